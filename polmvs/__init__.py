@@ -1,0 +1,33 @@
+"""polmvs: multi-view reconstruction of glossy, textureless surfaces from polarization cameras.
+
+Conventions (each is pinned by a test in ``tests/test_conventions.py``)
+------------------------------------------------------------------------
+Camera
+    x right, y down, z forward (OpenCV and COLMAP). ``p_in_cam = cam_from_world * p_in_world``.
+    A ray ``v`` is unit and leaves the camera, ``v_z > 0``; a visible surface normal has
+    ``n . v < 0``. Points and vectors are rows of ``(..., 3)`` arrays.
+Pixels
+    COLMAP's: the origin is the corner of the image, so pixel ``(row, col)`` has its centre at
+    ``xy = (col + 0.5, row + 0.5)``. OpenCV counts from pixel centres; the shift lives in
+    :mod:`polmvs.camera` and nowhere else. A 2x2 polarizer cell of the raw mosaic is one pixel of
+    the polarization image: ``K_half[:2] = K_raw[:2] / 2``.
+Polarization
+    ``aolp``: direction of greatest transmitted intensity, anticlockwise from +x as displayed,
+    modulo pi. ``phase``: direction in which the plane of incidence cuts the image plane, same
+    sense, modulo pi. ``phase = aolp`` for diffuse-dominant light, ``aolp + pi/2`` for
+    specular-dominant light. Both are axial: they are averaged and interpolated through
+    ``(cos 2x, sin 2x)`` only.
+Rows
+    ``m``: the unit normal of the plane of incidence. ``m . n = 0`` for the surface normal ``n``;
+    the residual is the sine of the angle between the normal and the plane of incidence.
+World
+    COLMAP's. Its scale is arbitrary unless the poses were given in metres.
+"""
+
+# pycolmap >= 4.1 exports its own deflate symbols: imported before zlib it makes PNG and npz
+# writing abort. Loading zlib first, before anything else of this package, cures it.
+import zlib  # noqa: F401
+
+from polmvs._version import __version__
+
+__all__ = ["__version__"]

@@ -1,0 +1,159 @@
+"""Cameras and posed views: rays, projection and the one place of the half-pixel shift.
+
+OpenCV counts pixels from their centres, COLMAP from the corner of the image. This is the only
+file that converts between the two; all other code uses COLMAP's and calls
+:func:`xy_to_opencv` at the border.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.geometry import RigidTransform
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+
+def xy_to_opencv(xy: NDArray[np.floating]) -> NDArray[np.floating]:
+    """COLMAP image coordinates (corner origin) to OpenCV's (first pixel centre at 0, 0)."""
+    return xy - 0.5
+
+
+def xy_from_opencv(xy: NDArray[np.floating]) -> NDArray[np.floating]:
+    """OpenCV image coordinates (first pixel centre at 0, 0) to COLMAP's (corner origin)."""
+    return xy + 0.5
+
+
+def pixel_centers(width: int, height: int) -> Array:
+    """Image coordinates of all pixel centres, ``(height, width, 2)``, COLMAP's convention."""
+    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+
+
+def sample_image(
+    image: NDArray[np.float32], xy: NDArray[np.floating], *, nearest: bool = False
+) -> NDArray[np.float32]:
+    """Sample an image at image coordinates, bilinearly or at the nearest pixel.
+
+    Parameters
+    ----------
+    image : (H, W) or (H, W, C) float32
+    xy : (..., 2), COLMAP convention, px. NaN and coordinates outside the image give 0.
+    nearest : sample the nearest pixel instead of interpolating.
+
+    Returns
+    -------
+    (...) or (..., C) float32
+    """
+    opencv_xy = xy_to_opencv(xy).astype(np.float32).reshape(-1, 2)
+    # OpenCV's maps are limited to 32767 a side: fold a long list of points into a rectangle.
+    num = len(opencv_xy)
+    side = 4096
+    padded = -(-max(num, 1) // side) * side if num > side else max(num, 1)
+    maps = np.full((padded, 2), -10.0, np.float32)
+    np.copyto(maps[:num], opencv_xy)
+    maps = maps.reshape(-1, min(side, padded), 2)
+    # NaN has no defined conversion to fixed point inside remap.
+    np.nan_to_num(maps, copy=False, nan=-10.0, posinf=-10.0, neginf=-10.0)
+    sampled = cv2.remap(
+        np.ascontiguousarray(image, np.float32),
+        maps,
+        None,
+        cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=0,
+    )
+    channels = image.shape[2:]
+    flat = sampled.reshape(-1, *channels)[:num]
+    return np.asarray(flat.reshape(*xy.shape[:-1], *channels), np.float32)
+
+
+class Camera(Protocol):
+    """What the rest of the package needs of a camera: rays of pixels and pixels of points."""
+
+    @property
+    def width(self) -> int:
+        """Image width, px."""
+
+    @property
+    def height(self) -> int:
+        """Image height, px."""
+
+    @property
+    def mean_focal_px(self) -> float:
+        """Focal length, px; the mean of the two axes."""
+
+    def rays(self, xy: NDArray[np.floating]) -> Array:
+        """Unit rays ``(..., 3)`` in the camera frame of image coordinates ``(..., 2)``."""
+
+    def project(self, points_in_cam: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Image coordinates ``(..., 2)`` of camera-frame points; NaN behind the camera."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PinholeCamera:
+    """A camera without distortion; the fast path in plain NumPy.
+
+    ``fx, fy, cx, cy`` in px, COLMAP's convention (a centred principal point is ``width / 2``).
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @property
+    def mean_focal_px(self) -> float:
+        """Mean of the two focal lengths, px."""
+        return 0.5 * (self.fx + self.fy)
+
+    @property
+    def K(self) -> Array:
+        """Calibration matrix ``(3, 3)``."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def rays(self, xy: NDArray[np.floating]) -> Array:
+        """Unit rays ``(..., 3)`` in the camera frame of image coordinates ``(..., 2)``."""
+        x = (np.asarray(xy[..., 0], np.float64) - self.cx) / self.fx
+        y = (np.asarray(xy[..., 1], np.float64) - self.cy) / self.fy
+        inverse_norm = 1.0 / np.sqrt(x * x + y * y + 1.0)
+        return np.stack([x * inverse_norm, y * inverse_norm, inverse_norm], axis=-1)
+
+    def project(self, points_in_cam: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Image coordinates ``(..., 2)`` of camera-frame points; NaN behind the camera."""
+        z = np.where(points_in_cam[..., 2] > 0, points_in_cam[..., 2], np.nan)
+        return np.stack(
+            [
+                self.fx * points_in_cam[..., 0] / z + self.cx,
+                self.fy * points_in_cam[..., 1] / z + self.cy,
+            ],
+            axis=-1,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One posed image.
+
+    Attributes
+    ----------
+    name : file name of the raw mosaic, also the image's name in the COLMAP model.
+    camera : of the half-size polarization image.
+    cam_from_world : pose.
+    """
+
+    name: str
+    camera: Camera
+    cam_from_world: RigidTransform
+
+    @property
+    def center_in_world(self) -> Array:
+        """Camera centre ``(3,)`` in the world."""
+        return self.cam_from_world.inverse().translation

@@ -1,0 +1,72 @@
+"""Rigid and similarity transforms, mirroring ``pycolmap.Rigid3d`` and ``Sim3d``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RigidTransform:
+    """``target_from_source``: ``p_in_target = rotation @ p_in_source + translation``.
+
+    Attributes
+    ----------
+    rotation : (3, 3) float64
+    translation : (3,) float64
+    """
+
+    rotation: Array
+    translation: Array
+
+    def __mul__(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Transform points ``(..., 3)``; float32 stays float32."""
+        rotation = self.rotation.astype(points.dtype, copy=False)
+        return points @ rotation.T + self.translation.astype(points.dtype, copy=False)
+
+    def inverse(self) -> RigidTransform:
+        """``source_from_target``."""
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
+
+
+@dataclass(frozen=True)
+class SimilarityTransform:
+    """``p_in_target = scale * rotation @ p_in_source + translation``."""
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    def __mul__(self, points: NDArray[np.floating]) -> Array:
+        """Transform points ``(..., 3)``."""
+        return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation
+
+
+def align_points(source: Array, target: Array) -> SimilarityTransform:
+    """Least-squares similarity that takes ``source`` to ``target`` (Umeyama 1991).
+
+    Parameters
+    ----------
+    source, target : (N, 3), N >= 3, not all on one line.
+
+    Raises
+    ------
+    ValueError
+        For fewer than three points, or points that leave the rotation undetermined.
+    """
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3:
+        raise ValueError(f"{source.shape=}, {target.shape=} but expected two (N, 3).")
+    source_centered = source - source.mean(axis=0)
+    target_centered = target - target.mean(axis=0)
+    left, singular, right = np.linalg.svd(target_centered.T @ source_centered)
+    if len(source) < 3 or singular[1] <= 1e-9 * max(singular[0], 1e-300):
+        raise ValueError("alignment needs at least three points that are not on one line.")
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = (left * sign) @ right
+    scale = float((singular * sign).sum() / (source_centered**2).sum())
+    translation = target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
+    return SimilarityTransform(scale, rotation, translation)
