@@ -1,0 +1,118 @@
+"""Options of every stage: typed, checked, in one place.
+
+Each stage takes its own frozen dataclass. The command line makes its flags from the fields
+(``option`` carries the help text), and the run writes the resolved values into ``run.json``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from polmvs.errors import OptionError
+
+
+class Model(StrEnum):
+    """Relation between the measured angle and the surface normal."""
+
+    OPA = "opa"
+    PPA = "ppa"
+
+
+class Light(StrEnum):
+    """Which reflection dominates the polarisation of the part."""
+
+    SPECULAR = "specular"
+    DIFFUSE = "diffuse"
+
+
+class Contour(StrEnum):
+    """How a PPA contour is traced."""
+
+    TANGENT = "tangent"
+    NORMALS = "normals"
+
+
+class Estimator(StrEnum):
+    """How a normal is solved from its rows."""
+
+    ROBUST = "robust"
+    ALGEBRAIC = "algebraic"
+
+
+def option(default: Any, help_text: str) -> Any:
+    """A dataclass field with its help text, which names the unit."""
+    return field(default=default, metadata={"help": help_text})
+
+
+def _require(holds: bool, message: str) -> None:
+    if not holds:
+        raise OptionError(message)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """How raw mosaics become polarization images."""
+
+    pattern: tuple[int, int, int, int] = option(
+        (90, 45, 135, 0), "polarizer angles of a 2x2 cell in degrees, row by row"
+    )
+    gamma: float = option(1.0, "encoding gamma: linear = (raw / full scale) ** (1 / gamma)")
+    saturation: float = option(
+        0.98, "share of the full scale from which a sample counts as clipped"
+    )
+    darkness: float = option(
+        0.004, "share of the full scale under which mean intensity is darkness"
+    )
+
+    def __post_init__(self) -> None:
+        _require(
+            sorted(self.pattern) == [0, 45, 90, 135],
+            f"--pattern needs each of 0, 45, 90, 135 once, not {self.pattern}.",
+        )
+        _require(0.1 <= self.gamma <= 10, f"--gamma must lie in 0.1 to 10, not {self.gamma}.")
+        _require(
+            0 < self.saturation <= 1, f"--saturation must lie in 0 to 1, not {self.saturation}."
+        )
+        _require(0 <= self.darkness < 0.5, f"--darkness must lie in 0 to 0.5, not {self.darkness}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmOptions:
+    """Where poses come from."""
+
+    intrinsics: tuple[float, ...] | None = option(
+        None, "fx,fy,cx,cy of the half-size polarization images, px, COLMAP's convention"
+    )
+    camera_model: str = option(
+        "SIMPLE_RADIAL", "COLMAP camera model to estimate where no intrinsics are given"
+    )
+    sparse: Path | None = option(None, "existing COLMAP model to use instead of running SfM")
+    single_camera: bool = option(True, "all images share one camera")
+    seed: int = option(0, "random seed of SfM")
+
+    def __post_init__(self) -> None:
+        if self.intrinsics is not None:
+            _require(
+                len(self.intrinsics) == 4 and min(self.intrinsics) > 0,
+                f"--intrinsics needs four positive numbers fx,fy,cx,cy, not {self.intrinsics}.",
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormalOptions:
+    """How normals are solved from phase angles."""
+
+    estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
+    light: Light = option(Light.SPECULAR, "reflection that dominates the polarisation")
+    window_px: int = option(17, "side of the window of rows about a track's point, px")
+    min_dolp: float = option(0.1, "DoLP from which a pixel's phase is used on its own")
+
+    def __post_init__(self) -> None:
+        _require(
+            self.window_px >= 1 and self.window_px % 2 == 1,
+            f"--window-px must be odd and positive, not {self.window_px}.",
+        )
+        _require(0 < self.min_dolp < 1, f"--min-dolp must lie in 0 to 1, not {self.min_dolp}.")
