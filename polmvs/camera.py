@@ -62,8 +62,8 @@ def sample_image(
     np.nan_to_num(maps, copy=False, nan=-10.0, posinf=-10.0, neginf=-10.0)
     sampled = cv2.remap(
         np.ascontiguousarray(image, np.float32),
-        maps,
-        None,
+        maps[..., 0],
+        maps[..., 1],
         cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,

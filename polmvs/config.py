@@ -60,12 +60,8 @@ class CaptureOptions:
         (90, 45, 135, 0), "polarizer angles of a 2x2 cell in degrees, row by row"
     )
     gamma: float = option(1.0, "encoding gamma: linear = (raw / full scale) ** (1 / gamma)")
-    saturation: float = option(
-        0.98, "share of the full scale from which a sample counts as clipped"
-    )
-    darkness: float = option(
-        0.004, "share of the full scale under which mean intensity is darkness"
-    )
+    saturation: float = option(0.98, "share of full scale from which a sample counts as clipped")
+    darkness: float = option(0.004, "share of full scale under which a pixel counts as dark")
 
     def __post_init__(self) -> None:
         _require(
@@ -74,7 +70,7 @@ class CaptureOptions:
         )
         _require(0.1 <= self.gamma <= 10, f"--gamma must lie in 0.1 to 10, not {self.gamma}.")
         _require(
-            0 < self.saturation <= 1, f"--saturation must lie in 0 to 1, not {self.saturation}."
+            0 < self.saturation <= 1, f"--saturation must lie in 0 to 1, not {self.saturation}"
         )
         _require(0 <= self.darkness < 0.5, f"--darkness must lie in 0 to 0.5, not {self.darkness}.")
 
