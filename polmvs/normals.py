@@ -1,0 +1,183 @@
+"""Normals from stacked constraint rows: the paper's eigenvector and a weighted robust estimator.
+
+Everything is batched over points: arrays are component first, ``(3, K, N)`` for K rows of N
+points, so that thousands of 3x3 problems are solved by a few vector operations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating]
+Array = NDArray[np.float64]
+
+MIN_SIN_ZENITH = 0.1  # a row of a nearly frontal surface says little: its weight is capped here
+CAUCHY_SCALE = 2.385  # 95 % efficiency on Gaussian residuals
+NUM_ROUNDS = 5  # of reweighting; the change of later ones is below 0.01 deg
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormalEstimate:
+    """Normals of N points with what is known about their quality.
+
+    Attributes
+    ----------
+    normals : (N, 3) float64, unit, frame of the rows, facing the viewers; NaN where not valid.
+    valid : (N,) bool
+    conditioning : (N,) ratio of the middle to the largest singular value of the weighted rows,
+        0 for rows of rank 1, at most 1.
+    sigma_deg : (N,) standard deviation along the larger axis of the covariance, degrees.
+    residual : (N,) weighted root mean square of ``m . n``: sine of the angle to the planes of
+        incidence.
+    num_rows : (N,) int, rows that counted, outliers (weight under a quarter) left out.
+    row_weights : (K, N) robust weights in [0, 1].
+    """
+
+    normals: Array
+    valid: NDArray[np.bool_]
+    conditioning: Array
+    sigma_deg: Array
+    residual: Array
+    num_rows: NDArray[np.int64]
+    row_weights: Floats
+
+
+def smallest_eigenvectors(matrices: Floats) -> tuple[Array, Array]:
+    """Eigenvalues and the eigenvector of the smallest one of symmetric 3x3 matrices.
+
+    Closed form (Smith 1961), one or two orders of magnitude faster than a LAPACK call per matrix.
+
+    Parameters
+    ----------
+    matrices : (6, N), the entries xx, yy, zz, xy, xz, yz.
+
+    Returns
+    -------
+    eigenvalues : (3, N) float64, ascending.
+    eigenvectors : (3, N) float64, unit; an arbitrary one where the smallest eigenvalue is double.
+    """
+    xx, yy, zz, xy, xz, yz = np.asarray(matrices, np.float64)
+    mean = (xx + yy + zz) / 3
+    bxx, byy, bzz = xx - mean, yy - mean, zz - mean
+    off = xy * xy + xz * xz + yz * yz
+    spread = np.sqrt((bxx * bxx + byy * byy + bzz * bzz + 2 * off) / 6)
+    det = bxx * (byy * bzz - yz * yz) - xy * (xy * bzz - yz * xz) + xz * (xy * yz - byy * xz)
+    safe = np.maximum(spread, 1e-300)
+    angle = np.arccos(np.clip(det / (2 * safe**3), -1, 1)) / 3
+    largest = mean + 2 * spread * np.cos(angle)
+    smallest = mean + 2 * spread * np.cos(angle + 2 * np.pi / 3)
+    middle = 3 * mean - largest - smallest
+
+    # The eigenvector spans the null space of A - smallest I: the longest cross product of rows.
+    axx, ayy, azz = xx - smallest, yy - smallest, zz - smallest
+    crosses = np.array(
+        [
+            [xy * yz - xz * ayy, xz * xy - axx * yz, axx * ayy - xy * xy],
+            [xy * azz - xz * yz, xz * xz - axx * azz, axx * yz - xy * xz],
+            [ayy * azz - yz * yz, yz * xz - xy * azz, xy * yz - ayy * xz],
+        ]
+    )
+    norms = np.sqrt((crosses**2).sum(axis=1))
+    best = norms.argmax(axis=0)
+    columns = np.arange(crosses.shape[2])
+    vectors = crosses[best, :, columns].T
+    length = norms[best, columns]
+    degenerate = ~(length > 1e-14 * np.maximum(spread, 1e-150) ** 2)
+    vectors = np.where(degenerate, np.array([[0.0], [0.0], [1.0]]), vectors)
+    vectors = vectors / np.where(degenerate, 1.0, length)
+    return np.array([smallest, middle, largest]), vectors
+
+
+def solve_normals(
+    rows: Floats,
+    rays: Floats,
+    sigma: Floats,
+    *,
+    robust: bool = True,
+    min_rows: int = 2,
+    min_conditioning: float = 0.02,
+) -> NormalEstimate:
+    """Normals of N points from K rows each.
+
+    The paper's estimator (``robust=False``): the eigenvector of the smallest eigenvalue of
+    ``M^T M`` over the usable rows, all alike. The robust one: rows weighted by the inverse
+    variance of their residual, ``(sin(theta) sigma)^2`` with theta the angle between normal and
+    ray, and by a Cauchy loss; both re-estimated in ``NUM_ROUNDS`` rounds.
+
+    Parameters
+    ----------
+    rows : (3, K, N), unit, any one frame per point; NaN rows are left out.
+    rays : (3, K, N), unit, same frame, from the cameras towards the points.
+    sigma : (K, N), standard deviation of the row's turn about its ray, radians; infinite or
+        NaN: the row is left out.
+    robust : weighted robust estimator, or the paper's.
+    min_rows, min_conditioning : under these a point has no normal (NaN, not valid).
+    """
+    if rows.ndim != 3 or rows.shape[0] != 3 or rows.shape != rays.shape:
+        raise ValueError(f"{rows.shape=}, {rays.shape=} but expected two (3, K, N).")
+    if sigma.shape != rows.shape[1:]:
+        raise ValueError(f"{sigma.shape=} but expected {rows.shape[1:]}.")
+    usable = np.isfinite(sigma) & (sigma > 0) & np.isfinite(rows).all(axis=0)
+    rows = np.where(usable, rows, 0)
+    precision = np.where(usable, 1 / np.where(usable, sigma, 1) ** 2, 0)
+    weights = precision if robust else usable.astype(rows.dtype)
+    outlier_weights = usable.astype(rows.dtype)
+    normals = _smallest(rows, weights)[1]
+    for round_index in range(NUM_ROUNDS if robust else 0):
+        residuals = _dot(rows, normals)
+        sin2 = np.maximum(1 - _dot(rays, normals) ** 2, MIN_SIN_ZENITH**2)
+        z2 = residuals**2 * precision / sin2
+        # Anneal: a wide loss first, so that a poor start does not reject the good rows.
+        scale = CAUCHY_SCALE * 2.0 ** max(2 - round_index, 0)
+        outlier_weights = np.where(usable, 1 / (1 + z2 / scale**2), 0)
+        weights = precision / sin2 * outlier_weights
+        normals = _smallest(rows, weights)[1]
+    return _describe(rows, rays, weights, outlier_weights, min_rows, min_conditioning)
+
+
+def _dot(rows: Floats, normals: Floats) -> Floats:
+    """``m . n`` for rows (3, K, N) and normals (3, N)."""
+    n = normals.astype(rows.dtype, copy=False)
+    return np.asarray(rows[0] * n[0] + rows[1] * n[1] + rows[2] * n[2])
+
+
+def _smallest(rows: Floats, weights: Floats) -> tuple[Array, Array]:
+    """Eigenvalues and smallest eigenvector of the weighted ``M^T M``."""
+    x, y, z = rows
+    wx, wy, wz = weights * x, weights * y, weights * z
+    products = (wx * x, wy * y, wz * z, wx * y, wx * z, wy * z)
+    return smallest_eigenvectors(np.array([p.sum(axis=0, dtype=np.float64) for p in products]))
+
+
+def _describe(
+    rows: Floats,
+    rays: Floats,
+    weights: Floats,
+    outlier_weights: Floats,
+    min_rows: int,
+    min_conditioning: float,
+) -> NormalEstimate:
+    """Final solution with its sign, conditioning, covariance and validity."""
+    eigenvalues, normals = _smallest(rows, weights)
+    num_rows = (outlier_weights > 0.25).sum(axis=0)
+    total = weights.sum(axis=0, dtype=np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        conditioning = np.sqrt(np.maximum(eigenvalues[1], 0) / eigenvalues[2])
+        residual = np.sqrt(np.maximum(eigenvalues[0], 0) / total)
+        # The precision matrix of the normal on its tangent plane is M^T W M itself.
+        sigma_deg = np.degrees(1 / np.sqrt(eigenvalues[1]))
+    facing = (_dot(rays, normals) * weights).sum(axis=0)
+    normals = np.where(facing > 0, -normals, normals)
+    valid = (num_rows >= min_rows) & (conditioning >= min_conditioning) & (total > 0)
+    return NormalEstimate(
+        normals=np.where(valid, normals, np.nan).T,
+        valid=valid,
+        conditioning=np.where(total > 0, conditioning, 0.0),
+        sigma_deg=np.where(valid, sigma_deg, np.nan),
+        residual=np.where(valid, residual, np.nan),
+        num_rows=num_rows,
+        row_weights=outlier_weights,
+    )
