@@ -112,3 +112,56 @@ class NormalOptions:
             f"--window-px must be odd and positive, not {self.window_px}.",
         )
         _require(0 < self.min_dolp < 1, f"--min-dolp must lie in 0 to 1, not {self.min_dolp}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PropagationOptions:
+    """How ranges spread from the seeds over the polarised region."""
+
+    contour: Contour = option(
+        Contour.TANGENT,
+        "PPA contours: 'tangent' (iso-range, one view) or 'normals' (multi-view normals along "
+        "the iso-depth paths, as in the paper)",
+    )
+    step_px: float = option(0.5, "step of the contours, px")
+    spacing_px: float = option(5.0, "distance between contours and between their nodes, px")
+    stride_px: int = option(2, "distance between the dense points of one view, px")
+    num_rounds: int = option(3, "rounds of normals and ranges")
+    max_neighbors: int = option(15, "other views that give rows to one view")
+
+    def __post_init__(self) -> None:
+        _require(0.05 <= self.step_px <= 4, f"--step-px must lie in 0.05 to 4, not {self.step_px}.")
+        _require(
+            self.step_px <= self.spacing_px <= 64,
+            f"--spacing-px must lie in {self.step_px} to 64, not {self.spacing_px}.",
+        )
+        _require(1 <= self.stride_px <= 16, f"--stride-px must lie in 1 to 16: {self.stride_px}.")
+        _require(
+            1 <= self.num_rounds <= 20, f"--num-rounds must lie in 1 to 20: {self.num_rounds}."
+        )
+        _require(
+            self.max_neighbors >= 1, f"--max-neighbors must be 1 or more: {self.max_neighbors}."
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FusionOptions:
+    """How the views' points become one cloud."""
+
+    min_views: int = option(2, "views that must agree on a point, its own included")
+    max_range_difference_px: float = option(
+        2.0, "disagreement of two views' distances, in footprints of a pixel"
+    )
+    max_normal_difference_deg: float = option(15.0, "disagreement of two views' normals, degrees")
+    voxel_px: float = option(
+        0.5, "edge of the merging voxel, in footprints of a pixel; 0: no merging"
+    )
+
+    def __post_init__(self) -> None:
+        _require(self.min_views >= 1, f"--min-views must be 1 or more, not {self.min_views}.")
+        _require(self.max_range_difference_px > 0, "--max-range-difference-px must be positive.")
+        _require(
+            0 < self.max_normal_difference_deg <= 90,
+            "--max-normal-difference-deg must lie in 0 to 90.",
+        )
+        _require(self.voxel_px >= 0, "--voxel-px must not be negative.")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
 
+MIN_VISIBLE_COSINE = 0.03  # between normal and viewing direction; flatter sight is no sight
 MIN_SIN_ZENITH = 0.1  # a row of a nearly frontal surface says little: its weight is capped here
 CAUCHY_SCALE = 2.385  # 95 % efficiency on Gaussian residuals
 NUM_ROUNDS = 5  # of reweighting; the change of later ones is below 0.01 deg
@@ -65,7 +66,7 @@ def smallest_eigenvectors(matrices: Floats) -> tuple[Array, Array]:
     off = xy * xy + xz * xz + yz * yz
     spread = np.sqrt((bxx * bxx + byy * byy + bzz * bzz + 2 * off) / 6)
     det = bxx * (byy * bzz - yz * yz) - xy * (xy * bzz - yz * xz) + xz * (xy * yz - byy * xz)
-    safe = np.maximum(spread, 1e-300)
+    safe = np.maximum(spread, 1e-100)
     angle = np.arccos(np.clip(det / (2 * safe**3), -1, 1)) / 3
     largest = mean + 2 * spread * np.cos(angle)
     smallest = mean + 2 * spread * np.cos(angle + 2 * np.pi / 3)
@@ -97,6 +98,7 @@ def solve_normals(
     sigma: Floats,
     *,
     robust: bool = True,
+    initial_normals: Floats | None = None,
     min_rows: int = 2,
     min_conditioning: float = 0.02,
 ) -> NormalEstimate:
@@ -105,7 +107,8 @@ def solve_normals(
     The paper's estimator (``robust=False``): the eigenvector of the smallest eigenvalue of
     ``M^T M`` over the usable rows, all alike. The robust one: rows weighted by the inverse
     variance of their residual, ``(sin(theta) sigma)^2`` with theta the angle between normal and
-    ray, and by a Cauchy loss; both re-estimated in ``NUM_ROUNDS`` rounds.
+    ray, and by a Cauchy loss; both re-estimated in ``NUM_ROUNDS`` rounds. A view from behind the
+    surface cannot see it: its row is left out.
 
     Parameters
     ----------
@@ -114,6 +117,8 @@ def solve_normals(
     sigma : (K, N), standard deviation of the row's turn about its ray, radians; infinite or
         NaN: the row is left out.
     robust : weighted robust estimator, or the paper's.
+    initial_normals : (3, N), where known (else NaN): a start that tells which views face the
+        point before its first solution.
     min_rows, min_conditioning : under these a point has no normal (NaN, not valid).
     """
     if rows.ndim != 3 or rows.shape[0] != 3 or rows.shape != rays.shape:
@@ -125,14 +130,19 @@ def solve_normals(
     precision = np.where(usable, 1 / np.where(usable, sigma, 1) ** 2, 0)
     weights = precision if robust else usable.astype(rows.dtype)
     outlier_weights = usable.astype(rows.dtype)
+    if initial_normals is not None:
+        cosine = _dot(rays, initial_normals)
+        weights = weights * ~(cosine > 0)  # NaN: unknown, kept
     normals = _smallest(rows, weights)[1]
     for round_index in range(NUM_ROUNDS if robust else 0):
-        residuals = _dot(rows, normals)
-        sin2 = np.maximum(1 - _dot(rays, normals) ** 2, MIN_SIN_ZENITH**2)
-        z2 = residuals**2 * precision / sin2
+        cosine = _dot(rays, normals)
+        facing = np.sign((cosine * weights).sum(axis=0))
+        visible = usable & (cosine * facing > MIN_VISIBLE_COSINE)
+        sin2 = np.maximum(1 - cosine**2, MIN_SIN_ZENITH**2)
+        z2 = _dot(rows, normals) ** 2 * precision / sin2
         # Anneal: a wide loss first, so that a poor start does not reject the good rows.
         scale = CAUCHY_SCALE * 2.0 ** max(2 - round_index, 0)
-        outlier_weights = np.where(usable, 1 / (1 + z2 / scale**2), 0)
+        outlier_weights = np.where(visible, 1 / (1 + z2 / scale**2), 0)
         weights = precision / sin2 * outlier_weights
         normals = _smallest(rows, weights)[1]
     return _describe(rows, rays, weights, outlier_weights, min_rows, min_conditioning)

@@ -1,0 +1,169 @@
+"""Phase maps: what the geometry needs of one view, and the rows that many views give a point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import View, pixel_centers, sample_image
+from polmvs.config import Light, Model
+from polmvs.models import rows_from_axial
+from polmvs.region import Region, smooth
+
+Floats = NDArray[np.floating]
+Image = NDArray[np.float32]
+
+FINE_SMOOTHING_PX = 1.5
+COARSE_SMOOTHING_PX = 5.0  # bridges marks and frontal spots
+MODEL_SIGMA = 0.014  # rad; error of a phase that noise does not explain, strongly polarised light
+MIXTURE_SIGMA = 0.006  # rad x DoLP; light of the other kind mixed in turns the phase by this / DoLP
+
+
+@dataclass(frozen=True)
+class PhaseMap:
+    """Phase of one view, smoothed over the reliable pixels of its region.
+
+    Attributes
+    ----------
+    view : camera, pose and name.
+    region : where the view shows a polarised surface.
+    samples : (H, W, 3) float32: ``dolp cos 2 phase``, ``dolp sin 2 phase`` and the inverse
+        variance of the row's turn about its ray (1 / rad^2; 0: no phase here).
+    intensity : (H, W) float32, s0 in units of full scale.
+    """
+
+    view: View
+    region: Region
+    samples: Image
+    intensity: Image
+
+
+def build_phase_map(
+    view: View,
+    s0: Image,
+    s1: Image,
+    s2: Image,
+    sigma: Image,
+    region: Region,
+    light: Light,
+) -> PhaseMap:
+    """Smooth the Stokes images over the reliable pixels and turn them into phase and precision.
+
+    Parameters
+    ----------
+    s0, s1, s2 : (H, W) float32, Stokes images.
+    sigma : (H, W) float32, standard deviation of s1 and of s2.
+    region : of this view.
+    light : which reflection dominates; specular light turns the phase by pi/2 from the AoLP.
+    """
+    weight = region.reliable.astype(np.float32)
+    stokes = np.dstack([s0, s1, s2, np.square(sigma)])
+    fine, fine_weight = _normalized_smoothing(stokes, weight, FINE_SMOOTHING_PX)
+    coarse, coarse_weight = _normalized_smoothing(stokes, weight, COARSE_SMOOTHING_PX)
+    use_fine = fine_weight > 0.25
+    smoothed = np.where(use_fine[..., None], fine, coarse)
+    width_px = np.where(use_fine, FINE_SMOOTHING_PX, COARSE_SMOOTHING_PX)
+    share = np.where(use_fine, fine_weight, coarse_weight)
+    sign = -1.0 if light is Light.SPECULAR else 1.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        axial = sign * smoothed[..., 1:3] / smoothed[..., :1]
+        dolp = np.linalg.norm(axial, axis=-1)
+        # A Gaussian of width w averages 4 pi w^2 independent pixels.
+        noise = np.sqrt(smoothed[..., 3] / (4 * np.pi * width_px**2 * share)) / smoothed[..., 0]
+        variance = MODEL_SIGMA**2 + (MIXTURE_SIGMA**2 + (0.5 * noise) ** 2) / dolp**2
+        precision = np.where(region.inside & (share > 0.02), 1 / variance, 0)
+    samples = np.dstack([axial, precision]).astype(np.float32)
+    np.nan_to_num(samples, copy=False, nan=0.0)
+    return PhaseMap(view, region, samples, s0)
+
+
+def _normalized_smoothing(
+    images: Image, weight: Image, sigma_px: float
+) -> tuple[NDArray[np.float32], Image]:
+    """Gaussian mean of the weighted pixels, and their share under the Gaussian."""
+    share = smooth(weight, sigma_px)
+    mean = smooth(images * weight[..., None], sigma_px) / np.maximum(share, 1e-6)[..., None]
+    return mean.astype(np.float32), share
+
+
+def view_rays(view: View) -> NDArray[np.float32]:
+    """Unit rays ``(H, W, 3)`` of all pixels, camera frame."""
+    camera = view.camera
+    return camera.rays(pixel_centers(camera.width, camera.height)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Constraint rows of N points from K views, world frame, component first.
+
+    Attributes
+    ----------
+    rows, rays : (3, K, N) float32, unit; NaN rows where a view has no phase.
+    sigma : (K, N) float32, rad; infinite where the row does not count.
+    """
+
+    rows: NDArray[np.float32]
+    rays: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+
+
+def gather_rows(
+    model: Model,
+    points_in_world: Floats,
+    maps: Sequence[PhaseMap],
+    range_maps: Sequence[Image | None] | None = None,
+    *,
+    range_tolerance: float = 0.02,
+) -> Rows:
+    """Rows of points from all views that see them (paper, eq. coeff_2, before stacking).
+
+    Parameters
+    ----------
+    model : which rows.
+    points_in_world : (N, 3).
+    maps : K phase maps.
+    range_maps : per view ``(h, w)`` distances from the camera centre, 0 where unknown: a point
+        that lies behind its view's map by more than ``range_tolerance`` (relative) is occluded.
+    """
+    points = np.asarray(points_in_world, np.float32)
+    num_views, num_points = len(maps), len(points)
+    rows = np.full((3, num_views, num_points), np.nan, np.float32)
+    rays = np.zeros((3, num_views, num_points), np.float32)
+    sigma = np.full((num_views, num_points), np.inf, np.float32)
+    for k, phase_map in enumerate(maps):
+        in_cam = phase_map.view.cam_from_world * points
+        distance = np.linalg.norm(in_cam, axis=-1)
+        ray = in_cam / np.maximum(distance, 1e-12)[:, None]
+        xy = phase_map.view.camera.project(in_cam)
+        samples = sample_image(phase_map.samples, xy)
+        precision = samples[:, 2]
+        range_map = range_maps[k] if range_maps is not None else None
+        if range_map is not None:
+            seen = sample_range(range_map, phase_map.view, xy)
+            precision = np.where(
+                (seen > 0) & (distance > (1 + range_tolerance) * seen), 0, precision
+            )
+        row, turn = _row_and_turn(model, samples, ray)
+        rotation = phase_map.view.cam_from_world.rotation.astype(np.float32)
+        rows[:, k] = (row @ rotation).T
+        rays[:, k] = (ray @ rotation).T
+        with np.errstate(divide="ignore"):
+            sigma[k] = np.where(precision > 0, turn / np.sqrt(precision), np.inf)
+    return Rows(rows, rays, sigma)
+
+
+def sample_range(range_map: Image, view: View, xy: Floats) -> NDArray[np.float32]:
+    """Nearest value of a range map, which may be coarser than the view by a whole factor."""
+    return sample_image(range_map, xy / (view.camera.width // range_map.shape[1]), nearest=True)
+
+
+def _row_and_turn(model: Model, samples: Image, rays: Floats) -> tuple[Floats, Floats]:
+    """Row in the camera frame, and how far it turns about the ray per turn of the phase."""
+    row = rows_from_axial(model, samples[:, 0], samples[:, 1], rays)
+    if model is Model.OPA:
+        return row, np.ones(len(row), np.float32)
+    # v_z / (1 - (v . d)^2): the length of v x d is v_z over the row's length in the image plane.
+    return row, (row[:, 0] ** 2 + row[:, 1] ** 2) / rays[:, 2]

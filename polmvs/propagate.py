@@ -1,0 +1,370 @@
+"""Contour propagation: from a few seeds to the range of every point of a polarised region.
+
+Contours traced through a view's phase carry a seed's range across the region; normals solved from
+the phases of all views carry it sideways, from contour to contour. One robust least-squares
+problem per view joins both, so that every node draws on all seeds. Normals need the points' place
+in the other views, so the two alternate; they depend on it weakly and few rounds suffice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from polmvs.camera import sample_image
+from polmvs.config import Contour, Model, PropagationOptions
+from polmvs.contour import Contours, cover_with_contours, direction_field
+from polmvs.normals import NormalEstimate, solve_normals
+from polmvs.phasemap import PhaseMap, gather_rows, view_rays
+from polmvs.surface import (
+    Edges,
+    SeedTies,
+    log_range_increment,
+    slope_sigma,
+    solve_log_ranges,
+)
+from polmvs.tracks import Seeds
+
+Floats = NDArray[np.floating]
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Image = NDArray[np.float32]
+
+NORMAL_SIGMA_FLOOR = 0.004  # rad; systematic error of multi-view normals
+MAX_SEED_DISTANCE_PX = 12.0  # from a seed to the nodes it is tied to
+NUM_TIES = 4
+NUM_NEIGHBORS = 6
+
+
+@dataclass(frozen=True)
+class DenseView:
+    """Dense result of one view on a lattice of its pixels.
+
+    Attributes
+    ----------
+    stride_px : lattice point (i, j) lies at ``xy = ((j + 0.5) stride, (i + 0.5) stride)``.
+    range_map : (h, w) float32, distance from the camera centre, world units; 0 where unknown.
+    normals_in_world : (h, w, 3) float32, unit; NaN where unknown.
+    sigma_deg : (h, w) float32, standard deviation of the normal.
+    """
+
+    stride_px: int
+    range_map: Image
+    normals_in_world: Image
+    sigma_deg: Image
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """Nodes of one view's contour network and what is known about them."""
+
+    xy: Image
+    rays_in_world: NDArray[np.float32]
+    ray_z: NDArray[np.float32]
+    tail: Indices
+    head: Indices
+    on_contour: NDArray[np.bool_]
+    log_range: Array
+    normals: Array
+    normal_sigma: Array
+
+
+def choose_neighbors(maps: Sequence[PhaseMap], seeds: Seeds, max_neighbors: int) -> list[list[int]]:
+    """For each view, itself and the views that share most seeds with it, spread in direction."""
+    seen = np.array([_visible_seeds(m, seeds)[0] for m in maps], float).reshape(len(maps), -1)
+    shared = seen @ seen.T
+    neighbors = []
+    for k in range(len(maps)):
+        shared[k, k] = np.inf
+        order = np.argsort(-shared[k], kind="stable")
+        neighbors.append([int(j) for j in order[: max_neighbors + 1]])
+    return neighbors
+
+
+def _visible_seeds(phase_map: PhaseMap, seeds: Seeds) -> tuple[NDArray[np.bool_], Array]:
+    """Which seeds project into the view's region facing it, and where."""
+    in_cam = phase_map.view.cam_from_world * seeds.points_in_world
+    xy = phase_map.view.camera.project(in_cam)
+    inside = sample_image(phase_map.region.inside.astype(np.float32), xy, nearest=True) > 0
+    to_point = seeds.points_in_world - phase_map.view.center_in_world
+    facing = (to_point * seeds.normals_in_world).sum(-1) < -0.1 * np.linalg.norm(to_point, axis=-1)
+    known = np.isfinite(seeds.normals_in_world).all(axis=-1)
+    return inside & (facing | ~known), np.asarray(xy, np.float64)
+
+
+def propagate(
+    model: Model,
+    maps: Sequence[PhaseMap],
+    seeds: Seeds,
+    options: PropagationOptions,
+    *,
+    num_threads: int = 2,
+    on_progress: Callable[[int], None] | None = None,
+) -> list[DenseView | None]:
+    """Range and normal over the polarised region of every view.
+
+    Parameters
+    ----------
+    model : OPA or PPA; it decides the rows of the normals and what is constant on a contour.
+    maps : phase maps of the posed views.
+    seeds : points on the surface.
+    on_progress : called after each view of each round.
+
+    Returns
+    -------
+    Per view its dense result, or None where no seed reaches the view's region.
+    """
+    neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
+
+    def advance(result: None) -> None:
+        if on_progress is not None:
+            on_progress(1)
+
+    with ThreadPoolExecutor(num_threads) as pool:
+        nodes = list(pool.map(lambda m: _start(model, m, seeds, options), maps))
+        dense: list[DenseView | None] = [None] * len(maps)
+        for _ in range(options.num_rounds):
+            range_maps = [d.range_map if d is not None else None for d in dense]
+
+            def one_round(
+                k: int, range_maps: list[Image | None] = range_maps
+            ) -> tuple[_Nodes | None, DenseView | None]:
+                current = nodes[k]
+                if current is None:
+                    return None, None
+                used = neighbors[k]
+                updated = _update(
+                    model,
+                    maps[k],
+                    [maps[j] for j in used],
+                    [range_maps[j] for j in used],
+                    current,
+                    seeds,
+                    options,
+                )
+                result = _densify(maps[k], updated, options)
+                if on_progress is not None:
+                    on_progress(1)
+                return updated, result
+
+            results = list(pool.map(one_round, range(len(maps))))
+            nodes = [r[0] for r in results]
+            dense = [r[1] for r in results]
+    return dense
+
+
+def _start(
+    model: Model, phase_map: PhaseMap, seeds: Seeds, options: PropagationOptions
+) -> _Nodes | None:
+    """Trace the contours of a view and give each node a first range from the nearest seeds."""
+    visible, seed_xy = _visible_seeds(phase_map, seeds)
+    if not visible.any():
+        return None
+    path_model = Model.OPA if options.contour is Contour.NORMALS else model
+    rays = view_rays(phase_map.view)
+    dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
+    passable = phase_map.region.inside & ~phase_map.region.edges & (dolp > 0.05)
+    field = direction_field(path_model, phase_map.samples, rays, passable)
+    keep_every = max(int(round(options.spacing_px / options.step_px)), 1)
+    contours = cover_with_contours(
+        field,
+        seed_xy[visible],
+        phase_map.region.inside & ~phase_map.region.edges,
+        spacing_px=options.spacing_px,
+        step_px=options.step_px,
+        keep_every=keep_every,
+    )
+    if not len(contours.xy):
+        return None
+    rays_in_cam = phase_map.view.camera.rays(contours.xy)
+    tail, head, on_contour = _network(contours, phase_map, options.spacing_px)
+    distance = np.linalg.norm(
+        seeds.points_in_world[visible] - phase_map.view.center_in_world, axis=-1
+    )
+    log_range = _interpolate(seed_xy[visible], np.log(distance), contours.xy)
+    num = len(contours.xy)
+    return _Nodes(
+        xy=contours.xy,
+        rays_in_world=(rays_in_cam @ phase_map.view.cam_from_world.rotation).astype(np.float32),
+        ray_z=rays_in_cam[:, 2].astype(np.float32),
+        tail=tail,
+        head=head,
+        on_contour=on_contour,
+        log_range=log_range,
+        normals=seeds.normals_in_world[visible][cKDTree(seed_xy[visible]).query(contours.xy)[1]],
+        normal_sigma=np.full(num, np.nan),
+    )
+
+
+def _interpolate(known_xy: Floats, values: Array, xy: Floats, num_nearest: int = 5) -> Array:
+    """Median of the nearest known values: a rough start that one wrong seed does not spoil."""
+    nearest = min(num_nearest, len(known_xy))
+    indices = cKDTree(known_xy).query(xy, k=nearest)[1].reshape(len(xy), nearest)
+    return np.asarray(np.median(values[indices], axis=1), np.float64)
+
+
+def _network(
+    contours: Contours, phase_map: PhaseMap, spacing_px: float
+) -> tuple[Indices, Indices, NDArray[np.bool_]]:
+    """Edges between consecutive nodes of a curve and between neighbouring nodes of all curves."""
+    xy = contours.xy
+    num = len(xy)
+    follows = contours.curve[1:] == contours.curve[:-1]
+    along = np.stack([np.flatnonzero(follows), np.flatnonzero(follows) + 1], axis=1)
+    k = min(NUM_NEIGHBORS + 1, num)
+    distance, index = cKDTree(xy).query(xy, k=k, distance_upper_bound=2.2 * spacing_px)
+    tails = np.repeat(np.arange(num), k)
+    heads, near = index.reshape(-1), distance.reshape(-1)
+    cross = (heads < num) & (heads != tails) & (near > 0)
+    pairs = np.unique(np.sort(np.stack([tails[cross], heads[cross]], axis=1), axis=1), axis=0)
+    is_along = np.isin(pairs[:, 0] * num + pairs[:, 1], along[:, 0] * num + along[:, 1])
+    pairs = np.concatenate([along, pairs[~is_along]])
+    on_contour = np.arange(len(pairs)) < len(along)
+    # An edge may not cross a crease or leave the region.
+    open_pixels = (phase_map.region.inside & ~phase_map.region.edges).astype(np.float32)
+    clear = np.ones(len(pairs), bool)
+    for share in (0.25, 0.5, 0.75):
+        between = (1 - share) * xy[pairs[:, 0]] + share * xy[pairs[:, 1]]
+        clear &= sample_image(open_pixels, between, nearest=True) > 0
+    return pairs[clear, 0], pairs[clear, 1], on_contour[clear]
+
+
+def _update(
+    model: Model,
+    phase_map: PhaseMap,
+    used_maps: Sequence[PhaseMap],
+    range_maps: Sequence[Image | None],
+    nodes: _Nodes,
+    seeds: Seeds,
+    options: PropagationOptions,
+) -> _Nodes:
+    """One round: normals at the nodes from all views, then ranges from normals and seeds."""
+    center = phase_map.view.center_in_world
+    points = center + np.exp(nodes.log_range)[:, None] * nodes.rays_in_world
+    known = np.isfinite(nodes.log_range)
+    points[~known] = center  # projects nowhere: no rows
+    rows = gather_rows(model, points, used_maps, range_maps)
+    estimate = solve_normals(rows.rows, rows.rays, rows.sigma, initial_normals=nodes.normals.T)
+    normals, sigma = _fill_normals(nodes, estimate)
+    own_sigma = rows.sigma[0]
+    edges = _edges(model, nodes, normals, sigma, own_sigma, options)
+    ties, num_seeds = _tie_seeds(phase_map, nodes, normals, seeds)
+    solution = solve_log_ranges(len(nodes.xy), edges, ties, num_seeds)
+    return replace(nodes, log_range=solution.log_range, normals=normals, normal_sigma=sigma)
+
+
+def _fill_normals(nodes: _Nodes, estimate: NormalEstimate) -> tuple[Array, Array]:
+    """Normals with the gaps filled from neighbours, which widens their deviation."""
+    sigma = np.hypot(np.radians(estimate.sigma_deg), NORMAL_SIGMA_FLOOR)
+    good = estimate.valid & (estimate.num_rows >= 3) & (estimate.sigma_deg < 5)
+    if not good.any():
+        return estimate.normals, sigma
+    normals = estimate.normals.copy()
+    k = min(8, int(good.sum()))
+    index = cKDTree(nodes.xy[good]).query(nodes.xy[~good], k=k)[1].reshape(-1, k)
+    mean = normals[good][index].mean(axis=1)
+    normals[~good] = mean / np.linalg.norm(mean, axis=-1, keepdims=True)
+    sigma[~good] = 0.1
+    return normals, sigma
+
+
+def _edges(
+    model: Model,
+    nodes: _Nodes,
+    normals: Array,
+    sigma: Array,
+    own_sigma: Floats,
+    options: PropagationOptions,
+) -> Edges:
+    """Increments from normals on all edges, and the constancy along the contours."""
+    tail, head = nodes.tail, nodes.head
+    rays = nodes.rays_in_world.astype(np.float64)
+    mean = normals[tail] + normals[head]
+    mean /= np.linalg.norm(mean, axis=-1, keepdims=True)
+    angle = np.linalg.norm(rays[head] - rays[tail], axis=-1)
+    slope = slope_sigma(mean, rays[tail], 0.5 * (sigma[tail] + sigma[head]))
+    delta = log_range_increment(mean, rays[tail], rays[head])
+    edge_sigma = np.maximum(angle * slope, 1e-7)
+    finite = np.isfinite(delta) & np.isfinite(edge_sigma)
+    use = nodes.on_contour & finite & (options.contour is Contour.TANGENT)
+    # Constant range (PPA) or depth (OPA); its slope errs by the turn of the row about the ray.
+    constant = np.log(nodes.ray_z[tail] / nodes.ray_z[head]) if model is Model.OPA else 0.0 * angle
+    turn = 0.5 * (own_sigma[tail] + own_sigma[head])
+    cosine = np.abs((mean * rays[tail]).sum(axis=-1))
+    constant_sigma = (
+        angle * turn * np.sqrt(1 - np.minimum(cosine, 1) ** 2) / np.maximum(cosine, 0.05)
+    )
+    use &= np.isfinite(constant_sigma)
+    return Edges(
+        tail=np.concatenate([tail[finite], tail[use]]),
+        head=np.concatenate([head[finite], head[use]]),
+        delta=np.concatenate([delta[finite], constant[use]]),
+        sigma=np.concatenate([edge_sigma[finite], np.maximum(constant_sigma[use], 1e-7)]),
+    )
+
+
+def _tie_seeds(
+    phase_map: PhaseMap, nodes: _Nodes, normals: Array, seeds: Seeds
+) -> tuple[SeedTies, int]:
+    """Tie every visible seed to the nearest nodes through the plane of the node's normal."""
+    visible, seed_xy = _visible_seeds(phase_map, seeds)
+    to_seed = seeds.points_in_world - phase_map.view.center_in_world
+    distance = np.linalg.norm(to_seed, axis=-1)
+    k = min(NUM_TIES, len(nodes.xy))
+    gap, node = cKDTree(nodes.xy).query(np.where(visible[:, None], seed_xy, -1e6), k=k)
+    gap, node = gap.reshape(-1, k), node.reshape(-1, k)
+    seed = np.repeat(np.arange(len(distance)), k)
+    node, gap = node.reshape(-1), gap.reshape(-1)
+    rays = (to_seed / distance[:, None])[seed]
+    with np.errstate(invalid="ignore"):
+        step = log_range_increment(
+            normals[node], rays, nodes.rays_in_world[node].astype(np.float64)
+        )
+    ok = visible[seed] & (gap < MAX_SEED_DISTANCE_PX) & np.isfinite(step)
+    seed, node, gap, step = seed[ok], node[ok], gap[ok], step[ok]
+    footprint = 1 / phase_map.view.camera.mean_focal_px
+    sigma = np.sqrt(
+        k * (seeds.sigma[seed] / distance[seed]) ** 2 + (0.02 * (1 + gap) * footprint) ** 2
+    )
+    value = np.log(distance[seed]) + step
+    return SeedTies(node=node, seed=seed, value=value, sigma=sigma), len(distance)
+
+
+def _densify(phase_map: PhaseMap, nodes: _Nodes, options: PropagationOptions) -> DenseView | None:
+    """Ranges and normals on the lattice of the region, from the planes of the nearest nodes."""
+    good = np.isfinite(nodes.log_range) & np.isfinite(nodes.normals).all(axis=-1)
+    if not good.any():
+        return None
+    camera, stride = phase_map.view.camera, options.stride_px
+    height, width = camera.height // stride, camera.width // stride
+    grid = (np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1) + 0.5) * stride
+    open_pixels = (phase_map.region.inside & ~phase_map.region.edges).astype(np.float32)
+    wanted = sample_image(open_pixels, grid, nearest=True) > 0
+    xy = grid[wanted]
+    k = min(4, int(good.sum()))
+    gap, index = cKDTree(nodes.xy[good]).query(xy, k=k, distance_upper_bound=2 * options.spacing_px)
+    gap, index = gap.reshape(-1, k), index.reshape(-1, k)
+    found = np.isfinite(gap)
+    index = np.where(found, index, 0)
+    rays = camera.rays(xy) @ phase_map.view.cam_from_world.rotation
+    normals = nodes.normals[good][index]
+    step = log_range_increment(normals, nodes.rays_in_world[good][index], rays[:, None])
+    weight = np.where(found, 1 / (1 + gap**2), 0)
+    total = weight.sum(axis=1)
+    has = total > 0
+    weight = weight / np.maximum(total, 1e-12)[:, None]
+    log_range = (weight * (nodes.log_range[good][index] + step)).sum(axis=1)
+    normal = (weight[..., None] * normals).sum(axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    range_map = np.zeros((height, width), np.float32)
+    range_map[wanted] = np.where(has, np.exp(log_range), 0)
+    normal_map = np.full((height, width, 3), np.nan, np.float32)
+    normal_map[wanted] = np.where(has[:, None], normal, np.nan)
+    sigma_map = np.full((height, width), np.nan, np.float32)
+    sigma_map[wanted] = np.degrees((weight * nodes.normal_sigma[good][index]).sum(axis=1))
+    return DenseView(stride, range_map, normal_map, sigma_map)
