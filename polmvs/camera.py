@@ -19,6 +19,9 @@ from polmvs.geometry import RigidTransform
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
+MAX_OPENCV_COORDINATE = 32000.0  # of cv2.remap, px
+OUTSIDE = np.float32(-10.0)
+
 
 def xy_to_opencv(xy: NDArray[np.floating]) -> NDArray[np.floating]:
     """COLMAP image coordinates (corner origin) to OpenCV's (first pixel centre at 0, 0)."""
@@ -50,20 +53,17 @@ def sample_image(
     -------
     (...) or (..., C) float32
     """
-    opencv_xy = xy_to_opencv(xy).astype(np.float32).reshape(-1, 2)
-    # OpenCV's maps are limited to 32767 a side: fold a long list of points into a rectangle.
-    num = len(opencv_xy)
-    side = 4096
-    padded = -(-max(num, 1) // side) * side if num > side else max(num, 1)
-    maps = np.full((padded, 2), -10.0, np.float32)
-    np.copyto(maps[:num], opencv_xy)
-    maps = maps.reshape(-1, min(side, padded), 2)
-    # NaN has no defined conversion to fixed point inside remap.
-    np.nan_to_num(maps, copy=False, nan=-10.0, posinf=-10.0, neginf=-10.0)
+    maps = xy_to_opencv(np.asarray(xy, np.float32)).reshape(-1, 2)
+    num, side = len(maps), 4096
+    if num > side:  # OpenCV's maps are limited to 32767 a side: fold a long list
+        maps = np.concatenate([maps, np.full((-num % side, 2), OUTSIDE, np.float32)])
+    # NaN has no defined conversion to fixed point inside remap; comparisons with it are False.
+    maps = np.where(np.abs(maps) < MAX_OPENCV_COORDINATE, maps, OUTSIDE)
+    maps = maps.reshape(-1, min(side, max(num, 1)), 2) if num else np.full((1, 1, 2), OUTSIDE)
     sampled = cv2.remap(
-        np.ascontiguousarray(image, np.float32),
-        maps[..., 0],
-        maps[..., 1],
+        image if image.flags.c_contiguous else np.ascontiguousarray(image),
+        maps.astype(np.float32, copy=False),
+        None,  # type: ignore[arg-type]
         cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,

@@ -10,10 +10,11 @@ afterwards, so nothing drifts.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
 from polmvs.config import Model
@@ -80,30 +81,37 @@ def trace_contours(
     step_px: float = 0.5,
     max_length_px: float = 2000.0,
     keep_every: int = 1,
-    blocked: Mask | None = None,
+    claims: NDArray[np.int32] | None = None,
+    first_curve: int = 0,
 ) -> Contours:
     """Trace contours both ways from all seeds in lock step (midpoint rule).
 
+    A contour ends where the field ends (region edge, crease, weak polarisation, clipped pixels:
+    whatever was not passable), where neighbouring directions disagree, or where it closes.
+
     Parameters
     ----------
-    field : (H, W, 2), from :func:`direction_field`; several views may be stacked in one image.
+    field : (H, W, 2), from :func:`direction_field`.
     seeds_xy : (S, 2), image coordinates.
     step_px : step length, px.
     max_length_px : of each half of a curve.
     keep_every : nodes kept, in steps.
-    blocked : (H, W) bool, pixels where a curve ends (other curves are near).
+    claims : cells of the image, each owned by the first curve that entered it (-1: free), over
+        the same extent as the field; a curve ends in a cell of another. Updated in place.
+    first_curve : index of the first seed's curve.
     """
-    seeds = np.asarray(seeds_xy, np.float32)
-    angle = _angle(sample_image(field, seeds))
+    seeds = np.asarray(seeds_xy, np.float32).reshape(-1, 2)
+    start = sample_image(field, seeds)
+    angle = _angle(start)
     forward = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    start_ok = np.linalg.norm(sample_image(field, seeds), axis=-1) > MIN_COHERENCE
-    curve = np.flatnonzero(start_ok)
+    curve = np.flatnonzero(np.linalg.norm(start, axis=-1) > MIN_COHERENCE)
     nodes, owners = [seeds[curve]], [curve]
     arcs = [np.zeros(len(curve), np.float32)]
     # Both halves of a curve side by side, (2, S, 2): a closed curve ends where they meet.
     position = np.stack([seeds[curve]] * 2)
     heading = np.stack([forward, -forward])[:, curve]
     alive = np.ones(position.shape[:2], bool)
+    check_every = max(keep_every // 2, 1)
     for index in range(1, int(max_length_px / step_px) + 1):
         if not len(curve):
             break
@@ -111,11 +119,11 @@ def trace_contours(
         position = np.where(alive[..., None], position + step_px * middle_heading, position)
         heading, still_ok = _heading(field, position, middle_heading)
         alive &= ok & still_ok
-        if blocked is not None:
-            alive &= ~_lookup(blocked, position)
-        if index * step_px > 4:
+        if index * step_px > 2 * MEETING_PX:
             gap = ((position[0] - position[1]) ** 2).sum(axis=-1)
             alive &= (gap > MEETING_PX**2) | ~alive.all(axis=0)
+        if claims is not None and index % check_every == 0:
+            alive &= _claim(claims, field.shape, position, curve + first_curve)
         if index % keep_every == 0:
             for half, way in enumerate((1, -1)):
                 nodes.append(position[half][alive[half]])
@@ -127,7 +135,7 @@ def trace_contours(
             curve = curve[going]
     xy, owner, arc = np.concatenate(nodes), np.concatenate(owners), np.concatenate(arcs)
     order = np.lexsort((arc, owner))
-    return Contours(xy[order], owner[order], arc[order])
+    return Contours(xy[order], owner[order] + first_curve, arc[order])
 
 
 def _angle(axial: Image) -> NDArray[np.float32]:
@@ -145,11 +153,23 @@ def _heading(field: Image, xy: Image, previous: Image) -> tuple[Image, Mask]:
     return heading, coherent & (np.abs(dot) > MIN_COHERENCE)
 
 
-def _lookup(mask: Mask, xy: Image) -> Mask:
-    height, width = mask.shape
-    col = np.clip(xy[..., 0].astype(np.int64), 0, width - 1)
-    row = np.clip(xy[..., 1].astype(np.int64), 0, height - 1)
-    return mask[row, col]
+def _cells(claims: NDArray[np.int32], shape: tuple[int, ...], xy: Image) -> tuple[Any, Any]:
+    """Row and column of the claim cells of image coordinates."""
+    rows, cols = claims.shape
+    row = (xy[..., 1] * np.float32(rows / shape[0])).astype(np.int64)
+    col = (xy[..., 0] * np.float32(cols / shape[1])).astype(np.int64)
+    return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
+
+
+def _claim(
+    claims: NDArray[np.int32], shape: tuple[int, ...], xy: Image, curve: NDArray[np.int64]
+) -> Mask:
+    """Claim the cells of positions (2, S, 2) for their curves; False where another curve owns it."""
+    row, col = _cells(claims, shape, xy)
+    mine = np.broadcast_to(curve, row.shape).astype(np.int32)
+    free = claims[row, col] < 0
+    claims[row[free], col[free]] = mine[free]
+    return np.asarray(claims[row, col] == mine)
 
 
 def cover_with_contours(
@@ -159,32 +179,50 @@ def cover_with_contours(
     *,
     spacing_px: float,
     step_px: float = 0.5,
-    keep_every: int = 8,
 ) -> Contours:
     """Contours from the seeds, then sideways of them until the region is covered.
 
     First the seeds' own contours, then in rounds from free places ever closer together; a new
-    curve ends where it comes within half the spacing of an earlier one. Places of the region
-    that no contour can reach (frontal spots, marks) become curves of a single node.
+    curve ends where it meets an earlier one. Places of the region that no contour can reach
+    (frontal spots, marks) become curves of a single node. Several views may be covered at once:
+    their fields lie below each other in one image.
+
+    Parameters
+    ----------
+    field : (H, W, 2), from :func:`direction_field`.
+    seeds_xy : (S, 2), image coordinates.
+    inside : (H, W) bool, the region to cover.
+    spacing_px : distance between contours, and between the nodes kept of each.
+    step_px : step length, px.
     """
     height, width = field.shape[:2]
-    passable = (field**2).sum(axis=-1) > MIN_COHERENCE**2
-    blocked = np.zeros((height, width), bool)
-    spacings = spacing_px * 2.0 ** np.arange(4, -1, -1)
+    keep_every = max(round(spacing_px / step_px), 1)
+    cell_px = 0.7 * spacing_px
+    claims = np.full((max(int(height / cell_px), 1), max(int(width / cell_px), 1)), -1, np.int32)
     candidates = [np.asarray(seeds_xy, np.float32).reshape(-1, 2)]
-    candidates += [_lattice(width, height, s) for s in spacings]
+    candidates += [_lattice(width, height, spacing_px * scale) for scale in (16, 4, 1)]
     parts, num_curves = [], 0
     for places in candidates:
-        free = ~_lookup(blocked, places) & _lookup(passable, places)
-        traced = trace_contours(
-            field, places[free], step_px=step_px, keep_every=keep_every, blocked=blocked
+        free = claims[_cells(claims, field.shape, places)] < 0
+        free &= np.linalg.norm(sample_image(field, places, nearest=True), axis=-1) > MIN_COHERENCE
+        parts.append(
+            trace_contours(
+                field,
+                places[free],
+                step_px=step_px,
+                keep_every=keep_every,
+                claims=claims,
+                first_curve=num_curves,
+            )
         )
-        parts.append(Contours(traced.xy, traced.curve + num_curves, traced.arc_px))
         num_curves += int(free.sum())
-        blocked |= _near_nodes(traced.xy, (height, width), 0.5 * spacing_px)
     lone = candidates[-1]
-    lone = lone[~_lookup(blocked, lone) & _lookup(inside, lone)]
-    parts.append(Contours(lone, num_curves + np.arange(len(lone)), np.zeros(len(lone), np.float32)))
+    lone = lone[sample_image(inside.astype(np.float32), lone, nearest=True) > 0]
+    traced = np.concatenate([p.xy for p in parts])
+    if len(traced) and len(lone):
+        lone = lone[cKDTree(traced).query(lone)[0] > 0.7 * spacing_px]
+    curve = num_curves + np.arange(len(lone))
+    parts.append(Contours(lone, curve, np.zeros(len(lone), np.float32)))
     return Contours(
         np.concatenate([p.xy for p in parts]),
         np.concatenate([p.curve for p in parts]),
@@ -196,14 +234,3 @@ def _lattice(width: int, height: int, spacing: float) -> NDArray[np.float32]:
     x = np.arange(spacing / 2, width, spacing)
     y = np.arange(spacing / 2, height, spacing)
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float32)
-
-
-def _near_nodes(xy: Image, shape: tuple[int, int], radius_px: float) -> Mask:
-    """Pixels within a radius of any node."""
-    marked = np.zeros(shape, np.uint8)
-    col = np.clip(xy[:, 0].astype(np.int64), 0, shape[1] - 1)
-    row = np.clip(xy[:, 1].astype(np.int64), 0, shape[0] - 1)
-    marked[row, col] = 1
-    size = 2 * max(round(radius_px), 1) + 1
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    return np.asarray(cv2.dilate(marked, kernel) > 0)

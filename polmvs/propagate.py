@@ -38,6 +38,9 @@ Image = NDArray[np.float32]
 NORMAL_SIGMA_FLOOR = 0.004  # rad; systematic error of multi-view normals
 MAX_SEED_DISTANCE_PX = 12.0  # from a seed to the nodes it is tied to
 NUM_TIES = 4
+MIN_SEED_COSINE = 0.995  # 5.7 deg between the normals of a seed and of a node it is tied to
+MIN_CREASE_ANGLE = 0.03  # rad, between neighbouring normals
+CREASE_FACTOR = 4.0  # a crease turns the normal this much more than noise or local curvature
 NUM_NEIGHBORS = 6
 
 
@@ -170,14 +173,12 @@ def _start(
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
     passable = phase_map.region.inside & ~phase_map.region.edges & (dolp > 0.05)
     field = direction_field(path_model, phase_map.samples, rays, passable)
-    keep_every = max(int(round(options.spacing_px / options.step_px)), 1)
     contours = cover_with_contours(
         field,
         seed_xy[visible],
         phase_map.region.inside & ~phase_map.region.edges,
         spacing_px=options.spacing_px,
         step_px=options.step_px,
-        keep_every=keep_every,
     )
     if not len(contours.xy):
         return None
@@ -282,7 +283,8 @@ def _edges(
     options: PropagationOptions,
 ) -> Edges:
     """Increments from normals on all edges, and the constancy along the contours."""
-    tail, head = nodes.tail, nodes.head
+    joined = _smooth_edges(nodes, normals, sigma)
+    tail, head = nodes.tail[joined], nodes.head[joined]
     rays = nodes.rays_in_world.astype(np.float64)
     mean = normals[tail] + normals[head]
     mean /= np.linalg.norm(mean, axis=-1, keepdims=True)
@@ -291,7 +293,7 @@ def _edges(
     delta = log_range_increment(mean, rays[tail], rays[head])
     edge_sigma = np.maximum(angle * slope, 1e-7)
     finite = np.isfinite(delta) & np.isfinite(edge_sigma)
-    use = nodes.on_contour & finite & (options.contour is Contour.TANGENT)
+    use = nodes.on_contour[joined] & finite & (options.contour is Contour.TANGENT)
     # Constant range (PPA) or depth (OPA); its slope errs by the turn of the row about the ray.
     constant = np.log(nodes.ray_z[tail] / nodes.ray_z[head]) if model is Model.OPA else 0.0 * angle
     turn = 0.5 * (own_sigma[tail] + own_sigma[head])
@@ -308,6 +310,21 @@ def _edges(
     )
 
 
+def _smooth_edges(nodes: _Nodes, normals: Array, sigma: Array) -> NDArray[np.bool_]:
+    """Edges without a crease: normals differ no more than noise and the curvature about them."""
+    tail, head = nodes.tail, nodes.head
+    turn = np.arccos(np.clip((normals[tail] * normals[head]).sum(axis=-1), -1, 1))
+    num = len(nodes.xy)
+    degree = np.maximum(np.bincount(tail, minlength=num) + np.bincount(head, minlength=num), 1)
+    # Root turn averaged over a node's edges: a crease crosses few of them, curvature all.
+    root = np.sqrt(turn)
+    local = ((np.bincount(tail, root, num) + np.bincount(head, root, num)) / degree) ** 2
+    noise = np.hypot(sigma[tail], sigma[head])
+    expected = np.minimum(local[tail], local[head])
+    limit = np.maximum(MIN_CREASE_ANGLE, CREASE_FACTOR * np.maximum(noise, expected))
+    return np.asarray(~(turn > limit))
+
+
 def _tie_seeds(
     phase_map: PhaseMap, nodes: _Nodes, normals: Array, seeds: Seeds
 ) -> tuple[SeedTies, int]:
@@ -322,10 +339,11 @@ def _tie_seeds(
     node, gap = node.reshape(-1), gap.reshape(-1)
     rays = (to_seed / distance[:, None])[seed]
     with np.errstate(invalid="ignore"):
-        step = log_range_increment(
-            normals[node], rays, nodes.rays_in_world[node].astype(np.float64)
-        )
-    ok = visible[seed] & (gap < MAX_SEED_DISTANCE_PX) & np.isfinite(step)
+        node_rays = nodes.rays_in_world[node].astype(np.float64)
+        step = log_range_increment(normals[node], rays, node_rays)
+        # A seed of another surface, hidden behind this one, has another normal.
+        alike = ~((seeds.normals_in_world[seed] * normals[node]).sum(axis=-1) < MIN_SEED_COSINE)
+    ok = visible[seed] & alike & (gap < MAX_SEED_DISTANCE_PX) & np.isfinite(step)
     seed, node, gap, step = seed[ok], node[ok], gap[ok], step[ok]
     footprint = 1 / phase_map.view.camera.mean_focal_px
     sigma = np.sqrt(

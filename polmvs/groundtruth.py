@@ -1,0 +1,284 @@
+"""Reader of rendered ground truth: cameras, depth, normals and masks of a capture.
+
+The layout is that of ``gt/`` in the bundled capture: ``cameras.json`` with ``width``, ``height``
+and, for each image, ``K`` of the half-size polarization image (COLMAP's pixel convention) and
+``cam_from_world`` (3x4, metres); beside it ``STEM_depth.png`` (uint16, 20 um, 0 = nothing),
+``STEM_normal.png`` (16-bit RGB, camera frame, ``n = value / 32767.5 - 1``) and ``STEM_mask.png``
+(not 0 on the part).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import PinholeCamera, View, pixel_centers
+from polmvs.errors import DataError
+from polmvs.geometry import RigidTransform
+from polmvs.neighbors import in_cells_beside, voxel_representatives
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+DEPTH_UNIT_M = 20e-6
+PART_SPACING_M = 0.0005
+OTHER_SPACING_M = 0.002
+NEAR_PART_M = 0.01  # other surfaces this near the part are sampled as finely as the part
+MAX_RELATIVE_BEND = 0.005  # second difference of inverse depth above which depth is discontinuous
+_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+_REMEDY = "copy the ground truth again"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfacePoints:
+    """A sampling of every true surface of the scene.
+
+    Attributes
+    ----------
+    points : (N, 3) float64, world, m
+    normals : (N, 3) float32, world, unit, towards the cameras; NaN off the part
+    is_part : (N,) bool, whether the point lies on the part
+    spacing_m : distance between neighbouring points of the part, m
+    """
+
+    points: Array
+    normals: NDArray[np.float32]
+    is_part: Mask
+    spacing_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundTruth:
+    """True cameras and maps of a capture; the maps are read from disk when asked for.
+
+    Attributes
+    ----------
+    folder : where ``cameras.json`` lies.
+    views : posed true cameras by image name, of the half-size images, metres.
+    """
+
+    folder: Path
+    views: Mapping[str, View]
+    _surfaces: dict[tuple[float, float], SurfacePoints] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Image names in the file's order."""
+        return tuple(self.views)
+
+    def find(self, name: str) -> View | None:
+        """True view of an image, looked up by its name or by the last part of it."""
+        return self.views.get(name) or self.views.get(PurePosixPath(name).name)
+
+    def mask(self, name: str) -> Mask:
+        """Whether each pixel shows the part, ``(H, W)``."""
+        return np.asarray(self._image(name, "mask", np.uint8, 2).astype(np.bool_))
+
+    def depth(self, name: str) -> NDArray[np.float32]:
+        """Depth z of the whole scene, ``(H, W)`` float32, m; NaN where there is nothing."""
+        depth = self._image(name, "depth", np.uint16, 2).astype(np.float32)
+        depth[depth == 0] = np.nan
+        depth *= np.float32(DEPTH_UNIT_M)
+        return depth
+
+    def normals(self, name: str) -> NDArray[np.float32]:
+        """Unit normals of the part, ``(H, W, 3)`` float32, camera frame; NaN off the part."""
+        encoded = self._image(name, "normal", np.uint16, 3)[..., ::-1]
+        normals = encoded.astype(np.float32) / np.float32(32767.5) - np.float32(1)
+        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), np.float32(1e-6))
+        normals[~self.mask(name)] = np.nan
+        return normals
+
+    def surface_points(
+        self, spacing_m: float = PART_SPACING_M, other_spacing_m: float = OTHER_SPACING_M
+    ) -> SurfacePoints:
+        """Sample all surfaces that the views see: their back-projected depth pixels, thinned.
+
+        Parameters
+        ----------
+        spacing_m : voxel side of the part and of what lies within about 10 mm of it, m.
+        other_spacing_m : voxel side of the rest of the scene, m.
+
+        Returns
+        -------
+        SurfacePoints
+            Pixels of the part beside a depth discontinuity are left out. No closer together than
+            the pixels of all views are; kept in memory for the next call.
+
+        Raises
+        ------
+        DataError
+            When no pixel of any view lies on the part.
+        """
+        key = (spacing_m, other_spacing_m)
+        if key not in self._surfaces:
+            self._surfaces[key] = _sample_surfaces(self, *key)
+        return self._surfaces[key]
+
+    def _image(
+        self, name: str, kind: str, dtype: type[np.generic], num_dims: int
+    ) -> NDArray[np.generic]:
+        """Read one map and check it against the camera."""
+        path = _map_path(self.folder, name, kind)
+        image = _read_png(path)
+        camera = self.views[name].camera
+        if image.shape[:2] != (camera.height, camera.width):
+            raise DataError(
+                path,
+                f"is {image.shape[1]}x{image.shape[0]} px but cameras.json says "
+                f"{camera.width}x{camera.height}; {_REMEDY}.",
+            )
+        if image.ndim != num_dims or image.dtype != dtype:
+            channels = 1 if num_dims == 2 else 3
+            bits = 8 * np.dtype(dtype).itemsize
+            raise DataError(path, f"must be a {bits}-bit PNG of {channels} channel(s); {_REMEDY}.")
+        return image
+
+
+def open_ground_truth(folder: str | Path) -> GroundTruth:
+    """Open the ground truth of a capture.
+
+    Parameters
+    ----------
+    folder : the folder with ``cameras.json``, or the capture's folder that has it in ``gt/``.
+
+    Raises
+    ------
+    DataError
+        When the folder, ``cameras.json`` or a map is missing, or ``cameras.json`` is malformed.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise DataError(root, "no such folder; give a capture's folder or its gt/ folder.")
+    if not (root / "cameras.json").is_file() and (root / "gt").is_dir():
+        root = root / "gt"
+    cameras_path = root / "cameras.json"
+    if not cameras_path.is_file():
+        raise DataError(cameras_path, "missing; give a folder with ground truth.")
+    truth = GroundTruth(folder=root, views=_read_views(cameras_path))
+    for name in truth.names:
+        for kind in ("depth", "normal", "mask"):
+            path = _map_path(root, name, kind)
+            if not path.is_file():
+                raise DataError(path, f"missing, but cameras.json lists {name}; {_REMEDY}.")
+    return truth
+
+
+def _map_path(folder: Path, name: str, kind: str) -> Path:
+    return folder / f"{PurePosixPath(name).stem}_{kind}.png"
+
+
+def _read_png(path: Path) -> NDArray[np.generic]:
+    """Decode a PNG as stored (colour as BGR); a truncated one is an error, not a grey area."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(path, f"cannot be read ({error.strerror}); {_REMEDY}.") from error
+    complete = data.startswith(_PNG_START) and data.endswith(_PNG_END)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if complete else None
+    if image is None:
+        raise DataError(path, f"not a whole PNG image; {_REMEDY}.")
+    return image
+
+
+def _read_views(path: Path) -> dict[str, View]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(path, f"cannot be read as JSON ({error}); {_REMEDY}.") from error
+    try:
+        width, height = int(content["width"]), int(content["height"])
+        images = dict(content["images"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(path, f"needs integer width, height and images; {_REMEDY}.") from error
+    if not images or min(width, height) <= 0:
+        raise DataError(path, f"lists no image or no size; {_REMEDY}.")
+    return {name: _parse_view(path, name, entry, width, height) for name, entry in images.items()}
+
+
+def _parse_view(path: Path, name: str, entry: Any, width: int, height: int) -> View:
+    try:
+        K = np.array(entry["K"], np.float64)
+        pose = np.array(entry["cam_from_world"], np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(path, f"{name} needs numbers K and cam_from_world; {_REMEDY}.") from error
+    if K.shape != (3, 3) or not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 0:
+        raise DataError(path, f"K of {name} must be 3x3 with positive focal lengths; {_REMEDY}.")
+    if np.abs(K - [[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]]).max() > 1e-9:
+        raise DataError(path, f"K of {name} must be without skew; {_REMEDY}.")
+    if pose.shape != (3, 4) or not _is_rotation(pose[:, :3]) or not np.isfinite(pose).all():
+        raise DataError(path, f"cam_from_world of {name} must be a 3x4 rigid motion; {_REMEDY}.")
+    camera = PinholeCamera(
+        width=width, height=height, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2]
+    )
+    return View(
+        name=name, camera=camera, cam_from_world=RigidTransform(pose[:, :3].copy(), pose[:, 3])
+    )
+
+
+def _is_rotation(matrix: Array) -> bool:
+    return bool(np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-5) and np.linalg.det(matrix) > 0)
+
+
+def _sample_surfaces(truth: GroundTruth, spacing_m: float, other_spacing_m: float) -> SurfacePoints:
+    """Back-project every view; thin the part and what is near it finely, the rest coarsely."""
+    if not 0 < spacing_m <= other_spacing_m:
+        raise ValueError(f"{spacing_m=}, {other_spacing_m=} but expected 0 < spacing <= other.")
+    samples = [_back_project(truth, name) for name in truth.names]
+    part = np.concatenate([sample[0] for sample in samples])
+    normals = np.concatenate([sample[1] for sample in samples])
+    other = np.concatenate([sample[2] for sample in samples])
+    if len(part) == 0:
+        raise DataError(truth.folder, f"no mask shows the part; {_REMEDY}.")
+    kept = voxel_representatives(part, spacing_m)
+    part, normals = part[kept], normals[kept]
+    near = in_cells_beside(other, part, NEAR_PART_M)
+    fine, coarse = other[near], other[~near]
+    fine = fine[voxel_representatives(fine, spacing_m)]
+    coarse = coarse[voxel_representatives(coarse, other_spacing_m)]
+    num_other = len(fine) + len(coarse)
+    return SurfacePoints(
+        points=np.concatenate([part, fine, coarse]),
+        normals=np.concatenate([normals, np.full((num_other, 3), np.nan, np.float32)]),
+        is_part=np.arange(len(part) + num_other) < len(part),
+        spacing_m=spacing_m,
+    )
+
+
+def _back_project(truth: GroundTruth, name: str) -> tuple[Array, NDArray[np.float32], Array]:
+    """World points and normals of one view's part, and world points of all else it sees."""
+    view = truth.views[name]
+    depth, mask = truth.depth(name).astype(np.float64), truth.mask(name)
+    seen = np.isfinite(depth)
+    part = seen & mask & _is_smooth(depth)
+    rays = view.camera.rays(pixel_centers(view.camera.width, view.camera.height))
+    points_in_cam = rays * (depth / rays[..., 2])[..., None]
+    world_from_cam = view.cam_from_world.inverse()
+    normals = truth.normals(name)[part] @ world_from_cam.rotation.T.astype(np.float32)
+    return (
+        np.asarray(world_from_cam * points_in_cam[part]),
+        np.asarray(normals, np.float32),
+        np.asarray(world_from_cam * points_in_cam[seen & ~mask]),
+    )
+
+
+def _is_smooth(depth: Array) -> Mask:
+    """Whether a pixel's 3x3 neighbours continue its surface; inverse depth is linear on a plane."""
+    inverse = 1.0 / np.where(np.isfinite(depth), depth, np.inf)
+    padded = np.pad(inverse, 1, mode="reflect", reflect_type="odd")
+    height, width = depth.shape
+    bend = np.zeros_like(inverse)
+    for row, col in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        ahead = padded[1 + row : 1 + row + height, 1 + col : 1 + col + width]
+        behind = padded[1 - row : 1 - row + height, 1 - col : 1 - col + width]
+        np.maximum(bend, np.abs(ahead + behind - 2.0 * inverse), out=bend)
+    return np.asarray(bend < MAX_RELATIVE_BEND * inverse, np.bool_)

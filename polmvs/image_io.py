@@ -1,0 +1,232 @@
+"""Image files at the edge: raw mosaics and masks in, PNG out; every fault is a ``DataError``."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.errors import DataError
+
+PathArg: TypeAlias = str | PathLike[str]
+Mosaic: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_GRAY = 0  # colour type of a monochrome PNG without alpha
+BROKEN = "Copy it again from the camera or take it out of the folder."
+
+
+class MosaicHeader(NamedTuple):
+    """What is known of a mosaic before its pixels are used.
+
+    Attributes
+    ----------
+    width, height : of the raw mosaic, px.
+    bit_depth : of the file's samples, 8 or 16.
+    """
+
+    width: int
+    height: int
+    bit_depth: int
+
+
+def read_mosaic(path: PathArg) -> Mosaic:
+    """Read a raw polarizer mosaic as it was stored.
+
+    Parameters
+    ----------
+    path : an 8- or 16-bit monochrome PNG, TIFF, BMP or PGM.
+
+    Returns
+    -------
+    (H, W) uint8 or uint16, H and W even.
+
+    Raises
+    ------
+    DataError
+        The file is missing, truncated, no image, in colour, of odd size or of another type.
+    """
+    image = _decode(path, _read_bytes(path))
+    if image.ndim != 2:
+        raise DataError(
+            path,
+            f"has {image.shape[2]} channels; a monochrome polarizer mosaic is expected. "
+            "Record the camera's raw format (Mono8 to Mono16), not a colour or processed one.",
+        )
+    if image.dtype not in (np.uint8, np.uint16):
+        raise DataError(
+            path, f"has {image.dtype} samples; export the raw mosaic as 8- or 16-bit integers."
+        )
+    _require_even(path, width=image.shape[1], height=image.shape[0])
+    return image
+
+
+def probe_mosaic(path: PathArg) -> MosaicHeader:
+    """Check a mosaic as :func:`read_mosaic` does, without decoding its pixels where it is a PNG.
+
+    The checksums of a PNG are verified, so that it will decode later. Other formats are decoded.
+
+    Raises
+    ------
+    DataError
+        As :func:`read_mosaic`.
+    """
+    data = _read_bytes(path)
+    if data.startswith(PNG_SIGNATURE):
+        _check_png(path, data)
+        width, height, bit_depth, colour_type = struct.unpack_from(">IIBB", data, 16)
+        if colour_type == PNG_GRAY and bit_depth in (8, 16):
+            _require_even(path, width=width, height=height)
+            return MosaicHeader(width, height, bit_depth)
+    del data
+    raw = read_mosaic(path)
+    return MosaicHeader(raw.shape[1], raw.shape[0], 8 * raw.dtype.itemsize)
+
+
+def read_mask(path: PathArg, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Read a mask of the half-size polarization image.
+
+    Parameters
+    ----------
+    path : an image; a pixel is inside where any colour channel is not 0, alpha is ignored.
+    shape : (H, W) that the mask must have, px.
+
+    Returns
+    -------
+    (H, W) bool
+
+    Raises
+    ------
+    DataError
+        The file is missing, truncated, no image or of another size.
+    """
+    image = _decode(path, _read_bytes(path))
+    height, width = image.shape[:2]
+    if (height, width) != tuple(shape):
+        raise DataError(
+            path,
+            f"the mask is {width}x{height} px, the polarization image {shape[1]}x{shape[0]} px. "
+            "Draw it at the size of the polarization image, half that of the raw mosaic.",
+        )
+    if image.ndim == 2:
+        return np.asarray(image != 0)
+    return np.asarray((image[..., :3] != 0).any(axis=-1))
+
+
+def write_png(path: PathArg, image: NDArray[Any]) -> None:
+    """Write a PNG whole or not at all, whatever the suffix of its name.
+
+    Parameters
+    ----------
+    path : file to write or replace; its folder must exist.
+    image : (H, W), (H, W, 3) or (H, W, 4), uint8 or uint16, channels in OpenCV's order (BGR).
+
+    Raises
+    ------
+    DataError
+        The system refuses, e.g. a full disk or a read-only folder.
+    """
+    if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or image.size == 0:
+        raise ValueError(f"{image.dtype=}, {image.shape=} but expected a uint8 or uint16 image.")
+    encoded, data = cv2.imencode(".png", image)
+    if not encoded:
+        raise ValueError(f"OpenCV cannot encode {image.shape=} as PNG.")
+    write_bytes(path, data.tobytes())
+
+
+def write_bytes(path: PathArg, data: bytes) -> None:
+    """Write a file whole or not at all: a temporary name beside it, then a rename.
+
+    Raises
+    ------
+    DataError
+        The system refuses; the temporary file is gone and an older file of that name is intact.
+    """
+    target = Path(path)
+    # A rename would put a plain file in the place of a device such as /dev/null.
+    if target.exists() and not target.is_file():
+        raise DataError(target, "exists and is no plain file. Choose another name.")
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(data)
+        os.replace(temporary, target)
+    except OSError as error:
+        raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
+    finally:
+        _remove_quietly(temporary)
+
+
+def _remove_quietly(path: Path) -> None:
+    """Remove a file that may not exist, without hiding the error that led here."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        return
+
+
+def _read_bytes(path: PathArg) -> bytes:
+    """A file's content, or a ``DataError`` with the system's reason."""
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise DataError(path, "no such file.") from error
+    except OSError as error:
+        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+    if not data:
+        raise DataError(path, f"is empty. {BROKEN}")
+    return data
+
+
+def _decode(path: PathArg, data: bytes) -> NDArray[Any]:
+    """Pixels of an encoded image, unchanged; OpenCV's own complaints are kept off the terminal."""
+    if data.startswith(PNG_SIGNATURE):
+        _check_png(path, data)
+    logging = cv2.utils.logging
+    level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    finally:
+        logging.setLogLevel(level)
+    if image is None:
+        raise DataError(path, f"is not a readable image, or is damaged or truncated. {BROKEN}")
+    return np.asarray(image)
+
+
+def _check_png(path: PathArg, data: bytes) -> None:
+    """Walk the chunks to IEND: OpenCV may fill the missing part of a truncated PNG with zeros."""
+    view = memoryview(data)
+    position = len(PNG_SIGNATURE)
+    kind = b""
+    while kind != b"IEND":
+        if position + 12 > len(view):
+            raise DataError(path, f"is truncated: the PNG ends after {len(view)} bytes. {BROKEN}")
+        length, kind = struct.unpack_from(">I4s", view, position)
+        end = position + 12 + length
+        if end > len(view):
+            raise DataError(path, f"is truncated: the PNG ends after {len(view)} bytes. {BROKEN}")
+        (checksum,) = struct.unpack_from(">I", view, end - 4)
+        # Chunk order: IHDR of 13 bytes comes first.
+        if position == len(PNG_SIGNATURE) and (kind, length) != (b"IHDR", 13):
+            raise DataError(path, f"is damaged: the PNG has no header. {BROKEN}")
+        if zlib.crc32(view[position + 4 : end - 4]) != checksum:
+            raise DataError(path, f"is damaged: wrong checksum at byte {position}. {BROKEN}")
+        position = end
+
+
+def _require_even(path: PathArg, *, width: int, height: int) -> None:
+    """A mosaic is made of whole 2x2 cells."""
+    if width % 2 or height % 2 or not width or not height:
+        raise DataError(
+            path,
+            f"is {width}x{height} px; a polarizer mosaic has an even width and height. "
+            "Set the camera's region of interest to even offsets and sizes.",
+        )

@@ -1,0 +1,93 @@
+"""Thinning of large clouds to voxels, and nearest neighbours among them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+
+_AXIS_BITS = 21
+
+
+def voxel_representatives(points: Array, side: float) -> NDArray[np.intp]:
+    """Indices of one point per occupied voxel, the nearest to the voxel's centre, in order.
+
+    Parameters
+    ----------
+    points : (N, 3), finite
+    side : side of a voxel, in the unit of the points.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.intp)
+    # Surfaces like to lie at round coordinates: shifted voxels do not split them in two.
+    scaled = points / side + 0.37
+    cells = np.floor(scaled)
+    order = np.argsort(((scaled - cells - 0.5) ** 2).sum(axis=1))
+    _, first = np.unique(_cell_keys(cells)[order], return_index=True)
+    return np.sort(order[first])
+
+
+def in_cells_beside(points: Array, others: Array, side: float) -> NDArray[np.bool_]:
+    """Whether a point's cell of the given side, or one of its 26 neighbours, holds an other.
+
+    True within ``side`` of an other and false beyond ``2 sqrt(3) side``, for ``(N, 3)`` points
+    and ``(M, 3)`` others.
+    """
+    occupied = others[voxel_representatives(others, side)]
+    steps = np.stack(np.meshgrid(*3 * [np.arange(-1.0, 2.0)]), axis=-1).reshape(-1, 1, 3)
+    cells = np.floor(occupied / side + 0.37) + steps
+    grown = np.unique(_cell_keys(cells.reshape(-1, 3)))
+    keys = _cell_keys(np.floor(points / side + 0.37))
+    found = np.searchsorted(grown, keys)
+    return np.asarray(np.append(grown, -1)[found] == keys, np.bool_)
+
+
+def nearest_points(points: Array, queries: Array, *, far: float) -> tuple[Array, NDArray[np.intp]]:
+    """Nearest point of each query; exact within ``far``, beyond it among a thinned sampling.
+
+    A search from afar has to look at a large part of a surface, since all of it is about as
+    near; a few floaters would otherwise take most of the time.
+
+    Parameters
+    ----------
+    points : (N, 3)
+    queries : (M, 3)
+    far : distance from which the search is coarse, among points about ``far / 5`` apart. There
+        the distance found is too long by ``0.35 far`` at the very most, by ``0.02 far`` from a
+        point above a surface.
+
+    Returns
+    -------
+    distances : (M,) float64; inf where there are no points.
+    indices : (M,) of the nearest points; 0 where there are no points.
+    """
+    if len(points) == 0 or len(queries) == 0:
+        return np.full(len(queries), np.inf), np.zeros(len(queries), np.intp)
+    distances, indices = _query(points, queries, far)
+    distant = np.flatnonzero(~np.isfinite(distances))
+    if len(distant) > 0:
+        kept = voxel_representatives(points, far / 5.0)
+        distances[distant], among_kept = _query(points[kept], queries[distant], np.inf)
+        indices[distant] = kept[among_kept]
+    return distances, indices
+
+
+def _query(points: Array, queries: Array, bound: float) -> tuple[Array, NDArray[np.intp]]:
+    # Neighbours in a row visit the same leaves while these are in the cache: 3 times faster.
+    cell = max(float(np.median(np.ptp(points, axis=0))), 1e-12) / 100.0
+    order = np.argsort(_cell_keys(np.floor(queries * (1.0 / cell))))
+    # The sliding midpoint tree is built several times faster than the balanced one.
+    tree = cKDTree(points, leafsize=32, balanced_tree=False)
+    distances, indices = np.empty(len(queries)), np.empty(len(queries), np.intp)
+    distances[order], indices[order] = tree.query(
+        queries[order], distance_upper_bound=bound, workers=-1
+    )
+    return distances, indices
+
+
+def _cell_keys(cells: Array) -> NDArray[np.int64]:
+    """One integer per integral cell ``(N, 3)``; cells more than 2**21 apart may share one."""
+    x, y, z = (cells.astype(np.int64) & ((1 << _AXIS_BITS) - 1)).T
+    return np.asarray((x << (2 * _AXIS_BITS)) | (y << _AXIS_BITS) | z, np.int64)
