@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import View, pixel_centers, sample_image
 from polmvs.config import Light, Model
+from polmvs.errors import DataError
 from polmvs.models import rows_from_axial
 from polmvs.region import Region, smooth
+from polmvs.storage import map_array, save_array
 
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
@@ -33,12 +37,20 @@ class PhaseMap:
     samples : (H, W, 3) float32: ``dolp cos 2 phase``, ``dolp sin 2 phase`` and the inverse
         variance of the row's turn about its ray (1 / rad^2; 0: no phase here).
     intensity : (H, W) float32, s0 in units of full scale.
+    folder : where the arrays are stored, if they are.
     """
 
     view: View
     region: Region
     samples: Image
     intensity: Image
+    folder: Path | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle a stored map as its place."""
+        if self.folder is not None:
+            return open_phase_map, (self.view, self.folder)
+        return PhaseMap, (self.view, self.region, self.samples, self.intensity)
 
 
 def build_phase_map(
@@ -77,7 +89,36 @@ def build_phase_map(
         precision = np.where(region.inside & (share > 0.02), 1 / variance, 0)
     samples = np.dstack([axial, precision]).astype(np.float32)
     np.nan_to_num(samples, copy=False, nan=0.0)
-    return PhaseMap(view, region, samples, s0)
+    return PhaseMap(view, region, samples, np.asarray(s0, np.float32))
+
+
+def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:
+    """Write a phase map as ``.npy`` files named after the view; returns the stored one."""
+    stem = folder / phase_map.view.name
+    region = phase_map.region
+    flags = region.inside * 1 | region.reliable * 2 | region.edges * 4
+    save_array(stem.with_name(stem.name + ".samples.npy"), phase_map.samples)
+    save_array(stem.with_name(stem.name + ".intensity.npy"), phase_map.intensity)
+    save_array(stem.with_name(stem.name + ".region.npy"), flags.astype(np.uint8))
+    return open_phase_map(phase_map.view, folder)
+
+
+def open_phase_map(view: View, folder: Path) -> PhaseMap:
+    """Open a stored phase map; its images stay on disk until they are read.
+
+    Raises
+    ------
+    DataError
+        If a file is missing, damaged, or of another size than the view's camera.
+    """
+    samples = map_array(folder / f"{view.name}.samples.npy")
+    intensity = map_array(folder / f"{view.name}.intensity.npy")
+    flags = map_array(folder / f"{view.name}.region.npy")
+    size = (view.camera.height, view.camera.width)
+    if not samples.shape[:2] == intensity.shape == flags.shape == size:
+        raise DataError(folder / view.name, "has another size than its camera; use --overwrite.")
+    region = Region((flags & 1) > 0, (flags & 2) > 0, (flags & 4) > 0)
+    return PhaseMap(view, region, samples, intensity, folder)
 
 
 def _normalized_smoothing(
@@ -157,7 +198,7 @@ def gather_rows(
 
 def sample_range(range_map: Image, view: View, xy: Floats) -> NDArray[np.float32]:
     """Nearest value of a range map, which may be coarser than the view by a whole factor."""
-    return sample_image(range_map, xy / (view.camera.width // range_map.shape[1]), nearest=True)
+    return sample_image(range_map, xy / round(view.camera.width / range_map.shape[1]), nearest=True)
 
 
 def _row_and_turn(model: Model, samples: Image, rays: Floats) -> tuple[Floats, Floats]:

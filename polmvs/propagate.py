@@ -9,8 +9,9 @@ in the other views, so the two alternate; they depend on it weakly and few round
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,9 @@ from scipy.spatial import cKDTree
 from polmvs.camera import sample_image
 from polmvs.config import Contour, Model, PropagationOptions
 from polmvs.contour import Contours, cover_with_contours, direction_field
+from polmvs.dense import DenseView, store_dense_view
 from polmvs.normals import NormalEstimate, solve_normals
+from polmvs.parallel import Workers
 from polmvs.phasemap import PhaseMap, gather_rows, view_rays
 from polmvs.surface import (
     Edges,
@@ -42,24 +45,8 @@ MIN_SEED_COSINE = 0.995  # 5.7 deg between the normals of a seed and of a node i
 MIN_CREASE_ANGLE = 0.03  # rad, between neighbouring normals
 CREASE_FACTOR = 4.0  # a crease turns the normal this much more than noise or local curvature
 NUM_NEIGHBORS = 6
-
-
-@dataclass(frozen=True)
-class DenseView:
-    """Dense result of one view on a lattice of its pixels.
-
-    Attributes
-    ----------
-    stride_px : lattice point (i, j) lies at ``xy = ((j + 0.5) stride, (i + 0.5) stride)``.
-    range_map : (h, w) float32, distance from the camera centre, world units; 0 where unknown.
-    normals_in_world : (h, w, 3) float32, unit; NaN where unknown.
-    sigma_deg : (h, w) float32, standard deviation of the normal.
-    """
-
-    stride_px: int
-    range_map: Image
-    normals_in_world: Image
-    sigma_deg: Image
+MIN_CONTOUR_DOLP = 0.05  # smoothed; contours stop under it
+MAX_STACKED_VIEWS = 8
 
 
 @dataclass(frozen=True)
@@ -105,8 +92,9 @@ def propagate(
     maps: Sequence[PhaseMap],
     seeds: Seeds,
     options: PropagationOptions,
+    folder: Path,
     *,
-    num_threads: int = 2,
+    workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> list[DenseView | None]:
     """Range and normal over the polarised region of every view.
@@ -116,79 +104,97 @@ def propagate(
     model : OPA or PPA; it decides the rows of the normals and what is constant on a contour.
     maps : phase maps of the posed views.
     seeds : points on the surface.
-    on_progress : called after each view of each round.
+    folder : for the dense views, which stay on disk; existing files are replaced.
+    workers : processes to share the views among; None: this one.
+    on_progress : called with the number of views done, ``(num_rounds + 1)`` times per view.
 
     Returns
     -------
     Per view its dense result, or None where no seed reaches the view's region.
     """
+    workers = workers or Workers(1)
+    report = on_progress or (lambda count: None)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
-
-    def advance(result: None) -> None:
-        if on_progress is not None:
-            on_progress(1)
-
-    with ThreadPoolExecutor(num_threads) as pool:
-        nodes = list(pool.map(lambda m: _start(model, m, seeds, options), maps))
-        dense: list[DenseView | None] = [None] * len(maps)
-        for _ in range(options.num_rounds):
-            range_maps = [d.range_map if d is not None else None for d in dense]
-
-            def one_round(
-                k: int, range_maps: list[Image | None] = range_maps
-            ) -> tuple[_Nodes | None, DenseView | None]:
-                current = nodes[k]
-                if current is None:
-                    return None, None
-                used = neighbors[k]
-                updated = _update(
-                    model,
-                    maps[k],
-                    [maps[j] for j in used],
-                    [range_maps[j] for j in used],
-                    current,
-                    seeds,
-                    options,
-                )
-                result = _densify(maps[k], updated, options)
-                if on_progress is not None:
-                    on_progress(1)
-                return updated, result
-
-            results = list(pool.map(one_round, range(len(maps))))
-            nodes = [r[0] for r in results]
-            dense = [r[1] for r in results]
+    nodes: list[_Nodes | None] = []
+    chunks = _chunks(maps, workers.num)
+    for started in workers.map(partial(_start, model, seeds, options), chunks):
+        nodes += started
+        report(len(started))
+    dense: list[DenseView | None] = [None] * len(maps)
+    for round_index in range(options.num_rounds):
+        last = round_index == options.num_rounds - 1
+        tasks = [
+            _Task(
+                maps=[maps[j] for j in near],
+                dense=[dense[j] for j in near],
+                nodes=nodes[k],
+                stride_px=options.stride_px if last else 2 * options.stride_px,
+                path=folder / f"{maps[k].view.name}.{round_index}",
+            )
+            for k, near in enumerate(neighbors)
+        ]
+        for k, result in enumerate(workers.map(partial(_round, model, seeds, options), tasks)):
+            nodes[k], dense[k] = result
+            report(1)
     return dense
 
 
+def _chunks(maps: Sequence[PhaseMap], num_workers: int) -> list[Sequence[PhaseMap]]:
+    """Split the views so that every worker has some and no stack of fields gets too large."""
+    num = min(MAX_STACKED_VIEWS, -(-len(maps) // num_workers))
+    return [maps[i : i + num] for i in range(0, len(maps), num)]
+
+
 def _start(
-    model: Model, phase_map: PhaseMap, seeds: Seeds, options: PropagationOptions
-) -> _Nodes | None:
-    """Trace the contours of a view and give each node a first range from the nearest seeds."""
-    visible, seed_xy = _visible_seeds(phase_map, seeds)
-    if not visible.any():
-        return None
+    model: Model, seeds: Seeds, options: PropagationOptions, maps: Sequence[PhaseMap]
+) -> list[_Nodes | None]:
+    """Trace the contours of some views and give each node a first range from the seeds."""
     path_model = Model.OPA if options.contour is Contour.NORMALS else model
-    rays = view_rays(phase_map.view)
-    dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
-    passable = phase_map.region.inside & ~phase_map.region.edges & (dolp > 0.05)
-    field = direction_field(path_model, phase_map.samples, rays, passable)
+    fields, insides, seeds_xy = [], [], []
+    top = 0.0
+    for phase_map in maps:
+        open_pixels = phase_map.region.inside & ~phase_map.region.edges
+        dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
+        passable = open_pixels & (dolp > MIN_CONTOUR_DOLP)
+        passable[[0, -1]] = False  # the views lie below each other: keep them apart
+        fields.append(
+            direction_field(path_model, phase_map.samples, view_rays(phase_map.view), passable)
+        )
+        insides.append(open_pixels)
+        visible, xy = _visible_seeds(phase_map, seeds)
+        seeds_xy.append(xy[visible] + [0.0, top])
+        top += phase_map.view.camera.height
     contours = cover_with_contours(
-        field,
-        seed_xy[visible],
-        phase_map.region.inside & ~phase_map.region.edges,
+        np.concatenate(fields),
+        np.concatenate(seeds_xy),
+        np.concatenate(insides),
         spacing_px=options.spacing_px,
         step_px=options.step_px,
     )
-    if not len(contours.xy):
+    starts = np.cumsum([0] + [m.view.camera.height for m in maps])
+    owner = np.searchsorted(starts, contours.xy[:, 1], side="right") - 1
+    results = []
+    for k, phase_map in enumerate(maps):
+        mine = owner == k
+        xy = (contours.xy[mine] - [0.0, starts[k]]).astype(np.float32)
+        part = Contours(xy, contours.curve[mine], contours.arc_px[mine])
+        results.append(_start_view(phase_map, seeds, part, options))
+    return results
+
+
+def _start_view(
+    phase_map: PhaseMap, seeds: Seeds, contours: Contours, options: PropagationOptions
+) -> _Nodes | None:
+    """Network of a view's contours with ranges and normals from the nearest seeds."""
+    visible, seed_xy = _visible_seeds(phase_map, seeds)
+    if not visible.any() or not len(contours.xy):
         return None
     rays_in_cam = phase_map.view.camera.rays(contours.xy)
     tail, head, on_contour = _network(contours, phase_map, options.spacing_px)
     distance = np.linalg.norm(
         seeds.points_in_world[visible] - phase_map.view.center_in_world, axis=-1
     )
-    log_range = _interpolate(seed_xy[visible], np.log(distance), contours.xy)
-    num = len(contours.xy)
+    nearest = cKDTree(seed_xy[visible]).query(contours.xy)[1]
     return _Nodes(
         xy=contours.xy,
         rays_in_world=(rays_in_cam @ phase_map.view.cam_from_world.rotation).astype(np.float32),
@@ -196,10 +202,33 @@ def _start(
         tail=tail,
         head=head,
         on_contour=on_contour,
-        log_range=log_range,
-        normals=seeds.normals_in_world[visible][cKDTree(seed_xy[visible]).query(contours.xy)[1]],
-        normal_sigma=np.full(num, np.nan),
+        log_range=_interpolate(seed_xy[visible], np.log(distance), contours.xy),
+        normals=seeds.normals_in_world[visible][nearest],
+        normal_sigma=np.full(len(contours.xy), np.nan),
     )
+
+
+@dataclass(frozen=True)
+class _Task:
+    """One view in one round: its own map first, then its neighbours'."""
+
+    maps: list[PhaseMap]
+    dense: list[DenseView | None]
+    nodes: _Nodes | None
+    stride_px: int
+    path: Path
+
+
+def _round(
+    model: Model, seeds: Seeds, options: PropagationOptions, task: _Task
+) -> tuple[_Nodes | None, DenseView | None]:
+    """Normals and ranges of one view's nodes, and the dense view that they make."""
+    if task.nodes is None:
+        return None, None
+    range_maps = [d.range_map if d is not None else None for d in task.dense]
+    nodes = _update(model, task.maps[0], task.maps, range_maps, task.nodes, seeds, options)
+    dense = _densify(task.maps[0], nodes, task.stride_px, 2 * options.spacing_px)
+    return nodes, store_dense_view(dense, task.path) if dense is not None else None
 
 
 def _interpolate(known_xy: Floats, values: Array, xy: Floats, num_nearest: int = 5) -> Array:
@@ -353,19 +382,21 @@ def _tie_seeds(
     return SeedTies(node=node, seed=seed, value=value, sigma=sigma), len(distance)
 
 
-def _densify(phase_map: PhaseMap, nodes: _Nodes, options: PropagationOptions) -> DenseView | None:
+def _densify(
+    phase_map: PhaseMap, nodes: _Nodes, stride: int, max_gap_px: float
+) -> DenseView | None:
     """Ranges and normals on the lattice of the region, from the planes of the nearest nodes."""
     good = np.isfinite(nodes.log_range) & np.isfinite(nodes.normals).all(axis=-1)
     if not good.any():
         return None
-    camera, stride = phase_map.view.camera, options.stride_px
+    camera = phase_map.view.camera
     height, width = camera.height // stride, camera.width // stride
     grid = (np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1) + 0.5) * stride
     open_pixels = (phase_map.region.inside & ~phase_map.region.edges).astype(np.float32)
     wanted = sample_image(open_pixels, grid, nearest=True) > 0
     xy = grid[wanted]
     k = min(4, int(good.sum()))
-    gap, index = cKDTree(nodes.xy[good]).query(xy, k=k, distance_upper_bound=2 * options.spacing_px)
+    gap, index = cKDTree(nodes.xy[good]).query(xy, k=k, distance_upper_bound=max_gap_px)
     gap, index = gap.reshape(-1, k), index.reshape(-1, k)
     found = np.isfinite(gap)
     index = np.where(found, index, 0)

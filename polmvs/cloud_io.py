@@ -1,0 +1,128 @@
+"""Point clouds as files: the only importer of Open3D, which takes seconds to import."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.errors import DataError, PolmvsError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A point cloud as arrays.
+
+    Attributes
+    ----------
+    points : (N, 3) float64
+    normals : (N, 3) float64, unit, or None
+    colors : (N, 3) uint8 or None
+    scalars : further per-point values by name, each (N,)
+    """
+
+    points: Array
+    normals: Array | None = None
+    colors: NDArray[np.uint8] | None = None
+    scalars: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+
+def _open3d() -> Any:
+    """Import Open3D where a cloud is handled, and only there."""
+    try:
+        import open3d
+    except ImportError as error:
+        raise PolmvsError(
+            f"Open3D cannot be imported ({error}); Open3D 0.20 needs the system library "
+            "libusb-1.0, version 0.19 does not."
+        ) from error
+    return open3d
+
+
+def to_open3d(cloud: Cloud) -> Any:
+    """Make an ``open3d.t.geometry.PointCloud``; points, normals and scalars as float32."""
+    o3d = _open3d()
+    points = np.ascontiguousarray(cloud.points, np.float32)
+    result = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
+    if cloud.normals is not None:
+        result.point.normals = o3d.core.Tensor(np.ascontiguousarray(cloud.normals, np.float32))
+    if cloud.colors is not None:
+        result.point.colors = o3d.core.Tensor(np.ascontiguousarray(cloud.colors, np.uint8))
+    for name, values in cloud.scalars.items():
+        column = np.ascontiguousarray(values, np.float32).reshape(-1, 1)
+        result.point[name] = o3d.core.Tensor(column)
+    return result
+
+
+def write_cloud(path: str | Path, cloud: Cloud) -> None:
+    """Write a binary PLY that Open3D, MeshLab and CloudCompare open, whole or not at all.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be written.
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp.ply")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if len(cloud.points):
+            written = _open3d().t.io.write_point_cloud(str(temporary), to_open3d(cloud))
+            if not written:
+                raise DataError(target, "cannot be written; is the disk full or read-only?")
+        else:  # Open3D refuses clouds without points
+            temporary.write_bytes(_empty_ply(cloud))
+        os.replace(temporary, target)
+    except OSError as error:
+        raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _empty_ply(cloud: Cloud) -> bytes:
+    """A PLY of no points with the columns of the cloud."""
+    columns = ["float x", "float y", "float z", "float nx", "float ny", "float nz"]
+    columns += ["uchar red", "uchar green", "uchar blue"]
+    columns += [f"float {name}" for name in cloud.scalars]
+    lines = ["ply", "format binary_little_endian 1.0", "element vertex 0"]
+    lines += [f"property {c}" for c in columns]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode()
+
+
+def read_cloud(path: str | Path) -> Cloud:
+    """Read a PLY with whatever columns it has.
+
+    Raises
+    ------
+    DataError
+        If the file is missing or no point cloud.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise DataError(source, "no such file; give a PLY point cloud.")
+    with source.open("rb") as file:
+        header = file.read(4096)
+    if not header.startswith(b"ply"):
+        raise DataError(source, "is no PLY file; give a PLY point cloud.")
+    if b"element vertex 0\n" in header:
+        return Cloud(np.zeros((0, 3)))
+    o3d = _open3d()
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        loaded = o3d.t.io.read_point_cloud(str(source))
+    if "positions" not in loaded.point or not len(loaded.point.positions):
+        raise DataError(source, "cannot be read as a point cloud; is it truncated?")
+    columns = {name: loaded.point[name].numpy() for name in loaded.point}
+    normals = columns.pop("normals", None)
+    return Cloud(
+        points=columns.pop("positions").astype(np.float64),
+        normals=None if normals is None else normals.astype(np.float64),
+        colors=columns.pop("colors", None),
+        scalars={name: values.reshape(-1) for name, values in columns.items()},
+    )
