@@ -60,10 +60,10 @@ def sample_image(
     # NaN has no defined conversion to fixed point inside remap; comparisons with it are False.
     maps = np.where(np.abs(maps) < MAX_OPENCV_COORDINATE, maps, OUTSIDE)
     maps = maps.reshape(-1, min(side, max(num, 1)), 2) if num else np.full((1, 1, 2), OUTSIDE)
-    sampled = cv2.remap(
+    sampled = cv2.remap(  # type: ignore[call-overload]
         image if image.flags.c_contiguous else np.ascontiguousarray(image),
         maps.astype(np.float32, copy=False),
-        None,  # type: ignore[arg-type]
+        None,
         cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,

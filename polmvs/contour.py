@@ -142,7 +142,7 @@ def _angle(axial: Image) -> NDArray[np.float32]:
     return np.asarray(0.5 * np.arctan2(axial[..., 1], axial[..., 0]), np.float32)
 
 
-def _heading(field: Image, xy: Image, previous: Image) -> tuple[Image, Mask]:
+def _heading(field: Image, xy: Floats, previous: Floats) -> tuple[Image, Mask]:
     """Unit direction of the field nearest to the previous one, and where the field is coherent."""
     axial = sample_image(field, xy)
     angle = _angle(axial)
@@ -153,7 +153,7 @@ def _heading(field: Image, xy: Image, previous: Image) -> tuple[Image, Mask]:
     return heading, coherent & (np.abs(dot) > MIN_COHERENCE)
 
 
-def _cells(claims: NDArray[np.int32], shape: tuple[int, ...], xy: Image) -> tuple[Any, Any]:
+def _cells(claims: NDArray[np.int32], shape: tuple[int, ...], xy: Floats) -> tuple[Any, Any]:
     """Row and column of the claim cells of image coordinates."""
     rows, cols = claims.shape
     row = (xy[..., 1] * np.float32(rows / shape[0])).astype(np.int64)
@@ -162,9 +162,9 @@ def _cells(claims: NDArray[np.int32], shape: tuple[int, ...], xy: Image) -> tupl
 
 
 def _claim(
-    claims: NDArray[np.int32], shape: tuple[int, ...], xy: Image, curve: NDArray[np.int64]
+    claims: NDArray[np.int32], shape: tuple[int, ...], xy: Floats, curve: NDArray[np.int64]
 ) -> Mask:
-    """Claim the cells of positions (2, S, 2) for their curves; False where another curve owns it."""
+    """Claim the cells of positions (2, S, 2) for their curves; False where another owns it."""
     row, col = _cells(claims, shape, xy)
     mine = np.broadcast_to(curve, row.shape).astype(np.int32)
     free = claims[row, col] < 0

@@ -44,7 +44,7 @@ class DenseView:
         """Image coordinates ``(h, w, 2)`` of the lattice."""
         height, width = self.range_map.shape
         indices = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-        return (indices + 0.5) * self.stride_px
+        return np.asarray((indices + 0.5) * self.stride_px, np.float64)
 
 
 def store_dense_view(dense: DenseView, path: Path) -> DenseView:
@@ -60,8 +60,13 @@ def store_dense_view(dense: DenseView, path: Path) -> DenseView:
 
 def open_dense_view(stride_px: int, path: Path) -> DenseView:
     """Map a stored dense view into memory."""
-    arrays = (map_array(_member(path, name)) for name in ("range", "normals", "sigma"))
-    return DenseView(stride_px, *arrays, path=path)
+    return DenseView(
+        stride_px=stride_px,
+        range_map=map_array(_member(path, "range")),
+        normals_in_world=map_array(_member(path, "normals")),
+        sigma_deg=map_array(_member(path, "sigma")),
+        path=path,
+    )
 
 
 def _member(path: Path, name: str) -> Path:

@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 
-NORMAL_SIGMA_FLOOR = 0.004  # rad; systematic error of multi-view normals
+NORMAL_SIGMA_FLOOR = 0.012  # rad; systematic error of multi-view normals
 MAX_SEED_DISTANCE_PX = 12.0  # from a seed to the nodes it is tied to
 NUM_TIES = 4
 MIN_SEED_COSINE = 0.995  # 5.7 deg between the normals of a seed and of a node it is tied to

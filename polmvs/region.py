@@ -66,7 +66,7 @@ def find_region(
     mask : (H, W) bool, the user's region; it replaces the search, edges are still found.
     """
     intensity = np.maximum(smooth(s0, SMOOTHING_PX), 1e-6)
-    axial = np.dstack([smooth(s1, SMOOTHING_PX), smooth(s2, SMOOTHING_PX)])
+    axial = smooth(np.dstack([s1, s2]), SMOOTHING_PX)
     dolp = np.hypot(axial[..., 0], axial[..., 1]) / intensity
     texture = _relative_gradient(s0)
     core = (dolp > min_dolp) & valid
@@ -132,7 +132,7 @@ def _fill_holes(mask: Mask, texture: Image) -> Mask:
     flat = np.bincount(labels.ravel(), (texture < LOW_TEXTURE).ravel(), minlength=num) / area
     fill = closed & ((area <= MARK_AREA_PX) | (flat > 0.7))
     fill[0] = False
-    return mask | fill[labels]
+    return np.asarray(mask | fill[labels])
 
 
 def _marks(s0: Image, polarised: Mask) -> Mask:

@@ -26,7 +26,7 @@ CAUCHY_SCALE = 2.385
 
 @dataclass(frozen=True, kw_only=True)
 class Edges:
-    """Edges between nodes: ``log_range[head] - log_range[tail] = delta``, with deviation ``sigma``."""
+    """Edges between nodes: ``log_range[head] - log_range[tail] = delta``, deviation ``sigma``."""
 
     tail: Indices
     head: Indices
