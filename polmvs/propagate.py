@@ -46,7 +46,7 @@ MIN_CREASE_ANGLE = 0.03  # rad, between neighbouring normals
 CREASE_FACTOR = 4.0  # a crease turns the normal this much more than noise or local curvature
 NUM_NEIGHBORS = 6
 MIN_CONTOUR_DOLP = 0.05  # smoothed; contours stop under it
-MAX_STACKED_VIEWS = 8
+STACKED_VIEWS = 4  # whose contours are traced together
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,7 @@ def propagate(
     report = on_progress or (lambda count: None)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
     nodes: list[_Nodes | None] = []
-    chunks = _chunks(maps, workers.num)
-    for started in workers.map(partial(_start, model, seeds, options), chunks):
+    for started in workers.map(partial(_start, model, seeds, options), _chunks(maps)):
         nodes += started
         report(len(started))
     dense: list[DenseView | None] = [None] * len(maps)
@@ -139,10 +138,9 @@ def propagate(
     return dense
 
 
-def _chunks(maps: Sequence[PhaseMap], num_workers: int) -> list[Sequence[PhaseMap]]:
-    """Split the views so that every worker has some and no stack of fields gets too large."""
-    num = min(MAX_STACKED_VIEWS, -(-len(maps) // num_workers))
-    return [maps[i : i + num] for i in range(0, len(maps), num)]
+def _chunks(maps: Sequence[PhaseMap]) -> list[Sequence[PhaseMap]]:
+    """Split the views; not by the number of workers, which must not change the result."""
+    return [maps[i : i + STACKED_VIEWS] for i in range(0, len(maps), STACKED_VIEWS)]
 
 
 def _start(

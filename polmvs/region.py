@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.float32]
+Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 SMOOTHING_PX = (
@@ -17,6 +18,9 @@ SMOOTHING_PX = (
 LOW_TEXTURE = 0.03  # relative intensity gradient per px under which a surface shows no texture
 SIMILAR_INTENSITY = 1.6  # factor within which unpolarised pixels may belong to a polarised region
 MIN_AREA_PX = 200  # of a region
+MIN_CORE_SHARE = 0.03  # of a region: less means that it has run into the background
+GROWTH_PX = 15.0  # reach of a round of growth is about three times this
+MAX_GROWTH_ROUNDS = 6
 MARK_AREA_PX = 1500  # holes of up to this area are filled whatever they show (printed marks)
 MIN_PHASE_JUMP = 0.12  # change of (cos 2 phase, sin 2 phase) per px that counts as a crease
 
@@ -96,23 +100,49 @@ def _relative_gradient(s0: Image) -> Image:
 
 
 def _grow(core: Mask, intensity: Image, texture: Image) -> Mask:
-    """Core plus textureless neighbours of like intensity, holes filled, small regions dropped."""
-    weight = smooth(core.astype(np.float32), 15.0)
-    reference = smooth(np.where(core, intensity, 0), 15.0) / np.maximum(weight, 1e-6)
-    similar = (
-        (intensity < SIMILAR_INTENSITY * reference)
-        & (intensity * SIMILAR_INTENSITY > reference)
-        & (texture < LOW_TEXTURE)
-        & (weight > 1e-4)
-    )
-    joined = _open(_fill_holes(core | similar, texture), 5)
-    num, labels, stats, _ = cv2.connectedComponentsWithStats(
-        joined.astype(np.uint8), connectivity=4
-    )
-    core_area = np.bincount(labels[core & joined], minlength=num)
-    keep = (core_area > 0.1 * stats[:, cv2.CC_STAT_AREA]) & (core_area >= MIN_AREA_PX)
+    """Core plus textureless neighbours of like intensity, holes filled, small regions dropped.
+
+    The intensity that a neighbour must resemble is that of the region next to it, and follows
+    shading as the region grows. Where growth would swallow much more than the core (an open,
+    textureless background) the core stays as it is.
+    """
+    flat = texture < LOW_TEXTURE
+    grown = core
+    for _ in range(MAX_GROWTH_ROUNDS):
+        weight = smooth(grown.astype(np.float32), GROWTH_PX)
+        reference = smooth(np.where(grown, intensity, 0), GROWTH_PX) / np.maximum(weight, 1e-6)
+        similar = (
+            flat
+            & (intensity < SIMILAR_INTENSITY * reference)
+            & (intensity * SIMILAR_INTENSITY > reference)
+            & (weight > 1e-3)
+        )
+        before = int(grown.sum())
+        grown = _touching(_open(grown | similar, 5), core)
+        if grown.sum() < 1.02 * before:
+            break
+    grown = _substantial(_fill_holes(grown, texture), core, MIN_CORE_SHARE)
+    alone = _substantial(_fill_holes(core, texture) & ~grown, core, 0.0)
+    return _fill_holes(grown | alone, texture)
+
+
+def _touching(mask: Mask, core: Mask) -> Mask:
+    """Connected parts of the mask that hold some of the core."""
+    labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]
+    held = np.zeros(int(labels.max()) + 1, bool)
+    held[labels[core & mask]] = True
+    held[0] = False
+    return np.asarray(held[labels])
+
+
+def _substantial(mask: Mask, core: Mask, min_core_share: float) -> Mask:
+    """Connected parts with enough of the core, in px and as a share of the part."""
+    num, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    core_area = np.bincount(labels[core & mask], minlength=num)
+    area = stats[:, cv2.CC_STAT_AREA]
+    keep = (core_area >= MIN_AREA_PX) & (core_area >= min_core_share * area)
     keep[0] = False
-    return np.asarray(_fill_holes(keep[labels], texture))
+    return np.asarray(keep[labels])
 
 
 def _fill_holes(mask: Mask, texture: Image) -> Mask:
@@ -128,9 +158,9 @@ def _fill_holes(mask: Mask, texture: Image) -> Mask:
         & (left + stats[:, cv2.CC_STAT_WIDTH] < width)
         & (top + stats[:, cv2.CC_STAT_HEIGHT] < height)
     )
-    area = stats[:, cv2.CC_STAT_AREA]
-    flat = np.bincount(labels.ravel(), (texture < LOW_TEXTURE).ravel(), minlength=num) / area
-    fill = closed & ((area <= MARK_AREA_PX) | (flat > 0.7))
+    area = np.maximum(stats[:, cv2.CC_STAT_AREA], 1)
+    flat = np.bincount(labels.ravel(), (texture < LOW_TEXTURE).ravel(), minlength=num)
+    fill = closed & ((area <= MARK_AREA_PX) | (flat > 0.7 * area))
     fill[0] = False
     return np.asarray(mask | fill[labels])
 
@@ -145,7 +175,7 @@ def _marks(s0: Image, polarised: Mask) -> Mask:
     return _dilate((weight > 0.02) & ((deviation > 1.5) | (deviation < 0.5)), 3)
 
 
-def _phase_jumps(axial: Image, dolp: Image, min_dolp: float) -> Mask:
+def _phase_jumps(axial: Floats, dolp: Floats, min_dolp: float) -> Mask:
     """Where the phase changes abruptly between two polarised sides."""
     unit = axial / np.maximum(np.linalg.norm(axial, axis=-1, keepdims=True), 1e-9)
     dx = cv2.Sobel(unit, cv2.CV_32F, 1, 0, scale=1 / 8)

@@ -1,0 +1,61 @@
+"""Small analytic scenes that several test files share."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from polmvs.camera import PinholeCamera, View
+from polmvs.config import Light
+from polmvs.phasemap import PhaseMap, build_phase_map
+from polmvs.region import find_region
+from polmvs.synthetic import Plane, SyntheticView, render_view, ring_of_views
+from polmvs.tracks import Seeds
+
+CAMERA = PinholeCamera(width=160, height=128, fx=120.0, fy=120.0, cx=80.0, cy=64.0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    surface: object
+    views: list[View]
+    rendered: list[SyntheticView]
+    maps: list[PhaseMap]
+
+    def surface_points(self, num: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """True points and normals (world), from pixels of the first view well inside."""
+        first, view = self.rendered[0], self.views[0]
+        inside = first.mask.copy()
+        inside[:12], inside[-12:], inside[:, :12], inside[:, -12:] = False, False, False, False
+        pixels = np.argwhere(inside)
+        chosen = pixels[np.random.default_rng(seed).choice(len(pixels), num, replace=False)]
+        rays = view.camera.rays(chosen[:, ::-1] + 0.5)
+        in_cam = rays * first.range[chosen[:, 0], chosen[:, 1], None]
+        normals = first.normals_in_cam[chosen[:, 0], chosen[:, 1]]
+        world = view.cam_from_world.inverse()
+        return world * in_cam, normals @ world.rotation.T
+
+    def seeds(self, num: int, sigma: float = 1e-4) -> Seeds:
+        points, normals = self.surface_points(num)
+        return Seeds(points, normals, np.full(num, sigma))
+
+
+def board_scene(num_views: int = 6, sensor: str = "ppa") -> Scene:
+    """A tilted glossy board that lies whole in most views of a ring."""
+    surface = Plane(
+        point=np.array([0.0, 0.0, 0.0]), normal=np.array([0.1, -0.05, 1.0]), extent=(0.12, 0.15)
+    )
+    views = ring_of_views(
+        num_views, CAMERA, target=np.zeros(3), distance=0.5, elevation_deg=45, roll_deg=20
+    )
+    rendered = [render_view(v, surface, sensor=sensor, s0=0.2, background=0.6) for v in views]
+    return Scene(surface, views, rendered, [phase_map_of(r) for r in rendered])
+
+
+def phase_map_of(rendered: SyntheticView, light: Light = Light.SPECULAR) -> PhaseMap:
+    """Phase map of a rendered view without noise."""
+    i0, i45, i90, i135 = rendered.intensities.astype(np.float32)
+    s0, s1, s2 = 0.5 * (i0 + i45 + i90 + i135), i0 - i90, i45 - i135
+    valid = np.ones(s0.shape, bool)
+    region = find_region(s0, s1, s2, valid, min_dolp=0.1)
+    sigma = np.full(s0.shape, 1e-3, np.float32)
+    return build_phase_map(rendered.view, s0, s1, s2, sigma, region, light)
