@@ -15,6 +15,12 @@ from polmvs.errors import DataError, PolmvsError
 
 Array = NDArray[np.float64]
 
+PLY_BYTES = {
+    "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
+    "int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4,
+    "double": 8, "float64": 8,
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Cloud:
@@ -107,16 +113,13 @@ def read_cloud(path: str | Path) -> Cloud:
     source = Path(path)
     if not source.is_file():
         raise DataError(source, "no such file; give a PLY point cloud.")
-    with source.open("rb") as file:
-        header = file.read(4096)
-    if not header.startswith(b"ply"):
-        raise DataError(source, "is no PLY file; give a PLY point cloud.")
-    if b"element vertex 0\n" in header:
+    num_points = _checked_header(source)
+    if num_points == 0:
         return Cloud(np.zeros((0, 3)))
     o3d = _open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         loaded = o3d.t.io.read_point_cloud(str(source))
-    if "positions" not in loaded.point or not len(loaded.point.positions):
+    if "positions" not in loaded.point or len(loaded.point.positions) != num_points:
         raise DataError(source, "cannot be read as a point cloud; is it truncated?")
     columns = {name: loaded.point[name].numpy() for name in loaded.point}
     normals = columns.pop("normals", None)
@@ -126,3 +129,29 @@ def read_cloud(path: str | Path) -> Cloud:
         colors=columns.pop("colors", None),
         scalars={name: values.reshape(-1) for name, values in columns.items()},
     )
+
+
+def _checked_header(source: Path) -> int:
+    """Number of points that a PLY promises, once the file is known to be long enough.
+
+    Open3D fills a truncated file up with zeros.
+    """
+    with source.open("rb") as file:
+        head = file.read(65536)
+    end = head.find(b"end_header")
+    if not head.startswith(b"ply") or end < 0:
+        raise DataError(source, "is no PLY file; give a PLY point cloud.")
+    lines = [line.split() for line in head[:end].decode("ascii", "replace").splitlines()]
+    elements = [line for line in lines if line[:1] == ["element"]]
+    if not elements or elements[0][1:2] != ["vertex"] or not elements[0][-1].isdigit():
+        raise DataError(source, "holds no vertices; give a PLY point cloud.")
+    num_points = int(elements[0][-1])
+    start = lines.index(elements[0]) + 1
+    stop = lines.index(elements[1]) if len(elements) > 1 else len(lines)
+    types = [line[1] for line in lines[start:stop] if line[:1] == ["property"]]
+    ascii_format = ["format", "ascii", "1.0"] in lines
+    # An ASCII value takes two bytes at the least.
+    row_bytes = sum(2 if ascii_format else PLY_BYTES.get(name, 1) for name in types)
+    if source.stat().st_size < end + num_points * row_bytes:
+        raise DataError(source, "is truncated; write or copy it again.")
+    return num_points

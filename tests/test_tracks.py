@@ -78,7 +78,7 @@ def test_a_point_off_every_region_has_no_normal(scene):
 
 def test_seeds_lie_on_the_part_only(scene):
     on, _ = scene.surface_points(30)
-    off = on + [0.5, 0.0, 0.0]
+    off = on + np.array([0.5, 0.0, 0.0])
     tracks = tracks_at(scene, np.concatenate([on, off]))
     estimate = track_normals(Model.PPA, tracks, scene.maps, NormalOptions(window_px=5))
     seeds, chosen = select_seeds(tracks, estimate, scene.maps)
@@ -145,5 +145,5 @@ def test_a_damaged_phase_map_is_named(scene, tmp_path):
     store_phase_map(scene.maps[0], tmp_path)
     path = tmp_path / f"{scene.views[0].name}.samples.npy"
     path.write_bytes(path.read_bytes()[:40])
-    with pytest.raises(DataError, match="samples.npy"):
+    with pytest.raises(DataError, match=r"samples\.npy"):
         open_phase_map(scene.views[0], tmp_path)
