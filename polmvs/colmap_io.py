@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
-import struct
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,6 +19,7 @@ import pycolmap as pycolmap  # re-exported, see above
 from numpy.typing import NDArray
 
 from polmvs.camera import Camera, PinholeCamera, View
+from polmvs.colmap_check import check_binary_model
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
 from polmvs.tracks import Tracks
@@ -36,9 +37,6 @@ PERSPECTIVE_MODELS = frozenset(
 FIELD_MARGIN = 1.05
 BORDER_SAMPLES = 64  # along each side of the image
 MODEL_FILES = ("cameras", "images", "points3D")  # rigs and frames came with COLMAP 3.12
-# Smallest records of COLMAP's binary files, bytes: a count that the file cannot hold is a fault
-# that pycolmap 4.2 answers with an endless loop.
-MIN_RECORD_BYTES = {"cameras": 24, "images": 73, "points3D": 43, "rigs": 8, "frames": 8}
 
 
 def set_verbosity(verbose: bool) -> None:
@@ -90,8 +88,7 @@ class ColmapCamera:
     def project(self, points_in_cam: NDArray[np.floating]) -> NDArray[np.floating]:
         """Image coordinates ``(..., 2)`` of camera-frame points.
 
-        NaN behind the camera and outside the model's domain: more than 5 % further from the
-        optical axis than the image's widest ray.
+        NaN behind the camera and more than 5 % further from the axis than the widest ray.
         """
         points = np.asarray(points_in_cam, np.float64)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
@@ -135,13 +132,15 @@ def _pycolmap_camera(camera: ColmapCamera) -> pycolmap.Camera:
 def _widest_angle(camera: ColmapCamera) -> float:
     """Angle from the optical axis of the widest ray of the image's border, with margin, rad."""
     along = np.linspace(0, 1, BORDER_SAMPLES)
-    zero, one = np.zeros_like(along), np.ones_like(along)
-    x = np.concatenate([along, along, zero, one]) * camera.width
-    y = np.concatenate([zero, one, along, along]) * camera.height
-    z = camera.rays(np.stack([x, y], axis=-1))[:, 2]
-    if np.isnan(z).any():  # the border is beyond the inverse of the distortion: no bound known
+    share = [np.stack([along, np.full_like(along, side)], axis=-1) for side in (0, 1)]
+    border = np.concatenate([*share, *(pair[:, ::-1] for pair in share)])
+    z = camera.rays(border * (camera.width, camera.height))[:, 2]
+    inside = z[np.isfinite(z)]
+    if not len(inside):
         return float(np.pi / 2)
-    return float(FIELD_MARGIN * np.arccos(np.clip(z.min(), 0, 1)))
+    # Where the border reaches beyond the fold, the last rays before it are the bound themselves.
+    margin = FIELD_MARGIN if len(inside) == len(z) else 1.0
+    return float(margin * np.arccos(inside.min()))
 
 
 def camera_from_colmap(camera: pycolmap.Camera) -> Camera:
@@ -221,6 +220,8 @@ def _tracks(reconstruction: pycolmap.Reconstruction, images: list[pycolmap.Image
     seen = [image.get_observation_points2D() for image in images]
     obs_ids = np.array([point.point3D_id for view in seen for point in view], np.int64)
     obs_xy = np.array([point.xy for view in seen for point in view], np.float64)
+    if not np.isin(obs_ids, ids).all():
+        raise ValueError("keypoints observe points that are missing")
     return Tracks(
         point3D_ids=ids,
         points_in_world=np.array([p.xyz for _, p in points], np.float64).reshape(-1, 3),
@@ -277,28 +278,24 @@ def read_model(path: str | os.PathLike[str]) -> SparseModel:
     """
     folder = find_model(path)
     if _model_suffix(folder) == ".bin":
-        _check_binary(folder)
+        check_binary_model(folder, _num_params)
     try:
         model = model_from_reconstruction(pycolmap.Reconstruction(str(folder)))
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OverflowError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(folder, f"is no sound COLMAP model ({reason}). Export it again.") from error
+        # COLMAP's own words, less the place in its source and the length.
+        reason = re.sub(r"\[[\w.]+:\d+\]", "", " ".join(str(error).split()))[:120].strip()
+        raise DataError(
+            folder, f"is no sound COLMAP model ({reason or 'no reason given'}). Export it again."
+        ) from error
     if not model.views:
         raise DataError(folder, "has no registered image. Run COLMAP again or leave out --sparse.")
-    finite = all(np.isfinite(view.cam_from_world.translation).all() for view in model.views)
-    if not (finite and np.isfinite(model.tracks.points_in_world).all()):
+    numbers = [view.cam_from_world.translation for view in model.views]
+    if not all(np.isfinite(array).all() for array in (*numbers, model.tracks.points_in_world)):
         raise DataError(folder, "is no sound COLMAP model (not all numbers in it are finite).")
     return model
 
 
-def _check_binary(folder: Path) -> None:
-    """Refuse files that are too short for the number of records that they announce."""
-    for name, record_bytes in MIN_RECORD_BYTES.items():
-        path = folder / f"{name}.bin"
-        if not path.is_file():
-            continue
-        with path.open("rb") as file:
-            head = file.read(8)
-        count = struct.unpack("<Q", head)[0] if len(head) == 8 else 1
-        if len(head) < 8 or count * record_bytes > path.stat().st_size - 8:
-            raise DataError(path, "is truncated or no file of COLMAP's. Export the model again.")
+def _num_params(model_id: int) -> int:
+    """Number of parameters of a camera model; ValueError where pycolmap does not know it."""
+    model = pycolmap.CameraModelId(model_id)
+    return len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)

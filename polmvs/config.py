@@ -6,6 +6,7 @@ Each stage takes its own frozen dataclass. The command line makes its flags from
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -13,12 +14,15 @@ from typing import Any
 
 from polmvs.errors import OptionError
 
+MAX_DEFAULT_WORKERS = 8  # each holds a few hundred MB
+
 
 class Model(StrEnum):
     """Relation between the measured angle and the surface normal."""
 
     OPA = "opa"
     PPA = "ppa"
+    TILTED = "tilted"
 
 
 class Light(StrEnum):
@@ -45,6 +49,12 @@ class Estimator(StrEnum):
 def option(default: Any, help_text: str) -> Any:
     """A dataclass field with its help text, which names the unit."""
     return field(default=default, metadata={"help": help_text})
+
+
+def default_num_workers() -> int:
+    """One process for each core that this one may use, at most ``MAX_DEFAULT_WORKERS``."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return max(1, min(cores or 1, MAX_DEFAULT_WORKERS))
 
 
 def _require(holds: bool, message: str) -> None:
@@ -98,20 +108,33 @@ class SfmOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RegionOptions:
+    """Where the part is and which phase its light shows."""
+
+    light: Light = option(Light.SPECULAR, "reflection that dominates the polarisation")
+    min_dolp: float = option(0.1, "DoLP from which a pixel's phase is used on its own")
+    mask: Path | None = option(
+        None,
+        "folder of masks, STEM.png or STEM_mask.png for each image, of the size of the "
+        "polarization images, not 0 on the part; without it the part is found",
+    )
+
+    def __post_init__(self) -> None:
+        _require(0 < self.min_dolp < 1, f"--min-dolp must lie in 0 to 1, not {self.min_dolp}.")
+
+
+@dataclass(frozen=True, kw_only=True)
 class NormalOptions:
     """How normals are solved from phase angles."""
 
     estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
-    light: Light = option(Light.SPECULAR, "reflection that dominates the polarisation")
     window_px: int = option(17, "side of the window of rows about a track's point, px")
-    min_dolp: float = option(0.1, "DoLP from which a pixel's phase is used on its own")
 
     def __post_init__(self) -> None:
         _require(
             self.window_px >= 1 and self.window_px % 2 == 1,
             f"--window-px must be odd and positive, not {self.window_px}.",
         )
-        _require(0 < self.min_dolp < 1, f"--min-dolp must lie in 0 to 1, not {self.min_dolp}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,3 +188,40 @@ class FusionOptions:
             "--max-normal-difference-deg must lie in 0 to 90.",
         )
         _require(self.voxel_px >= 0, "--voxel-px must not be negative.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationOptions:
+    """What the results are measured against."""
+
+    gt: Path | None = option(
+        None, "folder of the ground truth (cameras.json and maps), or the capture's that has gt/"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """All that decides the result of a run, by stage."""
+
+    capture: CaptureOptions = field(default_factory=CaptureOptions)
+    sfm: SfmOptions = field(default_factory=SfmOptions)
+    region: RegionOptions = field(default_factory=RegionOptions)
+    normals: NormalOptions = field(default_factory=NormalOptions)
+    propagation: PropagationOptions = field(default_factory=PropagationOptions)
+    fusion: FusionOptions = field(default_factory=FusionOptions)
+    evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """How a run is carried out; nothing here changes its result."""
+
+    overwrite: bool = option(False, "delete an earlier run's results in OUT first")
+    resume: bool = option(False, "go on with the run in OUT at its first unfinished stage")
+    workers: int = option(default_num_workers(), "processes to share the views among")
+
+    def __post_init__(self) -> None:
+        _require(
+            not (self.overwrite and self.resume), "--overwrite and --resume exclude each other."
+        )
+        _require(self.workers >= 1, f"--workers must be 1 or more, not {self.workers}.")

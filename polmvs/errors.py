@@ -28,6 +28,10 @@ class DataError(PolmvsError):
         self.path = path
         self.reason = reason
 
+    def __reduce__(self) -> tuple[type[DataError], tuple[str | PathLike[str], str]]:
+        """Pickle the parts, so that the error of a worker process arrives whole."""
+        return type(self), (self.path, self.reason)
+
 
 class OptionError(PolmvsError):
     """An option is malformed or contradicts another one or the data."""

@@ -1,7 +1,8 @@
-"""The two camera models: forward phase, constraint rows and parametrisation of the normal.
+"""The camera models: forward phase, constraint rows and parametrisation of the normal.
 
-One formula serves both (paper, Table "Summary of the OPA and PPA models"): the PPA model uses the
-pixel's own ray ``v``; the OPA model replaces it by the optical axis ``(0, 0, 1)``.
+One formula serves all (paper, Table "Summary of the OPA and PPA models"): the PPA model uses the
+pixel's own ray ``v``; the OPA model replaces it by the optical axis ``(0, 0, 1)``. The geometry of
+the tilted model is that of PPA, on Stokes images corrected by :mod:`polmvs.tilted`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 def model_rays(model: Model, rays_in_cam: Floats) -> Floats:
-    """Rays as the model sees them: themselves under PPA, the optical axis under OPA."""
+    """Rays as the model sees them: the optical axis under OPA, themselves under the others."""
     if model is Model.OPA:
         return np.broadcast_to(OPTICAL_AXIS.astype(rays_in_cam.dtype), rays_in_cam.shape)
     return rays_in_cam
@@ -34,7 +35,7 @@ def phase_from_normal(model: Model, normals_in_cam: Floats, rays_in_cam: Floats)
 
     Parameters
     ----------
-    model : OPA or PPA.
+    model : OPA, PPA or tilted.
     normals_in_cam : (..., 3), camera frame; the sign does not matter.
     rays_in_cam : (..., 3), unit rays, camera frame.
 
@@ -57,7 +58,7 @@ def rows_from_phase(model: Model, phase: Floats, rays_in_cam: Floats) -> Array:
 
     Parameters
     ----------
-    model : OPA or PPA.
+    model : OPA, PPA or tilted.
     phase : (...) radians, modulo pi.
     rays_in_cam : (..., 3), unit rays, camera frame.
 
@@ -66,7 +67,8 @@ def rows_from_phase(model: Model, phase: Floats, rays_in_cam: Floats) -> Array:
     (..., 3) float64, camera frame: the unit normal of the plane of incidence, ``v x d``. It is
     also a tangent of the surface, and perpendicular to the model's ray.
     """
-    return rows_from_axial(model, np.cos(2 * phase), np.sin(2 * phase), rays_in_cam)
+    cos2, sin2 = np.cos(2 * phase), np.sin(2 * phase)
+    return np.asarray(rows_from_axial(model, cos2, sin2, rays_in_cam), np.float64)
 
 
 def rows_from_axial(model: Model, cos2: Floats, sin2: Floats, rays_in_cam: Floats) -> Floats:
@@ -74,15 +76,21 @@ def rows_from_axial(model: Model, cos2: Floats, sin2: Floats, rays_in_cam: Float
 
     A pair of zero length (no polarisation) gives a NaN row.
     """
-    length = np.hypot(cos2, sin2)
+    length = np.sqrt(cos2 * cos2 + sin2 * sin2)
     with np.errstate(invalid="ignore", divide="ignore"):
-        cos2 = cos2 / length
-        # Half angles without trigonometry; the sign of the sine is that of sin2.
-        cos = np.sqrt(np.maximum(0.5 * (1 + cos2), 0))
-        sin = np.copysign(np.sqrt(np.maximum(0.5 * (1 - cos2), 0)), sin2)
+        cos2, sin2 = cos2 / length, sin2 / length
+    # Half angles without trigonometry, the larger first: the smaller is a difference of near
+    # equals. The sign is that of sin2.
+    larger = np.sqrt(0.5 + 0.5 * np.abs(cos2))
+    smaller = np.abs(0.5 * sin2) / larger
+    steep = cos2 < 0
+    cos = np.where(steep, smaller, larger)
+    sin = np.copysign(np.where(steep, larger, smaller), sin2)
     v = model_rays(model, rays_in_cam)
-    rows = np.stack([v[..., 2] * sin, v[..., 2] * cos, -v[..., 0] * sin - v[..., 1] * cos], axis=-1)
-    return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
+    x, y = v[..., 2] * sin, v[..., 2] * cos
+    z = -v[..., 0] * sin - v[..., 1] * cos
+    scale = 1 / np.sqrt(x * x + y * y + z * z)
+    return np.stack([x * scale, y * scale, z * scale], axis=-1)
 
 
 def normal_from_angles(model: Model, phase: Floats, zenith: Floats, rays_in_cam: Floats) -> Array:
@@ -90,7 +98,7 @@ def normal_from_angles(model: Model, phase: Floats, zenith: Floats, rays_in_cam:
 
     Parameters
     ----------
-    model : OPA or PPA.
+    model : OPA, PPA or tilted.
     phase, zenith : (...) radians; the zenith angle lies between the normal and ``-v`` (PPA) or
         the optical axis (OPA).
     rays_in_cam : (..., 3), unit rays, camera frame.
@@ -104,4 +112,4 @@ def normal_from_angles(model: Model, phase: Floats, zenith: Floats, rays_in_cam:
     axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
     zenith = np.asarray(zenith)[..., None]
     # Rodrigues; the axis is perpendicular to v.
-    return -(np.cos(zenith) * v + np.sin(zenith) * np.cross(axis, v))
+    return np.asarray(-(np.cos(zenith) * v + np.sin(zenith) * np.cross(axis, v)))

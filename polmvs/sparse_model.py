@@ -9,6 +9,7 @@ import logging
 import os
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
@@ -17,7 +18,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import Camera, PinholeCamera, View
+from polmvs.camera import Camera, PinholeCamera
 from polmvs.colmap_io import ColmapCamera, SparseModel, camera_to_colmap, pycolmap
 from polmvs.errors import DataError
 from polmvs.tracks import Tracks
@@ -122,8 +123,8 @@ def _stem(name: str) -> str:
 
 def _unique_stems(names: Sequence[str]) -> dict[str, str]:
     """Name of each stem that occurs once."""
-    stems = [_stem(name) for name in names]
-    return {stem: name for stem, name in zip(stems, names, strict=True) if stems.count(stem) == 1}
+    count = Counter(_stem(name) for name in names)
+    return {_stem(name): name for name in names if count[_stem(name)] == 1}
 
 
 def _fit_camera(camera: Camera, width: int, height: int, source: str | PathLike[str]) -> Camera:

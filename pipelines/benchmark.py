@@ -1,0 +1,54 @@
+"""Print the seconds and memory of the stages of one or more runs, side by side.
+
+    python pipelines/benchmark.py OUT [OUT ...]
+    python pipelines/benchmark.py --capture CAPTURE OUT [flags of polmvs compare]
+
+With ``--capture`` that capture is run first, into the only OUT.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from polmvs.cli import main as run_polmvs
+from polmvs.errors import PolmvsError
+from polmvs.summary import stage_table
+from polmvs.workspace import RUN_FILE, Workspace
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "runs", type=Path, nargs="+", metavar="OUT", help="folders of finished runs"
+    )
+    parser.add_argument("--capture", type=Path, help="compare the models on this capture first")
+    args, flags = parser.parse_known_args(argv)
+    if args.capture is not None:
+        if len(args.runs) != 1:
+            parser.error("--capture goes with one OUT")
+        status = run_polmvs(["compare", str(args.capture), str(args.runs[0]), *flags])
+        if status != 0:
+            return status
+    elif flags:
+        parser.error(f"unknown arguments: {' '.join(flags)}")
+    try:
+        records = {str(out): asdict(Workspace(_folder(out)).load()) for out in args.runs}
+    except PolmvsError as error:
+        print(f"{parser.prog}: error: {error}", file=sys.stderr)
+        return error.exit_status
+    print(stage_table(records))
+    return 0
+
+
+def _folder(path: Path) -> Path:
+    """The folder of a run, which may be named by its ``run.json``."""
+    return path.parent if path.name == RUN_FILE else path
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

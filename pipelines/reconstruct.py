@@ -1,0 +1,48 @@
+"""Reconstruct a capture with one model: the whole chain as one call of the library.
+
+    python pipelines/reconstruct.py CAPTURE OUT [--model opa] [--intrinsics fx,fy,cx,cy] ...
+
+The same as ``polmvs reconstruct``, to copy and change.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from polmvs.cli.flags import GROUPS, add_flags, add_run_flags, options_from, run_options
+from polmvs.cli.terminal import Terminal, guarded
+from polmvs.config import Model
+from polmvs.pipeline import Job, reconstruct
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("capture", type=Path, help="folder of raw polarizer mosaics")
+    parser.add_argument("out", type=Path, help="folder of the results")
+    parser.add_argument("--model", type=Model, choices=list(Model), default=Model.PPA)
+    add_run_flags(parser)
+    add_flags(parser, [name for name in GROUPS if name != "evaluation"])
+    args = parser.parse_args(argv)
+
+    def run() -> int:
+        job = Job(
+            capture=args.capture,
+            out=args.out,
+            options=options_from(args),
+            how=run_options(args),
+            monitor=terminal,
+        )
+        outcome = reconstruct(job, args.model)
+        cloud = outcome.workspace.cloud(args.model)
+        print(outcome.empty or f"{cloud}: {outcome.results[f'num_points_{args.model}']:,} points")
+        return 0 if outcome.empty is None else 3
+
+    with Terminal(verbose=True) as terminal:
+        return guarded(run, terminal, parser.prog)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

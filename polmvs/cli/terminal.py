@@ -1,0 +1,142 @@
+"""What the user sees of a run: progress, warnings, the log file, and one line for every error."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from types import TracebackType
+
+from tqdm import tqdm
+
+from polmvs.errors import DataError, PolmvsError
+from polmvs.run import Report
+from polmvs.workspace import Workspace
+
+INTERRUPTED = 130  # as shells report a program ended by Ctrl-C
+LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+
+logger = logging.getLogger(__name__)
+package_logger = logging.getLogger("polmvs")
+
+
+class _TerminalHandler(logging.Handler):
+    """Lines on stderr that do not break the progress bar; tracebacks are for the log file."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.exc_info is None:
+            level = "" if record.levelno < logging.WARNING else f"{record.levelname.lower()}: "
+            tqdm.write(f"{level}{record.getMessage()}", file=sys.stderr)
+
+
+class _LogFileHandler(logging.FileHandler):
+    """A log on a full disk is no reason to complain in the middle of a run."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Do nothing."""
+
+
+class Terminal:
+    """One call of the command: a :class:`polmvs.run.Monitor` that shows and logs.
+
+    Parameters
+    ----------
+    verbose : show every step, and log details.
+    """
+
+    def __init__(self, *, verbose: bool) -> None:
+        self.verbose = verbose
+        self.workspace: Workspace | None = None
+        self._handlers: list[logging.Handler] = []
+
+    def __enter__(self) -> Terminal:
+        handler = _TerminalHandler(logging.INFO if self.verbose else logging.WARNING)
+        self._add(handler)
+        package_logger.setLevel(logging.DEBUG if self.verbose else logging.INFO)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        for handler in self._handlers:
+            package_logger.removeHandler(handler)
+            handler.close()
+        self._handlers.clear()
+
+    def opened(self, workspace: Workspace) -> None:
+        """Log into the output folder from now on."""
+        self.workspace = workspace
+        try:
+            handler = _LogFileHandler(workspace.log, encoding="utf-8")
+        except OSError as error:
+            reason = f"cannot be written: {error.strerror or error}."
+            raise DataError(workspace.log, reason) from error
+        handler.setFormatter(logging.Formatter(LOG_FORMAT))
+        self._add(handler)
+
+    @contextmanager
+    def stage(self, name: str, total: int | None) -> Iterator[Report]:
+        """Show a bar, if this is a terminal."""
+        with tqdm(
+            total=total, desc=name, disable=None, leave=False, file=sys.stderr, mininterval=0.2
+        ) as bar:
+
+            def report(count: int) -> None:
+                bar.update(count)
+
+            yield report
+
+    def _add(self, handler: logging.Handler) -> None:
+        self._handlers.append(handler)
+        package_logger.addHandler(handler)
+
+
+def guarded(command: Callable[[], int], terminal: Terminal, name: str) -> int:
+    """Run a command; whatever goes wrong becomes one line on stderr and an exit status.
+
+    Parameters
+    ----------
+    command : gives the exit status.
+    terminal : of this call.
+    name : of the command, for the message.
+    """
+    try:
+        return command()
+    except KeyboardInterrupt:
+        kept = "; finished stages are kept, go on with --resume"
+        _complain(name, "interrupted" + (kept if terminal.workspace is not None else ""))
+        return INTERRUPTED
+    except PolmvsError as error:
+        logger.debug("%s", error, exc_info=True)
+        _complain(name, f"error: {error}")
+        return error.exit_status
+    except BrokenPipeError:  # the reader of stdout has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (BrokenProcessPool, MemoryError):
+        logger.debug("out of memory", exc_info=True)
+        _complain(name, "error: out of memory, or a worker was killed. Give --workers 1.")
+        return 1
+    except OSError as error:
+        logger.debug("%s", error, exc_info=True)
+        place = f"{error.filename}: " if error.filename else ""
+        _complain(name, f"error: {place}{error.strerror or error}.")
+        return 1
+    except Exception as error:
+        logger.critical("internal error", exc_info=True)
+        where = f"; see {terminal.workspace.log}" if terminal.workspace is not None else ""
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        _complain(name, f"internal error: {text}{where}")
+        return 1
+
+
+def _complain(name: str, message: str) -> None:
+    line = " ".join(message.split())
+    logger.log(logging.ERROR, "%s", line, exc_info=(None, None, None))
+    print(f"{name}: {line}", file=sys.stderr)

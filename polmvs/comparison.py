@@ -1,0 +1,305 @@
+"""Compare the clouds of several models, against the truth or against the phases themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import View, sample_image
+from polmvs.capture import Capture
+from polmvs.cloud_io import Cloud, read_cloud
+from polmvs.colmap_io import read_model
+from polmvs.config import Light, Model, Options
+from polmvs.evaluate import evaluate, phase_errors_on_part, track_normal_errors
+from polmvs.groundtruth import GroundTruth, open_ground_truth
+from polmvs.image_io import write_bytes
+from polmvs.metrics import AngleStats, axial_errors_deg
+from polmvs.models import phase_from_normal
+from polmvs.option_values import to_plain
+from polmvs.phasemap import PhaseMap
+from polmvs.stages import open_maps
+from polmvs.summary import summary_text
+from polmvs.workspace import Workspace, write_json
+
+Floats = NDArray[np.floating]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+MIN_DOLP = 0.1  # of pixels whose phase is compared
+MAX_RESIDUAL_POINTS = 100_000  # of a cloud, evenly spread, that phase residuals are taken from
+CELL_PX = 4  # of coverage and occlusion: wider than the distance of the cloud's points
+MAX_RELATIVE_EXCESS = 0.01  # of a visible point's distance over the nearest one's in its cell
+MIN_VISIBLE_COSINE = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Consistency:
+    """How well a cloud fits the capture that it was made from; no truth needed.
+
+    Attributes
+    ----------
+    num_points : of the cloud.
+    phase_residual : angle between the phase that a point's normal predicts, under the cloud's
+        model, and the measured one, over all views that see the point.
+    coverage : share of the region's pixels, over all views, that show a point of the cloud.
+    agreement : share of the views that see a point that agree with it in place and normal.
+    track_residual_median_deg : angle between the normals of the sparse points and their planes
+        of incidence, over the points on the polarised surface.
+    """
+
+    num_points: int
+    phase_residual: AngleStats
+    coverage: float
+    agreement: float
+    track_residual_median_deg: float
+
+
+def measure_consistency(
+    model: Model, cloud: Cloud, tracks: Cloud, maps: Sequence[PhaseMap]
+) -> Consistency:
+    """Compare a cloud with the phase maps of all views.
+
+    Parameters
+    ----------
+    model : of the cloud.
+    cloud : dense, with normals and, if it has points, ``num_views``.
+    tracks : sparse points with ``residual`` and ``seed``.
+    maps : of all views.
+    """
+    num = len(cloud.points)
+    step = -(-num // MAX_RESIDUAL_POINTS) or 1
+    covered = inside = 0
+    seeing = np.zeros(num, np.int64)
+    errors = [np.zeros(0)]
+    for phase_map in maps:
+        cells = _region_cells(phase_map.region.inside)
+        inside += int(cells.sum())
+        if num == 0 or cloud.normals is None:
+            continue
+        visible, hit = visible_points(cloud.points, cloud.normals, phase_map)
+        covered += int((hit & cells).sum())
+        seeing += visible
+        chosen = np.flatnonzero(visible[::step]) * step
+        errors.append(
+            phase_residuals_deg(model, cloud.points[chosen], cloud.normals[chosen], phase_map)
+        )
+    confirmed = np.minimum(cloud.scalars.get("num_views", np.zeros(num)), np.maximum(seeing, 1))
+    return Consistency(
+        num_points=num,
+        phase_residual=AngleStats.from_degrees(np.concatenate(errors)),
+        coverage=covered / inside if inside else float("nan"),
+        agreement=float(confirmed.sum() / max(seeing.sum(), 1)) if num else float("nan"),
+        track_residual_median_deg=_track_residual(tracks),
+    )
+
+
+def _track_residual(tracks: Cloud) -> float:
+    """Median over the seeds; NaN where there are none."""
+    residuals = tracks.scalars.get("residual", np.zeros(0))
+    used = (tracks.scalars.get("seed", np.zeros(0)) > 0) & np.isfinite(residuals)
+    if not used.any():
+        return float("nan")
+    return float(np.degrees(np.arcsin(min(float(np.median(residuals[used])), 1.0))))
+
+
+def visible_points(points: Floats, normals: Floats, phase_map: PhaseMap) -> tuple[Mask, Mask]:
+    """Which points a view sees in its region, and which of its cells show one.
+
+    A point is seen if it faces the camera and no point in its cell is clearly nearer.
+
+    Parameters
+    ----------
+    points, normals : (N, 3), world.
+
+    Returns
+    -------
+    visible : (N,) bool
+    hit : (H / CELL_PX, W / CELL_PX) bool, rounded up
+    """
+    view, inside = phase_map.view, phase_map.region.inside
+    in_cam = view.cam_from_world * points
+    distance = np.linalg.norm(in_cam, axis=1)
+    xy = view.camera.project(in_cam)
+    to_camera = view.center_in_world - points
+    facing = (to_camera * normals).sum(axis=1) > MIN_VISIBLE_COSINE * distance
+    seen = facing & (sample_image(inside.astype(np.float32), xy, nearest=True) > 0)
+    shape = tuple(-(-side // CELL_PX) for side in inside.shape)
+    cols, rows = np.floor(xy[seen] / CELL_PX).astype(np.intp).T
+    cell = rows * shape[1] + cols
+    nearest = np.full(shape[0] * shape[1], np.inf)
+    np.minimum.at(nearest, cell, distance[seen])
+    visible = np.zeros(len(points), np.bool_)
+    visible[seen] = distance[seen] <= (1 + MAX_RELATIVE_EXCESS) * nearest[cell]
+    return visible, np.isfinite(nearest).reshape(shape)
+
+
+def _region_cells(inside: Mask) -> Mask:
+    """Cells of CELL_PX px whose centre lies inside."""
+    half = CELL_PX // 2
+    padded = np.pad(inside, ((0, CELL_PX), (0, CELL_PX)))
+    shape = tuple(-(-side // CELL_PX) for side in inside.shape)
+    return np.asarray(padded[half::CELL_PX, half::CELL_PX][: shape[0], : shape[1]])
+
+
+def phase_residuals_deg(
+    model: Model, points: Floats, normals: Floats, phase_map: PhaseMap
+) -> NDArray[np.float64]:
+    """Axial difference between predicted and measured phase at points, degrees.
+
+    Parameters
+    ----------
+    points, normals : (N, 3), world.
+
+    Returns
+    -------
+    (N,), NaN where the view shows no polarised light.
+    """
+    view = phase_map.view
+    in_cam = view.cam_from_world * points
+    rays = in_cam / np.linalg.norm(in_cam, axis=1, keepdims=True)
+    predicted = phase_from_normal(model, normals @ view.cam_from_world.rotation.T, rays)
+    samples = sample_image(phase_map.samples, view.camera.project(in_cam))
+    measured = 0.5 * np.arctan2(samples[:, 1], samples[:, 0])
+    counted = (samples[:, 2] > 0) & (np.hypot(samples[:, 0], samples[:, 1]) > MIN_DOLP)
+    return np.where(counted, axial_errors_deg(measured, predicted), np.nan)
+
+
+class LazyPhases(Mapping[str, Image]):
+    """Phase of images by name, with their DoLP in ``dolps``; one image is held at a time.
+
+    Parameters
+    ----------
+    names : of the images.
+    load : gives phase and DoLP (H, W) of an image.
+    """
+
+    def __init__(self, names: Sequence[str], load: Callable[[str], tuple[Image, Image]]) -> None:
+        self.names = tuple(names)
+        self.load = load
+        self.dolps: dict[str, Image] = {}
+
+    def __getitem__(self, name: str) -> Image:
+        """Phase (H, W), rad, NaN where there is none; its DoLP is then in ``dolps``."""
+        phase, dolp = self.load(name)
+        self.dolps.clear()
+        self.dolps[name] = dolp
+        return phase
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def phase_errors(
+    capture: Capture, maps: Sequence[PhaseMap], light: Light, truth: GroundTruth
+) -> dict[str, dict[Model, AngleStats]]:
+    """Errors of the measured phase on the part, under each model with the true normals.
+
+    Returns
+    -------
+    ``maps``: of the phase maps, which the geometry uses. ``pixels``: of the single pixels of the
+    capture, those neither clipped nor dark.
+    """
+    stored = {_stem(phase_map.view.name): phase_map for phase_map in maps}
+    raw = {_stem(name): name for name in capture.names}
+    turn = np.float32(np.pi / 2 if light is Light.SPECULAR else 0)
+
+    def of_map(name: str) -> tuple[Image, Image]:
+        cos, sin, precision = np.moveaxis(stored[_stem(name)].samples, -1, 0)
+        phase = np.where(precision > 0, 0.5 * np.arctan2(sin, cos), np.nan)
+        return phase.astype(np.float32), np.hypot(cos, sin)
+
+    def of_pixels(name: str) -> tuple[Image, Image]:
+        stokes = capture.load(raw[_stem(name)])
+        return np.where(stokes.valid, stokes.aolp + turn, np.float32(np.nan)), stokes.dolp
+
+    sources = (("maps", stored, of_map), ("pixels", raw, of_pixels))
+    errors = {}
+    for source, known, load in sources:
+        phases = LazyPhases([name for name in truth.names if _stem(name) in known], load)
+        errors[source] = phase_errors_on_part(phases, phases.dolps, truth)
+    return errors
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem
+
+
+def named_as_truth(views: Sequence[View], truth: GroundTruth) -> list[View]:
+    """Views under the truth's names, which may have another suffix."""
+    by_stem = {_stem(name): name for name in truth.names}
+    return [replace(view, name=by_stem.get(_stem(view.name), view.name)) for view in views]
+
+
+def measure_against_truth(
+    cloud: Cloud, tracks: Cloud | None, views: Sequence[View], truth: GroundTruth
+) -> dict[str, Any]:
+    """Figures of a dense cloud, and of the normals of sparse points, in terms of JSON."""
+    named = named_as_truth(views, truth)
+    metrics, alignment = evaluate(cloud.points, cloud.normals, named, truth)
+    figures: dict[str, Any] = {"cloud": metrics, "alignment": alignment}
+    if tracks is not None and tracks.normals is not None:
+        valid = tracks.scalars["valid"] > 0
+        figures["tracks"] = track_normal_errors(tracks.points, tracks.normals, valid, named, truth)
+    return dict(to_plain(figures))
+
+
+def compare_models(
+    capture: Capture, workspace: Workspace, options: Options, models: Sequence[Model]
+) -> dict[str, Any]:
+    """Measure the clouds of an output folder, in terms of JSON.
+
+    Returns
+    -------
+    ``models``: for each its ``consistency`` and, with ground truth, its ``truth``. ``phase``:
+    with ground truth, what :func:`phase_errors` gives.
+    """
+    maps = open_maps(workspace)
+    views = [phase_map.view for phase_map in maps]
+    gt = options.evaluation.gt
+    truth = open_ground_truth(gt) if gt is not None else None
+    figures: dict[str, Any] = {}
+    for model in models:
+        cloud = read_cloud(workspace.cloud(model))
+        tracks = read_cloud(workspace.normals(model))
+        figures[model] = {"consistency": measure_consistency(model, cloud, tracks, maps)}
+        if truth is not None:
+            figures[model]["truth"] = measure_against_truth(cloud, tracks, views, truth)
+    phase = None
+    if truth is not None:
+        phase = phase_errors(capture, maps, options.region.light, truth)
+    return dict(to_plain({"models": figures, "phase": phase}))
+
+
+def write_comparison(
+    capture: Capture,
+    workspace: Workspace,
+    options: Options,
+    models: Sequence[Model],
+    results: Mapping[str, Any],
+) -> None:
+    """Write ``metrics.json`` and ``summary.md``."""
+    metrics = {"capture": str(capture.folder), "results": dict(results)}
+    metrics |= compare_models(capture, workspace, options, models)
+    write_json(workspace.metrics, metrics)
+    write_bytes(workspace.summary, summary_text(metrics).encode())
+
+
+def evaluate_file(cloud: Path, gt: Path, sparse: Path) -> dict[str, Any]:
+    """Figures of a cloud file against the truth, in terms of JSON.
+
+    Parameters
+    ----------
+    cloud : PLY in the frame of ``sparse``.
+    gt : folder of the ground truth.
+    sparse : COLMAP model; its camera centres are brought onto the true ones.
+    """
+    truth = open_ground_truth(gt)
+    return measure_against_truth(read_cloud(cloud), None, read_model(sparse).views, truth)
