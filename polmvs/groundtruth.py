@@ -233,18 +233,22 @@ def _sample_surfaces(truth: GroundTruth, spacing_m: float, other_spacing_m: floa
     """Back-project every view; thin the part and what is near it finely, the rest coarsely."""
     if not 0 < spacing_m <= other_spacing_m:
         raise ValueError(f"{spacing_m=}, {other_spacing_m=} but expected 0 < spacing <= other.")
-    samples = [_back_project(truth, name) for name in truth.names]
-    part = np.concatenate([sample[0] for sample in samples])
-    normals = np.concatenate([sample[1] for sample in samples])
-    other = np.concatenate([sample[2] for sample in samples])
+    parts = [_back_project(truth, name, part=True) for name in truth.names]
+    part = np.concatenate([points for points, _ in parts])
+    normals = np.concatenate([normals for _, normals in parts])
     if len(part) == 0:
         raise DataError(truth.folder, f"no mask shows the part; {_REMEDY}.")
     kept = voxel_representatives(part, spacing_m)
     part, normals = part[kept], normals[kept]
-    near = in_cells_beside(other, part, NEAR_PART_M)
-    fine, coarse = other[near], other[~near]
-    fine = fine[voxel_representatives(fine, spacing_m)]
-    coarse = coarse[voxel_representatives(coarse, other_spacing_m)]
+    del parts
+    anchors = _thinned(part, NEAR_PART_M)
+    fine, coarse = np.zeros((0, 3)), np.zeros((0, 3))
+    for name in truth.names:  # one view at a time, thinned as it comes: the rest is large
+        other = _back_project(truth, name, part=False)[0]
+        near = in_cells_beside(other, anchors, NEAR_PART_M)
+        fine = np.concatenate([fine, other[near]])
+        coarse = _thinned(np.concatenate([coarse, other[~near]]), other_spacing_m)
+    fine = _thinned(fine, spacing_m)
     num_other = len(fine) + len(coarse)
     return SurfacePoints(
         points=np.concatenate([part, fine, coarse]),
@@ -254,21 +258,24 @@ def _sample_surfaces(truth: GroundTruth, spacing_m: float, other_spacing_m: floa
     )
 
 
-def _back_project(truth: GroundTruth, name: str) -> tuple[Array, NDArray[np.float32], Array]:
-    """World points and normals of one view's part, and world points of all else it sees."""
+def _thinned(points: Array, spacing_m: float) -> Array:
+    return points[voxel_representatives(points, spacing_m)]
+
+
+def _back_project(
+    truth: GroundTruth, name: str, *, part: bool
+) -> tuple[Array, NDArray[np.float32]]:
+    """World points of one view's part with their normals, or of all else it sees (no normals)."""
     view = truth.views[name]
     depth, mask = truth.depth(name).astype(np.float64), truth.mask(name)
-    seen = np.isfinite(depth)
-    part = seen & mask & _is_smooth(depth)
-    rays = view.camera.rays(pixel_centers(view.camera.width, view.camera.height))
-    points_in_cam = rays * (depth / rays[..., 2])[..., None]
+    wanted = np.isfinite(depth) & (mask & _is_smooth(depth) if part else ~mask)
+    rays = view.camera.rays(pixel_centers(view.camera.width, view.camera.height)[wanted])
     world_from_cam = view.cam_from_world.inverse()
-    normals = truth.normals(name)[part] @ world_from_cam.rotation.T.astype(np.float32)
-    return (
-        np.asarray(world_from_cam * points_in_cam[part]),
-        np.asarray(normals, np.float32),
-        np.asarray(world_from_cam * points_in_cam[seen & ~mask]),
-    )
+    points = world_from_cam * (rays * (depth[wanted] / rays[..., 2])[..., None])
+    if not part:
+        return np.asarray(points), np.zeros((0, 3), np.float32)
+    normals = truth.normals(name)[wanted] @ world_from_cam.rotation.T.astype(np.float32)
+    return np.asarray(points), np.asarray(normals, np.float32)
 
 
 def _is_smooth(depth: Array) -> Mask:
