@@ -136,15 +136,13 @@ def _widest_angle(camera: ColmapCamera) -> float:
     border = np.concatenate([*share, *(pair[:, ::-1] for pair in share)])
     z = camera.rays(border * (camera.width, camera.height))[:, 2]
     inside = z[np.isfinite(z)]
-    if not len(inside):
-        return float(np.pi / 2)
     # Where the border reaches beyond the fold, the last rays before it are the bound themselves.
     margin = FIELD_MARGIN if len(inside) == len(z) else 1.0
-    return float(margin * np.arccos(inside.min()))
+    return float(margin * np.arccos(inside.min(initial=1.0) if len(inside) else 0.0))
 
 
 def camera_from_colmap(camera: pycolmap.Camera) -> Camera:
-    """A ``pycolmap.Camera`` as a camera of this package; the fast pinhole where it is one."""
+    """A ``pycolmap.Camera`` as this package's; the fast pinhole where it is one."""
     model = str(camera.model_name)
     if model in PERSPECTIVE_MODELS and camera.is_undistorted():
         return PinholeCamera(
@@ -282,7 +280,7 @@ def read_model(path: str | os.PathLike[str]) -> SparseModel:
     try:
         model = model_from_reconstruction(pycolmap.Reconstruction(str(folder)))
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OverflowError) as error:
-        # COLMAP's own words, less the place in its source and the length.
+        # COLMAP's own words, shortened and without the place in its source.
         reason = re.sub(r"\[[\w.]+:\d+\]", "", " ".join(str(error).split()))[:120].strip()
         raise DataError(
             folder, f"is no sound COLMAP model ({reason or 'no reason given'}). Export it again."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -21,6 +22,7 @@ from polmvs.image_io import write_bytes
 from polmvs.metrics import AngleStats, axial_errors_deg
 from polmvs.models import phase_from_normal
 from polmvs.option_values import to_plain
+from polmvs.parallel import Workers
 from polmvs.phasemap import PhaseMap
 from polmvs.stages import open_maps
 from polmvs.summary import summary_text
@@ -241,18 +243,23 @@ def named_as_truth(views: Sequence[View], truth: GroundTruth) -> list[View]:
 def measure_against_truth(
     cloud: Cloud, tracks: Cloud | None, views: Sequence[View], truth: GroundTruth
 ) -> dict[str, Any]:
-    """Figures of a dense cloud, and of the normals of sparse points, in terms of JSON."""
+    """Figures of a dense cloud, and of the normals of sparse points."""
     named = named_as_truth(views, truth)
     metrics, alignment = evaluate(cloud.points, cloud.normals, named, truth)
     figures: dict[str, Any] = {"cloud": metrics, "alignment": alignment}
     if tracks is not None and tracks.normals is not None:
         valid = tracks.scalars["valid"] > 0
         figures["tracks"] = track_normal_errors(tracks.points, tracks.normals, valid, named, truth)
-    return dict(to_plain(figures))
+    return figures
 
 
 def compare_models(
-    capture: Capture, workspace: Workspace, options: Options, models: Sequence[Model]
+    capture: Capture,
+    workspace: Workspace,
+    options: Options,
+    models: Sequence[Model],
+    *,
+    workers: Workers,
 ) -> dict[str, Any]:
     """Measure the clouds of an output folder, in terms of JSON.
 
@@ -262,20 +269,39 @@ def compare_models(
     with ground truth, what :func:`phase_errors` gives.
     """
     maps = open_maps(workspace)
-    views = [phase_map.view for phase_map in maps]
+    clouds = {model: read_cloud(workspace.cloud(model)) for model in models}
+    tracks = {model: read_cloud(workspace.normals(model)) for model in models}
+    tasks: list[Callable[[], Any]] = []
     gt = options.evaluation.gt
-    truth = open_ground_truth(gt) if gt is not None else None
-    figures: dict[str, Any] = {}
-    for model in models:
-        cloud = read_cloud(workspace.cloud(model))
-        tracks = read_cloud(workspace.normals(model))
-        figures[model] = {"consistency": measure_consistency(model, cloud, tracks, maps)}
-        if truth is not None:
-            figures[model]["truth"] = measure_against_truth(cloud, tracks, views, truth)
-    phase = None
-    if truth is not None:
-        phase = phase_errors(capture, maps, options.region.light, truth)
-    return dict(to_plain({"models": figures, "phase": phase}))
+    if gt is not None:  # the longest first
+        truth = open_ground_truth(gt)
+        views = [phase_map.view for phase_map in maps]
+        tasks.append(partial(_measure_all, clouds, tracks, views, truth))
+        tasks.append(partial(phase_errors, capture, maps, options.region.light, truth))
+    tasks += [partial(measure_consistency, m, clouds[m], tracks[m], maps) for m in models]
+    done = list(workers.map(_call, tasks))
+    consistencies = done[-len(models) :]
+    figures: dict[str, Any] = {
+        model: {"consistency": found} for model, found in zip(models, consistencies, strict=True)
+    }
+    if gt is not None:
+        for model in models:
+            figures[model]["truth"] = done[0][model]
+    return dict(to_plain({"models": figures, "phase": done[1] if gt is not None else None}))
+
+
+def _measure_all(
+    clouds: Mapping[Model, Cloud],
+    tracks: Mapping[Model, Cloud],
+    views: Sequence[View],
+    truth: GroundTruth,
+) -> dict[Model, dict[str, Any]]:
+    """All models together: sampling the true surface is most of the work."""
+    return {m: measure_against_truth(clouds[m], tracks[m], views, truth) for m in clouds}
+
+
+def _call(task: Callable[[], Any]) -> Any:
+    return task()
 
 
 def write_comparison(
@@ -284,10 +310,12 @@ def write_comparison(
     options: Options,
     models: Sequence[Model],
     results: Mapping[str, Any],
+    *,
+    workers: Workers,
 ) -> None:
     """Write ``metrics.json`` and ``summary.md``."""
     metrics = {"capture": str(capture.folder), "results": dict(results)}
-    metrics |= compare_models(capture, workspace, options, models)
+    metrics |= compare_models(capture, workspace, options, models, workers=workers)
     write_json(workspace.metrics, metrics)
     write_bytes(workspace.summary, summary_text(metrics).encode())
 
@@ -302,4 +330,5 @@ def evaluate_file(cloud: Path, gt: Path, sparse: Path) -> dict[str, Any]:
     sparse : COLMAP model; its camera centres are brought onto the true ones.
     """
     truth = open_ground_truth(gt)
-    return measure_against_truth(read_cloud(cloud), None, read_model(sparse).views, truth)
+    figures = measure_against_truth(read_cloud(cloud), None, read_model(sparse).views, truth)
+    return dict(to_plain(figures))

@@ -250,7 +250,14 @@ def _evaluate_stage(run: Run, models: Sequence[Model]) -> Stage:
     evaluation = run.options.evaluation
 
     def work(report: Report) -> stages.Facts:
-        write_comparison(run.capture, run.workspace, run.options, models, run.record.results)
+        write_comparison(
+            run.capture,
+            run.workspace,
+            run.options,
+            models,
+            run.record.results,
+            workers=run.workers,
+        )
         return {"evaluation": to_plain(evaluation)}
 
     stage = Stage(name=EVALUATE, work=work, after=tuple(densify_stage(m) for m in models))

@@ -10,7 +10,6 @@ principal point, which COLMAP leaves at the image's centre: 6 px off, there, tur
 
 from __future__ import annotations
 
-import copy
 import logging
 import shutil
 from collections.abc import Callable, Sequence
@@ -18,6 +17,7 @@ from pathlib import Path
 
 import cv2
 
+from polmvs.bundle import MAX_REPROJ_ERROR_PX, refine
 from polmvs.camera import PinholeCamera
 from polmvs.colmap_io import SparseModel, model_from_reconstruction, pycolmap
 from polmvs.config import SfmOptions
@@ -28,13 +28,8 @@ logger = logging.getLogger(__name__)
 
 MAX_EXHAUSTIVE_IMAGES = 200  # 20,000 pairs, some minutes on two cores
 SEQUENTIAL_OVERLAP = 20
-MAX_REPROJ_ERROR_PX = 2.0
-MIN_TRI_ANGLE_DEG = 1.5
-LOSS_SCALE_PX = 0.5  # Cauchy; about twice the error of a good keypoint
 # With few images most tracks have two views only; with more those are mostly mismatches.
 MAX_IMAGES_TWO_VIEW_TRACKS = 5
-MIN_VIEWS_PRINCIPAL_POINT = 4  # of three views two captures of three got worse, of four none
-MAX_PRINCIPAL_POINT_SHIFT = 0.1  # of the image's width; more is an estimate gone astray
 MIN_FOCAL, MAX_FOCAL = 0.2, 10.0  # of the image's width
 MOSAIC_TOLERANCE = 0.15  # a full mosaic's centre lies in the corner of the half-size image
 NO_MODEL_REMEDY = (
@@ -89,7 +84,11 @@ def run_sfm(
     report("mapping")
     reconstruction = _map(database, image_folder, work_folder / "models", len(names), options)
     report("bundle adjustment")
-    reconstruction = _refine(reconstruction, options)
+    reconstruction = refine(
+        reconstruction,
+        free_intrinsics=options.intrinsics is None,
+        single_camera=options.single_camera,
+    )
     write_reconstruction(reconstruction, sparse_folder)
     model = model_from_reconstruction(reconstruction, names)
     _log_result(model, reconstruction.compute_mean_reprojection_error())
@@ -247,54 +246,6 @@ def _map(
     if len(found) > 1:
         logger.warning("SfM: the images fall into %d models; the largest is used.", len(found))
     return largest
-
-
-def _refine(
-    reconstruction: pycolmap.Reconstruction, options: SfmOptions
-) -> pycolmap.Reconstruction:
-    """Last bundle adjustment, with a robust loss, and the filters after it."""
-    free = options.intrinsics is None
-    num_views = reconstruction.num_reg_images()
-    if free and options.single_camera and num_views >= MIN_VIEWS_PRINCIPAL_POINT:
-        with_point = copy.deepcopy(reconstruction)
-        _adjust(with_point, free_intrinsics=True, free_principal_point=True)
-        if _principal_points_plausible(with_point):
-            return with_point
-        logger.warning("SfM: the principal point cannot be estimated; the centre is kept.")
-    _adjust(reconstruction, free_intrinsics=free, free_principal_point=False)
-    return reconstruction
-
-
-def _adjust(
-    reconstruction: pycolmap.Reconstruction, *, free_intrinsics: bool, free_principal_point: bool
-) -> None:
-    """Bundle adjustment in place on one thread, then drop what is beyond the thresholds."""
-    bundle = pycolmap.BundleAdjustmentOptions()
-    bundle.refine_focal_length = free_intrinsics
-    bundle.refine_extra_params = free_intrinsics
-    bundle.refine_principal_point = free_principal_point
-    bundle.print_summary = False
-    bundle.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    bundle.ceres.loss_function_scale = LOSS_SCALE_PX
-    bundle.ceres.solver_options.num_threads = 1  # sums over threads depend on their timing
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in reconstruction.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # Not pycolmap.bundle_adjustment: release 4.2 turns the log level back to INFO in it.
-    pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
-    observations = pycolmap.ObservationManager(reconstruction)
-    observations.filter_all_points3D(MAX_REPROJ_ERROR_PX, MIN_TRI_ANGLE_DEG)
-    reconstruction.update_point_3d_errors()
-
-
-def _principal_points_plausible(reconstruction: pycolmap.Reconstruction) -> bool:
-    """Whether every camera's principal point stayed near the centre of its image."""
-    return all(
-        max(abs(c.principal_point_x - c.width / 2), abs(c.principal_point_y - c.height / 2))
-        < MAX_PRINCIPAL_POINT_SHIFT * c.width
-        for c in reconstruction.cameras.values()
-    )
 
 
 def _log_result(model: SparseModel, error_px: float) -> None:

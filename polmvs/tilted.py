@@ -102,10 +102,32 @@ def correct_intensities(
     return _as_ppa(_apply(solver, intensities), rays, light)
 
 
+def correct_parameters(
+    parameters: Floats, rays: Floats, *, light: Light, solver: Floats | None = None
+) -> Floats:
+    """As :func:`correct_intensities`, from image-plane Stokes parameters of any shape.
+
+    Parameters
+    ----------
+    parameters : (3, ...), ``s0, s1, s2`` as in :func:`stokes_solver`.
+    rays : (..., 3), unit, camera frame.
+    light : which reflection dominates.
+    solver : :func:`stokes_solver` of the rays, where it is at hand.
+
+    Returns
+    -------
+    (3, ...)
+    """
+    if parameters.shape != (3, *rays.shape[:-1]) or rays.shape[-1] != 3:
+        raise ValueError(f"{parameters.shape=}, {rays.shape=} but expected (3, ...), (..., 3).")
+    solver = stokes_solver(rays) if solver is None else solver
+    return np.stack(_as_ppa(_apply(solver, parameters), rays, light))
+
+
 def correct_stokes(
     stokes: Stokes, rays: Floats, *, light: Light, solver: Floats | None = None
 ) -> Stokes:
-    """As :func:`correct_intensities`, for the Stokes images of one view with their noise.
+    """As :func:`correct_parameters`, for the Stokes images of one view with their noise.
 
     Parameters
     ----------
@@ -118,10 +140,8 @@ def correct_stokes(
     -------
     The corrected images; ``sigma`` is scaled by :func:`sigma_scale`.
     """
-    if (*stokes.shape, 3) != rays.shape:
-        raise ValueError(f"{rays.shape=} but expected {(*stokes.shape, 3)}.")
-    solver = stokes_solver(rays) if solver is None else solver
-    s0, s1, s2 = _as_ppa(_apply(solver, (stokes.s0, stokes.s1, stokes.s2)), rays, light)
+    parameters = np.stack([stokes.s0, stokes.s1, stokes.s2])
+    s0, s1, s2 = correct_parameters(parameters, rays, light=light, solver=solver)
     return replace(
         stokes,
         s0=np.asarray(s0, np.float32),
@@ -228,10 +248,10 @@ def _product(left: Floats, right: Floats) -> Floats:
     return product
 
 
-def _apply(solver: Floats, images: Any) -> Floats:
-    """Solver (H, W, 3, C) times C images (H, W): (3, H, W)."""
+def _apply(solver: Floats, images: Floats) -> Floats:
+    """Solver (..., 3, C) times C images (C, ...): (3, ...)."""
     rows = np.moveaxis(solver, (-2, -1), (0, 1))
-    result = np.empty((3, *rows.shape[2:]), np.result_type(solver, *images))
+    result = np.empty((3, *rows.shape[2:]), np.result_type(solver, images))
     for row, out in zip(rows, result, strict=True):
         np.multiply(row[0], images[0], out=out)
         for weight, image in zip(row[1:], images[1:], strict=True):

@@ -1,0 +1,297 @@
+"""What the experiments measure on: a capture, its truth, and poses in the truth's world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.alignment import AlignmentReport, align_to_truth
+from polmvs.camera import View
+from polmvs.capture import Capture
+from polmvs.colmap_io import read_model
+from polmvs.config import Light, Model, RegionOptions
+from polmvs.errors import DataError
+from polmvs.geometry import RigidTransform, SimilarityTransform
+from polmvs.groundtruth import GroundTruth
+from polmvs.image_io import read_mask
+from polmvs.phasemap import PhaseMap, build_phase_map, view_rays
+from polmvs.region import Region, find_region, smooth
+from polmvs.sparse_model import match_model_to_capture, short_list
+from polmvs.stages import find_mask
+from polmvs.stokes import Stokes
+from polmvs.tilted import correct_stokes
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+DEFAULT_BLUR_PX = 1.0  # the paper blurs "the images" and does not say how much
+
+
+class Truth(Protocol):
+    """What an experiment needs of a ground truth; maps are ``(H, W)`` of the half-size images."""
+
+    @property
+    def folder(self) -> Path:
+        """Where it lies, for messages."""
+
+    @property
+    def views(self) -> Mapping[str, View]:
+        """True views by image name, metres."""
+
+    def mask(self, name: str) -> Mask:
+        """Whether each pixel shows the part."""
+
+    def depth(self, name: str) -> Image:
+        """True z, m; NaN where there is nothing."""
+
+    def normals(self, name: str) -> Image:
+        """True normals (H, W, 3), unit, camera frame; NaN off the part."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """A capture with poses in the world of its truth.
+
+    Attributes
+    ----------
+    capture, truth : where pixels and true maps are read from.
+    views : posed views under the truth's image names, true world, metres.
+    raw_names : file name of each view's mosaic, in the order of ``views``.
+    region : light, DoLP threshold, and a folder of masks that narrows the truth's.
+    blur_px : deviation of the Gaussian that the images are blurred with, px; 0: none.
+    alignment : how estimated poses were brought into the true world; None for true poses.
+    """
+
+    capture: Capture
+    truth: Truth
+    views: tuple[View, ...]
+    raw_names: tuple[str, ...]
+    region: RegionOptions
+    blur_px: float = DEFAULT_BLUR_PX
+    alignment: AlignmentReport | None = None
+
+    def settings(self) -> dict[str, Any]:
+        """What the results depend on, for their record."""
+        return {
+            "capture": str(self.capture.folder),
+            "truth": str(self.truth.folder),
+            "num_views": len(self.views),
+            "poses": "true" if self.alignment is None else "sfm",
+            "alignment": self.alignment,
+            "light": self.region.light,
+            "min_dolp": self.region.min_dolp,
+            "blur_px": self.blur_px,
+        }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewData:
+    """Measured and true maps of one view.
+
+    Attributes
+    ----------
+    view : posed camera.
+    light : which reflection dominates.
+    rays : (H, W, 3) float32, unit, camera frame.
+    sharp, blurred : Stokes images as captured, and blurred as in the paper.
+    part : (H, W) bool, the part by the true mask.
+    counted : (H, W) bool, pixels of the part neither clipped nor dark, with a DoLP above the
+        threshold in the blurred images.
+    normals_in_cam : (H, W, 3) float32, true normals in the frame of the (estimated) camera.
+    range_map : (H, W) float32, true distance from the camera centre, m; 0 where nothing is.
+    """
+
+    view: View
+    light: Light
+    rays: Image
+    sharp: Stokes
+    blurred: Stokes
+    part: Mask
+    counted: Mask
+    normals_in_cam: Image
+    range_map: Image
+
+    def blurred_for(self, model: Model) -> Stokes:
+        """Blurred Stokes images as the model takes them: corrected under ``tilted``."""
+        return self._for(model, self.blurred)
+
+    def axial(self, model: Model) -> Image:
+        """``(s0 cos 2 phase, s0 sin 2 phase)`` times the DoLP of the blurred images, (H, W, 2)."""
+        stokes = self.blurred_for(model)
+        sign = np.float32(-1 if self.light is Light.SPECULAR else 1)
+        return sign * np.dstack([stokes.s1, stokes.s2])
+
+    def find_region(self, min_dolp: float) -> Region:
+        """The part with its reliable pixels (no printed marks) and edges."""
+        s = self.sharp
+        return find_region(s.s0, s.s1, s.s2, s.valid, min_dolp=min_dolp, mask=self.part)
+
+    def phase_map(self, model: Model, region: Region) -> PhaseMap:
+        """The package's own phase map: smoothed over the reliable pixels, with precisions."""
+        s = self._for(model, self.sharp)
+        return build_phase_map(self.view, s.s0, s.s1, s.s2, s.sigma, region, self.light)
+
+    def plain_map(self, model: Model) -> PhaseMap:
+        """A phase map of the paper's kind: blurred pixels over the threshold, all alike."""
+        axial = self.axial(model) / np.maximum(self.blurred.s0, 1e-6)[..., None]
+        samples = np.dstack([axial, self.counted.astype(np.float32)])
+        region = Region(self.part, self.counted, np.zeros_like(self.part))
+        return PhaseMap(self.view, region, samples.astype(np.float32), self.sharp.s0)
+
+    def _for(self, model: Model, stokes: Stokes) -> Stokes:
+        if model is not Model.TILTED:
+            return stokes
+        return correct_stokes(stokes, self.rays, light=self.light)
+
+
+def open_scene(
+    capture: Capture,
+    truth: Truth,
+    region: RegionOptions,
+    *,
+    blur_px: float = DEFAULT_BLUR_PX,
+    sparse: Path | None = None,
+) -> Scene:
+    """Match a capture with its truth, and with estimated poses where they are given.
+
+    Parameters
+    ----------
+    sparse : COLMAP model whose poses replace the true ones, aligned by the camera centres.
+
+    Raises
+    ------
+    DataError
+        No image has a truth, sizes differ, or the poses are of other images.
+    """
+    raw_of = _raw_names(capture, truth)
+    views = [view for name, view in truth.views.items() if name in raw_of]
+    for view in views:
+        if (view.camera.width, view.camera.height) != (capture.width, capture.height):
+            raise DataError(
+                truth.folder,
+                f"its cameras are {view.camera.width}x{view.camera.height} px, the polarization "
+                f"images {capture.width}x{capture.height} px; give the truth of this capture.",
+            )
+    alignment = None
+    if sparse is not None:
+        views, alignment = _estimated_views(sparse, capture, truth, raw_of)
+    return Scene(
+        capture=capture,
+        truth=truth,
+        views=tuple(views),
+        raw_names=tuple(raw_of[view.name] for view in views),
+        region=region,
+        blur_px=blur_px,
+        alignment=alignment,
+    )
+
+
+def _raw_names(capture: Capture, truth: Truth) -> dict[str, str]:
+    """Mosaic of each image of the truth, by name without suffix; images without one left out."""
+    by_stem = {_stem(name): name for name in capture.names}
+    found = {name: by_stem[_stem(name)] for name in truth.views if _stem(name) in by_stem}
+    if not found:
+        raise DataError(
+            truth.folder,
+            f"its images are named like {next(iter(truth.views))!r}, the capture's like "
+            f"{capture.names[0]!r}; none match. Give the truth of this capture.",
+        )
+    return found
+
+
+def _estimated_views(
+    sparse: Path, capture: Capture, truth: Truth, raw_of: Mapping[str, str]
+) -> tuple[list[View], AlignmentReport]:
+    """Views of a COLMAP model in the world of the truth."""
+    names = list(raw_of)
+    model = match_model_to_capture(
+        read_model(sparse), names, capture.width, capture.height, source=sparse
+    )
+    # The alignment asks for cameras only, which every truth has.
+    true_cameras = GroundTruth(folder=truth.folder, views=truth.views)
+    truth_from_world, report = align_to_truth(model.views, true_cameras)
+    if report.dropped:
+        raise DataError(
+            sparse,
+            f"poses of {short_list(report.dropped)} do not match the true ones; give a model "
+            "of this capture without wrongly registered images.",
+        )
+    views = [_in_truth(view, truth_from_world) for view in model.views]
+    return sorted(views, key=lambda view: names.index(view.name)), report
+
+
+def _in_truth(view: View, truth_from_world: SimilarityTransform) -> View:
+    """A view of the estimated world in the true one; its camera frame is scaled to metres."""
+    rotation = view.cam_from_world.rotation @ truth_from_world.rotation.T
+    translation = truth_from_world.scale * view.cam_from_world.translation
+    shifted = translation - rotation @ truth_from_world.translation
+    return replace(view, cam_from_world=RigidTransform(rotation, shifted))
+
+
+def load_view(scene: Scene, index: int) -> ViewData:
+    """Read the mosaic and true maps of one view.
+
+    Raises
+    ------
+    DataError
+        A file is missing, damaged or of another size.
+    """
+    view, name = scene.views[index], scene.views[index].name
+    truth, true_view = scene.truth, scene.truth.views[scene.views[index].name]
+    sharp = scene.capture.load(scene.raw_names[index])
+    blurred = _blur(sharp, scene.blur_px)
+    part = truth.mask(name)
+    if scene.region.mask is not None:
+        part = part & read_mask(find_mask(scene.region.mask, name), part.shape)
+    # The surface that a pixel shows is true whatever the pose; only its frame is the camera's.
+    turn = view.cam_from_world.rotation @ true_view.cam_from_world.rotation.T
+    depth = truth.depth(name)
+    range_map = np.nan_to_num(depth / view_rays(true_view)[..., 2], nan=0.0)
+    normals = truth.normals(name) @ turn.T.astype(np.float32)
+    known = np.isfinite(normals).all(axis=-1)
+    return ViewData(
+        view=view,
+        light=scene.region.light,
+        rays=view_rays(view),
+        sharp=sharp,
+        blurred=blurred,
+        part=part,
+        counted=part & known & blurred.valid & (blurred.dolp > scene.region.min_dolp),
+        normals_in_cam=normals,
+        range_map=range_map.astype(np.float32),
+    )
+
+
+def _blur(stokes: Stokes, blur_px: float) -> Stokes:
+    """Stokes images of Gaussian-blurred intensities; validity stays that of the pixel itself."""
+    if blur_px <= 0:
+        return stokes
+    images = smooth(np.dstack([stokes.s0, stokes.s1, stokes.s2]), blur_px)
+    s0, s1, s2 = (np.ascontiguousarray(images[..., i]) for i in range(3))
+    return replace(stokes, s0=s0, s1=s1, s2=s2)
+
+
+def require_counted(scene: Scene, num_counted: Sequence[int] | int) -> None:
+    """Refuse to go on without a single pixel to measure on.
+
+    Raises
+    ------
+    DataError
+        All counts are 0.
+    """
+    if int(np.sum(num_counted)) == 0:
+        raise DataError(
+            scene.capture.folder,
+            f"no pixel of the part has a DoLP above {scene.region.min_dolp}; "
+            "give a lower --min-dolp, or the mask of a polarised surface.",
+        )
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem

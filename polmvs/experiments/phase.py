@@ -1,0 +1,208 @@
+"""Experiment 1: error of the phase that each model predicts from true normals (paper, 5.2).
+
+Measured is the phase of the Stokes images blurred as in the paper; counted are the pixels of the
+part over the DoLP threshold. The third model predicts, beside the normal's phase, what a tilted
+polarizer makes of it: the same error as that of the corrected measured phase under PPA.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.config import Model
+from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
+from polmvs.experiments.statistics import ErrorTally, SignedStats, ratio
+from polmvs.models import phase_from_normal
+from polmvs.parallel import Workers
+from polmvs.stokes import axial_difference
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Density = NDArray[np.float64]
+
+ANGLES = ("viewing", "azimuth", "zenith")
+ANGLE_LIMITS_DEG = {"viewing": 90.0, "azimuth": 180.0, "zenith": 90.0}
+ANGLE_BINS = 90
+ERROR_BINS = 180  # over -90 to 90 degrees
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewPhase:
+    """Tallies of one view.
+
+    Attributes
+    ----------
+    name : of the image.
+    all_pixels, unmarked : by model, over all counted pixels and over those outside of marks.
+    counts : by model, (3, ANGLE_BINS, ERROR_BINS), pixels by angle and error.
+    """
+
+    name: str
+    all_pixels: Mapping[Model, ErrorTally]
+    unmarked: Mapping[Model, ErrorTally]
+    counts: Mapping[Model, Density]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhaseResult:
+    """Phase errors of the models over a capture.
+
+    Attributes
+    ----------
+    all_pixels : over the counted pixels of all views.
+    unmarked : over those outside of printed marks (:class:`polmvs.region.Region`, ``reliable``).
+    per_view : root mean square error of each view, degrees, by image name.
+    densities : by model, (3, ANGLE_BINS, ERROR_BINS), for the angles of ``ANGLES``: share of the
+        pixels of an angle's bin in each bin of the error; NaN where an angle has no pixels.
+    """
+
+    all_pixels: Mapping[Model, SignedStats]
+    unmarked: Mapping[Model, SignedStats]
+    per_view: Mapping[str, Mapping[Model, float]]
+    densities: Mapping[Model, Density]
+
+    def ratio(self, model: Model) -> float:
+        """Root mean square error over that of OPA, all pixels."""
+        return ratio(self.all_pixels[model].rmse_deg, self.all_pixels[Model.OPA].rmse_deg)
+
+    def ratio_unmarked(self, model: Model) -> float:
+        """Root mean square error over that of OPA, outside of marks."""
+        return ratio(self.unmarked[model].rmse_deg, self.unmarked[Model.OPA].rmse_deg)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PhaseImages:
+    """Images of one view for the paper's other figure.
+
+    Attributes
+    ----------
+    name : of the image.
+    intensity : (H, W), s0.
+    part : (H, W) bool.
+    measured : (H, W), phase, rad; NaN where it is not counted.
+    predicted : by model, (H, W), rad; NaN off the part.
+    """
+
+    name: str
+    intensity: Image
+    part: Mask
+    measured: Array
+    predicted: Mapping[Model, Array]
+
+
+def measure_phase(
+    scene: Scene, workers: Workers, report: Callable[[int], None] = lambda count: None
+) -> PhaseResult:
+    """Phase errors of all models over all views.
+
+    Raises
+    ------
+    DataError
+        No pixel is counted, or a file is at fault.
+    """
+    views = []
+    for view in workers.map(partial(measure_view, scene), range(len(scene.views))):
+        views.append(view)
+        report(1)
+    totals = {m: _total([view.all_pixels[m] for view in views]).stats() for m in Model}
+    require_counted(scene, totals[Model.OPA].num_pixels)
+    return PhaseResult(
+        all_pixels=totals,
+        unmarked={m: _total([view.unmarked[m] for view in views]).stats() for m in Model},
+        per_view={v.name: {m: v.all_pixels[m].stats().rmse_deg for m in Model} for v in views},
+        densities={m: _normalize(np.sum([v.counts[m] for v in views], axis=0)) for m in Model},
+    )
+
+
+def measure_view(scene: Scene, index: int) -> ViewPhase:
+    """Tallies of one view."""
+    data = load_view(scene, index)
+    reliable = data.find_region(scene.region.min_dolp).reliable[data.counted]
+    angles = _angles(data)
+    errors = {model: _errors_deg(data, model) for model in Model}
+    return ViewPhase(
+        name=data.view.name,
+        all_pixels={model: ErrorTally.of(error) for model, error in errors.items()},
+        unmarked={model: ErrorTally.of(error[reliable]) for model, error in errors.items()},
+        counts={model: _histograms(angles, error) for model, error in errors.items()},
+    )
+
+
+def phase_images(scene: Scene, index: int) -> PhaseImages:
+    """Intensity, measured and predicted phases of one view."""
+    data = load_view(scene, index)
+    measured = _phase(data, Model.PPA)
+    # What tilted polarizers turn the phase by is the same for the light's and the normal's.
+    turn = axial_difference(measured, _phase(data, Model.TILTED))
+    predicted = {m: phase_from_normal(m, data.normals_in_cam, data.rays) for m in Model}
+    predicted[Model.TILTED] = np.mod(predicted[Model.TILTED] + turn, np.pi)
+    return PhaseImages(
+        name=data.view.name,
+        intensity=data.sharp.s0,
+        part=data.part,
+        measured=np.where(data.counted, measured, np.nan),
+        predicted={m: np.where(data.part, phase, np.nan) for m, phase in predicted.items()},
+    )
+
+
+def _phase(data: ViewData, model: Model) -> Array:
+    """Measured phase (H, W), rad in [0, pi), as the model takes it."""
+    axial = data.axial(model)
+    return np.asarray(np.mod(0.5 * np.arctan2(axial[..., 1], axial[..., 0]), np.pi), np.float64)
+
+
+def _errors_deg(data: ViewData, model: Model) -> Array:
+    """Predicted minus measured phase of the counted pixels, (P,) degrees."""
+    counted = data.counted
+    predicted = phase_from_normal(model, data.normals_in_cam[counted], data.rays[counted])
+    return np.degrees(axial_difference(predicted, _phase(data, model)[counted]))
+
+
+def _angles(data: ViewData) -> dict[str, Array]:
+    """Angles of the counted pixels that errors are plotted against, (P,) degrees.
+
+    Between ray and normal; between the azimuths of ray and normal in the image plane; between
+    the normal and the optical axis.
+    """
+    rays = data.rays[data.counted].astype(np.float64)
+    normals = data.normals_in_cam[data.counted].astype(np.float64)
+    cosine = np.clip(-(rays * normals).sum(axis=-1), -1, 1)
+    azimuth = np.arctan2(normals[:, 1], normals[:, 0]) - np.arctan2(rays[:, 1], rays[:, 0])
+    return {
+        "viewing": np.degrees(np.arccos(cosine)),
+        "azimuth": np.degrees(np.abs(np.mod(azimuth + np.pi, 2 * np.pi) - np.pi)),
+        "zenith": np.degrees(np.arccos(np.clip(-normals[:, 2], -1, 1))),
+    }
+
+
+def _histograms(angles: Mapping[str, Array], errors: Array) -> Density:
+    """Pixels by angle and error, (3, ANGLE_BINS, ERROR_BINS)."""
+    kept = np.isfinite(errors)
+    bins = (ANGLE_BINS, ERROR_BINS)
+    return np.stack(
+        [
+            np.histogram2d(
+                angles[name][kept],
+                errors[kept],
+                bins,
+                range=((0, ANGLE_LIMITS_DEG[name]), (-90, 90)),
+            )[0]
+            for name in ANGLES
+        ]
+    )
+
+
+def _normalize(counts: Density) -> Density:
+    """Counts to shares of the pixels of each angle's bin."""
+    total = counts.sum(axis=-1, keepdims=True)
+    return np.divide(counts, total, out=np.full_like(counts, np.nan), where=total > 0)
+
+
+def _total(tallies: list[ErrorTally]) -> ErrorTally:
+    return sum(tallies[1:], tallies[0])
