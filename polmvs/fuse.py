@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
 from polmvs.config import FusionOptions
@@ -17,8 +18,9 @@ from polmvs.phasemap import PhaseMap
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
 
-MAX_CONFLICT_SHARE = 0.5  # of the views that could see a point and see through it
+MAX_CONFLICT_SHARE = 0.5  # of the views that could see a point and see something else there
 MIN_VISIBLE_COSINE = 0.1  # between normal and viewing direction, for a view to have a say
 OUTLIER_NEIGHBORS = 8
 OUTLIER_SPACINGS = 4.0  # a point this many spacings from its neighbours is alone
@@ -65,9 +67,9 @@ def fuse(
     """Fuse the dense views into one cloud.
 
     A point stays if enough views agree with it in distance and normal and if not most of the
-    views that should see it see through it. It moves along its ray to the mean of the places
-    that the agreeing views give it. Points closer than the merging voxel become one; lone points
-    go.
+    views that should see it see through it or show no polarised surface there. It moves along
+    its ray to the mean of the places that the agreeing views give it. Points closer than the
+    merging voxel become one; lone points go.
 
     Parameters
     ----------
@@ -120,7 +122,7 @@ def _confirm(
         agrees = close & (opinion.cosine > min_cosine)
         votes += agrees
         behind = opinion.excess > 2 * options.max_range_difference_px * footprint
-        conflicts += behind & (opinion.facing > MIN_VISIBLE_COSINE)
+        conflicts += (behind | opinion.outside) & (opinion.facing > MIN_VISIBLE_COSINE)
         place += np.where(agrees, opinion.place, 0)
         normal += np.where(agrees[:, None], opinion.normals, 0)
     place /= votes
@@ -144,6 +146,7 @@ class _Opinion:
     none). ``normals``, ``cosine``: its normal and the cosine to the point's own. ``excess``: how
     much farther than the point its surface lies, along its own ray (NaN: it has none there).
     ``facing``: cosine between the point's normal and the direction to the other camera.
+    ``outside``: it shows the point's place and no polarised surface there.
     """
 
     place: Array
@@ -151,6 +154,7 @@ class _Opinion:
     cosine: Array
     excess: Array
     facing: Array
+    outside: Mask
 
 
 def _opinion(
@@ -182,7 +186,16 @@ def _opinion(
         facing = (to_camera * normals).sum(-1) / own_range
     excess = np.where(seen > 0, seen - own_range, np.nan)
     cosine = (seen_normals * normals).sum(axis=-1)
-    return _Opinion(place, np.nan_to_num(seen_normals), cosine, excess, facing)
+    outside = _shows_background(phase_map, xy)
+    return _Opinion(place, np.nan_to_num(seen_normals), cosine, excess, facing, outside)
+
+
+def _shows_background(phase_map: PhaseMap, xy: Floats) -> Mask:
+    """Which places lie in the image but outside its region."""
+    camera = phase_map.view.camera
+    in_image = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
+    inside = sample_image(phase_map.region.inside.astype(np.float32), xy, nearest=True) > 0
+    return np.asarray(in_image & ~inside)
 
 
 def _concatenate(clouds: Sequence[FusedCloud]) -> FusedCloud:
@@ -235,8 +248,6 @@ def _merge(cloud: FusedCloud, voxel: float) -> FusedCloud:
 
 def _without_lone_points(cloud: FusedCloud) -> FusedCloud:
     """Remove points far from their neighbours, by the spacing that is usual in the cloud."""
-    from scipy.spatial import cKDTree
-
     k = min(OUTLIER_NEIGHBORS + 1, len(cloud.points))
     if k < 2:
         return cloud

@@ -79,55 +79,77 @@ def solve_log_ranges(
     ties: SeedTies,
     num_seeds: int,
     *,
+    modes: Array | None = None,
+    mode_sigma: float = 1.0,
     num_rounds: int = 4,
 ) -> RangeSolution:
     """Robust least squares for the log-ranges of the nodes that seeds reach.
 
     Iteratively reweighted with Cauchy losses on seeds and edges; each round is one sparse
-    Cholesky-like factorisation (SuperLU on the normal matrix).
+    factorisation (SuperLU on the normal matrix).
+
+    Parameters
+    ----------
+    num_nodes : N.
+    edges, ties : what is known, with deviations of independent errors.
+    num_seeds : S; a seed is tied to several nodes and right or wrong as a whole.
+    modes : (N, M), smooth functions of the nodes. The log-range is the integral of the edges
+        plus a combination of these: the errors of the increments are not independent, a wrong
+        camera model bends the whole surface.
+    mode_sigma : standard deviation of a mode's coefficient.
+    num_rounds : of reweighting.
     """
+    modes = np.zeros((num_nodes, 0)) if modes is None else modes
     reached = _reached_nodes(num_nodes, edges, ties)
-    index = np.cumsum(reached) - 1
     keep = reached[edges.tail] & reached[edges.head]
-    tail, head = index[edges.tail[keep]], index[edges.head[keep]]
-    delta, edge_precision = edges.delta[keep], 1 / edges.sigma[keep] ** 2
-    node, tie_precision = index[ties.node], 1 / ties.sigma**2
-    edge_weight, tie_weight = np.ones(len(tail)), np.ones(len(node))
-    seed_weight = np.ones(num_seeds)
-    size = int(reached.sum())
-    solution = np.full(num_nodes, np.nan)
-    weights = np.zeros(len(edges.tail))
+    num_edges, num_modes, size = int(keep.sum()), modes.shape[1], int(reached.sum())
+    log_range = np.full(num_nodes, np.nan)
+    seed_weight, edge_weight = np.ones(num_seeds), np.zeros(len(edges.tail))
     if size == 0:
-        return RangeSolution(log_range=solution, seed_weight=seed_weight, edge_weight=weights)
-    values = np.zeros(size)
+        return RangeSolution(log_range=log_range, seed_weight=seed_weight, edge_weight=edge_weight)
+    design = _design(reached, edges, keep, ties, modes)
+    target = np.concatenate([edges.delta[keep], ties.value, np.zeros(num_modes)])
+    sigma = np.concatenate([edges.sigma[keep], ties.sigma, np.full(num_modes, mode_sigma)])
+    precision = 1 / sigma**2
+    robust = np.ones(len(target))
     for round_index in range(num_rounds):
-        we, wt = edge_weight * edge_precision, tie_weight * tie_precision
-        diagonal = (
-            np.bincount(tail, we, size) + np.bincount(head, we, size) + np.bincount(node, wt, size)
+        weighted = design.T.multiply(robust * precision)
+        factors = splu(
+            (weighted @ design).tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            options={"SymmetricMode": True},
         )
-        rows = np.concatenate([tail, head, np.arange(size)])
-        cols = np.concatenate([head, tail, np.arange(size)])
-        matrix = sparse.csc_matrix((np.concatenate([-we, -we, diagonal]), (rows, cols)))
-        right = (
-            np.bincount(head, we * delta, size)
-            - np.bincount(tail, we * delta, size)
-            + np.bincount(node, wt * ties.value, size)
-        )
-        values = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
-            right
-        )
+        unknowns = factors.solve(weighted @ target)
         scale = CAUCHY_SCALE * 2.0 ** max(num_rounds - 3 - round_index, 0)
-        edge_z2 = (values[head] - values[tail] - delta) ** 2 * edge_precision
-        edge_weight = 1 / (1 + edge_z2 / scale**2)
-        # A seed is tied to several nodes; it is right or wrong as a whole.
-        tie_z2 = (values[node] - ties.value) ** 2 * tie_precision
+        z2 = (design @ unknowns - target) ** 2 * precision
+        tie_z2 = z2[num_edges : len(z2) - num_modes]
         count = np.maximum(np.bincount(ties.seed, minlength=num_seeds), 1)
-        seed_z2 = np.bincount(ties.seed, tie_z2, num_seeds) / count
-        seed_weight = 1 / (1 + seed_z2 / scale**2)
-        tie_weight = seed_weight[ties.seed]
-    solution[reached] = values
-    weights[keep] = edge_weight
-    return RangeSolution(log_range=solution, seed_weight=seed_weight, edge_weight=weights)
+        seed_weight = 1 / (1 + np.bincount(ties.seed, tie_z2, num_seeds) / count / scale**2)
+        robust[:num_edges] = 1 / (1 + z2[:num_edges] / scale**2)
+        robust[num_edges : len(z2) - num_modes] = seed_weight[ties.seed]
+    log_range[reached] = unknowns[:size] + modes[reached] @ unknowns[size:]
+    edge_weight[keep] = robust[:num_edges]
+    return RangeSolution(log_range=log_range, seed_weight=seed_weight, edge_weight=edge_weight)
+
+
+def _design(
+    reached: NDArray[np.bool_], edges: Edges, keep: NDArray[np.bool_], ties: SeedTies, modes: Array
+) -> sparse.csr_matrix:
+    """Rows: edges, ties, the modes' prior. Columns: integrals at the reached nodes, modes."""
+    index = np.cumsum(reached) - 1
+    num_edges, num_ties, num_modes = int(keep.sum()), len(ties.node), modes.shape[1]
+    size = int(reached.sum())
+    edge, tie = np.arange(num_edges), num_edges + np.arange(num_ties)
+    prior, mode = num_edges + num_ties + np.arange(num_modes), size + np.arange(num_modes)
+    rows = [edge, edge, tie, np.repeat(tie, num_modes), prior]
+    cols = [index[edges.head[keep]], index[edges.tail[keep]], index[ties.node]]
+    cols += [np.tile(mode, num_ties), mode]
+    values = [np.ones(num_edges), -np.ones(num_edges), np.ones(num_ties)]
+    values += [modes[ties.node].reshape(-1), np.ones(num_modes)]
+    return sparse.csr_matrix(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))),
+        shape=(num_edges + num_ties + num_modes, size + num_modes),
+    )
 
 
 def _reached_nodes(num_nodes: int, edges: Edges, ties: SeedTies) -> NDArray[np.bool_]:
