@@ -15,7 +15,7 @@ from polmvs.camera import View, sample_image
 from polmvs.capture import Capture
 from polmvs.cloud_io import Cloud, read_cloud
 from polmvs.colmap_io import read_model
-from polmvs.config import Light, Model, Options
+from polmvs.config import Model, Options
 from polmvs.evaluate import evaluate, phase_errors_on_part, track_normal_errors
 from polmvs.groundtruth import GroundTruth, open_ground_truth
 from polmvs.image_io import write_bytes
@@ -23,7 +23,7 @@ from polmvs.metrics import AngleStats, axial_errors_deg
 from polmvs.models import phase_from_normal
 from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
-from polmvs.phasemap import PhaseMap
+from polmvs.phasemap import PhaseMap, correct_for_tilt, view_rays
 from polmvs.stages import open_maps
 from polmvs.summary import summary_text
 from polmvs.workspace import Workspace, write_json
@@ -200,9 +200,15 @@ class LazyPhases(Mapping[str, Image]):
 
 
 def phase_errors(
-    capture: Capture, maps: Sequence[PhaseMap], light: Light, truth: GroundTruth
+    capture: Capture, maps: Sequence[PhaseMap], tilted_maps: Sequence[PhaseMap], truth: GroundTruth
 ) -> dict[str, dict[Model, AngleStats]]:
     """Errors of the measured phase on the part, under each model with the true normals.
+
+    Parameters
+    ----------
+    capture : whose single pixels are measured too.
+    maps, tilted_maps : of the same views, for OPA and PPA and for the tilted model.
+    truth : with the true normals.
 
     Returns
     -------
@@ -210,24 +216,37 @@ def phase_errors(
     capture, those neither clipped nor dark.
     """
     stored = {_stem(phase_map.view.name): phase_map for phase_map in maps}
+    corrected = {_stem(phase_map.view.name): phase_map for phase_map in tilted_maps}
     raw = {_stem(name): name for name in capture.names}
-    turn = np.float32(np.pi / 2 if light is Light.SPECULAR else 0)
 
-    def of_map(name: str) -> tuple[Image, Image]:
-        cos, sin, precision = np.moveaxis(stored[_stem(name)].samples, -1, 0)
-        phase = np.where(precision > 0, 0.5 * np.arctan2(sin, cos), np.nan)
-        return phase.astype(np.float32), np.hypot(cos, sin)
-
-    def of_pixels(name: str) -> tuple[Image, Image]:
+    def of_pixels(name: str, *, tilted: bool) -> tuple[Image, Image]:
+        phase_map = stored[_stem(name)]
         stokes = capture.load(raw[_stem(name)])
+        if tilted:
+            stokes = correct_for_tilt(stokes, view_rays(phase_map.view), phase_map.diffuse)
+        turn = np.where(phase_map.diffuse, np.float32(0), np.float32(np.pi / 2))
         return np.where(stokes.valid, stokes.aolp + turn, np.float32(np.nan)), stokes.dolp
 
-    sources = (("maps", stored, of_map), ("pixels", raw, of_pixels))
+    sources = {
+        "maps": (lambda n: _of_map(stored[_stem(n)]), lambda n: _of_map(corrected[_stem(n)])),
+        "pixels": (partial(of_pixels, tilted=False), partial(of_pixels, tilted=True)),
+    }
+    names = [name for name in truth.names if _stem(name) in stored]
     errors = {}
-    for source, known, load in sources:
-        phases = LazyPhases([name for name in truth.names if _stem(name) in known], load)
+    for source, (measured, as_ppa) in sources.items():
+        phases, ppa_phases = LazyPhases(names, measured), LazyPhases(names, as_ppa)
         errors[source] = phase_errors_on_part(phases, phases.dolps, truth)
+        # The corrected phase is one that PPA predicts.
+        of_tilted = phase_errors_on_part(ppa_phases, ppa_phases.dolps, truth)[Model.PPA]
+        errors[source][Model.TILTED] = of_tilted
     return errors
+
+
+def _of_map(phase_map: PhaseMap) -> tuple[Image, Image]:
+    """Phase, NaN where there is none, and DoLP of a phase map."""
+    cos, sin, precision = np.moveaxis(phase_map.samples, -1, 0)
+    phase = np.where(precision > 0, 0.5 * np.arctan2(sin, cos), np.nan)
+    return phase.astype(np.float32), np.hypot(cos, sin)
 
 
 def _stem(name: str) -> str:
@@ -268,17 +287,17 @@ def compare_models(
     ``models``: for each its ``consistency`` and, with ground truth, its ``truth``. ``phase``:
     with ground truth, what :func:`phase_errors` gives.
     """
-    maps = open_maps(workspace)
+    maps = {model: open_maps(workspace, model) for model in (Model.PPA, Model.TILTED, *models)}
     clouds = {model: read_cloud(workspace.cloud(model)) for model in models}
     tracks = {model: read_cloud(workspace.normals(model)) for model in models}
     tasks: list[Callable[[], Any]] = []
     gt = options.evaluation.gt
     if gt is not None:  # the longest first
         truth = open_ground_truth(gt)
-        views = [phase_map.view for phase_map in maps]
+        views = [phase_map.view for phase_map in maps[Model.PPA]]
         tasks.append(partial(_measure_all, clouds, tracks, views, truth))
-        tasks.append(partial(phase_errors, capture, maps, options.region.light, truth))
-    tasks += [partial(measure_consistency, m, clouds[m], tracks[m], maps) for m in models]
+        tasks.append(partial(phase_errors, capture, maps[Model.PPA], maps[Model.TILTED], truth))
+    tasks += [partial(measure_consistency, m, clouds[m], tracks[m], maps[m]) for m in models]
     done = list(workers.map(_call, tasks))
     consistencies = done[-len(models) :]
     figures: dict[str, Any] = {

@@ -111,7 +111,9 @@ class SfmOptions:
 class RegionOptions:
     """Where the part is and which phase its light shows."""
 
-    light: Light = option(Light.SPECULAR, "reflection that dominates the polarisation")
+    light: Light | None = option(
+        None, "reflection that dominates the polarisation; by default decided for each part"
+    )
     min_dolp: float = option(0.1, "DoLP from which a pixel's phase is used on its own")
     mask: Path | None = option(
         None,

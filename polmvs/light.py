@@ -10,7 +10,6 @@ polarised up to wholly, diffuse light of a smooth dielectric hardly over 0.4).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from polmvs.camera import sample_image
 from polmvs.config import Model, NormalOptions
 from polmvs.normals import NormalEstimate
-from polmvs.phasemap import PhaseMap
+from polmvs.phasemap import PhaseMap, turned
 from polmvs.tracks import Tracks, track_normals
 
 Array = NDArray[np.float64]
@@ -31,15 +30,7 @@ DIFFUSE_DOLP = 0.4  # largest DoLP of diffuse light from a smooth dielectric of 
 DOLP_VOTES = 20.0  # log-likelihood that a clearly higher DoLP is worth
 
 
-def turned(phase_map: PhaseMap, where: Mask) -> PhaseMap:
-    """The same map with the phase turned by a quarter turn on some pixels, not stored."""
-    sign = np.where(where, -1, 1).astype(np.float32)
-    samples = phase_map.samples.copy()
-    samples[..., :2] *= sign[..., None]
-    return replace(phase_map, samples=samples, folder=None)
-
-
-def find_diffuse(tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions) -> list[Mask]:
+def find_diffuse(tracks: Tracks, maps: Sequence[PhaseMap]) -> list[Mask]:
     """Pixels of each view whose light is diffuse-dominant.
 
     Every connected part of a view's region is decided as a whole, by the points that project
@@ -49,17 +40,15 @@ def find_diffuse(tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOption
     ----------
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps built under the assumption of specular light.
-    options : window of the rows.
 
     Returns
     -------
     One ``(H, W)`` bool mask for each map.
     """
-    everywhere = [np.ones(m.region.inside.shape, bool) for m in maps]
+    options = NormalOptions()
+    opposite = [turned(m, np.ones(m.region.inside.shape, bool)) for m in maps]
     specular = track_normals(Model.PPA, tracks, maps, options)
-    diffuse = track_normals(
-        Model.PPA, tracks, [turned(m, e) for m, e in zip(maps, everywhere, strict=True)], options
-    )
+    diffuse = track_normals(Model.PPA, tracks, opposite, options)
     votes, voting = specular_votes(specular, diffuse)
     overall = float(votes[voting].sum()) + _dolp_votes(maps)
     return [_diffuse_parts(m, tracks, votes, voting, overall) for m in maps]

@@ -6,7 +6,7 @@ points, so that thousands of 3x3 problems are solved by a few vector operations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,10 @@ MIN_VISIBLE_COSINE = 0.03  # between normal and viewing direction; flatter sight
 MIN_SIN_ZENITH = 0.1  # a row of a nearly frontal surface says little: its weight is capped here
 CAUCHY_SCALE = 2.385  # 95 % efficiency on Gaussian residuals
 NUM_ROUNDS = 5  # of reweighting; the change of later ones is below 0.01 deg
+DOUBTFUL_LOSS = 0.25  # from which a point is tried again; about 0.12 without outliers
+NUM_PAIRS = 24  # of rows that a doubtful point is started from again
+MIN_ROWS_TO_DOUBT = 7  # that count; of fewer, some agree by chance
+MIN_PAIR_SINE = 0.05  # of the angle between the two rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +112,8 @@ def solve_normals(
     ``M^T M`` over the usable rows, all alike. The robust one: rows weighted by the inverse
     variance of their residual, ``(sin(theta) sigma)^2`` with theta the angle between normal and
     ray, and by a Cauchy loss; both re-estimated in ``NUM_ROUNDS`` rounds. A view from behind the
-    surface cannot see it: its row is left out.
+    surface cannot see it: its row is left out. A point whose rows disagree is started again from
+    pairs of its rows: of ten rows, three may be wrong.
 
     Parameters
     ----------
@@ -134,18 +139,97 @@ def solve_normals(
         cosine = _dot(rays, initial_normals)
         weights = weights * ~(cosine > 0)  # NaN: unknown, kept
     normals = _smallest(rows, weights)[1]
-    for round_index in range(NUM_ROUNDS if robust else 0):
-        cosine = _dot(rays, normals)
-        facing = np.sign((cosine * weights).sum(axis=0))
-        visible = usable & (cosine * facing > MIN_VISIBLE_COSINE)
+    if robust:
+        problem = _Problem(rows, rays, precision, weights)
+        normals = problem.iterate(normals)
+        normals = problem.try_again(normals)
+        weights, outlier_weights = problem.weights(normals, CAUCHY_SCALE)
+    estimate = _describe(rows, rays, weights, outlier_weights, min_rows, min_conditioning)
+    if robust:
+        return estimate
+    sigma = _algebraic_sigma(rows, rays, precision, estimate.normals.T)
+    return replace(estimate, sigma_deg=np.degrees(sigma, dtype=np.float64))
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Rows and rays (3, K, N), precisions (K, N), 0 where a row does not count.
+
+    ``votes`` (K, N) are the rows' votes on which side of the surface the viewers are.
+    """
+
+    rows: Floats
+    rays: Floats
+    precision: Floats
+    votes: Floats
+
+    def iterate(self, normals: Array, first_round: int = 0) -> Array:
+        """Reweight and solve again, in ``NUM_ROUNDS`` rounds."""
+        for round_index in range(first_round, NUM_ROUNDS):
+            # Anneal: a wide loss first, so that a poor start does not reject the good rows.
+            scale = CAUCHY_SCALE * 2.0 ** max(2 - round_index, 0)
+            normals = _smallest(self.rows, self.weights(normals, scale)[0])[1]
+        return normals
+
+    def weights(self, normals: Array, scale: float) -> tuple[Floats, Floats]:
+        """Weights (K, N) of the squared ``m . n``, and their robust part in [0, 1]."""
+        z2, sin2, visible = self._errors(normals)
+        robust = np.where(visible, 1 / (1 + z2 / scale**2), 0)
+        return self.precision / sin2 * robust, robust
+
+    def losses(self, normals: Array) -> Floats:
+        """Mean of ``z^2 / (z^2 + c^2)`` (N,) over the rows that count, 1 where one is not seen.
+
+        Bounded, unlike the loss that is minimised: it judges by the number of rows that agree.
+        """
+        z2, _, visible = self._errors(normals)
+        counted = self.precision > 0
+        loss = np.where(visible, z2 / (z2 + CAUCHY_SCALE**2), 1) * counted
+        return np.asarray(loss.sum(axis=0) / np.maximum(counted.sum(axis=0), 1))
+
+    def try_again(self, normals: Array) -> Array:
+        """Start points that are badly explained again from pairs of rows; the better one stays."""
+        losses = self.losses(normals)
+        enough = (self.precision > 0).sum(axis=0) >= MIN_ROWS_TO_DOUBT
+        where = np.flatnonzero((losses > DOUBTFUL_LOSS) & enough)
+        if len(where) == 0:
+            return normals
+        parts = (self.rows, self.rays, self.precision, self.votes)
+        some = _Problem(*(part[..., where] for part in parts))
+        again = some.iterate(some._best_pair(normals[:, where]), first_round=2)
+        better = some.losses(again) < losses[where]
+        improved = normals.copy()
+        improved[:, where[better]] = again[:, better]
+        return improved
+
+    def _best_pair(self, normals: Array) -> Array:
+        """Of the normals given and those of pairs of rows, the ones of least loss (3, N)."""
+        best, least = normals.copy(), self.losses(normals)
+        rng = np.random.default_rng(0)
+        # Rows that count come first in this order, so that no pair is wasted on others.
+        order = np.argsort(self.precision <= 0, axis=0, kind="stable")
+        count = (self.precision > 0).sum(axis=0)
+        points = np.arange(len(count))
+        for _ in range(NUM_PAIRS):
+            first, step = rng.random((2, len(count)))
+            i = np.floor(first * count).astype(np.int64)
+            j = (i + 1 + np.floor(step * (count - 1)).astype(np.int64)) % count
+            a, b = (self.rows[:, order[k, points], points] for k in (i, j))
+            candidate = np.cross(a, b, axis=0).astype(np.float64)
+            length = np.linalg.norm(candidate, axis=0)
+            candidate /= np.maximum(length, MIN_PAIR_SINE)
+            losses = np.where(length > MIN_PAIR_SINE, self.losses(candidate), np.inf)
+            better = losses < least
+            best[:, better], least[better] = candidate[:, better], losses[better]
+        return best
+
+    def _errors(self, normals: Array) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Squared error over sigma, squared sine of the zenith angle, and who sees the point."""
+        cosine = _dot(self.rays, normals)
+        facing = np.sign((cosine * self.votes).sum(axis=0))
+        visible = (self.precision > 0) & (cosine * facing > MIN_VISIBLE_COSINE)
         sin2 = np.maximum(1 - cosine**2, MIN_SIN_ZENITH**2)
-        z2 = _dot(rows, normals) ** 2 * precision / sin2
-        # Anneal: a wide loss first, so that a poor start does not reject the good rows.
-        scale = CAUCHY_SCALE * 2.0 ** max(2 - round_index, 0)
-        outlier_weights = np.where(visible, 1 / (1 + z2 / scale**2), 0)
-        weights = precision / sin2 * outlier_weights
-        normals = _smallest(rows, weights)[1]
-    return _describe(rows, rays, weights, outlier_weights, min_rows, min_conditioning)
+        return _dot(self.rows, normals) ** 2 * self.precision / sin2, sin2, visible
 
 
 def _dot(rows: Floats, normals: Floats) -> Floats:
@@ -191,3 +275,25 @@ def _describe(
         num_rows=num_rows,
         row_weights=outlier_weights,
     )
+
+
+def _algebraic_sigma(rows: Floats, rays: Floats, precision: Floats, normals: Array) -> Array:
+    """Deviation (N,) of a solution with all weights alike along its larger axis, rad.
+
+    The covariance on the tangent plane is ``A^-1 B A^-1`` with ``A = M^T M`` and B the same with
+    each row weighted by the variance of its residual.
+    """
+    least = np.eye(3)[np.argmin(np.abs(np.nan_to_num(normals)), axis=0)].T
+    first = np.cross(normals, least, axis=0)
+    first /= np.linalg.norm(first, axis=0)
+    a, b = _dot(rows, first), _dot(rows, np.cross(normals, first, axis=0))
+    sin2 = np.maximum(1 - _dot(rays, normals) ** 2, MIN_SIN_ZENITH**2)
+    variance = np.divide(sin2, precision, out=np.zeros_like(sin2), where=precision > 0)
+    products = (a * a, a * b, b * b)
+    aa, ab, bb = (p.sum(axis=0, dtype=np.float64) for p in products)
+    noise = [(p * variance).sum(axis=0, dtype=np.float64) for p in products]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.array([[bb, -ab], [-ab, aa]]) / (aa * bb - ab * ab)
+        middle = np.array([noise[:2], noise[1:]])
+        (xx, xy), (_, yy) = np.einsum("ijn,jkn,kln->iln", inverse, middle, inverse)
+        return np.asarray(np.sqrt(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,13 @@ from polmvs.config import Light, Model
 from polmvs.errors import DataError
 from polmvs.models import rows_from_axial
 from polmvs.region import Region, smooth
+from polmvs.stokes import Stokes
 from polmvs.storage import map_array, save_array
+from polmvs.tilted import correct_stokes, stokes_solver
 
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 FINE_SMOOTHING_PX = 1.5
 COARSE_SMOOTHING_PX = 5.0  # bridges marks and frontal spots
@@ -37,20 +41,25 @@ class PhaseMap:
     samples : (H, W, 3) float32: ``dolp cos 2 phase``, ``dolp sin 2 phase`` and the inverse
         variance of the row's turn about its ray (1 / rad^2; 0: no phase here).
     intensity : (H, W) float32, s0 in units of full scale.
+    diffuse : (H, W) bool, pixels whose light is diffuse-dominant; the others' is specular.
     folder : where the arrays are stored, if they are.
+    tilted : the samples are corrected for tilted polarizers (:func:`as_tilted`).
     """
 
     view: View
     region: Region
     samples: Image
     intensity: Image
+    diffuse: Mask
     folder: Path | None = None
+    tilted: bool = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle a stored map as its place."""
         if self.folder is not None:
-            return open_phase_map, (self.view, self.folder)
-        return PhaseMap, (self.view, self.region, self.samples, self.intensity)
+            return partial(open_phase_map, tilted=self.tilted), (self.view, self.folder)
+        arrays = (self.samples, self.intensity, self.diffuse)
+        return PhaseMap, (self.view, self.region, *arrays, None, self.tilted)
 
 
 def build_phase_map(
@@ -79,9 +88,8 @@ def build_phase_map(
     smoothed = np.where(use_fine[..., None], fine, coarse)
     width_px = np.where(use_fine, FINE_SMOOTHING_PX, COARSE_SMOOTHING_PX)
     share = np.where(use_fine, fine_weight, coarse_weight)
-    sign = -1.0 if light is Light.SPECULAR else 1.0
     with np.errstate(divide="ignore", invalid="ignore"):
-        axial = sign * smoothed[..., 1:3] / smoothed[..., :1]
+        axial = _phase_sign(light) * smoothed[..., 1:3] / smoothed[..., :1]
         dolp = np.linalg.norm(axial, axis=-1)
         # A Gaussian of width w averages 4 pi w^2 independent pixels.
         noise = np.sqrt(smoothed[..., 3] / (4 * np.pi * width_px**2 * share)) / smoothed[..., 0]
@@ -89,21 +97,89 @@ def build_phase_map(
         precision = np.where(region.inside & (share > 0.02), 1 / variance, 0)
     samples = np.dstack([axial, precision]).astype(np.float32)
     np.nan_to_num(samples, copy=False, nan=0.0)
-    return PhaseMap(view, region, samples, np.asarray(s0, np.float32))
+    diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
+    return PhaseMap(view, region, samples, np.asarray(s0, np.float32), diffuse)
+
+
+def correct_for_tilt(stokes: Stokes, rays: Floats, diffuse: Mask) -> Stokes:
+    """Stokes images that a sensor obeying PPA would have given, each pixel by its kind of light.
+
+    Parameters
+    ----------
+    stokes : (H, W) images.
+    rays : (H, W, 3), unit, camera frame.
+    diffuse : (H, W) bool, pixels whose light is diffuse-dominant.
+    """
+    solver = stokes_solver(rays)
+    corrected = correct_stokes(stokes, rays, light=Light.SPECULAR, solver=solver)
+    if not diffuse.any():
+        return corrected
+    other = correct_stokes(stokes, rays, light=Light.DIFFUSE, solver=solver)
+    return Stokes(
+        s0=np.where(diffuse, other.s0, corrected.s0),
+        s1=np.where(diffuse, other.s1, corrected.s1),
+        s2=np.where(diffuse, other.s2, corrected.s2),
+        sigma=np.where(diffuse, other.sigma, corrected.sigma),
+        valid=stokes.valid,
+    )
+
+
+def as_tilted(phase_map: PhaseMap) -> PhaseMap:
+    """The phase map that a sensor obeying PPA would have given, not stored.
+
+    Presumes that the polarizers are tilted for oblique rays (:mod:`polmvs.tilted`). The
+    correction is linear in the Stokes parameters and varies slowly over the image, so that it may
+    follow the smoothing.
+    """
+    sign = np.where(phase_map.diffuse, _phase_sign(Light.DIFFUSE), _phase_sign(Light.SPECULAR))
+    one = np.ones(sign.shape, np.float32)
+    measured = Stokes(
+        s0=one,
+        s1=sign * phase_map.samples[..., 0],
+        s2=sign * phase_map.samples[..., 1],
+        sigma=one,
+        valid=phase_map.samples[..., 2] > 0,
+    )
+    corrected = correct_for_tilt(measured, view_rays(phase_map.view), phase_map.diffuse)
+    scale = sign / np.maximum(corrected.s0, 1e-6)
+    # The turn of a row about its ray stays as certain as it was; that of the phase changes.
+    precision = phase_map.samples[..., 2] / np.square(corrected.sigma)
+    samples = np.dstack([scale * corrected.s1, scale * corrected.s2, precision])
+    samples = np.nan_to_num(samples.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    return replace(phase_map, samples=samples, folder=None, tilted=True)
+
+
+def _phase_sign(light: Light) -> np.float32:
+    """Factor from ``(cos, sin)`` of twice the AoLP to that of twice the phase."""
+    return np.float32(-1.0 if light is Light.SPECULAR else 1.0)
+
+
+def turned(phase_map: PhaseMap, where: Mask) -> PhaseMap:
+    """The map with the other kind of light on some pixels, their phase turned; not stored."""
+    sign = np.where(where, -1, 1).astype(np.float32)
+    samples = phase_map.samples.copy()
+    samples[..., :2] *= sign[..., None]
+    return replace(phase_map, samples=samples, diffuse=phase_map.diffuse ^ where, folder=None)
 
 
 def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:
-    """Write a phase map as ``.npy`` files named after the view; returns the stored one."""
-    stem = folder / phase_map.view.name
-    region = phase_map.region
-    flags = region.inside * 1 | region.reliable * 2 | region.edges * 4
-    save_array(stem.with_name(stem.name + ".samples.npy"), phase_map.samples)
-    save_array(stem.with_name(stem.name + ".intensity.npy"), phase_map.intensity)
-    save_array(stem.with_name(stem.name + ".region.npy"), flags.astype(np.uint8))
-    return open_phase_map(phase_map.view, folder)
+    """Write a phase map as ``.npy`` files named after the view; returns the stored one.
+
+    A tilted map shares all files but the samples with the map that it was made from.
+    """
+    region, name = phase_map.region, phase_map.view.name
+    flags = region.inside * 1 | region.reliable * 2 | region.edges * 4 | phase_map.diffuse * 8
+    save_array(folder / _samples_name(name, phase_map.tilted), phase_map.samples)
+    save_array(folder / f"{name}.intensity.npy", phase_map.intensity)
+    save_array(folder / f"{name}.region.npy", flags.astype(np.uint8))
+    return open_phase_map(phase_map.view, folder, tilted=phase_map.tilted)
 
 
-def open_phase_map(view: View, folder: Path) -> PhaseMap:
+def _samples_name(name: str, tilted: bool) -> str:
+    return f"{name}.tilted.npy" if tilted else f"{name}.samples.npy"
+
+
+def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMap:
     """Open a stored phase map; its images stay on disk until they are read.
 
     Raises
@@ -111,14 +187,14 @@ def open_phase_map(view: View, folder: Path) -> PhaseMap:
     DataError
         If a file is missing, damaged, or of another size than the view's camera.
     """
-    samples = map_array(folder / f"{view.name}.samples.npy")
+    samples = map_array(folder / _samples_name(view.name, tilted))
     intensity = map_array(folder / f"{view.name}.intensity.npy")
     flags = map_array(folder / f"{view.name}.region.npy")
     size = (view.camera.height, view.camera.width)
     if not samples.shape[:2] == intensity.shape == flags.shape == size:
         raise DataError(folder / view.name, "has another size than its camera; use --overwrite.")
     region = Region((flags & 1) > 0, (flags & 2) > 0, (flags & 4) > 0)
-    return PhaseMap(view, region, samples, intensity, folder)
+    return PhaseMap(view, region, samples, intensity, (flags & 8) > 0, folder, tilted)
 
 
 def _normalized_smoothing(

@@ -25,7 +25,7 @@ from polmvs.run import (
 )
 from polmvs.workspace import Workspace
 
-COMPARED = (Model.OPA, Model.PPA)
+COMPARED = (Model.OPA, Model.PPA, Model.TILTED)
 MIN_SFM_IMAGES = 2
 
 NO_REGION = (

@@ -21,6 +21,7 @@ from polmvs.cloud_io import Cloud, write_cloud
 from polmvs.colmap_io import SparseModel, read_model
 from polmvs.config import (
     FusionOptions,
+    Light,
     Model,
     NormalOptions,
     PropagationOptions,
@@ -30,9 +31,17 @@ from polmvs.config import (
 from polmvs.errors import DataError
 from polmvs.fuse import FusedCloud, fuse
 from polmvs.image_io import read_mask, write_png
+from polmvs.light import find_diffuse
 from polmvs.normals import NormalEstimate
 from polmvs.parallel import Workers
-from polmvs.phasemap import PhaseMap, build_phase_map, open_phase_map, store_phase_map
+from polmvs.phasemap import (
+    PhaseMap,
+    as_tilted,
+    build_phase_map,
+    open_phase_map,
+    store_phase_map,
+    turned,
+)
 from polmvs.propagate import propagate
 from polmvs.region import find_region
 from polmvs.sfm import run_sfm
@@ -163,13 +172,29 @@ def build_maps(
     """Find the region of every posed view and store its phase map."""
     views = posed_views(workspace)
     names = image_names(capture)
-    num_inside = 0
+    tracks = read_model(workspace.sparse).tracks
     with workspace.replacing(workspace.maps) as folder:
         build = partial(_build_map, capture, options, folder)
+        num_inside = 0
         for count in workers.map(build, views, [names[view.name] for view in views]):
             num_inside += count
             report(1)
-    return {"num_region_px": num_inside}
+        maps = [open_phase_map(view, folder) for view in views]
+        diffuse: list[NDArray[np.bool_] | None] = [None] * len(maps)
+        if options.light is None and len(tracks.point3D_ids):
+            diffuse = list(find_diffuse(tracks, maps))
+        num_diffuse = 0
+        for count in workers.map(partial(_finish_map, folder), maps, diffuse):
+            num_diffuse += count
+    return {"num_region_px": num_inside, "num_diffuse_px": num_diffuse}
+
+
+def _finish_map(folder: Path, phase_map: PhaseMap, diffuse: NDArray[np.bool_] | None) -> int:
+    """Turn what is diffuse, and store the tilted map beside; returns the diffuse pixels."""
+    if diffuse is not None and diffuse.any():
+        phase_map = store_phase_map(turned(phase_map, diffuse), folder)
+    store_phase_map(as_tilted(phase_map), folder)
+    return int((phase_map.diffuse & phase_map.region.inside).sum())
 
 
 def _build_map(
@@ -182,7 +207,8 @@ def _build_map(
         mask = read_mask(find_mask(options.mask, view.name), stokes.shape)
     s0, s1, s2 = stokes.s0, stokes.s1, stokes.s2
     region = find_region(s0, s1, s2, stokes.valid, min_dolp=options.min_dolp, mask=mask)
-    store_phase_map(build_phase_map(view, s0, s1, s2, stokes.sigma, region, options.light), folder)
+    light = options.light or Light.SPECULAR
+    store_phase_map(build_phase_map(view, s0, s1, s2, stokes.sigma, region, light), folder)
     return int(region.inside.sum())
 
 
@@ -204,15 +230,16 @@ def posed_views(workspace: Workspace) -> tuple[View, ...]:
     return views
 
 
-def open_maps(workspace: Workspace) -> list[PhaseMap]:
-    """Phase maps of all posed views; their pixels stay on disk."""
-    return [open_phase_map(view, workspace.maps) for view in posed_views(workspace)]
+def open_maps(workspace: Workspace, model: Model) -> list[PhaseMap]:
+    """Phase maps of all posed views for a model; their pixels stay on disk."""
+    tilted = model is Model.TILTED
+    return [open_phase_map(v, workspace.maps, tilted=tilted) for v in posed_views(workspace)]
 
 
 def solve_tracks(model: Model, workspace: Workspace, options: NormalOptions) -> Facts:
     """Normals of the sparse points under a model; PPA's also select the seeds."""
     tracks = read_model(workspace.sparse).tracks
-    maps = open_maps(workspace)
+    maps = open_maps(workspace, model)
     if len(tracks.point3D_ids) == 0:
         estimate = _no_estimate(len(maps))
     else:
@@ -294,7 +321,7 @@ def densify(
 
     Without a region or seeds the cloud has no points.
     """
-    maps = open_maps(workspace)
+    maps = open_maps(workspace, model)
     seeds = load_seeds(model, workspace)
     num_inside = sum(int(phase_map.region.inside.sum()) for phase_map in maps)
     if num_inside == 0 or len(seeds.sigma) == 0:

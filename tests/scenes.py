@@ -9,7 +9,7 @@ from polmvs.config import Light
 from polmvs.phasemap import PhaseMap, build_phase_map
 from polmvs.region import find_region
 from polmvs.synthetic import Plane, SyntheticView, render_view, ring_of_views
-from polmvs.tracks import Seeds
+from polmvs.tracks import Seeds, Tracks
 
 CAMERA = PinholeCamera(width=160, height=128, fx=120.0, fy=120.0, cx=80.0, cy=64.0)
 
@@ -39,7 +39,7 @@ class Scene:
         return Seeds(points, normals, np.full(num, sigma))
 
 
-def board_scene(num_views: int = 6, sensor: str = "ppa") -> Scene:
+def board_scene(num_views: int = 6, sensor: str = "ppa", light: str = "specular") -> Scene:
     """A tilted glossy board that lies whole in most views of a ring."""
     surface = Plane(
         point=np.array([0.0, 0.0, 0.0]), normal=np.array([0.1, -0.05, 1.0]), extent=(0.12, 0.15)
@@ -47,7 +47,9 @@ def board_scene(num_views: int = 6, sensor: str = "ppa") -> Scene:
     views = ring_of_views(
         num_views, CAMERA, target=np.zeros(3), distance=0.5, elevation_deg=45, roll_deg=20
     )
-    rendered = [render_view(v, surface, sensor=sensor, s0=0.2, background=0.6) for v in views]
+    rendered = [
+        render_view(v, surface, sensor=sensor, light=light, s0=0.2, background=0.6) for v in views
+    ]
     return Scene(surface, views, rendered, [phase_map_of(r) for r in rendered])
 
 
@@ -59,3 +61,20 @@ def phase_map_of(rendered: SyntheticView, light: Light = Light.SPECULAR) -> Phas
     region = find_region(s0, s1, s2, valid, min_dolp=0.1)
     sigma = np.full(s0.shape, 1e-3, np.float32)
     return build_phase_map(rendered.view, s0, s1, s2, sigma, region, light)
+
+
+def tracks_at(scene, points, views=None):
+    """Tracks of points as all (or some) views would observe them."""
+    views = range(len(scene.views)) if views is None else views
+    obs = [(t, k) for t in range(len(points)) for k in views]
+    xy = [scene.views[k].camera.project(scene.views[k].cam_from_world * points[t]) for t, k in obs]
+    num = len(points)
+    return Tracks(
+        point3D_ids=np.arange(num),
+        points_in_world=points,
+        colors=np.zeros((num, 3), np.uint8),
+        errors=np.zeros(num),
+        obs_track=np.array([t for t, _ in obs], np.int64),
+        obs_view=np.array([k for _, k in obs], np.int64),
+        obs_xy=np.array(xy).reshape(-1, 2),
+    )

@@ -14,11 +14,14 @@ import pytest
 
 from polmvs.cloud_io import read_cloud
 from polmvs.colmap_io import read_model
-from polmvs.config import Options, PropagationOptions, RunOptions, SfmOptions
-from polmvs.pipeline import Job, reconstruct
+from polmvs.config import Model, Options, PropagationOptions, RunOptions, SfmOptions
+from polmvs.pipeline import COMPARED, Job, reconstruct
 from polmvs.workspace import Workspace
 
-STAGES = ["capture", "sfm", "maps", "normals", "normals_opa", "densify_opa", "densify_ppa"]
+OTHERS = [model for model in COMPARED if model is not Model.PPA]
+NORMAL_STAGES = ["normals", *[f"normals_{model}" for model in OTHERS]]
+BEFORE_CLOUDS = ["capture", "sfm", "maps", *NORMAL_STAGES]
+STAGES = [*BEFORE_CLOUDS, *[f"densify_{model}" for model in COMPARED], "evaluate"]
 RESULTS = ("normals.ply", "normals_opa.ply", "opa.ply", "ppa.ply", "metrics.json")
 
 
@@ -47,7 +50,7 @@ def test_output_folder_is_as_described(demo_run: Path) -> None:
 
 def test_run_record(demo_run: Path) -> None:
     record = json.loads((demo_run / "run.json").read_text())
-    assert [stage["name"] for stage in record["stages"]] == [*STAGES, "evaluate"]
+    assert [stage["name"] for stage in record["stages"]] == STAGES
     for stage in record["stages"]:
         assert stage["seconds"] > 0
         assert 50 < stage["peak_rss_mb"] < 2500
@@ -130,28 +133,43 @@ def test_library_and_one_worker_give_the_same_cloud(
     first, again = read_cloud(demo_run / "ppa.ply"), read_cloud(tmp_path / "out" / "ppa.ply")
     # The model is written anew from its views and tracks: the last digits differ.
     assert len(again.points) == pytest.approx(len(first.points), rel=0.01)
-    names = [stage.name for stage in Workspace(tmp_path / "out").load().stages]
-    assert names == ["capture", "sparse", "maps", "normals", "densify_ppa"]
+    assert stages_of(tmp_path / "out") == ["capture", "sparse", "maps", "normals", "densify_ppa"]
 
 
 def start(out: Path, *arguments: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "polmvs", "demo", str(out), "--workers", "2", *arguments]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    """Kill a run and its workers without notice."""
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate(timeout=60)
 
 
 def wait_until(holds, process: subprocess.Popen[str], timeout_s: float = 60) -> None:
     deadline = time.monotonic() + timeout_s
     while not holds():
-        assert process.poll() is None, "the run ended before it could be stopped"
+        assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
-def copy_of_stages(demo_run: Path, out: Path, num_stages: int) -> None:
-    """A run that was stopped after so many stages."""
+def stages_of(out: Path) -> list[str]:
+    return [stage.name for stage in Workspace(out).load().stages]
+
+
+def copy_until(demo_run: Path, out: Path, last: str) -> None:
+    """A run that was stopped after this stage."""
     shutil.copytree(demo_run, out)
     record = json.loads((out / "run.json").read_text())
-    record["stages"] = record["stages"][:num_stages]
+    record["stages"] = record["stages"][: STAGES.index(last) + 1]
     record["finished"] = False
     (out / "run.json").write_text(json.dumps(record))
 
@@ -162,48 +180,44 @@ def test_killed_run_goes_on_to_the_same_result(demo_run: Path, tmp_path: Path, c
     process = start(out)
     wait_until((out / ".sfm.tmp").exists, process)
     time.sleep(0.5)
-    os.kill(process.pid, signal.SIGKILL)
-    process.communicate()
+    kill(process)
     assert not (out / "sparse").exists()
-    assert [stage.name for stage in Workspace(out).load().stages] == ["capture"]
+    assert stages_of(out) == ["capture"]
 
     process = start(out, "--resume")
     wait_until((out / ".densify_opa.tmp").exists, process)
-    os.kill(process.pid, signal.SIGKILL)
-    process.communicate()
+    kill(process)
     assert not (out / "opa.ply").exists()
-    assert [stage.name for stage in Workspace(out).load().stages] == STAGES[:5]
+    assert stages_of(out) == BEFORE_CLOUDS
 
     status, _, err = cli("demo", out, "--resume", "--workers", 2)
     assert (status, err) == (0, "")
     assert_same_results(out, demo_run)
     assert_no_temporary_files(out)
-    assert [stage.name for stage in Workspace(out).load().stages] == [*STAGES, "evaluate"]
+    assert stages_of(out) == STAGES
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupt_keeps_finished_stages_only(demo_run: Path, tmp_path: Path, number: int) -> None:
     out = tmp_path / "out"
-    copy_of_stages(demo_run, out, 5)
+    copy_until(demo_run, out, BEFORE_CLOUDS[-1])
     process = start(out, "--resume")
     wait_until((out / ".densify_opa.tmp").exists, process)
     process.send_signal(number)
     stdout, stderr = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert stderr == (
-        "polmvs demo: interrupted; finished stages are kept, go on with --resume\n"
-    )
+    assert stderr == ("polmvs demo: interrupted; finished stages are kept, go on with --resume\n")
     assert stdout == ""
     assert_no_temporary_files(out)
-    assert [stage.name for stage in Workspace(out).load().stages] == STAGES[:5]
+    assert stages_of(out) == BEFORE_CLOUDS
 
 
 def test_stages_alone_give_the_same_result(
     demo_run: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:
     out = tmp_path / "out"
-    copy_of_stages(demo_run, out, 2)
-    for name in ("normals.ply", "ppa.ply", "opa.ply", "metrics.json"):
+    copy_until(demo_run, out, "sfm")
+    for name in RESULTS:
         (out / name).unlink()
     shutil.rmtree(out / "maps")
     status, text, err = cli("normals", demo_capture, out)
@@ -239,7 +253,7 @@ def test_new_truth_is_measured_on_a_finished_run(
     demo_run: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:
     out = tmp_path / "out"
-    copy_of_stages(demo_run, out, 7)
+    copy_until(demo_run, out, STAGES[-2])
     record = json.loads((out / "run.json").read_text())
     record["options"]["evaluation"]["gt"] = None
     (out / "run.json").write_text(json.dumps(record))
@@ -253,11 +267,9 @@ def test_new_truth_is_measured_on_a_finished_run(
     assert metrics_of(out) == metrics_of(demo_run)
 
 
-def test_paper_contours_work_too(
-    demo_run: Path, demo_capture: Path, tmp_path: Path, cli
-) -> None:
+def test_paper_contours_work_too(demo_run: Path, demo_capture: Path, tmp_path: Path, cli) -> None:
     out = tmp_path / "out"
-    copy_of_stages(demo_run, out, 4)
+    copy_until(demo_run, out, "normals")
     status, _, err = cli("densify", demo_capture, out, "--contour", "normals")
     assert (status, err) == (0, "")
     status, text, _ = cli(

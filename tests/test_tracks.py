@@ -1,32 +1,15 @@
 import numpy as np
 import pytest
-from scenes import board_scene
+from scenes import board_scene, tracks_at
 
 from polmvs.config import Estimator, Model, NormalOptions
 from polmvs.phasemap import gather_rows, open_phase_map, store_phase_map
-from polmvs.tracks import Tracks, point_sigmas, select_seeds, track_normals, window_map
+from polmvs.tracks import point_sigmas, select_seeds, track_normals, window_map
 
 
 @pytest.fixture(scope="module")
 def scene():
     return board_scene(6)
-
-
-def tracks_at(scene, points, views=None):
-    """Tracks of points as all (or some) views would observe them."""
-    views = range(len(scene.views)) if views is None else views
-    obs = [(t, k) for t in range(len(points)) for k in views]
-    xy = [scene.views[k].camera.project(scene.views[k].cam_from_world * points[t]) for t, k in obs]
-    num = len(points)
-    return Tracks(
-        point3D_ids=np.arange(num),
-        points_in_world=points,
-        colors=np.zeros((num, 3), np.uint8),
-        errors=np.zeros(num),
-        obs_track=np.array([t for t, _ in obs]),
-        obs_view=np.array([k for _, k in obs]),
-        obs_xy=np.array(xy).reshape(-1, 2),
-    )
 
 
 def errors_deg(normals, truth):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from types import FrameType
 
 __all__ = ["entry_point", "main"]
@@ -27,8 +28,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def entry_point() -> None:
     """Run the console command; a plain kill ends it as cleanly as Ctrl-C does."""
-    signal.signal(signal.SIGTERM, _interrupt)
     try:
+        # COLMAP's log takes SIGTERM for itself when it is imported: after that.
+        import_module("polmvs.colmap_io")
+        signal.signal(signal.SIGTERM, _interrupt)
         status = main()
     except KeyboardInterrupt:  # while modules are imported
         status = 130

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import polmvs
-from polmvs import pipeline
+from polmvs import pipeline, plane_command
 from polmvs.camera import PinholeCamera
 from polmvs.cli.flags import (
     GROUPS,
@@ -49,6 +49,7 @@ def build_parser() -> Parser:
     _add_sfm(subparsers)
     _add_normals(subparsers)
     _add_densify(subparsers)
+    _add_plane(subparsers)
     return parser
 
 
@@ -168,6 +169,12 @@ def _add_densify(subparsers: Any) -> None:
     groups = ["capture", "sfm", "region", "normals", "propagation", "fusion"]
     parser = _add_job(subparsers, "densify", "the dense cloud, after 'normals'", densify, groups)
     _add_model(parser)
+
+
+def _add_plane(subparsers: Any) -> None:
+    plane_command.add_parser(subparsers).set_defaults(
+        run=lambda args, terminal: plane_command.run(args)
+    )
 
 
 def demo(args: argparse.Namespace, terminal: Terminal) -> int:

@@ -17,6 +17,7 @@ from polmvs.run import Report
 from polmvs.workspace import Workspace
 
 INTERRUPTED = 130  # as shells report a program ended by Ctrl-C
+FILE_ONLY = {"file_only": True}  # of records that the terminal gets in another form
 LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 logger = logging.getLogger(__name__)
@@ -27,7 +28,7 @@ class _TerminalHandler(logging.Handler):
     """Lines on stderr that do not break the progress bar; tracebacks are for the log file."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        if record.exc_info is None:
+        if not hasattr(record, "file_only"):
             level = "" if record.levelno < logging.WARNING else f"{record.levelname.lower()}: "
             tqdm.write(f"{level}{record.getMessage()}", file=sys.stderr)
 
@@ -113,23 +114,23 @@ def guarded(command: Callable[[], int], terminal: Terminal, name: str) -> int:
         _complain(name, "interrupted" + (kept if terminal.workspace is not None else ""))
         return INTERRUPTED
     except PolmvsError as error:
-        logger.debug("%s", error, exc_info=True)
+        logger.debug("where it happened:", exc_info=True, extra=FILE_ONLY)
         _complain(name, f"error: {error}")
         return error.exit_status
     except BrokenPipeError:  # the reader of stdout has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (BrokenProcessPool, MemoryError):
-        logger.debug("out of memory", exc_info=True)
+        logger.debug("where it happened:", exc_info=True, extra=FILE_ONLY)
         _complain(name, "error: out of memory, or a worker was killed. Give --workers 1.")
         return 1
     except OSError as error:
-        logger.debug("%s", error, exc_info=True)
+        logger.debug("where it happened:", exc_info=True, extra=FILE_ONLY)
         place = f"{error.filename}: " if error.filename else ""
         _complain(name, f"error: {place}{error.strerror or error}.")
         return 1
     except Exception as error:
-        logger.critical("internal error", exc_info=True)
+        logger.critical("internal error", exc_info=True, extra=FILE_ONLY)
         where = f"; see {terminal.workspace.log}" if terminal.workspace is not None else ""
         text = " ".join(f"{type(error).__name__}: {error}".split())
         _complain(name, f"internal error: {text}{where}")
@@ -138,5 +139,5 @@ def guarded(command: Callable[[], int], terminal: Terminal, name: str) -> int:
 
 def _complain(name: str, message: str) -> None:
     line = " ".join(message.split())
-    logger.log(logging.ERROR, "%s", line, exc_info=(None, None, None))
+    logger.error("%s", line, extra=FILE_ONLY)
     print(f"{name}: {line}", file=sys.stderr)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,7 +32,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-DEFAULT_BLUR_PX = 1.0  # the paper blurs "the images" and does not say how much
+DEFAULT_BLUR_PX = 1.5  # the paper blurs its images and does not say how much; ours are half as wide
+BLUR_REACH = 2.0  # deviations of the blur within which a mark spoils a pixel
 
 
 class Truth(Protocol):
@@ -132,6 +135,12 @@ class ViewData:
         s = self.sharp
         return find_region(s.s0, s.s1, s.s2, s.valid, min_dolp=min_dolp, mask=self.part)
 
+    def beside_marks(self, region: Region, blur_px: float) -> Mask:
+        """Pixels that printed marks (or other unreliable pixels) reach through the blur."""
+        size = 2 * math.ceil(BLUR_REACH * blur_px) + 1
+        spoiled = (self.part & ~region.reliable).astype(np.uint8)
+        return np.asarray(cv2.dilate(spoiled, np.ones((size, size), np.uint8)) > 0)
+
     def phase_map(self, model: Model, region: Region) -> PhaseMap:
         """The package's own phase map: smoothed over the reliable pixels, with precisions."""
         s = self._for(model, self.sharp)
@@ -142,7 +151,8 @@ class ViewData:
         axial = self.axial(model) / np.maximum(self.blurred.s0, 1e-6)[..., None]
         samples = np.dstack([axial, self.counted.astype(np.float32)])
         region = Region(self.part, self.counted, np.zeros_like(self.part))
-        return PhaseMap(self.view, region, samples.astype(np.float32), self.sharp.s0)
+        diffuse = np.full(region.inside.shape, self.light is Light.DIFFUSE)
+        return PhaseMap(self.view, region, samples.astype(np.float32), self.sharp.s0, diffuse)
 
     def _for(self, model: Model, stokes: Stokes) -> Stokes:
         if model is not Model.TILTED:
@@ -257,7 +267,7 @@ def load_view(scene: Scene, index: int) -> ViewData:
     known = np.isfinite(normals).all(axis=-1)
     return ViewData(
         view=view,
-        light=scene.region.light,
+        light=scene.region.light or Light.SPECULAR,
         rays=view_rays(view),
         sharp=sharp,
         blurred=blurred,

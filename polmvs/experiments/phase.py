@@ -30,6 +30,7 @@ ANGLES = ("viewing", "azimuth", "zenith")
 ANGLE_LIMITS_DEG = {"viewing": 90.0, "azimuth": 180.0, "zenith": 90.0}
 ANGLE_BINS = 90
 ERROR_BINS = 180  # over -90 to 90 degrees
+MIN_COLUMN_PIXELS = 200  # of an angle's bin: of fewer there is no density
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,10 +57,11 @@ class PhaseResult:
     Attributes
     ----------
     all_pixels : over the counted pixels of all views.
-    unmarked : over those outside of printed marks (:class:`polmvs.region.Region`, ``reliable``).
+    unmarked : over those that no printed mark (not ``reliable`` in :class:`polmvs.region.Region`)
+        reaches through the blur.
     per_view : root mean square error of each view, degrees, by image name.
     densities : by model, (3, ANGLE_BINS, ERROR_BINS), for the angles of ``ANGLES``: share of the
-        pixels of an angle's bin in each bin of the error; NaN where an angle has no pixels.
+        pixels of an angle's bin in each bin of the error; NaN where an angle has too few pixels.
     """
 
     all_pixels: Mapping[Model, SignedStats]
@@ -123,13 +125,14 @@ def measure_phase(
 def measure_view(scene: Scene, index: int) -> ViewPhase:
     """Tallies of one view."""
     data = load_view(scene, index)
-    reliable = data.find_region(scene.region.min_dolp).reliable[data.counted]
+    marked = data.beside_marks(data.find_region(scene.region.min_dolp), scene.blur_px)
+    unmarked = ~marked[data.counted]
     angles = _angles(data)
     errors = {model: _errors_deg(data, model) for model in Model}
     return ViewPhase(
         name=data.view.name,
         all_pixels={model: ErrorTally.of(error) for model, error in errors.items()},
-        unmarked={model: ErrorTally.of(error[reliable]) for model, error in errors.items()},
+        unmarked={model: ErrorTally.of(error[unmarked]) for model, error in errors.items()},
         counts={model: _histograms(angles, error) for model, error in errors.items()},
     )
 
@@ -201,7 +204,8 @@ def _histograms(angles: Mapping[str, Array], errors: Array) -> Density:
 def _normalize(counts: Density) -> Density:
     """Counts to shares of the pixels of each angle's bin."""
     total = counts.sum(axis=-1, keepdims=True)
-    return np.divide(counts, total, out=np.full_like(counts, np.nan), where=total > 0)
+    enough = np.broadcast_to(total >= MIN_COLUMN_PIXELS, counts.shape)
+    return np.divide(counts, total, out=np.full_like(counts, np.nan), where=enough)
 
 
 def _total(tallies: list[ErrorTally]) -> ErrorTally:

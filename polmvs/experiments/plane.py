@@ -1,0 +1,239 @@
+"""Experiment 2: normal of a planar region from one view (paper, 5.3, M1).
+
+The paper's eigenvector and the robust maximum likelihood of :mod:`polmvs.plane` see the same
+pixels. On a curved part the region of each view is the patch of the part whose true normals lie
+within a few degrees of one of them and that has the most pixels; its truth is their mean.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.config import Model
+from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
+from polmvs.metrics import AngleStats, angular_errors_deg
+from polmvs.parallel import Workers
+from polmvs.plane import PlaneEstimate, phase_residuals, plane_normal
+from polmvs.stokes import Stokes
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
+
+DEFAULT_PLANAR_DEG = 5.0
+NUM_CANDIDATES = 64  # normals tried as the middle of a patch
+MIN_PIXELS = 100
+
+# A lens may or may not tilt the polarizers (:mod:`polmvs.tilted`), and PPA leaves that out: what
+# it would turn a pixel's phase by is part of the phase's uncertainty. It is common to a whole part
+# of the image and does not average out as noise does over the pixels, hence the factor.
+TILT_FACTOR = 4.0
+
+
+class Weights(StrEnum):
+    """How the pixels of an estimate are weighed."""
+
+    ALIKE = "alike"
+    NOISE = "noise"
+    TILT_AWARE = "tilt-aware"
+
+
+# Name of the estimate, its model, and its weights; "alike" is the paper's eigenvector.
+ESTIMATES: dict[str, tuple[Model, Weights]] = {
+    "algebraic": (Model.PPA, Weights.ALIKE),
+    "weighted_noise": (Model.PPA, Weights.NOISE),
+    "weighted": (Model.PPA, Weights.TILT_AWARE),
+    "tilted_algebraic": (Model.TILTED, Weights.ALIKE),
+    "tilted": (Model.TILTED, Weights.NOISE),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagePlane:
+    """Estimates of one view; all by the name of the estimate.
+
+    Attributes
+    ----------
+    name : of the image.
+    num_pixels : of the region.
+    error_deg : angle to the true normal; NaN where none was found.
+    sigma_deg : as the estimator reports it.
+    seconds : wall time of the estimate.
+    """
+
+    name: str
+    num_pixels: int
+    error_deg: Mapping[str, float]
+    sigma_deg: Mapping[str, float]
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ambiguity:
+    """The normal against its twin, turned by pi about the optical axis.
+
+    Attributes
+    ----------
+    rmse_deg, rmse_turned_deg : phase residual of the true normal and of the twin, root mean
+        square over all views.
+    determined_share : of the views, those whose rows determine a single normal.
+    """
+
+    rmse_deg: float
+    rmse_turned_deg: float
+    determined_share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneResult:
+    """Single-view normals over a capture.
+
+    Attributes
+    ----------
+    stats : angular errors over the images, by estimate.
+    seconds : median time per estimate.
+    failed : images without an estimate.
+    per_image : of each image with enough pixels.
+    skipped : names of the images with fewer than ``MIN_PIXELS`` pixels.
+    ambiguity : of pi, by model.
+    """
+
+    stats: Mapping[str, AngleStats]
+    seconds: Mapping[str, float]
+    failed: Mapping[str, int]
+    per_image: tuple[ImagePlane, ...]
+    skipped: tuple[str, ...]
+    ambiguity: Mapping[Model, Ambiguity]
+
+
+def measure_plane(
+    scene: Scene,
+    workers: Workers,
+    report: Callable[[int], None] = lambda count: None,
+    *,
+    planar_deg: float = DEFAULT_PLANAR_DEG,
+) -> PlaneResult:
+    """Single-view normals of all views.
+
+    Parameters
+    ----------
+    planar_deg : how far true normals of the region may lie from its middle one, degrees.
+
+    Raises
+    ------
+    DataError
+        No view has enough pixels, or a file is at fault.
+    """
+    images, residuals = [], []
+    work = partial(measure_image, scene, planar_deg=planar_deg)
+    for image, residual in workers.map(work, range(len(scene.views))):
+        images.append(image)
+        residuals.append(residual)
+        report(1)
+    used = [i for i, image in enumerate(images) if image.num_pixels >= MIN_PIXELS]
+    require_counted(scene, len(used))
+    kept = [images[i] for i in used]
+    errors = {name: np.array([image.error_deg[name] for image in kept]) for name in ESTIMATES}
+    return PlaneResult(
+        stats={name: AngleStats.from_degrees(error) for name, error in errors.items()},
+        seconds={n: float(np.median([image.seconds[n] for image in kept])) for n in ESTIMATES},
+        failed={name: int(np.isnan(error).sum()) for name, error in errors.items()},
+        per_image=tuple(kept),
+        skipped=tuple(im.name for i, im in enumerate(images) if i not in used),
+        ambiguity={m: _pool([residuals[i][m] for i in used]) for m in Model},
+    )
+
+
+def measure_image(
+    scene: Scene, index: int, *, planar_deg: float
+) -> tuple[ImagePlane, dict[Model, Ambiguity]]:
+    """Estimates of one view, and its share in the ambiguity."""
+    data = load_view(scene, index)
+    region, true_normal = planar_region(data, planar_deg)
+    pixels = {model: _pixels(data, model, region) for model in Model}
+    estimates, seconds = {}, {}
+    enough = int(region.sum()) >= MIN_PIXELS
+    turn = _tilt_turn(pixels[Model.PPA][0], pixels[Model.TILTED][0])
+    for name, (model, weights) in ESTIMATES.items() if enough else ():
+        axial, rays, sigma = pixels[model]
+        start = time.perf_counter()
+        if weights is Weights.TILT_AWARE:
+            sigma = np.hypot(sigma, TILT_FACTOR * turn)
+        robust = weights is not Weights.ALIKE
+        estimates[name] = plane_normal(model, axial, rays, sigma, robust=robust)
+        seconds[name] = time.perf_counter() - start
+    image = ImagePlane(
+        name=data.view.name,
+        num_pixels=int(region.sum()),
+        error_deg={name: _error_deg(e, true_normal) for name, e in estimates.items()},
+        sigma_deg={name: e.sigma_deg for name, e in estimates.items()},
+        seconds=seconds,
+    )
+    ambiguity = {m: _ambiguity(m, true_normal, *pixels[m]) for m in Model} if enough else {}
+    return image, ambiguity
+
+
+def planar_region(data: ViewData, planar_deg: float) -> tuple[Mask, Array]:
+    """Counted pixels of the largest nearly planar patch, and their mean true normal.
+
+    Returns
+    -------
+    (H, W) bool, and (3,) unit, camera frame; NaN where no pixel is counted.
+    """
+    normals = data.normals_in_cam[data.counted].astype(np.float64)
+    region = np.zeros_like(data.counted)
+    if len(normals) == 0:
+        return region, np.full(3, np.nan)
+    candidates = normals[np.linspace(0, len(normals) - 1, NUM_CANDIDATES).astype(int)]
+    near = np.cos(np.radians(planar_deg))
+    shares = [(normals[::7] @ candidate > near).sum() for candidate in candidates]
+    inside = normals @ candidates[int(np.argmax(shares))] > near
+    region[data.counted] = inside
+    mean = normals[inside].sum(axis=0)
+    return region, mean / np.linalg.norm(mean)
+
+
+def _pixels(data: ViewData, model: Model, region: Mask) -> tuple[Floats, Floats, Floats]:
+    """Axial pair (2, N), rays (3, N) and phase deviation (N,) of the region's pixels."""
+    stokes: Stokes = data.blurred_for(model)
+    axial = np.ascontiguousarray(data.axial(model)[region].T)
+    rays = np.ascontiguousarray(data.rays[region].T)
+    return axial, rays, stokes.sigma_aolp[region]
+
+
+def _tilt_turn(axial: Floats, corrected: Floats) -> Floats:
+    """What tilted polarizers turn the phase by, (N,) rad, of axial pairs (2, N)."""
+    sine = axial[1] * corrected[0] - axial[0] * corrected[1]
+    return np.asarray(0.5 * np.arctan2(sine, (axial * corrected).sum(axis=0)))
+
+
+def _error_deg(estimate: PlaneEstimate, true_normal: Array) -> float:
+    return float(angular_errors_deg(estimate.normal, true_normal)) if estimate.valid else np.nan
+
+
+def _ambiguity(model: Model, normal: Array, axial: Array, rays: Array, sigma: Array) -> Ambiguity:
+    """Residuals of a normal and of its twin, and whether the rows tell them apart."""
+    turned = normal * [-1.0, -1.0, 1.0]
+    rmse = [
+        float(np.degrees(np.sqrt(np.nanmean(phase_residuals(model, n, axial, rays) ** 2))))
+        for n in (normal, turned)
+    ]
+    determined = plane_normal(model, axial, rays, sigma, robust=False).valid
+    return Ambiguity(rmse_deg=rmse[0], rmse_turned_deg=rmse[1], determined_share=float(determined))
+
+
+def _pool(parts: list[Ambiguity]) -> Ambiguity:
+    """Over all views, each of the same weight."""
+    return Ambiguity(
+        rmse_deg=float(np.sqrt(np.mean([p.rmse_deg**2 for p in parts]))),
+        rmse_turned_deg=float(np.sqrt(np.mean([p.rmse_turned_deg**2 for p in parts]))),
+        determined_share=float(np.mean([p.determined_share for p in parts])),
+    )
