@@ -31,6 +31,7 @@ from polmvs.workspace import Workspace, write_json
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Load = Callable[[str], tuple[Image, Image]]  # phase and DoLP (H, W) of an image, by its name
 
 MIN_DOLP = 0.1  # of pixels whose phase is compared
 MAX_RESIDUAL_POINTS = 100_000  # of a cloud, evenly spread, that phase residuals are taken from
@@ -180,7 +181,7 @@ class LazyPhases(Mapping[str, Image]):
     load : gives phase and DoLP (H, W) of an image.
     """
 
-    def __init__(self, names: Sequence[str], load: Callable[[str], tuple[Image, Image]]) -> None:
+    def __init__(self, names: Sequence[str], load: Load) -> None:
         self.names = tuple(names)
         self.load = load
         self.dolps: dict[str, Image] = {}
@@ -227,7 +228,7 @@ def phase_errors(
         turn = np.where(phase_map.diffuse, np.float32(0), np.float32(np.pi / 2))
         return np.where(stokes.valid, stokes.aolp + turn, np.float32(np.nan)), stokes.dolp
 
-    sources = {
+    sources: dict[str, tuple[Load, Load]] = {
         "maps": (lambda n: _of_map(stored[_stem(n)]), lambda n: _of_map(corrected[_stem(n)])),
         "pixels": (partial(of_pixels, tilted=False), partial(of_pixels, tilted=True)),
     }

@@ -149,7 +149,7 @@ class PropagationOptions:
         "the iso-depth paths, as in the paper)",
     )
     step_px: float = option(0.5, "step of the contours, px")
-    spacing_px: float = option(5.0, "distance between contours and between their nodes, px")
+    spacing_px: float = option(6.0, "distance between contours and between their nodes, px")
     stride_px: int = option(2, "distance between the dense points of one view, px")
     num_rounds: int = option(3, "rounds of normals and ranges")
     max_neighbors: int = option(15, "other views that give rows to one view")

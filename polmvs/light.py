@@ -19,7 +19,13 @@ from polmvs.camera import sample_image
 from polmvs.config import Model, NormalOptions
 from polmvs.normals import NormalEstimate
 from polmvs.phasemap import PhaseMap, turned
-from polmvs.tracks import Tracks, track_normals
+from polmvs.tracks import (
+    Tracks,
+    inside_shares,
+    normals_from_windows,
+    some_tracks,
+    window_map,
+)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -46,9 +52,11 @@ def find_diffuse(tracks: Tracks, maps: Sequence[PhaseMap]) -> list[Mask]:
     One ``(H, W)`` bool mask for each map.
     """
     options = NormalOptions()
-    opposite = [turned(m, np.ones(m.region.inside.shape, bool)) for m in maps]
-    specular = track_normals(Model.PPA, tracks, maps, options)
-    diffuse = track_normals(Model.PPA, tracks, opposite, options)
+    tracks = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
+    windows = [window_map(phase_map, options.window_px) for phase_map in maps]
+    opposite = [turned(m, np.ones(m.region.inside.shape, bool)) for m in windows]
+    specular = normals_from_windows(Model.PPA, tracks, windows, options.estimator)
+    diffuse = normals_from_windows(Model.PPA, tracks, opposite, options.estimator)
     votes, voting = specular_votes(specular, diffuse)
     overall = float(votes[voting].sum()) + _dolp_votes(maps)
     return [_diffuse_parts(m, tracks, votes, voting, overall) for m in maps]

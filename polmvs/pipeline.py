@@ -12,9 +12,9 @@ from polmvs import stages
 from polmvs.comparison import write_comparison
 from polmvs.config import Model, Options, RunOptions
 from polmvs.errors import OptionError
-from polmvs.option_values import to_plain
 from polmvs.run import (
     EVALUATE,
+    POSES,
     Monitor,
     Report,
     Run,
@@ -22,11 +22,13 @@ from polmvs.run import (
     densify_stage,
     normals_stage,
     open_run,
+    options_of,
 )
 from polmvs.workspace import Workspace
 
 COMPARED = (Model.OPA, Model.PPA, Model.TILTED)
 MIN_SFM_IMAGES = 2
+BEFORE_MAPS = ("capture", *POSES)
 
 NO_REGION = (
     "no polarised region: no view shows a surface with polarised light. Lower --min-dolp, check "
@@ -104,7 +106,7 @@ def compare(job: Job, models: Sequence[Model] = COMPARED) -> Outcome:
 
 def find_poses(job: Job) -> Outcome:
     """SfM alone: ``OUT/images`` and ``OUT/sparse``."""
-    with _open(job, min_images=MIN_SFM_IMAGES) as run:
+    with _open(job, BEFORE_MAPS, min_images=MIN_SFM_IMAGES) as run:
         run.do(_capture_stage(run))
         run.do(_pose_stage(run))
         return _close(run, ())
@@ -112,7 +114,8 @@ def find_poses(job: Job) -> Outcome:
 
 def solve_normals(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
     """Normals of the sparse points of a folder that has poses."""
-    with _open(job, min_images=stages.MIN_VIEWS, goes_on=True) as run:
+    own = ("maps", *_normal_names(models))
+    with _open(job, BEFORE_MAPS, own, goes_on=True) as run:
         todo = [_map_stage(run), *_normal_stages(run, models)]
         _begin_again(run, todo, job.how)
         for stage in todo:
@@ -122,7 +125,8 @@ def solve_normals(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
 
 def densify(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
     """Dense clouds of a folder that has normals."""
-    with _open(job, min_images=stages.MIN_VIEWS, goes_on=True) as run:
+    before = (*BEFORE_MAPS, "maps", *_normal_names(models))
+    with _open(job, before, [densify_stage(m) for m in models], goes_on=True) as run:
         todo = [_densify_stage(run, model) for model in models]
         _begin_again(run, todo, job.how)
         for stage in todo:
@@ -131,7 +135,8 @@ def densify(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
 
 
 def _whole_chain(job: Job, models: Sequence[Model], *, evaluated: bool) -> Outcome:
-    with _open(job, min_images=stages.MIN_VIEWS) as run:
+    names = (*BEFORE_MAPS, "maps", *_normal_names(models), *map(densify_stage, models))
+    with _open(job, names) as run:
         run.do(_capture_stage(run))
         run.do(_pose_stage(run))
         run.do(_map_stage(run))
@@ -144,13 +149,22 @@ def _whole_chain(job: Job, models: Sequence[Model], *, evaluated: bool) -> Outco
         return _close(run, models)
 
 
-def _open(job: Job, *, min_images: int, goes_on: bool = False) -> AbstractContextManager[Run]:
+def _open(
+    job: Job,
+    uses: Sequence[str],
+    own: Sequence[str] = (),
+    *,
+    min_images: int = stages.MIN_VIEWS,
+    goes_on: bool = False,
+) -> AbstractContextManager[Run]:
+    """Open the run; ``own`` stages of one that goes on are done again if that is asked for."""
     return open_run(
         job.capture,
         job.out,
         job.options,
         job.how,
         min_images=min_images,
+        uses=uses if job.how.overwrite else (*uses, *own),
         goes_on=goes_on,
         monitor=job.monitor,
         command_line=job.command_line,
@@ -216,9 +230,17 @@ def _map_stage(run: Run) -> Stage:
     return Stage(name="maps", work=work, after=("sfm",), total=_num_views(run))
 
 
+def _normal_models(models: Sequence[Model]) -> list[Model]:
+    """PPA first: it selects the seeds, which are the same for all models."""
+    return list(dict.fromkeys((Model.PPA, *models)))
+
+
+def _normal_names(models: Sequence[Model]) -> list[str]:
+    return [normals_stage(model) for model in _normal_models(models)]
+
+
 def _normal_stages(run: Run, models: Sequence[Model]) -> list[Stage]:
-    """PPA's first: it selects the seeds, which are the same for all models."""
-    return [_normal_stage(run, model) for model in dict.fromkeys((Model.PPA, *models))]
+    return [_normal_stage(run, model) for model in _normal_models(models)]
 
 
 def _normal_stage(run: Run, model: Model) -> Stage:
@@ -247,8 +269,6 @@ def _densify_stage(run: Run, model: Model) -> Stage:
 
 
 def _evaluate_stage(run: Run, models: Sequence[Model]) -> Stage:
-    evaluation = run.options.evaluation
-
     def work(report: Report) -> stages.Facts:
         write_comparison(
             run.capture,
@@ -258,10 +278,10 @@ def _evaluate_stage(run: Run, models: Sequence[Model]) -> Stage:
             run.record.results,
             workers=run.workers,
         )
-        return {"evaluation": to_plain(evaluation)}
+        return {}
 
     stage = Stage(name=EVALUATE, work=work, after=tuple(densify_stage(m) for m in models))
-    if run.record.results.get("evaluation") != to_plain(evaluation):
+    if run.record.stage_options.get(EVALUATE) != options_of(EVALUATE, run.options):
         run.record.forget([EVALUATE])
     return stage
 

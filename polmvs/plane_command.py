@@ -41,8 +41,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         type=Model,
         choices=list(Model),
         default=Model.PPA,
-        help="relation of measured angle and normal; 'tilted' presumes a lens that is not "
-        "telecentric on the image side (default: %(default)s)",
+        help="angle and normal; 'tilted' presumes a lens not telecentric on the image side "
+        "(default: %(default)s)",
     )
     parser.add_argument(
         "--light",
@@ -64,9 +64,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         help="estimate the focal length from the plane (tilted model); used where --intrinsics "
         "are not given",
     )
-    parser.add_argument(
-        "--find-planes", action="store_true", help="find all planes among the pixels"
-    )
+    parser.add_argument("--find-planes", action="store_true", help="find all planes in view")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     return parser
@@ -257,24 +255,25 @@ def _focal_figures(focal: FocalEstimate) -> dict[str, Any]:
 
 
 def _center(mask: Mask) -> list[float]:
-    rows, cols = np.nonzero(mask)
-    return [float(cols.mean() + 0.5), float(rows.mean() + 0.5)]
+    row, col = np.argwhere(mask).mean(axis=0)
+    return [float(col + 0.5), float(row + 0.5)]
 
 
 def _text(result: dict[str, Any]) -> str:
     """The figures for people."""
     fx, fy, cx, cy = result["intrinsics"]
-    plane = result["plane"]
     source = {"assumed": " (assumed: give --intrinsics)", "estimated": " (estimated)"}
     lines = [
         f"{result['image']}: {result['width']}x{result['height']} px, "
-        f"{plane['num_pixels']:,} pixels with a DoLP above {result['min_dolp']:g}",
+        f"{result['plane']['num_pixels']:,} pixels with a DoLP above {result['min_dolp']:g}",
         f"intrinsics    {fx:.6g},{fy:.6g},{cx:.6g},{cy:.6g}"
         + source.get(result["intrinsics_from"], ""),
     ]
     if "focal" in result:
         lines.append(_focal_line(result["focal"]))
-    lines.append(f"normal        {_plane_line(plane)}, {result['model']}, {result['estimator']}")
+    lines.append(
+        f"normal        {_plane_line(result['plane'])}, {result['model']}, {result['estimator']}"
+    )
     for index, found in enumerate(result.get("planes", [])):
         x, y = found["center_xy"]
         place = f"{found['num_pixels']:,} px about {x:.0f},{y:.0f}"

@@ -4,6 +4,12 @@ Under PPA a change of the focal length is a change of the plane's normal (the ro
 ``n_x sin + n_y cos - (x sin + y cos) n_z / f``), so that every focal length fits alike. The
 correction of the tilted model depends on the true obliqueness of the rays: of all focal lengths
 one leaves the least phase residual.
+
+Light that no single normal explains (mixed with that from under the surface, or from a second
+reflection) shifts the minimum by more than its deviation: on a real pond of nominally 870 px it
+was 837 +- 22, 880 +- 22 and 908 +- 25 px from the pixels with a DoLP over 0.35, 0.45 and 0.55. The
+correction is not linear in noise: blur images of weak polarisation (noise over a tenth of the
+polarised intensity) first.
 """
 
 from __future__ import annotations
@@ -20,13 +26,13 @@ from polmvs.config import Light, Model
 from polmvs.normals import CAUCHY_SCALE
 from polmvs.phase_errors import error_gradients, phase_errors, stack_samples
 from polmvs.plane import PlaneEstimate, plane_normal, robust_deviation, tangents
-from polmvs.tilted import correct_parameters
+from polmvs.tilted import correct_parameters, sigma_scale
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Array: TypeAlias = NDArray[np.float64]
 
-NUM_PIXELS = 30_000  # that are used of the given ones, at least if there are as many
-NUM_FOCALS = 24  # of the scan
+NUM_PIXELS = 20_000  # that are used of the given ones, at least if there are as many
+NUM_FOCALS = 20  # of the scan
 NUM_RUNS = 32  # of pixels from whose scatter the uncertainty is taken
 MIN_EIGENVALUE = 1e-6  # of the scaled normal equations: flatter is not observable
 LOG_STEP = 0.01  # of the numerical derivative on the logarithm of the focal length
@@ -68,24 +74,30 @@ class _View:
     model: Model
     light: Light
 
-    def axial_and_rays(self, focal_px: float) -> tuple[Floats, Floats]:
-        """Axial pairs (2, N) and unit rays (3, N) at a focal length."""
+    def phases(self, focal_px: float) -> tuple[Floats, Floats, Floats]:
+        """Axial pairs (2, N), unit rays (3, N) and sigma (N,) at a focal length.
+
+        The correction stretches the noise of the phase: sigma is that of the corrected one, so
+        that errors over sigma mean the same at every focal length.
+        """
         one = np.ones_like(self.offsets[:1])
         rays = np.concatenate([self.offsets / self.offsets.dtype.type(focal_px), one])
         rays /= np.sqrt((rays * rays).sum(axis=0))
-        parameters = self.parameters
+        parameters, sigma = self.parameters, self.sigma
         if self.model is Model.TILTED:
             parameters = correct_parameters(parameters, rays.T, light=self.light)
-        return -parameters[1:] if self.light is Light.SPECULAR else parameters[1:], rays
+            sigma = sigma * sigma_scale(parameters[1], parameters[2], rays.T, light=self.light)
+        axial = -parameters[1:] if self.light is Light.SPECULAR else parameters[1:]
+        return axial, rays, sigma
 
     def plane(self, focal_px: float) -> PlaneEstimate:
         """Robust normal at a focal length."""
-        return plane_normal(self.model, *self.axial_and_rays(focal_px), self.sigma)
+        return plane_normal(self.model, *self.phases(focal_px))
 
     def errors(self, focal_px: float, normal: Floats) -> Floats:
         """Phase errors (N,) over their sigma."""
-        samples = stack_samples(self.model, *self.axial_and_rays(focal_px), self.sigma)
-        return phase_errors(normal, samples) / self.sigma
+        samples = stack_samples(self.model, *self.phases(focal_px))
+        return np.asarray(phase_errors(normal, samples) * np.sqrt(samples[4]))
 
 
 def estimate_focal(
@@ -176,8 +188,8 @@ def _log_sigma(view: _View, focal: float, normal: Array, scale: float) -> float:
     step = float(np.exp(LOG_STEP))
     error = view.errors(focal, normal)
     slope = (view.errors(focal * step, normal) - view.errors(focal / step, normal)) / (2 * LOG_STEP)
-    samples = stack_samples(view.model, *view.axial_and_rays(focal), view.sigma)
-    on_normal = tangents(normal) @ error_gradients(normal, samples) / view.sigma
+    samples = stack_samples(view.model, *view.phases(focal))
+    on_normal = tangents(normal) @ error_gradients(normal, samples) * np.sqrt(samples[4])
     gradients = np.stack([*on_normal, slope]).astype(np.float64)
     weighted = gradients / (1 + np.square(error / (CAUCHY_SCALE * scale)))
     matrix = weighted @ gradients.T

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -154,6 +154,7 @@ class Run:
         self.record.results.update(facts)
         peak = round(peak_rss_mb(), 1)
         self.record.stages.append(StageRecord(name=stage.name, seconds=seconds, peak_rss_mb=peak))
+        self.record.stage_options[stage.name] = options_of(stage.name, self.options)
         self.save()
 
     def forget(self, name: str) -> None:
@@ -183,6 +184,7 @@ def open_run(
     how: RunOptions,
     *,
     min_images: int,
+    uses: Collection[str],
     goes_on: bool = False,
     monitor: Monitor | None = None,
     command_line: Sequence[str] = (),
@@ -197,6 +199,7 @@ def open_run(
     options : of all stages.
     how : workers, overwrite and resume.
     min_images : the fewest that will do.
+    uses : names of the stages that are taken over if they are finished.
     goes_on : the folder must hold a run, and its finished stages stay, whatever ``how`` says.
     monitor : who watches.
     command_line : for the record.
@@ -219,7 +222,8 @@ def open_run(
         resume=how.resume or goes_on,
     )
     identity = _identity(capture)
-    _require_same(record, identity, options, workspace)
+    _require_same_capture(record, identity, workspace)
+    _require_same_options(record, options, uses, workspace)
     record.capture, record.images = identity, list(image_names(capture))
     record.command_line, record.versions = list(command_line), versions()
     record.options = to_plain(options)
@@ -291,37 +295,40 @@ def _check_input(capture: Capture, options: Options, min_images: int) -> SparseM
     return None
 
 
-def _require_same(
-    record: Record, identity: dict[str, Any], options: Options, workspace: Workspace
+def _require_same_capture(record: Record, identity: dict[str, Any], workspace: Workspace) -> None:
+    """Finished stages must be of this capture."""
+    same = all(record.capture.get(key) == identity[key] for key in ("width", "height", "bytes"))
+    if record.stages and not same:
+        raise DataError(
+            workspace.root,
+            f"holds a run of another capture ({record.capture.get('folder')}), or its images have "
+            "changed. Give another OUT, or --overwrite.",
+        )
+
+
+def _require_same_options(
+    record: Record, options: Options, uses: Collection[str], workspace: Workspace
 ) -> None:
-    """Finished stages must be of this capture and of these options."""
-    if not record.stages:
-        return
-    for key in ("width", "height", "bytes"):
-        if record.capture.get(key) != identity[key]:
-            raise DataError(
-                workspace.root,
-                f"holds a run of another capture ({record.capture.get('folder')}), or its images "
-                "have changed. Give another OUT, or --overwrite.",
-            )
-    now = to_plain(options)
+    """Finished stages that are taken over must be of these options."""
     for stage in record.stages:
-        if stage.name == EVALUATE:  # cheap, and no stage reads it: it is done again
+        if stage.name not in uses:
             continue
-        for group in STAGE_OPTIONS.get(stage.name, ()):
-            _require_same_group(stage.name, record.options.get(group, {}), now[group], workspace)
+        before = record.stage_options.get(stage.name, {})
+        for group, now in options_of(stage.name, options).items():
+            for key, value in now.items():
+                earlier = before.get(group, {}).get(key)
+                if earlier != value:
+                    flag = "--" + key.replace("_", "-")
+                    raise OptionError(
+                        f"{flag} is {_text(value)} but the finished stage {stage.name!r} in "
+                        f"{workspace.root} used {_text(earlier)}. Give the same value, or "
+                        "--overwrite."
+                    )
 
 
-def _require_same_group(
-    stage: str, before: dict[str, Any], now: dict[str, Any], workspace: Workspace
-) -> None:
-    for key, value in now.items():
-        if before.get(key) != value:
-            flag = "--" + key.replace("_", "-")
-            raise OptionError(
-                f"{flag} is {_text(value)} but the finished stage {stage!r} in {workspace.root} "
-                f"used {_text(before.get(key))}. Give the same value, or --overwrite."
-            )
+def options_of(stage: str, options: Options) -> dict[str, Any]:
+    """Options that decide the result of a stage, by group, in terms of JSON."""
+    return {group: to_plain(getattr(options, group)) for group in STAGE_OPTIONS[stage]}
 
 
 def _text(value: Any) -> str:

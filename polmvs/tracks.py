@@ -86,27 +86,65 @@ def track_normals(
 ) -> NormalEstimate:
     """Normals of all tracks in one batch (paper, eq. coeff_2).
 
-    First from the views that matched the point, which surely see it, then from every view that
-    faces it.
-
     Parameters
     ----------
-    model : OPA or PPA.
+    model : OPA, PPA or tilted.
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps of the views.
     options : window and estimator.
     """
-    rows = gather_rows(
-        model, tracks.points_in_world, [window_map(m, options.window_px) for m in maps]
-    )
+    windows = [window_map(phase_map, options.window_px) for phase_map in maps]
+    return normals_from_windows(model, tracks, windows, options.estimator)
+
+
+def normals_from_windows(
+    model: Model, tracks: Tracks, windows: Sequence[PhaseMap], estimator: Estimator
+) -> NormalEstimate:
+    """As :func:`track_normals`, from phase maps that are averaged already (:func:`window_map`).
+
+    First from the views that matched the point, which surely see it, then from every view that
+    faces it.
+    """
+    rows = gather_rows(model, tracks.points_in_world, windows)
     matched = np.zeros(rows.sigma.shape, bool)
     matched[tracks.obs_view, tracks.obs_track] = True
-    robust = options.estimator is Estimator.ROBUST
+    robust = estimator is Estimator.ROBUST
     own_sigma = np.where(matched, rows.sigma, np.inf)
     own = solve_normals(rows.rows, rows.rays, own_sigma, robust=robust)
     facing = np.einsum("ikn,ni->kn", rows.rays, np.nan_to_num(own.normals)) < -0.05
     sigma = np.where(matched | facing, rows.sigma, np.inf)
     return solve_normals(rows.rows, rows.rays, sigma, robust=robust, initial_normals=own.normals.T)
+
+
+def some_tracks(tracks: Tracks, chosen: Mask) -> Tracks:
+    """The chosen ``(T,)`` tracks with their observations."""
+    index = np.cumsum(chosen) - 1
+    kept = chosen[tracks.obs_track]
+    return Tracks(
+        point3D_ids=tracks.point3D_ids[chosen],
+        points_in_world=tracks.points_in_world[chosen],
+        colors=tracks.colors[chosen],
+        errors=tracks.errors[chosen],
+        obs_track=index[tracks.obs_track[kept]],
+        obs_view=tracks.obs_view[kept],
+        obs_xy=tracks.obs_xy[kept],
+    )
+
+
+def inside_shares(
+    tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int = BORDER_MARGIN_PX
+) -> Array:
+    """Share ``(T,)`` of each track's observations that lie well inside their view's region."""
+    num_tracks = len(tracks.points_in_world)
+    inside = np.zeros(len(tracks.obs_track), bool)
+    kernel = np.ones((margin_px, margin_px), np.uint8)
+    for k, phase_map in enumerate(maps):
+        flags = phase_map.region.inside.astype(np.uint8)
+        eroded = cv2.erode(flags, kernel, borderType=cv2.BORDER_REPLICATE).astype(np.float32)
+        here = tracks.obs_view == k
+        inside[here] = sample_image(eroded, tracks.obs_xy[here], nearest=True) > 0
+    count = np.bincount(tracks.obs_track, minlength=num_tracks)
+    return np.asarray(np.bincount(tracks.obs_track, inside, num_tracks) / np.maximum(count, 1))
 
 
 def point_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
@@ -135,22 +173,9 @@ def select_seeds(
     -------
     The seeds, and which tracks ``(T,)`` they are.
     """
-    num_tracks = len(tracks.points_in_world)
-    inside = np.zeros(len(tracks.obs_track), bool)
-    kernel = np.ones((BORDER_MARGIN_PX, BORDER_MARGIN_PX), np.uint8)
-    for k, phase_map in enumerate(maps):
-        eroded = cv2.erode(
-            phase_map.region.inside.astype(np.uint8), kernel, borderType=cv2.BORDER_REPLICATE
-        )
-        here = tracks.obs_view == k
-        inside[here] = (
-            sample_image(eroded.astype(np.float32), tracks.obs_xy[here], nearest=True) > 0
-        )
-    count = np.bincount(tracks.obs_track, minlength=num_tracks)
-    share = np.bincount(tracks.obs_track, inside, num_tracks) / np.maximum(count, 1)
     good = (
         estimate.valid
-        & (share >= MIN_INSIDE_SHARE)
+        & (inside_shares(tracks, maps) >= MIN_INSIDE_SHARE)
         & (estimate.num_rows >= 3)
         & (estimate.sigma_deg < MAX_SEED_SIGMA_DEG)
         & (estimate.residual < MAX_SEED_RESIDUAL)

@@ -54,7 +54,8 @@ class Record:
     command_line : how the run was last called.
     capture : the capture's folder, its size in px, and the size in bytes of each file by name.
     images : names of the files in ``images/``.
-    options : resolved options of every stage.
+    options : resolved options of the last call.
+    stage_options : those that each finished stage used.
     versions : of the software.
     stages : finished ones, in order.
     results : what the stages found: numbers of views, points and seeds.
@@ -66,6 +67,7 @@ class Record:
     capture: dict[str, Any] = field(default_factory=dict)
     images: list[str] = field(default_factory=list)
     options: dict[str, Any] = field(default_factory=dict)
+    stage_options: dict[str, dict[str, Any]] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     stages: list[StageRecord] = field(default_factory=list)
     results: dict[str, Any] = field(default_factory=dict)
@@ -79,6 +81,8 @@ class Record:
     def forget(self, names: Sequence[str]) -> None:
         """Drop stages that are to be done again."""
         self.stages = [stage for stage in self.stages if stage.name not in names]
+        for name in names:
+            self.stage_options.pop(name, None)
 
 
 @dataclass(frozen=True)

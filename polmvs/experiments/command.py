@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,7 +17,8 @@ from polmvs.experiments.contours import DEFAULT_NUM_SEEDS, DEFAULT_STEP_PX
 from polmvs.experiments.data import DEFAULT_BLUR_PX, Scene, Truth, open_scene
 from polmvs.experiments.output import NAMES, check_output, write_report
 from polmvs.experiments.plane import DEFAULT_PLANAR_DEG
-from polmvs.experiments.tracks import DEFAULT_NUM_POINTS, Selection, TrackOptions
+from polmvs.experiments.tracks import DEFAULT_NUM_POINTS, TrackOptions
+from polmvs.experiments.view_choice import Selection
 from polmvs.groundtruth import open_ground_truth
 from polmvs.layouts import is_author_layout, open_author_capture
 from polmvs.parallel import Workers
@@ -163,9 +165,9 @@ def run(args: argparse.Namespace, monitor: Monitor | None = None) -> int:
     from polmvs.experiments.reports import num_steps, run_experiment
 
     check_output(args.out, args.name, overwrite=args.overwrite)
-    _require_apart(args)
+    require_apart(args)
     scene = scene_from(args)
-    options = experiment_options(args, scene)
+    options = experiment_options(args, scene, (args.name,))
     watcher = _Silence() if monitor is None else monitor
     with (
         Workers(args.workers) as workers,
@@ -207,8 +209,8 @@ def open_data(folder: Path, gt: Path | None, options: Options) -> tuple[Capture,
     return open_capture(folder, options.capture), open_ground_truth(folder if gt is None else gt)
 
 
-def experiment_options(args: argparse.Namespace, scene: Scene) -> Any:
-    """Options of the experiments, checked against the scene."""
+def experiment_options(args: argparse.Namespace, scene: Scene, names: Sequence[str]) -> Any:
+    """Options of some experiments, checked against the scene."""
     from polmvs.experiments.reports import ExperimentOptions, check_options
 
     for name, value, least in (
@@ -233,7 +235,7 @@ def experiment_options(args: argparse.Namespace, scene: Scene) -> Any:
         num_seeds=args.num_seeds,
         step_px=args.step_px,
     )
-    check_options(scene, options, [getattr(args, "name", "")])
+    check_options(scene, options, names)
     return options
 
 
@@ -260,7 +262,7 @@ def _numbers(text: str | None) -> tuple[int, ...] | None:
         raise OptionError(f"--k needs whole numbers with commas, not {text!r}.") from error
 
 
-def _require_apart(args: argparse.Namespace) -> None:
+def require_apart(args: argparse.Namespace) -> None:
     """Results must not mix with the input."""
     out = args.out.resolve()
     places = [args.capture, *(args.capture / name for name in ("raw", "images", "cams", "gt"))]

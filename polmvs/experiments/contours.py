@@ -216,7 +216,7 @@ def edge_seeds(part: Mask, num: int) -> NDArray[np.float32]:
     if len(outline) == 0:
         return np.zeros((0, 2), np.float32)
     places = (np.arange(num) + 0.5) * (len(outline) / num)
-    return outline[places.astype(int)] + np.float32(0.5)
+    return np.asarray(outline[places.astype(int)] + 0.5, np.float32)
 
 
 def _thinned(

@@ -12,18 +12,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.alignment import AlignmentReport, align_to_truth
+from polmvs.alignment import AlignmentReport
 from polmvs.camera import View
 from polmvs.capture import Capture
-from polmvs.colmap_io import read_model
 from polmvs.config import Light, Model, RegionOptions
 from polmvs.errors import DataError
-from polmvs.geometry import RigidTransform, SimilarityTransform
+from polmvs.experiments.estimated_poses import estimated_views
 from polmvs.groundtruth import GroundTruth
 from polmvs.image_io import read_mask
 from polmvs.phasemap import PhaseMap, build_phase_map, view_rays
 from polmvs.region import Region, find_region, smooth
-from polmvs.sparse_model import match_model_to_capture, short_list
 from polmvs.stages import find_mask
 from polmvs.stokes import Stokes
 from polmvs.tilted import correct_stokes
@@ -190,7 +188,9 @@ def open_scene(
             )
     alignment = None
     if sparse is not None:
-        views, alignment = _estimated_views(sparse, capture, truth, raw_of)
+        # The alignment asks for cameras only, which every truth has.
+        true_cameras = GroundTruth(folder=truth.folder, views=truth.views)
+        views, alignment = estimated_views(sparse, capture, true_cameras, list(raw_of))
     return Scene(
         capture=capture,
         truth=truth,
@@ -213,35 +213,6 @@ def _raw_names(capture: Capture, truth: Truth) -> dict[str, str]:
             f"{capture.names[0]!r}; none match. Give the truth of this capture.",
         )
     return found
-
-
-def _estimated_views(
-    sparse: Path, capture: Capture, truth: Truth, raw_of: Mapping[str, str]
-) -> tuple[list[View], AlignmentReport]:
-    """Views of a COLMAP model in the world of the truth."""
-    names = list(raw_of)
-    model = match_model_to_capture(
-        read_model(sparse), names, capture.width, capture.height, source=sparse
-    )
-    # The alignment asks for cameras only, which every truth has.
-    true_cameras = GroundTruth(folder=truth.folder, views=truth.views)
-    truth_from_world, report = align_to_truth(model.views, true_cameras)
-    if report.dropped:
-        raise DataError(
-            sparse,
-            f"poses of {short_list(report.dropped)} do not match the true ones; give a model "
-            "of this capture without wrongly registered images.",
-        )
-    views = [_in_truth(view, truth_from_world) for view in model.views]
-    return sorted(views, key=lambda view: names.index(view.name)), report
-
-
-def _in_truth(view: View, truth_from_world: SimilarityTransform) -> View:
-    """A view of the estimated world in the true one; its camera frame is scaled to metres."""
-    rotation = view.cam_from_world.rotation @ truth_from_world.rotation.T
-    translation = truth_from_world.scale * view.cam_from_world.translation
-    shifted = translation - rotation @ truth_from_world.translation
-    return replace(view, cam_from_world=RigidTransform(rotation, shifted))
 
 
 def load_view(scene: Scene, index: int) -> ViewData:

@@ -205,7 +205,8 @@ def _normalize(counts: Density) -> Density:
     """Counts to shares of the pixels of each angle's bin."""
     total = counts.sum(axis=-1, keepdims=True)
     enough = np.broadcast_to(total >= MIN_COLUMN_PIXELS, counts.shape)
-    return np.divide(counts, total, out=np.full_like(counts, np.nan), where=enough)
+    shares = np.divide(counts, total, out=np.full_like(counts, np.nan), where=enough)
+    return np.asarray(shares)
 
 
 def _total(tallies: list[ErrorTally]) -> ErrorTally:

@@ -31,6 +31,7 @@ Mask = NDArray[np.bool_]
 DEFAULT_PLANAR_DEG = 5.0
 NUM_CANDIDATES = 64  # normals tried as the middle of a patch
 MIN_PIXELS = 100
+MAX_SPREAD_DEG = 0.2  # of the true normals of a plane; 16-bit maps have less
 
 # A lens may or may not tilt the polarizers (:mod:`polmvs.tilted`), and PPA leaves that out: what
 # it would turn a pixel's phase by is part of the phase's uncertainty. It is common to a whole part
@@ -64,6 +65,7 @@ class ImagePlane:
     ----------
     name : of the image.
     num_pixels : of the region.
+    spread_deg : root mean square angle of the region's true normals to their mean, degrees.
     error_deg : angle to the true normal; NaN where none was found.
     sigma_deg : as the estimator reports it.
     seconds : wall time of the estimate.
@@ -71,6 +73,7 @@ class ImagePlane:
 
     name: str
     num_pixels: int
+    spread_deg: float
     error_deg: Mapping[str, float]
     sigma_deg: Mapping[str, float]
     seconds: Mapping[str, float]
@@ -112,6 +115,16 @@ class PlaneResult:
     per_image: tuple[ImagePlane, ...]
     skipped: tuple[str, ...]
     ambiguity: Mapping[Model, Ambiguity]
+
+    @property
+    def spread_deg(self) -> float:
+        """Median over the images of the spread of the region's true normals, degrees."""
+        return float(np.median([image.spread_deg for image in self.per_image]))
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether the regions are planes rather than patches of a curved part."""
+        return self.spread_deg < MAX_SPREAD_DEG
 
 
 def measure_plane(
@@ -173,6 +186,7 @@ def measure_image(
     image = ImagePlane(
         name=data.view.name,
         num_pixels=int(region.sum()),
+        spread_deg=_spread_deg(data.normals_in_cam[region], true_normal),
         error_deg={name: _error_deg(e, true_normal) for name, e in estimates.items()},
         sigma_deg={name: e.sigma_deg for name, e in estimates.items()},
         seconds=seconds,
@@ -215,11 +229,17 @@ def _tilt_turn(axial: Floats, corrected: Floats) -> Floats:
     return np.asarray(0.5 * np.arctan2(sine, (axial * corrected).sum(axis=0)))
 
 
+def _spread_deg(normals: Floats, mean: Array) -> float:
+    return AngleStats.from_degrees(angular_errors_deg(normals, mean)).rmse_deg
+
+
 def _error_deg(estimate: PlaneEstimate, true_normal: Array) -> float:
     return float(angular_errors_deg(estimate.normal, true_normal)) if estimate.valid else np.nan
 
 
-def _ambiguity(model: Model, normal: Array, axial: Array, rays: Array, sigma: Array) -> Ambiguity:
+def _ambiguity(
+    model: Model, normal: Array, axial: Floats, rays: Floats, sigma: Floats
+) -> Ambiguity:
     """Residuals of a normal and of its twin, and whether the rows tell them apart."""
     turned = normal * [-1.0, -1.0, 1.0]
     rmse = [

@@ -23,7 +23,8 @@ from polmvs.experiments.output import Report
 from polmvs.experiments.phase import measure_phase, phase_images
 from polmvs.experiments.plane import DEFAULT_PLANAR_DEG, TILT_FACTOR, measure_plane
 from polmvs.experiments.surfaces import open_surface
-from polmvs.experiments.tracks import TrackOptions, check_k, measure_tracks
+from polmvs.experiments.tracks import TrackOptions, measure_tracks
+from polmvs.experiments.view_choice import check_k
 from polmvs.parallel import Workers
 
 Progress = Callable[[int], None]
@@ -128,11 +129,22 @@ def _run_plane(
         "tilted polarizer would turn a phase by into its uncertainty: an error that neighbours "
         f"share. {_poses(scene)}\n\n{tables.plane_table(result)}"
     )
+    if not result.is_planar:
+        text += (
+            f"\nThis part is curved: the regions are patches whose true normals spread by "
+            f"{result.spread_deg:.1f}° (RMS). In one view curvature looks like perspective, so that "
+            "these errors are those of calling such a patch a plane.\n"
+        )
     caption = "Angular error of the normal of each image; phase residual of its twin"
     return Report(
         name="plane",
         title="Normal of a planar region from one view",
-        content={"settings": settings, **tables.plane_json(result)},
+        content={
+            "settings": settings,
+            "is_planar": result.is_planar,
+            "normal_spread_deg": result.spread_deg,
+            **tables.plane_json(result),
+        },
         text=text,
         figures={"plane_errors.png": (caption, figures.draw_plane(result))},
         lines={},
