@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,22 +16,21 @@ from polmvs.capture import Capture
 from polmvs.cloud_io import Cloud, read_cloud
 from polmvs.colmap_io import read_model
 from polmvs.config import Model, Options
-from polmvs.evaluate import evaluate, phase_errors_on_part, track_normal_errors
+from polmvs.evaluate import evaluate, track_normal_errors
 from polmvs.groundtruth import GroundTruth, open_ground_truth
 from polmvs.image_io import write_bytes
 from polmvs.metrics import AngleStats, axial_errors_deg
 from polmvs.models import phase_from_normal
 from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
-from polmvs.phasemap import PhaseMap, correct_for_tilt, view_rays
+from polmvs.phase_comparison import phase_errors, stem_of
+from polmvs.phasemap import PhaseMap
 from polmvs.stages import open_maps
 from polmvs.summary import summary_text
 from polmvs.workspace import Workspace, write_json
 
 Floats = NDArray[np.floating]
-Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-Load = Callable[[str], tuple[Image, Image]]  # phase and DoLP (H, W) of an image, by its name
 
 MIN_DOLP = 0.1  # of pixels whose phase is compared
 MAX_RESIDUAL_POINTS = 100_000  # of a cloud, evenly spread, that phase residuals are taken from
@@ -172,92 +171,10 @@ def phase_residuals_deg(
     return np.where(counted, axial_errors_deg(measured, predicted), np.nan)
 
 
-class LazyPhases(Mapping[str, Image]):
-    """Phase of images by name, with their DoLP in ``dolps``; one image is held at a time.
-
-    Parameters
-    ----------
-    names : of the images.
-    load : gives phase and DoLP (H, W) of an image.
-    """
-
-    def __init__(self, names: Sequence[str], load: Load) -> None:
-        self.names = tuple(names)
-        self.load = load
-        self.dolps: dict[str, Image] = {}
-
-    def __getitem__(self, name: str) -> Image:
-        """Phase (H, W), rad, NaN where there is none; its DoLP is then in ``dolps``."""
-        phase, dolp = self.load(name)
-        self.dolps.clear()
-        self.dolps[name] = dolp
-        return phase
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.names)
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-
-def phase_errors(
-    capture: Capture, maps: Sequence[PhaseMap], tilted_maps: Sequence[PhaseMap], truth: GroundTruth
-) -> dict[str, dict[Model, AngleStats]]:
-    """Errors of the measured phase on the part, under each model with the true normals.
-
-    Parameters
-    ----------
-    capture : whose single pixels are measured too.
-    maps, tilted_maps : of the same views, for OPA and PPA and for the tilted model.
-    truth : with the true normals.
-
-    Returns
-    -------
-    ``maps``: of the phase maps, which the geometry uses. ``pixels``: of the single pixels of the
-    capture, those neither clipped nor dark.
-    """
-    stored = {_stem(phase_map.view.name): phase_map for phase_map in maps}
-    corrected = {_stem(phase_map.view.name): phase_map for phase_map in tilted_maps}
-    raw = {_stem(name): name for name in capture.names}
-
-    def of_pixels(name: str, *, tilted: bool) -> tuple[Image, Image]:
-        phase_map = stored[_stem(name)]
-        stokes = capture.load(raw[_stem(name)])
-        if tilted:
-            stokes = correct_for_tilt(stokes, view_rays(phase_map.view), phase_map.diffuse)
-        turn = np.where(phase_map.diffuse, np.float32(0), np.float32(np.pi / 2))
-        return np.where(stokes.valid, stokes.aolp + turn, np.float32(np.nan)), stokes.dolp
-
-    sources: dict[str, tuple[Load, Load]] = {
-        "maps": (lambda n: _of_map(stored[_stem(n)]), lambda n: _of_map(corrected[_stem(n)])),
-        "pixels": (partial(of_pixels, tilted=False), partial(of_pixels, tilted=True)),
-    }
-    names = [name for name in truth.names if _stem(name) in stored]
-    errors = {}
-    for source, (measured, as_ppa) in sources.items():
-        phases, ppa_phases = LazyPhases(names, measured), LazyPhases(names, as_ppa)
-        errors[source] = phase_errors_on_part(phases, phases.dolps, truth)
-        # The corrected phase is one that PPA predicts.
-        of_tilted = phase_errors_on_part(ppa_phases, ppa_phases.dolps, truth)[Model.PPA]
-        errors[source][Model.TILTED] = of_tilted
-    return errors
-
-
-def _of_map(phase_map: PhaseMap) -> tuple[Image, Image]:
-    """Phase, NaN where there is none, and DoLP of a phase map."""
-    cos, sin, precision = np.moveaxis(phase_map.samples, -1, 0)
-    phase = np.where(precision > 0, 0.5 * np.arctan2(sin, cos), np.nan)
-    return phase.astype(np.float32), np.hypot(cos, sin)
-
-
-def _stem(name: str) -> str:
-    return PurePosixPath(name).stem
-
-
 def named_as_truth(views: Sequence[View], truth: GroundTruth) -> list[View]:
     """Views under the truth's names, which may have another suffix."""
-    by_stem = {_stem(name): name for name in truth.names}
-    return [replace(view, name=by_stem.get(_stem(view.name), view.name)) for view in views]
+    by_stem = {stem_of(name): name for name in truth.names}
+    return [replace(view, name=by_stem.get(stem_of(view.name), view.name)) for view in views]
 
 
 def measure_against_truth(

@@ -8,22 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from polmvs import stages
+from polmvs import cloud_stages, stages
 from polmvs.comparison import write_comparison
 from polmvs.config import Model, Options, RunOptions
 from polmvs.errors import OptionError
-from polmvs.run import (
-    EVALUATE,
-    POSES,
-    Monitor,
-    Report,
-    Run,
-    Stage,
-    densify_stage,
-    normals_stage,
-    open_run,
-    options_of,
-)
+from polmvs.run import Monitor, Report, Run, Stage, open_run
+from polmvs.run_checks import EVALUATE, POSES, densify_stage, normals_stage, options_of
 from polmvs.workspace import Workspace
 
 COMPARED = (Model.OPA, Model.PPA, Model.TILTED)
@@ -245,7 +235,7 @@ def _normal_stages(run: Run, models: Sequence[Model]) -> list[Stage]:
 
 def _normal_stage(run: Run, model: Model) -> Stage:
     def work(report: Report) -> stages.Facts:
-        return stages.solve_tracks(model, run.workspace, run.options.normals)
+        return cloud_stages.solve_tracks(model, run.workspace, run.options.normals)
 
     first = normals_stage(Model.PPA)
     after = "maps" if model is Model.PPA else first
@@ -256,7 +246,7 @@ def _densify_stage(run: Run, model: Model) -> Stage:
     propagation, fusion = run.options.propagation, run.options.fusion
 
     def work(report: Report) -> stages.Facts:
-        return stages.densify(
+        return cloud_stages.densify(
             model, run.workspace, propagation, fusion, workers=run.workers, report=report
         )
 
@@ -264,7 +254,7 @@ def _densify_stage(run: Run, model: Model) -> Stage:
         name=densify_stage(model),
         work=work,
         after=(normals_stage(Model.PPA), normals_stage(model)),
-        total=stages.densify_steps(_num_views(run), propagation),
+        total=cloud_stages.densify_steps(_num_views(run), propagation),
     )
 
 

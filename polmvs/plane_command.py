@@ -24,7 +24,6 @@ from polmvs.stokes import Stokes
 Mask = NDArray[np.bool_]
 
 MIN_PIXELS = 50
-MIN_INTENSITY = 0.5
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -97,7 +96,7 @@ def _add_pixel_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--min-intensity",
         type=float,
-        default=MIN_INTENSITY,
+        default=0.5,
         help="share of the pixels' median intensity from which one counts: where something dark "
         "is reflected, other light shows; 0: all (default: %(default)s)",
     )

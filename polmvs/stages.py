@@ -1,7 +1,8 @@
-"""The stages of a reconstruction: each reads what the stage before wrote, and writes its own.
+"""The stages from a capture to phase maps; :mod:`polmvs.cloud_stages` has those that follow.
 
-Every function writes whole files or folders only and returns what it found, in numbers. The order
-of the stages, their record and how a run goes on are in :mod:`polmvs.pipeline`.
+Each reads what the stage before wrote. Every function writes whole files or folders only and
+returns what it found, in numbers. Their order is in :mod:`polmvs.pipeline`, their record and how
+a run goes on in :mod:`polmvs.run`.
 """
 
 from __future__ import annotations
@@ -16,23 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import View
-from polmvs.capture import DISPLAY_GAMMA, Capture, intensity_image_8bit
-from polmvs.cloud_io import Cloud, write_cloud
+from polmvs.capture import Capture, intensity_image_8bit
 from polmvs.colmap_io import SparseModel, read_model
-from polmvs.config import (
-    FusionOptions,
-    Light,
-    Model,
-    NormalOptions,
-    PropagationOptions,
-    RegionOptions,
-    SfmOptions,
-)
+from polmvs.config import Light, Model, RegionOptions, SfmOptions
 from polmvs.errors import DataError
-from polmvs.fuse import FusedCloud, fuse
 from polmvs.image_io import read_mask, write_png
 from polmvs.light import find_diffuse
-from polmvs.normals import NormalEstimate
 from polmvs.parallel import Workers
 from polmvs.phasemap import (
     PhaseMap,
@@ -42,12 +32,9 @@ from polmvs.phasemap import (
     store_phase_map,
     turned,
 )
-from polmvs.propagate import propagate
 from polmvs.region import find_region
 from polmvs.sfm import run_sfm
 from polmvs.sparse_model import match_model_to_capture, short_list, write_model
-from polmvs.storage import map_array, save_array
-from polmvs.tracks import Seeds, Tracks, select_seeds, track_normals
 from polmvs.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -234,128 +221,3 @@ def open_maps(workspace: Workspace, model: Model) -> list[PhaseMap]:
     """Phase maps of all posed views for a model; their pixels stay on disk."""
     tilted = model is Model.TILTED
     return [open_phase_map(v, workspace.maps, tilted=tilted) for v in posed_views(workspace)]
-
-
-def solve_tracks(model: Model, workspace: Workspace, options: NormalOptions) -> Facts:
-    """Normals of the sparse points under a model; PPA's also select the seeds."""
-    tracks = read_model(workspace.sparse).tracks
-    maps = open_maps(workspace, model)
-    if len(tracks.point3D_ids) == 0:
-        estimate = _no_estimate(len(maps))
-    else:
-        estimate = track_normals(model, tracks, maps, options)
-    facts: Facts = {f"num_normals_{model}": int(estimate.valid.sum())}
-    if model is Model.PPA:
-        is_seed, sigma = np.zeros(len(tracks.point3D_ids), np.bool_), np.zeros(0)
-        if len(tracks.point3D_ids):
-            seeds, is_seed = select_seeds(tracks, estimate, maps)
-            sigma = seeds.sigma
-        seed_sigma = np.full(len(is_seed), np.nan)
-        seed_sigma[is_seed] = sigma
-        save_array(_seed_file(workspace), seed_sigma)
-        facts["num_seeds"] = int(is_seed.sum())
-    is_seed = np.isfinite(map_array(_seed_file(workspace)))
-    save_array(_normal_file(workspace, model), estimate.normals)
-    write_cloud(workspace.normals(model), _track_cloud(tracks, estimate, is_seed))
-    return facts
-
-
-def _no_estimate(num_views: int) -> NormalEstimate:
-    """The estimate of no tracks."""
-    none = np.zeros(0)
-    return NormalEstimate(
-        normals=np.zeros((0, 3)),
-        valid=np.zeros(0, np.bool_),
-        conditioning=none,
-        sigma_deg=none,
-        residual=none,
-        num_rows=np.zeros(0, np.int64),
-        row_weights=np.zeros((num_views, 0)),
-    )
-
-
-def _seed_file(workspace: Workspace) -> Path:
-    """Standard deviation of each track's place, NaN where it is no seed."""
-    return workspace.maps / "seeds.npy"
-
-
-def _normal_file(workspace: Workspace, model: Model) -> Path:
-    return workspace.maps / f"normals_{model}.npy"
-
-
-def _track_cloud(tracks: Tracks, estimate: NormalEstimate, is_seed: NDArray[np.bool_]) -> Cloud:
-    return Cloud(
-        points=tracks.points_in_world,
-        normals=estimate.normals,
-        colors=tracks.colors,
-        scalars={
-            "sigma_deg": estimate.sigma_deg,
-            "num_views": estimate.num_rows,
-            "residual": estimate.residual,
-            "conditioning": estimate.conditioning,
-            "valid": estimate.valid,
-            "seed": is_seed,
-        },
-    )
-
-
-def load_seeds(model: Model, workspace: Workspace) -> Seeds:
-    """Seeds with the normals of a model; which tracks they are is the same for all models."""
-    points = read_model(workspace.sparse).tracks.points_in_world
-    sigma = np.array(map_array(_seed_file(workspace)))
-    normals = np.array(map_array(_normal_file(workspace, model)))
-    used = np.isfinite(sigma)
-    return Seeds(points[used], normals[used], sigma[used])
-
-
-def densify(
-    model: Model,
-    workspace: Workspace,
-    propagation: PropagationOptions,
-    fusion: FusionOptions,
-    *,
-    workers: Workers,
-    report: Report,
-) -> Facts:
-    """Spread the seeds over the region of every view and fuse the views into one cloud.
-
-    Without a region or seeds the cloud has no points.
-    """
-    maps = open_maps(workspace, model)
-    seeds = load_seeds(model, workspace)
-    num_inside = sum(int(phase_map.region.inside.sum()) for phase_map in maps)
-    if num_inside == 0 or len(seeds.sigma) == 0:
-        write_cloud(workspace.cloud(model), Cloud(np.zeros((0, 3))))
-        return {f"num_points_{model}": 0}
-    with workspace.scratch(f"densify_{model}") as folder:
-        dense = propagate(
-            model, maps, seeds, propagation, folder, workers=workers, on_progress=report
-        )
-        cloud = fuse(
-            maps,
-            dense,
-            fusion,
-            max_neighbors=propagation.max_neighbors,
-            workers=workers,
-            on_progress=report,
-        )
-    write_cloud(workspace.cloud(model), _dense_cloud(cloud))
-    return {f"num_points_{model}": len(cloud.points)}
-
-
-def densify_steps(num_views: int, options: PropagationOptions) -> int:
-    """How many times :func:`densify` reports."""
-    return (options.num_rounds + 2) * num_views
-
-
-def _dense_cloud(cloud: FusedCloud) -> Cloud:
-    """The cloud with grey colours: intensity as COLMAP's images show it, brightest 1 % white."""
-    white = float(np.percentile(cloud.intensity, 99)) if len(cloud.intensity) else 1.0
-    share = np.clip(cloud.intensity / max(white, 1e-9), 0, 1) ** (1 / DISPLAY_GAMMA)
-    grey = np.rint(255 * share).astype(np.uint8)
-    return Cloud(
-        points=cloud.points,
-        normals=cloud.normals,
-        colors=np.repeat(grey[:, None], 3, axis=1),
-        scalars={"num_views": cloud.num_views, "sigma_deg": cloud.sigma_deg},
-    )

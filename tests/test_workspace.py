@@ -7,15 +7,13 @@ import pytest
 
 from polmvs.config import Model
 from polmvs.errors import DataError, OptionError
+from polmvs.record import Record, StageRecord, write_json
 from polmvs.runtime import peak_rss_mb, versions
 from polmvs.workspace import (
-    Record,
-    StageRecord,
     Workspace,
     has_content,
     prepare_output,
     require_apart,
-    write_json,
 )
 
 

@@ -132,8 +132,8 @@ def _run_plane(
     if not result.is_planar:
         text += (
             f"\nThis part is curved: the regions are patches whose true normals spread by "
-            f"{result.spread_deg:.1f}° (RMS). In one view curvature looks like perspective, so that "
-            "these errors are those of calling such a patch a plane.\n"
+            f"{result.spread_deg:.1f}° (RMS). In one view curvature looks like "
+            "perspective: these are the errors of calling such a patch a plane.\n"
         )
     caption = "Angular error of the normal of each image; phase residual of its twin"
     return Report(
