@@ -96,8 +96,8 @@ def _page(
         f"{total:.0f} s with {workers} processes, at most {memory} MB.\n",
     ]
     for capture, own in reports.items():
-        lines.append(f"# {capture}\n")
-        lines += [report.section(f"{capture}/") for report in own]
+        lines.append(f"## {capture}\n")
+        lines += [report.section(f"{capture}/", level=3) for report in own]
     content: dict[str, Any] = {
         "captures": {
             capture: {report.name: report.content for report in own}

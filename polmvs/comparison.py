@@ -25,9 +25,10 @@ from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
 from polmvs.phase_comparison import phase_errors, stem_of
 from polmvs.phasemap import PhaseMap
+from polmvs.record import write_json
 from polmvs.stages import open_maps
 from polmvs.summary import summary_text
-from polmvs.workspace import Workspace, write_json
+from polmvs.workspace import Workspace
 
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]

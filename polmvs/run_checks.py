@@ -32,12 +32,11 @@ def densify_stage(model: Model) -> str:
     return f"densify_{model}"
 
 
-# Stages by what they follow, and the groups of options that decide their results.
+# Groups of options that decide the result of a stage, and the order in which stages follow.
 STAGE_OPTIONS: dict[str, tuple[str, ...]] = {
     "capture": ("capture",),
     **{name: ("sfm",) for name in POSES},
     "maps": ("region",),
-    normals_stage(Model.PPA): ("normals",),
     **{normals_stage(model): ("normals",) for model in Model},
     **{densify_stage(model): ("propagation", "fusion") for model in Model},
     EVALUATE: ("evaluation",),

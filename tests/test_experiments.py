@@ -1,6 +1,7 @@
 """The paper's experiments: exact on analytic scenes, their statistics, output and bad input."""
 
 import argparse
+import importlib.util
 import json
 import shutil
 from dataclasses import dataclass, replace
@@ -336,7 +337,8 @@ def test_true_poses_as_a_model_give_the_same(tmp_path):
     scene = command.scene_from(_arguments(DEMO))
     camera = scene.views[0].camera
     (sparse / "cameras.txt").write_text(
-        f"1 PINHOLE {camera.width} {camera.height} {camera.fx} {camera.fy} {camera.cx} {camera.cy}\n"
+        f"1 PINHOLE {camera.width} {camera.height} "
+        f"{camera.fx} {camera.fy} {camera.cx} {camera.cy}\n"
     )
     lines = []
     for i, view in enumerate(scene.views, 1):
@@ -388,6 +390,35 @@ def test_overwrite_replaces_own_results_only(tmp_path):
         output.check_output(tmp_path, "tracks", overwrite=False)
 
 
-def test_page_of_the_paper(tmp_path, capsys):
-    page = pytest.importorskip("pipelines.paper", reason="needs the repository, not the wheel")
-    assert page.main(["--help"]) == 0 if False else True
+@pytest.fixture
+def page():
+    """The script ``pipelines/paper.py`` as a module."""
+    path = Path(__file__).parents[1] / "pipelines" / "paper.py"
+    spec = importlib.util.spec_from_file_location("paper", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_page_of_the_paper(tmp_path, monkeypatch, page):
+    def report(name, scene, options, workers, progress):
+        figures = {f"{name}.png": ("seen", b"png")}
+        return output.Report(
+            name=name, title=name, content={"value": 1.5}, text="text", figures=figures, lines={}
+        )
+
+    monkeypatch.setattr(page, "run_experiment", report)
+    out = tmp_path / "page"
+    assert page.main([str(out), str(DEMO), "--workers", "1"]) == 0
+    content = json.loads((out / "paper.json").read_text())
+    assert content["captures"]["demo_capture"]["tracks"] == {"value": 1.5}
+    links = _links((out / "paper.md").read_text())
+    assert len(links) == 4
+    assert all((out / link).is_file() for link in links)
+
+
+def test_page_refuses(tmp_path, capsys, page):
+    assert page.main([str(tmp_path / "page"), str(tmp_path / "none")]) == 1
+    assert page.main([str(tmp_path / "page"), str(DEMO), str(DEMO)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 2
+    assert not (tmp_path / "page").exists()

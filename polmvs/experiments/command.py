@@ -57,7 +57,8 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         "experiment",
         help=description,
         description=description[0].upper() + description[1:] + ".",
-        epilog="; ".join(f"{name}: {text}" for name, text in HELP.items()) + ".",
+        epilog="; ".join(f"{name}: {text}" for name, text in HELP.items())
+        + ". The model 'tilted' presumes a lens that is not telecentric on the image side.",
     )
     parser.add_argument("name", choices=NAMES, metavar="NAME", help=", ".join(NAMES))
     parser.add_argument(

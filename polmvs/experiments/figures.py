@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
 from polmvs.config import Model
@@ -116,6 +117,7 @@ def draw_plane(result: PlaneResult) -> bytes:
         )
     left.set_yscale("log")
     left.yaxis.set_major_formatter("{x:g}")
+    left.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(1, 0.5)))
     left.set_xlabel("image, in the order of plane.json")
     left.set_ylabel("angular error of the normal (°)")
     left.grid(True, which="both", alpha=0.25)

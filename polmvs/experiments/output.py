@@ -41,10 +41,10 @@ class Report:
     figures: Mapping[str, tuple[str, bytes]]
     lines: Mapping[str, bytes]
 
-    def section(self, folder: str = "") -> str:
-        """Markdown of the experiment with its figures, which lie in ``folder``."""
+    def section(self, folder: str = "", *, level: int = 1) -> str:
+        """Markdown of the experiment, its heading of a level; figures lie in ``folder``."""
         images = [f"![{caption}]({folder}{name})\n" for name, (caption, _) in self.figures.items()]
-        return "\n".join([f"## {self.title}\n", self.text, *images])
+        return "\n".join([f"{'#' * level} {self.title}\n", self.text, *images])
 
     def files(self) -> dict[str, bytes]:
         """All files by name, the JSON last: where it is, the others are."""
