@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+SHARP_SMOOTHING_PX = 0.7
 FINE_SMOOTHING_PX = 1.5
 COARSE_SMOOTHING_PX = 5.0  # bridges marks and frontal spots
 MODEL_SIGMA = 0.014  # rad; error of a phase that noise does not explain, strongly polarised light
@@ -42,6 +44,8 @@ class PhaseMap:
         variance of the row's turn about its ray (1 / rad^2; 0: no phase here).
     intensity : (H, W) float32, s0 in units of full scale.
     diffuse : (H, W) bool, pixels whose light is diffuse-dominant; the others' is specular.
+    lowest_dolp : (H, W) uint8, lowest DoLP of single pixels next to each pixel, in 1/255: what
+        is printed on a surface is less polarised than it, what is mirrored in it is not.
     folder : where the arrays are stored, if they are.
     tilted : the samples are corrected for tilted polarizers (:func:`as_tilted`).
     """
@@ -51,6 +55,7 @@ class PhaseMap:
     samples: Image
     intensity: Image
     diffuse: Mask
+    lowest_dolp: NDArray[np.uint8]
     folder: Path | None = None
     tilted: bool = False
 
@@ -58,7 +63,7 @@ class PhaseMap:
         """Pickle a stored map as its place."""
         if self.folder is not None:
             return partial(open_phase_map, tilted=self.tilted), (self.view, self.folder)
-        arrays = (self.samples, self.intensity, self.diffuse)
+        arrays = (self.samples, self.intensity, self.diffuse, self.lowest_dolp)
         return PhaseMap, (self.view, self.region, *arrays, None, self.tilted)
 
 
@@ -98,7 +103,17 @@ def build_phase_map(
     samples = np.dstack([axial, precision]).astype(np.float32)
     np.nan_to_num(samples, copy=False, nan=0.0)
     diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
-    return PhaseMap(view, region, samples, np.asarray(s0, np.float32), diffuse)
+    intensity = np.asarray(s0, np.float32)
+    return PhaseMap(view, region, samples, intensity, diffuse, _lowest_dolp(stokes))
+
+
+def _lowest_dolp(stokes: Image) -> NDArray[np.uint8]:
+    """Lowest DoLP in the 3x3 px about each pixel, in 1/255."""
+    sharp = smooth(stokes[..., :3], SHARP_SMOOTHING_PX)
+    dolp = np.hypot(sharp[..., 1], sharp[..., 2]) / np.maximum(sharp[..., 0], 1e-6)
+    quantised = (255 * np.clip(dolp, 0, 1)).astype(np.uint8)
+    lowest = cv2.erode(quantised, np.ones((3, 3), np.uint8))
+    return np.asarray(lowest, np.uint8)
 
 
 def correct_for_tilt(stokes: Stokes, rays: Floats, diffuse: Mask) -> Stokes:
@@ -145,8 +160,8 @@ def as_tilted(phase_map: PhaseMap) -> PhaseMap:
     # The turn of a row about its ray stays as certain as it was; that of the phase changes.
     precision = phase_map.samples[..., 2] / np.square(corrected.sigma)
     samples = np.dstack([scale * corrected.s1, scale * corrected.s2, precision])
-    samples = np.nan_to_num(samples.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-    return replace(phase_map, samples=samples, folder=None, tilted=True)
+    clean = np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+    return replace(phase_map, samples=clean, folder=None, tilted=True)
 
 
 def _phase_sign(light: Light) -> np.float32:
@@ -172,6 +187,7 @@ def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:
     save_array(folder / _samples_name(name, phase_map.tilted), phase_map.samples)
     save_array(folder / f"{name}.intensity.npy", phase_map.intensity)
     save_array(folder / f"{name}.region.npy", flags.astype(np.uint8))
+    save_array(folder / f"{name}.dolp.npy", phase_map.lowest_dolp)
     return open_phase_map(phase_map.view, folder, tilted=phase_map.tilted)
 
 
@@ -190,11 +206,14 @@ def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMa
     samples = map_array(folder / _samples_name(view.name, tilted))
     intensity = map_array(folder / f"{view.name}.intensity.npy")
     flags = map_array(folder / f"{view.name}.region.npy")
+    lowest_dolp = map_array(folder / f"{view.name}.dolp.npy")
     size = (view.camera.height, view.camera.width)
-    if not samples.shape[:2] == intensity.shape == flags.shape == size:
+    shapes = (samples.shape[:2], intensity.shape, flags.shape, lowest_dolp.shape)
+    if any(shape != size for shape in shapes):
         raise DataError(folder / view.name, "has another size than its camera; use --overwrite.")
     region = Region((flags & 1) > 0, (flags & 2) > 0, (flags & 4) > 0)
-    return PhaseMap(view, region, samples, intensity, (flags & 8) > 0, folder, tilted)
+    diffuse = (flags & 8) > 0
+    return PhaseMap(view, region, samples, intensity, diffuse, lowest_dolp, folder, tilted)
 
 
 def _normalized_smoothing(

@@ -24,7 +24,11 @@ Mask = NDArray[np.bool_]
 
 BORDER_MARGIN_PX = 7  # points nearer to the region's border may lie on the background
 KEYPOINT_SIGMA_PX = 0.5
+MIN_FACING_COSINE = 0.2  # between normal and viewing direction, for a view to have a say
 MIN_INSIDE_SHARE = 0.8  # of a track's views that must see it in their region
+MIN_SEEN_SHARE = 0.7  # of the views that a point faces, to show the surface at its place
+MAX_DOLP_SHARE = 0.85  # of a mark's DoLP in that of the surface about it
+CLEAR_DOLP = 0.15  # of the surface, for the comparison to tell
 MAX_SEED_SIGMA_DEG = 3.0
 MAX_SEED_RESIDUAL = 0.06  # sine; 3.4 deg between the normal and the planes of incidence
 
@@ -162,12 +166,60 @@ def point_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
     return np.asarray(1 / np.sqrt(smallest), np.float64)
 
 
+def seen_shares(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> Array:
+    """Share ``(T,)`` of the views which a point faces that show the region at its place.
+
+    0 for points that face no view or have no normal.
+    """
+    facing, seen = np.zeros(len(points)), np.zeros(len(points))
+    for phase_map in maps:
+        camera = phase_map.view.camera
+        to_camera = phase_map.view.center_in_world - points
+        cosine = (to_camera * normals).sum(axis=-1) / np.linalg.norm(to_camera, axis=-1)
+        xy = camera.project(phase_map.view.cam_from_world * points)
+        shown = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
+        shown &= cosine > MIN_FACING_COSINE
+        inside = sample_image(phase_map.region.inside.astype(np.float32), xy, nearest=True) > 0
+        facing += shown
+        seen += shown & inside
+    return np.asarray(seen / np.maximum(facing, 1))
+
+
+def dolp_shares(tracks: Tracks, maps: Sequence[PhaseMap]) -> Array:
+    """DoLP at the keypoints over that of the surface about them, the median ``(T,)`` of a track.
+
+    NaN where the surface is nowhere polarised enough to tell.
+    """
+    ratio = np.full(len(tracks.obs_track), np.nan)
+    for k, phase_map in enumerate(maps):
+        here = np.flatnonzero(tracks.obs_view == k)
+        xy = tracks.obs_xy[here]
+        lowest = sample_image(phase_map.lowest_dolp.astype(np.float32), xy, nearest=True) / 255
+        about = sample_image(phase_map.samples, xy, nearest=True)
+        surface = np.hypot(about[:, 0], about[:, 1])
+        ratio[here] = np.where(surface > CLEAR_DOLP, lowest / np.maximum(surface, 1e-6), np.nan)
+    known = np.isfinite(ratio)
+    # The median of each track: its ratios lie together once sorted by track and value.
+    order = np.lexsort((ratio[known], tracks.obs_track[known]))
+    owner, values = tracks.obs_track[known][order], ratio[known][order]
+    count = np.bincount(owner, minlength=len(tracks.points_in_world))
+    first = np.cumsum(count) - count
+    medians = np.full(len(count), np.nan)
+    has = count > 0
+    medians[has] = values[first[has] + (count[has] - 1) // 2]
+    return medians
+
+
 def select_seeds(
     tracks: Tracks,
     estimate: NormalEstimate,
     maps: Sequence[PhaseMap],
 ) -> tuple[Seeds, Mask]:
     """Tracks that lie on the polarised surface and whose normal explains their phases.
+
+    A glossy surface mirrors its surroundings, and on a flat one their mirror images make tracks
+    as good as any, behind the surface. They give themselves away: seen from aside they leave the
+    region, and unlike what is printed on the surface they are polarised as it is.
 
     Returns
     -------
@@ -176,6 +228,8 @@ def select_seeds(
     good = (
         estimate.valid
         & (inside_shares(tracks, maps) >= MIN_INSIDE_SHARE)
+        & (seen_shares(tracks.points_in_world, estimate.normals, maps) >= MIN_SEEN_SHARE)
+        & ~(dolp_shares(tracks, maps) > MAX_DOLP_SHARE)
         & (estimate.num_rows >= 3)
         & (estimate.sigma_deg < MAX_SEED_SIGMA_DEG)
         & (estimate.residual < MAX_SEED_RESIDUAL)

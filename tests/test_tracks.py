@@ -1,15 +1,29 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import board_scene, tracks_at
 
 from polmvs.config import Estimator, Model, NormalOptions
 from polmvs.phasemap import gather_rows, open_phase_map, store_phase_map
-from polmvs.tracks import point_sigmas, select_seeds, track_normals, window_map
+from polmvs.tracks import (
+    dolp_shares,
+    point_sigmas,
+    seen_shares,
+    select_seeds,
+    track_normals,
+    window_map,
+)
 
 
 @pytest.fixture(scope="module")
 def scene():
     return board_scene(6)
+
+
+def marked(maps):
+    """The maps as if a mark were printed on every point."""
+    return [replace(m, lowest_dolp=np.zeros_like(m.lowest_dolp)) for m in maps]
 
 
 def errors_deg(normals, truth):
@@ -64,7 +78,7 @@ def test_seeds_lie_on_the_part_only(scene):
     off = on + np.array([0.5, 0.0, 0.0])
     tracks = tracks_at(scene, np.concatenate([on, off]))
     estimate = track_normals(Model.PPA, tracks, scene.maps, NormalOptions(window_px=5))
-    seeds, chosen = select_seeds(tracks, estimate, scene.maps)
+    seeds, chosen = select_seeds(tracks, estimate, marked(scene.maps))
     assert chosen[:30].mean() > 0.5  # those near the border of a view are left out
     assert not chosen[30:].any()
     assert len(seeds.points_in_world) == chosen.sum()
@@ -130,3 +144,25 @@ def test_a_damaged_phase_map_is_named(scene, tmp_path):
     path.write_bytes(path.read_bytes()[:40])
     with pytest.raises(DataError, match=r"samples\.npy"):
         open_phase_map(scene.views[0], tmp_path)
+
+
+def test_a_mirror_image_behind_the_surface_is_no_seed(scene):
+    """Points well behind a board, as its mirror shows them, match the board's phases."""
+    on, normals = scene.surface_points(30)
+    behind = on - 0.12 * normals
+    # They are seen in the board in the views that look along the way to them.
+    tracks = tracks_at(scene, behind)
+    estimate = track_normals(Model.PPA, tracks, scene.maps, NormalOptions(window_px=5))
+    shares = seen_shares(behind, np.nan_to_num(estimate.normals), scene.maps)
+    assert np.median(seen_shares(on, normals, scene.maps)) > 0.9
+    assert np.median(shares) < 0.7
+    assert select_seeds(tracks, estimate, marked(scene.maps))[1].sum() < 6
+
+
+def test_what_is_polarised_like_the_surface_about_it_is_no_mark(scene):
+    points, _ = scene.surface_points(20)
+    tracks = tracks_at(scene, points)
+    assert np.median(dolp_shares(tracks, scene.maps)) > 0.9
+    assert np.nanmax(dolp_shares(tracks, marked(scene.maps))) == 0
+    nowhere = tracks_at(scene, points + np.array([0.5, 0.0, 0.0]))
+    assert np.isnan(dolp_shares(nowhere, scene.maps)).all()

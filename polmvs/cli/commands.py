@@ -24,6 +24,7 @@ from polmvs.cli.flags import (
 from polmvs.cli.terminal import Terminal
 from polmvs.comparison import evaluate_file
 from polmvs.config import EvaluationOptions, Model, Options, RunOptions, SfmOptions
+from polmvs.experiments.command import add_parser as add_experiment
 from polmvs.groundtruth import open_ground_truth
 from polmvs.summary import comparison_table, evaluation_text
 
@@ -50,6 +51,7 @@ def build_parser() -> Parser:
     _add_normals(subparsers)
     _add_densify(subparsers)
     _add_plane(subparsers)
+    add_experiment(subparsers)
     return parser
 
 

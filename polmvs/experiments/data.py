@@ -149,8 +149,8 @@ class ViewData:
         axial = self.axial(model) / np.maximum(self.blurred.s0, 1e-6)[..., None]
         samples = np.dstack([axial, self.counted.astype(np.float32)])
         region = Region(self.part, self.counted, np.zeros_like(self.part))
-        diffuse = np.full(region.inside.shape, self.light is Light.DIFFUSE)
-        return PhaseMap(self.view, region, samples.astype(np.float32), self.sharp.s0, diffuse)
+        base = self.phase_map(Model.PPA, region)
+        return replace(base, samples=samples.astype(np.float32))
 
     def _for(self, model: Model, stokes: Stokes) -> Stokes:
         if model is not Model.TILTED:
