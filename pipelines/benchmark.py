@@ -2,8 +2,10 @@
 
     python pipelines/benchmark.py OUT [OUT ...]
     python pipelines/benchmark.py --capture CAPTURE OUT [flags of polmvs compare]
+    OMP_NUM_THREADS=1 python pipelines/benchmark.py --estimators
 
-With ``--capture`` that capture is run first, into the only OUT.
+With ``--capture`` that capture is run first, into the only OUT. ``--estimators`` times the normal
+estimators beside a plain NumPy baseline.
 """
 
 from __future__ import annotations
@@ -13,6 +15,8 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+
+import benchmark_estimators
 
 from polmvs.cli import main as run_polmvs
 from polmvs.errors import PolmvsError
@@ -24,10 +28,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the script; the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
-        "runs", type=Path, nargs="+", metavar="OUT", help="folders of finished runs"
+        "runs", type=Path, nargs="*", metavar="OUT", help="folders of finished runs"
     )
     parser.add_argument("--capture", type=Path, help="compare the models on this capture first")
+    parser.add_argument("--estimators", action="store_true", help="time the normal estimators")
     args, flags = parser.parse_known_args(argv)
+    if args.estimators:
+        print(benchmark_estimators.run())
+    if not args.runs:
+        return 0 if args.estimators else parser.error("give the folder of a run, or --estimators")
     if args.capture is not None:
         if len(args.runs) != 1:
             parser.error("--capture goes with one OUT")

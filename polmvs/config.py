@@ -152,6 +152,11 @@ class PropagationOptions:
     spacing_px: float = option(6.0, "distance between contours and between their nodes, px")
     stride_px: int = option(2, "distance between the dense points of one view, px")
     num_rounds: int = option(3, "rounds of normals and ranges")
+    bending: float = option(
+        0.002,
+        "standard deviation, as a share of the distance, of the smooth bending of a surface by "
+        "errors of the camera model, which the seeds correct; 0: none",
+    )
     max_neighbors: int = option(15, "other views that give rows to one view")
 
     def __post_init__(self) -> None:
@@ -164,6 +169,7 @@ class PropagationOptions:
         _require(
             1 <= self.num_rounds <= 20, f"--num-rounds must lie in 1 to 20: {self.num_rounds}."
         )
+        _require(0 <= self.bending <= 0.1, f"--bending must lie in 0 to 0.1, not {self.bending}.")
         _require(
             self.max_neighbors >= 1, f"--max-neighbors must be 1 or more: {self.max_neighbors}."
         )

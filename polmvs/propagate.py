@@ -45,7 +45,6 @@ MIN_SEED_COSINE = 0.995  # 5.7 deg between the normals of a seed and of a node i
 MIN_CREASE_ANGLE = 0.03  # rad, between neighbouring normals
 CREASE_FACTOR = 4.0  # a crease turns the normal this much more than noise or local curvature
 NUM_NEIGHBORS = 6
-BENDING_SIGMA = 0.002  # of the log-range: half a percent of the distance
 MIN_CONTOUR_DOLP = 0.05  # smoothed; contours stop under it
 STACKED_VIEWS = 4  # whose contours are traced together
 
@@ -288,22 +287,22 @@ def _update(
         edges,
         ties,
         num_seeds,
-        modes=_bending_modes(nodes.xy),
-        mode_sigma=BENDING_SIGMA,
+        modes=_bending_modes(nodes.xy) if options.bending > 0 else None,
+        mode_sigma=options.bending,
     )
     return replace(nodes, log_range=solution.log_range, normals=normals, normal_sigma=sigma)
 
 
 def _bending_modes(xy: Image) -> Array:
-    """Polynomials of the nodes' place up to the third degree, of order one over the region.
+    """Polynomials of the nodes' place up to the second degree, of order one over the region.
 
     The errors of multi-view normals that a camera model leaves are smooth over a view: they tilt
     and bend the surface as a whole, which the seeds can tell.
     """
     low, high = xy.min(axis=0), xy.max(axis=0)
     x, y = (2 * (xy - low) / np.maximum(high - low, 1e-9) - 1).T.astype(np.float64)
-    legendre = [[np.ones_like(t), t, 1.5 * t**2 - 0.5, 2.5 * t**3 - 1.5 * t] for t in (x, y)]
-    degrees = [(i, j) for i in range(4) for j in range(4) if 1 <= i + j <= 2]
+    legendre = [[np.ones_like(t), t, 1.5 * t**2 - 0.5] for t in (x, y)]
+    degrees = [(i, j) for i in range(3) for j in range(3) if 1 <= i + j <= 2]
     return np.stack([legendre[0][i] * legendre[1][j] for i, j in degrees], axis=-1)
 
 

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -134,6 +135,24 @@ def test_library_and_one_worker_give_the_same_cloud(
     # The model is written anew from its views and tracks: the last digits differ.
     assert len(again.points) == pytest.approx(len(first.points), rel=0.01)
     assert stages_of(tmp_path / "out") == ["capture", "sparse", "maps", "normals", "densify_ppa"]
+
+
+def test_16_bit_tiff_with_own_poses_and_names(
+    demo_run: Path, demo_capture: Path, tmp_path: Path, cli
+) -> None:
+    """Images are matched to the model and to the truth by name without suffix."""
+    capture, out = tmp_path / "capture", tmp_path / "out"
+    (capture / "raw").mkdir(parents=True)
+    for path in (demo_capture / "raw").glob("*.png"):
+        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(capture / "raw" / f"{path.stem}.tif"), raw.astype(np.uint16) * 257)
+    flags = ("--sparse", demo_run / "sparse", "--gt", demo_capture, "--models", "ppa")
+    status, _, err = cli("compare", capture, out, *flags, "--stride-px", 4)
+    assert (status, err) == (0, "")
+    found = metrics_of(out)["models"]["ppa"]["truth"]
+    assert found["alignment"]["num_cameras"] == 10
+    assert found["cloud"]["f_score"][2] > 0.9
+    assert not (out / "opa.ply").exists()
 
 
 def start(out: Path, *arguments: str) -> subprocess.Popen[str]:
