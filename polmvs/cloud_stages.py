@@ -15,14 +15,18 @@ from polmvs.fuse import FusedCloud, fuse
 from polmvs.normals import NormalEstimate
 from polmvs.parallel import Workers
 from polmvs.propagate import propagate
-from polmvs.stages import Facts, Report, open_maps
+from polmvs.stages import Facts, Report, open_maps, tilt_maps
 from polmvs.storage import map_array, save_array
 from polmvs.tracks import Seeds, Tracks, select_seeds, track_normals
 from polmvs.workspace import Workspace
 
 
-def solve_tracks(model: Model, workspace: Workspace, options: NormalOptions) -> Facts:
+def solve_tracks(
+    model: Model, workspace: Workspace, options: NormalOptions, *, workers: Workers
+) -> Facts:
     """Normals of the sparse points under a model; PPA's also select the seeds."""
+    if model is Model.TILTED:
+        tilt_maps(workspace, workers=workers)
     tracks = read_model(workspace.sparse).tracks
     maps = open_maps(workspace, model)
     if len(tracks.point3D_ids) == 0:

@@ -206,7 +206,7 @@ def compare_models(
     ``models``: for each its ``consistency`` and, with ground truth, its ``truth``. ``phase``:
     with ground truth, what :func:`phase_errors` gives.
     """
-    maps = {model: open_maps(workspace, model) for model in (Model.PPA, Model.TILTED, *models)}
+    maps = {model: open_maps(workspace, model) for model in (Model.PPA, *models)}
     clouds = {model: read_cloud(workspace.cloud(model)) for model in models}
     tracks = {model: read_cloud(workspace.normals(model)) for model in models}
     tasks: list[Callable[[], Any]] = []
@@ -215,7 +215,7 @@ def compare_models(
         truth = open_ground_truth(gt)
         views = [phase_map.view for phase_map in maps[Model.PPA]]
         tasks.append(partial(_measure_all, clouds, tracks, views, truth))
-        tasks.append(partial(phase_errors, capture, maps[Model.PPA], maps[Model.TILTED], truth))
+        tasks.append(partial(phase_errors, capture, maps[Model.PPA], truth))
     tasks += [partial(measure_consistency, m, clouds[m], tracks[m], maps[m]) for m in models]
     done = list(workers.map(_call, tasks))
     consistencies = done[-len(models) :]

@@ -7,16 +7,22 @@ threads may hang.
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from contextlib import contextmanager
+from multiprocessing import connection, get_context, parent_process, resource_tracker
 from types import TracebackType
 from typing import Any, TypeVar
 
 import cv2
 
 T = TypeVar("T")
+
+HELD_BACK = (signal.SIGINT, signal.SIGTERM)
+POSIX = hasattr(signal, "pthread_sigmask")
 
 
 class Workers:
@@ -40,7 +46,8 @@ class Workers:
             self._pool = ProcessPoolExecutor(
                 self.num, mp_context=get_context("spawn"), initializer=_start_worker
             )
-        return self._pool.map(function, *iterables)
+        with _signals_held_back():
+            return self._pool.map(function, *iterables)
 
     def __enter__(self) -> Workers:
         return self
@@ -56,7 +63,41 @@ class Workers:
             self._pool = None
 
 
+@contextmanager
+def _signals_held_back() -> Iterator[None]:
+    """Start workers undisturbed: one that is stopped half-started prints a traceback.
+
+    Ctrl-C reaches all processes of a terminal. A worker inherits that it is blocked and never
+    sees it; this process handles it when the workers have been started.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    resource_tracker.ensure_running()  # it unblocks SIGINT when it is started
+    arrived: list[int] = []
+    before = {n: signal.signal(n, lambda n, _: arrived.append(n)) for n in HELD_BACK}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if POSIX else set()
+    try:
+        yield
+    finally:
+        if POSIX:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for held, handler in before.items():
+            signal.signal(held, handler)
+        for number in arrived:
+            signal.raise_signal(number)
+
+
 def _start_worker() -> None:
     """Ctrl-C is the parent's to handle, and one worker is one core."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A killed parent cannot stop its workers, and they would wait for work for ever."""
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)

@@ -14,7 +14,7 @@ from polmvs.config import Model
 from polmvs.evaluate import phase_errors_on_part
 from polmvs.groundtruth import GroundTruth
 from polmvs.metrics import AngleStats
-from polmvs.phasemap import PhaseMap, correct_for_tilt, view_rays
+from polmvs.phasemap import PhaseMap, as_tilted, correct_for_tilt, view_rays
 
 Image = NDArray[np.float32]
 Load = Callable[[str], tuple[Image, Image]]  # phase and DoLP (H, W) of an image, by its name
@@ -49,14 +49,14 @@ class LazyPhases(Mapping[str, Image]):
 
 
 def phase_errors(
-    capture: Capture, maps: Sequence[PhaseMap], tilted_maps: Sequence[PhaseMap], truth: GroundTruth
+    capture: Capture, maps: Sequence[PhaseMap], truth: GroundTruth
 ) -> dict[str, dict[Model, AngleStats]]:
     """Errors of the measured phase on the part, under each model with the true normals.
 
     Parameters
     ----------
     capture : whose single pixels are measured too.
-    maps, tilted_maps : of the same views, for OPA and PPA and for the tilted model.
+    maps : phase maps, as OPA and PPA use them.
     truth : with the true normals.
 
     Returns
@@ -65,8 +65,10 @@ def phase_errors(
     capture, those neither clipped nor dark.
     """
     stored = {stem_of(phase_map.view.name): phase_map for phase_map in maps}
-    corrected = {stem_of(phase_map.view.name): phase_map for phase_map in tilted_maps}
     raw = {stem_of(name): name for name in capture.names}
+
+    def of_map(name: str) -> tuple[Image, Image]:
+        return _of_map(stored[stem_of(name)])
 
     def of_pixels(name: str, *, tilted: bool) -> tuple[Image, Image]:
         phase_map = stored[stem_of(name)]
@@ -77,7 +79,7 @@ def phase_errors(
         return np.where(stokes.valid, stokes.aolp + turn, np.float32(np.nan)), stokes.dolp
 
     sources: dict[str, tuple[Load, Load]] = {
-        "maps": (lambda n: _of_map(stored[stem_of(n)]), lambda n: _of_map(corrected[stem_of(n)])),
+        "maps": (of_map, lambda name: _of_map(as_tilted(stored[stem_of(name)]))),
         "pixels": (partial(of_pixels, tilted=False), partial(of_pixels, tilted=True)),
     }
     names = [name for name in truth.names if stem_of(name) in stored]

@@ -235,7 +235,9 @@ def _normal_stages(run: Run, models: Sequence[Model]) -> list[Stage]:
 
 def _normal_stage(run: Run, model: Model) -> Stage:
     def work(report: Report) -> stages.Facts:
-        return cloud_stages.solve_tracks(model, run.workspace, run.options.normals)
+        return cloud_stages.solve_tracks(
+            model, run.workspace, run.options.normals, workers=run.workers
+        )
 
     first = normals_stage(Model.PPA)
     after = "maps" if model is Model.PPA else first

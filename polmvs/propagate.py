@@ -46,7 +46,7 @@ MIN_CREASE_ANGLE = 0.03  # rad, between neighbouring normals
 CREASE_FACTOR = 4.0  # a crease turns the normal this much more than noise or local curvature
 NUM_NEIGHBORS = 6
 MIN_CONTOUR_DOLP = 0.05  # smoothed; contours stop under it
-STACKED_VIEWS = 4  # whose contours are traced together
+MAX_STACKED_VIEWS = 8  # whose contours are traced together
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,8 @@ def propagate(
 
 def _chunks(maps: Sequence[PhaseMap]) -> list[Sequence[PhaseMap]]:
     """Split the views; not by the number of workers, which must not change the result."""
-    return [maps[i : i + STACKED_VIEWS] for i in range(0, len(maps), STACKED_VIEWS)]
+    size = max(min(MAX_STACKED_VIEWS, -(-len(maps) // 2)), 1)
+    return [maps[i : i + size] for i in range(0, len(maps), size)]
 
 
 def _start(

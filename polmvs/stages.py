@@ -13,9 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from polmvs.camera import View
 from polmvs.capture import Capture, intensity_image_8bit
 from polmvs.colmap_io import SparseModel, read_model
@@ -35,6 +32,7 @@ from polmvs.phasemap import (
 from polmvs.region import find_region
 from polmvs.sfm import run_sfm
 from polmvs.sparse_model import match_model_to_capture, short_list, write_model
+from polmvs.tracks import Tracks
 from polmvs.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -167,21 +165,20 @@ def build_maps(
             num_inside += count
             report(1)
         maps = [open_phase_map(view, folder) for view in views]
-        diffuse: list[NDArray[np.bool_] | None] = [None] * len(maps)
+        num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
         if options.light is None and len(tracks.point3D_ids):
-            diffuse = list(find_diffuse(tracks, maps))
-        num_diffuse = 0
-        for count in workers.map(partial(_finish_map, folder), maps, diffuse):
-            num_diffuse += count
+            num_diffuse = _turn_diffuse(tracks, maps, folder)
     return {"num_region_px": num_inside, "num_diffuse_px": num_diffuse}
 
 
-def _finish_map(folder: Path, phase_map: PhaseMap, diffuse: NDArray[np.bool_] | None) -> int:
-    """Turn what is diffuse, and store the tilted map beside; returns the diffuse pixels."""
-    if diffuse is not None and diffuse.any():
-        phase_map = store_phase_map(turned(phase_map, diffuse), folder)
-    store_phase_map(as_tilted(phase_map), folder)
-    return int((phase_map.diffuse & phase_map.region.inside).sum())
+def _turn_diffuse(tracks: Tracks, maps: Sequence[PhaseMap], folder: Path) -> int:
+    """Turn the phase where the light is diffuse; returns the number of these pixels."""
+    num_diffuse = 0
+    for phase_map, where in zip(maps, find_diffuse(tracks, maps), strict=True):
+        if where.any():
+            store_phase_map(turned(phase_map, where), folder)
+            num_diffuse += int(where.sum())
+    return num_diffuse
 
 
 def _build_map(
@@ -215,6 +212,16 @@ def posed_views(workspace: Workspace) -> tuple[View, ...]:
             "Record more views, or give a better model with --sparse.",
         )
     return views
+
+
+def tilt_maps(workspace: Workspace, *, workers: Workers) -> None:
+    """Store beside each phase map the one that the tilted model needs."""
+    for _ in workers.map(partial(_tilt_map, workspace.maps), open_maps(workspace, Model.PPA)):
+        pass
+
+
+def _tilt_map(folder: Path, phase_map: PhaseMap) -> None:
+    store_phase_map(as_tilted(phase_map), folder)
 
 
 def open_maps(workspace: Workspace, model: Model) -> list[PhaseMap]:
