@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,6 +52,16 @@ def _open3d() -> Any:
             "libusb-1.0, version 0.19 does not."
         ) from error
     return open3d
+
+
+def preload() -> None:
+    """Begin to import Open3D beside other work, such as that of COLMAP's mapper on one core."""
+
+    def load() -> None:
+        with suppress(PolmvsError):  # said when a cloud is written
+            _open3d()
+
+    threading.Thread(target=load, name="preload-open3d").start()
 
 
 def to_open3d(cloud: Cloud) -> Any:

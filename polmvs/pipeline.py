@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from polmvs import cloud_stages, stages
+from polmvs.cloud_io import preload
 from polmvs.comparison import write_comparison
 from polmvs.config import Model, Options, RunOptions
 from polmvs.errors import OptionError
@@ -202,9 +203,12 @@ def _pose_stage(run: Run) -> Stage:
         return stages.take_poses(given, run.workspace, source)
 
     def find(report: Report) -> stages.Facts:
-        return stages.find_poses(
-            run.record.images, run.workspace, run.options.sfm, report=lambda step: report(1)
-        )
+        def step(name: str) -> None:
+            if name == "mapping":  # on one core: the other can load what the next stages need
+                preload()
+            report(1)
+
+        return stages.find_poses(run.record.images, run.workspace, run.options.sfm, report=step)
 
     if given is not None:
         return Stage(name="sparse", work=take, after=("capture",))
