@@ -100,7 +100,11 @@ def _add_pixel_flags(parser: argparse.ArgumentParser) -> None:
         help="share of the pixels' median intensity from which one counts: where something dark "
         "is reflected, other light shows; 0: all (default: %(default)s)",
     )
-    parser.add_argument("--keep-clipped", action="store_true", help="use saturated pixels as well")
+    parser.add_argument(
+        "--drop-clipped",
+        action="store_true",
+        help="leave saturated pixels out; a plane at one exposure loses its brightest part",
+    )
     parser.add_argument(
         "--pattern",
         default="90,45,135,0",
@@ -196,7 +200,7 @@ def _select(args: argparse.Namespace, stokes: Stokes) -> Mask:
         if len(corners) < 3:
             raise OptionError(f"--polygon needs three corners or more, not {len(corners)}.")
         inside = polygon_mask(corners, stokes.shape)
-    valid = stokes.s0 > 0 if args.keep_clipped else stokes.valid
+    valid = stokes.valid if args.drop_clipped else stokes.s0 > 0
     mask = inside & valid & (stokes.dolp > args.min_dolp)
     if mask.any():
         mask &= stokes.s0 >= args.min_intensity * np.median(stokes.s0[mask])

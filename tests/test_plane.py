@@ -413,7 +413,7 @@ def test_a_missing_or_odd_image_is_a_data_error(tmp_path, capsys):
 
 @needs_carps
 def test_the_pond_fits_the_tilted_model_and_tells_its_focal_length(capsys):
-    common = [CARPS, "--min-dolp", "0.35", "--json"]
+    common = [CARPS, "--min-dolp", "0.35", "--drop-clipped", "--json"]
     result = json.loads(run(capsys, *common, "--estimate-focal"))
     residuals = result["residuals"]
     assert residuals["opa"]["rmse_deg"] == pytest.approx(11.9, abs=0.5)
@@ -431,7 +431,7 @@ def test_the_pond_fits_the_tilted_model_and_tells_its_focal_length(capsys):
 
 @needs_carps
 def test_the_clearer_part_of_the_pond_has_the_nominal_focal_length(capsys):
-    flags = ["--min-dolp", "0.45", "--estimate-focal", "--json"]
+    flags = ["--min-dolp", "0.45", "--drop-clipped", "--estimate-focal", "--json"]
     focal = json.loads(run(capsys, CARPS, *flags))["focal"]
     assert 850 < focal["focal_px"] < 930
     assert focal["focal_px"] == pytest.approx(870, abs=2 * focal["sigma_px"])
@@ -439,7 +439,7 @@ def test_the_clearer_part_of_the_pond_has_the_nominal_focal_length(capsys):
 
 @needs_carps
 def test_the_pond_with_its_clipped_pixels_has_the_residuals_of_the_design_notes(capsys):
-    flags = ["--min-dolp", "0.35", "--keep-clipped", "--json", "--intrinsics=880,880,612,512"]
+    flags = ["--min-dolp", "0.35", "--json", "--intrinsics=880,880,612,512"]
     residuals = json.loads(run(capsys, CARPS, *flags))["residuals"]
     assert residuals["opa"]["rmse_deg"] == pytest.approx(10.6, rel=0.05)
     assert residuals["opa"]["median_deg"] == pytest.approx(7.1, rel=0.05)
