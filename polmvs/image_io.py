@@ -18,6 +18,7 @@ from polmvs.errors import DataError
 PathArg: TypeAlias = str | PathLike[str]
 Mosaic: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
+SILENT = 0  # OpenCV's log level
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_GRAY = 0  # colour type of a monochrome PNG without alpha
 BROKEN = "Copy it again from the camera or take it out of the folder."
@@ -184,18 +185,23 @@ def _read_bytes(path: PathArg) -> bytes:
     return data
 
 
+def _set_log_level(level: int) -> int:
+    """Set OpenCV's log level, which moved in OpenCV 5; returns the one before."""
+    setter = cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel
+    return int(setter(level))
+
+
 def _decode(path: PathArg, data: bytes) -> NDArray[Any]:
     """Pixels of an encoded image, unchanged; OpenCV's own complaints are kept off the terminal."""
     if data.startswith(PNG_SIGNATURE):
         _check_png(path, data)
-    logging = cv2.utils.logging
-    level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    level = _set_log_level(SILENT)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     finally:
-        logging.setLogLevel(level)
+        _set_log_level(level)
     if image is None:
         raise DataError(path, f"is not a readable image, or is damaged or truncated. {BROKEN}")
     return np.asarray(image)

@@ -39,7 +39,9 @@ def test_pinhole_agrees_with_colmap():
     colmap = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 510, 321.5, 238])
     ours = PinholeCamera(width=640, height=480, fx=500, fy=510, cx=321.5, cy=238)
     xy = RNG.uniform(0, 480, size=(50, 2))
-    np.testing.assert_allclose(ours.rays(xy), colmap.cam_ray_from_img(xy), atol=1e-12)
+    plane = np.column_stack([colmap.cam_from_img(xy), np.ones(len(xy))])
+    rays = plane / np.linalg.norm(plane, axis=1, keepdims=True)
+    np.testing.assert_allclose(ours.rays(xy), rays, atol=1e-12)
     points = ours.rays(xy) * RNG.uniform(0.5, 3, size=(50, 1))
     np.testing.assert_allclose(ours.project(points), colmap.img_from_cam(points), atol=1e-9)
 
