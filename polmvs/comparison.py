@@ -204,7 +204,8 @@ def compare_models(
     Returns
     -------
     ``models``: for each its ``consistency`` and, with ground truth, its ``truth``. ``phase``:
-    with ground truth, what :func:`phase_errors` gives.
+    with ground truth, what :func:`phase_errors` gives. ``best_fit``: what
+    :func:`best_fitting_model` says.
     """
     maps = {model: open_maps(workspace, model) for model in (Model.PPA, *models)}
     clouds = {model: read_cloud(workspace.cloud(model)) for model in models}
@@ -225,7 +226,20 @@ def compare_models(
     if gt is not None:
         for model in models:
             figures[model]["truth"] = done[0][model]
-    return dict(to_plain({"models": figures, "phase": done[1] if gt is not None else None}))
+    phase = done[1] if gt is not None else None
+    best = best_fitting_model(dict(zip(models, consistencies, strict=True)))
+    return dict(to_plain({"models": figures, "phase": phase, "best_fit": best}))
+
+
+def best_fitting_model(found: Mapping[Model, Consistency]) -> Model | None:
+    """The model under which the planes of incidence of many views meet best in one normal.
+
+    It is told by the sparse points on the surface alone, whose place no model has touched: the
+    median angle between their normals and their planes of incidence. None without such points.
+    """
+    residuals = {model: one.track_residual_median_deg for model, one in found.items()}
+    known = {model: value for model, value in residuals.items() if np.isfinite(value)}
+    return min(known, key=lambda model: known[model]) if known else None
 
 
 def _measure_all(

@@ -35,8 +35,18 @@ def summary_text(metrics: Mapping[str, Any]) -> str:
         + f". {results['num_tracks']} sparse points, {results['num_seeds']} of them seeds.",
         "",
         comparison_table(metrics),
+        *best_fit_lines(metrics),
     ]
     return "\n".join(lines) + "\n"
+
+
+def best_fit_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Which model the capture's phases fit best, if there is anything to tell it by."""
+    best = metrics.get("best_fit")
+    if best is None:
+        return []
+    residual = dig(metrics["models"], best, "consistency", "track_residual_median_deg")
+    return ["", f"The phases fit {best.upper()} best: {number(residual)} deg at the seeds."]
 
 
 def comparison_table(metrics: Mapping[str, Any]) -> str:

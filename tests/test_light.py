@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scenes import CAMERA, Scene, board_scene, phase_map_of, tracks_at
 
+from polmvs.comparison import Consistency, best_fitting_model
 from polmvs.config import Light, Model, NormalOptions
 from polmvs.light import find_diffuse
+from polmvs.metrics import AngleStats
 from polmvs.phasemap import as_tilted, gather_rows, open_phase_map, store_phase_map, turned
 from polmvs.synthetic import Plane, Sphere, render_view, ring_of_views
 from polmvs.tracks import track_normals
@@ -27,12 +29,12 @@ def dome_scene(light: str) -> Scene:
     return Scene(ball, views, rendered, [phase_map_of(r) for r in rendered])
 
 
-def floor_scene(light: Light) -> Scene:
-    """A floor that fills most of views with oblique rays, behind tilted polarizers."""
+def floor_scene(light: Light, sensor: str = "tilted") -> Scene:
+    """A floor that fills most of views with oblique rays."""
     floor = Plane(point=np.zeros(3), normal=np.array([0.05, 0.1, 1.0]), extent=(0.5, 0.5))
     views = ring_of_views(6, CAMERA, target=np.zeros(3), distance=0.5, elevation_deg=30)
     rendered = [
-        render_view(v, floor, light=light.value, sensor="tilted", s0=0.2, background=0.6)
+        render_view(v, floor, light=light.value, sensor=sensor, s0=0.2, background=0.6)
         for v in views
     ]
     return Scene(floor, views, rendered, [phase_map_of(r, light) for r in rendered])
@@ -121,3 +123,39 @@ def test_a_stored_tilted_map_shares_its_region(board, tmp_path):
     again = pickle.loads(pickle.dumps(stored))
     np.testing.assert_array_equal(again.samples, stored.samples)
     np.testing.assert_array_equal(open_phase_map(base.view, tmp_path).samples, base.samples)
+
+
+@pytest.mark.parametrize("sensor", ["ppa", "tilted"])
+def test_the_residuals_tell_which_model_a_sensor_follows(sensor, tmp_path):
+    """Wide rays over a floor, behind polarizers of either kind."""
+    scene = floor_scene(Light.SPECULAR, sensor)
+    points, _ = scene.surface_points(40)
+    tracks = tracks_at(scene, points)
+    found = {}
+    for model, used in (
+        (Model.OPA, scene.maps),
+        (Model.PPA, scene.maps),
+        (Model.TILTED, [as_tilted(m) for m in scene.maps]),
+    ):
+        estimate = track_normals(model, tracks, used, NormalOptions(window_px=5))
+        residual = float(np.degrees(np.arcsin(np.nanmedian(estimate.residual))))
+        none = AngleStats.from_degrees(np.zeros(0))
+        found[model] = Consistency(
+            num_points=0,
+            phase_residual=none,
+            coverage=0.0,
+            agreement=0.0,
+            track_residual_median_deg=residual,
+        )
+    assert best_fitting_model(found) is Model(sensor)
+
+
+def test_without_points_no_model_fits_best():
+    none = Consistency(
+        num_points=0,
+        phase_residual=AngleStats.from_degrees(np.zeros(0)),
+        coverage=float("nan"),
+        agreement=float("nan"),
+        track_residual_median_deg=float("nan"),
+    )
+    assert best_fitting_model({Model.PPA: none}) is None

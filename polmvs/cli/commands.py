@@ -26,7 +26,7 @@ from polmvs.comparison import evaluate_file
 from polmvs.config import EvaluationOptions, Model, Options, RunOptions, SfmOptions
 from polmvs.experiments.command import add_parser as add_experiment
 from polmvs.groundtruth import open_ground_truth
-from polmvs.summary import comparison_table, evaluation_text
+from polmvs.summary import best_fit_lines, comparison_table, evaluation_text
 
 EMPTY_STATUS = 3
 DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"
@@ -271,7 +271,7 @@ def _report_cloud(outcome: pipeline.Outcome, model: Model) -> int:
 
 def _report_comparison(outcome: pipeline.Outcome) -> int:
     metrics = json.loads(outcome.workspace.metrics.read_text(encoding="utf-8"))
-    print(comparison_table(metrics))
+    print("\n".join([comparison_table(metrics), *best_fit_lines(metrics)]))
     clouds = ", ".join(f"{model}.ply" for model in metrics["models"])
     print(
         f"{outcome.workspace.root}: {clouds}, metrics.json, summary.md; {_views(outcome.results)}"
