@@ -21,16 +21,19 @@ from polmvs.camera import sample_image
 from polmvs.config import Contour, Model, PropagationOptions
 from polmvs.contour import Contours, cover_with_contours, direction_field
 from polmvs.dense import DenseView, store_dense_view
-from polmvs.normals import NormalEstimate, solve_normals
+from polmvs.network import (
+    Nodes,
+    bending_modes,
+    connect,
+    fill_normals,
+    node_edges,
+    tie_seeds,
+    visible_seeds,
+)
+from polmvs.normals import solve_normals
 from polmvs.parallel import Workers
 from polmvs.phasemap import PhaseMap, gather_rows, view_rays
-from polmvs.surface import (
-    Edges,
-    SeedTies,
-    log_range_increment,
-    slope_sigma,
-    solve_log_ranges,
-)
+from polmvs.surface import log_range_increment, solve_log_ranges
 from polmvs.tracks import Seeds
 
 Floats = NDArray[np.floating]
@@ -38,35 +41,13 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 
-NORMAL_SIGMA_FLOOR = 0.012  # rad; systematic error of multi-view normals
-MAX_SEED_DISTANCE_PX = 12.0  # from a seed to the nodes it is tied to
-NUM_TIES = 4
-MIN_SEED_COSINE = 0.995  # 5.7 deg between the normals of a seed and of a node it is tied to
-MIN_CREASE_ANGLE = 0.03  # rad, between neighbouring normals
-CREASE_FACTOR = 4.0  # a crease turns the normal this much more than noise or local curvature
-NUM_NEIGHBORS = 6
 MIN_CONTOUR_DOLP = 0.05  # smoothed; contours stop under it
 MAX_STACKED_VIEWS = 8  # whose contours are traced together
 
 
-@dataclass(frozen=True)
-class _Nodes:
-    """Nodes of one view's contour network and what is known about them."""
-
-    xy: Image
-    rays_in_world: NDArray[np.float32]
-    ray_z: NDArray[np.float32]
-    tail: Indices
-    head: Indices
-    on_contour: NDArray[np.bool_]
-    log_range: Array
-    normals: Array
-    normal_sigma: Array
-
-
 def choose_neighbors(maps: Sequence[PhaseMap], seeds: Seeds, max_neighbors: int) -> list[list[int]]:
-    """For each view, itself and the views that share most seeds with it, spread in direction."""
-    seen = np.array([_visible_seeds(m, seeds)[0] for m in maps], float).reshape(len(maps), -1)
+    """For each view, itself first, then the views that share most seeds with it."""
+    seen = np.array([visible_seeds(m, seeds)[0] for m in maps], float).reshape(len(maps), -1)
     shared = seen @ seen.T
     neighbors = []
     for k in range(len(maps)):
@@ -74,17 +55,6 @@ def choose_neighbors(maps: Sequence[PhaseMap], seeds: Seeds, max_neighbors: int)
         order = np.argsort(-shared[k], kind="stable")
         neighbors.append([int(j) for j in order[: max_neighbors + 1]])
     return neighbors
-
-
-def _visible_seeds(phase_map: PhaseMap, seeds: Seeds) -> tuple[NDArray[np.bool_], Array]:
-    """Which seeds project into the view's region facing it, and where."""
-    in_cam = phase_map.view.cam_from_world * seeds.points_in_world
-    xy = phase_map.view.camera.project(in_cam)
-    inside = sample_image(phase_map.region.inside.astype(np.float32), xy, nearest=True) > 0
-    to_point = seeds.points_in_world - phase_map.view.center_in_world
-    facing = (to_point * seeds.normals_in_world).sum(-1) < -0.1 * np.linalg.norm(to_point, axis=-1)
-    known = np.isfinite(seeds.normals_in_world).all(axis=-1)
-    return inside & (facing | ~known), np.asarray(xy, np.float64)
 
 
 def propagate(
@@ -115,7 +85,7 @@ def propagate(
     workers = workers or Workers(1)
     report = on_progress or (lambda count: None)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
-    nodes: list[_Nodes | None] = []
+    nodes: list[Nodes | None] = []
     for started in workers.map(partial(_start, model, seeds, options), _chunks(maps)):
         nodes += started
         report(len(started))
@@ -146,7 +116,7 @@ def _chunks(maps: Sequence[PhaseMap]) -> list[Sequence[PhaseMap]]:
 
 def _start(
     model: Model, seeds: Seeds, options: PropagationOptions, maps: Sequence[PhaseMap]
-) -> list[_Nodes | None]:
+) -> list[Nodes | None]:
     """Trace the contours of some views and give each node a first range from the seeds."""
     path_model = Model.OPA if options.contour is Contour.NORMALS else model
     fields, insides, seeds_xy = [], [], []
@@ -160,7 +130,7 @@ def _start(
             direction_field(path_model, phase_map.samples, view_rays(phase_map.view), passable)
         )
         insides.append(open_pixels)
-        visible, xy = _visible_seeds(phase_map, seeds)
+        visible, xy = visible_seeds(phase_map, seeds)
         seeds_xy.append(xy[visible] + [0.0, top])
         top += phase_map.view.camera.height
     contours = cover_with_contours(
@@ -183,18 +153,18 @@ def _start(
 
 def _start_view(
     phase_map: PhaseMap, seeds: Seeds, contours: Contours, options: PropagationOptions
-) -> _Nodes | None:
+) -> Nodes | None:
     """Network of a view's contours with ranges and normals from the nearest seeds."""
-    visible, seed_xy = _visible_seeds(phase_map, seeds)
+    visible, seed_xy = visible_seeds(phase_map, seeds)
     if not visible.any() or not len(contours.xy):
         return None
     rays_in_cam = phase_map.view.camera.rays(contours.xy)
-    tail, head, on_contour = _network(contours, phase_map, options.spacing_px)
+    tail, head, on_contour = connect(contours, phase_map, options.spacing_px)
     distance = np.linalg.norm(
         seeds.points_in_world[visible] - phase_map.view.center_in_world, axis=-1
     )
     nearest = cKDTree(seed_xy[visible]).query(contours.xy)[1]
-    return _Nodes(
+    return Nodes(
         xy=contours.xy,
         rays_in_world=(rays_in_cam @ phase_map.view.cam_from_world.rotation).astype(np.float32),
         ray_z=rays_in_cam[:, 2].astype(np.float32),
@@ -213,14 +183,14 @@ class _Task:
 
     maps: list[PhaseMap]
     dense: list[DenseView | None]
-    nodes: _Nodes | None
+    nodes: Nodes | None
     stride_px: int
     path: Path
 
 
 def _round(
     model: Model, seeds: Seeds, options: PropagationOptions, task: _Task
-) -> tuple[_Nodes | None, DenseView | None]:
+) -> tuple[Nodes | None, DenseView | None]:
     """Normals and ranges of one view's nodes, and the dense view that they make."""
     if task.nodes is None:
         return None, None
@@ -237,41 +207,15 @@ def _interpolate(known_xy: Floats, values: Array, xy: Floats, num_nearest: int =
     return np.asarray(np.median(values[indices], axis=1), np.float64)
 
 
-def _network(
-    contours: Contours, phase_map: PhaseMap, spacing_px: float
-) -> tuple[Indices, Indices, NDArray[np.bool_]]:
-    """Edges between consecutive nodes of a curve and between neighbouring nodes of all curves."""
-    xy = contours.xy
-    num = len(xy)
-    follows = contours.curve[1:] == contours.curve[:-1]
-    along = np.stack([np.flatnonzero(follows), np.flatnonzero(follows) + 1], axis=1)
-    k = min(NUM_NEIGHBORS + 1, num)
-    distance, index = cKDTree(xy).query(xy, k=k, distance_upper_bound=2.2 * spacing_px)
-    tails = np.repeat(np.arange(num), k)
-    heads, near = index.reshape(-1), distance.reshape(-1)
-    cross = (heads < num) & (heads != tails) & (near > 0)
-    pairs = np.unique(np.sort(np.stack([tails[cross], heads[cross]], axis=1), axis=1), axis=0)
-    is_along = np.isin(pairs[:, 0] * num + pairs[:, 1], along[:, 0] * num + along[:, 1])
-    pairs = np.concatenate([along, pairs[~is_along]])
-    on_contour = np.arange(len(pairs)) < len(along)
-    # An edge may not cross a crease or leave the region.
-    open_pixels = (phase_map.region.inside & ~phase_map.region.edges).astype(np.float32)
-    clear = np.ones(len(pairs), bool)
-    for share in (0.25, 0.5, 0.75):
-        between = (1 - share) * xy[pairs[:, 0]] + share * xy[pairs[:, 1]]
-        clear &= sample_image(open_pixels, between, nearest=True) > 0
-    return pairs[clear, 0], pairs[clear, 1], on_contour[clear]
-
-
 def _update(
     model: Model,
     phase_map: PhaseMap,
     used_maps: Sequence[PhaseMap],
     range_maps: Sequence[Image | None],
-    nodes: _Nodes,
+    nodes: Nodes,
     seeds: Seeds,
     options: PropagationOptions,
-) -> _Nodes:
+) -> Nodes:
     """One round: normals at the nodes from all views, then ranges from normals and seeds."""
     center = phase_map.view.center_in_world
     points = center + np.exp(nodes.log_range)[:, None] * nodes.rays_in_world
@@ -279,131 +223,22 @@ def _update(
     points[~known] = center  # projects nowhere: no rows
     rows = gather_rows(model, points, used_maps, range_maps)
     estimate = solve_normals(rows.rows, rows.rays, rows.sigma, initial_normals=nodes.normals.T)
-    normals, sigma = _fill_normals(nodes, estimate)
+    normals, sigma = fill_normals(nodes, estimate)
     own_sigma = rows.sigma[0]
-    edges = _edges(model, nodes, normals, sigma, own_sigma, options)
-    ties, num_seeds = _tie_seeds(phase_map, nodes, normals, seeds)
+    edges = node_edges(model, nodes, normals, sigma, own_sigma, options)
+    ties, num_seeds = tie_seeds(phase_map, nodes, normals, seeds)
     solution = solve_log_ranges(
         len(nodes.xy),
         edges,
         ties,
         num_seeds,
-        modes=_bending_modes(nodes.xy) if options.bending > 0 else None,
+        modes=bending_modes(nodes.xy) if options.bending > 0 else None,
         mode_sigma=options.bending,
     )
     return replace(nodes, log_range=solution.log_range, normals=normals, normal_sigma=sigma)
 
 
-def _bending_modes(xy: Image) -> Array:
-    """Polynomials of the nodes' place up to the second degree, of order one over the region.
-
-    The errors of multi-view normals that a camera model leaves are smooth over a view: they tilt
-    and bend the surface as a whole, which the seeds can tell.
-    """
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    x, y = (2 * (xy - low) / np.maximum(high - low, 1e-9) - 1).T.astype(np.float64)
-    legendre = [[np.ones_like(t), t, 1.5 * t**2 - 0.5] for t in (x, y)]
-    degrees = [(i, j) for i in range(3) for j in range(3) if 1 <= i + j <= 2]
-    return np.stack([legendre[0][i] * legendre[1][j] for i, j in degrees], axis=-1)
-
-
-def _fill_normals(nodes: _Nodes, estimate: NormalEstimate) -> tuple[Array, Array]:
-    """Normals with the gaps filled from neighbours, which widens their deviation."""
-    sigma = np.hypot(np.radians(estimate.sigma_deg), NORMAL_SIGMA_FLOOR)
-    good = estimate.valid & (estimate.num_rows >= 3) & (estimate.sigma_deg < 5)
-    if not good.any():
-        return estimate.normals, sigma
-    normals = estimate.normals.copy()
-    k = min(8, int(good.sum()))
-    index = cKDTree(nodes.xy[good]).query(nodes.xy[~good], k=k)[1].reshape(-1, k)
-    mean = normals[good][index].mean(axis=1)
-    normals[~good] = mean / np.linalg.norm(mean, axis=-1, keepdims=True)
-    sigma[~good] = 0.1
-    return normals, sigma
-
-
-def _edges(
-    model: Model,
-    nodes: _Nodes,
-    normals: Array,
-    sigma: Array,
-    own_sigma: Floats,
-    options: PropagationOptions,
-) -> Edges:
-    """Increments from normals on all edges, and the constancy along the contours."""
-    joined = _smooth_edges(nodes, normals, sigma)
-    tail, head = nodes.tail[joined], nodes.head[joined]
-    rays = nodes.rays_in_world.astype(np.float64)
-    mean = normals[tail] + normals[head]
-    mean /= np.linalg.norm(mean, axis=-1, keepdims=True)
-    angle = np.linalg.norm(rays[head] - rays[tail], axis=-1)
-    slope = slope_sigma(mean, rays[tail], 0.5 * (sigma[tail] + sigma[head]))
-    delta = log_range_increment(mean, rays[tail], rays[head])
-    edge_sigma = np.maximum(angle * slope, 1e-7)
-    finite = np.isfinite(delta) & np.isfinite(edge_sigma)
-    use = nodes.on_contour[joined] & finite & (options.contour is Contour.TANGENT)
-    # Constant range (PPA) or depth (OPA); its slope errs by the turn of the row about the ray.
-    constant = np.log(nodes.ray_z[tail] / nodes.ray_z[head]) if model is Model.OPA else 0.0 * angle
-    turn = 0.5 * (own_sigma[tail] + own_sigma[head])
-    cosine = np.abs((mean * rays[tail]).sum(axis=-1))
-    constant_sigma = (
-        angle * turn * np.sqrt(1 - np.minimum(cosine, 1) ** 2) / np.maximum(cosine, 0.05)
-    )
-    use &= np.isfinite(constant_sigma)
-    return Edges(
-        tail=np.concatenate([tail[finite], tail[use]]),
-        head=np.concatenate([head[finite], head[use]]),
-        delta=np.concatenate([delta[finite], constant[use]]),
-        sigma=np.concatenate([edge_sigma[finite], np.maximum(constant_sigma[use], 1e-7)]),
-    )
-
-
-def _smooth_edges(nodes: _Nodes, normals: Array, sigma: Array) -> NDArray[np.bool_]:
-    """Edges without a crease: normals differ no more than noise and the curvature about them."""
-    tail, head = nodes.tail, nodes.head
-    turn = np.arccos(np.clip((normals[tail] * normals[head]).sum(axis=-1), -1, 1))
-    num = len(nodes.xy)
-    degree = np.maximum(np.bincount(tail, minlength=num) + np.bincount(head, minlength=num), 1)
-    # Root turn averaged over a node's edges: a crease crosses few of them, curvature all.
-    root = np.sqrt(turn)
-    local = ((np.bincount(tail, root, num) + np.bincount(head, root, num)) / degree) ** 2
-    noise = np.hypot(sigma[tail], sigma[head])
-    expected = np.minimum(local[tail], local[head])
-    limit = np.maximum(MIN_CREASE_ANGLE, CREASE_FACTOR * np.maximum(noise, expected))
-    return np.asarray(~(turn > limit))
-
-
-def _tie_seeds(
-    phase_map: PhaseMap, nodes: _Nodes, normals: Array, seeds: Seeds
-) -> tuple[SeedTies, int]:
-    """Tie every visible seed to the nearest nodes through the plane of the node's normal."""
-    visible, seed_xy = _visible_seeds(phase_map, seeds)
-    to_seed = seeds.points_in_world - phase_map.view.center_in_world
-    distance = np.linalg.norm(to_seed, axis=-1)
-    k = min(NUM_TIES, len(nodes.xy))
-    gap, node = cKDTree(nodes.xy).query(np.where(visible[:, None], seed_xy, -1e6), k=k)
-    gap, node = gap.reshape(-1, k), node.reshape(-1, k)
-    seed = np.repeat(np.arange(len(distance)), k)
-    node, gap = node.reshape(-1), gap.reshape(-1)
-    rays = (to_seed / distance[:, None])[seed]
-    with np.errstate(invalid="ignore"):
-        node_rays = nodes.rays_in_world[node].astype(np.float64)
-        step = log_range_increment(normals[node], rays, node_rays)
-        # A seed of another surface, hidden behind this one, has another normal.
-        alike = ~((seeds.normals_in_world[seed] * normals[node]).sum(axis=-1) < MIN_SEED_COSINE)
-    ok = visible[seed] & alike & (gap < MAX_SEED_DISTANCE_PX) & np.isfinite(step)
-    seed, node, gap, step = seed[ok], node[ok], gap[ok], step[ok]
-    footprint = 1 / phase_map.view.camera.mean_focal_px
-    sigma = np.sqrt(
-        k * (seeds.sigma[seed] / distance[seed]) ** 2 + (0.02 * (1 + gap) * footprint) ** 2
-    )
-    value = np.log(distance[seed]) + step
-    return SeedTies(node=node, seed=seed, value=value, sigma=sigma), len(distance)
-
-
-def _densify(
-    phase_map: PhaseMap, nodes: _Nodes, stride: int, max_gap_px: float
-) -> DenseView | None:
+def _densify(phase_map: PhaseMap, nodes: Nodes, stride: int, max_gap_px: float) -> DenseView | None:
     """Ranges and normals on the lattice of the region, from the planes of the nearest nodes."""
     good = np.isfinite(nodes.log_range) & np.isfinite(nodes.normals).all(axis=-1)
     if not good.any():
