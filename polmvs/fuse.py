@@ -194,8 +194,7 @@ def _shows_background(phase_map: PhaseMap, xy: Floats) -> Mask:
     """Which places lie in the image but outside its region."""
     camera = phase_map.view.camera
     in_image = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
-    inside = sample_image(phase_map.region.inside.astype(np.float32), xy, nearest=True) > 0
-    return np.asarray(in_image & ~inside)
+    return np.asarray(in_image & ~phase_map.shows_surface(xy))
 
 
 def _concatenate(clouds: Sequence[FusedCloud]) -> FusedCloud:

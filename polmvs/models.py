@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Model
+from polmvs.config import Light, Model
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
@@ -23,6 +23,14 @@ def model_rays(model: Model, rays_in_cam: Floats) -> Floats:
     if model is Model.OPA:
         return np.broadcast_to(OPTICAL_AXIS.astype(rays_in_cam.dtype), rays_in_cam.shape)
     return rays_in_cam
+
+
+def phase_sign(light: Light) -> np.float32:
+    """Factor from ``(cos, sin)`` of twice the AoLP to that of twice the phase.
+
+    Specular light turns the phase by pi/2 from the AoLP, diffuse light does not.
+    """
+    return np.float32(-1.0 if light is Light.SPECULAR else 1.0)
 
 
 def phase_direction(phase: Floats) -> Array:

@@ -59,11 +59,10 @@ def visible_seeds(phase_map: PhaseMap, seeds: Seeds) -> tuple[NDArray[np.bool_],
     """Which seeds project into the view's region facing it, and where."""
     in_cam = phase_map.view.cam_from_world * seeds.points_in_world
     xy = phase_map.view.camera.project(in_cam)
-    inside = sample_image(phase_map.region.inside.astype(np.float32), xy, nearest=True) > 0
     to_point = seeds.points_in_world - phase_map.view.center_in_world
     facing = (to_point * seeds.normals_in_world).sum(-1) < -0.1 * np.linalg.norm(to_point, axis=-1)
     known = np.isfinite(seeds.normals_in_world).all(axis=-1)
-    return inside & (facing | ~known), np.asarray(xy, np.float64)
+    return phase_map.shows_surface(xy) & (facing | ~known), np.asarray(xy, np.float64)
 
 
 def connect(

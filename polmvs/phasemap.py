@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from polmvs.camera import View, pixel_centers, sample_image
 from polmvs.config import Light, Model
 from polmvs.errors import DataError
-from polmvs.models import rows_from_axial
+from polmvs.models import phase_sign, rows_from_axial
 from polmvs.region import Region, smooth
 from polmvs.stokes import Stokes
 from polmvs.storage import map_array, save_array
@@ -59,6 +59,10 @@ class PhaseMap:
     folder: Path | None = None
     tilted: bool = False
 
+    def shows_surface(self, xy: Floats) -> Mask:
+        """Whether the pixels at image coordinates ``(..., 2)`` belong to the region."""
+        return sample_image(self.region.inside.astype(np.float32), xy, nearest=True) > 0
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle a stored map as its place."""
         if self.folder is not None:
@@ -94,7 +98,7 @@ def build_phase_map(
     width_px = np.where(use_fine, FINE_SMOOTHING_PX, COARSE_SMOOTHING_PX)
     share = np.where(use_fine, fine_weight, coarse_weight)
     with np.errstate(divide="ignore", invalid="ignore"):
-        axial = _phase_sign(light) * smoothed[..., 1:3] / smoothed[..., :1]
+        axial = phase_sign(light) * smoothed[..., 1:3] / smoothed[..., :1]
         dolp = np.linalg.norm(axial, axis=-1)
         # A Gaussian of width w averages 4 pi w^2 independent pixels.
         noise = np.sqrt(smoothed[..., 3] / (4 * np.pi * width_px**2 * share)) / smoothed[..., 0]
@@ -146,7 +150,7 @@ def as_tilted(phase_map: PhaseMap) -> PhaseMap:
     correction is linear in the Stokes parameters and varies slowly over the image, so that it may
     follow the smoothing.
     """
-    sign = np.where(phase_map.diffuse, _phase_sign(Light.DIFFUSE), _phase_sign(Light.SPECULAR))
+    sign = np.where(phase_map.diffuse, phase_sign(Light.DIFFUSE), phase_sign(Light.SPECULAR))
     one = np.ones(sign.shape, np.float32)
     measured = Stokes(
         s0=one,
@@ -162,11 +166,6 @@ def as_tilted(phase_map: PhaseMap) -> PhaseMap:
     samples = np.dstack([scale * corrected.s1, scale * corrected.s2, precision])
     clean = np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
     return replace(phase_map, samples=clean, folder=None, tilted=True)
-
-
-def _phase_sign(light: Light) -> np.float32:
-    """Factor from ``(cos, sin)`` of twice the AoLP to that of twice the phase."""
-    return np.float32(-1.0 if light is Light.SPECULAR else 1.0)
 
 
 def turned(phase_map: PhaseMap, where: Mask) -> PhaseMap:

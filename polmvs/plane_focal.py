@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from polmvs.config import Light, Model
+from polmvs.models import phase_sign
 from polmvs.normals import CAUCHY_SCALE
 from polmvs.phase_errors import error_gradients, phase_errors, stack_samples
 from polmvs.plane import PlaneEstimate, plane_normal, robust_deviation, tangents
@@ -87,8 +88,7 @@ class _View:
         if self.model is Model.TILTED:
             parameters = correct_parameters(parameters, rays.T, light=self.light)
             sigma = sigma * sigma_scale(parameters[1], parameters[2], rays.T, light=self.light)
-        axial = -parameters[1:] if self.light is Light.SPECULAR else parameters[1:]
-        return axial, rays, sigma
+        return phase_sign(self.light) * parameters[1:], rays, sigma
 
     def plane(self, focal_px: float) -> PlaneEstimate:
         """Robust normal at a focal length."""

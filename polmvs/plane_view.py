@@ -13,6 +13,7 @@ from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.capture import Capture, _full_scale_16
 from polmvs.config import CaptureOptions, Light, Model
 from polmvs.image_io import probe_mosaic
+from polmvs.models import phase_sign
 from polmvs.phasemap import MIXTURE_SIGMA, MODEL_SIGMA
 from polmvs.plane import PlaneEstimate, plane_normal
 from polmvs.plane_focal import FocalEstimate, estimate_focal
@@ -54,9 +55,7 @@ class PlaneView:
         stokes = self.stokes
         if model is Model.TILTED:
             stokes = correct_stokes(stokes, rays, light=self.light)
-        axial = np.stack([stokes.s1, stokes.s2])
-        if self.light is Light.SPECULAR:
-            axial = -axial
+        axial = phase_sign(self.light) * np.stack([stokes.s1, stokes.s2])
         return axial, np.ascontiguousarray(np.moveaxis(rays, -1, 0)), phase_sigma(stokes)
 
     def plane(self, model: Model, camera: PinholeCamera, *, robust: bool = True) -> PlaneEstimate:

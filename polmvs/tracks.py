@@ -179,9 +179,8 @@ def seen_shares(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> Arra
         xy = camera.project(phase_map.view.cam_from_world * points)
         shown = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
         shown &= cosine > MIN_FACING_COSINE
-        inside = sample_image(phase_map.region.inside.astype(np.float32), xy, nearest=True) > 0
         facing += shown
-        seen += shown & inside
+        seen += shown & phase_map.shows_surface(xy)
     return np.asarray(seen / np.maximum(facing, 1))
 
 

@@ -20,6 +20,7 @@ from polmvs.errors import DataError
 from polmvs.experiments.estimated_poses import estimated_views
 from polmvs.groundtruth import GroundTruth
 from polmvs.image_io import read_mask
+from polmvs.models import phase_sign
 from polmvs.phasemap import PhaseMap, build_phase_map, view_rays
 from polmvs.region import Region, find_region, smooth
 from polmvs.stages import find_mask
@@ -125,8 +126,7 @@ class ViewData:
     def axial(self, model: Model) -> Image:
         """``(s0 cos 2 phase, s0 sin 2 phase)`` times the DoLP of the blurred images, (H, W, 2)."""
         stokes = self.blurred_for(model)
-        sign = np.float32(-1 if self.light is Light.SPECULAR else 1)
-        return sign * np.dstack([stokes.s1, stokes.s2])
+        return phase_sign(self.light) * np.dstack([stokes.s1, stokes.s2])
 
     def find_region(self, min_dolp: float) -> Region:
         """The part with its reliable pixels (no printed marks) and edges."""

@@ -11,8 +11,6 @@ VERMILLION, ORANGE, SKY, BLUE, GREEN, GREY = (
     "#D55E00", "#E69F00", "#56B4E9", "#0072B2", "#009E73", "#666666",
 )  # fmt: skip
 
-MODEL_COLORS = {Model.OPA: VERMILLION, Model.PPA: BLUE, Model.TILTED: GREEN}
-
 PLANE_LABELS = {
     "algebraic": "PPA, eigenvector (paper)",
     "weighted_noise": "PPA, robust, noise weights",
