@@ -75,11 +75,10 @@ def align_to_truth(
     centers = np.array([view.center_in_world for view, _ in pairs])
     true_centers = np.array([true.center_in_world for _, true in pairs])
     try:
-        used = _consistent_cameras(centers, true_centers)
-        truth_from_world = align_points(centers[used], true_centers[used])
+        truth_from_world, used = align_cameras(centers, true_centers)
     except ValueError as error:
         raise DataError(path, f"cameras cannot be aligned: {error}") from error
-    residuals = _residuals(truth_from_world, centers[used], true_centers[used])
+    residuals = align_residuals(truth_from_world, centers[used], true_centers[used])
     rotation_errors = [
         _rotation_error_deg(view, true, truth_from_world)
         for (view, true), is_used in zip(pairs, used, strict=True)
@@ -97,6 +96,34 @@ def align_to_truth(
     return truth_from_world, report
 
 
+def align_cameras(centers: Array, true_centers: Array) -> tuple[SimilarityTransform, Mask]:
+    """Least-squares similarity from the camera centres that one similarity explains.
+
+    Parameters
+    ----------
+    centers, true_centers : (N, 3) float64, the same cameras in the source and the target frame.
+
+    Returns
+    -------
+    SimilarityTransform
+        ``target_from_source``.
+    (N,) bool
+        The cameras used; all of them when there are fewer than five.
+
+    Raises
+    ------
+    ValueError
+        For fewer than three cameras, or centres on one line.
+    """
+    used = _consistent_cameras(centers, true_centers)
+    return align_points(centers[used], true_centers[used]), used
+
+
+def align_residuals(transform: SimilarityTransform, source: Array, target: Array) -> Array:
+    """Distances ``(N,)`` of the transformed source points from the target, target units."""
+    return np.asarray(np.linalg.norm(transform * source - target, axis=1))
+
+
 def _consistent_cameras(centers: Array, true_centers: Array) -> Mask:
     """Which cameras one similarity explains; all of them when there are fewer than five."""
     used = np.ones(len(centers), np.bool_)
@@ -105,7 +132,7 @@ def _consistent_cameras(centers: Array, true_centers: Array) -> Mask:
     spread = float(np.sqrt(((true_centers - true_centers.mean(axis=0)) ** 2).sum(1).mean()))
     used = _best_majority(centers, true_centers)
     for _ in range(10):
-        residuals = _residuals(
+        residuals = align_residuals(
             align_points(centers[used], true_centers[used]), centers, true_centers
         )
         limit = max(OUTLIER_RATIO * float(np.median(residuals)), OUTLIER_FLOOR * spread)
@@ -125,7 +152,7 @@ def _best_majority(centers: Array, true_centers: Array) -> Mask:
             transform = align_points(centers[triple], true_centers[triple])
         except ValueError:
             continue
-        residuals = _residuals(transform, centers, true_centers)
+        residuals = align_residuals(transform, centers, true_centers)
         score = float(np.partition(residuals, majority - 1)[majority - 1])
         if score < best:
             best, best_residuals = score, residuals
@@ -138,10 +165,6 @@ def _triples(num: int) -> list[list[int]]:
         return [list(triple) for triple in combinations(range(num), 3)]
     rng = np.random.default_rng(0)
     return [rng.choice(num, 3, replace=False).tolist() for _ in range(MAX_TRIPLES)]
-
-
-def _residuals(transform: SimilarityTransform, source: Array, target: Array) -> Array:
-    return np.asarray(np.linalg.norm(transform * source - target, axis=1))
 
 
 def _rotation_error_deg(view: View, true: View, truth_from_world: SimilarityTransform) -> float:

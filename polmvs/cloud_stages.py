@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from polmvs.capture import DISPLAY_GAMMA
 from polmvs.cloud_io import Cloud, write_cloud
 from polmvs.colmap_io import read_model
-from polmvs.config import FusionOptions, Model, NormalOptions, PropagationOptions
+from polmvs.config import FusionOptions, Method, Model, NormalOptions, PropagationOptions
 from polmvs.fuse import FusedCloud, fuse
+from polmvs.integrate import integrate, plan_rounds
 from polmvs.normals import NormalEstimate
 from polmvs.parallel import Workers
 from polmvs.propagate import propagate
@@ -117,9 +118,8 @@ def densify(
         write_cloud(workspace.cloud(model), Cloud(np.zeros((0, 3))))
         return {f"num_points_{model}": 0}
     with workspace.scratch(f"densify_{model}") as folder:
-        dense = propagate(
-            model, maps, seeds, propagation, folder, workers=workers, on_progress=report
-        )
+        spread = integrate if propagation.method is Method.INTEGRATE else propagate
+        dense = spread(model, maps, seeds, propagation, folder, workers=workers, on_progress=report)
         cloud = fuse(
             maps,
             dense,
@@ -134,6 +134,8 @@ def densify(
 
 def densify_steps(num_views: int, options: PropagationOptions) -> int:
     """How many times :func:`densify` reports."""
+    if options.method is Method.INTEGRATE:
+        return (len(plan_rounds(options)) + 1) * num_views
     return (options.num_rounds + 2) * num_views
 
 
@@ -146,5 +148,9 @@ def _dense_cloud(cloud: FusedCloud) -> Cloud:
         points=cloud.points,
         normals=cloud.normals,
         colors=np.repeat(grey[:, None], 3, axis=1),
-        scalars={"num_views": cloud.num_views, "sigma_deg": cloud.sigma_deg},
+        scalars={
+            "num_views": cloud.num_views,
+            "sigma": cloud.sigma,
+            "sigma_deg": cloud.sigma_deg,
+        },
     )

@@ -6,6 +6,7 @@ Each stage takes its own frozen dataclass. The command line makes its flags from
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -30,6 +31,13 @@ class Light(StrEnum):
 
     SPECULAR = "specular"
     DIFFUSE = "diffuse"
+
+
+class Method(StrEnum):
+    """How ranges spread over a view's region."""
+
+    INTEGRATE = "integrate"
+    CONTOUR = "contour"
 
 
 class Contour(StrEnum):
@@ -143,15 +151,22 @@ class NormalOptions:
 class PropagationOptions:
     """How ranges spread from the seeds over the polarised region."""
 
+    method: Method = option(
+        Method.INTEGRATE,
+        "'integrate': multi-view normals over the region's pixels, coarse to fine; 'contour': "
+        "along phase contours, as in the paper",
+    )
     contour: Contour = option(
         Contour.TANGENT,
-        "PPA contours: 'tangent' (iso-range, one view) or 'normals' (multi-view normals along "
-        "the iso-depth paths, as in the paper)",
+        "contours: 'tangent' (iso-range under PPA, one view) or 'normals' (multi-view normals "
+        "along the iso-depth paths, as in the paper)",
     )
     step_px: float = option(0.5, "step of the contours, px")
     spacing_px: float = option(6.0, "distance between contours and between their nodes, px")
     stride_px: int = option(2, "distance between the dense points of one view, px")
-    num_rounds: int = option(3, "rounds of normals and ranges")
+    num_rounds: int = option(
+        6, "rounds of normals and ranges; of integrate on its coarsest lattice, two finer follow"
+    )
     bending: float = option(
         0.002,
         "standard deviation, as a share of the distance, of the smooth bending of a surface by "
@@ -187,6 +202,9 @@ class FusionOptions:
     voxel_px: float = option(
         0.5, "edge of the merging voxel, in footprints of a pixel; 0: no merging"
     )
+    voxel: float | None = option(
+        None, "edge of the merging voxel in units of the model, instead of --voxel-px; 0: none"
+    )
 
     def __post_init__(self) -> None:
         _require(self.min_views >= 1, f"--min-views must be 1 or more, not {self.min_views}.")
@@ -196,6 +214,7 @@ class FusionOptions:
             "--max-normal-difference-deg must lie in 0 to 90.",
         )
         _require(self.voxel_px >= 0, "--voxel-px must not be negative.")
+        _require(self.voxel is None or self.voxel >= 0, "--voxel must not be negative.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,6 +224,50 @@ class EvaluationOptions:
     gt: Path | None = option(
         None, "folder of the ground truth (cameras.json and maps), or the capture's that has gt/"
     )
+
+
+def _is_positive(value: str | float) -> bool:
+    """Whether a number, or its text, is finite and positive."""
+    try:
+        return 0 < float(value) < math.inf
+    except ValueError:
+        return False
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceOptions:
+    """What gives the reconstruction its metric scale and frame; nothing does by default."""
+
+    reference: Path | None = option(
+        None,
+        "known camera centres in metres: .json (image name to center or cam_from_world) or .txt "
+        "(lines: name x y z); they fix scale, rotation and origin",
+    )
+    aruco: str | None = option(
+        None,
+        "DICT:SIZE of printed markers in the scene, such as DICT_4X4_50:0.05, SIZE the side of "
+        "the black square in metres; fixes the scale",
+    )
+    scale: tuple[str, str, float] | None = field(
+        default=None,
+        metadata={
+            "help": "distance in metres between two images' cameras or sparse points (ids)",
+            "metavar": ("A", "B", "DISTANCE"),
+        },
+    )
+
+    def __post_init__(self) -> None:
+        if self.aruco is not None:
+            name, _, size = self.aruco.rpartition(":")
+            _require(
+                bool(name) and _is_positive(size),
+                "--aruco needs DICT:SIZE with a positive size in metres, such as "
+                f"DICT_4X4_50:0.05, not {self.aruco}.",
+            )
+        if self.scale is not None:
+            first, second, distance = self.scale
+            _require(first != second, f"--scale needs two different ends, not {first} twice.")
+            _require(_is_positive(distance), f"--scale needs a positive distance, not {distance}.")
 
 
 @dataclass(frozen=True, kw_only=True)

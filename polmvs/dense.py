@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from polmvs.storage import map_array, save_array
+from polmvs.surface import log_range_increment
 
+Floats = NDArray[np.floating]
+Array = NDArray[np.float64]
 Image = NDArray[np.float32]
+
+NUM_NEAREST = 4  # known points that a point of the surface between them is made of
+MEMBERS = ("range", "normals", "sigma_deg", "sigma", "confidence")  # of a stored view
 
 
 @dataclass(frozen=True)
@@ -24,6 +31,9 @@ class DenseView:
     range_map : (h, w) float32, distance from the camera centre, world units; 0 where unknown.
     normals_in_world : (h, w, 3) float32, unit; NaN where unknown.
     sigma_deg : (h, w) float32, standard deviation of the normal.
+    sigma : (h, w) float32, standard deviation of the range, world units.
+    confidence : (h, w) float32, share from 0 to 1 of the views facing the point whose phase
+        agrees with its normal.
     path : stem of the files that hold the arrays, if they are stored.
     """
 
@@ -31,42 +41,155 @@ class DenseView:
     range_map: Image
     normals_in_world: Image
     sigma_deg: Image
+    sigma: Image
+    confidence: Image
     path: Path | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle a stored view as its place."""
         if self.path is not None:
             return open_dense_view, (self.stride_px, self.path)
-        arrays = (self.range_map, self.normals_in_world, self.sigma_deg)
-        return DenseView, (self.stride_px, *arrays)
+        return DenseView, (self.stride_px, *self._arrays())
 
-    def lattice_xy(self) -> NDArray[np.float64]:
+    def _arrays(self) -> tuple[Image, ...]:
+        maps = (self.range_map, self.normals_in_world, self.sigma_deg, self.sigma)
+        return (*maps, self.confidence)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Lattice points (h, w) with a range and a normal."""
+        has_normal = np.isfinite(self.normals_in_world).all(axis=-1)
+        return np.asarray((self.range_map > 0) & has_normal)
+
+    def lattice_xy(self) -> Array:
         """Image coordinates ``(h, w, 2)`` of the lattice."""
-        height, width = self.range_map.shape
-        indices = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-        return np.asarray((indices + 0.5) * self.stride_px, np.float64)
+        return lattice_xy(*self.range_map.shape, self.stride_px)
+
+
+def lattice_xy(num_rows: int, num_cols: int, stride_px: int) -> Array:
+    """Image coordinates ``(num_rows, num_cols, 2)`` of a view's lattice."""
+    indices = np.stack(np.meshgrid(np.arange(num_cols), np.arange(num_rows)), axis=-1)
+    return np.asarray((indices + 0.5) * stride_px, np.float64)
+
+
+@dataclass(frozen=True)
+class SurfaceSamples:
+    """Some points of the surface that a view sees.
+
+    Attributes
+    ----------
+    xy : (N, 2), image coordinates; rays_in_world : (N, 3), unit.
+    log_range : (N,); normals : (N, 3), unit, world.
+    normal_sigma : (N,), rad; log_range_sigma : (N,); confidence : (N,), 0 to 1.
+    """
+
+    xy: Floats
+    rays_in_world: Floats
+    log_range: Array
+    normals: Array
+    normal_sigma: Array
+    log_range_sigma: Array
+    confidence: Array
+
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> SurfaceSamples:
+        """Some of the points."""
+        return SurfaceSamples(*(getattr(self, f.name)[index] for f in fields(self)))
+
+
+def view_samples(dense: DenseView, rays_in_world: Floats) -> SurfaceSamples:
+    """The known points of a dense view; ``rays_in_world`` (h, w, 3) are its lattice's."""
+    known = dense.known
+    distance = dense.range_map[known].astype(np.float64)
+    return SurfaceSamples(
+        xy=dense.lattice_xy()[known],
+        rays_in_world=rays_in_world[known],
+        log_range=np.log(distance),
+        normals=dense.normals_in_world[known].astype(np.float64),
+        normal_sigma=np.radians(dense.sigma_deg[known].astype(np.float64)),
+        log_range_sigma=dense.sigma[known] / distance,
+        confidence=dense.confidence[known].astype(np.float64),
+    )
+
+
+def extend_planes(
+    samples: SurfaceSamples, xy: Floats, rays_in_world: Floats, max_gap_px: float
+) -> SurfaceSamples:
+    """The surface at other pixels, from the nearest samples.
+
+    The chord from a sample is perpendicular to the mean of the normals at its ends, exactly so on
+    planes and spheres.
+
+    Parameters
+    ----------
+    samples : at least one, all finite.
+    xy, rays_in_world : (N, 2) and (N, 3), where the surface is wanted.
+    max_gap_px : from farther samples nothing is taken.
+
+    Returns
+    -------
+    SurfaceSamples of N points, with NaN ranges and normals where no sample is near.
+    """
+    k = min(NUM_NEAREST, len(samples.xy))
+    gap, index = cKDTree(samples.xy).query(xy, k=k, distance_upper_bound=max_gap_px)
+    gap, index = gap.reshape(-1, k), index.reshape(-1, k)
+    found = np.isfinite(gap)
+    index = np.where(found, index, 0)
+    normals = samples.normals[index]
+    weight = np.where(found, 1 / (1 + np.where(found, gap, 0) ** 2), 0)
+    total = weight.sum(axis=1)
+    weight = weight / np.maximum(total, 1e-12)[:, None]
+    normal = (weight[..., None] * normals).sum(axis=1)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normal = np.where(total[:, None] > 0, normal / length, np.nan)
+
+    def mean(values: Array) -> Array:
+        return np.where(total > 0, (weight * values).sum(axis=1), np.nan)
+
+    chord = normals + normal[:, None]
+    step = log_range_increment(chord, samples.rays_in_world[index], rays_in_world[:, None])
+    return SurfaceSamples(
+        xy=xy,
+        rays_in_world=rays_in_world,
+        log_range=mean(samples.log_range[index] + step),
+        normals=normal,
+        normal_sigma=mean(samples.normal_sigma[index]),
+        log_range_sigma=mean(samples.log_range_sigma[index]),
+        confidence=mean(samples.confidence[index]),
+    )
+
+
+def dense_view(samples: SurfaceSamples, wanted: NDArray[np.bool_], stride_px: int) -> DenseView:
+    """A dense view of samples at the ``wanted`` (h, w) points of its lattice, row by row."""
+    known = np.isfinite(samples.log_range) & np.isfinite(samples.normals).all(axis=-1)
+    distance = np.where(known, np.exp(np.where(known, samples.log_range, 0)), 0)
+
+    def image(values: Array, unknown: float) -> Image:
+        result = np.full((*wanted.shape, *values.shape[1:]), unknown, np.float32)
+        good = known if values.ndim == 1 else known[:, None]
+        result[wanted] = np.where(good, values, unknown)
+        return result
+
+    return DenseView(
+        stride_px=stride_px,
+        range_map=image(distance, 0.0),
+        normals_in_world=image(samples.normals, np.nan),
+        sigma_deg=image(np.degrees(samples.normal_sigma), np.nan),
+        sigma=image(samples.log_range_sigma * distance, np.nan),
+        confidence=image(samples.confidence, 0.0),
+    )
 
 
 def store_dense_view(dense: DenseView, path: Path) -> DenseView:
     """Write a dense view to ``path.range.npy`` and its fellows; returns the stored one."""
-    for name, array in (
-        ("range", dense.range_map),
-        ("normals", dense.normals_in_world),
-        ("sigma", dense.sigma_deg),
-    ):
+    for name, array in zip(MEMBERS, dense._arrays(), strict=True):
         save_array(_member(path, name), array)
     return open_dense_view(dense.stride_px, path)
 
 
 def open_dense_view(stride_px: int, path: Path) -> DenseView:
     """Map a stored dense view into memory."""
-    return DenseView(
-        stride_px=stride_px,
-        range_map=map_array(_member(path, "range")),
-        normals_in_world=map_array(_member(path, "normals")),
-        sigma_deg=map_array(_member(path, "sigma")),
-        path=path,
-    )
+    return DenseView(stride_px, *(map_array(_member(path, name)) for name in MEMBERS), path)
 
 
 def _member(path: Path, name: str) -> Path:

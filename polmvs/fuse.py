@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from polmvs.camera import sample_image
 from polmvs.config import FusionOptions
 from polmvs.dense import DenseView
+from polmvs.opinion import ask_view
 from polmvs.parallel import Workers
 from polmvs.phasemap import PhaseMap
 
@@ -21,6 +22,9 @@ Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 MAX_CONFLICT_SHARE = 0.5  # of the views that could see a point and see something else there
+SIGMAS = 3.0  # by how many deviations of both two views may differ
+MIN_TOLERANCE = 0.5  # share of the tolerance that is left to views however certain they are
+MIN_SIGMA_PX = 0.02  # of a range, in footprints: no view is trusted more than that
 MIN_VISIBLE_COSINE = 0.1  # between normal and viewing direction, for a view to have a say
 OUTLIER_NEIGHBORS = 8
 OUTLIER_SPACINGS = 4.0  # a point this many spacings from its neighbours is alone
@@ -36,6 +40,8 @@ class FusedCloud:
     intensity : (N,) float32, s0 in units of full scale.
     num_views : (N,) int32, views that agree on the point.
     sigma_deg : (N,) float32, standard deviation of the normal.
+    sigma : (N,) float32, standard deviation of the place along the normal, world units. Views
+        err alike, so that their number does not narrow it.
     """
 
     points: Array
@@ -43,16 +49,14 @@ class FusedCloud:
     intensity: NDArray[np.float32]
     num_views: NDArray[np.int32]
     sigma_deg: NDArray[np.float32]
+    sigma: NDArray[np.float32]
 
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> FusedCloud:
         """Some of the points."""
-        return FusedCloud(
-            self.points[index],
-            self.normals[index],
-            self.intensity[index],
-            self.num_views[index],
-            self.sigma_deg[index],
-        )
+        return FusedCloud(*(getattr(self, name)[index] for name in COLUMNS))
+
+
+COLUMNS = tuple(column.name for column in fields(FusedCloud))
 
 
 def fuse(
@@ -67,9 +71,11 @@ def fuse(
     """Fuse the dense views into one cloud.
 
     A point stays if enough views agree with it in distance and normal and if not most of the
-    views that should see it see through it or show no polarised surface there. It moves along
-    its ray to the mean of the places that the agreeing views give it. Points closer than the
-    merging voxel become one; lone points go.
+    views that should see it see through it or show no polarised surface there. Distances may
+    differ by what their deviations explain, at most by as many footprints as the options say and
+    never by less than half of it. The point moves along its ray to the mean of the places that the
+    agreeing views give it, weighted by their deviations. Points closer than the merging voxel
+    become one; lone points go.
 
     Parameters
     ----------
@@ -97,7 +103,8 @@ def fuse(
     if not len(cloud.points):
         return cloud
     footprint = float(np.median(np.concatenate([p[1] for p in parts])))
-    return _without_lone_points(_merge(cloud, options.voxel_px * footprint))
+    voxel = options.voxel if options.voxel is not None else options.voxel_px * footprint
+    return _without_lone_points(merge(cloud, voxel))
 
 
 def _confirm(
@@ -106,126 +113,71 @@ def _confirm(
     """Points of the first view that enough of the others confirm, and their pixels' footprints."""
     phase_map, dense = views[0]
     view = phase_map.view
-    known = (dense.range_map > 0) & np.isfinite(dense.normals_in_world).all(axis=-1)
+    known = dense.known
     xy = dense.lattice_xy()[known]
     distance = dense.range_map[known].astype(np.float64)
     normals = dense.normals_in_world[known].astype(np.float64)
     rays = view.camera.rays(xy) @ view.cam_from_world.rotation
     center = view.center_in_world
     footprint = distance / view.camera.mean_focal_px
-    place, normal = distance.copy(), normals.copy()
+    # As the others' deviations: grazing sight counts less.
+    cosine = np.maximum(np.abs((rays * normals).sum(axis=-1)), MIN_VISIBLE_COSINE)
+    sigma = _finite_sigma(dense.sigma[known] / cosine, footprint)
+    tolerance = options.max_range_difference_px * footprint
+    total = 1 / sigma**2
+    place, normal = total * distance, total[:, None] * normals
     votes, conflicts = np.ones(len(distance), np.int32), np.zeros(len(distance), np.int32)
     min_cosine = np.cos(np.radians(options.max_normal_difference_deg))
     for other_map, other in views[1:]:
-        opinion = _opinion(other_map, other, center, rays, distance, normals)
-        close = np.abs(opinion.place - distance) < options.max_range_difference_px * footprint
-        agrees = close & (opinion.cosine > min_cosine)
+        opinion = ask_view(other_map, other, center, rays, distance, normals)
+        other_sigma = _finite_sigma(opinion.sigma, footprint)
+        explained = SIGMAS * np.hypot(sigma, other_sigma)
+        allowed = np.clip(explained, MIN_TOLERANCE * tolerance, tolerance)
+        agrees = (np.abs(opinion.place - distance) < allowed) & (opinion.cosine > min_cosine)
         votes += agrees
-        behind = opinion.excess > 2 * options.max_range_difference_px * footprint
+        behind = opinion.excess > 2 * allowed
         conflicts += (behind | opinion.outside) & (opinion.facing > MIN_VISIBLE_COSINE)
-        place += np.where(agrees, opinion.place, 0)
-        normal += np.where(agrees[:, None], opinion.normals, 0)
-    place /= votes
+        weight = np.where(agrees, 1 / other_sigma**2, 0)
+        total += weight
+        place += weight * np.where(agrees, opinion.place, 0)
+        normal += weight[:, None] * opinion.normals
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     keep = (votes >= options.min_views) & (conflicts <= MAX_CONFLICT_SHARE * (votes + conflicts))
     cloud = FusedCloud(
-        center + place[:, None] * rays,
-        normal,
-        sample_image(phase_map.intensity, xy),
-        votes,
-        dense.sigma_deg[known],
+        points=center + (place / total)[:, None] * rays,
+        normals=normal,
+        intensity=sample_image(phase_map.intensity, xy),
+        num_views=votes,
+        sigma_deg=dense.sigma_deg[known],
+        sigma=np.sqrt(votes / total) * np.abs((rays * normal).sum(axis=-1)),
     )
     return cloud[keep], footprint[keep].astype(np.float32)
 
 
-@dataclass(frozen=True)
-class _Opinion:
-    """What another view says of a view's points.
-
-    ``place``: distance along the first view's rays at which the other's surface is met (NaN:
-    none). ``normals``, ``cosine``: its normal and the cosine to the point's own. ``excess``: how
-    much farther than the point its surface lies, along its own ray (NaN: it has none there).
-    ``facing``: cosine between the point's normal and the direction to the other camera.
-    ``outside``: it shows the point's place and no polarised surface there.
-    """
-
-    place: Array
-    normals: Array
-    cosine: Array
-    excess: Array
-    facing: Array
-    outside: Mask
-
-
-def _opinion(
-    phase_map: PhaseMap,
-    dense: DenseView,
-    center: Array,
-    rays: Array,
-    distance: Array,
-    normals: Array,
-) -> _Opinion:
-    """Look a view's points up in another dense view."""
-    view = phase_map.view
-    points = center + distance[:, None] * rays
-    in_cam = view.cam_from_world * points
-    own_range = np.linalg.norm(in_cam, axis=-1)
-    xy = view.camera.project(in_cam)
-    lattice_xy = xy / dense.stride_px
-    seen = sample_image(dense.range_map, lattice_xy, nearest=True).astype(np.float64)
-    seen_normals = sample_image(dense.normals_in_world, lattice_xy, nearest=True)
-    seen_normals = np.where(seen[:, None] > 0, seen_normals.astype(np.float64), np.nan)
-    other_center = view.center_in_world
-    # The other's surface element at the nearest lattice point: a plane through its point.
-    nearest_xy = (np.floor(np.nan_to_num(lattice_xy)) + 0.5) * dense.stride_px
-    other_rays = view.camera.rays(nearest_xy) @ view.cam_from_world.rotation
-    elements = other_center + seen[:, None] * other_rays
-    with np.errstate(divide="ignore", invalid="ignore"):
-        place = ((elements - center) * seen_normals).sum(-1) / (rays * seen_normals).sum(-1)
-        to_camera = other_center - points
-        facing = (to_camera * normals).sum(-1) / own_range
-    excess = np.where(seen > 0, seen - own_range, np.nan)
-    cosine = (seen_normals * normals).sum(axis=-1)
-    outside = _shows_background(phase_map, xy)
-    return _Opinion(place, np.nan_to_num(seen_normals), cosine, excess, facing, outside)
-
-
-def _shows_background(phase_map: PhaseMap, xy: Floats) -> Mask:
-    """Which places lie in the image but outside its region."""
-    camera = phase_map.view.camera
-    in_image = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
-    return np.asarray(in_image & ~phase_map.shows_surface(xy))
+def _finite_sigma(sigma: Floats, footprint: Array) -> Array:
+    """Deviations of ranges, no smaller than a share of the footprint; large where unknown."""
+    known = np.isfinite(sigma)
+    return np.where(known, np.maximum(sigma, MIN_SIGMA_PX * footprint), footprint)
 
 
 def _concatenate(clouds: Sequence[FusedCloud]) -> FusedCloud:
     """All points of some clouds."""
-    empty = FusedCloud(
-        np.zeros((0, 3)),
-        np.zeros((0, 3)),
-        np.zeros(0, np.float32),
-        np.zeros(0, np.int32),
-        np.zeros(0, np.float32),
-    )
-    clouds = [empty, *clouds]
-    return FusedCloud(
-        np.concatenate([c.points for c in clouds]),
-        np.concatenate([c.normals for c in clouds]),
-        np.concatenate([c.intensity for c in clouds]),
-        np.concatenate([c.num_views for c in clouds]),
-        np.concatenate([c.sigma_deg for c in clouds]),
-    )
+    vectors, numbers = np.zeros((0, 3)), np.zeros(0, np.float32)
+    empty = FusedCloud(vectors, vectors, numbers, np.zeros(0, np.int32), numbers, numbers)
+    parts = [empty, *clouds]
+    return FusedCloud(*(np.concatenate([getattr(c, name) for c in parts]) for name in COLUMNS))
 
 
-def _merge(cloud: FusedCloud, voxel: float) -> FusedCloud:
-    """One point per voxel: means weighted by the number of agreeing views."""
-    if voxel <= 0:
+def merge(cloud: FusedCloud, voxel: float) -> FusedCloud:
+    """One point per voxel (world units; 0: no merging): means weighted by views and certainty."""
+    if voxel <= 0 or not len(cloud.points):
         return cloud
     cells = np.floor((cloud.points - cloud.points.min(axis=0)) / voxel).astype(np.int64)
     extent = cells.max(axis=0) + 1
     key = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
     unique, inverse = np.unique(key, return_inverse=True)
     num = len(unique)
-    weight = cloud.num_views.astype(np.float64)
+    weight = cloud.num_views / np.maximum(cloud.sigma.astype(np.float64), 1e-3 * voxel) ** 2
     total = np.bincount(inverse, weight, num)
 
     def mean(values: Floats) -> Array:
@@ -237,11 +189,12 @@ def _merge(cloud: FusedCloud, voxel: float) -> FusedCloud:
     views = np.zeros(num, np.int32)
     np.maximum.at(views, inverse, cloud.num_views)
     return FusedCloud(
-        points,
-        normals,
-        mean(cloud.intensity).astype(np.float32),
-        views,
-        mean(cloud.sigma_deg).astype(np.float32),
+        points=points,
+        normals=normals,
+        intensity=mean(cloud.intensity).astype(np.float32),
+        num_views=views,
+        sigma_deg=mean(cloud.sigma_deg).astype(np.float32),
+        sigma=mean(cloud.sigma).astype(np.float32),
     )
 
 

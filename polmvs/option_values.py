@@ -1,7 +1,8 @@
 """Options as text, as TOML and JSON values, and back; the types of the dataclass fields decide.
 
-A field may be ``bool``, ``int``, ``float``, ``str``, ``Path``, a ``StrEnum`` or a tuple of numbers,
-each also ``| None``.
+A field may be ``bool``, ``int``, ``float``, ``str``, ``Path``, a ``StrEnum``, a tuple of numbers or
+a mixed tuple such as ``tuple[str, str, float]``, each also ``| None``. On the command line a tuple
+of numbers is one text with commas, a mixed tuple as many texts as it has elements.
 """
 
 from __future__ import annotations
@@ -30,12 +31,14 @@ class FieldInfo:
     kind : its type without ``None``: a class, or ``tuple[...]``.
     default : its default value.
     help_text : what it means, with the unit.
+    metavar : names of a mixed tuple's elements, if it has any.
     """
 
     name: str
     kind: Any
     default: Any
     help_text: str
+    metavar: tuple[str, ...] | None = None
 
     @property
     def flag(self) -> str:
@@ -53,9 +56,17 @@ def describe_fields(cls: type) -> tuple[FieldInfo, ...]:
             kind=_without_none(hints[f.name]),
             default=getattr(defaults, f.name),
             help_text=f.metadata.get("help", ""),
+            metavar=f.metadata.get("metavar"),
         )
         for f in fields(cls)
     )
+
+
+def mixed_kinds(kind: Any) -> tuple[Any, ...]:
+    """Types of the elements of a mixed tuple, in order; empty for every other type."""
+    elements = typing.get_args(kind) if typing.get_origin(kind) is tuple else ()
+    is_mixed = len(set(elements)) > 1 and Ellipsis not in elements
+    return elements if is_mixed else ()
 
 
 def parse_text(kind: Any, text: str) -> Any:
@@ -129,6 +140,10 @@ def _convert(kind: Any, value: Any) -> Any:
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list | tuple):
             raise TypeError("a list is expected")
+        if kinds := mixed_kinds(kind):
+            if len(value) != len(kinds):
+                raise TypeError(f"a list of {len(kinds)} is expected")
+            return tuple(map(_convert, kinds, value))
         element = typing.get_args(kind)[0]
         return tuple(_convert(element, item) for item in value)
     expected: tuple[type, ...] = (kind,)

@@ -1,8 +1,7 @@
-"""Phase maps: what the geometry needs of one view, and the rows that many views give a point."""
+"""Phase maps: what the geometry needs of one view."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import View, pixel_centers, sample_image
-from polmvs.config import Light, Model
+from polmvs.config import Light
 from polmvs.errors import DataError
-from polmvs.models import phase_sign, rows_from_axial
+from polmvs.models import phase_sign
 from polmvs.region import Region, smooth
 from polmvs.stokes import Stokes
 from polmvs.storage import map_array, save_array
@@ -108,7 +107,8 @@ def build_phase_map(
     np.nan_to_num(samples, copy=False, nan=0.0)
     diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
     intensity = np.asarray(s0, np.float32)
-    return PhaseMap(view, region, samples, intensity, diffuse, _lowest_dolp(stokes))
+    sharp = PhaseMap(view, region, samples, intensity, diffuse, _lowest_dolp(stokes))
+    return _with_doubt(sharp, 1.0, _corrected(sharp))
 
 
 def _lowest_dolp(stokes: Image) -> NDArray[np.uint8]:
@@ -150,7 +150,25 @@ def as_tilted(phase_map: PhaseMap) -> PhaseMap:
     correction is linear in the Stokes parameters and varies slowly over the image, so that it may
     follow the smoothing.
     """
-    sign = np.where(phase_map.diffuse, phase_sign(Light.DIFFUSE), phase_sign(Light.SPECULAR))
+    corrected = _corrected(phase_map)
+    sign = _signs(phase_map)
+    scale = sign / np.maximum(corrected.s0, 1e-6)
+    # The turn of a row about its ray stays as certain as it was; that of the phase changes.
+    certain = _with_doubt(phase_map, -1.0, corrected).samples[..., 2]
+    precision = certain / np.square(corrected.sigma)
+    samples = np.dstack([scale * corrected.s1, scale * corrected.s2, precision])
+    clean = np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+    return replace(phase_map, samples=clean, folder=None, tilted=True)
+
+
+def _signs(phase_map: PhaseMap) -> Image:
+    """Factor (H, W) from twice the AoLP to twice the phase, by each pixel's kind of light."""
+    return np.where(phase_map.diffuse, phase_sign(Light.DIFFUSE), phase_sign(Light.SPECULAR))
+
+
+def _corrected(phase_map: PhaseMap) -> Stokes:
+    """The map's samples as Stokes images of intensity one, corrected for the tilt."""
+    sign = _signs(phase_map)
     one = np.ones(sign.shape, np.float32)
     measured = Stokes(
         s0=one,
@@ -159,21 +177,34 @@ def as_tilted(phase_map: PhaseMap) -> PhaseMap:
         sigma=one,
         valid=phase_map.samples[..., 2] > 0,
     )
-    corrected = correct_for_tilt(measured, view_rays(phase_map.view), phase_map.diffuse)
-    scale = sign / np.maximum(corrected.s0, 1e-6)
-    # The turn of a row about its ray stays as certain as it was; that of the phase changes.
-    precision = phase_map.samples[..., 2] / np.square(corrected.sigma)
-    samples = np.dstack([scale * corrected.s1, scale * corrected.s2, precision])
-    clean = np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
-    return replace(phase_map, samples=clean, folder=None, tilted=True)
+    return correct_for_tilt(measured, view_rays(phase_map.view), phase_map.diffuse)
+
+
+def _with_doubt(phase_map: PhaseMap, share: float, corrected: Stokes) -> PhaseMap:
+    """Widen (share 1) each phase's variance by what a tilt of the polarizers would turn it.
+
+    A model that leaves the tilt out does not know whether the lens makes it, so that the turn is a
+    deviation of its phase: oblique rays count less. -1 takes the widening back.
+    """
+    sign = _signs(phase_map)
+    cos, sin, precision = np.moveaxis(phase_map.samples, -1, 0)
+    real = sign * (cos * corrected.s1 + sin * corrected.s2)
+    imaginary = sign * (sin * corrected.s1 - cos * corrected.s2)
+    turn = 0.5 * np.arctan2(imaginary, real)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variance = 1 / precision + share * turn**2
+        widened = np.where((precision > 0) & (variance > 0), 1 / variance, 0)
+    samples = np.dstack([cos, sin, widened]).astype(np.float32)
+    return replace(phase_map, samples=samples, folder=None)
 
 
 def turned(phase_map: PhaseMap, where: Mask) -> PhaseMap:
     """The map with the other kind of light on some pixels, their phase turned; not stored."""
     sign = np.where(where, -1, 1).astype(np.float32)
-    samples = phase_map.samples.copy()
-    samples[..., :2] *= sign[..., None]
-    return replace(phase_map, samples=samples, diffuse=phase_map.diffuse ^ where, folder=None)
+    certain = _with_doubt(phase_map, -1.0, _corrected(phase_map))
+    certain.samples[..., :2] *= sign[..., None]
+    other = replace(certain, diffuse=phase_map.diffuse ^ where)
+    return _with_doubt(other, 1.0, _corrected(other))
 
 
 def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:
@@ -228,77 +259,3 @@ def view_rays(view: View) -> NDArray[np.float32]:
     """Unit rays ``(H, W, 3)`` of all pixels, camera frame."""
     camera = view.camera
     return camera.rays(pixel_centers(camera.width, camera.height)).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Constraint rows of N points from K views, world frame, component first.
-
-    Attributes
-    ----------
-    rows, rays : (3, K, N) float32, unit; NaN rows where a view has no phase.
-    sigma : (K, N) float32, rad; infinite where the row does not count.
-    """
-
-    rows: NDArray[np.float32]
-    rays: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-
-
-def gather_rows(
-    model: Model,
-    points_in_world: Floats,
-    maps: Sequence[PhaseMap],
-    range_maps: Sequence[Image | None] | None = None,
-    *,
-    range_tolerance: float = 0.02,
-) -> Rows:
-    """Rows of points from all views that see them (paper, eq. coeff_2, before stacking).
-
-    Parameters
-    ----------
-    model : which rows.
-    points_in_world : (N, 3).
-    maps : K phase maps.
-    range_maps : per view ``(h, w)`` distances from the camera centre, 0 where unknown: a point
-        that lies behind its view's map by more than ``range_tolerance`` (relative) is occluded.
-    """
-    points = np.asarray(points_in_world, np.float32)
-    num_views, num_points = len(maps), len(points)
-    rows = np.full((3, num_views, num_points), np.nan, np.float32)
-    rays = np.zeros((3, num_views, num_points), np.float32)
-    sigma = np.full((num_views, num_points), np.inf, np.float32)
-    for k, phase_map in enumerate(maps):
-        in_cam = phase_map.view.cam_from_world * points
-        distance = np.linalg.norm(in_cam, axis=-1)
-        ray = in_cam / np.maximum(distance, 1e-12)[:, None]
-        xy = phase_map.view.camera.project(in_cam)
-        samples = sample_image(phase_map.samples, xy)
-        precision = samples[:, 2]
-        range_map = range_maps[k] if range_maps is not None else None
-        if range_map is not None:
-            seen = sample_range(range_map, phase_map.view, xy)
-            precision = np.where(
-                (seen > 0) & (distance > (1 + range_tolerance) * seen), 0, precision
-            )
-        row, turn = _row_and_turn(model, samples, ray)
-        rotation = phase_map.view.cam_from_world.rotation.astype(np.float32)
-        rows[:, k] = (row @ rotation).T
-        rays[:, k] = (ray @ rotation).T
-        with np.errstate(divide="ignore"):
-            sigma[k] = np.where(precision > 0, turn / np.sqrt(precision), np.inf)
-    return Rows(rows, rays, sigma)
-
-
-def sample_range(range_map: Image, view: View, xy: Floats) -> NDArray[np.float32]:
-    """Nearest value of a range map, which may be coarser than the view by a whole factor."""
-    return sample_image(range_map, xy / round(view.camera.width / range_map.shape[1]), nearest=True)
-
-
-def _row_and_turn(model: Model, samples: Image, rays: Floats) -> tuple[Floats, Floats]:
-    """Row in the camera frame, and how far it turns about the ray per turn of the phase."""
-    row = rows_from_axial(model, samples[:, 0], samples[:, 1], rays)
-    if model is Model.OPA:
-        return row, np.ones(len(row), np.float32)
-    # v_z / (1 - (v . d)^2): the length of v x d is v_z over the row's length in the image plane.
-    return row, (row[:, 0] ** 2 + row[:, 1] ** 2) / rays[:, 2]

@@ -9,31 +9,20 @@ in the other views, so the two alternate; they depend on it weakly and few round
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from polmvs.camera import sample_image
 from polmvs.config import Contour, Model, PropagationOptions
 from polmvs.contour import Contours, cover_with_contours, direction_field
 from polmvs.dense import DenseView, store_dense_view
-from polmvs.network import (
-    Nodes,
-    bending_modes,
-    connect,
-    fill_normals,
-    node_edges,
-    tie_seeds,
-    visible_seeds,
-)
-from polmvs.normals import solve_normals
+from polmvs.network import Nodes, connect, visible_seeds
 from polmvs.parallel import Workers
-from polmvs.phasemap import PhaseMap, gather_rows, view_rays
-from polmvs.surface import log_range_increment, solve_log_ranges
+from polmvs.phasemap import PhaseMap, view_rays
+from polmvs.relax import relax, spread_nodes, surface_at_seeds
 from polmvs.tracks import Seeds
 
 Floats = NDArray[np.floating]
@@ -155,25 +144,17 @@ def _start_view(
     phase_map: PhaseMap, seeds: Seeds, contours: Contours, options: PropagationOptions
 ) -> Nodes | None:
     """Network of a view's contours with ranges and normals from the nearest seeds."""
-    visible, seed_xy = visible_seeds(phase_map, seeds)
-    if not visible.any() or not len(contours.xy):
+    surface = surface_at_seeds(phase_map, seeds, contours.xy)
+    if surface is None:
         return None
-    rays_in_cam = phase_map.view.camera.rays(contours.xy)
     tail, head, on_contour = connect(contours, phase_map, options.spacing_px)
-    distance = np.linalg.norm(
-        seeds.points_in_world[visible] - phase_map.view.center_in_world, axis=-1
-    )
-    nearest = cKDTree(seed_xy[visible]).query(contours.xy)[1]
     return Nodes(
-        xy=contours.xy,
-        rays_in_world=(rays_in_cam @ phase_map.view.cam_from_world.rotation).astype(np.float32),
-        ray_z=rays_in_cam[:, 2].astype(np.float32),
+        surface=surface,
+        ray_z=phase_map.view.camera.rays(contours.xy)[:, 2],
+        spacing_px=options.spacing_px,
         tail=tail,
         head=head,
         on_contour=on_contour,
-        log_range=_interpolate(seed_xy[visible], np.log(distance), contours.xy),
-        normals=seeds.normals_in_world[visible][nearest],
-        normal_sigma=np.full(len(contours.xy), np.nan),
     )
 
 
@@ -194,80 +175,14 @@ def _round(
     """Normals and ranges of one view's nodes, and the dense view that they make."""
     if task.nodes is None:
         return None, None
-    range_maps = [d.range_map if d is not None else None for d in task.dense]
-    nodes = _update(model, task.maps[0], task.maps, range_maps, task.nodes, seeds, options)
-    dense = _densify(task.maps[0], nodes, task.stride_px, 2 * options.spacing_px)
-    return nodes, store_dense_view(dense, task.path) if dense is not None else None
-
-
-def _interpolate(known_xy: Floats, values: Array, xy: Floats, num_nearest: int = 5) -> Array:
-    """Median of the nearest known values: a rough start that one wrong seed does not spoil."""
-    nearest = min(num_nearest, len(known_xy))
-    indices = cKDTree(known_xy).query(xy, k=nearest)[1].reshape(len(xy), nearest)
-    return np.asarray(np.median(values[indices], axis=1), np.float64)
-
-
-def _update(
-    model: Model,
-    phase_map: PhaseMap,
-    used_maps: Sequence[PhaseMap],
-    range_maps: Sequence[Image | None],
-    nodes: Nodes,
-    seeds: Seeds,
-    options: PropagationOptions,
-) -> Nodes:
-    """One round: normals at the nodes from all views, then ranges from normals and seeds."""
-    center = phase_map.view.center_in_world
-    points = center + np.exp(nodes.log_range)[:, None] * nodes.rays_in_world
-    known = np.isfinite(nodes.log_range)
-    points[~known] = center  # projects nowhere: no rows
-    rows = gather_rows(model, points, used_maps, range_maps)
-    estimate = solve_normals(rows.rows, rows.rays, rows.sigma, initial_normals=nodes.normals.T)
-    normals, sigma = fill_normals(nodes, estimate)
-    own_sigma = rows.sigma[0]
-    edges = node_edges(model, nodes, normals, sigma, own_sigma, options)
-    ties, num_seeds = tie_seeds(phase_map, nodes, normals, seeds)
-    solution = solve_log_ranges(
-        len(nodes.xy),
-        edges,
-        ties,
-        num_seeds,
-        modes=bending_modes(nodes.xy) if options.bending > 0 else None,
-        mode_sigma=options.bending,
+    nodes = relax(
+        model,
+        task.maps,
+        task.dense,
+        task.nodes,
+        seeds,
+        bending=options.bending,
+        along_contours=options.contour is Contour.TANGENT,
     )
-    return replace(nodes, log_range=solution.log_range, normals=normals, normal_sigma=sigma)
-
-
-def _densify(phase_map: PhaseMap, nodes: Nodes, stride: int, max_gap_px: float) -> DenseView | None:
-    """Ranges and normals on the lattice of the region, from the planes of the nearest nodes."""
-    good = np.isfinite(nodes.log_range) & np.isfinite(nodes.normals).all(axis=-1)
-    if not good.any():
-        return None
-    camera = phase_map.view.camera
-    height, width = camera.height // stride, camera.width // stride
-    grid = (np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1) + 0.5) * stride
-    open_pixels = (phase_map.region.inside & ~phase_map.region.edges).astype(np.float32)
-    wanted = sample_image(open_pixels, grid, nearest=True) > 0
-    xy = grid[wanted]
-    k = min(4, int(good.sum()))
-    gap, index = cKDTree(nodes.xy[good]).query(xy, k=k, distance_upper_bound=max_gap_px)
-    gap, index = gap.reshape(-1, k), index.reshape(-1, k)
-    found = np.isfinite(gap)
-    index = np.where(found, index, 0)
-    rays = camera.rays(xy) @ phase_map.view.cam_from_world.rotation
-    normals = nodes.normals[good][index]
-    step = log_range_increment(normals, nodes.rays_in_world[good][index], rays[:, None])
-    weight = np.where(found, 1 / (1 + gap**2), 0)
-    total = weight.sum(axis=1)
-    has = total > 0
-    weight = weight / np.maximum(total, 1e-12)[:, None]
-    log_range = (weight * (nodes.log_range[good][index] + step)).sum(axis=1)
-    normal = (weight[..., None] * normals).sum(axis=1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    range_map = np.zeros((height, width), np.float32)
-    range_map[wanted] = np.where(has, np.exp(log_range), 0)
-    normal_map = np.full((height, width, 3), np.nan, np.float32)
-    normal_map[wanted] = np.where(has[:, None], normal, np.nan)
-    sigma_map = np.full((height, width), np.nan, np.float32)
-    sigma_map[wanted] = np.degrees((weight * nodes.normal_sigma[good][index]).sum(axis=1))
-    return DenseView(stride, range_map, normal_map, sigma_map)
+    dense = spread_nodes(task.maps[0], nodes.surface, task.stride_px, 2 * options.spacing_px)
+    return nodes, store_dense_view(dense, task.path) if dense is not None else None

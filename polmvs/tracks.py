@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from polmvs.camera import View, sample_image
 from polmvs.config import Estimator, Model, NormalOptions
 from polmvs.normals import NormalEstimate, solve_normals
-from polmvs.phasemap import PhaseMap, gather_rows
+from polmvs.phasemap import PhaseMap
+from polmvs.rows import gather_rows
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

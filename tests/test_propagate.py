@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import board_scene
@@ -113,13 +115,15 @@ def plane_view(scene, k, offset=0.0):
     view, surface = scene.views[k], scene.surface
     normal = surface.normal / np.linalg.norm(surface.normal)
     shape = (view.camera.height // 2, view.camera.width // 2)
-    empty = DenseView(2, np.zeros(shape, np.float32), np.zeros((*shape, 3)), np.zeros(shape))
+    zero = np.zeros(shape, np.float32)
+    empty = DenseView(2, zero, np.zeros((*shape, 3), np.float32), zero, zero, zero)
     rays = view.camera.rays(empty.lattice_xy()) @ view.cam_from_world.rotation
     top = (surface.point + offset * normal - view.center_in_world) @ normal
     mask = scene.rendered[k].mask[1::2, 1::2]
     ranges = np.where(mask, top / (rays @ normal), 0).astype(np.float32)
     normals = np.where(mask[..., None], normal, np.nan).astype(np.float32)
-    return DenseView(2, ranges, normals, np.full(shape, 0.3, np.float32))
+    some = np.full(shape, 0.3, np.float32)
+    return DenseView(2, ranges, normals, some, 1e-3 * some, some)
 
 
 def test_fusion_keeps_what_views_agree_on_and_drops_what_one_view_says_alone(scene):
@@ -158,7 +162,7 @@ def test_normals_must_agree(scene):
     turned = dense[1].normals_in_world @ np.array(
         [[1, 0, 0], [0, np.cos(0.5), -np.sin(0.5)], [0, np.sin(0.5), np.cos(0.5)]], np.float32
     )
-    dense[1] = DenseView(2, dense[1].range_map, turned.astype(np.float32), dense[1].sigma_deg)
+    dense[1] = replace(dense[1], normals_in_world=turned.astype(np.float32))
     assert len(fuse(scene.maps[:2], dense, FusionOptions()).points) == 0
 
 

@@ -5,7 +5,8 @@ import pytest
 from scenes import board_scene, tracks_at
 
 from polmvs.config import Estimator, Model, NormalOptions
-from polmvs.phasemap import gather_rows, open_phase_map, store_phase_map
+from polmvs.phasemap import open_phase_map, store_phase_map
+from polmvs.rows import gather_rows
 from polmvs.tracks import (
     dolp_shares,
     point_sigmas,

@@ -5,14 +5,21 @@ from __future__ import annotations
 import argparse
 import tomllib
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from polmvs.config import Options, RunOptions
 from polmvs.errors import DataError, OptionError
-from polmvs.option_values import FieldInfo, describe_fields, from_plain, parse_text, to_plain
+from polmvs.option_values import (
+    FieldInfo,
+    describe_fields,
+    from_plain,
+    mixed_kinds,
+    parse_text,
+    to_plain,
+)
 from polmvs.workspace import Workspace
 
 T = TypeVar("T")
@@ -124,9 +131,36 @@ def _add_flag(section: Any, group: str, info: FieldInfo) -> None:
         section.add_argument(info.flag, action=argparse.BooleanOptionalAction, **common)
     elif isinstance(info.kind, type) and issubclass(info.kind, StrEnum):
         section.add_argument(info.flag, type=info.kind, choices=list(info.kind), **common)
+    elif kinds := mixed_kinds(info.kind):
+        common["metavar"] = info.metavar or tuple(map(_metavar, kinds))
+        section.add_argument(info.flag, nargs=len(kinds), action=_StoreMixed, kinds=kinds, **common)
     else:
         metavar = _metavar(info.kind)
         section.add_argument(info.flag, type=_parser_of(info.kind), metavar=metavar, **common)
+
+
+class _StoreMixed(argparse.Action):
+    """Stores a mixed tuple; each element is read as its own type, which ``type=`` cannot."""
+
+    def __init__(self, *args: Any, kinds: tuple[Any, ...], **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.kinds = kinds
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        """Convert the texts and store them."""
+        try:
+            parts = [
+                _parser_of(kind)(text) for kind, text in zip(self.kinds, values or (), strict=True)
+            ]
+        except argparse.ArgumentTypeError as error:
+            raise argparse.ArgumentError(self, str(error)) from error
+        setattr(namespace, self.dest, tuple(parts))
 
 
 def _parser_of(kind: Any) -> Callable[[str], Any]:

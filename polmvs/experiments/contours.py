@@ -181,7 +181,7 @@ def trace_view(
     for name, model in sources:
         phase_map = own
         if model is Model.TILTED:
-            phase_map = open_phase_map(own.view, folder / Model.TILTED)
+            phase_map = open_phase_map(own.view, folder / Model.TILTED, tilted=True)
         paths = _trace(model, phase_map, seeds_xy, step_px, scene.region.min_dolp)
         if model is Model.OPA:
             depths = seed_range * own.view.camera.rays(seeds_xy)[:, 2]

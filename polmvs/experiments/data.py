@@ -21,7 +21,7 @@ from polmvs.experiments.estimated_poses import estimated_views
 from polmvs.groundtruth import GroundTruth
 from polmvs.image_io import read_mask
 from polmvs.models import phase_sign
-from polmvs.phasemap import PhaseMap, build_phase_map, view_rays
+from polmvs.phasemap import PhaseMap, as_tilted, build_phase_map, view_rays
 from polmvs.region import Region, find_region, smooth
 from polmvs.stages import find_mask
 from polmvs.stokes import Stokes
@@ -141,8 +141,9 @@ class ViewData:
 
     def phase_map(self, model: Model, region: Region) -> PhaseMap:
         """The package's own phase map: smoothed over the reliable pixels, with precisions."""
-        s = self._for(model, self.sharp)
-        return build_phase_map(self.view, s.s0, s.s1, s.s2, s.sigma, region, self.light)
+        s = self.sharp
+        measured = build_phase_map(self.view, s.s0, s.s1, s.s2, s.sigma, region, self.light)
+        return as_tilted(measured) if model is Model.TILTED else measured
 
     def plain_map(self, model: Model) -> PhaseMap:
         """A phase map of the paper's kind: blurred pixels over the threshold, all alike."""

@@ -25,7 +25,7 @@ from polmvs.experiments.view_choice import Selection, check_k, order_at_random, 
 from polmvs.metrics import angular_errors_deg
 from polmvs.normals import solve_normals
 from polmvs.parallel import Workers
-from polmvs.phasemap import Rows, gather_rows
+from polmvs.rows import Rows, gather_rows
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from polmvs.config import Model
 from polmvs.contour import Contours
 from polmvs.normals import solve_normals
-from polmvs.phasemap import PhaseMap, gather_rows
+from polmvs.phasemap import PhaseMap
+from polmvs.rows import gather_rows
 from polmvs.surface import log_range_increment
 
 Array = NDArray[np.float64]
