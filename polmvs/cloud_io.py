@@ -1,8 +1,9 @@
-"""Point clouds as files: the only importer of Open3D, which takes seconds to import."""
+"""Point clouds and meshes as files: the only importer of Open3D, which takes seconds to import."""
 
 from __future__ import annotations
 
 import os
+import re
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError, PolmvsError
+from polmvs.image_io import write_bytes
 
 Array = NDArray[np.float64]
 
@@ -40,6 +42,24 @@ class Cloud:
     normals: Array | None = None
     colors: NDArray[np.uint8] | None = None
     scalars: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh as arrays.
+
+    Attributes
+    ----------
+    vertices : (V, 3) float64
+    normals : (V, 3) float64, unit, outwards
+    triangles : (F, 3) int32, indices of vertices, anticlockwise seen from outside
+    colors : (V, 3) uint8 or None
+    """
+
+    vertices: Array
+    normals: Array
+    triangles: NDArray[np.int32]
+    colors: NDArray[np.uint8] | None = None
 
 
 def _open3d() -> Any:
@@ -167,3 +187,87 @@ def _checked_header(source: Path) -> int:
     if source.stat().st_size < end + num_points * row_bytes:
         raise DataError(source, "is truncated; write or copy it again.")
     return num_points
+
+
+def solve_poisson(
+    points: Array, normals: Array, *, depth: int, scale: float
+) -> tuple[Array, NDArray[np.int32]]:
+    """Vertices ``(V, 3)`` and triangles ``(F, 3)`` of the closed Poisson surface of a cloud.
+
+    On one thread: with several the result depends on which is first.
+
+    Parameters
+    ----------
+    points, normals : (N, 3), normals unit and outwards.
+    depth : of the octree; a cell is ``scale * extent / 2**depth`` wide.
+    scale : side of the octree's cube over the points' extent.
+    """
+    o3d = _open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+            cloud, depth=depth, scale=scale, n_threads=1
+        )
+    return np.array(mesh.vertices, np.float64), np.array(mesh.triangles, np.int32)
+
+
+def write_mesh(path: str | Path, mesh: Mesh) -> None:
+    """Write a binary PLY that Open3D, MeshLab and Blender open, whole or not at all.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be written.
+    """
+    columns = [("float", "<f4", name) for name in ("x", "y", "z", "nx", "ny", "nz")]
+    values = [*mesh.vertices.T, *mesh.normals.T]
+    if mesh.colors is not None:
+        columns += [("uchar", "u1", name) for name in ("red", "green", "blue")]
+        values += [*mesh.colors.T]
+    vertices = np.empty(len(mesh.vertices), [(name, code) for _, code, name in columns])
+    for (_, _, name), column in zip(columns, values, strict=True):
+        vertices[name] = column
+    faces = np.empty(len(mesh.triangles), [("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, mesh.triangles
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    lines += [f"property {kind} {name}" for kind, _, name in columns]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    header = ("\n".join([*lines, "end_header"]) + "\n").encode()
+    target = Path(path)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
+    write_bytes(target, header + vertices.tobytes() + faces.tobytes())
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """Read a PLY mesh; normals that it lacks are computed.
+
+    Raises
+    ------
+    DataError
+        If the file is missing, truncated or no mesh.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise DataError(source, "no such file; give a PLY mesh.")
+    num_vertices = _checked_header(source)
+    with source.open("rb") as file:
+        found = re.search(rb"^element face (\d+)", file.read(65536), re.MULTILINE)
+    if found is None:
+        raise DataError(source, "holds no faces; give a PLY mesh.")
+    if num_vertices == 0:
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    o3d = _open3d()
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = o3d.io.read_triangle_mesh(str(source))
+    vertices, triangles = np.array(mesh.vertices), np.array(mesh.triangles, np.int32)
+    if len(vertices) != num_vertices or len(triangles) < int(found[1]):
+        raise DataError(source, "cannot be read as a mesh; is it truncated?")
+    if not mesh.has_vertex_normals():
+        mesh.compute_vertex_normals()
+    colors = np.rint(255 * np.array(mesh.vertex_colors)).astype(np.uint8)
+    normals = np.array(mesh.vertex_normals)
+    return Mesh(vertices, normals, triangles.reshape(-1, 3), colors if len(colors) else None)
