@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from polmvs.camera import View
 from polmvs.dense import extend_planes
@@ -20,6 +21,7 @@ AGREEMENT_SIGMAS = 3.0
 MIN_OVERLAP = 8  # points that two views' surfaces share
 OVERLAP_GAP_PX = 24.0  # between a view's nodes and another's points, as it sees them
 MAX_SEED_NORMAL_SIGMA = 0.05  # rad
+MAX_CONTRADICTION = 3.0  # deviations of a track from the place that the outlines give
 
 
 @dataclass(frozen=True)
@@ -176,3 +178,25 @@ def join_seeds(parts: Sequence[Seeds]) -> Seeds:
         np.concatenate([np.zeros((0, 3)), *(part.normals_in_world for part in parts)]),
         np.concatenate([np.zeros(0), *(part.sigma for part in parts)]),
     )
+
+
+def contradicted(seeds: Seeds, part_seeds: Seeds) -> NDArray[np.bool_]:
+    """Which seeds (S,) lie off a surface that the outlines placed, by more than its deviation.
+
+    Parameters
+    ----------
+    seeds : of tracks.
+    part_seeds : from :func:`polmvs.parts.find_part_seeds`; a seed is held against the nearest
+        one if it lies over or under the part and not beside it.
+    """
+    if not len(part_seeds.sigma) or not len(seeds.sigma):
+        return np.zeros(len(seeds.sigma), np.bool_)
+    tree = cKDTree(part_seeds.points_in_world)
+    near = tree.query(seeds.points_in_world)[1]
+    offset = seeds.points_in_world - part_seeds.points_in_world[near]
+    height = np.abs((offset * part_seeds.normals_in_world[near]).sum(axis=-1))
+    beside = np.sqrt(np.maximum((offset**2).sum(axis=-1) - height**2, 0))
+    k = min(2, len(part_seeds.sigma))
+    spacing = np.median(tree.query(part_seeds.points_in_world, k=k)[0][..., -1])
+    spread = np.hypot(part_seeds.sigma[near], seeds.sigma)
+    return np.asarray((height > MAX_CONTRADICTION * spread) & (beside < 2 * spacing))

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.capture import DISPLAY_GAMMA
+from polmvs.agreement import PartReport, contradicted, join_seeds
 from polmvs.cloud_io import Cloud, write_cloud
 from polmvs.colmap_io import read_model
 from polmvs.config import FusionOptions, Method, Model, NormalOptions, PropagationOptions
-from polmvs.fuse import FusedCloud, fuse
+from polmvs.dense import DenseView, find_dense_view, store_dense_view
+from polmvs.fuse import fuse, no_points
 from polmvs.integrate import integrate, plan_rounds
 from polmvs.normals import NormalEstimate
+from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
+from polmvs.parts import find_part_seeds
 from polmvs.propagate import propagate
-from polmvs.stages import Facts, Report, open_maps, tilt_maps
+from polmvs.scene_cloud import join_clouds, surface_cloud, surroundings_cloud
+from polmvs.stages import Facts, Report, open_maps, posed_views, tilt_maps
 from polmvs.storage import map_array, save_array
 from polmvs.tracks import Seeds, Tracks, select_seeds, track_normals
 from polmvs.workspace import Workspace
+
+logger = logging.getLogger(__name__)
+
+SEED_COLUMNS = 7  # place, normal, deviation
 
 
 def solve_tracks(
@@ -48,6 +57,69 @@ def solve_tracks(
     save_array(_normal_file(workspace, model), estimate.normals)
     write_cloud(workspace.normals(model), _track_cloud(tracks, estimate, is_seed))
     return facts
+
+
+def place_parts(
+    workspace: Workspace, options: NormalOptions, *, max_neighbors: int, workers: Workers
+) -> Facts:
+    """Seeds for the parts on which none of the sparse points lies, from their outlines.
+
+    They come from PPA and are the same for all models.
+    """
+    seeds = load_seeds(Model.PPA, workspace)
+    reports: list[PartReport] = []
+    points = read_model(workspace.sparse).tracks.points_in_world
+    found = np.zeros((0, SEED_COLUMNS))
+    if options.unseeded and len(points):
+        new, reports = find_part_seeds(
+            Model.PPA,
+            open_maps(workspace, Model.PPA),
+            seeds,
+            points,
+            max_neighbors=max_neighbors,
+            workers=workers,
+        )
+        found = np.column_stack([new.points_in_world, new.normals_in_world, _shared_sigma(new)])
+        _drop_seeds(workspace, contradicted(seeds, new))
+    save_array(_part_file(workspace), found)
+    for part in reports:
+        if part.doubt:
+            logger.warning(
+                "%s: a part of %d px without a sparse point stays undetermined: %s.",
+                part.view,
+                part.num_px,
+                part.doubt,
+            )
+    num_seeds = int(np.isfinite(map_array(_seed_file(workspace))).sum())
+    return {
+        "num_seeds": num_seeds,
+        "num_part_seeds": len(found),
+        "parts": [to_plain(part) for part in reports],
+    }
+
+
+def _drop_seeds(workspace: Workspace, dropped: NDArray[np.bool_]) -> None:
+    """Take the name of a seed from tracks that the outlines contradict."""
+    sigma = np.array(map_array(_seed_file(workspace)))
+    index = np.flatnonzero(np.isfinite(sigma))
+    if dropped.any():
+        logger.warning("%d sparse points contradict the outlines and are no seeds.", dropped.sum())
+        sigma[index[dropped]] = np.nan
+        save_array(_seed_file(workspace), sigma)
+
+
+def _shared_sigma(seeds: Seeds) -> NDArray[np.float64]:
+    """Deviations that make seeds which err as one weigh as one.
+
+    All seeds of a part have the same deviation, and one part's is hardly another's.
+    """
+    _, part, count = np.unique(seeds.sigma, return_inverse=True, return_counts=True)
+    return np.asarray(seeds.sigma * np.sqrt(count[part]))
+
+
+def _part_file(workspace: Workspace) -> Path:
+    """Seeds of the parts without sparse points: place, normal, deviation."""
+    return workspace.maps / "parts.npy"
 
 
 def _no_estimate(num_views: int) -> NormalEstimate:
@@ -90,12 +162,18 @@ def _track_cloud(tracks: Tracks, estimate: NormalEstimate, is_seed: NDArray[np.b
 
 
 def load_seeds(model: Model, workspace: Workspace) -> Seeds:
-    """Seeds with the normals of a model; which tracks they are is the same for all models."""
+    """Seeds with the normals of a model; which points they are is the same for all models."""
     points = read_model(workspace.sparse).tracks.points_in_world
     sigma = np.array(map_array(_seed_file(workspace)))
     normals = np.array(map_array(_normal_file(workspace, model)))
     used = np.isfinite(sigma)
-    return Seeds(points[used], normals[used], sigma[used])
+    tracks = Seeds(points[used], normals[used], sigma[used])
+    if not _part_file(workspace).is_file():
+        return tracks
+    parts = np.array(map_array(_part_file(workspace)))
+    if model is not Model.PPA:
+        parts[:, 3:6] = np.nan  # each model solves its own
+    return join_seeds([tracks, Seeds(parts[:, :3], parts[:, 3:6], parts[:, 6])])
 
 
 def densify(
@@ -109,27 +187,49 @@ def densify(
 ) -> Facts:
     """Spread the seeds over the region of every view and fuse the views into one cloud.
 
-    Without a region or seeds the cloud has no points.
+    Without a region or seeds the surface has no points.
     """
     maps = open_maps(workspace, model)
     seeds = load_seeds(model, workspace)
     num_inside = sum(int(phase_map.region.inside.sum()) for phase_map in maps)
-    if num_inside == 0 or len(seeds.sigma) == 0:
-        write_cloud(workspace.cloud(model), Cloud(np.zeros((0, 3))))
-        return {f"num_points_{model}": 0}
     with workspace.scratch(f"densify_{model}") as folder:
-        spread = integrate if propagation.method is Method.INTEGRATE else propagate
-        dense = spread(model, maps, seeds, propagation, folder, workers=workers, on_progress=report)
-        cloud = fuse(
-            maps,
-            dense,
-            fusion,
-            max_neighbors=propagation.max_neighbors,
-            workers=workers,
-            on_progress=report,
+        views = folder / "views"
+        views.mkdir()
+        if num_inside == 0 or len(seeds.sigma) == 0:
+            cloud = no_points()
+        else:
+            spread = integrate if propagation.method is Method.INTEGRATE else propagate
+            dense = spread(
+                model, maps, seeds, propagation, folder, workers=workers, on_progress=report
+            )
+            cloud = fuse(
+                maps,
+                dense,
+                fusion,
+                max_neighbors=propagation.max_neighbors,
+                workers=workers,
+                on_progress=report,
+            )
+            for phase_map, view in zip(maps, dense, strict=True):
+                if view is not None:
+                    store_dense_view(view, views / phase_map.view.name)
+        surface = surface_cloud(cloud)
+        around = surroundings_cloud(
+            workspace, cloud, maps, fusion, folder / "around", workers=workers
         )
-    write_cloud(workspace.cloud(model), _dense_cloud(cloud))
-    return {f"num_points_{model}": len(cloud.points)}
+        workspace.replace(views, workspace.views(model))
+    write_cloud(workspace.cloud(model), join_clouds(surface, around))
+    return {
+        f"num_points_{model}": len(surface.points),
+        f"num_surroundings_{model}": len(around.points),
+    }
+
+
+def open_dense_views(workspace: Workspace, model: Model) -> list[DenseView | None]:
+    """Dense results of all posed views under a model, None where a view has none."""
+    folder = workspace.views(model)
+    names = [view.name for view in posed_views(workspace)]
+    return [find_dense_view(folder / name) for name in names]
 
 
 def densify_steps(num_views: int, options: PropagationOptions) -> int:
@@ -137,20 +237,3 @@ def densify_steps(num_views: int, options: PropagationOptions) -> int:
     if options.method is Method.INTEGRATE:
         return (len(plan_rounds(options)) + 1) * num_views
     return (options.num_rounds + 2) * num_views
-
-
-def _dense_cloud(cloud: FusedCloud) -> Cloud:
-    """The cloud with grey colours: intensity as COLMAP's images show it, brightest 1 % white."""
-    white = float(np.percentile(cloud.intensity, 99)) if len(cloud.intensity) else 1.0
-    share = np.clip(cloud.intensity / max(white, 1e-9), 0, 1) ** (1 / DISPLAY_GAMMA)
-    grey = np.rint(255 * share).astype(np.uint8)
-    return Cloud(
-        points=cloud.points,
-        normals=cloud.normals,
-        colors=np.repeat(grey[:, None], 3, axis=1),
-        scalars={
-            "num_views": cloud.num_views,
-            "sigma": cloud.sigma,
-            "sigma_deg": cloud.sigma_deg,
-        },
-    )

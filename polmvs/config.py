@@ -9,49 +9,18 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from polmvs.choices import Contour as Contour
+from polmvs.choices import Estimator as Estimator
+from polmvs.choices import Light as Light
+from polmvs.choices import Method as Method
+from polmvs.choices import Model as Model
+from polmvs.choices import Surroundings as Surroundings
 from polmvs.errors import OptionError
 
 MAX_DEFAULT_WORKERS = 8  # each holds a few hundred MB
-
-
-class Model(StrEnum):
-    """Relation between the measured angle and the surface normal."""
-
-    OPA = "opa"
-    PPA = "ppa"
-    TILTED = "tilted"
-
-
-class Light(StrEnum):
-    """Which reflection dominates the polarisation of the part."""
-
-    SPECULAR = "specular"
-    DIFFUSE = "diffuse"
-
-
-class Method(StrEnum):
-    """How ranges spread over a view's region."""
-
-    INTEGRATE = "integrate"
-    CONTOUR = "contour"
-
-
-class Contour(StrEnum):
-    """How a PPA contour is traced."""
-
-    TANGENT = "tangent"
-    NORMALS = "normals"
-
-
-class Estimator(StrEnum):
-    """How a normal is solved from its rows."""
-
-    ROBUST = "robust"
-    ALGEBRAIC = "algebraic"
 
 
 def option(default: Any, help_text: str) -> Any:
@@ -139,6 +108,7 @@ class NormalOptions:
 
     estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
     window_px: int = option(17, "side of the window of rows about a track's point, px")
+    unseeded: bool = option(True, "place parts without a sparse point by their outlines")
 
     def __post_init__(self) -> None:
         _require(
@@ -205,6 +175,16 @@ class FusionOptions:
     voxel: float | None = option(
         None, "edge of the merging voxel in units of the model, instead of --voxel-px; 0: none"
     )
+    surroundings: Surroundings = option(
+        Surroundings.SPARSE,
+        "what the cloud holds beside the polarised parts: nothing, the sparse points, or points "
+        "of OpenCV's stereo",
+    )
+    workspace: Path | None = option(
+        None,
+        "COLMAP dense workspace of the same images: its depth maps are kept, their holes filled, "
+        "and its points are the surroundings",
+    )
 
     def __post_init__(self) -> None:
         _require(self.min_views >= 1, f"--min-views must be 1 or more, not {self.min_views}.")
@@ -215,6 +195,17 @@ class FusionOptions:
         )
         _require(self.voxel_px >= 0, "--voxel-px must not be negative.")
         _require(self.voxel is None or self.voxel >= 0, "--voxel must not be negative.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """What is made of a dense cloud."""
+
+    mesh: bool = option(True, "a Poisson mesh, where the cloud supports it")
+    colmap: bool = option(True, "a COLMAP dense workspace with depth and normal maps")
+    in_place: bool = option(
+        False, "fill --workspace itself, after a backup, and not a copy of it in OUT"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,10 +267,12 @@ class Options:
 
     capture: CaptureOptions = field(default_factory=CaptureOptions)
     sfm: SfmOptions = field(default_factory=SfmOptions)
+    reference: ReferenceOptions = field(default_factory=ReferenceOptions)
     region: RegionOptions = field(default_factory=RegionOptions)
     normals: NormalOptions = field(default_factory=NormalOptions)
     propagation: PropagationOptions = field(default_factory=PropagationOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
+    export: ExportOptions = field(default_factory=ExportOptions)
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)
 
 

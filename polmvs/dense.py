@@ -63,13 +63,20 @@ class DenseView:
 
     def lattice_xy(self) -> Array:
         """Image coordinates ``(h, w, 2)`` of the lattice."""
-        return lattice_xy(*self.range_map.shape, self.stride_px)
+        num_rows, num_cols = self.range_map.shape
+        return lattice_xy(num_rows, num_cols, self.stride_px)
 
 
 def lattice_xy(num_rows: int, num_cols: int, stride_px: int) -> Array:
     """Image coordinates ``(num_rows, num_cols, 2)`` of a view's lattice."""
     indices = np.stack(np.meshgrid(np.arange(num_cols), np.arange(num_rows)), axis=-1)
     return np.asarray((indices + 0.5) * stride_px, np.float64)
+
+
+def lattice_points(wanted: NDArray[np.bool_], stride_px: int) -> Array:
+    """Image coordinates ``(N, 2)`` of the ``wanted`` (h, w) points of a lattice, row by row."""
+    num_rows, num_cols = wanted.shape
+    return lattice_xy(num_rows, num_cols, stride_px)[wanted]
 
 
 @dataclass(frozen=True)
@@ -184,12 +191,23 @@ def store_dense_view(dense: DenseView, path: Path) -> DenseView:
     """Write a dense view to ``path.range.npy`` and its fellows; returns the stored one."""
     for name, array in zip(MEMBERS, dense._arrays(), strict=True):
         save_array(_member(path, name), array)
+    save_array(_member(path, "stride"), np.array(dense.stride_px))
     return open_dense_view(dense.stride_px, path)
 
 
 def open_dense_view(stride_px: int, path: Path) -> DenseView:
     """Map a stored dense view into memory."""
-    return DenseView(stride_px, *(map_array(_member(path, name)) for name in MEMBERS), path)
+    range_map, normals, sigma_deg, sigma, confidence = (
+        map_array(_member(path, name)) for name in MEMBERS
+    )
+    return DenseView(stride_px, range_map, normals, sigma_deg, sigma, confidence, path)
+
+
+def find_dense_view(path: Path) -> DenseView | None:
+    """Map a stored dense view into memory that says itself what its stride is; None: no such."""
+    if not _member(path, "stride").is_file():
+        return None
+    return open_dense_view(int(map_array(_member(path, "stride"))), path)
 
 
 def _member(path: Path, name: str) -> Path:

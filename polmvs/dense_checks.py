@@ -14,7 +14,7 @@ from polmvs.colmap_io import SparseModel, camera_from_colmap, camera_to_colmap
 from polmvs.dense_workspace import DenseWorkspace, ImageLoader, WorkspaceView
 from polmvs.errors import DataError
 from polmvs.geometry import SimilarityTransform, align_points
-from polmvs.sparse_model import _matching_names as matching_names
+from polmvs.sparse_model import matching_names as matching_names
 from polmvs.undistort import warp_image
 
 Array = NDArray[np.float64]

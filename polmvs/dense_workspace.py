@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from polmvs.camera import PinholeCamera, View
-from polmvs.colmap_io import SparseModel, pycolmap, read_model
+from polmvs.colmap_io import SparseModel, read_model
 from polmvs.colmap_maps import (
     DepthNormals,
     check_depth_map,
@@ -44,7 +44,7 @@ from polmvs.dense_layout import (
     write_maps,
 )
 from polmvs.errors import DataError
-from polmvs.image_io import write_png
+from polmvs.image_io import read_gray, write_png
 from polmvs.sparse_model import short_list, write_model
 from polmvs.tracks import Tracks
 from polmvs.undistort import undistorted_model, warp_dense_view, warp_image
@@ -93,17 +93,14 @@ class WorkspaceView:
         return DepthNormals(depth, read_normal_map(self.normals, self.camera))
 
     def load_image(self) -> NDArray[np.uint8]:
-        """The undistorted image in grey, ``(H, W)`` uint8, as COLMAP itself reads it.
+        """The undistorted image in grey, ``(H, W)`` uint8.
 
         Raises
         ------
         DataError
             It is no image or of another size than the camera.
         """
-        bitmap = pycolmap.Bitmap.read(str(self.image), False)
-        if bitmap is None:
-            raise DataError(self.image, "is not a readable image. Undistort the images again.")
-        gray = np.asarray(bitmap.to_array(), np.uint8)
+        gray = read_gray(self.image)
         if gray.shape != (self.camera.height, self.camera.width):
             raise DataError(
                 self.image,

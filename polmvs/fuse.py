@@ -99,7 +99,7 @@ def fuse(
         parts.append(part)
         if on_progress is not None:
             on_progress(1)
-    cloud = _concatenate([p[0] for p in parts])
+    cloud = concatenate([p[0] for p in parts])
     if not len(cloud.points):
         return cloud
     footprint = float(np.median(np.concatenate([p[1] for p in parts])))
@@ -160,12 +160,16 @@ def _finite_sigma(sigma: Floats, footprint: Array) -> Array:
     return np.where(known, np.maximum(sigma, MIN_SIGMA_PX * footprint), footprint)
 
 
-def _concatenate(clouds: Sequence[FusedCloud]) -> FusedCloud:
+def concatenate(clouds: Sequence[FusedCloud]) -> FusedCloud:
     """All points of some clouds."""
-    vectors, numbers = np.zeros((0, 3)), np.zeros(0, np.float32)
-    empty = FusedCloud(vectors, vectors, numbers, np.zeros(0, np.int32), numbers, numbers)
-    parts = [empty, *clouds]
+    parts = [no_points(), *clouds]
     return FusedCloud(*(np.concatenate([getattr(c, name) for c in parts]) for name in COLUMNS))
+
+
+def no_points() -> FusedCloud:
+    """A cloud without points."""
+    vectors, numbers = np.zeros((0, 3)), np.zeros(0, np.float32)
+    return FusedCloud(vectors, vectors, numbers, np.zeros(0, np.int32), numbers, numbers)
 
 
 def merge(cloud: FusedCloud, voxel: float) -> FusedCloud:

@@ -121,6 +121,21 @@ def read_mask(path: PathArg, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return np.asarray((image[..., :3] != 0).any(axis=-1))
 
 
+def read_gray(path: PathArg) -> NDArray[np.uint8]:
+    """Read an 8-bit image as grey, ``(H, W)`` uint8; the mean of the colour channels.
+
+    Raises
+    ------
+    DataError
+        The file is missing, truncated, no image or not of 8 bit.
+    """
+    image = _decode(path, _read_bytes(path))
+    if image.dtype != np.uint8:
+        raise DataError(path, "is no 8-bit image.")
+    gray = image if image.ndim == 2 else np.rint(image[..., :3].mean(axis=-1))
+    return np.asarray(gray, np.uint8)
+
+
 def write_png(path: PathArg, image: NDArray[Any]) -> None:
     """Write a PNG whole or not at all, whatever the suffix of its name.
 

@@ -23,11 +23,12 @@ from polmvs.dense import (
     SurfaceSamples,
     dense_view,
     extend_planes,
-    lattice_xy,
+    lattice_points,
     store_dense_view,
     view_samples,
 )
 from polmvs.network import Nodes, uncrossed
+from polmvs.opinion import surface_of_others
 from polmvs.parallel import Workers
 from polmvs.phasemap import PhaseMap
 from polmvs.propagate import choose_neighbors
@@ -68,6 +69,7 @@ def integrate(
     """
     workers = workers or Workers(1)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
+    folder.mkdir(parents=True, exist_ok=True)
     dense: list[DenseView | None] = [None] * len(maps)
     for index, plan in enumerate(plan_rounds(options)):
         tasks = [
@@ -132,19 +134,19 @@ def _round(model: Model, seeds: Seeds, bending: float, task: _Task) -> DenseView
         bending=bending,
         use_opinions=task.plan.use_opinions,
     )
-    return store_dense_view(dense_view(nodes.surface, wanted, stride_px), task.path)
+    dense = dense_view(nodes.surface, wanted, stride_px)
+    return store_dense_view(dense, task.path) if dense.known.any() else None
 
 
 def _start(task: _Task, seeds: Seeds, wanted: Mask) -> SurfaceSamples | None:
-    """The lattice's surface from the view's last result, or from the seeds in the first round."""
+    """The lattice's surface: of the view's last result; else of the seeds, or of the others."""
     phase_map, before = task.maps[0], task.dense[0]
-    xy = lattice_xy(*wanted.shape, task.plan.stride_px)[wanted]
+    xy = lattice_points(wanted, task.plan.stride_px)
     if before is None:
-        return surface_at_seeds(phase_map, seeds, xy)
+        surface = surface_at_seeds(phase_map, seeds, xy)
+        return surface or surface_of_others(task.maps, task.dense, xy, MAX_GAP_STRIDES)
     camera, rotation = phase_map.view.camera, phase_map.view.cam_from_world.rotation
     coarse = view_samples(before, camera.rays(before.lattice_xy()) @ rotation)
-    if not len(coarse.xy):
-        return None
     return extend_planes(coarse, xy, camera.rays(xy) @ rotation, MAX_GAP_STRIDES * before.stride_px)
 
 

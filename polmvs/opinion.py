@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.dense import DenseView
+from polmvs.dense import DenseView, SurfaceSamples, extend_planes, view_samples
 from polmvs.phasemap import PhaseMap
 
 Array = NDArray[np.float64]
@@ -45,10 +46,10 @@ class Opinion:
 def ask_view(
     phase_map: PhaseMap,
     dense: DenseView,
-    center: Array,
-    rays: Array,
-    distance: Array,
-    normals: Array,
+    center: Floats,
+    rays: Floats,
+    distance: Floats,
+    normals: Floats,
 ) -> Opinion:
     """Look a view's points up in another dense view.
 
@@ -89,6 +90,57 @@ def ask_view(
     cosine = (seen_normals * normals).sum(axis=-1)
     outside = _shows_background(phase_map, xy)
     return Opinion(place, sigma, np.nan_to_num(seen_normals), cosine, excess, facing, outside)
+
+
+def surface_of_others(
+    maps: Sequence[PhaseMap],
+    dense: Sequence[DenseView | None],
+    xy: Floats,
+    max_gap_strides: float,
+) -> SurfaceSamples | None:
+    """A first guess of the surface at pixels of the first view: what the other views show there.
+
+    Parameters
+    ----------
+    maps, dense : of the views, the first one's own first.
+    xy : (N, 2), where the surface is wanted.
+    max_gap_strides : from the others' points to the pixels, in strides of their lattices.
+
+    Returns
+    -------
+    None where they show nothing in the view's region.
+    """
+    view, center = maps[0].view, maps[0].view.center_in_world
+    known = [(m.view, d) for m, d in zip(maps[1:], dense[1:], strict=True) if d is not None]
+    if not known or not len(xy):
+        return None
+    parts, normals = [], []
+    for other, result in known:
+        rotation = other.cam_from_world.rotation
+        samples = view_samples(result, other.camera.rays(result.lattice_xy()) @ rotation)
+        parts.append(
+            other.center_in_world + np.exp(samples.log_range)[:, None] * samples.rays_in_world
+        )
+        normals.append(samples.normals)
+    points = np.concatenate(parts)
+    distance = np.linalg.norm(points - center, axis=-1)
+    unknown = np.full(len(points), np.nan)
+    shown = SurfaceSamples(
+        xy=np.asarray(view.camera.project(view.cam_from_world * points), np.float64),
+        rays_in_world=(points - center) / distance[:, None],
+        log_range=np.log(distance),
+        normals=np.concatenate(normals),
+        normal_sigma=unknown,
+        log_range_sigma=unknown,
+        confidence=np.zeros(len(points)),
+    )
+    facing = (shown.rays_in_world * shown.normals).sum(axis=-1) < 0
+    shown = shown[facing & maps[0].shows_surface(shown.xy)]
+    if not len(shown.xy):
+        return None
+    stride_px = max(result.stride_px for _, result in known)
+    rays = view.camera.rays(xy) @ view.cam_from_world.rotation
+    return extend_planes(shown, xy, rays, max_gap_strides * stride_px)
 
 
 def _shows_background(phase_map: PhaseMap, xy: Floats) -> Mask:

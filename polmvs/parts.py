@@ -42,6 +42,7 @@ FOLLOWER_BOUNDS = 0.12  # of log range about where the first view puts the part
 MAX_FOLLOWERS = 6  # views that place a part again
 MAX_TRIES = 3  # first views for what may be one part
 NUM_PART_SEEDS = 48
+MIN_SEEDS = 3  # on a piece: fewer cannot bear each other out, and one false track is enough
 
 
 KNOWN_PART = "most views show it as a part that has its place"
@@ -79,8 +80,8 @@ def find_part_seeds(
     ----------
     model : of the rows.
     maps : phase maps of the posed views.
-    seeds : those there are. A piece of a view is left alone if one lies on it, or if most of the
-        other views show it with one.
+    seeds : those there are. A piece of a view is left alone if three lie on it, or if most of the
+        other views show it so.
     points_in_world : (N, 3), points of the scene; they bound the range of the parts.
     max_neighbors : other views that place a piece.
     workers : processes to share the views among; None: this one.
@@ -106,12 +107,12 @@ def _pieces_of(phase_map: PhaseMap) -> list[Piece]:
 def _seeded_pieces(
     maps: Sequence[PhaseMap], pieces: Sequence[Sequence[Piece]], seeds: Seeds
 ) -> set[PieceId]:
-    """Pieces on which a seed lies."""
+    """Pieces on which enough seeds lie to bear each other out."""
     seeded: set[PieceId] = set()
     for k, phase_map in enumerate(maps):
         visible, xy = visible_seeds(phase_map, seeds)
         for index, piece in enumerate(pieces[k]):
-            if (piece.signed_distance(xy[visible]) < 0).any():
+            if (piece.signed_distance(xy[visible]) < 0).sum() >= MIN_SEEDS:
                 seeded.add((k, index))
     return seeded
 

@@ -184,7 +184,8 @@ def _with_doubt(phase_map: PhaseMap, share: float, corrected: Stokes) -> PhaseMa
     """Widen (share 1) each phase's variance by what a tilt of the polarizers would turn it.
 
     A model that leaves the tilt out does not know whether the lens makes it, so that the turn is a
-    deviation of its phase: oblique rays count less. -1 takes the widening back.
+    deviation of its phase: oblique rays count less. -1 takes the widening back; from averages of
+    widened phases, whose turns differ, never more than to the least variance there is.
     """
     sign = _signs(phase_map)
     cos, sin, precision = np.moveaxis(phase_map.samples, -1, 0)
@@ -192,8 +193,8 @@ def _with_doubt(phase_map: PhaseMap, share: float, corrected: Stokes) -> PhaseMa
     imaginary = sign * (sin * corrected.s1 - cos * corrected.s2)
     turn = 0.5 * np.arctan2(imaginary, real)
     with np.errstate(divide="ignore", invalid="ignore"):
-        variance = 1 / precision + share * turn**2
-        widened = np.where((precision > 0) & (variance > 0), 1 / variance, 0)
+        variance = np.maximum(1 / precision + share * turn**2, MODEL_SIGMA**2)
+        widened = np.where(precision > 0, 1 / variance, 0)
     samples = np.dstack([cos, sin, widened]).astype(np.float32)
     return replace(phase_map, samples=samples, folder=None)
 

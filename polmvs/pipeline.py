@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from polmvs import cloud_stages, stages
-from polmvs.cloud_io import preload
-from polmvs.comparison import write_comparison
+from polmvs import stages
 from polmvs.config import Model, Options, RunOptions
 from polmvs.errors import OptionError
-from polmvs.run import Monitor, Report, Run, Stage, open_run
-from polmvs.run_checks import EVALUATE, POSES, densify_stage, normals_stage, options_of
+from polmvs.job_stages import (
+    normal_names,
+    plan_capture,
+    plan_densify,
+    plan_evaluation,
+    plan_exports,
+    plan_maps,
+    plan_normals,
+    plan_poses,
+)
+from polmvs.run import Monitor, Run, Stage, open_run
+from polmvs.run_checks import (
+    PARTS,
+    POSES,
+    dense_stage,
+    densify_stage,
+    mesh_stage,
+)
 from polmvs.workspace import Workspace
 
 COMPARED = (Model.OPA, Model.PPA, Model.TILTED)
@@ -26,8 +40,9 @@ NO_REGION = (
     "--pattern and --gamma, or give the part with --mask."
 )
 NO_SEEDS = (
-    "no seeds: no sparse point lies on the polarised surface with a normal that fits its light. "
-    "Put a few printed marks or labels on the part, check --light, or give the part with --mask."
+    "no seeds: no sparse point lies on the polarised surface with a normal that fits its light, "
+    "and no part could be placed by its outline. Put a few printed marks or labels on the part, "
+    "check --light, or give the part with --mask."
 )
 NO_POINTS = (
     "no points: the views agree on none. Check --intrinsics or --sparse and --light, or record "
@@ -81,7 +96,12 @@ def reconstruct(job: Job, model: Model = Model.PPA) -> Outcome:
     PolmvsError
         The input is unusable or a stage fails; finished stages stay in the output folder.
     """
-    return _whole_chain(job, (model,), evaluated=False)
+    job = _with_poses_of_workspace(job)
+    names = (*_chain_names((model,)), mesh_stage(model), dense_stage(model))
+    with _open(job, names) as run:
+        for stage in (*_chain(run, (model,)), *plan_exports(run, model)):
+            run.do(stage)
+        return _close(run, (model,))
 
 
 def compare(job: Job, models: Sequence[Model] = COMPARED) -> Outcome:
@@ -92,22 +112,27 @@ def compare(job: Job, models: Sequence[Model] = COMPARED) -> Outcome:
     PolmvsError
         As :func:`reconstruct`.
     """
-    return _whole_chain(job, models, evaluated=True)
+    job = _with_poses_of_workspace(job)
+    with _open(job, _chain_names(models)) as run:
+        for stage in _chain(run, models):
+            run.do(stage)
+        run.do(plan_evaluation(run, models))
+        return _close(run, models)
 
 
 def find_poses(job: Job) -> Outcome:
     """SfM alone: ``OUT/images`` and ``OUT/sparse``."""
     with _open(job, BEFORE_MAPS, min_images=MIN_SFM_IMAGES) as run:
-        run.do(_capture_stage(run))
-        run.do(_pose_stage(run))
+        run.do(plan_capture(run))
+        run.do(plan_poses(run))
         return _close(run, ())
 
 
 def solve_normals(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
     """Normals of the sparse points of a folder that has poses."""
-    own = ("maps", *_normal_names(models))
+    own = ("maps", PARTS, *normal_names(models))
     with _open(job, BEFORE_MAPS, own, goes_on=True) as run:
-        todo = [_map_stage(run), *_normal_stages(run, models)]
+        todo = [plan_maps(run), *plan_normals(run, models)]
         _begin_again(run, todo, job.how)
         for stage in todo:
             run.do(stage)
@@ -116,28 +141,52 @@ def solve_normals(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
 
 def densify(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
     """Dense clouds of a folder that has normals."""
-    before = (*BEFORE_MAPS, "maps", *_normal_names(models))
+    before = _before_densify(models)
     with _open(job, before, [densify_stage(m) for m in models], goes_on=True) as run:
-        todo = [_densify_stage(run, model) for model in models]
+        todo = [plan_densify(run, model) for model in models]
         _begin_again(run, todo, job.how)
         for stage in todo:
             run.do(stage)
         return _close(run, models)
 
 
-def _whole_chain(job: Job, models: Sequence[Model], *, evaluated: bool) -> Outcome:
-    names = (*BEFORE_MAPS, "maps", *_normal_names(models), *map(densify_stage, models))
-    with _open(job, names) as run:
-        run.do(_capture_stage(run))
-        run.do(_pose_stage(run))
-        run.do(_map_stage(run))
-        for stage in _normal_stages(run, models):
+def export(job: Job, model: Model = Model.PPA) -> Outcome:
+    """Mesh and COLMAP workspace of a folder that has a dense cloud."""
+    before = (*_before_densify((model,)), densify_stage(model))
+    own = (mesh_stage(model), dense_stage(model))
+    with _open(job, before, own, goes_on=True) as run:
+        todo = plan_exports(run, model)
+        _begin_again(run, todo, job.how)
+        for stage in todo:
             run.do(stage)
-        for model in models:
-            run.do(_densify_stage(run, model))
-        if evaluated:
-            run.do(_evaluate_stage(run, models))
-        return _close(run, models)
+        return _close(run, (model,))
+
+
+def _with_poses_of_workspace(job: Job) -> Job:
+    """Poses of the given COLMAP workspace, unless others are given."""
+    workspace, sfm = job.options.fusion.workspace, job.options.sfm
+    if workspace is None or sfm.sparse is not None:
+        return job
+    sfm = replace(sfm, sparse=workspace / "sparse")
+    return replace(job, options=replace(job.options, sfm=sfm))
+
+
+def _before_densify(models: Sequence[Model]) -> tuple[str, ...]:
+    return (*BEFORE_MAPS, "maps", PARTS, *normal_names(models))
+
+
+def _chain_names(models: Sequence[Model]) -> tuple[str, ...]:
+    return (*_before_densify(models), *map(densify_stage, models))
+
+
+def _chain(run: Run, models: Sequence[Model]) -> Iterator[Stage]:
+    """The stages to the dense clouds; each is made when those before are done."""
+    yield plan_capture(run)
+    yield plan_poses(run)
+    yield plan_maps(run)
+    yield from plan_normals(run, models)
+    for model in models:
+        yield plan_densify(run, model)
 
 
 def _open(
@@ -168,7 +217,7 @@ def _close(run: Run, models: Sequence[Model]) -> Outcome:
     empty = None
     if any(results.get(f"num_points_{model}") == 0 for model in models):
         empty = NO_POINTS
-        if results.get("num_seeds") == 0:
+        if results.get("num_seeds") == 0 and not results.get("num_part_seeds"):
             empty = NO_SEEDS
         if results.get("num_region_px") == 0:
             empty = NO_REGION
@@ -185,102 +234,3 @@ def _begin_again(run: Run, todo: Sequence[Stage], how: RunOptions) -> None:
             f"{run.workspace.root}: the stage {todo[-1].name!r} is finished. Give --overwrite to "
             "do it again."
         )
-
-
-def _capture_stage(run: Run) -> Stage:
-    def work(report: Report) -> stages.Facts:
-        return stages.write_images(run.capture, run.workspace, workers=run.workers, report=report)
-
-    return Stage(name="capture", work=work, total=len(run.capture.paths))
-
-
-def _pose_stage(run: Run) -> Stage:
-    given, source = run.given_model, run.options.sfm.sparse
-
-    def take(report: Report) -> stages.Facts:
-        assert given is not None
-        assert source is not None
-        return stages.take_poses(given, run.workspace, source)
-
-    def find(report: Report) -> stages.Facts:
-        def step(name: str) -> None:
-            if name == "mapping":  # on one core: the other can load what the next stages need
-                preload()
-            report(1)
-
-        return stages.find_poses(run.record.images, run.workspace, run.options.sfm, report=step)
-
-    if given is not None:
-        return Stage(name="sparse", work=take, after=("capture",))
-    return Stage(name="sfm", work=find, after=("capture",), total=stages.SFM_STEPS)
-
-
-def _map_stage(run: Run) -> Stage:
-    def work(report: Report) -> stages.Facts:
-        return stages.build_maps(
-            run.capture, run.workspace, run.options.region, workers=run.workers, report=report
-        )
-
-    return Stage(name="maps", work=work, after=("sfm",), total=_num_views(run))
-
-
-def _normal_models(models: Sequence[Model]) -> list[Model]:
-    """PPA first: it selects the seeds, which are the same for all models."""
-    return list(dict.fromkeys((Model.PPA, *models)))
-
-
-def _normal_names(models: Sequence[Model]) -> list[str]:
-    return [normals_stage(model) for model in _normal_models(models)]
-
-
-def _normal_stages(run: Run, models: Sequence[Model]) -> list[Stage]:
-    return [_normal_stage(run, model) for model in _normal_models(models)]
-
-
-def _normal_stage(run: Run, model: Model) -> Stage:
-    def work(report: Report) -> stages.Facts:
-        return cloud_stages.solve_tracks(
-            model, run.workspace, run.options.normals, workers=run.workers
-        )
-
-    first = normals_stage(Model.PPA)
-    after = "maps" if model is Model.PPA else first
-    return Stage(name=normals_stage(model), work=work, after=(after,))
-
-
-def _densify_stage(run: Run, model: Model) -> Stage:
-    propagation, fusion = run.options.propagation, run.options.fusion
-
-    def work(report: Report) -> stages.Facts:
-        return cloud_stages.densify(
-            model, run.workspace, propagation, fusion, workers=run.workers, report=report
-        )
-
-    return Stage(
-        name=densify_stage(model),
-        work=work,
-        after=(normals_stage(Model.PPA), normals_stage(model)),
-        total=cloud_stages.densify_steps(_num_views(run), propagation),
-    )
-
-
-def _evaluate_stage(run: Run, models: Sequence[Model]) -> Stage:
-    def work(report: Report) -> stages.Facts:
-        write_comparison(
-            run.capture,
-            run.workspace,
-            run.options,
-            models,
-            run.record.results,
-            workers=run.workers,
-        )
-        return {}
-
-    stage = Stage(name=EVALUATE, work=work, after=tuple(densify_stage(m) for m in models))
-    if run.record.stage_options.get(EVALUATE) != options_of(EVALUATE, run.options):
-        run.record.forget([EVALUATE])
-    return stage
-
-
-def _num_views(run: Run) -> int:
-    return int(run.record.results.get("num_views", len(run.capture.paths)))

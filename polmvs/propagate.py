@@ -78,6 +78,7 @@ def propagate(
     for started in workers.map(partial(_start, model, seeds, options), _chunks(maps)):
         nodes += started
         report(len(started))
+    folder.mkdir(parents=True, exist_ok=True)
     dense: list[DenseView | None] = [None] * len(maps)
     for round_index in range(options.num_rounds):
         last = round_index == options.num_rounds - 1

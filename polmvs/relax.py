@@ -21,6 +21,7 @@ from polmvs.dense import (
     SurfaceSamples,
     dense_view,
     extend_planes,
+    lattice_points,
     lattice_xy,
 )
 from polmvs.network import (
@@ -103,9 +104,11 @@ def relax(
     center = maps[0].view.center_in_world
     surface = nodes.surface
     points = center + np.exp(surface.log_range)[:, None] * surface.rays_in_world
-    points[~np.isfinite(surface.log_range)] = center  # projects nowhere: no rows
+    unknown = ~np.isfinite(surface.log_range)
+    points[unknown] = center  # anywhere
     range_maps = [d.range_map if d is not None else None for d in dense]
     rows = gather_rows(model, points, maps, range_maps)
+    rows.sigma[:, unknown] = np.inf  # other views may see this one's camera: no rows
     estimate = solve_normals(rows.rows, rows.rays, rows.sigma, initial_normals=surface.normals.T)
     normals, normal_sigma = fill_normals(nodes, estimate)
     surface = replace(
@@ -162,20 +165,19 @@ def tie_opinions(
     if not said:
         none = np.zeros(0, np.int64)
         return SeedTies(node=none, seed=none, value=np.zeros(0), sigma=np.zeros(0))
-    places, sigmas = np.array(said), np.array(deviations)
-    place, sigma = _consensus(places, sigmas)
-    enough = np.isfinite(places).sum(axis=0) >= MIN_OPINIONS
-    node = np.flatnonzero(enough & np.isfinite(place) & np.isfinite(sigma))
+    place, sigma, count = _consensus(np.array(said), np.array(deviations))
+    node = np.flatnonzero((count >= MIN_OPINIONS) & np.isfinite(place) & np.isfinite(sigma))
     alike = max(OPINION_REACH_PX / nodes.spacing_px, 1.0)
     return SeedTies(
         node=node, seed=node, value=np.log(place[node]), sigma=alike * sigma[node] / place[node]
     )
 
 
-def _consensus(places: Array, sigmas: Array) -> tuple[Array, Array]:
-    """Robust weighted mean (N,) of what K views say (K, N), NaN: nothing, and its deviation.
+def _consensus(places: Array, sigmas: Array) -> tuple[Array, Array, Array]:
+    """Robust weighted mean (N,) of what K views say (K, N), NaN: nothing.
 
-    The views' errors are not independent, so that their number does not narrow it.
+    With it its deviation, which the number of views does not narrow because their errors are not
+    independent, and how many agree.
     """
     order = np.sort(places, axis=0)  # NaN last
     count = np.isfinite(places).sum(axis=0)
@@ -189,7 +191,7 @@ def _consensus(places: Array, sigmas: Array) -> tuple[Array, Array]:
         total = weight.sum(axis=0)
         place = (weight * np.where(near, places, 0)).sum(axis=0) / total
         own = np.sqrt(near.sum(axis=0) / total)
-    return place, np.hypot(own, spread)
+    return place, np.hypot(own, spread), near.sum(axis=0)
 
 
 def _joined(first: SeedTies, second: SeedTies, num_first: int) -> SeedTies:
@@ -217,6 +219,6 @@ def spread_nodes(
     if not good.any():
         return None
     wanted = open_lattice(phase_map, stride_px)
-    xy = lattice_xy(*wanted.shape, stride_px)[wanted]
+    xy = lattice_points(wanted, stride_px)
     rays = phase_map.view.camera.rays(xy) @ phase_map.view.cam_from_world.rotation
     return dense_view(extend_planes(surface[good], xy, rays, max_gap_px), wanted, stride_px)

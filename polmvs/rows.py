@@ -50,13 +50,13 @@ def gather_rows(
     range_maps : per view ``(h, w)`` distances from the camera centre, 0 where unknown: a point
         that lies behind its view's map by more than ``range_tolerance`` (relative) is occluded.
     """
-    points = np.asarray(points_in_world, np.float32)
+    points = np.asarray(points_in_world, np.float64)  # the origin may be far
     num_views, num_points = len(maps), len(points)
     rows = np.full((3, num_views, num_points), np.nan, np.float32)
     rays = np.zeros((3, num_views, num_points), np.float32)
     sigma = np.full((num_views, num_points), np.inf, np.float32)
     for k, phase_map in enumerate(maps):
-        in_cam = phase_map.view.cam_from_world * points
+        in_cam = (phase_map.view.cam_from_world * points).astype(np.float32)
         distance = np.linalg.norm(in_cam, axis=-1)
         ray = in_cam / np.maximum(distance, 1e-12)[:, None]
         xy = phase_map.view.camera.project(in_cam)

@@ -140,7 +140,7 @@ class Run:
         self.save()
         for forgotten in names:
             for path in self.workspace.files_of(forgotten):
-                path.unlink(missing_ok=True)
+                self.workspace.discard(path)
 
     def save(self, *, finished: bool = False) -> None:
         """Write ``run.json``."""

@@ -9,16 +9,20 @@ from typing import Any
 from polmvs.capture import Capture
 from polmvs.colmap_io import SparseModel
 from polmvs.config import Model, Options
+from polmvs.dense_checks import require_same_frame
+from polmvs.dense_workspace import open_dense_workspace
 from polmvs.errors import DataError, OptionError
 from polmvs.groundtruth import open_ground_truth
 from polmvs.image_io import read_mask
 from polmvs.option_values import to_plain
 from polmvs.record import Record
+from polmvs.reference_io import check_reference
 from polmvs.sfm import check_intrinsics
 from polmvs.stages import find_mask, fit_model, image_names
 from polmvs.workspace import Workspace
 
 EVALUATE = "evaluate"
+PARTS = "parts"
 POSES = ("sfm", "sparse")  # two ways to the same files
 
 
@@ -32,23 +36,39 @@ def densify_stage(model: Model) -> str:
     return f"densify_{model}"
 
 
+def mesh_stage(model: Model) -> str:
+    """Name of the stage of the mesh."""
+    return f"mesh_{model}"
+
+
+def dense_stage(model: Model) -> str:
+    """Name of the stage of the COLMAP dense workspace."""
+    return f"dense_{model}"
+
+
 # Groups of options that decide the result of a stage, and the order in which stages follow.
 STAGE_OPTIONS: dict[str, tuple[str, ...]] = {
     "capture": ("capture",),
-    **{name: ("sfm",) for name in POSES},
+    **{name: ("sfm", "reference") for name in POSES},
     "maps": ("region",),
     **{normals_stage(model): ("normals",) for model in Model},
+    PARTS: ("normals",),
     **{densify_stage(model): ("propagation", "fusion") for model in Model},
+    **{mesh_stage(model): () for model in Model},
+    **{dense_stage(model): ("fusion", "export") for model in Model},
     EVALUATE: ("evaluation",),
 }
 STAGE_RANK = {
     "capture": 0,
     **dict.fromkeys(POSES, 1),
     "maps": 2,
-    **{normals_stage(model): 4 for model in Model},
+    **{normals_stage(model): 5 for model in Model},
     normals_stage(Model.PPA): 3,
-    **{densify_stage(model): 5 for model in Model},
-    EVALUATE: 6,
+    PARTS: 4,
+    **{densify_stage(model): 6 for model in Model},
+    **{mesh_stage(model): 7 for model in Model},
+    **{dense_stage(model): 8 for model in Model},
+    EVALUATE: 9,
 }
 
 
@@ -56,7 +76,9 @@ def command_of(name: str) -> str:
     """The command that does a stage alone."""
     if STAGE_RANK[name] <= STAGE_RANK["sfm"]:
         return "sfm"
-    return "normals" if STAGE_RANK[name] < STAGE_RANK[densify_stage(Model.PPA)] else "densify"
+    if STAGE_RANK[name] < STAGE_RANK[densify_stage(Model.PPA)]:
+        return "normals"
+    return "densify" if name.startswith("densify") else "export"
 
 
 def alternatives(name: str) -> tuple[str, ...]:
@@ -66,7 +88,13 @@ def alternatives(name: str) -> tuple[str, ...]:
 
 def inputs_of(options: Options) -> list[Path]:
     """Folders that are read beside the capture."""
-    paths = (options.sfm.sparse, options.region.mask, options.evaluation.gt)
+    paths = (
+        options.sfm.sparse,
+        options.reference.reference,
+        options.region.mask,
+        options.fusion.workspace,
+        options.evaluation.gt,
+    )
     return [path for path in paths if path is not None]
 
 
@@ -94,8 +122,15 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
             read_mask(find_mask(options.region.mask, image), (capture.height, capture.width))
     if options.evaluation.gt is not None:
         open_ground_truth(options.evaluation.gt)
+    check_reference(options.reference)
+    if options.export.in_place and options.fusion.workspace is None:
+        raise OptionError("--in-place needs a --workspace to fill.")
+    dense = open_dense_workspace(options.fusion.workspace) if options.fusion.workspace else None
     if options.sfm.sparse is not None:
-        return fit_model(capture, options.sfm.sparse)
+        model = fit_model(capture, options.sfm.sparse)
+        if dense is not None:
+            require_same_frame(dense, model)
+        return model
     if options.sfm.intrinsics is not None:
         check_intrinsics(options.sfm.intrinsics, capture.width, capture.height)
     return None

@@ -60,7 +60,7 @@ def match_model_to_capture(
     DataError
         No image matches, or a camera has another aspect ratio.
     """
-    new_names = _matching_names([view.name for view in model.views], names, source)
+    new_names = matching_names([view.name for view in model.views], names, source)
     kept = [i for i, name in enumerate(new_names) if name is not None]
     dropped = [model.views[i].name for i, name in enumerate(new_names) if name is None]
     if dropped:
@@ -94,7 +94,7 @@ def short_list(names: Sequence[str]) -> str:
     return ", ".join(names[:MAX_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
-def _matching_names(
+def matching_names(
     model_names: Sequence[str], names: Sequence[str], source: str | PathLike[str]
 ) -> list[str | None]:
     """The capture's name of each of the model's images, None where it has none."""

@@ -16,9 +16,9 @@ from typing import Any
 from polmvs.camera import View
 from polmvs.capture import Capture, intensity_image_8bit
 from polmvs.colmap_io import SparseModel, read_model
-from polmvs.config import Light, Model, RegionOptions, SfmOptions
+from polmvs.config import Light, Model, ReferenceOptions, RegionOptions, SfmOptions
 from polmvs.errors import DataError
-from polmvs.image_io import read_mask, write_png
+from polmvs.image_io import read_gray, read_mask, write_png
 from polmvs.light import find_diffuse
 from polmvs.parallel import Workers
 from polmvs.phasemap import (
@@ -29,6 +29,8 @@ from polmvs.phasemap import (
     store_phase_map,
     turned,
 )
+from polmvs.reference import transform_model
+from polmvs.reference_io import metric_frame
 from polmvs.region import find_region
 from polmvs.sfm import run_sfm
 from polmvs.sparse_model import match_model_to_capture, short_list, write_model
@@ -101,16 +103,18 @@ def find_poses(
     names: Sequence[str],
     workspace: Workspace,
     options: SfmOptions,
+    reference: ReferenceOptions,
     *,
     report: Callable[[str], None],
 ) -> Facts:
-    """Run SfM on the images."""
+    """Run SfM on the images, and bring its model into the metric frame that is asked for."""
     with workspace.scratch("sfm") as folder:
         model = run_sfm(
             workspace.images, names, folder / "work", folder / "sparse", options, report
         )
+        facts = _take_frame(model, workspace, reference, folder / "sparse")
         workspace.replace(folder / "sparse", workspace.sparse)
-    return _pose_facts(model, workspace.images)
+    return _pose_facts(model, workspace.images) | facts
 
 
 def fit_model(capture: Capture, source: Path) -> SparseModel:
@@ -121,12 +125,38 @@ def fit_model(capture: Capture, source: Path) -> SparseModel:
     )
 
 
-def take_poses(model: SparseModel, workspace: Workspace, source: Path) -> Facts:
+def take_poses(
+    model: SparseModel, workspace: Workspace, source: Path, reference: ReferenceOptions
+) -> Facts:
     """Write an existing model that was fitted to the capture; the original is not touched."""
     with workspace.scratch("sfm") as folder:
         write_model(model, folder / "sparse")
+        facts = _take_frame(model, workspace, reference, folder / "sparse")
         workspace.replace(folder / "sparse", workspace.sparse)
-    return _pose_facts(model, source)
+    return _pose_facts(model, source) | facts
+
+
+def _take_frame(
+    model: SparseModel, workspace: Workspace, options: ReferenceOptions, target: Path
+) -> Facts:
+    """Rewrite a model in the metric frame that the options give; without one it stays."""
+    frame = metric_frame(model, options, lambda name: read_gray(workspace.images / name))
+    if frame is None:
+        return {"frame": None, "unit": "model unit"}
+    write_model(transform_model(model, frame.metric_from_world), target)
+    similarity = frame.metric_from_world
+    facts = {
+        "source": frame.source,
+        "scale": frame.scale,
+        "relative_sigma": frame.relative_sigma,
+        "rms_residual": frame.rms_residual,
+        "num_used": frame.num_used,
+        "dropped": list(frame.dropped),
+        "checked_by": dict(frame.checked_by),
+        "rotation": similarity.rotation.tolist(),
+        "translation": similarity.translation.tolist(),
+    }
+    return {"frame": facts, "unit": "m"}
 
 
 def _pose_facts(model: SparseModel, source: Path) -> Facts:

@@ -19,10 +19,12 @@ from polmvs.image_io import write_bytes
 
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an ``.npy`` file whole or not at all."""
+    """Write an ``.npy`` file whole or not at all, into a folder that there is.
+
+    A worker that is late must not make the folder of a stage again that was given up.
+    """
     buffer = io.BytesIO()
     np.save(buffer, array)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, buffer.getvalue())
 
 

@@ -68,7 +68,7 @@ def log_range_increment(normals: Floats, rays_tail: Floats, rays_head: Floats) -
 
     The normal may be of any length.
     """
-    least = -MAX_GRAZING * np.linalg.norm(normals, axis=-1)
+    least = -MAX_GRAZING * np.maximum(np.linalg.norm(normals, axis=-1), 1e-12)
     tail = np.minimum((normals * rays_tail).sum(axis=-1), least)
     head = np.minimum((normals * rays_head).sum(axis=-1), least)
     return np.asarray(np.log(tail / head), np.float64)
@@ -208,13 +208,20 @@ class _Factors:
         )
         self.border = self.weighted @ mode_columns
         self.inner = self.factors.solve(self.border)
-        self.schur = self.weighted_modes @ mode_columns - self.border.T @ self.inner
+        self.schur = _product(self.weighted_modes, mode_columns)
+        self.schur -= _product(self.border.T, self.inner)
 
     def solve(self, targets: Array) -> Array:
         """Least-squares solutions (unknowns, R) for right-hand sides (rows, R)."""
         inner = self.factors.solve(self.weighted @ targets)
-        modes = np.linalg.solve(self.schur, self.weighted_modes @ targets - self.border.T @ inner)
+        right = _product(self.weighted_modes, targets) - _product(self.border.T, inner)
+        modes = np.linalg.solve(self.schur, right)
         return np.concatenate([inner - self.inner @ modes, modes])
+
+
+def _product(a: Array, b: Array) -> Array:
+    """``a @ b`` of long thin matrices, summed in one order whatever threads BLAS has to spare."""
+    return np.asarray(np.einsum("ij,jk->ik", a, b))
 
 
 def _reached_nodes(num_nodes: int, edges: Edges, ties: SeedTies) -> NDArray[np.bool_]:

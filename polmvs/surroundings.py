@@ -49,6 +49,7 @@ class Kind(IntEnum):
     SURFACE = 0
     SPARSE = 1
     STEREO = 2
+    COLMAP = 3
 
 
 @dataclass(frozen=True)
@@ -247,6 +248,7 @@ def stereo_surroundings(
     on_progress : called with the number of views done, twice for each view with points.
     """
     workers = workers or Workers(1)
+    folder.mkdir(parents=True, exist_ok=True)
     kept = sparse_surroundings(tracks, maps).is_kept
     certain = some_tracks(tracks, kept)
     chosen = choose_partners(certain, [m.view for m in maps], max_partners)

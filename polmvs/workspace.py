@@ -10,21 +10,20 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from polmvs.config import Model
 from polmvs.errors import DataError, OptionError
+from polmvs.own_files import require_own
 from polmvs.record import Record, StageRecord, write_json
 
 logger = logging.getLogger(__name__)
 
 RUN_FILE = "run.json"
 LOG_FILE = "polmvs.log"
-# What a run writes in its folders, by folder; images are known by name from the record.
-FOLDER_PATTERNS = {"sparse": ("*.bin",), "maps": ("*.npy",)}
 
 
 @dataclass(frozen=True)
@@ -81,14 +80,38 @@ class Workspace:
         """Dense cloud."""
         return self.root / f"{model}.ply"
 
+    def views(self, model: Model) -> Path:
+        """Dense views: ranges, normals and deviations of each view."""
+        return self.root / f"views_{model}"
+
+    def mesh(self, model: Model) -> Path:
+        """Poisson mesh of the dense cloud."""
+        return self.root / f"{model}_mesh.ply"
+
+    def dense(self, model: Model) -> Path:
+        """COLMAP dense workspace: ``dense/`` is PPA's."""
+        return self.root / ("dense" if model is Model.PPA else f"dense_{model}")
+
     def files_of(self, stage: str) -> list[Path]:
-        """Files that nothing but this stage writes, outside the folders."""
+        """Files, and a folder, that nothing but this stage writes; those of all stages left out."""
         if stage == "evaluate":
             return [self.metrics, self.summary]
         kind, _, model = stage.partition("_")
         if kind == "normals":
             return [self.normals(Model(model or Model.PPA))]
-        return [self.cloud(Model(model))] if kind == "densify" else []
+        if kind == "densify":
+            return [self.cloud(Model(model))]
+        if kind == "dense":
+            return [self.dense(Model(model))]
+        return [self.mesh(Model(model))] if kind == "mesh" else []
+
+    def discard(self, path: Path) -> None:
+        """Delete a file or a folder that a stage wrote; DataError if it holds anything else."""
+        if path.is_dir():
+            require_own(path, set())
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
     def temporary(self, name: str) -> Path:
         """A name in the folder for work that is not finished."""
@@ -111,7 +134,7 @@ class Workspace:
         """
         if target.exists():
             names = {file.name for file in folder.iterdir()}
-            _require_own(target, names)
+            require_own(target, names)
             shutil.rmtree(target)
         folder.replace(target)
 
@@ -230,7 +253,9 @@ def result_names() -> list[str]:
     """Names of all files and folders that a run may write, the record last."""
     names = ["images", "sparse", "maps", "metrics.json", "summary.md", LOG_FILE]
     for model in Model:
-        names += [Workspace(Path()).normals(model).name, Workspace(Path()).cloud(model).name]
+        here = Workspace(Path())
+        names += [here.normals(model).name, here.cloud(model).name, here.views(model).name]
+        names += [here.mesh(model).name, here.dense(model).name]
     return [*names, RUN_FILE]
 
 
@@ -249,7 +274,7 @@ def _remove_results(workspace: Workspace) -> None:
     images = set(workspace.load().images)
     folders = [root / name for name in present if (root / name).is_dir()]
     for folder in folders:
-        _require_own(folder, images if folder == workspace.images else set())
+        require_own(folder, images if folder == workspace.images else set())
     try:
         _remove_temporary(root)
         for name in present:
@@ -260,15 +285,6 @@ def _remove_results(workspace: Workspace) -> None:
                 path.unlink()
     except OSError as error:
         raise DataError(root, f"cannot be emptied: {error.strerror or error}.") from error
-
-
-def _require_own(folder: Path, names: Set[str]) -> None:
-    """Refuse to delete a folder with files other than these and those that a run writes in it."""
-    patterns = FOLDER_PATTERNS.get(folder.name, ())
-    for file in folder.iterdir():
-        own = file.name in names or any(file.match(pattern) for pattern in patterns)
-        if folder.is_symlink() or file.is_dir() or not own:
-            raise DataError(file, "was not written by polmvs. Move it out of the way.")
 
 
 def _remove_temporary(root: Path) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 import polmvs
-from polmvs.cli.commands import build_parser
 from polmvs.cli.flags import GROUPS, options_from, run_options
+from polmvs.cli.parsers import build_parser
 from polmvs.config import Contour, Model, Options, RunOptions
 from polmvs.option_values import describe_fields, from_plain, to_plain
 from polmvs.pipeline import COMPARED

@@ -17,10 +17,11 @@ from polmvs.cloud_io import read_cloud
 from polmvs.colmap_io import read_model
 from polmvs.config import Model, Options, PropagationOptions, RunOptions, SfmOptions
 from polmvs.pipeline import COMPARED, Job, reconstruct
+from polmvs.surroundings import Kind
 from polmvs.workspace import Workspace
 
 OTHERS = [model for model in COMPARED if model is not Model.PPA]
-NORMAL_STAGES = ["normals", *[f"normals_{model}" for model in OTHERS]]
+NORMAL_STAGES = ["normals", "parts", *[f"normals_{model}" for model in OTHERS]]
 BEFORE_CLOUDS = ["capture", "sfm", "maps", *NORMAL_STAGES]
 STAGES = [*BEFORE_CLOUDS, *[f"densify_{model}" for model in COMPARED], "evaluate"]
 RESULTS = ("normals.ply", "normals_opa.ply", "opa.ply", "ppa.ply", "metrics.json")
@@ -98,11 +99,14 @@ def test_clouds_carry_normals_colours_and_scalars(demo_run: Path) -> None:
     cloud = read_cloud(demo_run / "ppa.ply")
     assert len(cloud.points) > 10_000
     assert cloud.normals is not None
-    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-4)
+    length = np.linalg.norm(cloud.normals, axis=1)
+    np.testing.assert_allclose(length, cloud.scalars["kind"] == Kind.SURFACE, atol=1e-4)
     assert cloud.colors is not None
     assert cloud.colors.std() > 0
-    assert set(cloud.scalars) == {"num_views", "sigma_deg"}
+    assert set(cloud.scalars) == {"num_views", "sigma_deg", "sigma", "kind"}
     assert cloud.scalars["num_views"].min() >= 2
+    kinds = cloud.scalars["kind"]
+    assert set(kinds.astype(int)) == {Kind.SURFACE, Kind.SPARSE}
 
 
 def test_sparse_normals_carry_their_quality(demo_run: Path) -> None:
@@ -134,7 +138,8 @@ def test_library_and_one_worker_give_the_same_cloud(
     first, again = read_cloud(demo_run / "ppa.ply"), read_cloud(tmp_path / "out" / "ppa.ply")
     # The model is written anew from its views and tracks: the last digits differ.
     assert len(again.points) == pytest.approx(len(first.points), rel=0.01)
-    assert stages_of(tmp_path / "out") == ["capture", "sparse", "maps", "normals", "densify_ppa"]
+    before_cloud = ["capture", "sparse", "maps", "normals", "parts"]
+    assert stages_of(tmp_path / "out") == [*before_cloud, "densify_ppa", "mesh_ppa", "dense_ppa"]
 
 
 def test_16_bit_tiff_with_own_poses_and_names(
@@ -288,8 +293,9 @@ def test_new_truth_is_measured_on_a_finished_run(
 
 def test_paper_contours_work_too(demo_run: Path, demo_capture: Path, tmp_path: Path, cli) -> None:
     out = tmp_path / "out"
-    copy_until(demo_run, out, "normals")
-    status, _, err = cli("densify", demo_capture, out, "--contour", "normals")
+    copy_until(demo_run, out, "parts")
+    args = ("--method", "contour", "--contour", "normals")
+    status, _, err = cli("densify", demo_capture, out, *args)
     assert (status, err) == (0, "")
     status, text, _ = cli(
         "evaluate", out / "ppa.ply", "--gt", demo_capture, "--sparse", out / "sparse", "--json"
@@ -297,3 +303,4 @@ def test_paper_contours_work_too(demo_run: Path, demo_capture: Path, tmp_path: P
     assert status == 0
     assert json.loads(text)["cloud"]["f_score"][1] > 0.9
     assert PropagationOptions().contour == "tangent"
+    assert PropagationOptions().method == "integrate"

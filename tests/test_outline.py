@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import CAMERA, Scene, board_scene, phase_map_of
 
-from polmvs.agreement import join_seeds, most_agreeing
+from polmvs.agreement import contradicted, join_seeds, most_agreeing
 from polmvs.config import Model
 from polmvs.geometry import RigidTransform
 from polmvs.misfit import Misfit
@@ -197,8 +197,8 @@ def test_two_views_are_not_enough(board):
 
 
 def test_a_part_with_seeds_is_left_alone(board):
-    """Even where only some of the views show a seed."""
-    seeds = board.seeds(1)
+    """Even where only some of the views show the seeds."""
+    seeds = board.seeds(3)
     found, reports = find_part_seeds(Model.PPA, board.maps, seeds, ABOUT)
     assert len(found.sigma) == 0
     assert reports == []
@@ -207,7 +207,7 @@ def test_a_part_with_seeds_is_left_alone(board):
 def test_a_part_that_one_view_shows_without_its_seeds_is_left_alone(board):
     hidden = board.maps[0]
     away = replace(hidden, view=replace(hidden.view, name="away.png"))
-    first = np.array([0])
+    first = np.array([0, 0, 0])  # in one place, so that one disc hides them
     seeds = Seeds(*(a[first] for a in _fields(board.seeds(30))))
     # A seed outside the region of one view only: its mark is outshone there.
     region = hidden.region
@@ -218,6 +218,22 @@ def test_a_part_that_one_view_shows_without_its_seeds_is_left_alone(board):
     found, reports = find_part_seeds(Model.PPA, maps, seeds, ABOUT)
     assert len(found.sigma) == 0
     assert reports == []
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.02])
+def test_a_lone_seed_is_held_against_the_outlines(board, offset):
+    true = board.seeds(1)
+    lone = replace(true, points_in_world=true.points_in_world + offset * true.normals_in_world)
+    found, reports = find_part_seeds(Model.PPA, board.maps, lone, ABOUT)
+    assert [report.doubt for report in reports] == [""]
+    assert contradicted(lone, found).tolist() == [offset > 0]
+    shift = np.array([0.5, 0.0, 0.0])
+    beside = replace(lone, points_in_world=lone.points_in_world + shift)
+    assert not contradicted(beside, found).any()
+
+
+def test_nothing_contradicts_without_outlines(board):
+    assert not contradicted(board.seeds(4), NO_SEEDS).any()
 
 
 def _fields(seeds: Seeds):

@@ -2,12 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import board_scene
+from scenes import CAMERA, board_scene
 
 from polmvs.camera import PinholeCamera
 from polmvs.config import Contour, FusionOptions, Model, PropagationOptions
 from polmvs.dense import DenseView, open_dense_view, store_dense_view
-from polmvs.fuse import fuse
+from polmvs.fuse import FusedCloud, fuse, merge
 from polmvs.parallel import Workers
 from polmvs.propagate import propagate
 from polmvs.tracks import Seeds
@@ -92,6 +92,8 @@ def test_the_frame_and_scale_of_the_world_do_not_matter(scene, tmp_path):
 def test_workers_give_the_same_result_as_one_process(scene, tmp_path):
     from polmvs.phasemap import store_phase_map
 
+    for name in ("maps", "one", "two"):
+        (tmp_path / name).mkdir()
     maps = [store_phase_map(m, tmp_path / "maps") for m in scene.maps]
     counts = []
     with Workers(2) as workers:
@@ -164,6 +166,102 @@ def test_normals_must_agree(scene):
     )
     dense[1] = replace(dense[1], normals_in_world=turned.astype(np.float32))
     assert len(fuse(scene.maps[:2], dense, FusionOptions()).points) == 0
+
+
+def one_view_off(scene, off, sigma_off, *, sigma=3e-4, k=0, **options):
+    """Fused cloud of true views of a deviation, one of them off by so much with its own."""
+    dense = []
+    for j in range(6):
+        view = plane_view(scene, j, off if j == k else 0.0)
+        known = view.range_map > 0
+        own = np.where(known, sigma_off if j == k else sigma, np.nan).astype(np.float32)
+        dense.append(replace(view, sigma=own))
+    return fuse(scene.maps, dense, FusionOptions(voxel_px=0, **options))
+
+
+def test_the_surer_view_has_the_greater_weight(scene):
+    """1 mm off with a third of the others' deviation: nine of fourteen parts, and the reverse."""
+    for sigma_off, expected in ((1e-4, 9 / 14), (3e-4, 1 / 6), (9e-4, (1 / 9) / (5 + 1 / 9))):
+        cloud = one_view_off(scene, 1e-3, sigma_off)
+        everywhere = cloud.num_views == 6
+        assert everywhere.sum() > 1000
+        # Views look at the board at different angles, which their deviations go with.
+        assert np.median(distances(scene, cloud.points[everywhere])) == pytest.approx(
+            1e-3 * expected, rel=0.1
+        )
+
+
+def test_the_tolerance_narrows_for_certain_views_but_not_below_half(scene):
+    """A footprint is 4 mm, the tolerance two of them: 8 mm along the ray, 4 mm where certain."""
+    footprint = 0.5 / CAMERA.fx
+    certain, doubtful = footprint / 100, 2 * footprint
+
+    def votes(off, sigma):
+        cloud = one_view_off(scene, off, sigma, sigma=sigma, min_views=5)
+        return np.median(cloud.num_views)
+
+    # Offsets along the normal; along rays 45 degrees off it they are 1.4 times as large.
+    assert votes(0.5 * footprint, certain) == 6
+    assert votes(1.0 * footprint, certain) == 5
+    assert votes(1.0 * footprint, doubtful) == 6
+    assert votes(2.0 * footprint, doubtful) == 5
+
+
+def test_the_fused_deviation_is_that_of_a_view_and_along_the_normal(scene):
+    """Views err alike: six of them are no surer than one."""
+    cloud = one_view_off(scene, 0.0, 3e-4)
+    assert (cloud.num_views == 6).sum() > 1000
+    np.testing.assert_allclose(cloud.sigma, 3e-4, rtol=0.15)
+    mixed = one_view_off(scene, 0.0, 1e-4)
+    expected = np.sqrt(6 / (5 / 3e-4**2 + 1 / 1e-4**2))
+    assert np.median(mixed.sigma[mixed.num_views == 6]) == pytest.approx(expected, rel=0.1)
+
+
+def test_an_unknown_deviation_is_that_of_a_footprint(scene):
+    cloud = one_view_off(scene, 1e-3, np.nan, sigma=np.nan)
+    everywhere = cloud.num_views == 6
+    assert np.median(distances(scene, cloud.points[everywhere])) == pytest.approx(1e-3 / 6, rel=0.1)
+    np.testing.assert_allclose(np.median(cloud.sigma), 0.5 / CAMERA.fx * 0.72, rtol=0.25)
+
+
+@pytest.mark.parametrize("scale", [1.0, 20.0])
+def test_the_voxel_is_in_units_of_the_world(scene, scale):
+    dense = [plane_view(scene, k) for k in range(6)]
+    voxel = 0.01
+    cloud = fuse(scene.maps, dense, FusionOptions(voxel=voxel, voxel_px=scale))
+    # A board of 24 x 30 cm, some cells cut by the tilted plane.
+    assert 600 < len(cloud.points) < 2000
+    fine = fuse(scene.maps, dense, FusionOptions(voxel=voxel / 2))
+    assert 2.5 < len(fine.points) / len(cloud.points) < 5
+    whole = fuse(scene.maps, dense, FusionOptions(voxel=0.0))
+    np.testing.assert_array_equal(
+        whole.points, fuse(scene.maps, dense, FusionOptions(voxel_px=0)).points
+    )
+
+
+def test_min_views_counts_the_views_own_vote(scene):
+    dense = [plane_view(scene, k) for k in range(3)] + [None] * 3
+    for min_views in (1, 2, 3):
+        cloud = fuse(scene.maps, dense, FusionOptions(min_views=min_views, voxel_px=0))
+        assert cloud.num_views.min() == min_views
+        assert cloud.num_views.max() == 3
+    assert len(fuse(scene.maps, dense, FusionOptions(min_views=4)).points) == 0
+
+
+def test_merged_points_lie_where_the_surer_ones_do():
+    """Two points in a voxel: 16 times the weight for a quarter of the deviation."""
+    cloud = FusedCloud(
+        points=np.array([[0.0, 0, 0], [0.4, 0, 0], [5.0, 0, 0]]),
+        normals=np.array([[0.0, 0, -1], [0, 0, -1], [0, 0, -1]]),
+        intensity=np.zeros(3, np.float32),
+        num_views=np.array([2, 2, 3], np.int32),
+        sigma_deg=np.ones(3, np.float32),
+        sigma=np.array([0.4, 0.1, 0.1], np.float32),
+    )
+    merged = merge(cloud, 1.0)
+    np.testing.assert_allclose(merged.points[:, 0], [0.4 * 16 / 17, 5.0], rtol=1e-6)
+    np.testing.assert_array_equal(merged.num_views, [2, 3])
+    np.testing.assert_allclose(merged.sigma, [(0.4 + 16 * 0.1) / 17, 0.1], rtol=1e-6)
 
 
 def test_a_stored_dense_view_travels_as_its_path(scene, tmp_path):

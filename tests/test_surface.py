@@ -116,3 +116,104 @@ def test_modes_do_nothing_where_the_increments_are_right():
     seeds = ties([3, 20, 36], 0.01 * np.array([3, 20, 36]))
     solution = solve_log_ranges(40, chain(40), seeds, 3, modes=modes, mode_sigma=0.01)
     np.testing.assert_allclose(solution.log_range, 0.01 * np.arange(40), atol=1e-6)
+
+
+def lattice(rows, columns, rng, sigma=0.02):
+    """Edges of a grid of nodes whose true log-range is zero, with noise."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    pairs = [(index[:, :-1], index[:, 1:]), (index[:-1], index[1:])]
+    tail, head = (np.concatenate([p[i].ravel() for p in pairs]) for i in (0, 1))
+    spread = sigma * rng.uniform(0.5, 2, len(tail))
+    return Edges(tail=tail, head=head, delta=spread * rng.normal(size=len(tail)), sigma=spread)
+
+
+def noisy_ties(nodes, rng, sigma=0.01):
+    return ties(nodes, sigma * rng.normal(size=len(nodes)), sigma)
+
+
+def dense_system(num, edges, seeds, modes):
+    """Rows (edges, ties, prior) over nodes and modes, not yet weighted."""
+    num_modes = modes.shape[1]
+    matrix = np.zeros((len(edges.tail) + len(seeds.node) + num_modes, num + num_modes))
+    row = np.arange(len(edges.tail))
+    matrix[row, edges.head], matrix[row, edges.tail] = 1, -1
+    row = len(edges.tail) + np.arange(len(seeds.node))
+    matrix[row, seeds.node] = 1
+    matrix[row, num:] = modes[seeds.node]
+    matrix[len(matrix) - num_modes :, num:] = np.eye(num_modes)
+    return matrix
+
+
+def polynomials(rows, columns, num):
+    y, x = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij")
+    return np.stack([x, y, x * y], axis=-1).reshape(-1, 3)[:, :num]
+
+
+@pytest.mark.parametrize("num_modes", [0, 3])
+def test_the_bordered_solution_is_the_least_squares_one(num_modes):
+    """Modes as further columns, their prior as further rows."""
+    rng = np.random.default_rng(5)
+    edges, modes = lattice(6, 7, rng), polynomials(6, 7, num_modes)
+    seeds = noisy_ties([3, 17, 30, 41, 17], rng)
+    result = solve_log_ranges(42, edges, seeds, 5, modes=modes, mode_sigma=0.03, num_rounds=1)
+    matrix = dense_system(42, edges, seeds, modes)
+    target = np.concatenate([edges.delta, seeds.value, np.zeros(num_modes)])
+    sigma = np.concatenate([edges.sigma, seeds.sigma, np.full(num_modes, 0.03)])
+    expected = np.linalg.lstsq(matrix / sigma[:, None], target / sigma, rcond=None)[0]
+    expected = expected[:42] + modes @ expected[42:]
+    np.testing.assert_allclose(result.log_range, expected, atol=1e-11)
+
+
+@pytest.mark.parametrize("num_modes", [0, 3])
+def test_the_deviation_is_that_of_the_normal_matrix(num_modes):
+    """Within what 16 draws leave, 18 %: for the weights that the last solution had."""
+    rng = np.random.default_rng(6)
+    edges, modes = lattice(9, 9, rng), polynomials(9, 9, num_modes)
+    seeds = noisy_ties([3, 17, 30, 41, 70], rng)
+    seeds.value[2] += 0.06  # a doubtful one, so that a weight differs from one
+    result = solve_log_ranges(81, edges, seeds, 5, modes=modes, mode_sigma=0.03, num_rounds=30)
+    assert result.seed_weight[2] < 0.9
+    weight = np.concatenate([result.edge_weight, result.seed_weight, np.ones(num_modes)])
+    sigma = np.concatenate([edges.sigma, seeds.sigma, np.full(num_modes, 0.03)])
+    matrix = dense_system(81, edges, seeds, modes) * (np.sqrt(weight) / sigma)[:, None]
+    covariance = np.linalg.inv(matrix.T @ matrix)
+    to_ranges = np.hstack([np.eye(81), modes])
+    expected = np.sqrt(np.diag(to_ranges @ covariance @ to_ranges.T))
+    ratio = result.sigma / expected
+    # Neighbouring nodes err alike: some ten numbers, each with 18 % of its own.
+    assert ratio.mean() == pytest.approx(1, abs=0.1)
+    assert np.sqrt(((ratio - 1) ** 2).mean()) < 0.25
+    assert np.abs(ratio - 1).max() < 4 * 0.18
+
+
+def test_two_in_three_errors_are_smaller_than_their_deviation():
+    errors = []
+    for trial in range(30):
+        rng = np.random.default_rng(trial)
+        seeds = noisy_ties([3, 40, 77, 110, 140], rng)
+        result = solve_log_ranges(144, lattice(12, 12, rng), seeds, 5)
+        errors.append(np.abs(result.log_range) / result.sigma)
+    share = [(np.array(errors) < level).mean() for level in (1, 2)]
+    # 30 trials of about three independent numbers each: 5 % of their own.
+    assert share[0] == pytest.approx(0.68, abs=0.1)
+    assert share[1] == pytest.approx(0.95, abs=0.05)
+
+
+def test_the_deviation_grows_with_the_distance_from_the_seeds():
+    result = solve_log_ranges(60, chain(60, 0.0, 0.01), ties([0], [0.0], 0.001), 1)
+    assert result.sigma[0] == pytest.approx(0.001, rel=0.6)
+    assert result.sigma[50] == pytest.approx(0.01 * np.sqrt(50), rel=0.6)
+    assert np.isnan(solve_log_ranges(3, chain(3), ties([], []), 0).sigma).all()
+
+
+def test_the_same_result_twice():
+    rng = np.random.default_rng(8)
+    edges, seeds = lattice(9, 9, rng), noisy_ties([3, 17, 30], rng)
+    one, two = (solve_log_ranges(81, edges, seeds, 3) for _ in range(2))
+    np.testing.assert_array_equal(one.sigma, two.sigma)
+
+
+def test_the_normal_of_an_increment_may_be_of_any_length():
+    normal, rays = np.array([0.2, -0.4, -0.9]), np.array([[0.0, 0, 1], [0.1, 0, 0.995]])
+    step = log_range_increment(normal, rays[0], rays[1])
+    assert log_range_increment(7 * normal, rays[0], rays[1]) == pytest.approx(step, abs=1e-12)

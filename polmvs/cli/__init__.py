@@ -13,7 +13,7 @@ __all__ = ["entry_point", "main"]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``polmvs`` with these arguments, those of the process by default; the exit status."""
-    from polmvs.cli.commands import build_parser
+    from polmvs.cli.parsers import build_parser
     from polmvs.cli.terminal import Terminal, guarded
 
     arguments = list(sys.argv[1:] if argv is None else argv)

@@ -1,182 +1,29 @@
-"""The commands: each parses, calls one library function and prints what came of it."""
+"""The commands: each calls one library function and prints what came of it."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import polmvs
-from polmvs import pipeline, plane_command
+from polmvs import pipeline
 from polmvs.camera import PinholeCamera
-from polmvs.cli.flags import (
-    GROUPS,
-    Parser,
-    add_flags,
-    add_run_flags,
-    options_from,
-    recorded_options,
-    run_options,
-)
+from polmvs.cli.flags import options_from, recorded_options, run_options
 from polmvs.cli.terminal import Terminal
+from polmvs.cloud_io import read_cloud, write_mesh
 from polmvs.comparison import evaluate_file
 from polmvs.config import EvaluationOptions, Model, Options, RunOptions, SfmOptions
-from polmvs.experiments.command import add_parser as add_experiment
+from polmvs.errors import OptionError
 from polmvs.groundtruth import open_ground_truth
+from polmvs.mesh import poisson_mesh
 from polmvs.summary import best_fit_lines, comparison_table, evaluation_text
 
 EMPTY_STATUS = 3
 DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"
 DEMO_OUT = Path("polmvs-demo")
-
-Command = Callable[[argparse.Namespace, Terminal], int]
-
-
-def build_parser() -> Parser:
-    """The parser of the whole command line."""
-    parser = Parser(
-        prog="polmvs",
-        description="Dense clouds of glossy, textureless surfaces from polarization cameras.",
-    )
-    parser.add_argument("--version", action="version", version=f"polmvs {polmvs.__version__}")
-    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_demo(subparsers)
-    _add_reconstruct(subparsers)
-    _add_compare(subparsers)
-    _add_evaluate(subparsers)
-    _add_sfm(subparsers)
-    _add_normals(subparsers)
-    _add_densify(subparsers)
-    _add_plane(subparsers)
-    add_experiment(subparsers)
-    return parser
-
-
-def _add(subparsers: Any, name: str, help_text: str, run: Command) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = subparsers.add_parser(
-        name, help=help_text, description=help_text[0].upper() + help_text[1:] + "."
-    )
-    parser.add_argument("-v", "--verbose", action="store_true", help="show every step")
-    parser.set_defaults(run=run)
-    return parser
-
-
-def _add_job(
-    subparsers: Any, name: str, help_text: str, run: Command, groups: Sequence[str]
-) -> argparse.ArgumentParser:
-    """A command on a capture."""
-    parser = _add(subparsers, name, help_text, run)
-    parser.add_argument(
-        "capture",
-        type=Path,
-        metavar="CAPTURE",
-        help="folder of raw polarizer mosaics, in it or in its raw/",
-    )
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the results")
-    add_run_flags(parser)
-    add_flags(parser, groups)
-    return parser
-
-
-def _add_model(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--model",
-        type=Model,
-        choices=list(Model),
-        default=Model.PPA,
-        help="relation of measured angle and normal (default: %(default)s)",
-    )
-
-
-def _add_demo(subparsers: Any) -> None:
-    parser = _add(
-        subparsers, "demo", "compare OPA and PPA on the bundled capture of a glossy board", demo
-    )
-    parser.add_argument(
-        "out",
-        type=Path,
-        metavar="OUT",
-        nargs="?",
-        default=DEMO_OUT,
-        help="folder of the results (default: %(default)s)",
-    )
-    add_run_flags(parser)
-
-
-def _add_reconstruct(subparsers: Any) -> None:
-    groups = [name for name in GROUPS if name != "evaluation"]
-    _add_model(
-        _add_job(
-            subparsers,
-            "reconstruct",
-            "capture in, dense cloud of one model out",
-            reconstruct,
-            groups,
-        )
-    )
-
-
-def _add_compare(subparsers: Any) -> None:
-    parser = _add_job(
-        subparsers,
-        "compare",
-        "dense clouds of several models on the same poses, seeds and region, and figures that "
-        "tell them apart",
-        compare,
-        list(GROUPS),
-    )
-    parser.add_argument(
-        "--models",
-        type=_models,
-        default=pipeline.COMPARED,
-        metavar="MODEL,...",
-        help=f"what to compare, of {', '.join(Model)} (default: {','.join(pipeline.COMPARED)})",
-    )
-
-
-def _models(text: str) -> tuple[Model, ...]:
-    return tuple(dict.fromkeys(Model(name.strip()) for name in text.split(",")))
-
-
-def _add_evaluate(subparsers: Any) -> None:
-    parser = _add(subparsers, "evaluate", "measure a cloud against ground truth", evaluate)
-    parser.add_argument("cloud", type=Path, metavar="CLOUD.ply", help="points, if possible normals")
-    parser.add_argument("--gt", type=Path, required=True, metavar="DIR", help="ground truth")
-    parser.add_argument(
-        "--sparse",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="COLMAP model in whose frame the cloud is; its cameras align it with the truth",
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
-
-
-def _add_sfm(subparsers: Any) -> None:
-    _add_job(subparsers, "sfm", "the first stages alone: images and poses", sfm, ["capture", "sfm"])
-
-
-def _add_normals(subparsers: Any) -> None:
-    groups = ["capture", "sfm", "region", "normals"]
-    parser = _add_job(
-        subparsers, "normals", "normals of the sparse points, after 'sfm'", normals, groups
-    )
-    _add_model(parser)
-
-
-def _add_densify(subparsers: Any) -> None:
-    groups = ["capture", "sfm", "region", "normals", "propagation", "fusion"]
-    parser = _add_job(subparsers, "densify", "the dense cloud, after 'normals'", densify, groups)
-    _add_model(parser)
-
-
-def _add_plane(subparsers: Any) -> None:
-    plane_command.add_parser(subparsers).set_defaults(
-        run=lambda args, terminal: plane_command.run(args)
-    )
 
 
 def demo(args: argparse.Namespace, terminal: Terminal) -> int:
@@ -238,6 +85,22 @@ def densify(args: argparse.Namespace, terminal: Terminal) -> int:
     return _report_cloud(outcome, args.model)
 
 
+def export(args: argparse.Namespace, terminal: Terminal) -> int:
+    """Run ``polmvs export``."""
+    outcome = pipeline.export(_job_from(args, terminal, goes_on=True), args.model)
+    return _report_cloud(outcome, args.model)
+
+
+def mesh(args: argparse.Namespace, terminal: Terminal) -> int:
+    """Run ``polmvs mesh``."""
+    if args.mesh.exists() and not args.overwrite:
+        raise OptionError(f"{args.mesh}: exists. Give --overwrite to replace it.")
+    made = poisson_mesh(read_cloud(args.cloud), source=args.cloud)
+    write_mesh(args.mesh, made)
+    print(f"{args.mesh}: {len(made.triangles):,} triangles")
+    return 0
+
+
 def _job_from(
     args: argparse.Namespace, terminal: Terminal, *, goes_on: bool = False
 ) -> pipeline.Job:
@@ -261,11 +124,18 @@ def _job(
 
 
 def _report_cloud(outcome: pipeline.Outcome, model: Model) -> int:
-    results = outcome.results
+    results, workspace = outcome.results, outcome.workspace
+    unit = "metres" if results.get("unit") == "m" else "the model's unit, not metric"
     print(
-        f"{outcome.workspace.cloud(model)}: {results[f'num_points_{model}']:,} points from "
-        f"{_views(results)}"
+        f"{workspace.cloud(model)}: {results[f'num_points_{model}']:,} points from "
+        f"{_views(results)}, and {results[f'num_surroundings_{model}']:,} of the surroundings; "
+        f"in {unit}"
     )
+    if workspace.mesh(model).is_file():
+        print(f"{workspace.mesh(model)}: {results[f'num_triangles_{model}']:,} triangles")
+    dense = results.get(f"dense_{model}")
+    if dense is not None and Path(dense).is_dir():
+        print(f"{dense}: COLMAP dense workspace")
     return _status(outcome)
 
 

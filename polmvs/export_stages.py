@@ -1,0 +1,103 @@
+"""The stages after a dense cloud: its mesh, and a COLMAP workspace of its depth and normal maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from polmvs.cloud_io import Mesh, read_cloud, write_mesh
+from polmvs.cloud_stages import open_dense_views
+from polmvs.colmap_io import SparseModel, read_model
+from polmvs.colmap_maps import DepthNormals
+from polmvs.config import Model
+from polmvs.dense import DenseView
+from polmvs.dense_checks import common_views, require_matching_images, require_same_frame
+from polmvs.dense_filling import fill_workspace
+from polmvs.dense_workspace import open_dense_workspace, write_dense_workspace
+from polmvs.errors import DataError
+from polmvs.image_io import read_gray
+from polmvs.mesh import MIN_POINTS, poisson_mesh
+from polmvs.own_files import mark_own_workspace
+from polmvs.stages import Facts
+from polmvs.surroundings import Kind
+from polmvs.undistort import warp_dense_view
+from polmvs.workspace import Workspace
+
+DenseViews = dict[str, DenseView | None]
+
+
+def make_mesh(model: Model, workspace: Workspace) -> Facts:
+    """Mesh of the polarised surfaces; none, and a fact that says so, of too few points."""
+    source = workspace.cloud(model)
+    cloud = read_cloud(source)
+    kinds = cloud.scalars.get("kind")
+    if kinds is None or int((kinds == Kind.SURFACE).sum()) < MIN_POINTS:
+        return {f"num_triangles_{model}": 0}
+    mesh: Mesh = poisson_mesh(cloud, source=source)
+    write_mesh(workspace.mesh(model), mesh)
+    return {f"num_triangles_{model}": len(mesh.triangles)}
+
+
+def write_workspace(model: Model, workspace: Workspace) -> Facts:
+    """A COLMAP workspace of the run's own undistorted images and maps."""
+    sparse = read_model(workspace.sparse)
+    dense = _by_name(sparse, workspace, model)
+    with workspace.scratch(f"dense_{model}") as folder:
+        target = folder / "dense"
+        write_dense_workspace(
+            target, sparse, lambda name: read_gray(workspace.images / name), dense.__getitem__
+        )
+        mark_own_workspace(target)
+        workspace.replace(target, workspace.dense(model))
+    return {f"dense_{model}": str(workspace.dense(model).absolute())}
+
+
+def fill_given(model: Model, workspace: Workspace, given: Path, *, in_place: bool) -> Facts:
+    """A copy of the user's workspace, or that one itself, with the holes of its maps filled.
+
+    Raises
+    ------
+    DataError
+        The workspace is unusable, or not of these images and this model.
+    """
+    sparse = read_model(workspace.sparse)
+    dense = _by_name(sparse, workspace, model)
+    source = open_dense_workspace(given)
+    require_same_frame(source, sparse)
+    require_matching_images(source, sparse, lambda name: read_gray(workspace.images / name))
+    pairs = {pair.item.view.name: pair for pair in common_views(source, sparse)}
+
+    def load_fill(name: str) -> DepthNormals | None:
+        pair = pairs.get(name)
+        view = dense.get(pair.view.name) if pair is not None else None
+        if pair is None or view is None:
+            return None
+        return warp_dense_view(view, pair.view, pair.item.camera)
+
+    if in_place:
+        backup = fill_workspace(source, None, load_fill, in_place=True)
+        return {f"dense_{model}": str(given.absolute()), f"backup_{model}": str(backup)}
+    with workspace.scratch(f"dense_{model}") as folder:
+        target = folder / "dense"
+        fill_workspace(source, target, load_fill)
+        mark_own_workspace(target)
+        workspace.replace(target, workspace.dense(model))
+    return {f"dense_{model}": str(workspace.dense(model).absolute())}
+
+
+def _by_name(sparse: SparseModel, workspace: Workspace, model: Model) -> DenseViews:
+    """Dense views by image name.
+
+    Raises
+    ------
+    DataError
+        There are none.
+    """
+    names = [view.name for view in sparse.views]
+    dense = dict(zip(names, open_dense_views(workspace, model), strict=True))
+    if not any(dense.values()):
+        raise DataError(
+            workspace.views(model),
+            "holds no depth maps, so that there is no COLMAP workspace to write. "
+            "Look at the warnings in polmvs.log.",
+        )
+    return dense

@@ -1,0 +1,124 @@
+"""The cloud of a whole scene: the polarised surfaces and their surroundings, told apart by kind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.capture import DISPLAY_GAMMA
+from polmvs.cloud_io import Cloud
+from polmvs.colmap_io import read_model
+from polmvs.config import FusionOptions, Surroundings
+from polmvs.dense_checks import require_matching_images, require_same_frame
+from polmvs.dense_workspace import open_dense_workspace
+from polmvs.fuse import FusedCloud
+from polmvs.image_io import read_gray
+from polmvs.kept_depth import kept_cloud
+from polmvs.parallel import Workers
+from polmvs.phasemap import PhaseMap
+from polmvs.surroundings import (
+    Kind,
+    SparseSurroundings,
+    sparse_surroundings,
+    stereo_surroundings,
+)
+from polmvs.workspace import Workspace
+
+T = TypeVar("T", bound=np.generic)
+
+
+def surface_cloud(cloud: FusedCloud, kind: Kind = Kind.SURFACE) -> Cloud:
+    """A fused cloud as it is written, with grey colours as in COLMAP's images.
+
+    The brightest 1 % are white.
+    """
+    white = float(np.percentile(cloud.intensity, 99)) if len(cloud.intensity) else 1.0
+    share = np.clip(cloud.intensity / max(white, 1e-9), 0, 1) ** (1 / DISPLAY_GAMMA)
+    grey = np.rint(255 * share).astype(np.uint8)
+    return Cloud(
+        points=cloud.points,
+        normals=cloud.normals,
+        colors=np.repeat(grey[:, None], 3, axis=1),
+        scalars={
+            "num_views": cloud.num_views,
+            "sigma": cloud.sigma,
+            "sigma_deg": cloud.sigma_deg,
+            "kind": np.full(len(cloud.points), kind, np.float32),
+        },
+    )
+
+
+def surroundings_cloud(
+    workspace: Workspace,
+    surface: FusedCloud,
+    maps: Sequence[PhaseMap],
+    options: FusionOptions,
+    folder: Path,
+    *,
+    workers: Workers,
+) -> Cloud:
+    """Points of the scene beside its polarised parts, of the kind that the options ask for.
+
+    Parameters
+    ----------
+    workspace : with the sparse model.
+    surface : of the polarised parts; what COLMAP saw there is left out.
+    maps : of all views.
+    folder : for what is kept on disk meanwhile.
+
+    Raises
+    ------
+    DataError
+        The COLMAP workspace of the options is unusable, or not of these images and this model.
+    """
+    model = read_model(workspace.sparse)
+    if options.workspace is not None:
+        dense = open_dense_workspace(options.workspace)
+        require_same_frame(dense, model)
+        require_matching_images(dense, model, lambda name: read_gray(workspace.images / name))
+        return surface_cloud(kept_cloud(dense, surface.points), Kind.COLMAP)
+    if options.surroundings is Surroundings.STEREO:
+        return surface_cloud(
+            stereo_surroundings(model.tracks, maps, folder, workers=workers), Kind.STEREO
+        )
+    if options.surroundings is Surroundings.SPARSE:
+        return _sparse_cloud(sparse_surroundings(model.tracks, maps))
+    return surface_cloud(surface[np.zeros(len(surface.points), np.bool_)])
+
+
+def _sparse_cloud(sparse: SparseSurroundings) -> Cloud:
+    """Sparse points as they are written; they have no normals, which is zero in a PLY file."""
+    num = len(sparse.points)
+    unknown = np.full(num, np.nan)
+    return Cloud(
+        points=sparse.points,
+        normals=np.zeros((num, 3)),
+        colors=sparse.colors,
+        scalars={
+            "num_views": sparse.num_views,
+            "sigma": unknown,
+            "sigma_deg": unknown,
+            "kind": np.full(num, Kind.SPARSE, np.float32),
+        },
+    )
+
+
+def join_clouds(first: Cloud, second: Cloud) -> Cloud:
+    """The points of two clouds with the same columns."""
+    return Cloud(
+        points=np.concatenate([first.points, second.points]),
+        normals=_joined(first.normals, second.normals),
+        colors=_joined(first.colors, second.colors),
+        scalars={
+            name: np.concatenate([values, second.scalars[name]])
+            for name, values in first.scalars.items()
+        },
+    )
+
+
+def _joined(first: NDArray[T] | None, second: NDArray[T] | None) -> NDArray[T] | None:
+    return None if first is None or second is None else np.concatenate([first, second])
