@@ -202,6 +202,12 @@ def densify(
             dense = spread(
                 model, maps, seeds, propagation, folder, workers=workers, on_progress=report
             )
+
+            def keep(index: int, confirmed: NDArray[np.bool_]) -> None:
+                view = dense[index]
+                assert view is not None  # has points
+                store_dense_view(view.only(confirmed), views / maps[index].view.name)
+
             cloud = fuse(
                 maps,
                 dense,
@@ -209,10 +215,8 @@ def densify(
                 max_neighbors=propagation.max_neighbors,
                 workers=workers,
                 on_progress=report,
+                on_confirmed=keep,
             )
-            for phase_map, view in zip(maps, dense, strict=True):
-                if view is not None:
-                    store_dense_view(view, views / phase_map.view.name)
         surface = surface_cloud(cloud)
         around = surroundings_cloud(
             workspace, cloud, maps, fusion, folder / "around", workers=workers

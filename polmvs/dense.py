@@ -61,6 +61,18 @@ class DenseView:
         has_normal = np.isfinite(self.normals_in_world).all(axis=-1)
         return np.asarray((self.range_map > 0) & has_normal)
 
+    def only(self, kept: NDArray[np.bool_]) -> DenseView:
+        """The view with nothing known outside the ``kept`` (h, w) points of its lattice."""
+        nothing = np.float32(np.nan)
+        return DenseView(
+            stride_px=self.stride_px,
+            range_map=np.where(kept, self.range_map, np.float32(0)),
+            normals_in_world=np.where(kept[..., None], self.normals_in_world, nothing),
+            sigma_deg=np.where(kept, self.sigma_deg, nothing),
+            sigma=np.where(kept, self.sigma, nothing),
+            confidence=np.where(kept, self.confidence, np.float32(0)),
+        )
+
     def lattice_xy(self) -> Array:
         """Image coordinates ``(h, w, 2)`` of the lattice."""
         num_rows, num_cols = self.range_map.shape

@@ -67,6 +67,7 @@ def fuse(
     max_neighbors: int = 15,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
+    on_confirmed: Callable[[int, Mask], None] | None = None,
 ) -> FusedCloud:
     """Fuse the dense views into one cloud.
 
@@ -85,6 +86,8 @@ def fuse(
     max_neighbors : other views that are asked about a view's points, nearest first.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done.
+    on_confirmed : called with the index of each view that has a result and with the points
+        (h, w) of its lattice on which the others agree.
     """
     workers = workers or Workers(1)
     used = [k for k, d in enumerate(dense) if d is not None]
@@ -94,23 +97,33 @@ def fuse(
         order = np.argsort(((centers - centers[i]) ** 2).sum(axis=-1), kind="stable")
         near = [used[j] for j in order if j != i][:max_neighbors]
         tasks.append([(maps[j], dense[j]) for j in [k, *near]])
-    parts = []
-    for part in workers.map(partial(_confirm, options), tasks):
-        parts.append(part)
+    clouds, footprints = [], []
+    for k, part in zip(used, workers.map(partial(_confirm, options), tasks), strict=True):
+        clouds.append(part.cloud)
+        footprints.append(part.footprint)
+        if on_confirmed is not None:
+            on_confirmed(k, part.confirmed)
         if on_progress is not None:
             on_progress(1)
-    cloud = concatenate([p[0] for p in parts])
+    cloud = concatenate(clouds)
     if not len(cloud.points):
         return cloud
-    footprint = float(np.median(np.concatenate([p[1] for p in parts])))
+    footprint = float(np.median(np.concatenate(footprints)))
     voxel = options.voxel if options.voxel is not None else options.voxel_px * footprint
     return _without_lone_points(merge(cloud, voxel))
 
 
-def _confirm(
-    options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]
-) -> tuple[FusedCloud, NDArray[np.float32]]:
-    """Points of the first view that enough of the others confirm, and their pixels' footprints."""
+@dataclass(frozen=True)
+class _Confirmed:
+    """Confirmed points of a view, their pixels' footprints, and where (h, w) they lie in it."""
+
+    cloud: FusedCloud
+    footprint: NDArray[np.float32]
+    confirmed: Mask
+
+
+def _confirm(options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]) -> _Confirmed:
+    """Points of the first view that enough of the others confirm."""
     phase_map, dense = views[0]
     view = phase_map.view
     known = dense.known
@@ -151,7 +164,9 @@ def _confirm(
         sigma_deg=dense.sigma_deg[known],
         sigma=np.sqrt(votes / total) * np.abs((rays * normal).sum(axis=-1)),
     )
-    return cloud[keep], footprint[keep].astype(np.float32)
+    confirmed = known.copy()
+    confirmed[known] = keep
+    return _Confirmed(cloud[keep], footprint[keep].astype(np.float32), confirmed)
 
 
 def _finite_sigma(sigma: Floats, footprint: Array) -> Array:

@@ -164,7 +164,7 @@ def open_ground_truth(folder: str | Path) -> GroundTruth:
     cameras_path = root / "cameras.json"
     if not cameras_path.is_file():
         raise DataError(cameras_path, "missing; give a folder with ground truth.")
-    truth = GroundTruth(folder=root, views=_read_views(cameras_path))
+    truth = GroundTruth(folder=root, views=read_views(cameras_path))
     for name in truth.names:
         for kind in ("depth", "normal", "mask"):
             path = _map_path(root, name, kind)
@@ -190,7 +190,7 @@ def _read_png(path: Path) -> NDArray[np.generic]:
     return image
 
 
-def _read_views(path: Path) -> dict[str, View]:
+def read_views(path: Path) -> dict[str, View]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

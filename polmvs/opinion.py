@@ -62,7 +62,7 @@ def ask_view(
     view = phase_map.view
     points = center + distance[:, None] * rays
     in_cam = view.cam_from_world * points
-    own_range = np.linalg.norm(in_cam, axis=-1)
+    own_range = np.sqrt(_dot(in_cam, in_cam))
     xy = view.camera.project(in_cam)
     lattice_xy = xy / dense.stride_px
     seen = sample_image(dense.range_map, lattice_xy, nearest=True).astype(np.float64)
@@ -75,19 +75,19 @@ def ask_view(
     nearest_xy = (np.floor(np.nan_to_num(lattice_xy)) + 0.5) * dense.stride_px
     other_rays = view.camera.rays(nearest_xy) @ view.cam_from_world.rotation
     elements = other_center + seen[:, None] * other_rays
-    slant = (rays * seen_normals).sum(-1)
+    slant = _dot(rays, seen_normals)
     mean = seen_normals + normals
     with np.errstate(divide="ignore", invalid="ignore"):
-        place = ((elements - center) * mean).sum(-1) / (rays * mean).sum(-1)
+        place = _dot(elements - center, mean) / _dot(rays, mean)
         # An error along the other's ray moves the surface along its normal, by less where it looks
         # at a grazing angle; but there its rows come from farther off, so that it is not trusted
         # more.
         seen_sigma = sample_image(dense.sigma, lattice_xy, nearest=True)
         sigma = seen_sigma / np.abs(slant)
         to_camera = other_center - points
-        facing = (to_camera * normals).sum(-1) / own_range
+        facing = _dot(to_camera, normals) / own_range
     excess = np.where(seen > 0, seen - own_range, np.nan)
-    cosine = (seen_normals * normals).sum(axis=-1)
+    cosine = _dot(seen_normals, normals)
     outside = _shows_background(phase_map, xy)
     return Opinion(place, sigma, np.nan_to_num(seen_normals), cosine, excess, facing, outside)
 
@@ -134,7 +134,7 @@ def surface_of_others(
         log_range_sigma=unknown,
         confidence=np.zeros(len(points)),
     )
-    facing = (shown.rays_in_world * shown.normals).sum(axis=-1) < 0
+    facing = _dot(shown.rays_in_world, shown.normals) < 0
     shown = shown[facing & maps[0].shows_surface(shown.xy)]
     if not len(shown.xy):
         return None
@@ -148,3 +148,8 @@ def _shows_background(phase_map: PhaseMap, xy: Floats) -> Mask:
     camera = phase_map.view.camera
     in_image = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
     return np.asarray(in_image & ~phase_map.shows_surface(xy))
+
+
+def _dot(a: Floats, b: Floats) -> Array:
+    """Products (N,) of vectors (N, 3); several times as fast as a sum over so short an axis."""
+    return np.asarray(np.einsum("ni,ni->n", a, b))

@@ -97,10 +97,24 @@ def _truth_rows(models: Mapping[str, Any], phase: Mapping[str, Any]) -> list[lis
             *_pairs(models, ("truth", "tracks", "errors"), "mean_deg", "median_deg"),
         ],
     ]
+    rows += _map_rows(models)
     columns = [cloud_rows(model["truth"]["cloud"]) for model in models.values()]
     for cells in zip(*columns, strict=True):
         rows.append([cells[0][0], *[cell[1] for cell in cells]])
     return rows
+
+
+def _map_rows(models: Mapping[str, Any]) -> list[list[str]]:
+    """Rows of the dense depth and normal maps."""
+    maps = [dig(model, "truth", "maps") for model in models.values()]
+    return [
+        ["depth maps, RMSE, mm", *[number(dig(m, "depth_rmse_m"), 1e3) for m in maps]],
+        ["depth maps within 1 mm, %", *[number(dig(m, "depth_within_1mm"), 100, 1) for m in maps]],
+        [
+            "normal maps, mean / median error, deg",
+            *[_pair(dig(m, "normals"), "mean_deg", "median_deg") for m in maps],
+        ],
+    ]
 
 
 def cloud_rows(cloud: Mapping[str, Any]) -> list[list[str]]:

@@ -69,8 +69,9 @@ def log_range_increment(normals: Floats, rays_tail: Floats, rays_head: Floats) -
     The normal may be of any length.
     """
     least = -MAX_GRAZING * np.maximum(np.linalg.norm(normals, axis=-1), 1e-12)
-    tail = np.minimum((normals * rays_tail).sum(axis=-1), least)
-    head = np.minimum((normals * rays_head).sum(axis=-1), least)
+    # Several times as fast as a sum over so short an axis.
+    tail = np.minimum(np.einsum("...i,...i->...", normals, rays_tail), least)
+    head = np.minimum(np.einsum("...i,...i->...", normals, rays_head), least)
     return np.asarray(np.log(tail / head), np.float64)
 
 

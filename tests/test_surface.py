@@ -206,6 +206,19 @@ def test_the_deviation_grows_with_the_distance_from_the_seeds():
     assert np.isnan(solve_log_ranges(3, chain(3), ties([], []), 0).sigma).all()
 
 
+def test_seeds_that_the_loss_doubts_leave_a_wider_deviation():
+    """Two seeds 2.3 deviations off either way: each counts half."""
+    sigmas = []
+    for num in range(40, 48):
+        seeds = ties([5, 12, 25, 35], [0.023, -0.023, 0.023, -0.023], 0.01)
+        result = solve_log_ranges(num, chain(num, 0.0, 1e-6), seeds, 4)
+        np.testing.assert_allclose(result.seed_weight, 1 / (1 + (2.3 / 2.385) ** 2), rtol=1e-3)
+        sigmas.append(result.sigma[20])
+    # The mean of eight numbers of 18 % each.
+    expected = 0.01 / np.sqrt(4 / (1 + (2.3 / 2.385) ** 2))
+    assert np.mean(sigmas) == pytest.approx(expected, rel=0.15)
+
+
 def test_the_same_result_twice():
     rng = np.random.default_rng(8)
     edges, seeds = lattice(9, 9, rng), noisy_ties([3, 17, 30], rng)
@@ -216,4 +229,6 @@ def test_the_same_result_twice():
 def test_the_normal_of_an_increment_may_be_of_any_length():
     normal, rays = np.array([0.2, -0.4, -0.9]), np.array([[0.0, 0, 1], [0.1, 0, 0.995]])
     step = log_range_increment(normal, rays[0], rays[1])
-    assert log_range_increment(7 * normal, rays[0], rays[1]) == pytest.approx(step, abs=1e-12)
+    for length in (7.0, 0.01):
+        scaled = log_range_increment(length * normal, rays[0], rays[1])
+        assert scaled == pytest.approx(step, abs=1e-12)
