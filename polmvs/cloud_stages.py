@@ -16,6 +16,7 @@ from polmvs.dense import DenseView, find_dense_view, store_dense_view
 from polmvs.fuse import fuse, no_points
 from polmvs.integrate import integrate, plan_rounds
 from polmvs.normals import NormalEstimate
+from polmvs.opinion import hidden_by
 from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
 from polmvs.parts import find_part_seeds
@@ -203,11 +204,7 @@ def densify(
                 model, maps, seeds, propagation, folder, workers=workers, on_progress=report
             )
 
-            def keep(index: int, confirmed: NDArray[np.bool_]) -> None:
-                view = dense[index]
-                assert view is not None  # has points
-                store_dense_view(view.only(confirmed), views / maps[index].view.name)
-
+            confirmed: dict[int, NDArray[np.bool_]] = {}
             cloud = fuse(
                 maps,
                 dense,
@@ -215,8 +212,13 @@ def densify(
                 max_neighbors=propagation.max_neighbors,
                 workers=workers,
                 on_progress=report,
-                on_confirmed=keep,
+                on_confirmed=confirmed.__setitem__,
             )
+            for index, points in confirmed.items():
+                dense_view, view = dense[index], maps[index].view
+                assert dense_view is not None  # has points
+                seen = points & ~hidden_by(dense_view, view, cloud.points, cloud.normals)
+                store_dense_view(dense_view.only(seen), views / view.name)
         surface = surface_cloud(cloud)
         around = surroundings_cloud(
             workspace, cloud, maps, fusion, folder / "around", workers=workers

@@ -33,7 +33,7 @@ class DenseView:
     sigma_deg : (h, w) float32, standard deviation of the normal.
     sigma : (h, w) float32, standard deviation of the range, world units.
     confidence : (h, w) float32, share from 0 to 1 of the views facing the point whose phase
-        agrees with its normal.
+        agrees with its normal; 0 where the view's own phase denies it.
     path : stem of the files that hold the arrays, if they are stored.
     """
 

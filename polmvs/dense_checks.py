@@ -83,7 +83,8 @@ def require_same_frame(
         f"its poses are in another frame than those of the capture's model: the scene lies "
         f"{errors[worst]:.3g} px apart in {pairs[worst].item.view.name}, the worst of "
         f"{len(pairs)} views{_after_similarity(pairs, distances, max_error_px)}. "
-        "Give the model that the workspace was made from as --sparse.",
+        "Give the model that the workspace was made from as --sparse, without --reference, --aruco "
+        "and --scale.",
     )
 
 

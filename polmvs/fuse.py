@@ -126,7 +126,7 @@ def _confirm(options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]
     """Points of the first view that enough of the others confirm."""
     phase_map, dense = views[0]
     view = phase_map.view
-    known = dense.known
+    known = dense.known & (dense.confidence > 0)
     xy = dense.lattice_xy()[known]
     distance = dense.range_map[known].astype(np.float64)
     normals = dense.normals_in_world[known].astype(np.float64)

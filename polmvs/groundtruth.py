@@ -191,6 +191,7 @@ def _read_png(path: Path) -> NDArray[np.generic]:
 
 
 def read_views(path: Path) -> dict[str, View]:
+    """Views by image name of a ``cameras.json``; DataError where it is malformed."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,8 @@ from polmvs.dense_workspace import DenseWorkspace, WorkspaceView
 from polmvs.fuse import FusedCloud, concatenate, merge, no_points
 
 Array = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
 
 STRIDE_PX = 2
 MIN_VIEWS = 2  # with a point in the same voxel of AGREEMENT_PX, in footprints of a pixel
@@ -49,6 +52,11 @@ def kept_cloud(workspace: DenseWorkspace, surface_points: Array) -> FusedCloud:
     num_views = _views_in_voxel(cloud.points, owner, AGREEMENT_PX * footprint)
     cloud = replace(cloud, num_views=num_views)
     keep = num_views >= MIN_VIEWS
+    if not keep.any():
+        logger.warning(
+            "%s: no two views agree on a point of its depth maps. Are they of its own model?",
+            workspace.folder,
+        )
     if len(surface_points):
         reach = CLEARANCE_PX * footprint
         distance = cKDTree(surface_points).query(cloud.points, distance_upper_bound=reach)[0]

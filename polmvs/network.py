@@ -30,7 +30,9 @@ MAX_SEED_DISTANCE_PX = 12.0  # from a seed to the nodes it is tied to
 NUM_TIES = 4
 MIN_SEED_COSINE = 0.995  # 5.7 deg between the normals of a seed and of a node it is tied to
 MIN_CREASE_ANGLE = 0.03  # rad, between neighbouring normals
-CREASE_FACTOR = 4.0  # a crease turns the normal this much more than noise or local curvature
+# A crease turns the normal this much more than noise or local curvature does. On a cylinder half
+# of a lattice's edges turn: their local mean is a quarter of a turn, which must pass.
+CREASE_FACTOR = 5.0
 NUM_NEIGHBORS = 6
 FILLED_SIGMA = 0.1  # rad, of a normal taken from the neighbours
 
@@ -211,4 +213,4 @@ def tie_seeds(phase_map: PhaseMap, nodes: Nodes, seeds: Seeds) -> SeedTies:
         k * (seeds.sigma[seed] / distance[seed]) ** 2 + (0.02 * (1 + gap) * footprint) ** 2
     )
     value = np.log(distance[seed]) + step
-    return SeedTies(node=node, seed=seed, value=value, sigma=sigma)
+    return SeedTies(node=node, seed=seed, value=value, sigma=sigma, common=np.zeros(len(node)))

@@ -8,13 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import sample_image
+from polmvs.camera import View, sample_image
 from polmvs.dense import DenseView, SurfaceSamples, extend_planes, view_samples
 from polmvs.phasemap import PhaseMap
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
+
+MIN_HIDING_COSINE = 0.1  # between a normal and the direction to the camera
+HIDING_DISTANCE = 0.02  # relative, as in gathering rows
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def ask_view(
     view = phase_map.view
     points = center + distance[:, None] * rays
     in_cam = view.cam_from_world * points
-    own_range = np.sqrt(_dot(in_cam, in_cam))
+    own_range = np.linalg.norm(in_cam, axis=-1)
     xy = view.camera.project(in_cam)
     lattice_xy = xy / dense.stride_px
     seen = sample_image(dense.range_map, lattice_xy, nearest=True).astype(np.float64)
@@ -75,19 +78,19 @@ def ask_view(
     nearest_xy = (np.floor(np.nan_to_num(lattice_xy)) + 0.5) * dense.stride_px
     other_rays = view.camera.rays(nearest_xy) @ view.cam_from_world.rotation
     elements = other_center + seen[:, None] * other_rays
-    slant = _dot(rays, seen_normals)
+    slant = (rays * seen_normals).sum(-1)
     mean = seen_normals + normals
     with np.errstate(divide="ignore", invalid="ignore"):
-        place = _dot(elements - center, mean) / _dot(rays, mean)
+        place = ((elements - center) * mean).sum(-1) / (rays * mean).sum(-1)
         # An error along the other's ray moves the surface along its normal, by less where it looks
         # at a grazing angle; but there its rows come from farther off, so that it is not trusted
         # more.
         seen_sigma = sample_image(dense.sigma, lattice_xy, nearest=True)
         sigma = seen_sigma / np.abs(slant)
         to_camera = other_center - points
-        facing = _dot(to_camera, normals) / own_range
+        facing = (to_camera * normals).sum(-1) / own_range
     excess = np.where(seen > 0, seen - own_range, np.nan)
-    cosine = _dot(seen_normals, normals)
+    cosine = (seen_normals * normals).sum(axis=-1)
     outside = _shows_background(phase_map, xy)
     return Opinion(place, sigma, np.nan_to_num(seen_normals), cosine, excess, facing, outside)
 
@@ -134,7 +137,7 @@ def surface_of_others(
         log_range_sigma=unknown,
         confidence=np.zeros(len(points)),
     )
-    facing = _dot(shown.rays_in_world, shown.normals) < 0
+    facing = (shown.rays_in_world * shown.normals).sum(axis=-1) < 0
     shown = shown[facing & maps[0].shows_surface(shown.xy)]
     if not len(shown.xy):
         return None
@@ -143,13 +146,31 @@ def surface_of_others(
     return extend_planes(shown, xy, rays, max_gap_strides * stride_px)
 
 
+def hidden_by(dense: DenseView, view: View, points: Floats, normals: Floats) -> Mask:
+    """Which lattice points (h, w) of a view lie behind a surface that faces it.
+
+    Views may agree on a surface that this one cannot see, and its phase need not deny it.
+
+    Parameters
+    ----------
+    dense, view : of the view.
+    points, normals : (N, 3), world, of the surfaces of all views.
+    """
+    to_point = points - view.center_in_world
+    distance = np.linalg.norm(to_point, axis=-1)
+    facing = (to_point * normals).sum(axis=-1) < -MIN_HIDING_COSINE * distance
+    xy = view.camera.project(view.cam_from_world * points) / dense.stride_px
+    height, width = dense.range_map.shape
+    with np.errstate(invalid="ignore"):
+        shown = facing & ((xy >= 0) & (xy < [width, height])).all(axis=-1)
+    cols, rows = np.floor(xy[shown]).astype(np.intp).T
+    nearest = np.full((height, width), np.inf)
+    np.minimum.at(nearest, (rows, cols), distance[shown])
+    return np.asarray(dense.range_map > (1 + HIDING_DISTANCE) * nearest)
+
+
 def _shows_background(phase_map: PhaseMap, xy: Floats) -> Mask:
     """Which places lie in the image but outside its region."""
     camera = phase_map.view.camera
     in_image = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
     return np.asarray(in_image & ~phase_map.shows_surface(xy))
-
-
-def _dot(a: Floats, b: Floats) -> Array:
-    """Products (N,) of vectors (N, 3); several times as fast as a sum over so short an axis."""
-    return np.asarray(np.einsum("ni,ni->n", a, b))

@@ -37,12 +37,17 @@ class Edges:
 
 @dataclass(frozen=True, kw_only=True)
 class SeedTies:
-    """Seeds tied to nodes: ``log_range[node] = value`` with deviation ``sigma``; by seed index."""
+    """Seeds tied to nodes: ``log_range[node] = value`` with deviation ``sigma``; by seed index.
+
+    ``common`` is the deviation of an error that all ties share, whatever their number; it does
+    not change their weight, only how certain the solution is.
+    """
 
     node: Indices
     seed: Indices
     value: Array
     sigma: Array
+    common: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,9 +74,8 @@ def log_range_increment(normals: Floats, rays_tail: Floats, rays_head: Floats) -
     The normal may be of any length.
     """
     least = -MAX_GRAZING * np.maximum(np.linalg.norm(normals, axis=-1), 1e-12)
-    # Several times as fast as a sum over so short an axis.
-    tail = np.minimum(np.einsum("...i,...i->...", normals, rays_tail), least)
-    head = np.minimum(np.einsum("...i,...i->...", normals, rays_head), least)
+    tail = np.minimum((normals * rays_tail).sum(axis=-1), least)
+    head = np.minimum((normals * rays_head).sum(axis=-1), least)
     return np.asarray(np.log(tail / head), np.float64)
 
 
@@ -135,7 +139,8 @@ def solve_log_ranges(
         robust[:num_edges] = 1 / (1 + z2[:num_edges] / scale**2)
         robust[num_edges : len(z2) - num_modes] = seed_weight[ties.seed]
     log_range[reached] = system.log_ranges(solution)[:, 0]
-    draws = factors.solve(_noise(sigma, used))
+    common = np.concatenate([np.zeros(num_edges), ties.common, np.zeros(num_modes)])
+    draws = factors.solve(_noise(sigma, used, common))
     spread[reached] = system.log_ranges(draws).std(axis=1)
     edge_weight[keep] = robust[:num_edges]
     return RangeSolution(
@@ -143,14 +148,18 @@ def solve_log_ranges(
     )
 
 
-def _noise(sigma: Array, robust: Array) -> Array:
+def _noise(sigma: Array, robust: Array, common: Array) -> Array:
     """Draws (M, NUM_DRAWS) of the observations' noise, wider where the loss trusts them less.
+
+    Observations with a ``common`` deviation err as one by that much.
 
     The solutions for them scatter as the solution for the observations does: its deviation at
     every node without the inverse of the normal matrix.
     """
-    draws = np.random.default_rng(0).standard_normal((len(sigma), NUM_DRAWS))
-    return draws * (sigma / np.sqrt(np.maximum(robust, 1e-6)))[:, None]
+    rng = np.random.default_rng(0)
+    own = np.where(common > 0, 0, sigma / np.sqrt(np.maximum(robust, 1e-6)))
+    draws = rng.standard_normal((len(sigma), NUM_DRAWS)) * own[:, None]
+    return draws + common[:, None] * rng.standard_normal(NUM_DRAWS)
 
 
 class _System:
