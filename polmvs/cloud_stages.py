@@ -21,7 +21,7 @@ from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
 from polmvs.parts import find_part_seeds
 from polmvs.propagate import propagate
-from polmvs.scene_cloud import join_clouds, surface_cloud, surroundings_cloud
+from polmvs.scene_cloud import join_clouds, open_given, surface_cloud, surroundings_cloud
 from polmvs.stages import Facts, Report, open_maps, posed_views, tilt_maps
 from polmvs.storage import map_array, save_array
 from polmvs.tracks import Seeds, Tracks, select_seeds, track_normals
@@ -193,7 +193,8 @@ def densify(
     maps = open_maps(workspace, model)
     seeds = load_seeds(model, workspace)
     num_inside = sum(int(phase_map.region.inside.sum()) for phase_map in maps)
-    with workspace.scratch(f"densify_{model}") as folder:
+    given = open_given(workspace, fusion)
+    with workspace.scratch(f"densify_{model}") as folder, workers.stopped_on_error():
         views = folder / "views"
         views.mkdir()
         if num_inside == 0 or len(seeds.sigma) == 0:
@@ -221,7 +222,7 @@ def densify(
                 store_dense_view(dense_view.only(seen), views / view.name)
         surface = surface_cloud(cloud)
         around = surroundings_cloud(
-            workspace, cloud, maps, fusion, folder / "around", workers=workers
+            workspace, cloud, maps, fusion, given, folder / "around", workers=workers
         )
         workspace.replace(views, workspace.views(model))
     write_cloud(workspace.cloud(model), join_clouds(surface, around))

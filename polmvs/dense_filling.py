@@ -176,6 +176,12 @@ def _swap_in(staged: Path, stereo: Path) -> Path:
     return backup
 
 
+def previous_backups(source: DenseWorkspace) -> list[Path]:
+    """Backups of earlier fillings in place, the first of them first."""
+    found = source.folder.glob(f"{BACKUP}-*")
+    return sorted(found, key=lambda path: (len(path.name), path.name))
+
+
 def _new_backup(folder: Path) -> Path:
     """Make the first backup folder of a number that is free."""
     number = 1

@@ -20,6 +20,9 @@ logger = logging.getLogger(__name__)
 STRIDE_PX = 2
 MIN_VIEWS = 2  # with a point in the same voxel of AGREEMENT_PX, in footprints of a pixel
 AGREEMENT_PX = 2.0
+# Share of the points: COLMAP keeps what other views confirm, so that most have a second view, and
+# hardly one by chance where the maps are of another unit or frame than the poses.
+MIN_AGREEMENT = 0.1
 VOXEL_PX = 1.0  # edge of the merging voxel, in footprints of a pixel
 DEPTH_SIGMA_PX = 0.5  # of COLMAP's depth, in footprints: it matches to about half a pixel
 NORMAL_SIGMA_DEG = 10.0  # that COLMAP's fusion allows between views
@@ -52,10 +55,12 @@ def kept_cloud(workspace: DenseWorkspace, surface_points: Array) -> FusedCloud:
     num_views = _views_in_voxel(cloud.points, owner, AGREEMENT_PX * footprint)
     cloud = replace(cloud, num_views=num_views)
     keep = num_views >= MIN_VIEWS
-    if not keep.any():
+    if keep.mean() < MIN_AGREEMENT:
         logger.warning(
-            "%s: no two views agree on a point of its depth maps. Are they of its own model?",
+            "%s: two views agree on %.2g %% of the points of its depth maps. Are they of its own "
+            "model?",
             workspace.folder,
+            100 * keep.mean(),
         )
     if len(surface_points):
         reach = CLEARANCE_PX * footprint

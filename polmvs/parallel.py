@@ -49,6 +49,20 @@ class Workers:
         with _signals_held_back():
             return self._pool.map(function, *iterables)
 
+    @contextmanager
+    def stopped_on_error(self) -> Iterator[None]:
+        """Stop what is under way when an error comes, before its files are taken away."""
+        try:
+            yield
+        except BaseException:
+            self._stop(cancel=True)
+            raise
+
+    def _stop(self, *, cancel: bool) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=cancel)
+            self._pool = None
+
     def __enter__(self) -> Workers:
         return self
 
@@ -58,9 +72,7 @@ class Workers:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=kind is not None)
-            self._pool = None
+        self._stop(cancel=kind is not None)
 
 
 @contextmanager

@@ -51,7 +51,8 @@ MAX_OPINION_OUTLIER = 3.0  # deviations from the views' median
 # one.
 OPINION_REACH_PX = 24.0
 # Share of an opinion's deviation that all opinions of a view have in common, as the views share
-# seeds and rows. At 0 the stated deviations came out half of the errors on a curved part, at 1 twice.
+# seeds and rows. On a curved part the stated deviations came out half of the errors at 0 and
+# twice the errors at 1.
 COMMON_SHARE = 0.5
 MIN_OWN_WEIGHT = 0.25  # robust weight of a row 4 deviations off
 

@@ -23,10 +23,10 @@ from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
 from polmvs.record import Record, StageRecord
 from polmvs.run_checks import (
-    STAGE_RANK,
     alternatives,
     check_input,
     command_of,
+    followers,
     identity_of,
     inputs_of,
     options_of,
@@ -134,13 +134,14 @@ class Run:
 
     def forget(self, name: str) -> None:
         """Have a stage done again, and all that follow it; their files go."""
-        rank = STAGE_RANK[name]
-        names = [n for n, r in STAGE_RANK.items() if r > rank or n in alternatives(name)]
+        names = followers(name)
+        paths = [path for forgotten in names for path in self.workspace.files_of(forgotten)]
+        for path in paths:
+            self.workspace.require_own(path)
         self.record.forget(names)
         self.save()
-        for forgotten in names:
-            for path in self.workspace.files_of(forgotten):
-                self.workspace.discard(path)
+        for path in paths:
+            self.workspace.discard(path)
 
     def save(self, *, finished: bool = False) -> None:
         """Write ``run.json``."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from polmvs.capture import Capture
 from polmvs.colmap_io import SparseModel
-from polmvs.config import Model, Options
+from polmvs.config import Model, Options, ReferenceOptions
 from polmvs.dense_checks import require_same_frame
 from polmvs.dense_workspace import open_dense_workspace
 from polmvs.errors import DataError, OptionError
@@ -23,6 +23,7 @@ from polmvs.workspace import Workspace
 
 EVALUATE = "evaluate"
 PARTS = "parts"
+EXPORTS = ("mesh_", "dense_")  # how the stages begin that nothing follows
 POSES = ("sfm", "sparse")  # two ways to the same files
 
 
@@ -86,6 +87,23 @@ def alternatives(name: str) -> tuple[str, ...]:
     return POSES if name in POSES else (name,)
 
 
+def followers(name: str) -> list[str]:
+    """A stage, and those that read what it writes: not another model's, and nothing of exports."""
+    if name.startswith(EXPORTS):
+        return [name]
+    model, rank = _model_of(name), STAGE_RANK[name]
+    later = [other for other, its_rank in STAGE_RANK.items() if its_rank > rank]
+    return [
+        *alternatives(name),
+        *(other for other in later if model is None or _model_of(other) in (model, None)),
+    ]
+
+
+def _model_of(name: str) -> str | None:
+    """The model that a stage is of; None for those of all. PPA's normals select the seeds."""
+    return next((str(model) for model in Model if name.endswith(f"_{model}")), None)
+
+
 def inputs_of(options: Options) -> list[Path]:
     """Folders that are read beside the capture."""
     paths = (
@@ -128,7 +146,7 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
     dense = open_dense_workspace(options.fusion.workspace) if options.fusion.workspace else None
     if options.sfm.sparse is not None:
         model = fit_model(capture, options.sfm.sparse)
-        if dense is not None:
+        if dense is not None and options.reference == ReferenceOptions():
             require_same_frame(dense, model)
         return model
     if options.sfm.intrinsics is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -14,7 +15,8 @@ from polmvs.cloud_io import Cloud
 from polmvs.colmap_io import read_model
 from polmvs.config import FusionOptions, Surroundings
 from polmvs.dense_checks import require_matching_images, require_same_frame
-from polmvs.dense_workspace import open_dense_workspace
+from polmvs.dense_filling import previous_backups
+from polmvs.dense_workspace import DenseWorkspace, open_dense_workspace
 from polmvs.fuse import FusedCloud
 from polmvs.image_io import read_gray
 from polmvs.kept_depth import kept_cloud
@@ -27,6 +29,8 @@ from polmvs.surroundings import (
     stereo_surroundings,
 )
 from polmvs.workspace import Workspace
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T", bound=np.generic)
 
@@ -52,11 +56,36 @@ def surface_cloud(cloud: FusedCloud, kind: Kind = Kind.SURFACE) -> Cloud:
     )
 
 
+def open_given(workspace: Workspace, options: FusionOptions) -> DenseWorkspace | None:
+    """The COLMAP workspace of the options, found to be of the run's images and model.
+
+    Raises
+    ------
+    DataError
+        It is unusable, or not of these.
+    """
+    if options.workspace is None:
+        return None
+    given = open_dense_workspace(options.workspace)
+    if backups := previous_backups(given):
+        logger.warning(
+            "%s: was filled before, and what filled it counts as COLMAP's; the maps from before "
+            "are in %s.",
+            given.folder,
+            backups[0].name,
+        )
+    model = read_model(workspace.sparse)
+    require_same_frame(given, model)
+    require_matching_images(given, model, lambda name: read_gray(workspace.images / name))
+    return given
+
+
 def surroundings_cloud(
     workspace: Workspace,
     surface: FusedCloud,
     maps: Sequence[PhaseMap],
     options: FusionOptions,
+    given: DenseWorkspace | None,
     folder: Path,
     *,
     workers: Workers,
@@ -68,19 +97,12 @@ def surroundings_cloud(
     workspace : with the sparse model.
     surface : of the polarised parts; what COLMAP saw there is left out.
     maps : of all views.
+    given : the user's COLMAP workspace, if there is one; its points are the surroundings.
     folder : for what is kept on disk meanwhile.
-
-    Raises
-    ------
-    DataError
-        The COLMAP workspace of the options is unusable, or not of these images and this model.
     """
+    if given is not None:
+        return surface_cloud(kept_cloud(given, surface.points), Kind.COLMAP)
     model = read_model(workspace.sparse)
-    if options.workspace is not None:
-        dense = open_dense_workspace(options.workspace)
-        require_same_frame(dense, model)
-        require_matching_images(dense, model, lambda name: read_gray(workspace.images / name))
-        return surface_cloud(kept_cloud(dense, surface.points), Kind.COLMAP)
     if options.surroundings is Surroundings.STEREO:
         return surface_cloud(
             stereo_surroundings(model.tracks, maps, folder, workers=workers), Kind.STEREO

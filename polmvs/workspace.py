@@ -105,13 +105,17 @@ class Workspace:
             return [self.dense(Model(model))]
         return [self.mesh(Model(model))] if kind == "mesh" else []
 
-    def discard(self, path: Path) -> None:
-        """Delete a file or a folder that a stage wrote; DataError if it holds anything else."""
+    def require_own(self, path: Path) -> None:
+        """Refuse, by DataError, to delete a folder that holds more than a stage wrote."""
         if path.is_dir():
             require_own(path, set())
+
+    def discard(self, path: Path) -> None:
+        """Delete a file or folder that a stage wrote, if it is there."""
+        if path.is_dir():
+            self.require_own(path)
             shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
 
     def temporary(self, name: str) -> Path:
         """A name in the folder for work that is not finished."""

@@ -8,6 +8,7 @@ import pytest
 from polmvs.config import Model
 from polmvs.errors import DataError, OptionError
 from polmvs.record import Record, StageRecord, write_json
+from polmvs.run_checks import followers
 from polmvs.runtime import peak_rss_mb, versions
 from polmvs.workspace import (
     Workspace,
@@ -186,3 +187,15 @@ def test_machine_facts() -> None:
     assert set(versions()) >= {"polmvs", "python", "numpy", "open3d"}
     assert "unknown" not in versions().values()
     assert 20 < peak_rss_mb() < 100_000
+
+
+def test_what_follows_a_stage_leaves_other_models_alone():
+    assert followers("mesh_ppa") == ["mesh_ppa"]
+    assert set(followers("densify_tilted")) == {
+        "densify_tilted",
+        "mesh_tilted",
+        "dense_tilted",
+        "evaluate",
+    }
+    assert {"densify_opa", "dense_ppa", "parts", "evaluate"} <= set(followers("normals"))
+    assert {"sparse", "maps"} <= set(followers("sfm"))
