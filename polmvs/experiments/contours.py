@@ -119,6 +119,8 @@ def measure_contours(
     """
     with TemporaryDirectory(prefix="polmvs-contours-") as name:
         folder = Path(name)
+        for model in (Model.PPA, Model.TILTED):
+            (folder / model).mkdir()
         counts = []
         for counted in workers.map(partial(_store_maps, scene, folder), range(len(scene.views))):
             counts.append(counted)
