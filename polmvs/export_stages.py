@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from polmvs.cloud_io import Mesh, read_cloud, write_mesh
+from polmvs.cloud_io import read_cloud, write_mesh
 from polmvs.cloud_stages import open_dense_views
 from polmvs.colmap_io import SparseModel, read_model
 from polmvs.colmap_maps import DepthNormals
 from polmvs.config import Model
 from polmvs.dense import DenseView
-from polmvs.dense_checks import common_views, require_matching_images, require_same_frame
+from polmvs.dense_checks import common_views
 from polmvs.dense_filling import fill_workspace
-from polmvs.dense_workspace import open_dense_workspace, write_dense_workspace
+from polmvs.dense_workspace import write_dense_workspace
 from polmvs.errors import DataError
 from polmvs.image_io import read_gray
 from polmvs.mesh import MIN_POINTS, poisson_mesh
 from polmvs.own_files import mark_own_workspace
+from polmvs.scene_cloud import open_checked
 from polmvs.stages import Facts
 from polmvs.surroundings import Kind
 from polmvs.undistort import warp_dense_view
@@ -32,7 +35,7 @@ def make_mesh(model: Model, workspace: Workspace) -> Facts:
     kinds = cloud.scalars.get("kind")
     if kinds is None or int((kinds == Kind.SURFACE).sum()) < MIN_POINTS:
         return {f"num_triangles_{model}": 0}
-    mesh: Mesh = poisson_mesh(cloud, source=source)
+    mesh = poisson_mesh(cloud, source=source)
     write_mesh(workspace.mesh(model), mesh)
     return {f"num_triangles_{model}": len(mesh.triangles)}
 
@@ -41,13 +44,10 @@ def write_workspace(model: Model, workspace: Workspace) -> Facts:
     """A COLMAP workspace of the run's own undistorted images and maps."""
     sparse = read_model(workspace.sparse)
     dense = _by_name(sparse, workspace, model)
-    with workspace.scratch(f"dense_{model}") as folder:
-        target = folder / "dense"
+    with _new_workspace(model, workspace) as target:
         write_dense_workspace(
             target, sparse, lambda name: read_gray(workspace.images / name), dense.__getitem__
         )
-        mark_own_workspace(target)
-        workspace.replace(target, workspace.dense(model))
     return {f"dense_{model}": str(workspace.dense(model).absolute())}
 
 
@@ -61,9 +61,7 @@ def fill_given(model: Model, workspace: Workspace, given: Path, *, in_place: boo
     """
     sparse = read_model(workspace.sparse)
     dense = _by_name(sparse, workspace, model)
-    source = open_dense_workspace(given)
-    require_same_frame(source, sparse)
-    require_matching_images(source, sparse, lambda name: read_gray(workspace.images / name))
+    source = open_checked(given, workspace)
     pairs = {pair.item.view.name: pair for pair in common_views(source, sparse)}
 
     def load_fill(name: str) -> DepthNormals | None:
@@ -76,12 +74,19 @@ def fill_given(model: Model, workspace: Workspace, given: Path, *, in_place: boo
     if in_place:
         backup = fill_workspace(source, None, load_fill, in_place=True)
         return {f"dense_{model}": str(given.absolute()), f"backup_{model}": str(backup)}
+    with _new_workspace(model, workspace) as target:
+        fill_workspace(source, target, load_fill)
+    return {f"dense_{model}": str(workspace.dense(model).absolute())}
+
+
+@contextmanager
+def _new_workspace(model: Model, workspace: Workspace) -> Iterator[Path]:
+    """Where to write a COLMAP workspace, which then takes the place of the model's last one."""
     with workspace.scratch(f"dense_{model}") as folder:
         target = folder / "dense"
-        fill_workspace(source, target, load_fill)
+        yield target
         mark_own_workspace(target)
         workspace.replace(target, workspace.dense(model))
-    return {f"dense_{model}": str(workspace.dense(model).absolute())}
 
 
 def _by_name(sparse: SparseModel, workspace: Workspace, model: Model) -> DenseViews:

@@ -66,7 +66,7 @@ def open_given(workspace: Workspace, options: FusionOptions) -> DenseWorkspace |
     """
     if options.workspace is None:
         return None
-    given = open_dense_workspace(options.workspace)
+    given = open_checked(options.workspace, workspace)
     if backups := previous_backups(given):
         logger.warning(
             "%s: was filled before, and what filled it counts as COLMAP's; the maps from before "
@@ -74,7 +74,18 @@ def open_given(workspace: Workspace, options: FusionOptions) -> DenseWorkspace |
             given.folder,
             backups[0].name,
         )
-    model = read_model(workspace.sparse)
+    return given
+
+
+def open_checked(folder: Path, workspace: Workspace) -> DenseWorkspace:
+    """A user's COLMAP workspace, found to be of the run's images and model.
+
+    Raises
+    ------
+    DataError
+        It is unusable, or not of these.
+    """
+    given, model = open_dense_workspace(folder), read_model(workspace.sparse)
     require_same_frame(given, model)
     require_matching_images(given, model, lambda name: read_gray(workspace.images / name))
     return given
