@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from polmvs.cli import main as run_polmvs
 from polmvs.config import Model
 from polmvs.errors import PolmvsError
-from polmvs.models import phase_from_normal, rows_from_phase
-from polmvs.normals import NUM_ROUNDS, solve_normals
-from polmvs.plane import plane_normal
-from polmvs.summary import format_table, stage_table
-from polmvs.workspace import RUN_FILE, Workspace
+from polmvs.evaluation.tables import format_table, stage_table
+from polmvs.normals.estimator import NUM_ROUNDS, solve_normals
+from polmvs.normals.single_view.plane import plane_normal
+from polmvs.pipeline.run_folder import RUN_FILE, Workspace
+from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
 
 Array = NDArray[np.float64]
 

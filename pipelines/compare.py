@@ -16,8 +16,8 @@ from pathlib import Path
 from polmvs.cli.flags import GROUPS, add_flags, add_run_flags, options_from, run_options
 from polmvs.cli.terminal import Terminal, guarded
 from polmvs.config import EvaluationOptions
-from polmvs.pipeline import Job, compare
-from polmvs.summary import comparison_table
+from polmvs.evaluation.tables import comparison_table
+from polmvs.pipeline.jobs import Job, compare
 
 
 def main(argv: Sequence[str] | None = None) -> int:

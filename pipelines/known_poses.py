@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from polmvs.cli.terminal import Terminal, guarded
-from polmvs.known_poses import write_known_poses
+from polmvs.poses.known_poses import write_known_poses
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 from polmvs.cli.flags import GROUPS, add_flags, add_run_flags, options_from, run_options
 from polmvs.cli.terminal import Terminal, guarded
 from polmvs.config import Model
-from polmvs.pipeline import Job, reconstruct
+from polmvs.pipeline.jobs import Job, reconstruct
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera
-from polmvs.cloud_io import Cloud, read_cloud
 from polmvs.errors import PolmvsError
 from polmvs.geometry import RigidTransform
-from polmvs.image_io import write_png
+from polmvs.io.clouds import Cloud, read_cloud
+from polmvs.io.images import write_png
 
 Array = NDArray[np.float64]
 

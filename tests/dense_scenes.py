@@ -5,14 +5,14 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from polmvs.camera import PinholeCamera, View, pixel_centers
-from polmvs.cloud_io import read_cloud
-from polmvs.colmap_io import ColmapCamera, SparseModel, pycolmap
-from polmvs.colmap_maps import DepthNormals, map_pixel_xy
-from polmvs.dense import DenseView
-from polmvs.dense_workspace import write_dense_workspace
+from polmvs.colmap.dense_workspace import write_dense_workspace
+from polmvs.colmap.maps import DepthNormals, map_pixel_xy
+from polmvs.colmap.models import ColmapCamera, SparseModel, pycolmap
 from polmvs.geometry import RigidTransform
-from polmvs.synthetic import Plane, ring_of_views
-from polmvs.tracks import Tracks
+from polmvs.io.clouds import read_cloud
+from polmvs.normals.tracks import Tracks
+from polmvs.surface.dense_view import DenseView
+from polmvs.synthetic.captures import Plane, ring_of_views
 
 PINHOLE = PinholeCamera(width=160, height=128, fx=120.0, fy=121.0, cx=79.0, cy=63.0)
 OPENCV = ColmapCamera(

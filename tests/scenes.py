@@ -6,10 +6,10 @@ import numpy as np
 
 from polmvs.camera import PinholeCamera, View
 from polmvs.config import Light
-from polmvs.phasemap import PhaseMap, build_phase_map
-from polmvs.region import find_region
-from polmvs.synthetic import Plane, SyntheticView, render_view, ring_of_views
-from polmvs.tracks import Seeds, Tracks
+from polmvs.normals.tracks import Seeds, Tracks
+from polmvs.polarization.phase_map import PhaseMap, build_phase_map
+from polmvs.polarization.region import find_region
+from polmvs.synthetic.captures import Plane, SyntheticView, render_view, ring_of_views
 
 CAMERA = PinholeCamera(width=160, height=128, fx=120.0, fy=120.0, cx=80.0, cy=64.0)
 

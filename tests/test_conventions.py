@@ -18,8 +18,8 @@ from polmvs.camera import (
 )
 from polmvs.config import Light, Model
 from polmvs.geometry import RigidTransform, align_points
-from polmvs.models import phase_from_normal, rows_from_phase
-from polmvs.synthetic import Plane, look_at, render_view
+from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
+from polmvs.synthetic.captures import Plane, look_at, render_view
 
 RNG = np.random.default_rng(0)
 
@@ -135,7 +135,7 @@ def test_rendered_phase_is_that_of_the_model(light):
 def test_zlib_works_after_everything_is_imported():
     """Imported before zlib, pycolmap breaks deflate: PNG and npz writing abort."""
     code = (
-        "import polmvs, polmvs.colmap_io, io, zlib, cv2, numpy as np\n"
+        "import polmvs, polmvs.colmap.models, io, zlib, cv2, numpy as np\n"
         "np.savez_compressed(io.BytesIO(), a=np.arange(100000))\n"
         "assert cv2.imencode('.png', np.zeros((300, 300), np.uint8))[0]\n"
         "assert zlib.decompress(zlib.compress(b'a' * 100000)) == b'a' * 100000\n"

@@ -30,7 +30,7 @@ def entry_point() -> None:
     """Run the console command; a plain kill ends it as cleanly as Ctrl-C does."""
     try:
         # COLMAP's log takes SIGTERM for itself when it is imported: after that.
-        import_module("polmvs.colmap_io")
+        import_module("polmvs.colmap.models")
         signal.signal(signal.SIGTERM, _interrupt)
         status = main()
     except KeyboardInterrupt:  # while modules are imported

@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import polmvs
-from polmvs import pipeline
 from polmvs.camera import PinholeCamera
 from polmvs.cli.flags import options_from, recorded_options, run_options
 from polmvs.cli.terminal import Terminal
-from polmvs.cloud_io import read_cloud, write_mesh
-from polmvs.comparison import evaluate_file
 from polmvs.config import EvaluationOptions, Model, Options, RunOptions, SfmOptions
 from polmvs.errors import OptionError
-from polmvs.groundtruth import open_ground_truth
-from polmvs.mesh import poisson_mesh
-from polmvs.summary import best_fit_lines, comparison_table, evaluation_text
+from polmvs.evaluation.comparison import evaluate_file
+from polmvs.evaluation.tables import best_fit_lines, comparison_table, evaluation_text
+from polmvs.io.clouds import read_cloud, write_mesh
+from polmvs.io.ground_truth import open_ground_truth
+from polmvs.pipeline import jobs as pipeline
+from polmvs.surface.poisson import poisson_mesh
 
 EMPTY_STATUS = 3
 DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"

@@ -20,7 +20,7 @@ from polmvs.option_values import (
     parse_text,
     to_plain,
 )
-from polmvs.workspace import Workspace
+from polmvs.pipeline.run_folder import Workspace
 
 T = TypeVar("T")
 

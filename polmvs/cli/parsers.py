@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import polmvs
-from polmvs import pipeline, plane_command
 from polmvs.cli import commands
 from polmvs.cli.flags import GROUPS, Parser, add_flags, add_run_flags
 from polmvs.cli.terminal import Terminal
 from polmvs.config import Model
 from polmvs.experiments.command import add_parser as add_experiment
+from polmvs.normals.single_view import command as plane_command
+from polmvs.pipeline import jobs as pipeline
 
 Command = Callable[[argparse.Namespace, Terminal], int]
 

@@ -13,8 +13,8 @@ from types import TracebackType
 from tqdm import tqdm
 
 from polmvs.errors import DataError, PolmvsError
-from polmvs.run import Report
-from polmvs.workspace import Workspace
+from polmvs.pipeline.run import Report
+from polmvs.pipeline.run_folder import Workspace
 
 INTERRUPTED = 130  # as shells report a program ended by Ctrl-C
 FILE_ONLY = {"file_only": True}  # of records that the terminal gets in another form
@@ -41,7 +41,7 @@ class _LogFileHandler(logging.FileHandler):
 
 
 class Terminal:
-    """One call of the command: a :class:`polmvs.run.Monitor` that shows and logs.
+    """One call of the command: a :class:`polmvs.pipeline.run.Monitor` that shows and logs.
 
     Parameters
     ----------

@@ -9,7 +9,6 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Protocol
 
-from polmvs.capture import Capture, open_capture
 from polmvs.cli.flags import add_flags, options_from
 from polmvs.config import CaptureOptions, Options, default_num_workers
 from polmvs.errors import DataError, OptionError
@@ -19,9 +18,10 @@ from polmvs.experiments.output import NAMES, check_output, write_report
 from polmvs.experiments.plane import DEFAULT_PLANAR_DEG
 from polmvs.experiments.tracks import DEFAULT_NUM_POINTS, TrackOptions
 from polmvs.experiments.view_choice import Selection
-from polmvs.groundtruth import open_ground_truth
-from polmvs.layouts import is_author_layout, open_author_capture
+from polmvs.io.ground_truth import open_ground_truth
+from polmvs.io.layouts import is_author_layout, open_author_capture
 from polmvs.parallel import Workers
+from polmvs.polarization.capture import Capture, open_capture
 
 logger = logging.getLogger(__name__)
 

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
 from polmvs.config import Model
-from polmvs.contour import Contours, direction_field, trace_contours
 from polmvs.experiments.data import Scene, load_view, require_counted
 from polmvs.experiments.surfaces import TrueSurface
 from polmvs.experiments.two_views import second_view, step_with_normals
 from polmvs.parallel import Workers
-from polmvs.phasemap import PhaseMap, open_phase_map, store_phase_map, view_rays
+from polmvs.polarization.phase_map import PhaseMap, open_phase_map, store_phase_map, view_rays
+from polmvs.surface.contour import Contours, direction_field, trace_contours
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]

@@ -12,20 +12,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.alignment import AlignmentReport
 from polmvs.camera import View
-from polmvs.capture import Capture
 from polmvs.config import Light, Model, RegionOptions
 from polmvs.errors import DataError
 from polmvs.experiments.estimated_poses import estimated_views
-from polmvs.groundtruth import GroundTruth
-from polmvs.image_io import read_mask
-from polmvs.models import phase_sign
-from polmvs.phasemap import PhaseMap, as_tilted, build_phase_map, view_rays
-from polmvs.region import Region, find_region, smooth
-from polmvs.stages import find_mask
-from polmvs.stokes import Stokes
-from polmvs.tilted import correct_stokes
+from polmvs.io.ground_truth import GroundTruth
+from polmvs.io.images import read_mask
+from polmvs.pipeline.stages.capture import find_mask
+from polmvs.polarization.angle_models import phase_sign
+from polmvs.polarization.capture import Capture
+from polmvs.polarization.phase_map import PhaseMap, as_tilted, build_phase_map, view_rays
+from polmvs.polarization.region import Region, find_region, smooth
+from polmvs.polarization.stokes import Stokes
+from polmvs.polarization.tilted import correct_stokes
+from polmvs.poses.alignment import AlignmentReport
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from polmvs.alignment import AlignmentReport, align_to_truth
 from polmvs.camera import View
-from polmvs.capture import Capture
-from polmvs.colmap_io import read_model
+from polmvs.colmap.models import read_model
+from polmvs.colmap.sparse_model import match_model_to_capture, short_list
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, SimilarityTransform
-from polmvs.groundtruth import GroundTruth
-from polmvs.sparse_model import match_model_to_capture, short_list
+from polmvs.io.ground_truth import GroundTruth
+from polmvs.polarization.capture import Capture
+from polmvs.poses.alignment import AlignmentReport, align_to_truth
 
 
 def estimated_views(

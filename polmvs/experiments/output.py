@@ -14,7 +14,7 @@ from typing import Any
 
 from polmvs.errors import DataError, OptionError
 from polmvs.option_values import to_plain
-from polmvs.workspace import has_content
+from polmvs.pipeline.run_folder import has_content
 
 NAMES = ("phase", "plane", "tracks", "contours")
 _OWN = re.compile(rf"({'|'.join(NAMES)})(_\w+)?\.(json|md|png|ply)")

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from polmvs.config import Model
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.experiments.statistics import ErrorTally, SignedStats, ratio
-from polmvs.models import phase_from_normal
 from polmvs.parallel import Workers
-from polmvs.stokes import axial_difference
+from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.stokes import axial_difference
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -57,7 +57,8 @@ class PhaseResult:
     Attributes
     ----------
     all_pixels : over the counted pixels of all views.
-    unmarked : over those that no printed mark (not ``reliable`` in :class:`polmvs.region.Region`)
+    unmarked : over those that no printed mark (not ``reliable`` in
+    :class:`polmvs.polarization.region.Region`)
         reaches through the blur.
     per_view : root mean square error of each view, degrees, by image name.
     densities : by model, (3, ANGLE_BINS, ERROR_BINS), for the angles of ``ANGLES``: share of the

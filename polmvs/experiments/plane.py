@@ -1,6 +1,7 @@
 """Experiment 2: normal of a planar region from one view (paper, 5.3, M1).
 
-The paper's eigenvector and the robust maximum likelihood of :mod:`polmvs.plane` see the same
+The paper's eigenvector and the robust maximum likelihood of
+:mod:`polmvs.normals.single_view.plane` see the same
 pixels. On a curved part the region of each view is the patch of the part whose true normals lie
 within a few degrees of one of them and that has the most pixels; its truth is their mean.
 """
@@ -18,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import Model
+from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
-from polmvs.metrics import AngleStats, angular_errors_deg
+from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
 from polmvs.parallel import Workers
-from polmvs.plane import PlaneEstimate, phase_residuals, plane_normal
-from polmvs.stokes import Stokes
+from polmvs.polarization.stokes import Stokes
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
@@ -33,7 +34,8 @@ NUM_CANDIDATES = 64  # normals tried as the middle of a patch
 MIN_PIXELS = 100
 MAX_SPREAD_DEG = 0.2  # of the true normals of a plane; 16-bit maps have less
 
-# A lens may or may not tilt the polarizers (:mod:`polmvs.tilted`), and PPA leaves that out: what
+# A lens may or may not tilt the polarizers (:mod:`polmvs.polarization.tilted`), and PPA leaves
+# that out: what
 # it would turn a pixel's phase by is part of the phase's uncertainty. It is common to a whole part
 # of the image and does not average out as noise does over the pixels, hence the factor.
 TILT_FACTOR = 4.0

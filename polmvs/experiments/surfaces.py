@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from polmvs.errors import DataError
 from polmvs.experiments.data import Truth
-from polmvs.groundtruth import GroundTruth
-from polmvs.layouts import BoardTruth
+from polmvs.io.ground_truth import GroundTruth
+from polmvs.io.layouts import BoardTruth
 from polmvs.neighbors import nearest_points
 
 Array = NDArray[np.float64]

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import Model
+from polmvs.evaluation.metrics import angular_errors_deg
 from polmvs.experiments.data import Scene, load_view, require_counted
 from polmvs.experiments.view_choice import Selection, check_k, order_at_random, order_by_angle
-from polmvs.metrics import angular_errors_deg
-from polmvs.normals import solve_normals
+from polmvs.normals.estimator import solve_normals
+from polmvs.normals.rows import Rows, gather_rows
 from polmvs.parallel import Workers
-from polmvs.rows import Rows, gather_rows
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]

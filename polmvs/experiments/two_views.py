@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import Model
-from polmvs.contour import Contours
-from polmvs.normals import solve_normals
-from polmvs.phasemap import PhaseMap
-from polmvs.rows import gather_rows
-from polmvs.surface import log_range_increment
+from polmvs.normals.estimator import solve_normals
+from polmvs.normals.rows import gather_rows
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.surface.contour import Contours
+from polmvs.surface.log_range import log_range_increment
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -62,7 +62,7 @@ def step_with_normals(
     ----------
     maps : of the view of the paths, and of the second view.
     range_maps : of the same views, by which occluded rows are told; see
-        :func:`polmvs.phasemap.gather_rows`.
+        :func:`polmvs.polarization.phase_map.gather_rows`.
     paths : nodes of each curve ordered by their arc, seeds at arc 0; ``curve`` counts in seeds.
     seed_range : (S,), distance of each seed from the camera centre.
 

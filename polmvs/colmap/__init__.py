@@ -1,0 +1,1 @@
+"""COLMAP's models, maps and workspaces: the only importer of pycolmap."""

@@ -1,0 +1,196 @@
+"""Fill the holes of a dense workspace that COLMAP made, in a new folder or in place.
+
+COLMAP's own depth is kept as it is. It was found with images whose pixels lie half a pixel from
+where its stereo takes them to be (see :mod:`polmvs.colmap.maps`), so that its part of a fused
+cloud lies about half a pixel beside the sparse points; what fills the holes does not.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from polmvs.colmap.dense_workspace import DenseWorkspace, WorkspaceView
+from polmvs.colmap.maps import DepthNormals
+from polmvs.colmap.workspace_layout import (
+    FUSION_FILE,
+    GEOMETRIC,
+    IMAGES,
+    SPARSE,
+    STEREO,
+    map_files,
+    new_folder,
+    write_lines,
+    write_maps,
+)
+from polmvs.errors import DataError, OptionError
+
+# Depth and normals of an image in the workspace's pixels by name, None for none.
+FillLoader = Callable[[str], DepthNormals | None]
+
+BACKUP = "stereo.polmvs-backup"
+
+
+def fill_maps(own: DepthNormals | None, fill: DepthNormals) -> DepthNormals:
+    """Maps with the holes of one's own filled: where its depth is positive it is kept.
+
+    Parameters
+    ----------
+    own, fill : depth (H, W) and normals (H, W, 3), of one size; ``own`` may be missing.
+    """
+    if own is None:
+        return fill
+    if own.depth.shape != fill.depth.shape:
+        raise ValueError(f"{fill.depth.shape=} but expected {own.depth.shape}.")
+    kept = own.depth > 0
+    return DepthNormals(
+        depth=np.where(kept, own.depth, fill.depth),
+        normals=np.where(kept[..., None], own.normals, fill.normals),
+    )
+
+
+def fill_workspace(
+    source: DenseWorkspace,
+    target: str | PathLike[str] | None,
+    load_fill: FillLoader,
+    *,
+    in_place: bool = False,
+) -> Path | None:
+    """Put depth and normals into a workspace where it has none.
+
+    The result has geometric maps of every view that had maps of either kind or has a fill, and
+    all of them are in its ``fusion.cfg``, so that one fusion uses both. Clouds and meshes made of
+    the old maps are not copied.
+
+    Parameters
+    ----------
+    source : the workspace; not modified unless ``in_place``.
+    target : folder of the new workspace, which may exist if it is empty; None with ``in_place``.
+    load_fill : gives a view's depth and normals by name.
+    in_place : change the source itself. Every file that is replaced goes into
+        ``stereo.polmvs-backup-<n>/`` first; after a failure all is as it was.
+
+    Returns
+    -------
+    The folder of the backup, None where a new workspace was written.
+
+    Raises
+    ------
+    DataError
+        A map is damaged, or the system refuses.
+    OptionError
+        Both or neither of ``target`` and ``in_place``, or the target lies in the source.
+    """
+    if in_place != (target is None):
+        raise OptionError("Filling a workspace needs a new folder or in_place, and not both.")
+    if target is None:
+        with _scratch(source.folder) as scratch:
+            staged = scratch / STEREO
+            _write_filled(source, staged, load_fill)
+            return _swap_in(staged, source.stereo)
+    folder = source.folder.resolve()
+    if folder == Path(target).resolve() or folder in Path(target).resolve().parents:
+        raise OptionError(f"{target} lies in the workspace; choose another folder or in_place.")
+    with new_folder(target) as root:
+        for name in (IMAGES, SPARSE, STEREO):
+            shutil.copytree(source.folder / name, root / name)
+        _write_filled(source, root / STEREO, load_fill)
+    return None
+
+
+@contextmanager
+def _scratch(folder: Path) -> Iterator[Path]:
+    """A temporary folder in another one."""
+    try:
+        scratch = Path(tempfile.mkdtemp(prefix=".polmvs-", dir=folder))
+    except OSError as error:
+        raise DataError(folder, f"cannot be changed: {error.strerror or error}.") from error
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _write_filled(source: DenseWorkspace, stereo: Path, load_fill: FillLoader) -> None:
+    """Write the maps that change, and ``fusion.cfg``, into a stereo folder."""
+    stereo.mkdir(exist_ok=True)
+    fused = []
+    for item in source.views:
+        fill = load_fill(item.view.name)
+        if fill is not None:
+            _require_size(item, fill)
+            write_maps(stereo, item.view.name, fill_maps(item.load_maps(), fill))
+        elif item.depth is not None and not _is_geometric(source, item):
+            maps = item.load_maps()
+            assert maps is not None  # has a depth map
+            write_maps(stereo, item.view.name, maps)
+        if fill is not None or item.depth is not None:
+            fused.append(item.view.name)
+    write_lines(stereo / FUSION_FILE, fused)
+
+
+def _is_geometric(source: DenseWorkspace, item: WorkspaceView) -> bool:
+    return item.depth == map_files(source.stereo, item.view.name, GEOMETRIC)[0]
+
+
+def _require_size(item: WorkspaceView, fill: DepthNormals) -> None:
+    """A fill is in the workspace's pixels."""
+    if fill.depth.shape != (item.camera.height, item.camera.width):
+        raise ValueError(
+            f"{fill.depth.shape=} of {item.view.name} but expected "
+            f"{(item.camera.height, item.camera.width)}."
+        )
+
+
+def _swap_in(staged: Path, stereo: Path) -> Path:
+    """Put staged files in the place of those of a stereo folder, which go to a new backup."""
+    backup = _new_backup(stereo.parent)
+    moved: list[tuple[Path, Path]] = []  # from, to; in order
+    try:
+        for file in sorted(path for path in staged.rglob("*") if path.is_file()):
+            relative = file.relative_to(staged)
+            for start, end in (
+                (stereo / relative, backup / relative),
+                (file, stereo / relative),
+            ):
+                if start.exists():
+                    end.parent.mkdir(parents=True, exist_ok=True)
+                    os.replace(start, end)
+                    moved.append((start, end))
+    except BaseException as error:
+        for start, end in reversed(moved):
+            os.replace(end, start)
+        shutil.rmtree(backup, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise DataError(
+                stereo, f"cannot be changed: {error.strerror or error}. It is as it was."
+            ) from error
+        raise
+    return backup
+
+
+def previous_backups(source: DenseWorkspace) -> list[Path]:
+    """Backups of earlier fillings in place, the first of them first."""
+    found = source.folder.glob(f"{BACKUP}-*")
+    return sorted(found, key=lambda path: (len(path.name), path.name))
+
+
+def _new_backup(folder: Path) -> Path:
+    """Make the first backup folder of a number that is free."""
+    number = 1
+    while True:
+        backup = folder / f"{BACKUP}-{number}"
+        try:
+            backup.mkdir()
+            return backup
+        except FileExistsError:
+            number += 1
+        except OSError as error:
+            raise DataError(folder, f"cannot be changed: {error.strerror or error}.") from error

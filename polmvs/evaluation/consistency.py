@@ -1,0 +1,185 @@
+"""How well a cloud fits the capture that it was made from; no truth is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import sample_image
+from polmvs.config import Model
+from polmvs.evaluation.metrics import AngleStats, axial_errors_deg
+from polmvs.io.clouds import Cloud
+from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.surface.surroundings import Kind
+
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+MIN_DOLP = 0.1  # of pixels whose phase is compared
+MAX_RESIDUAL_POINTS = 100_000  # of a cloud, evenly spread, that phase residuals are taken from
+CELL_PX = 4  # of coverage and occlusion: wider than the distance of the cloud's points
+MAX_RELATIVE_EXCESS = 0.01  # of a visible point's distance over the nearest one's in its cell
+MIN_VISIBLE_COSINE = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Consistency:
+    """How well a cloud's polarised surface fits the capture that it was made from.
+
+    Attributes
+    ----------
+    num_points : of the cloud, on the polarised surface.
+    phase_residual : angle between the phase that a point's normal predicts, under the cloud's
+        model, and the measured one, over all views that see the point.
+    coverage : share of the region's pixels, over all views, that show a point of the cloud.
+    agreement : share of the views that see a point that agree with it in place and normal.
+    track_residual_median_deg : angle between the normals of the sparse points and their planes
+        of incidence, over the points on the polarised surface.
+    """
+
+    num_points: int
+    phase_residual: AngleStats
+    coverage: float
+    agreement: float
+    track_residual_median_deg: float
+
+
+def measure_consistency(
+    model: Model, cloud: Cloud, tracks: Cloud, maps: Sequence[PhaseMap]
+) -> Consistency:
+    """Compare the polarised surface of a cloud with the phase maps of all views.
+
+    Parameters
+    ----------
+    model : of the cloud.
+    cloud : dense, with normals and, if it has points, ``num_views``. Points whose ``kind`` is
+        that of the surroundings are left out; without a ``kind`` all are of the surface.
+    tracks : sparse points with ``residual`` and ``seed``.
+    maps : of all views.
+    """
+    cloud = _polarised_surface(cloud)
+    num = len(cloud.points)
+    step = -(-num // MAX_RESIDUAL_POINTS) or 1
+    covered = inside = 0
+    seeing = np.zeros(num, np.int64)
+    errors = [np.zeros(0)]
+    for phase_map in maps:
+        cells = _region_cells(phase_map.region.inside)
+        inside += int(cells.sum())
+        if num == 0 or cloud.normals is None:
+            continue
+        visible, hit = visible_points(cloud.points, cloud.normals, phase_map)
+        covered += int((hit & cells).sum())
+        seeing += visible
+        chosen = np.flatnonzero(visible[::step]) * step
+        errors.append(
+            phase_residuals_deg(model, cloud.points[chosen], cloud.normals[chosen], phase_map)
+        )
+    confirmed = np.minimum(cloud.scalars.get("num_views", np.zeros(num)), np.maximum(seeing, 1))
+    return Consistency(
+        num_points=num,
+        phase_residual=AngleStats.from_degrees(np.concatenate(errors)),
+        coverage=covered / inside if inside else float("nan"),
+        agreement=float(confirmed.sum() / max(seeing.sum(), 1)) if num else float("nan"),
+        track_residual_median_deg=_track_residual(tracks),
+    )
+
+
+def _polarised_surface(cloud: Cloud) -> Cloud:
+    """The points of the polarised surface, as a cloud of their own."""
+    kind = cloud.scalars.get("kind")
+    if kind is None:
+        return cloud
+    kept = kind == Kind.SURFACE
+    return Cloud(
+        points=cloud.points[kept],
+        normals=None if cloud.normals is None else cloud.normals[kept],
+        colors=None if cloud.colors is None else cloud.colors[kept],
+        scalars={name: values[kept] for name, values in cloud.scalars.items()},
+    )
+
+
+def _track_residual(tracks: Cloud) -> float:
+    """Median over the seeds; NaN where there are none."""
+    residuals = tracks.scalars.get("residual", np.zeros(0))
+    used = (tracks.scalars.get("seed", np.zeros(0)) > 0) & np.isfinite(residuals)
+    if not used.any():
+        return float("nan")
+    return float(np.degrees(np.arcsin(min(float(np.median(residuals[used])), 1.0))))
+
+
+def visible_points(points: Floats, normals: Floats, phase_map: PhaseMap) -> tuple[Mask, Mask]:
+    """Which points a view sees in its region, and which of its cells show one.
+
+    A point is seen if it faces the camera and no point in its cell is clearly nearer.
+
+    Parameters
+    ----------
+    points, normals : (N, 3), world.
+
+    Returns
+    -------
+    visible : (N,) bool
+    hit : (H / CELL_PX, W / CELL_PX) bool, rounded up
+    """
+    view, inside = phase_map.view, phase_map.region.inside
+    in_cam = view.cam_from_world * points
+    distance = np.linalg.norm(in_cam, axis=1)
+    xy = view.camera.project(in_cam)
+    to_camera = view.center_in_world - points
+    facing = (to_camera * normals).sum(axis=1) > MIN_VISIBLE_COSINE * distance
+    seen = facing & (sample_image(inside.astype(np.float32), xy, nearest=True) > 0)
+    shape = tuple(-(-side // CELL_PX) for side in inside.shape)
+    cols, rows = np.floor(xy[seen] / CELL_PX).astype(np.intp).T
+    cell = rows * shape[1] + cols
+    nearest = np.full(shape[0] * shape[1], np.inf)
+    np.minimum.at(nearest, cell, distance[seen])
+    visible = np.zeros(len(points), np.bool_)
+    visible[seen] = distance[seen] <= (1 + MAX_RELATIVE_EXCESS) * nearest[cell]
+    return visible, np.isfinite(nearest).reshape(shape)
+
+
+def _region_cells(inside: Mask) -> Mask:
+    """Cells of CELL_PX px whose centre lies inside."""
+    half = CELL_PX // 2
+    padded = np.pad(inside, ((0, CELL_PX), (0, CELL_PX)))
+    shape = tuple(-(-side // CELL_PX) for side in inside.shape)
+    return np.asarray(padded[half::CELL_PX, half::CELL_PX][: shape[0], : shape[1]])
+
+
+def phase_residuals_deg(
+    model: Model, points: Floats, normals: Floats, phase_map: PhaseMap
+) -> NDArray[np.float64]:
+    """Axial difference between predicted and measured phase at points, degrees.
+
+    Parameters
+    ----------
+    points, normals : (N, 3), world.
+
+    Returns
+    -------
+    (N,), NaN where the view shows no polarised light.
+    """
+    view = phase_map.view
+    in_cam = view.cam_from_world * points
+    rays = in_cam / np.linalg.norm(in_cam, axis=1, keepdims=True)
+    predicted = phase_from_normal(model, normals @ view.cam_from_world.rotation.T, rays)
+    samples = sample_image(phase_map.samples, view.camera.project(in_cam))
+    measured = 0.5 * np.arctan2(samples[:, 1], samples[:, 0])
+    counted = (samples[:, 2] > 0) & (np.hypot(samples[:, 0], samples[:, 1]) > MIN_DOLP)
+    return np.where(counted, axial_errors_deg(measured, predicted), np.nan)
+
+
+def best_fitting_model(found: Mapping[Model, Consistency]) -> Model | None:
+    """The model under which the planes of incidence of many views meet best in one normal.
+
+    It is told by the sparse points on the surface alone, whose place no model has touched: the
+    median angle between their normals and their planes of incidence. None without such points.
+    """
+    residuals = {model: one.track_residual_median_deg for model, one in found.items()}
+    known = {model: value for model, value in residuals.items() if np.isfinite(value)}
+    return min(known, key=lambda model: known[model]) if known else None

@@ -1,0 +1,207 @@
+"""Errors of dense depth and normal maps against the truth, pixel by pixel.
+
+The truth is known at the centres of the pixels, the maps at the points of a lattice between them.
+Inverse depth, which is linear on a plane, is interpolated; only where all pixels about a lattice
+point are on the part and continue one surface is there a truth to compare with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import View, sample_image
+from polmvs.errors import DataError
+from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
+from polmvs.geometry import SimilarityTransform
+from polmvs.io.ground_truth import GroundTruth
+from polmvs.poses.alignment import align_to_truth
+from polmvs.surface.dense_view import DenseView, lattice_xy
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+WITHIN_M = 0.001
+WITHIN_SIGMAS = 2.0
+WHOLE_SHARE = 0.999  # of the pixels about a lattice point; interpolation rounds
+MAX_SLOPE = 20.0  # depth per width of a pixel's footprint: a surface seen under 3 deg, or a step
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapErrors:
+    """Errors of depth and normal maps over the part's pixels of all views together.
+
+    All figures but ``outside`` are over the lattice points that lie wholly on the part; those of
+    errors are NaN where no such point has a value.
+
+    Attributes
+    ----------
+    num_pixels : lattice points with a value and a truth.
+    coverage : their share of all lattice points of the part, also in views without a map.
+    outside : share of the lattice points with a value that show nothing of the part.
+    depth_rmse_m, depth_median_m, depth_p95_m : of the absolute error of depth, m.
+    depth_bias_m : mean error, positive behind the surface, m.
+    depth_within_1mm : share of the errors below 1 mm.
+    normals : angles between normals and truth.
+    sigma_ratio_median : median of the range's absolute error over its standard deviation; 0.67
+        where errors are normal and the deviations true.
+    within_two_sigma : share of the errors below two standard deviations; 0.95 likewise.
+    """
+
+    num_pixels: int
+    coverage: float
+    outside: float
+    depth_rmse_m: float
+    depth_median_m: float
+    depth_p95_m: float
+    depth_bias_m: float
+    depth_within_1mm: float
+    normals: AngleStats
+    sigma_ratio_median: float
+    within_two_sigma: float
+
+
+class _Truth(NamedTuple):
+    """Truth of one view at the points (h, w) of a lattice, camera frame, m."""
+
+    on_part: Mask  # wholly, and of one surface
+    off_part: Mask  # wholly
+    depth: Array
+    normals: Image  # of any length
+
+
+class _ViewErrors(NamedTuple):
+    """Errors of one view at its P points with a value and a truth, and what they are a share of."""
+
+    depth_m: Array
+    normal_deg: Array
+    sigma_ratio: Array
+    num_on_part: int
+    num_known: int
+    num_outside: int
+
+
+def map_errors(
+    views: Sequence[View], dense: Sequence[DenseView | None], truth: GroundTruth
+) -> MapErrors:
+    """Compare dense views with the true depth and normal maps.
+
+    The estimated world is brought onto the true one by the camera centres, which fixes the scale;
+    each map is then compared in its own camera, so that errors of single poses do not count.
+
+    Parameters
+    ----------
+    views : V estimated views, named as the truth's; those that it does not know are left out.
+    dense : V maps of the same views, in the same world; None where a view has none.
+    truth : maps of the same camera.
+
+    Raises
+    ------
+    DataError
+        When the cameras do not fix the alignment, or the truth's maps have another size.
+    """
+    truth_from_world, _ = align_to_truth(views, truth)
+    strides = [one.stride_px for one in dense if one is not None]
+    stride_px = strides[0] if strides else 1
+    found = [
+        _view_errors(view, one, stride_px, truth, truth_from_world)
+        for view, one in zip(views, dense, strict=True)
+        if truth.find(view.name) is not None
+    ]
+    return _summary(found)
+
+
+def _view_errors(
+    view: View,
+    dense: DenseView | None,
+    stride_px: int,
+    truth: GroundTruth,
+    truth_from_world: SimilarityTransform,
+) -> _ViewErrors:
+    """Errors of one view; where it has no map, only what it should have shown."""
+    camera = view.camera
+    if dense is None:
+        xy = lattice_xy(camera.height // stride_px, camera.width // stride_px, stride_px)
+        num_on_part = int(_truth_at(xy, view, truth).on_part.sum())
+        return _ViewErrors(np.zeros(0), np.zeros(0), np.zeros(0), num_on_part, 0, 0)
+    xy = dense.lattice_xy()
+    true = _truth_at(xy, view, truth)
+    has_range = dense.range_map > 0
+    compared = has_range & true.on_part
+    z_of_ray = camera.rays(xy[compared])[:, 2]
+    scale = truth_from_world.scale
+    depth = scale * dense.range_map[compared].astype(np.float64) * z_of_ray
+    error = depth - true.depth[compared]
+    sigma = scale * dense.sigma[compared].astype(np.float64) * z_of_ray  # range's, along z
+    in_cam = dense.normals_in_world[compared] @ view.cam_from_world.rotation.T
+    return _ViewErrors(
+        depth_m=error,
+        normal_deg=angular_errors_deg(in_cam, true.normals[compared]),
+        sigma_ratio=np.abs(error[sigma > 0]) / sigma[sigma > 0],
+        num_on_part=int(true.on_part.sum()),
+        num_known=int(has_range.sum()),
+        num_outside=int((has_range & true.off_part).sum()),
+    )
+
+
+def _truth_at(xy: Array, view: View, truth: GroundTruth) -> _Truth:
+    """Interpolate the true maps of a view at image coordinates ``(h, w, 2)``."""
+    true = truth.find(view.name)
+    assert true is not None
+    size, true_size = ((c.width, c.height) for c in (view.camera, true.camera))
+    if size != true_size:
+        raise DataError(
+            truth.folder / "cameras.json",
+            f"has images of {true_size[0]}x{true_size[1]} px but the capture's are "
+            f"{size[0]}x{size[1]} px; give the ground truth of this capture.",
+        )
+    depth, mask = truth.depth(true.name), truth.mask(true.name)
+    usable = mask & np.isfinite(depth)
+    inverse = np.where(usable, 1 / np.where(usable, depth, 1), 0).astype(np.float32)
+    mean = sample_image(inverse, xy).astype(np.float64)
+    spread = np.sqrt(np.maximum(sample_image(np.square(inverse), xy) - mean**2, 0))
+    # Two pixels whose depths differ by a share d deviate by d / 2 from their mean.
+    steps = spread > 0.5 * MAX_SLOPE / true.camera.mean_focal_px * mean
+    on_part = (sample_image(usable.astype(np.float32), xy) > WHOLE_SHARE) & ~steps
+    return _Truth(
+        on_part=on_part,
+        off_part=sample_image(mask.astype(np.float32), xy) < 1 - WHOLE_SHARE,
+        depth=np.where(on_part, 1 / np.where(on_part, mean, 1), np.nan),
+        normals=sample_image(np.nan_to_num(truth.normals(true.name)), xy),
+    )
+
+
+def _summary(views: Sequence[_ViewErrors]) -> MapErrors:
+    """The figures of all views together."""
+    depth = np.concatenate([np.zeros(0), *(one.depth_m for one in views)])
+    ratio = np.concatenate([np.zeros(0), *(one.sigma_ratio for one in views)])
+    angles = np.concatenate([np.zeros(0), *(one.normal_deg for one in views)])
+    size = np.abs(depth)
+    num_known = sum(one.num_known for one in views)
+    median, p95 = np.percentile(size, (50, 95)) if len(size) else (np.nan, np.nan)
+    return MapErrors(
+        num_pixels=len(depth),
+        coverage=_ratio(len(depth), sum(one.num_on_part for one in views)),
+        outside=_ratio(sum(one.num_outside for one in views), num_known),
+        depth_rmse_m=float(np.sqrt(_mean(depth**2))),
+        depth_median_m=float(median),
+        depth_p95_m=float(p95),
+        depth_bias_m=_mean(depth),
+        depth_within_1mm=_mean(size < WITHIN_M),
+        normals=AngleStats.from_degrees(angles),
+        sigma_ratio_median=float(np.median(ratio)) if len(ratio) else float("nan"),
+        within_two_sigma=_mean(ratio < WITHIN_SIGMAS),
+    )
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else float("nan")
+
+
+def _mean(values: Array | Mask) -> float:
+    return float(values.mean()) if len(values) else float("nan")

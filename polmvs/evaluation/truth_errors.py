@@ -1,0 +1,207 @@
+"""Evaluation stage: brings estimates into the true frame and measures them there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import View, pixel_centers
+from polmvs.config import Model
+from polmvs.evaluation.metrics import (
+    THRESHOLDS_M,
+    AngleStats,
+    CloudMetrics,
+    angular_errors_deg,
+    axial_errors_deg,
+    evaluate_cloud,
+)
+from polmvs.io.ground_truth import GroundTruth
+from polmvs.neighbors import nearest_points
+from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.poses.alignment import AlignmentReport, align_to_truth
+
+__all__ = [
+    "AlignmentReport",
+    "TrackNormalErrors",
+    "align_to_truth",
+    "evaluate",
+    "phase_errors_on_part",
+    "points_on_part",
+    "track_normal_errors",
+]
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+ON_PART_M = 0.003
+IN_FRONT_M = 0.010
+MIN_DOLP = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackNormalErrors:
+    """Errors of the normals of sparse points.
+
+    Attributes
+    ----------
+    errors : of the valid points on the part, degrees, 0 to 180
+    num_points : points given
+    num_valid : those with a valid normal
+    num_on_part : those of the valid ones on the part
+    """
+
+    errors: AngleStats
+    num_points: int
+    num_valid: int
+    num_on_part: int
+
+
+def evaluate(
+    cloud_points: Floats,
+    cloud_normals: Floats | None,
+    views: Sequence[View],
+    truth: GroundTruth,
+    *,
+    thresholds_m: tuple[float, ...] = THRESHOLDS_M,
+) -> tuple[CloudMetrics, AlignmentReport]:
+    """Align a cloud by its cameras and compare it with the truth.
+
+    Parameters
+    ----------
+    cloud_points : (N, 3), estimated world, any scale; rows that are not finite are ignored
+    cloud_normals : (N, 3) or None, estimated world; NaN rows have no normal
+    views : estimated views, in the same world
+    thresholds_m : distances of accuracy, completeness and F-score, m.
+
+    Raises
+    ------
+    DataError
+        When the cameras do not fix the alignment.
+    """
+    truth_from_world, report = align_to_truth(views, truth)
+    surface = truth.surface_points()
+    finite = np.isfinite(cloud_points).all(axis=1)
+    metrics = evaluate_cloud(
+        truth_from_world * cloud_points[finite],
+        None if cloud_normals is None else cloud_normals[finite] @ truth_from_world.rotation.T,
+        surface.points,
+        surface.normals,
+        surface.is_part,
+        thresholds_m,
+        spacing_m=surface.spacing_m,
+    )
+    return metrics, report
+
+
+def track_normal_errors(
+    points: Floats,
+    normals: Floats,
+    valid: Mask,
+    views: Sequence[View],
+    truth: GroundTruth,
+) -> TrackNormalErrors:
+    """Errors of the normals of the sparse points that lie on the part.
+
+    A point is on the part if in at least one view it projects into the true mask, eroded by one
+    pixel, within 3 mm of the true depth, and in no view lies more than 10 mm in front of the
+    nearest surface among the 3x3 pixels about it. Its true normal is that of the nearest true
+    point of the part.
+
+    Parameters
+    ----------
+    points, normals : (N, 3), estimated world
+    valid : (N,) bool, which normals count
+    views : estimated views, in the same world.
+    """
+    if normals.shape != points.shape or valid.shape != points.shape[:1]:
+        raise ValueError(f"{points.shape=}, {normals.shape=}, {valid.shape=} do not fit.")
+    truth_from_world, _ = align_to_truth(views, truth)
+    counted = valid & np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
+    points_in_truth = truth_from_world * points[counted]
+    on_part = points_on_part(points_in_truth, truth)
+    surface = truth.surface_points()
+    _, nearest = nearest_points(
+        surface.points[surface.is_part], points_in_truth[on_part], far=IN_FRONT_M
+    )
+    errors = angular_errors_deg(
+        normals[counted][on_part] @ truth_from_world.rotation.T,
+        surface.normals[surface.is_part][nearest],
+    )
+    return TrackNormalErrors(
+        errors=AngleStats.from_degrees(errors),
+        num_points=len(points),
+        num_valid=int(counted.sum()),
+        num_on_part=int(on_part.sum()),
+    )
+
+
+def points_on_part(points_in_truth: Floats, truth: GroundTruth) -> Mask:
+    """Whether points ``(N, 3)``, true frame, m, lie on the part; see `track_normal_errors`."""
+    near = np.zeros(len(points_in_truth), np.bool_)
+    floats = np.zeros(len(points_in_truth), np.bool_)
+    kernel = np.ones((3, 3), np.uint8)
+    for name, view in truth.views.items():
+        points_in_cam = view.cam_from_world * points_in_truth
+        inside, rows, cols = _pixels(view, points_in_cam)
+        z = points_in_cam[inside, 2]
+        depth = truth.depth(name)
+        mask = cv2.erode(truth.mask(name).astype(np.uint8), kernel).astype(np.bool_)
+        # NaN, where the camera sees nothing, is infinitely far: all points there float.
+        closest = cv2.erode(np.where(np.isfinite(depth), depth, np.float32(np.inf)), kernel)
+        near[inside] |= mask[rows, cols] & (np.abs(z - depth[rows, cols]) <= ON_PART_M)
+        floats[inside] |= z < closest[rows, cols] - IN_FRONT_M
+    return near & ~floats
+
+
+def phase_errors_on_part(
+    phases: Mapping[str, Floats],
+    dolps: Mapping[str, Floats],
+    truth: GroundTruth,
+    *,
+    min_dolp: float = MIN_DOLP,
+) -> dict[Model, AngleStats]:
+    """Axial errors of the phases that each model predicts from the true normals.
+
+    Parameters
+    ----------
+    phases : (H, W) of each image, phase (not AoLP), radians modulo pi; NaN is left out
+    dolps : (H, W) of the same images
+    min_dolp : pixels count above this DoLP.
+
+    Returns
+    -------
+    For OPA and PPA, the statistics over all pixels of the part in all images that have a truth.
+    """
+    errors: dict[Model, list[Array]] = {Model.OPA: [], Model.PPA: []}
+    for name, phase in phases.items():
+        view = truth.find(name)
+        if view is None:
+            continue
+        camera = view.camera
+        dolp = dolps[name]
+        if phase.shape != (camera.height, camera.width) or dolp.shape != phase.shape:
+            raise ValueError(
+                f"{phase.shape=}, {dolp.shape=} but expected {(camera.height, camera.width)}."
+            )
+        counted = truth.mask(view.name) & (dolp > min_dolp) & np.isfinite(phase)
+        normals = truth.normals(view.name)[counted]
+        rays = camera.rays(pixel_centers(camera.width, camera.height)[counted])
+        for model, values in errors.items():
+            values.append(axial_errors_deg(phase[counted], phase_from_normal(model, normals, rays)))
+    return {
+        model: AngleStats.from_degrees(np.concatenate([np.zeros(0), *values]))
+        for model, values in errors.items()
+    }
+
+
+def _pixels(view: View, points_in_cam: Floats) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp]]:
+    """Which points fall into the image, and the row and column of each of those."""
+    xy = view.camera.project(points_in_cam)
+    inside = (xy >= 0).all(axis=1) & (xy < [view.camera.width, view.camera.height]).all(axis=1)
+    cols, rows = np.floor(xy[inside]).astype(np.intp).T
+    return np.asarray(inside, np.bool_), rows, cols

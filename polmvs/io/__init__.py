@@ -1,0 +1,1 @@
+"""Images, arrays, clouds and other files, each fault a ``DataError``."""

@@ -1,0 +1,247 @@
+"""Other data layouts: the demo that the paper's authors published, and ACMM's depth maps.
+
+The authors' demo is a folder with
+
+- ``images/*.png``: raw mosaics 2448x2048, 8 bit, cells 90 45 / 135 0, encoded with a gamma of 0.5,
+  that is ``linear = (raw / 255) ** 2``;
+- ``cams/%08d_cam.txt``: in the text form of MVSNet and ACMM the word ``extrinsic``, a 4x4 matrix
+  camera from world, the word ``intrinsic``, a 3x3 matrix of the half-size image whose pixels are
+  counted from the centre of the first (OpenCV), and a line with the range of depths;
+- ``normal_w.npy`` (3x1) and ``pts_3d_corners_w.npy`` (4x3): the board's normal and corners in the
+  world.
+
+The board is all the truth there is: masks, depths and normals follow from it by geometry, as if
+nothing stood before it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import PinholeCamera, View, pixel_centers, xy_from_opencv
+from polmvs.config import CaptureOptions
+from polmvs.errors import DataError
+from polmvs.geometry import RigidTransform
+from polmvs.io.images import write_bytes
+from polmvs.polarization.capture import Capture, open_capture
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+AUTHOR_OPTIONS = CaptureOptions(pattern=(90, 45, 135, 0), gamma=0.5)
+MAX_OFF_PLANE = 0.02  # of the corners from the plane, in sizes of the board
+MAX_SIDE = 1 << 16  # of a depth map, px
+DMB_FLOAT = 1
+_DMB_HEADER = struct.Struct("<4i")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BoardTruth:
+    """Truth of a capture of one flat board: true maps of any view by intersecting its rays.
+
+    Attributes
+    ----------
+    folder : where it was read from.
+    views : posed views by image name, half-size images, units of the corners.
+    normal : (3,), unit, world, towards the cameras.
+    corners : (4, 3), world, in order around the board.
+    """
+
+    folder: Path
+    views: Mapping[str, View]
+    normal: Array
+    corners: Array
+
+    @property
+    def offset(self) -> float:
+        """Of the board's plane: ``normal . x = offset``."""
+        return float((self.corners @ self.normal).mean())
+
+    def mask(self, name: str) -> Mask:
+        """Whether each pixel shows the board, (H, W)."""
+        return np.isfinite(self.depth(name))
+
+    def depth(self, name: str) -> Image:
+        """Depth z of the board, (H, W) float32; NaN beside it."""
+        view = self.views[name]
+        rays = view.camera.rays(pixel_centers(view.camera.width, view.camera.height))
+        world_rays = rays @ view.cam_from_world.rotation
+        center = view.center_in_world
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (self.offset - center @ self.normal) / (world_rays @ self.normal)
+            points = center + world_rays * distance[..., None]
+            inside = (distance > 0) & self._inside(points)
+        return np.where(inside, distance * rays[..., 2], np.nan).astype(np.float32)
+
+    def normals(self, name: str) -> Image:
+        """Normals (H, W, 3) float32, camera frame, facing it; NaN beside the board."""
+        view = self.views[name]
+        normal = view.cam_from_world.rotation @ self.normal
+        if view.center_in_world @ self.normal < self.offset:
+            normal = -normal
+        shown = self.mask(name)[..., None]
+        return np.where(shown, normal, np.nan).astype(np.float32)
+
+    def _inside(self, points: Array) -> Mask:
+        """Whether points (..., 3) of the plane lie within the convex outline of the corners."""
+        edges = np.roll(self.corners, -1, axis=0) - self.corners
+        inwards = np.cross(self.normal, edges)
+        inwards *= np.sign(((self.corners.mean(axis=0) - self.corners) * inwards).sum(axis=1))[
+            :, None
+        ]
+        sides = points @ inwards.T - (self.corners * inwards).sum(axis=1)
+        return np.asarray((sides >= 0).all(axis=-1))
+
+
+def is_author_layout(folder: Path) -> bool:
+    """Whether a folder is laid out as the authors' demo."""
+    return (folder / "images").is_dir() and (folder / "cams").is_dir()
+
+
+def open_author_capture(
+    folder: Path, options: CaptureOptions | None = None
+) -> tuple[Capture, BoardTruth]:
+    """Open a capture in the layout of the authors' demo, with its truth.
+
+    Parameters
+    ----------
+    options : how mosaics become polarization images; None: the authors' own.
+
+    Raises
+    ------
+    DataError
+        A file is missing, damaged, or of another size or count.
+    """
+    capture = open_capture(folder / "images", AUTHOR_OPTIONS if options is None else options)
+    views = {}
+    for index, name in enumerate(capture.names):
+        path = folder / "cams" / f"{Path(name).stem}_cam.txt"
+        if not path.is_file():
+            path = folder / "cams" / f"{index:08d}_cam.txt"
+        views[name] = read_camera_text(path, name, capture.width, capture.height)
+    normal = _read_npy(folder / "normal_w.npy", 3).reshape(3)
+    corners = _read_npy(folder / "pts_3d_corners_w.npy", 12).reshape(4, 3)
+    length = float(np.linalg.norm(normal))
+    if not length > 0:
+        raise DataError(folder / "normal_w.npy", "is no direction; copy the data again.")
+    return capture, _board(folder, views, normal / length, corners)
+
+
+def _board(folder: Path, views: dict[str, View], normal: Array, corners: Array) -> BoardTruth:
+    """The board with its normal towards the cameras and its corners in order."""
+    center = corners.mean(axis=0)
+    size = float(np.linalg.norm(corners - center, axis=1).max())
+    if np.abs((corners - center) @ normal).max() > MAX_OFF_PLANE * size:
+        raise DataError(
+            folder / "pts_3d_corners_w.npy",
+            "the corners do not lie in a plane across normal_w.npy; copy the data again.",
+        )
+    cameras = np.array([view.center_in_world for view in views.values()])
+    if np.median((cameras - center) @ normal) < 0:
+        normal = -normal
+    first = corners[0] - center
+    angles = np.arctan2((corners - center) @ np.cross(normal, first), (corners - center) @ first)
+    return BoardTruth(folder=folder, views=views, normal=normal, corners=corners[angles.argsort()])
+
+
+def read_camera_text(path: Path, name: str, width: int, height: int) -> View:
+    """Read a camera in the text form of MVSNet and ACMM; its intrinsics count from pixel centres.
+
+    Parameters
+    ----------
+    name : of the image.
+    width, height : of the image that the intrinsics are of, px.
+
+    Raises
+    ------
+    DataError
+        The file is missing or malformed.
+    """
+    try:
+        words = path.read_text(encoding="ascii").split()
+    except (OSError, ValueError) as error:
+        raise DataError(
+            path, f"no readable camera file ({error}); each image needs one."
+        ) from error
+    try:
+        start, middle = words.index("extrinsic"), words.index("intrinsic")
+        pose = np.array(words[start + 1 : start + 17], np.float64).reshape(4, 4)
+        K = np.array(words[middle + 1 : middle + 10], np.float64).reshape(3, 3)
+    except ValueError as error:
+        raise DataError(
+            path, "needs 'extrinsic' with 16 numbers and 'intrinsic' with 9; copy it again."
+        ) from error
+    rotation = pose[:3, :3].copy()
+    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
+    if not rigid or not np.isfinite(pose).all():
+        raise DataError(path, "its extrinsic matrix is no rigid motion; copy it again.")
+    if not (np.isfinite(K).all() and min(K[0, 0], K[1, 1]) > 0):
+        raise DataError(path, "its focal lengths must be positive; copy it again.")
+    cx, cy = xy_from_opencv(K[:2, 2])
+    camera = PinholeCamera(
+        width=width, height=height, fx=K[0, 0], fy=K[1, 1], cx=float(cx), cy=float(cy)
+    )
+    return View(name=name, camera=camera, cam_from_world=RigidTransform(rotation, pose[:3, 3]))
+
+
+def read_dmb(path: Path) -> Image:
+    """Read a map of ACMM (``.dmb``): int32 type, height, width, channels, then float32.
+
+    Returns
+    -------
+    (H, W) float32, or (H, W, C) where there are more channels than one (normals).
+
+    Raises
+    ------
+    DataError
+        The file is missing, truncated, or of another type.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+    if len(data) < _DMB_HEADER.size:
+        raise DataError(path, "is truncated; copy it again.")
+    kind, height, width, channels = _DMB_HEADER.unpack_from(data)
+    sides = (height, width, channels)
+    if kind != DMB_FLOAT or min(sides) < 1 or max(sides) > MAX_SIDE:
+        raise DataError(path, "is no .dmb map of 32-bit floats.")
+    if len(data) != _DMB_HEADER.size + 4 * height * width * channels:
+        raise DataError(path, f"is truncated: {width}x{height} px are promised; copy it again.")
+    values = np.frombuffer(data, "<f4", offset=_DMB_HEADER.size).astype(np.float32)
+    return values.reshape((height, width) if channels == 1 else (height, width, channels))
+
+
+def write_dmb(path: Path, image: Image) -> None:
+    """Write a map (H, W) or (H, W, C) as ACMM's ``.dmb``, whole or not at all.
+
+    Raises
+    ------
+    DataError
+        The system refuses.
+    """
+    if image.ndim not in (2, 3) or image.size == 0:
+        raise ValueError(f"{image.shape=} but expected (H, W) or (H, W, C).")
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    header = _DMB_HEADER.pack(DMB_FLOAT, *image.shape[:2], channels)
+    write_bytes(path, header + np.ascontiguousarray(image, "<f4").tobytes())
+
+
+def _read_npy(path: Path, num: int) -> Array:
+    """Numbers of a ``.npy`` file."""
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(path, f"cannot be read ({error}); copy the data again.") from error
+    if not isinstance(values, np.ndarray) or values.size != num or values.dtype.kind not in "fiu":
+        raise DataError(path, f"needs {num} numbers; copy the data again.")
+    if not np.isfinite(values).all():
+        raise DataError(path, "has numbers that are not finite; copy the data again.")
+    return np.asarray(values, np.float64)

@@ -1,0 +1,1 @@
+"""Constraint rows, the robust estimator, normals of tracks, and the kind of light."""

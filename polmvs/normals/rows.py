@@ -1,0 +1,91 @@
+"""Constraint rows: what the phases of many views say about the normals of points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import View, sample_image
+from polmvs.config import Model
+from polmvs.polarization.angle_models import rows_from_axial
+from polmvs.polarization.phase_map import PhaseMap
+
+Floats = NDArray[np.floating]
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Constraint rows of N points from K views, world frame, component first.
+
+    Attributes
+    ----------
+    rows, rays : (3, K, N) float32, unit; NaN rows where a view has no phase.
+    sigma : (K, N) float32, rad; infinite where the row does not count.
+    """
+
+    rows: NDArray[np.float32]
+    rays: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+
+
+def gather_rows(
+    model: Model,
+    points_in_world: Floats,
+    maps: Sequence[PhaseMap],
+    range_maps: Sequence[Image | None] | None = None,
+    *,
+    range_tolerance: float = 0.02,
+) -> Rows:
+    """Rows of points from all views that see them (paper, eq. coeff_2, before stacking).
+
+    Parameters
+    ----------
+    model : which rows.
+    points_in_world : (N, 3).
+    maps : K phase maps.
+    range_maps : per view ``(h, w)`` distances from the camera centre, 0 where unknown: a point
+        that lies behind its view's map by more than ``range_tolerance`` (relative) is occluded.
+    """
+    points = np.asarray(points_in_world, np.float64)  # the origin may be far
+    num_views, num_points = len(maps), len(points)
+    rows = np.full((3, num_views, num_points), np.nan, np.float32)
+    rays = np.zeros((3, num_views, num_points), np.float32)
+    sigma = np.full((num_views, num_points), np.inf, np.float32)
+    for k, phase_map in enumerate(maps):
+        in_cam = (phase_map.view.cam_from_world * points).astype(np.float32)
+        distance = np.linalg.norm(in_cam, axis=-1)
+        ray = in_cam / np.maximum(distance, 1e-12)[:, None]
+        xy = phase_map.view.camera.project(in_cam)
+        samples = sample_image(phase_map.samples, xy)
+        precision = samples[:, 2]
+        range_map = range_maps[k] if range_maps is not None else None
+        if range_map is not None:
+            seen = sample_range(range_map, phase_map.view, xy)
+            precision = np.where(
+                (seen > 0) & (distance > (1 + range_tolerance) * seen), 0, precision
+            )
+        row, turn = _row_and_turn(model, samples, ray)
+        rotation = phase_map.view.cam_from_world.rotation.astype(np.float32)
+        rows[:, k] = (row @ rotation).T
+        rays[:, k] = (ray @ rotation).T
+        with np.errstate(divide="ignore"):
+            sigma[k] = np.where(precision > 0, turn / np.sqrt(precision), np.inf)
+    return Rows(rows, rays, sigma)
+
+
+def sample_range(range_map: Image, view: View, xy: Floats) -> NDArray[np.float32]:
+    """Nearest value of a range map, which may be coarser than the view by a whole factor."""
+    return sample_image(range_map, xy / round(view.camera.width / range_map.shape[1]), nearest=True)
+
+
+def _row_and_turn(model: Model, samples: Image, rays: Floats) -> tuple[Floats, Floats]:
+    """Row in the camera frame, and how far it turns about the ray per turn of the phase."""
+    row = rows_from_axial(model, samples[:, 0], samples[:, 1], rays)
+    if model is Model.OPA:
+        return row, np.ones(len(row), np.float32)
+    # v_z / (1 - (v . d)^2): the length of v x d is v_z over the row's length in the image plane.
+    return row, (row[:, 0] ** 2 + row[:, 1] ** 2) / rays[:, 2]

@@ -1,0 +1,132 @@
+"""The pixels of one image that show a plane: what ``polmvs plane`` measures on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import PinholeCamera, pixel_centers
+from polmvs.config import CaptureOptions, Light, Model
+from polmvs.io.images import probe_mosaic
+from polmvs.normals.single_view.focal import FocalEstimate, estimate_focal
+from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal
+from polmvs.normals.single_view.search import FoundPlane, find_planes
+from polmvs.polarization.angle_models import phase_sign
+from polmvs.polarization.capture import Capture, _full_scale_16
+from polmvs.polarization.phase_map import MIXTURE_SIGMA, MODEL_SIGMA
+from polmvs.polarization.stokes import Stokes
+from polmvs.polarization.tilted import correct_stokes
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+FOCAL_RANGE = (0.25, 6.0)  # focal lengths that are tried, image widths
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlaneView:
+    """One image and the pixels of it that are used.
+
+    Attributes
+    ----------
+    stokes : (H, W) images as measured.
+    mask : (H, W) bool, pixels that count.
+    light : which reflection dominates.
+    """
+
+    stokes: Stokes
+    mask: Mask
+    light: Light
+
+    def phase_map(self, model: Model, camera: PinholeCamera) -> tuple[Image, Image, Image]:
+        """Phase as the estimators take it.
+
+        Returns
+        -------
+        axial : (2, H, W), ``(cos 2 phase, sin 2 phase)`` times the polarised intensity.
+        rays : (3, H, W), unit, camera frame.
+        sigma : (H, W), standard deviation of the phase, rad.
+        """
+        rays = camera.rays(pixel_centers(camera.width, camera.height)).astype(np.float32)
+        stokes = self.stokes
+        if model is Model.TILTED:
+            stokes = correct_stokes(stokes, rays, light=self.light)
+        axial = phase_sign(self.light) * np.stack([stokes.s1, stokes.s2])
+        return axial, np.ascontiguousarray(np.moveaxis(rays, -1, 0)), phase_sigma(stokes)
+
+    def plane(self, model: Model, camera: PinholeCamera, *, robust: bool = True) -> PlaneEstimate:
+        """Best single normal of the pixels, by :func:`.plane.plane_normal`."""
+        axial, rays, sigma = self.phase_map(model, camera)
+        m = self.mask
+        return plane_normal(model, axial[:, m], rays[:, m], sigma[m], robust=robust)
+
+    def planes(self, model: Model, camera: PinholeCamera) -> list[FoundPlane]:
+        """All planes among the pixels, by :func:`.search.find_planes`."""
+        axial, rays, sigma = self.phase_map(model, camera)
+        return find_planes(model, axial, rays, sigma, self.mask)
+
+    def focal(self, camera: PinholeCamera) -> FocalEstimate:
+        """Focal length fx of the best single normal under the tilted model.
+
+        Parameters
+        ----------
+        camera : its principal point and aspect ratio are used.
+        """
+        stokes, mask = self.stokes, self.mask
+        xy = pixel_centers(camera.width, camera.height)[mask]
+        offsets = (xy - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy]
+        return estimate_focal(
+            Model.TILTED,
+            np.stack([stokes.s0[mask], stokes.s1[mask], stokes.s2[mask]]),
+            np.ascontiguousarray(offsets.T, np.float32),
+            phase_sigma(stokes)[mask],
+            light=self.light,
+            focal_range_px=(FOCAL_RANGE[0] * camera.width, FOCAL_RANGE[1] * camera.width),
+        )
+
+
+def load_stokes(path: Path, options: CaptureOptions) -> Stokes:
+    """Stokes images of one mosaic.
+
+    Raises
+    ------
+    DataError
+        The file is missing, damaged or no monochrome mosaic.
+    """
+    header = probe_mosaic(path)
+    capture = Capture(
+        folder=path.parent,
+        paths=(path,),
+        width=header.width // 2,
+        height=header.height // 2,
+        bit_depth=header.bit_depth,
+        full_scale=255 if header.bit_depth == 8 else _full_scale_16([path]),
+        options=options,
+    )
+    return capture.load(path.name)
+
+
+def phase_sigma(stokes: Stokes) -> Image:
+    """Deviation of the phase (H, W), rad: noise, the model's error, and light of the other kind.
+
+    As in :mod:`polmvs.polarization.phase_map`, for single pixels; infinite or NaN where there is
+    no polarisation.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        noise = MIXTURE_SIGMA**2 + np.square(0.5 * stokes.sigma / stokes.s0)
+        return np.asarray(np.sqrt(MODEL_SIGMA**2 + noise / np.square(stokes.dolp)), np.float32)
+
+
+def polygon_mask(corners: Sequence[Sequence[float]], shape: tuple[int, int]) -> Mask:
+    """Pixels (H, W) whose centres lie inside a polygon, by the even-odd rule."""
+    x, y = np.moveaxis(pixel_centers(shape[1], shape[0]), -1, 0)
+    inside = np.zeros(shape, np.bool_)
+    for (x0, y0), (x1, y1) in zip(corners, [*corners[1:], corners[0]], strict=True):
+        if y0 != y1:
+            crossing = x0 + (y - y0) * ((x1 - x0) / (y1 - y0))
+            inside ^= ((y0 > y) != (y1 > y)) & (x < crossing)
+    return inside

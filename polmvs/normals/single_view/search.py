@@ -1,0 +1,268 @@
+"""Several planes in one phase map: RANSAC on pairs of rows, then the robust estimator.
+
+The search runs on the map averaged over blocks of pixels, whose noise is low enough for a normal
+from two rows to be useful. What remains, once a plane is found, is searched again. In the end every
+block goes to the plane that explains it and its neighbours best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.config import Model
+from polmvs.normals.single_view.phase_errors import phase_errors, stack_samples
+from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
+from polmvs.polarization.angle_models import rows_from_axial
+
+Floats: TypeAlias = NDArray[np.floating[Any]]
+Array: TypeAlias = NDArray[np.float64]
+Mask: TypeAlias = NDArray[np.bool_]
+
+BLOCK_PX = 4
+NUM_HYPOTHESES = 400  # pairs of rows per plane
+NUM_SCORED = 2000  # blocks on which they are scored
+NUM_REFINED = 8  # of the best hypotheses that are refined
+MAX_REACH = 40  # blocks between the two of a pair, at most
+MIN_CROSS = 0.02  # sine of the angle between the two rows of a pair, at least
+COHERENCE_BLOCKS = 5  # side of the window in which most blocks have to agree
+COHERENT_SHARE = 0.6
+MODEL_SIGMA = 0.01  # rad; error of a block's phase that does not average out
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoundPlane:
+    """One of the planes of a view.
+
+    Attributes
+    ----------
+    estimate : normal and quality, from the pixels of ``mask``.
+    mask : (H, W) bool, its pixels; several areas where parallel planes are seen.
+    """
+
+    estimate: PlaneEstimate
+    mask: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Averages over blocks; (H', W') maps of what counts, arrays of the blocks that do."""
+
+    model: Model
+    known: Mask
+    axial: Floats
+    rays: Floats
+    sigma: Floats
+
+    def residuals(self, normal: Floats) -> Floats:
+        """Size of the phase residual (H', W'), infinite where nothing is known."""
+        residuals = np.full(self.known.shape, np.inf)
+        residuals[self.known] = np.abs(phase_residuals(self.model, normal, self.axial, self.rays))
+        return residuals
+
+    def refine(self, inside: Mask, normal: Floats | None = None) -> PlaneEstimate:
+        """Robust normal of the blocks of a map."""
+        some = inside[self.known]
+        return plane_normal(
+            self.model,
+            self.axial[:, some],
+            self.rays[:, some],
+            self.sigma[some],
+            initial_normal=normal,
+        )
+
+
+def find_planes(
+    model: Model,
+    axial: Floats,
+    rays: Floats,
+    sigma: Floats,
+    mask: Mask,
+    *,
+    min_share: float = 0.04,
+    max_planes: int = 8,
+    max_residual_deg: float = 3.0,
+    min_angle_deg: float = 5.0,
+    seed: int = 0,
+) -> list[FoundPlane]:
+    """Find the planes of a view, the largest support first.
+
+    Parameters
+    ----------
+    model : PPA or tilted; under OPA a plane is known by its azimuth only.
+    axial : (2, H, W), ``(cos 2 phase, sin 2 phase)`` times any positive number.
+    rays : (3, H, W), unit, camera frame.
+    sigma : (H, W), standard deviation of the phase, rad.
+    mask : (H, W) bool, pixels to explain.
+    min_share : least support of a plane, share of the mask.
+    max_planes : the search ends there at the latest.
+    max_residual_deg : of a block that supports a plane, beside three times its noise; degrees.
+    min_angle_deg : between the normals of two planes; what differs by less is the same plane
+        under light that the model does not explain.
+    seed : of the random pairs.
+
+    Returns
+    -------
+    Planes with disjoint masks; none where nothing is explained by a plane.
+    """
+    if axial.shape != (2, *mask.shape) or rays.shape != (3, *mask.shape):
+        raise ValueError(f"{axial.shape=}, {rays.shape=}, {mask.shape=}.")
+    blocks = _average(model, axial, rays, sigma, mask)
+    limit = np.full(blocks.known.shape, 0.0)
+    limit[blocks.known] = np.hypot(np.radians(max_residual_deg), 3 * blocks.sigma)
+    min_blocks = max(int(min_share * np.count_nonzero(blocks.known)), COHERENCE_BLOCKS**2)
+    rng = np.random.default_rng(seed)
+    left = blocks.known.copy()
+    normals: list[Array] = []
+    while len(normals) < max_planes and np.count_nonzero(left) >= min_blocks:
+        normal, support = _best_plane(blocks, left, limit, min_blocks, rng)
+        if np.count_nonzero(support) < min_blocks:
+            break
+        left &= ~support
+        if all(abs(float(normal @ other)) < np.cos(np.radians(min_angle_deg)) for other in normals):
+            normals.append(normal)
+    labels = _assign(blocks, normals, limit, min_blocks)
+    return _finish(model, axial, rays, sigma, mask, labels)
+
+
+def _average(model: Model, axial: Floats, rays: Floats, sigma: Floats, mask: Mask) -> _Blocks:
+    """Average a phase map over blocks, weighted by precision; half a block has to be known."""
+    length = np.hypot(axial[0], axial[1])
+    usable = mask & (length > 0) & (sigma > 0) & np.isfinite(length + sigma)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = np.where(usable, 1 / np.square(sigma, dtype=np.float64), 0)
+        unit = np.where(usable, axial / length, 0)
+    count, total = _block_sums(usable), _block_sums(weight)
+    known = count >= 0.5 * BLOCK_PX**2
+    total = total[known]
+    means = np.stack([_block_sums(weight * u)[known] for u in unit]) / total
+    mean_rays = np.stack([_block_sums(np.where(usable, r, 0))[known] for r in rays])
+    mean_rays /= np.sqrt((mean_rays * mean_rays).sum(axis=0))
+    return _Blocks(model, known, means, mean_rays, np.sqrt(1 / total + MODEL_SIGMA**2))
+
+
+def _block_sums(image: NDArray[Any]) -> Array:
+    """Sums over blocks, the rest at the far sides left out."""
+    rows, cols = image.shape[0] // BLOCK_PX, image.shape[1] // BLOCK_PX
+    whole = image[: rows * BLOCK_PX, : cols * BLOCK_PX].reshape(rows, BLOCK_PX, cols, BLOCK_PX)
+    return np.asarray(whole.sum(axis=(1, 3), dtype=np.float64))
+
+
+def _best_plane(
+    blocks: _Blocks, left: Mask, limit: Floats, min_blocks: int, rng: np.random.Generator
+) -> tuple[Array, Mask]:
+    """The best hypothesis about the blocks left, refined, and its coherent support."""
+    best, support = np.full(3, np.nan), np.zeros_like(left)
+    for hypothesis in _hypotheses(blocks, left, limit, rng):
+        normal: Array = hypothesis
+        inside = _coherent(blocks.residuals(normal) < limit, left, min_blocks // 2)
+        for _ in range(4):
+            if np.count_nonzero(inside) < min_blocks // 2:
+                break
+            normal = blocks.refine(inside, normal).normal
+            inside = _coherent(blocks.residuals(normal) < limit, left, min_blocks // 2)
+        if np.count_nonzero(inside) > np.count_nonzero(support):
+            best, support = normal, inside
+    return best, support
+
+
+def _hypotheses(
+    blocks: _Blocks, left: Mask, limit: Floats, rng: np.random.Generator
+) -> list[Array]:
+    """Normals of pairs of rows near each other, those first that most blocks agree with."""
+    rows = np.full((*left.shape, 3), np.nan)
+    rows[blocks.known] = rows_from_axial(
+        blocks.model, blocks.axial[0], blocks.axial[1], blocks.rays.T
+    )
+    height, width = left.shape
+    where = np.argwhere(left)
+    first = where[rng.integers(len(where), size=NUM_HYPOTHESES)]
+    reach = np.geomspace(4, MAX_REACH, NUM_HYPOTHESES)[:, None]
+    second = first + np.rint(rng.uniform(-1, 1, first.shape) * reach).astype(np.int64)
+    second = np.clip(second, 0, [height - 1, width - 1])
+    normals = np.cross(rows[tuple(first.T)], rows[tuple(second.T)])
+    length = np.linalg.norm(normals, axis=1)
+    usable = left[tuple(second.T)] & (length > MIN_CROSS)
+    normals = normals[usable] / length[usable, None]
+    some = left[blocks.known]
+    samples = stack_samples(
+        blocks.model, blocks.axial[:, some], blocks.rays[:, some], blocks.sigma[some]
+    )
+    step = max(1, samples.shape[1] // NUM_SCORED)
+    limits = limit[left][::step]
+    scores = [
+        np.count_nonzero(np.abs(phase_errors(normal, samples[:, ::step])) < limits)
+        for normal in normals
+    ]
+    return list(normals[np.argsort(scores)[::-1][:NUM_REFINED]])
+
+
+def _coherent(agree: Mask, left: Mask, min_blocks: int) -> Mask:
+    """Blocks left in whose neighbourhood most agree, in areas of some size."""
+    window = (COHERENCE_BLOCKS, COHERENCE_BLOCKS)
+    agreeing = cv2.blur((agree & left).astype(np.float32), window)
+    present = cv2.blur(left.astype(np.float32), window)
+    inside = left & (agreeing > COHERENT_SHARE * present)
+    num, labels, stats, _ = cv2.connectedComponentsWithStats(
+        inside.astype(np.uint8), connectivity=4
+    )
+    keep = stats[:, cv2.CC_STAT_AREA] >= min_blocks
+    keep[0] = False
+    return np.asarray(keep[labels]) if num > 1 else np.zeros_like(inside)
+
+
+def _assign(
+    blocks: _Blocks, normals: Sequence[Array], limit: Floats, min_blocks: int
+) -> NDArray[np.int64]:
+    """Number of the plane of each block (H', W'), -1 for none."""
+    labels = np.full(blocks.known.shape, -1, np.int64)
+    if not normals:
+        return labels
+    for _ in range(2):
+        residuals = np.stack([blocks.residuals(normal) for normal in normals])
+        smooth = [_mean_where(np.minimum(r, 2 * limit), blocks.known) for r in residuals]
+        nearest = np.argmin(smooth, axis=0)
+        labels[:] = -1
+        refined = []
+        for index, normal in enumerate(normals):
+            agree = (residuals[index] < limit) & (nearest == index)
+            inside = _coherent(agree, blocks.known, min_blocks // 2)
+            inside &= nearest == index
+            labels[inside] = index
+            enough = np.count_nonzero(inside) >= min_blocks
+            refined.append(blocks.refine(inside, normal).normal if enough else normal)
+        normals = refined
+    return labels
+
+
+def _mean_where(image: Floats, known: Mask) -> Floats:
+    """Mean over the known blocks of a window."""
+    window = (COHERENCE_BLOCKS, COHERENCE_BLOCKS)
+    total = cv2.blur(np.where(known, image, 0).astype(np.float32), window)
+    return np.asarray(total / np.maximum(cv2.blur(known.astype(np.float32), window), 1e-6))
+
+
+def _finish(
+    model: Model,
+    axial: Floats,
+    rays: Floats,
+    sigma: Floats,
+    mask: Mask,
+    labels: NDArray[np.int64],
+) -> list[FoundPlane]:
+    """Planes at the full size, from all pixels of their blocks."""
+    full = np.full(mask.shape, -1, np.int64)
+    grown = labels.repeat(BLOCK_PX, axis=0).repeat(BLOCK_PX, axis=1)
+    full[: grown.shape[0], : grown.shape[1]] = grown
+    found = []
+    for index in range(labels.max() + 1):
+        inside = mask & (full == index)
+        if inside.any():
+            estimate = plane_normal(model, axial[:, inside], rays[:, inside], sigma[inside])
+            found.append(FoundPlane(estimate=estimate, mask=inside))
+    return sorted(found, key=lambda plane: -plane.estimate.num_pixels)

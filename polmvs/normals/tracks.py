@@ -1,0 +1,238 @@
+"""Normals of sparse points from the phases of all views, and the seeds among them.
+
+SfM features sit on printed marks and edges, where the light is mixed: the phase at a keypoint is
+the worst one near it. Rows therefore come from the reliable pixels in a window about the
+projected point, in every view that sees it, not only in the views that matched it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import View, sample_image
+from polmvs.config import Estimator, Model, NormalOptions
+from polmvs.normals.estimator import NormalEstimate, solve_normals
+from polmvs.normals.rows import gather_rows
+from polmvs.polarization.phase_map import PhaseMap
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BORDER_MARGIN_PX = 7  # points nearer to the region's border may lie on the background
+KEYPOINT_SIGMA_PX = 0.5
+MIN_FACING_COSINE = 0.2  # between normal and viewing direction, for a view to have a say
+MIN_INSIDE_SHARE = 0.8  # of a track's views that must see it in their region
+MIN_SEEN_SHARE = 0.7  # of the views that a point faces, to show the surface at its place
+MAX_DOLP_SHARE = 0.85  # of a mark's DoLP in that of the surface about it
+CLEAR_DOLP = 0.15  # of the surface, for the comparison to tell
+MAX_SEED_SIGMA_DEG = 3.0
+MAX_SEED_RESIDUAL = 0.06  # sine; 3.4 deg between the normal and the planes of incidence
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Sparse points and their observations as flat arrays.
+
+    Attributes
+    ----------
+    point3D_ids : (T,) int64
+    points_in_world : (T, 3) float64
+    colors : (T, 3) uint8
+    errors : (T,) float64, mean reprojection error, px
+    obs_track, obs_view : (O,) int64, indices of a track and of a view
+    obs_xy : (O, 2) float64, image coordinates
+    """
+
+    point3D_ids: NDArray[np.int64]
+    points_in_world: Array
+    colors: NDArray[np.uint8]
+    errors: Array
+    obs_track: NDArray[np.int64]
+    obs_view: NDArray[np.int64]
+    obs_xy: Array
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Points of known place on the surface.
+
+    Attributes
+    ----------
+    points_in_world : (S, 3) float64
+    normals_in_world : (S, 3) float64, unit; NaN where unknown.
+    sigma : (S,) float64, standard deviation of the place, world units.
+    """
+
+    points_in_world: Array
+    normals_in_world: Array
+    sigma: Array
+
+
+def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
+    """Average the phase over a window of reliable pixels about every pixel (axially)."""
+    axial, precision = phase_map.samples[..., :2], phase_map.samples[..., 2]
+    weight = precision * phase_map.region.reliable
+    size = (window_px, window_px)
+    share = cv2.boxFilter(weight, -1, size, borderType=cv2.BORDER_CONSTANT)
+    mean = cv2.boxFilter(axial * weight[..., None], -1, size, borderType=cv2.BORDER_CONSTANT)
+    mean = mean / np.maximum(share, 1e-9)[..., None]
+    # The window's own precision where it is full, less where few of its pixels count.
+    samples = np.dstack([mean, np.where(phase_map.region.inside, share, 0)])
+    return replace(phase_map, samples=samples.astype(np.float32))
+
+
+def track_normals(
+    model: Model, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
+) -> NormalEstimate:
+    """Normals of all tracks in one batch (paper, eq. coeff_2).
+
+    Parameters
+    ----------
+    model : OPA, PPA or tilted.
+    tracks : sparse points; ``obs_view`` counts in ``maps``.
+    maps : phase maps of the views.
+    options : window and estimator.
+    """
+    windows = [window_map(phase_map, options.window_px) for phase_map in maps]
+    return normals_from_windows(model, tracks, windows, options.estimator)
+
+
+def normals_from_windows(
+    model: Model, tracks: Tracks, windows: Sequence[PhaseMap], estimator: Estimator
+) -> NormalEstimate:
+    """As :func:`track_normals`, from phase maps that are averaged already (:func:`window_map`).
+
+    First from the views that matched the point, which surely see it, then from every view that
+    faces it.
+    """
+    rows = gather_rows(model, tracks.points_in_world, windows)
+    matched = np.zeros(rows.sigma.shape, bool)
+    matched[tracks.obs_view, tracks.obs_track] = True
+    robust = estimator is Estimator.ROBUST
+    own_sigma = np.where(matched, rows.sigma, np.inf)
+    own = solve_normals(rows.rows, rows.rays, own_sigma, robust=robust)
+    facing = np.einsum("ikn,ni->kn", rows.rays, np.nan_to_num(own.normals)) < -0.05
+    sigma = np.where(matched | facing, rows.sigma, np.inf)
+    return solve_normals(rows.rows, rows.rays, sigma, robust=robust, initial_normals=own.normals.T)
+
+
+def some_tracks(tracks: Tracks, chosen: Mask) -> Tracks:
+    """The chosen ``(T,)`` tracks with their observations."""
+    index = np.cumsum(chosen) - 1
+    kept = chosen[tracks.obs_track]
+    return Tracks(
+        point3D_ids=tracks.point3D_ids[chosen],
+        points_in_world=tracks.points_in_world[chosen],
+        colors=tracks.colors[chosen],
+        errors=tracks.errors[chosen],
+        obs_track=index[tracks.obs_track[kept]],
+        obs_view=tracks.obs_view[kept],
+        obs_xy=tracks.obs_xy[kept],
+    )
+
+
+def inside_shares(
+    tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int = BORDER_MARGIN_PX
+) -> Array:
+    """Share ``(T,)`` of each track's observations that lie well inside their view's region."""
+    num_tracks = len(tracks.points_in_world)
+    inside = np.zeros(len(tracks.obs_track), bool)
+    kernel = np.ones((margin_px, margin_px), np.uint8)
+    for k, phase_map in enumerate(maps):
+        flags = phase_map.region.inside.astype(np.uint8)
+        eroded = cv2.erode(flags, kernel, borderType=cv2.BORDER_REPLICATE).astype(np.float32)
+        here = tracks.obs_view == k
+        inside[here] = sample_image(eroded, tracks.obs_xy[here], nearest=True) > 0
+    count = np.bincount(tracks.obs_track, minlength=num_tracks)
+    return np.asarray(np.bincount(tracks.obs_track, inside, num_tracks) / np.maximum(count, 1))
+
+
+def point_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
+    """Standard deviation ``(T,)`` of the points along their least certain axis, world units."""
+    information = np.zeros((len(tracks.points_in_world), 3, 3))
+    for k, view in enumerate(views):
+        seen = tracks.obs_track[tracks.obs_view == k]
+        to_point = tracks.points_in_world[seen] - view.center_in_world
+        distance = np.linalg.norm(to_point, axis=-1)
+        ray = to_point / distance[:, None]
+        precision = (view.camera.mean_focal_px / (KEYPOINT_SIGMA_PX * distance)) ** 2
+        across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+        information[seen] += precision[:, None, None] * across
+    smallest = np.maximum(np.linalg.eigvalsh(information)[:, 0], 1e-300)
+    return np.asarray(1 / np.sqrt(smallest), np.float64)
+
+
+def seen_shares(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> Array:
+    """Share ``(T,)`` of the views which a point faces that show the region at its place.
+
+    0 for points that face no view or have no normal.
+    """
+    facing, seen = np.zeros(len(points)), np.zeros(len(points))
+    for phase_map in maps:
+        camera = phase_map.view.camera
+        to_camera = phase_map.view.center_in_world - points
+        cosine = (to_camera * normals).sum(axis=-1) / np.linalg.norm(to_camera, axis=-1)
+        xy = camera.project(phase_map.view.cam_from_world * points)
+        shown = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
+        shown &= cosine > MIN_FACING_COSINE
+        facing += shown
+        seen += shown & phase_map.shows_surface(xy)
+    return np.asarray(seen / np.maximum(facing, 1))
+
+
+def dolp_shares(tracks: Tracks, maps: Sequence[PhaseMap]) -> Array:
+    """DoLP at the keypoints over that of the surface about them, the median ``(T,)`` of a track.
+
+    NaN where the surface is nowhere polarised enough to tell.
+    """
+    ratio = np.full(len(tracks.obs_track), np.nan)
+    for k, phase_map in enumerate(maps):
+        here = np.flatnonzero(tracks.obs_view == k)
+        xy = tracks.obs_xy[here]
+        lowest = sample_image(phase_map.lowest_dolp.astype(np.float32), xy, nearest=True) / 255
+        about = sample_image(phase_map.samples, xy, nearest=True)
+        surface = np.hypot(about[:, 0], about[:, 1])
+        ratio[here] = np.where(surface > CLEAR_DOLP, lowest / np.maximum(surface, 1e-6), np.nan)
+    known = np.isfinite(ratio)
+    # The median of each track: its ratios lie together once sorted by track and value.
+    order = np.lexsort((ratio[known], tracks.obs_track[known]))
+    owner, values = tracks.obs_track[known][order], ratio[known][order]
+    count = np.bincount(owner, minlength=len(tracks.points_in_world))
+    first = np.cumsum(count) - count
+    medians = np.full(len(count), np.nan)
+    has = count > 0
+    medians[has] = values[first[has] + (count[has] - 1) // 2]
+    return medians
+
+
+def select_seeds(
+    tracks: Tracks,
+    estimate: NormalEstimate,
+    maps: Sequence[PhaseMap],
+) -> tuple[Seeds, Mask]:
+    """Tracks that lie on the polarised surface and whose normal explains their phases.
+
+    A glossy surface mirrors its surroundings, and on a flat one their mirror images make tracks
+    as good as any, behind the surface. They give themselves away: seen from aside they leave the
+    region, and unlike what is printed on the surface they are polarised as it is.
+
+    Returns
+    -------
+    The seeds, and which tracks ``(T,)`` they are.
+    """
+    good = (
+        estimate.valid
+        & (inside_shares(tracks, maps) >= MIN_INSIDE_SHARE)
+        & (seen_shares(tracks.points_in_world, estimate.normals, maps) >= MIN_SEEN_SHARE)
+        & ~(dolp_shares(tracks, maps) > MAX_DOLP_SHARE)
+        & (estimate.num_rows >= 3)
+        & (estimate.sigma_deg < MAX_SEED_SIGMA_DEG)
+        & (estimate.residual < MAX_SEED_RESIDUAL)
+    )
+    sigma = point_sigmas(tracks, [m.view for m in maps])
+    return Seeds(tracks.points_in_world[good], estimate.normals[good], sigma[good]), good

@@ -1,0 +1,1 @@
+"""The jobs and their stages, the run's folder and its record."""

@@ -1,0 +1,263 @@
+"""Phase maps: what the geometry needs of one view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import View, pixel_centers, sample_image
+from polmvs.config import Light
+from polmvs.errors import DataError
+from polmvs.io.arrays import map_array, save_array
+from polmvs.polarization.angle_models import phase_sign
+from polmvs.polarization.region import Region, smooth
+from polmvs.polarization.stokes import Stokes
+from polmvs.polarization.tilted import correct_stokes, stokes_solver
+
+Floats = NDArray[np.floating]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+SHARP_SMOOTHING_PX = 0.7
+FINE_SMOOTHING_PX = 1.5
+COARSE_SMOOTHING_PX = 5.0  # bridges marks and frontal spots
+MODEL_SIGMA = 0.014  # rad; error of a phase that noise does not explain, strongly polarised light
+MIXTURE_SIGMA = 0.006  # rad x DoLP; light of the other kind mixed in turns the phase by this / DoLP
+
+
+@dataclass(frozen=True)
+class PhaseMap:
+    """Phase of one view, smoothed over the reliable pixels of its region.
+
+    Attributes
+    ----------
+    view : camera, pose and name.
+    region : where the view shows a polarised surface.
+    samples : (H, W, 3) float32: ``dolp cos 2 phase``, ``dolp sin 2 phase`` and the inverse
+        variance of the row's turn about its ray (1 / rad^2; 0: no phase here).
+    intensity : (H, W) float32, s0 in units of full scale.
+    diffuse : (H, W) bool, pixels whose light is diffuse-dominant; the others' is specular.
+    lowest_dolp : (H, W) uint8, lowest DoLP of single pixels next to each pixel, in 1/255: what
+        is printed on a surface is less polarised than it, what is mirrored in it is not.
+    folder : where the arrays are stored, if they are.
+    tilted : the samples are corrected for tilted polarizers (:func:`as_tilted`).
+    """
+
+    view: View
+    region: Region
+    samples: Image
+    intensity: Image
+    diffuse: Mask
+    lowest_dolp: NDArray[np.uint8]
+    folder: Path | None = None
+    tilted: bool = False
+
+    def shows_surface(self, xy: Floats) -> Mask:
+        """Whether the pixels at image coordinates ``(..., 2)`` belong to the region."""
+        return sample_image(self.region.inside.astype(np.float32), xy, nearest=True) > 0
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle a stored map as its place."""
+        if self.folder is not None:
+            return partial(open_phase_map, tilted=self.tilted), (self.view, self.folder)
+        arrays = (self.samples, self.intensity, self.diffuse, self.lowest_dolp)
+        return PhaseMap, (self.view, self.region, *arrays, None, self.tilted)
+
+
+def build_phase_map(
+    view: View,
+    s0: Image,
+    s1: Image,
+    s2: Image,
+    sigma: Image,
+    region: Region,
+    light: Light,
+) -> PhaseMap:
+    """Smooth the Stokes images over the reliable pixels and turn them into phase and precision.
+
+    Parameters
+    ----------
+    s0, s1, s2 : (H, W) float32, Stokes images.
+    sigma : (H, W) float32, standard deviation of s1 and of s2.
+    region : of this view.
+    light : which reflection dominates; specular light turns the phase by pi/2 from the AoLP.
+    """
+    weight = region.reliable.astype(np.float32)
+    stokes = np.dstack([s0, s1, s2, np.square(sigma)])
+    fine, fine_weight = _normalized_smoothing(stokes, weight, FINE_SMOOTHING_PX)
+    coarse, coarse_weight = _normalized_smoothing(stokes, weight, COARSE_SMOOTHING_PX)
+    use_fine = fine_weight > 0.25
+    smoothed = np.where(use_fine[..., None], fine, coarse)
+    width_px = np.where(use_fine, FINE_SMOOTHING_PX, COARSE_SMOOTHING_PX)
+    share = np.where(use_fine, fine_weight, coarse_weight)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        axial = phase_sign(light) * smoothed[..., 1:3] / smoothed[..., :1]
+        dolp = np.linalg.norm(axial, axis=-1)
+        # A Gaussian of width w averages 4 pi w^2 independent pixels.
+        noise = np.sqrt(smoothed[..., 3] / (4 * np.pi * width_px**2 * share)) / smoothed[..., 0]
+        variance = MODEL_SIGMA**2 + (MIXTURE_SIGMA**2 + (0.5 * noise) ** 2) / dolp**2
+        precision = np.where(region.inside & (share > 0.02), 1 / variance, 0)
+    samples = np.dstack([axial, precision]).astype(np.float32)
+    np.nan_to_num(samples, copy=False, nan=0.0)
+    diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
+    intensity = np.asarray(s0, np.float32)
+    sharp = PhaseMap(view, region, samples, intensity, diffuse, _lowest_dolp(stokes))
+    return _with_doubt(sharp, 1.0, _corrected(sharp))
+
+
+def _lowest_dolp(stokes: Image) -> NDArray[np.uint8]:
+    """Lowest DoLP in the 3x3 px about each pixel, in 1/255."""
+    sharp = smooth(stokes[..., :3], SHARP_SMOOTHING_PX)
+    dolp = np.hypot(sharp[..., 1], sharp[..., 2]) / np.maximum(sharp[..., 0], 1e-6)
+    quantised = (255 * np.clip(dolp, 0, 1)).astype(np.uint8)
+    lowest = cv2.erode(quantised, np.ones((3, 3), np.uint8))
+    return np.asarray(lowest, np.uint8)
+
+
+def correct_for_tilt(stokes: Stokes, rays: Floats, diffuse: Mask) -> Stokes:
+    """Stokes images that a sensor obeying PPA would have given, each pixel by its kind of light.
+
+    Parameters
+    ----------
+    stokes : (H, W) images.
+    rays : (H, W, 3), unit, camera frame.
+    diffuse : (H, W) bool, pixels whose light is diffuse-dominant.
+    """
+    solver = stokes_solver(rays)
+    corrected = correct_stokes(stokes, rays, light=Light.SPECULAR, solver=solver)
+    if not diffuse.any():
+        return corrected
+    other = correct_stokes(stokes, rays, light=Light.DIFFUSE, solver=solver)
+    return Stokes(
+        s0=np.where(diffuse, other.s0, corrected.s0),
+        s1=np.where(diffuse, other.s1, corrected.s1),
+        s2=np.where(diffuse, other.s2, corrected.s2),
+        sigma=np.where(diffuse, other.sigma, corrected.sigma),
+        valid=stokes.valid,
+    )
+
+
+def as_tilted(phase_map: PhaseMap) -> PhaseMap:
+    """The phase map that a sensor obeying PPA would have given, not stored.
+
+    Presumes that the polarizers are tilted for oblique rays (:mod:`polmvs.polarization.tilted`).
+    The
+    correction is linear in the Stokes parameters and varies slowly over the image, so that it may
+    follow the smoothing.
+    """
+    corrected = _corrected(phase_map)
+    sign = _signs(phase_map)
+    scale = sign / np.maximum(corrected.s0, 1e-6)
+    # The turn of a row about its ray stays as certain as it was; that of the phase changes.
+    certain = _with_doubt(phase_map, -1.0, corrected).samples[..., 2]
+    precision = certain / np.square(corrected.sigma)
+    samples = np.dstack([scale * corrected.s1, scale * corrected.s2, precision])
+    clean = np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+    return replace(phase_map, samples=clean, folder=None, tilted=True)
+
+
+def _signs(phase_map: PhaseMap) -> Image:
+    """Factor (H, W) from twice the AoLP to twice the phase, by each pixel's kind of light."""
+    return np.where(phase_map.diffuse, phase_sign(Light.DIFFUSE), phase_sign(Light.SPECULAR))
+
+
+def _corrected(phase_map: PhaseMap) -> Stokes:
+    """The map's samples as Stokes images of intensity one, corrected for the tilt."""
+    sign = _signs(phase_map)
+    one = np.ones(sign.shape, np.float32)
+    measured = Stokes(
+        s0=one,
+        s1=sign * phase_map.samples[..., 0],
+        s2=sign * phase_map.samples[..., 1],
+        sigma=one,
+        valid=phase_map.samples[..., 2] > 0,
+    )
+    return correct_for_tilt(measured, view_rays(phase_map.view), phase_map.diffuse)
+
+
+def _with_doubt(phase_map: PhaseMap, share: float, corrected: Stokes) -> PhaseMap:
+    """Widen (share 1) each phase's variance by what a tilt of the polarizers would turn it.
+
+    A model that leaves the tilt out does not know whether the lens makes it, so that the turn is a
+    deviation of its phase: oblique rays count less. -1 takes the widening back; from averages of
+    widened phases, whose turns differ, never more than to the least variance there is.
+    """
+    sign = _signs(phase_map)
+    cos, sin, precision = np.moveaxis(phase_map.samples, -1, 0)
+    real = sign * (cos * corrected.s1 + sin * corrected.s2)
+    imaginary = sign * (sin * corrected.s1 - cos * corrected.s2)
+    turn = 0.5 * np.arctan2(imaginary, real)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variance = np.maximum(1 / precision + share * turn**2, MODEL_SIGMA**2)
+        widened = np.where(precision > 0, 1 / variance, 0)
+    samples = np.dstack([cos, sin, widened]).astype(np.float32)
+    return replace(phase_map, samples=samples, folder=None)
+
+
+def turned(phase_map: PhaseMap, where: Mask) -> PhaseMap:
+    """The map with the other kind of light on some pixels, their phase turned; not stored."""
+    sign = np.where(where, -1, 1).astype(np.float32)
+    certain = _with_doubt(phase_map, -1.0, _corrected(phase_map))
+    certain.samples[..., :2] *= sign[..., None]
+    other = replace(certain, diffuse=phase_map.diffuse ^ where)
+    return _with_doubt(other, 1.0, _corrected(other))
+
+
+def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:
+    """Write a phase map as ``.npy`` files named after the view; returns the stored one.
+
+    A tilted map shares all files but the samples with the map that it was made from.
+    """
+    region, name = phase_map.region, phase_map.view.name
+    flags = region.inside * 1 | region.reliable * 2 | region.edges * 4 | phase_map.diffuse * 8
+    save_array(folder / _samples_name(name, phase_map.tilted), phase_map.samples)
+    save_array(folder / f"{name}.intensity.npy", phase_map.intensity)
+    save_array(folder / f"{name}.region.npy", flags.astype(np.uint8))
+    save_array(folder / f"{name}.dolp.npy", phase_map.lowest_dolp)
+    return open_phase_map(phase_map.view, folder, tilted=phase_map.tilted)
+
+
+def _samples_name(name: str, tilted: bool) -> str:
+    return f"{name}.tilted.npy" if tilted else f"{name}.samples.npy"
+
+
+def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMap:
+    """Open a stored phase map; its images stay on disk until they are read.
+
+    Raises
+    ------
+    DataError
+        If a file is missing, damaged, or of another size than the view's camera.
+    """
+    samples = map_array(folder / _samples_name(view.name, tilted))
+    intensity = map_array(folder / f"{view.name}.intensity.npy")
+    flags = map_array(folder / f"{view.name}.region.npy")
+    lowest_dolp = map_array(folder / f"{view.name}.dolp.npy")
+    size = (view.camera.height, view.camera.width)
+    shapes = (samples.shape[:2], intensity.shape, flags.shape, lowest_dolp.shape)
+    if any(shape != size for shape in shapes):
+        raise DataError(folder / view.name, "has another size than its camera; use --overwrite.")
+    region = Region((flags & 1) > 0, (flags & 2) > 0, (flags & 4) > 0)
+    diffuse = (flags & 8) > 0
+    return PhaseMap(view, region, samples, intensity, diffuse, lowest_dolp, folder, tilted)
+
+
+def _normalized_smoothing(
+    images: Image, weight: Image, sigma_px: float
+) -> tuple[NDArray[np.float32], Image]:
+    """Gaussian mean of the weighted pixels, and their share under the Gaussian."""
+    share = smooth(weight, sigma_px)
+    mean = smooth(images * weight[..., None], sigma_px) / np.maximum(share, 1e-6)[..., None]
+    return mean.astype(np.float32), share
+
+
+def view_rays(view: View) -> NDArray[np.float32]:
+    """Unit rays ``(H, W, 3)`` of all pixels, camera frame."""
+    camera = view.camera
+    return camera.rays(pixel_centers(camera.width, camera.height)).astype(np.float32)

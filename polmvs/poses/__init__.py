@@ -1,0 +1,1 @@
+"""Known poses, the metric frame, markers and triangulation."""

@@ -1,0 +1,154 @@
+"""A sparse model with known poses in the place of its own, its points triangulated anew.
+
+For rigs and robot arms whose cameras are calibrated, and to measure with true poses: the matches
+stay, only where the cameras stand and what follows from it is replaced.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import View
+from polmvs.colmap.models import SparseModel, read_model
+from polmvs.colmap.sparse_model import match_model_to_capture, write_model
+from polmvs.errors import DataError, OptionError
+from polmvs.io.ground_truth import read_views as read_known_views
+from polmvs.normals.tracks import Tracks, some_tracks
+from polmvs.poses.metric_frame import match_names
+from polmvs.poses.triangulation import intersect_rays
+
+Array = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+MAX_ERROR_PX = 2.0  # mean of a track: several times a keypoint's noise, less than a wrong match
+
+
+def write_known_poses(sparse: Path, cameras: Path, new: Path) -> SparseModel:
+    """Write a COLMAP model with known poses and triangulated points.
+
+    Parameters
+    ----------
+    sparse : COLMAP model whose matches are used; it is not modified.
+    cameras : ``cameras.json`` with ``width``, ``height`` and, for each image, ``K`` and
+        ``cam_from_world`` (3x4), as in a folder of ground truth.
+    new : folder of the new model, in the frame and unit of ``cameras``.
+
+    Raises
+    ------
+    DataError
+        A file is at fault, fewer than two images are known, or no track fits the poses.
+    OptionError
+        ``new`` exists.
+    """
+    if new.exists():
+        raise OptionError(f"{new}: exists. Give another NEW_MODEL.")
+    known = read_known_views(cameras)
+    model = with_known_poses(read_model(sparse), known, source=cameras)
+    write_model(model, new)
+    return model
+
+
+def with_known_poses(
+    model: SparseModel, known: Mapping[str, View], *, source: str | Path = "known poses"
+) -> SparseModel:
+    """Put known views in the place of a model's and triangulate its tracks anew.
+
+    Parameters
+    ----------
+    model : of the same images; its cameras may have another size of the same aspect ratio.
+    known : views by image name, all of one size; names match exactly, else by stem.
+    source : where they came from, for messages.
+
+    Returns
+    -------
+    SparseModel
+        In the frame and unit of the known poses, with their names; images that are not known
+        and tracks that do not fit (:func:`retriangulate`) are left out.
+
+    Raises
+    ------
+    DataError
+        Fewer than two images are known, or no track fits the poses.
+    """
+    names = [view.name for view in model.views]
+    num_known = len(match_names(list(known), names))
+    if num_known < 2:
+        raise DataError(
+            source,
+            f"knows {num_known} of the {len(names)} images of the model, 2 are needed; its names "
+            f"are like {next(iter(known), '')!r}, the model's like {names[0]!r}.",
+        )
+    camera = next(iter(known.values())).camera
+    fitted = match_model_to_capture(model, list(known), camera.width, camera.height, source=source)
+    views = tuple(known[view.name] for view in fitted.views)
+    tracks = retriangulate(views, fitted.tracks)
+    num_tracks, num_before = len(tracks.point3D_ids), len(model.tracks.point3D_ids)
+    if num_tracks == 0:
+        raise DataError(
+            source,
+            f"none of the model's {num_before} tracks fits its poses; cam_from_world takes points "
+            "of the world to the camera (x right, y down, z forward), K is of the given size.",
+        )
+    logger.info("%d of %d tracks fit the known poses.", num_tracks, num_before)
+    return replace(fitted, views=views, tracks=tracks)
+
+
+def retriangulate(
+    views: Sequence[View], tracks: Tracks, *, max_error_px: float = MAX_ERROR_PX
+) -> Tracks:
+    """Triangulate tracks from their observations, all tracks at once.
+
+    Parameters
+    ----------
+    views : that ``tracks.obs_view`` counts in.
+    tracks : whose points and errors do not matter.
+    max_error_px : mean reprojection error above which a track is dropped.
+
+    Returns
+    -------
+    Tracks
+        With new points and errors. Those seen once, from one place or under parallel rays, with
+        too large an error or behind a camera that observes them are dropped.
+    """
+    points = _intersect(views, tracks)
+    errors = _mean_errors(views, points, tracks)
+    good = errors <= max_error_px  # not where NaN
+    return some_tracks(replace(tracks, points_in_world=points, errors=errors), good)
+
+
+def _intersect(views: Sequence[View], tracks: Tracks) -> Array:
+    """Points ``(T, 3)`` nearest to the rays of each track; NaN where these do not tell."""
+    centers, rays = np.zeros((2, len(tracks.obs_view), 3))
+    for k, view in enumerate(views):
+        own = tracks.obs_view == k
+        centers[own] = view.center_in_world
+        rays[own] = view.camera.rays(tracks.obs_xy[own]) @ view.cam_from_world.rotation
+    points = np.full((len(tracks.point3D_ids), 3), np.nan)
+    # Tracks of equally many observations make a batch; their rays lie together once sorted.
+    order = np.argsort(tracks.obs_track, kind="stable")
+    count = np.bincount(tracks.obs_track, minlength=len(points))
+    first = np.cumsum(count) - count
+    for num in np.unique(count[count >= 2]):
+        batch = np.flatnonzero(count == num)
+        obs = order[first[batch][:, None] + np.arange(num)]
+        points[batch] = intersect_rays(centers[obs], rays[obs])
+    return points
+
+
+def _mean_errors(views: Sequence[View], points: Array, tracks: Tracks) -> Array:
+    """Mean reprojection error ``(T,)``, px; NaN where a view does not see the point."""
+    errors = np.zeros(len(tracks.obs_view))
+    for k, view in enumerate(views):
+        own = tracks.obs_view == k
+        xy = view.camera.project(view.cam_from_world * points[tracks.obs_track[own]])
+        errors[own] = np.linalg.norm(xy - tracks.obs_xy[own], axis=1)
+    count = np.bincount(tracks.obs_track, minlength=len(points))
+    total = np.bincount(tracks.obs_track, errors, len(points))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

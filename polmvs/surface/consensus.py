@@ -1,0 +1,176 @@
+"""What one view's dense result says about points of another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import View, sample_image
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.surface.dense_view import DenseView, SurfaceSamples, extend_planes, view_samples
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+MIN_HIDING_COSINE = 0.1  # between a normal and the direction to the camera
+HIDING_DISTANCE = 0.02  # relative, as in gathering rows
+
+
+@dataclass(frozen=True)
+class Opinion:
+    """What another view says of N points of a view.
+
+    Attributes
+    ----------
+    place : (N,) distance along the first view's rays at which the other's surface is met; NaN:
+        none.
+    sigma : (N,) its standard deviation.
+    normals : (N, 3) its normal there, zero where it has none.
+    cosine : (N,) between that normal and the point's own.
+    excess : (N,) how much farther than the point its surface lies, along its own ray; NaN: it has
+        none there.
+    facing : (N,) cosine between the point's normal and the direction to the other camera.
+    outside : (N,) it shows the point's place and no polarised surface there.
+    """
+
+    place: Array
+    sigma: Array
+    normals: Array
+    cosine: Array
+    excess: Array
+    facing: Array
+    outside: Mask
+
+
+def ask_view(
+    phase_map: PhaseMap,
+    dense: DenseView,
+    center: Floats,
+    rays: Floats,
+    distance: Floats,
+    normals: Floats,
+) -> Opinion:
+    """Look a view's points up in another dense view.
+
+    Parameters
+    ----------
+    phase_map, dense : of the other view.
+    center, rays, distance, normals : of the first view's points: camera centre (3,), unit rays
+        (N, 3), distances (N,) and unit normals (N, 3), world frame.
+    """
+    view = phase_map.view
+    points = center + distance[:, None] * rays
+    in_cam = view.cam_from_world * points
+    own_range = np.linalg.norm(in_cam, axis=-1)
+    xy = view.camera.project(in_cam)
+    lattice_xy = xy / dense.stride_px
+    seen = sample_image(dense.range_map, lattice_xy, nearest=True).astype(np.float64)
+    seen_normals = sample_image(dense.normals_in_world, lattice_xy, nearest=True)
+    seen_normals = np.where(seen[:, None] > 0, seen_normals.astype(np.float64), np.nan)
+    other_center = view.center_in_world
+    # The other's surface element at the nearest lattice point, and the chord from there to the
+    # point: perpendicular to the mean of both normals, exactly so on planes and spheres. The
+    # element's own plane would lie outside of every convex surface.
+    nearest_xy = (np.floor(np.nan_to_num(lattice_xy)) + 0.5) * dense.stride_px
+    other_rays = view.camera.rays(nearest_xy) @ view.cam_from_world.rotation
+    elements = other_center + seen[:, None] * other_rays
+    slant = (rays * seen_normals).sum(-1)
+    mean = seen_normals + normals
+    with np.errstate(divide="ignore", invalid="ignore"):
+        place = ((elements - center) * mean).sum(-1) / (rays * mean).sum(-1)
+        # An error along the other's ray moves the surface along its normal, by less where it looks
+        # at a grazing angle; but there its rows come from farther off, so that it is not trusted
+        # more.
+        seen_sigma = sample_image(dense.sigma, lattice_xy, nearest=True)
+        sigma = seen_sigma / np.abs(slant)
+        to_camera = other_center - points
+        facing = (to_camera * normals).sum(-1) / own_range
+    excess = np.where(seen > 0, seen - own_range, np.nan)
+    cosine = (seen_normals * normals).sum(axis=-1)
+    outside = _shows_background(phase_map, xy)
+    return Opinion(place, sigma, np.nan_to_num(seen_normals), cosine, excess, facing, outside)
+
+
+def surface_of_others(
+    maps: Sequence[PhaseMap],
+    dense: Sequence[DenseView | None],
+    xy: Floats,
+    max_gap_strides: float,
+) -> SurfaceSamples | None:
+    """A first guess of the surface at pixels of the first view: what the other views show there.
+
+    Parameters
+    ----------
+    maps, dense : of the views, the first one's own first.
+    xy : (N, 2), where the surface is wanted.
+    max_gap_strides : from the others' points to the pixels, in strides of their lattices.
+
+    Returns
+    -------
+    None where they show nothing in the view's region.
+    """
+    view, center = maps[0].view, maps[0].view.center_in_world
+    known = [(m.view, d) for m, d in zip(maps[1:], dense[1:], strict=True) if d is not None]
+    if not known or not len(xy):
+        return None
+    parts, normals = [], []
+    for other, result in known:
+        rotation = other.cam_from_world.rotation
+        samples = view_samples(result, other.camera.rays(result.lattice_xy()) @ rotation)
+        parts.append(
+            other.center_in_world + np.exp(samples.log_range)[:, None] * samples.rays_in_world
+        )
+        normals.append(samples.normals)
+    points = np.concatenate(parts)
+    distance = np.linalg.norm(points - center, axis=-1)
+    unknown = np.full(len(points), np.nan)
+    shown = SurfaceSamples(
+        xy=np.asarray(view.camera.project(view.cam_from_world * points), np.float64),
+        rays_in_world=(points - center) / distance[:, None],
+        log_range=np.log(distance),
+        normals=np.concatenate(normals),
+        normal_sigma=unknown,
+        log_range_sigma=unknown,
+        confidence=np.zeros(len(points)),
+    )
+    facing = (shown.rays_in_world * shown.normals).sum(axis=-1) < 0
+    shown = shown[facing & maps[0].shows_surface(shown.xy)]
+    if not len(shown.xy):
+        return None
+    stride_px = max(result.stride_px for _, result in known)
+    rays = view.camera.rays(xy) @ view.cam_from_world.rotation
+    return extend_planes(shown, xy, rays, max_gap_strides * stride_px)
+
+
+def hidden_by(dense: DenseView, view: View, points: Floats, normals: Floats) -> Mask:
+    """Which lattice points (h, w) of a view lie behind a surface that faces it.
+
+    Views may agree on a surface that this one cannot see, and its phase need not deny it.
+
+    Parameters
+    ----------
+    dense, view : of the view.
+    points, normals : (N, 3), world, of the surfaces of all views.
+    """
+    to_point = points - view.center_in_world
+    distance = np.linalg.norm(to_point, axis=-1)
+    facing = (to_point * normals).sum(axis=-1) < -MIN_HIDING_COSINE * distance
+    xy = view.camera.project(view.cam_from_world * points) / dense.stride_px
+    height, width = dense.range_map.shape
+    with np.errstate(invalid="ignore"):
+        shown = facing & ((xy >= 0) & (xy < [width, height])).all(axis=-1)
+    cols, rows = np.floor(xy[shown]).astype(np.intp).T
+    nearest = np.full((height, width), np.inf)
+    np.minimum.at(nearest, (rows, cols), distance[shown])
+    return np.asarray(dense.range_map > (1 + HIDING_DISTANCE) * nearest)
+
+
+def _shows_background(phase_map: PhaseMap, xy: Floats) -> Mask:
+    """Which places lie in the image but outside its region."""
+    camera = phase_map.view.camera
+    in_image = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
+    return np.asarray(in_image & ~phase_map.shows_surface(xy))

@@ -1,0 +1,226 @@
+"""Fusion: the points on which views agree, each placed by all views that see it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from polmvs.camera import sample_image
+from polmvs.config import FusionOptions
+from polmvs.parallel import Workers
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.surface.consensus import ask_view
+from polmvs.surface.dense_view import DenseView
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+MAX_CONFLICT_SHARE = 0.5  # of the views that could see a point and see something else there
+SIGMAS = 3.0  # by how many deviations of both two views may differ
+MIN_TOLERANCE = 0.5  # share of the tolerance that is left to views however certain they are
+MIN_SIGMA_PX = 0.02  # of a range, in footprints: no view is trusted more than that
+MIN_VISIBLE_COSINE = 0.1  # between normal and viewing direction, for a view to have a say
+OUTLIER_NEIGHBORS = 8
+OUTLIER_SPACINGS = 4.0  # a point this many spacings from its neighbours is alone
+
+
+@dataclass(frozen=True)
+class FusedCloud:
+    """Points of the surface in the world.
+
+    Attributes
+    ----------
+    points, normals : (N, 3) float64, world frame; normals are unit and face the cameras.
+    intensity : (N,) float32, s0 in units of full scale.
+    num_views : (N,) int32, views that agree on the point.
+    sigma_deg : (N,) float32, standard deviation of the normal.
+    sigma : (N,) float32, standard deviation of the place along the normal, world units. Views
+        err alike, so that their number does not narrow it.
+    """
+
+    points: Array
+    normals: Array
+    intensity: NDArray[np.float32]
+    num_views: NDArray[np.int32]
+    sigma_deg: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> FusedCloud:
+        """Some of the points."""
+        return FusedCloud(*(getattr(self, name)[index] for name in COLUMNS))
+
+
+COLUMNS = tuple(column.name for column in fields(FusedCloud))
+
+
+def fuse(
+    maps: Sequence[PhaseMap],
+    dense: Sequence[DenseView | None],
+    options: FusionOptions,
+    *,
+    max_neighbors: int = 15,
+    workers: Workers | None = None,
+    on_progress: Callable[[int], None] | None = None,
+    on_confirmed: Callable[[int, Mask], None] | None = None,
+) -> FusedCloud:
+    """Fuse the dense views into one cloud.
+
+    A point stays if enough views agree with it in distance and normal and if not most of the
+    views that should see it see through it or show no polarised surface there. Distances may
+    differ by what their deviations explain, at most by as many footprints as the options say and
+    never by less than half of it. The point moves along its ray to the mean of the places that the
+    agreeing views give it, weighted by their deviations. Points closer than the merging voxel
+    become one; lone points go.
+
+    Parameters
+    ----------
+    maps : phase maps of the views.
+    dense : per view its dense result.
+    options : thresholds, in footprints of a pixel.
+    max_neighbors : other views that are asked about a view's points, nearest first.
+    workers : processes to share the views among; None: this one.
+    on_progress : called with the number of views done.
+    on_confirmed : called with the index of each view that has a result and with the points
+        (h, w) of its lattice on which the others agree.
+    """
+    workers = workers or Workers(1)
+    used = [k for k, d in enumerate(dense) if d is not None]
+    centers = np.array([maps[k].view.center_in_world for k in used]).reshape(-1, 3)
+    tasks = []
+    for i, k in enumerate(used):
+        order = np.argsort(((centers - centers[i]) ** 2).sum(axis=-1), kind="stable")
+        near = [used[j] for j in order if j != i][:max_neighbors]
+        tasks.append([(maps[j], dense[j]) for j in [k, *near]])
+    clouds, footprints = [], []
+    for k, part in zip(used, workers.map(partial(_confirm, options), tasks), strict=True):
+        clouds.append(part.cloud)
+        footprints.append(part.footprint)
+        if on_confirmed is not None:
+            on_confirmed(k, part.confirmed)
+        if on_progress is not None:
+            on_progress(1)
+    cloud = concatenate(clouds)
+    if not len(cloud.points):
+        return cloud
+    footprint = float(np.median(np.concatenate(footprints)))
+    voxel = options.voxel if options.voxel is not None else options.voxel_px * footprint
+    return _without_lone_points(merge(cloud, voxel))
+
+
+@dataclass(frozen=True)
+class _Confirmed:
+    """Confirmed points of a view, their pixels' footprints, and where (h, w) they lie in it."""
+
+    cloud: FusedCloud
+    footprint: NDArray[np.float32]
+    confirmed: Mask
+
+
+def _confirm(options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]) -> _Confirmed:
+    """Points of the first view that enough of the others confirm."""
+    phase_map, dense = views[0]
+    view = phase_map.view
+    known = dense.known & (dense.confidence > 0)
+    xy = dense.lattice_xy()[known]
+    distance = dense.range_map[known].astype(np.float64)
+    normals = dense.normals_in_world[known].astype(np.float64)
+    rays = view.camera.rays(xy) @ view.cam_from_world.rotation
+    center = view.center_in_world
+    footprint = distance / view.camera.mean_focal_px
+    # As the others' deviations: grazing sight counts less.
+    cosine = np.maximum(np.abs((rays * normals).sum(axis=-1)), MIN_VISIBLE_COSINE)
+    sigma = _finite_sigma(dense.sigma[known] / cosine, footprint)
+    tolerance = options.max_range_difference_px * footprint
+    total = 1 / sigma**2
+    place, normal = total * distance, total[:, None] * normals
+    votes, conflicts = np.ones(len(distance), np.int32), np.zeros(len(distance), np.int32)
+    min_cosine = np.cos(np.radians(options.max_normal_difference_deg))
+    for other_map, other in views[1:]:
+        opinion = ask_view(other_map, other, center, rays, distance, normals)
+        other_sigma = _finite_sigma(opinion.sigma, footprint)
+        explained = SIGMAS * np.hypot(sigma, other_sigma)
+        allowed = np.clip(explained, MIN_TOLERANCE * tolerance, tolerance)
+        agrees = (np.abs(opinion.place - distance) < allowed) & (opinion.cosine > min_cosine)
+        votes += agrees
+        behind = opinion.excess > 2 * allowed
+        conflicts += (behind | opinion.outside) & (opinion.facing > MIN_VISIBLE_COSINE)
+        weight = np.where(agrees, 1 / other_sigma**2, 0)
+        total += weight
+        place += weight * np.where(agrees, opinion.place, 0)
+        normal += weight[:, None] * opinion.normals
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    keep = (votes >= options.min_views) & (conflicts <= MAX_CONFLICT_SHARE * (votes + conflicts))
+    cloud = FusedCloud(
+        points=center + (place / total)[:, None] * rays,
+        normals=normal,
+        intensity=sample_image(phase_map.intensity, xy),
+        num_views=votes,
+        sigma_deg=dense.sigma_deg[known],
+        sigma=np.sqrt(votes / total) * np.abs((rays * normal).sum(axis=-1)),
+    )
+    confirmed = known.copy()
+    confirmed[known] = keep
+    return _Confirmed(cloud[keep], footprint[keep].astype(np.float32), confirmed)
+
+
+def _finite_sigma(sigma: Floats, footprint: Array) -> Array:
+    """Deviations of ranges, no smaller than a share of the footprint; large where unknown."""
+    known = np.isfinite(sigma)
+    return np.where(known, np.maximum(sigma, MIN_SIGMA_PX * footprint), footprint)
+
+
+def concatenate(clouds: Sequence[FusedCloud]) -> FusedCloud:
+    """All points of some clouds."""
+    parts = [no_points(), *clouds]
+    return FusedCloud(*(np.concatenate([getattr(c, name) for c in parts]) for name in COLUMNS))
+
+
+def no_points() -> FusedCloud:
+    """A cloud without points."""
+    vectors, numbers = np.zeros((0, 3)), np.zeros(0, np.float32)
+    return FusedCloud(vectors, vectors, numbers, np.zeros(0, np.int32), numbers, numbers)
+
+
+def merge(cloud: FusedCloud, voxel: float) -> FusedCloud:
+    """One point per voxel (world units; 0: no merging): means weighted by views and certainty."""
+    if voxel <= 0 or not len(cloud.points):
+        return cloud
+    cells = np.floor((cloud.points - cloud.points.min(axis=0)) / voxel).astype(np.int64)
+    extent = cells.max(axis=0) + 1
+    key = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+    unique, inverse = np.unique(key, return_inverse=True)
+    num = len(unique)
+    weight = cloud.num_views / np.maximum(cloud.sigma.astype(np.float64), 1e-3 * voxel) ** 2
+    total = np.bincount(inverse, weight, num)
+
+    def mean(values: Floats) -> Array:
+        return np.bincount(inverse, weight * values, num) / total
+
+    points = np.stack([mean(cloud.points[:, i]) for i in range(3)], axis=-1)
+    normals = np.stack([mean(cloud.normals[:, i]) for i in range(3)], axis=-1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    views = np.zeros(num, np.int32)
+    np.maximum.at(views, inverse, cloud.num_views)
+    return FusedCloud(
+        points=points,
+        normals=normals,
+        intensity=mean(cloud.intensity).astype(np.float32),
+        num_views=views,
+        sigma_deg=mean(cloud.sigma_deg).astype(np.float32),
+        sigma=mean(cloud.sigma).astype(np.float32),
+    )
+
+
+def _without_lone_points(cloud: FusedCloud) -> FusedCloud:
+    """Remove points far from their neighbours, by the spacing that is usual in the cloud."""
+    k = min(OUTLIER_NEIGHBORS + 1, len(cloud.points))
+    if k < 2:
+        return cloud
+    gaps = cKDTree(cloud.points).query(cloud.points, k=k, workers=-1)[0][:, -1]
+    return cloud[gaps <= OUTLIER_SPACINGS * np.median(gaps)]

@@ -1,0 +1,1 @@
+"""Parts without seeds, placed by their outlines."""

@@ -1,0 +1,216 @@
+"""The network of a view's nodes: the edges between them, and what ties them to known places."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from polmvs.camera import sample_image
+from polmvs.config import Model
+from polmvs.normals.estimator import NormalEstimate
+from polmvs.normals.tracks import Seeds
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.surface.contour import Contours
+from polmvs.surface.dense_view import SurfaceSamples
+from polmvs.surface.log_range import Edges, SeedTies, log_range_increment, slope_sigma
+
+Floats = NDArray[np.floating]
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Image = NDArray[np.float32]
+
+# Systematic error of multi-view normals, rad, between nodes REFERENCE_SPACING_PX apart. Errors of
+# edges count as independent: that of denser ones must be larger to add up to the same.
+NORMAL_SIGMA_FLOOR = 0.012
+REFERENCE_SPACING_PX = 6.0
+MAX_SEED_DISTANCE_PX = 12.0  # from a seed to the nodes it is tied to
+NUM_TIES = 4
+MIN_SEED_COSINE = 0.995  # 5.7 deg between the normals of a seed and of a node it is tied to
+MIN_CREASE_ANGLE = 0.03  # rad, between neighbouring normals
+# A crease turns the normal this much more than noise or local curvature does. On a cylinder half
+# of a lattice's edges turn: their local mean is a quarter of a turn, which must pass.
+CREASE_FACTOR = 5.0
+NUM_NEIGHBORS = 6
+FILLED_SIGMA = 0.1  # rad, of a normal taken from the neighbours
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Nodes of one view, on contours or on a lattice, and what is known about them.
+
+    Attributes
+    ----------
+    surface : the nodes with what is known of the surface there; NaN where unknown.
+    ray_z : (N,), z component of the nodes' rays in the camera frame.
+    spacing_px : distance between neighbouring nodes.
+    tail, head : (E,) indices of the nodes that an edge joins.
+    on_contour : (E,) bool, edges between consecutive nodes of a contour.
+    """
+
+    surface: SurfaceSamples
+    ray_z: Floats
+    spacing_px: float
+    tail: Indices
+    head: Indices
+    on_contour: NDArray[np.bool_]
+
+
+def visible_seeds(phase_map: PhaseMap, seeds: Seeds) -> tuple[NDArray[np.bool_], Array]:
+    """Which seeds project into the view's region facing it, and where."""
+    in_cam = phase_map.view.cam_from_world * seeds.points_in_world
+    xy = phase_map.view.camera.project(in_cam)
+    to_point = seeds.points_in_world - phase_map.view.center_in_world
+    facing = (to_point * seeds.normals_in_world).sum(-1) < -0.1 * np.linalg.norm(to_point, axis=-1)
+    known = np.isfinite(seeds.normals_in_world).all(axis=-1)
+    return phase_map.shows_surface(xy) & (facing | ~known), np.asarray(xy, np.float64)
+
+
+def connect(
+    contours: Contours, phase_map: PhaseMap, spacing_px: float
+) -> tuple[Indices, Indices, NDArray[np.bool_]]:
+    """Edges between consecutive nodes of a curve and between neighbouring nodes of all curves."""
+    xy = contours.xy
+    num = len(xy)
+    follows = contours.curve[1:] == contours.curve[:-1]
+    along = np.stack([np.flatnonzero(follows), np.flatnonzero(follows) + 1], axis=1)
+    k = min(NUM_NEIGHBORS + 1, num)
+    distance, index = cKDTree(xy).query(xy, k=k, distance_upper_bound=2.2 * spacing_px)
+    tails = np.repeat(np.arange(num), k)
+    heads, near = index.reshape(-1), distance.reshape(-1)
+    cross = (heads < num) & (heads != tails) & (near > 0)
+    pairs = np.unique(np.sort(np.stack([tails[cross], heads[cross]], axis=1), axis=1), axis=0)
+    is_along = np.isin(pairs[:, 0] * num + pairs[:, 1], along[:, 0] * num + along[:, 1])
+    pairs = np.concatenate([along, pairs[~is_along]])
+    on_contour = np.arange(len(pairs)) < len(along)
+    clear = uncrossed(phase_map, xy[pairs[:, 0]], xy[pairs[:, 1]])
+    return pairs[clear, 0], pairs[clear, 1], on_contour[clear]
+
+
+def uncrossed(phase_map: PhaseMap, start_xy: Floats, end_xy: Floats) -> NDArray[np.bool_]:
+    """Which lines between pixels cross no crease and stay in the region."""
+    open_pixels = (phase_map.region.inside & ~phase_map.region.edges).astype(np.float32)
+    clear = np.ones(len(start_xy), bool)
+    for share in (0.25, 0.5, 0.75):
+        between = (1 - share) * start_xy + share * end_xy
+        clear &= sample_image(open_pixels, between, nearest=True) > 0
+    return clear
+
+
+def bending_modes(xy: Image) -> Array:
+    """Polynomials of the nodes' place up to the second degree, of order one over the region.
+
+    The errors of multi-view normals that a camera model leaves are smooth over a view: they tilt
+    and bend the surface as a whole, which the seeds can tell.
+    """
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    x, y = (2 * (xy - low) / np.maximum(high - low, 1e-9) - 1).T.astype(np.float64)
+    legendre = [[np.ones_like(t), t, 1.5 * t**2 - 0.5] for t in (x, y)]
+    degrees = [(i, j) for i in range(3) for j in range(3) if 1 <= i + j <= 2]
+    return np.stack([legendre[0][i] * legendre[1][j] for i, j in degrees], axis=-1)
+
+
+def fill_normals(nodes: Nodes, estimate: NormalEstimate) -> tuple[Array, Array]:
+    """Normals with the gaps filled from neighbours, which widens their deviation."""
+    sigma = np.radians(estimate.sigma_deg)
+    good = estimate.valid & (estimate.num_rows >= 3) & (estimate.sigma_deg < 5)
+    if not good.any():
+        return estimate.normals, sigma
+    xy, normals = nodes.surface.xy, estimate.normals.copy()
+    k = min(8, int(good.sum()))
+    index = cKDTree(xy[good]).query(xy[~good], k=k)[1].reshape(-1, k)
+    mean = normals[good][index].mean(axis=1)
+    normals[~good] = mean / np.linalg.norm(mean, axis=-1, keepdims=True)
+    sigma[~good] = FILLED_SIGMA
+    return normals, sigma
+
+
+def node_edges(model: Model, nodes: Nodes, own_sigma: Floats, *, along_contours: bool) -> Edges:
+    """Increments from the nodes' normals on all edges, and the constancy along the contours.
+
+    Parameters
+    ----------
+    model : decides what is constant on a contour.
+    nodes : with normals.
+    own_sigma : (N,), deviation of the turn of the view's own row about its ray, rad.
+    along_contours : use that constancy.
+    """
+    surface = nodes.surface
+    floor = NORMAL_SIGMA_FLOOR * np.sqrt(REFERENCE_SPACING_PX / nodes.spacing_px)
+    sigma = np.hypot(surface.normal_sigma, floor)
+    joined = _smooth_edges(nodes, surface.normals, sigma)
+    tail, head = nodes.tail[joined], nodes.head[joined]
+    rays = surface.rays_in_world.astype(np.float64)
+    mean = surface.normals[tail] + surface.normals[head]
+    mean /= np.linalg.norm(mean, axis=-1, keepdims=True)
+    angle = np.linalg.norm(rays[head] - rays[tail], axis=-1)
+    slope = slope_sigma(mean, rays[tail], 0.5 * (sigma[tail] + sigma[head]))
+    delta = log_range_increment(mean, rays[tail], rays[head])
+    edge_sigma = np.maximum(angle * slope, 1e-7)
+    finite = np.isfinite(delta) & np.isfinite(edge_sigma)
+    edges = Edges(
+        tail=tail[finite], head=head[finite], delta=delta[finite], sigma=edge_sigma[finite]
+    )
+    if not along_contours:
+        return edges
+    # Constant range (PPA) or depth (OPA); its slope errs by the turn of the row about the ray.
+    constant = np.log(nodes.ray_z[tail] / nodes.ray_z[head]) if model is Model.OPA else 0.0 * angle
+    turn = 0.5 * (own_sigma[tail] + own_sigma[head])
+    cosine = np.abs((mean * rays[tail]).sum(axis=-1))
+    constant_sigma = (
+        angle * turn * np.sqrt(1 - np.minimum(cosine, 1) ** 2) / np.maximum(cosine, 0.05)
+    )
+    use = nodes.on_contour[joined] & finite & np.isfinite(constant_sigma)
+    return Edges(
+        tail=np.concatenate([edges.tail, tail[use]]),
+        head=np.concatenate([edges.head, head[use]]),
+        delta=np.concatenate([edges.delta, constant[use]]),
+        sigma=np.concatenate([edges.sigma, np.maximum(constant_sigma[use], 1e-7)]),
+    )
+
+
+def _smooth_edges(nodes: Nodes, normals: Array, sigma: Array) -> NDArray[np.bool_]:
+    """Edges without a crease: normals differ no more than noise and the curvature about them."""
+    tail, head = nodes.tail, nodes.head
+    turn = np.arccos(np.clip((normals[tail] * normals[head]).sum(axis=-1), -1, 1))
+    num = len(normals)
+    degree = np.maximum(np.bincount(tail, minlength=num) + np.bincount(head, minlength=num), 1)
+    # Root turn averaged over a node's edges: a crease crosses few of them, curvature all.
+    root = np.sqrt(turn)
+    local = ((np.bincount(tail, root, num) + np.bincount(head, root, num)) / degree) ** 2
+    noise = np.hypot(sigma[tail], sigma[head])
+    expected = np.minimum(local[tail], local[head])
+    limit = np.maximum(MIN_CREASE_ANGLE, CREASE_FACTOR * np.maximum(noise, expected))
+    return np.asarray(~(turn > limit))
+
+
+def tie_seeds(phase_map: PhaseMap, nodes: Nodes, seeds: Seeds) -> SeedTies:
+    """Tie every visible seed to the nearest nodes along the chords to them."""
+    surface = nodes.surface
+    visible, seed_xy = visible_seeds(phase_map, seeds)
+    to_seed = seeds.points_in_world - phase_map.view.center_in_world
+    distance = np.linalg.norm(to_seed, axis=-1)
+    k = min(NUM_TIES, len(surface.xy))
+    gap, node = cKDTree(surface.xy).query(np.where(visible[:, None], seed_xy, -1e6), k=k)
+    gap, node = gap.reshape(-1, k), node.reshape(-1, k)
+    seed = np.repeat(np.arange(len(distance)), k)
+    node, gap = node.reshape(-1), gap.reshape(-1)
+    rays = (to_seed / distance[:, None])[seed]
+    with np.errstate(invalid="ignore"):
+        node_rays = surface.rays_in_world[node].astype(np.float64)
+        seed_normals, node_normals = seeds.normals_in_world[seed], surface.normals[node]
+        known = np.isfinite(seed_normals).all(axis=-1, keepdims=True)
+        chord = node_normals + np.where(known, seed_normals, node_normals)
+        step = log_range_increment(chord, rays, node_rays)
+        # A seed of another surface, hidden behind this one, has another normal.
+        alike = ~((seed_normals * node_normals).sum(axis=-1) < MIN_SEED_COSINE)
+    ok = visible[seed] & alike & (gap < MAX_SEED_DISTANCE_PX) & np.isfinite(step)
+    seed, node, gap, step = seed[ok], node[ok], gap[ok], step[ok]
+    footprint = 1 / phase_map.view.camera.mean_focal_px
+    sigma = np.sqrt(
+        k * (seeds.sigma[seed] / distance[seed]) ** 2 + (0.02 * (1 + gap) * footprint) ** 2
+    )
+    value = np.log(distance[seed]) + step
+    return SeedTies(node=node, seed=seed, value=value, sigma=sigma, common=np.zeros(len(node)))

@@ -1,0 +1,1 @@
+"""Analytic captures: exact phase, depth, normals and noise."""

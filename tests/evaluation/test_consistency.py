@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import Scene, board_scene
+
+from polmvs.config import Model
+from polmvs.evaluation.consistency import Consistency, measure_consistency
+from polmvs.io.clouds import Cloud
+from polmvs.surface.surroundings import Kind
+
+NO_TRACKS = Cloud(np.zeros((0, 3)))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return board_scene(4)
+
+
+def surface_of(scene: Scene) -> Cloud:
+    points, normals = scene.surface_points(2000)
+    return Cloud(points, normals, scalars={"num_views": np.full(2000, 4.0)})
+
+
+def with_surroundings(surface: Cloud, kind: Kind) -> Cloud:
+    """The surface and as many points of the surroundings, which hover before it."""
+    num = len(surface.points)
+    hovering = surface.points + np.array([0.0, 0.0, 0.02])
+    normals = np.zeros((num, 3)) if kind is Kind.SPARSE else surface.normals
+    return Cloud(
+        points=np.concatenate([hovering, surface.points]),
+        normals=np.concatenate([normals, surface.normals]),
+        scalars={
+            "num_views": np.concatenate([np.zeros(num), surface.scalars["num_views"]]),
+            "kind": np.repeat(np.array([kind, Kind.SURFACE], np.float32), num),
+        },
+    )
+
+
+def measure(scene: Scene, cloud: Cloud) -> Consistency:
+    return measure_consistency(Model.PPA, cloud, NO_TRACKS, scene.maps)
+
+
+@pytest.mark.parametrize("kind", [Kind.SPARSE, Kind.STEREO])
+def test_only_the_polarised_surface_counts(scene: Scene, kind: Kind) -> None:
+    surface = surface_of(scene)
+    alone = measure(scene, surface)
+    assert alone.num_points == 2000
+    assert alone.agreement > 0.9
+    assert alone.phase_residual.median_deg < 0.1
+    cloud = with_surroundings(surface, kind)
+    assert str(measure(scene, cloud)) == str(alone)  # NaN is not equal to itself
+    unknown = Cloud(cloud.points, cloud.normals, scalars={"num_views": cloud.scalars["num_views"]})
+    assert measure(scene, unknown).num_points == 4000
+
+
+def test_surroundings_alone_are_no_points(scene: Scene) -> None:
+    surface = surface_of(scene)
+    cloud = Cloud(
+        surface.points, surface.normals, scalars={"kind": np.full(2000, Kind.SPARSE, np.float32)}
+    )
+    found = measure(scene, cloud)
+    assert found.num_points == 0
+    assert found.coverage == 0
+    assert np.isnan(found.agreement)

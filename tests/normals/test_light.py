@@ -1,0 +1,162 @@
+"""The quarter turn between specular and diffuse light, and maps corrected for tilted polarizers."""
+
+import numpy as np
+import pytest
+from scenes import CAMERA, Scene, board_scene, phase_map_of, tracks_at
+
+from polmvs.config import Light, Model, NormalOptions
+from polmvs.evaluation.comparison import Consistency, best_fitting_model
+from polmvs.evaluation.metrics import AngleStats
+from polmvs.normals.light import find_diffuse
+from polmvs.normals.rows import gather_rows
+from polmvs.normals.tracks import track_normals
+from polmvs.polarization.phase_map import as_tilted, open_phase_map, store_phase_map, turned
+from polmvs.synthetic.captures import Plane, Sphere, render_view, ring_of_views
+
+
+@pytest.fixture(scope="module")
+def board():
+    return board_scene(6)
+
+
+def dome_scene(light: str) -> Scene:
+    """A ball, whose light is polarised all round its rim under either kind of reflection."""
+    views = board_scene(6).views
+    ball = Sphere(center=np.zeros(3), radius=0.2)
+    rendered = [
+        render_view(v, ball, light=light, sensor="ppa", s0=0.3, background=0.9) for v in views
+    ]
+    # As the program begins: under the assumption of specular light.
+    return Scene(ball, views, rendered, [phase_map_of(r) for r in rendered])
+
+
+def floor_scene(light: Light, sensor: str = "tilted") -> Scene:
+    """A floor that fills most of views with oblique rays."""
+    floor = Plane(point=np.zeros(3), normal=np.array([0.05, 0.1, 1.0]), extent=(0.5, 0.5))
+    views = ring_of_views(6, CAMERA, target=np.zeros(3), distance=0.5, elevation_deg=30)
+    rendered = [
+        render_view(v, floor, light=light.value, sensor=sensor, s0=0.2, background=0.6)
+        for v in views
+    ]
+    return Scene(floor, views, rendered, [phase_map_of(r, light) for r in rendered])
+
+
+def diffuse_share(scene, tracks):
+    masks = find_diffuse(tracks, scene.maps)
+    inside = sum(int(m.region.inside.sum()) for m in scene.maps)
+    return sum(int(mask.sum()) for mask in masks) / inside
+
+
+def test_a_glossy_black_board_is_specular(board):
+    points, _ = board.surface_points(25)
+    assert diffuse_share(board, tracks_at(board, points)) == 0
+
+
+@pytest.mark.parametrize("light", ["specular", "diffuse"])
+def test_the_light_of_a_curved_thing_is_told(light):
+    scene = dome_scene(light)
+    points, _ = scene.surface_points(40)
+    expected = 1.0 if light == "diffuse" else 0.0
+    assert diffuse_share(scene, tracks_at(scene, points)) == pytest.approx(expected, abs=0.05)
+
+
+def test_without_points_strong_polarisation_means_specular(board):
+    none = tracks_at(board, np.zeros((0, 3)))
+    assert not any(mask.any() for mask in find_diffuse(none, board.maps))
+
+
+def test_turning_twice_changes_nothing(board):
+    phase_map = board.maps[0]
+    half = np.zeros(phase_map.region.inside.shape, bool)
+    half[:60] = True
+    once = turned(phase_map, half)
+    assert once.diffuse[:60].all()
+    assert not once.diffuse[60:].any()
+    np.testing.assert_array_equal(once.samples[:60, :, :2], -phase_map.samples[:60, :, :2])
+    again = turned(once, half)
+    np.testing.assert_allclose(again.samples, phase_map.samples, rtol=1e-5, atol=1e-7)
+    assert not again.diffuse.any()
+
+
+def test_the_kind_of_light_is_stored(board, tmp_path):
+    phase_map = board.maps[0]
+    half = np.zeros(phase_map.region.inside.shape, bool)
+    half[:60] = True
+    store_phase_map(turned(phase_map, half), tmp_path)
+    np.testing.assert_array_equal(open_phase_map(board.views[0], tmp_path).diffuse, half)
+
+
+@pytest.mark.parametrize("light", list(Light))
+def test_rows_of_a_tilted_sensor_are_exact_once_corrected(light):
+    scene = floor_scene(light)
+    points, truth = scene.surface_points(40)
+    maps = scene.maps
+    error = {}
+    for model, used in ((Model.PPA, maps), (Model.TILTED, [as_tilted(m) for m in maps])):
+        rows = gather_rows(model, points, used)
+        residual = np.einsum("ikn,ni->kn", rows.rows, truth)[np.isfinite(rows.sigma)]
+        error[model] = np.degrees(np.sqrt((residual**2).mean()))
+    assert error[Model.TILTED] < 0.2
+    assert error[Model.PPA] > 3 * error[Model.TILTED]
+
+
+def test_tilted_normals_of_a_tilted_sensor_are_nearer_to_the_truth():
+    scene = floor_scene(Light.SPECULAR)
+    points, truth = scene.surface_points(40)
+    tracks = tracks_at(scene, points)
+    mean = {}
+    for model, used in (
+        (Model.PPA, scene.maps),
+        (Model.TILTED, [as_tilted(m) for m in scene.maps]),
+    ):
+        found = track_normals(model, tracks, used, NormalOptions(window_px=5))
+        cosine = np.clip((found.normals * truth).sum(axis=-1), -1, 1)
+        mean[model] = np.degrees(np.arccos(cosine)).mean()
+    assert mean[Model.TILTED] < 0.5 * mean[Model.PPA]
+
+
+def test_a_stored_tilted_map_shares_its_region(board, tmp_path):
+    import pickle
+
+    base = store_phase_map(board.maps[0], tmp_path)
+    stored = store_phase_map(as_tilted(base), tmp_path)
+    assert stored.tilted
+    again = pickle.loads(pickle.dumps(stored))
+    np.testing.assert_array_equal(again.samples, stored.samples)
+    np.testing.assert_array_equal(open_phase_map(base.view, tmp_path).samples, base.samples)
+
+
+@pytest.mark.parametrize("sensor", ["ppa", "tilted"])
+def test_the_residuals_tell_which_model_a_sensor_follows(sensor, tmp_path):
+    """Wide rays over a floor, behind polarizers of either kind."""
+    scene = floor_scene(Light.SPECULAR, sensor)
+    points, _ = scene.surface_points(40)
+    tracks = tracks_at(scene, points)
+    found = {}
+    for model, used in (
+        (Model.OPA, scene.maps),
+        (Model.PPA, scene.maps),
+        (Model.TILTED, [as_tilted(m) for m in scene.maps]),
+    ):
+        estimate = track_normals(model, tracks, used, NormalOptions(window_px=5))
+        residual = float(np.degrees(np.arcsin(np.nanmedian(estimate.residual))))
+        none = AngleStats.from_degrees(np.zeros(0))
+        found[model] = Consistency(
+            num_points=0,
+            phase_residual=none,
+            coverage=0.0,
+            agreement=0.0,
+            track_residual_median_deg=residual,
+        )
+    assert best_fitting_model(found) is Model(sensor)
+
+
+def test_without_points_no_model_fits_best():
+    none = Consistency(
+        num_points=0,
+        phase_residual=AngleStats.from_degrees(np.zeros(0)),
+        coverage=float("nan"),
+        agreement=float("nan"),
+        track_residual_median_deg=float("nan"),
+    )
+    assert best_fitting_model({Model.PPA: none}) is None

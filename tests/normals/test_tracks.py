@@ -1,0 +1,169 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import board_scene, tracks_at
+
+from polmvs.config import Estimator, Model, NormalOptions
+from polmvs.normals.rows import gather_rows
+from polmvs.normals.tracks import (
+    dolp_shares,
+    point_sigmas,
+    seen_shares,
+    select_seeds,
+    track_normals,
+    window_map,
+)
+from polmvs.polarization.phase_map import open_phase_map, store_phase_map
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return board_scene(6)
+
+
+def marked(maps):
+    """The maps as if a mark were printed on every point."""
+    return [replace(m, lowest_dolp=np.zeros_like(m.lowest_dolp)) for m in maps]
+
+
+def errors_deg(normals, truth):
+    return np.degrees(np.arccos(np.clip((normals * truth).sum(-1), -1, 1)))
+
+
+@pytest.mark.parametrize("estimator", list(Estimator))
+def test_ppa_recovers_the_normals_of_a_perspective_view_and_opa_does_not(scene, estimator):
+    points, truth = scene.surface_points(60)
+    tracks = tracks_at(scene, points)
+    options = NormalOptions(estimator=estimator, window_px=5)
+    ppa = track_normals(Model.PPA, tracks, scene.maps, options)
+    opa = track_normals(Model.OPA, tracks, scene.maps, options)
+    assert ppa.valid.all()
+    assert errors_deg(ppa.normals, truth).mean() < 0.4
+    assert errors_deg(opa.normals, truth).mean() > 3
+    assert (ppa.num_rows >= 3).all()
+
+
+def test_rows_of_a_true_point_are_perpendicular_to_its_normal(scene):
+    points, truth = scene.surface_points(40)
+    rows = gather_rows(Model.PPA, points, scene.maps)
+    residual = np.einsum("ikn,ni->kn", rows.rows, truth)
+    counted = np.isfinite(rows.sigma)
+    assert counted.mean() > 0.8
+    # The smoothed phase of a plane is its own but for the border; sine of under half a degree.
+    assert np.percentile(np.abs(residual[counted]), 90) < 0.008
+
+
+def test_an_occluded_point_gets_no_row(scene):
+    points, _ = scene.surface_points(20)
+    nearer = []
+    for view, rendered in zip(scene.views, scene.rendered, strict=True):
+        del view
+        nearer.append(np.full(rendered.depth.shape, 0.1, np.float32))
+    rows = gather_rows(Model.PPA, points, scene.maps, nearer)
+    assert not np.isfinite(rows.sigma).any()
+    unknown = [np.zeros_like(n) for n in nearer]
+    assert np.isfinite(gather_rows(Model.PPA, points, scene.maps, unknown).sigma).any()
+
+
+def test_a_point_off_every_region_has_no_normal(scene):
+    tracks = tracks_at(scene, np.array([[0.4, 0.4, 0.0], [0.0, 0.0, 3.0]]))
+    estimate = track_normals(Model.PPA, tracks, scene.maps, NormalOptions())
+    assert not estimate.valid.any()
+    assert np.isnan(estimate.normals).all()
+    assert not select_seeds(tracks, estimate, scene.maps)[1].any()
+
+
+def test_seeds_lie_on_the_part_only(scene):
+    on, _ = scene.surface_points(30)
+    off = on + np.array([0.5, 0.0, 0.0])
+    tracks = tracks_at(scene, np.concatenate([on, off]))
+    estimate = track_normals(Model.PPA, tracks, scene.maps, NormalOptions(window_px=5))
+    seeds, chosen = select_seeds(tracks, estimate, marked(scene.maps))
+    assert chosen[:30].mean() > 0.5  # those near the border of a view are left out
+    assert not chosen[30:].any()
+    assert len(seeds.points_in_world) == chosen.sum()
+
+
+def test_sigma_of_a_point_is_that_of_its_triangulation(scene):
+    """Reprojected with half a pixel of noise, the least-squares point scatters by its sigma."""
+    points, _ = scene.surface_points(1)
+    tracks = tracks_at(scene, points)
+    sigma = point_sigmas(tracks, scene.views)[0]
+    rng = np.random.default_rng(0)
+    jacobian, noise = [], []
+    for view in scene.views:
+        in_cam = view.cam_from_world * points[0]
+        base = view.camera.project(in_cam)
+        step = 1e-6
+        jacobian.append(
+            np.array(
+                [
+                    (view.camera.project(view.cam_from_world * (points[0] + step * axis)) - base)
+                    / step
+                    for axis in np.eye(3)
+                ]
+            ).T
+        )
+        noise.append(rng.normal(scale=0.5, size=(4000, 2)))
+    design = np.concatenate(jacobian)
+    solved = np.linalg.lstsq(design, np.concatenate(noise, axis=1).T, rcond=None)[0].T
+    largest = np.sqrt(np.linalg.eigvalsh(np.cov(solved.T))[-1])
+    # Off-axis pixels are nearer together than on-axis ones: a few percent.
+    assert sigma == pytest.approx(largest, rel=0.15)
+
+
+def test_the_window_averages_axially_over_reliable_pixels(scene):
+    phase_map = scene.maps[0]
+    windowed = window_map(phase_map, 9)
+    inside = phase_map.region.reliable & (windowed.samples[..., 2] > 0)
+    middle = np.argwhere(inside)[len(np.argwhere(inside)) // 2]
+    r, c = middle
+    patch = np.s_[r - 4 : r + 5, c - 4 : c + 5]
+    weight = phase_map.samples[patch][..., 2] * phase_map.region.reliable[patch]
+    expected = (phase_map.samples[patch][..., :2] * weight[..., None]).sum((0, 1)) / weight.sum()
+    np.testing.assert_allclose(windowed.samples[r, c, :2], expected, rtol=1e-4)
+
+
+def test_a_stored_phase_map_comes_back_and_travels_as_its_path(scene, tmp_path):
+    import pickle
+
+    stored = store_phase_map(scene.maps[0], tmp_path)
+    again = open_phase_map(scene.views[0], tmp_path)
+    np.testing.assert_array_equal(again.samples, scene.maps[0].samples)
+    np.testing.assert_array_equal(again.region.edges, scene.maps[0].region.edges)
+    pickled = pickle.dumps(stored)
+    assert len(pickled) < 3000
+    np.testing.assert_array_equal(pickle.loads(pickled).samples, stored.samples)
+
+
+def test_a_damaged_phase_map_is_named(scene, tmp_path):
+    from polmvs.errors import DataError
+
+    store_phase_map(scene.maps[0], tmp_path)
+    path = tmp_path / f"{scene.views[0].name}.samples.npy"
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(DataError, match=r"samples\.npy"):
+        open_phase_map(scene.views[0], tmp_path)
+
+
+def test_a_mirror_image_behind_the_surface_is_no_seed(scene):
+    """Points well behind a board, as its mirror shows them, match the board's phases."""
+    on, normals = scene.surface_points(30)
+    behind = on - 0.12 * normals
+    # They are seen in the board in the views that look along the way to them.
+    tracks = tracks_at(scene, behind)
+    estimate = track_normals(Model.PPA, tracks, scene.maps, NormalOptions(window_px=5))
+    shares = seen_shares(behind, np.nan_to_num(estimate.normals), scene.maps)
+    assert np.median(seen_shares(on, normals, scene.maps)) > 0.9
+    assert np.median(shares) < 0.7
+    assert select_seeds(tracks, estimate, marked(scene.maps))[1].sum() < 6
+
+
+def test_what_is_polarised_like_the_surface_about_it_is_no_mark(scene):
+    points, _ = scene.surface_points(20)
+    tracks = tracks_at(scene, points)
+    assert np.median(dolp_shares(tracks, scene.maps)) > 0.9
+    assert np.nanmax(dolp_shares(tracks, marked(scene.maps))) == 0
+    nowhere = tracks_at(scene, points + np.array([0.5, 0.0, 0.0]))
+    assert np.isnan(dolp_shares(nowhere, scene.maps)).all()

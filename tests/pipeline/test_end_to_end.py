@@ -1,0 +1,306 @@
+"""The main job on the bundled capture: what the run leaves, how good it is, and how it goes on."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from polmvs.colmap.models import read_model
+from polmvs.config import Model, Options, PropagationOptions, RunOptions, SfmOptions
+from polmvs.io.clouds import read_cloud
+from polmvs.pipeline.jobs import COMPARED, Job, reconstruct
+from polmvs.pipeline.run_folder import Workspace
+from polmvs.surface.surroundings import Kind
+
+OTHERS = [model for model in COMPARED if model is not Model.PPA]
+NORMAL_STAGES = ["normals", "parts", *[f"normals_{model}" for model in OTHERS]]
+BEFORE_CLOUDS = ["capture", "sfm", "maps", *NORMAL_STAGES]
+STAGES = [*BEFORE_CLOUDS, *[f"densify_{model}" for model in COMPARED], "evaluate"]
+RESULTS = ("normals.ply", "normals_opa.ply", "opa.ply", "ppa.ply", "metrics.json")
+
+
+def metrics_of(out: Path) -> dict:
+    return json.loads((out / "metrics.json").read_text())
+
+
+def assert_same_results(out: Path, expected: Path) -> None:
+    for name in RESULTS:
+        assert (out / name).read_bytes() == (expected / name).read_bytes(), name
+
+
+def assert_no_temporary_files(out: Path) -> None:
+    assert [path.name for path in out.rglob(".*")] == []
+
+
+def test_output_folder_is_as_described(demo_run: Path) -> None:
+    names = {path.name for path in demo_run.iterdir()}
+    assert {"images", "sparse", "summary.md", "run.json", "polmvs.log", *RESULTS} <= names
+    assert len(list((demo_run / "images").glob("*.png"))) == 10
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {
+        path.name for path in (demo_run / "sparse").iterdir()
+    }
+    assert_no_temporary_files(demo_run)
+
+
+def test_run_record(demo_run: Path) -> None:
+    record = json.loads((demo_run / "run.json").read_text())
+    assert [stage["name"] for stage in record["stages"]] == STAGES
+    for stage in record["stages"]:
+        assert stage["seconds"] > 0
+        assert 50 < stage["peak_rss_mb"] < 2500
+    assert record["wall_s"] >= 0.99 * sum(stage["seconds"] for stage in record["stages"])
+    assert record["options"]["sfm"]["intrinsics"][0] == pytest.approx(333.75)
+    assert record["options"]["fusion"]["min_views"] == 2
+    assert {"python", "numpy", "pycolmap", "open3d", "polmvs"} <= set(record["versions"])
+    assert record["results"]["num_views"] == 10
+    assert record["results"]["unregistered"] == []
+    assert record["command_line"][:2] == ["polmvs", "demo"]
+    assert record["finished"] is True
+
+
+def test_ppa_reconstructs_the_board_and_opa_does_not(demo_run: Path) -> None:
+    models = metrics_of(demo_run)["models"]
+    opa, ppa = models["opa"]["truth"], models["ppa"]["truth"]
+    assert ppa["cloud"]["thresholds_m"] == [0.001, 0.002, 0.005]
+    # Measured 99.9 %; the prototype in the design notes had 94 %.
+    assert ppa["cloud"]["f_score"][1] > 0.9
+    assert ppa["cloud"]["completeness"][1] > 0.9
+    assert ppa["cloud"]["chamfer_m"] < 0.001
+    assert ppa["cloud"]["normal_mean_deg"] < 1
+    assert ppa["tracks"]["errors"]["mean_deg"] < 1
+    assert ppa["cloud"]["off_surface_share"] < 0.02
+    # Several times worse.
+    assert opa["cloud"]["f_score"][1] < 0.4 * ppa["cloud"]["f_score"][1]
+    assert opa["cloud"]["chamfer_m"] > 4 * ppa["cloud"]["chamfer_m"]
+    assert opa["tracks"]["errors"]["mean_deg"] > 4 * ppa["tracks"]["errors"]["mean_deg"]
+
+
+def test_comparison_without_truth_tells_the_models_apart(demo_run: Path) -> None:
+    metrics = metrics_of(demo_run)
+    opa = metrics["models"]["opa"]["consistency"]
+    ppa = metrics["models"]["ppa"]["consistency"]
+    assert ppa["coverage"] > 0.9
+    assert ppa["agreement"] > 0.9 > opa["agreement"]
+    assert ppa["phase_residual"]["rmse_deg"] < 0.5 * opa["phase_residual"]["rmse_deg"]
+    assert ppa["track_residual_median_deg"] < 0.5 * opa["track_residual_median_deg"]
+    assert metrics["phase"]["maps"]["ppa"]["rmse_deg"] < 4.5
+    assert metrics["phase"]["pixels"]["opa"]["rmse_deg"] > 15
+
+
+def test_clouds_carry_normals_colours_and_scalars(demo_run: Path) -> None:
+    cloud = read_cloud(demo_run / "ppa.ply")
+    assert len(cloud.points) > 10_000
+    assert cloud.normals is not None
+    length = np.linalg.norm(cloud.normals, axis=1)
+    np.testing.assert_allclose(length, cloud.scalars["kind"] == Kind.SURFACE, atol=1e-4)
+    assert cloud.colors is not None
+    assert cloud.colors.std() > 0
+    assert set(cloud.scalars) == {"num_views", "sigma_deg", "sigma", "kind"}
+    assert cloud.scalars["num_views"].min() >= 2
+    kinds = cloud.scalars["kind"]
+    assert set(kinds.astype(int)) == {Kind.SURFACE, Kind.SPARSE}
+
+
+def test_sparse_normals_carry_their_quality(demo_run: Path) -> None:
+    tracks = read_cloud(demo_run / "normals.ply")
+    assert len(tracks.points) == len(read_model(demo_run / "sparse").tracks.point3D_ids)
+    names = {"sigma_deg", "num_views", "residual", "conditioning", "valid", "seed"}
+    assert set(tracks.scalars) == names
+    assert tracks.normals is not None
+    valid = tracks.scalars["valid"] > 0
+    np.testing.assert_array_equal(np.isfinite(tracks.normals).all(axis=1), valid)
+    seeds = tracks.scalars["seed"] > 0
+    assert 20 < seeds.sum() <= valid.sum()
+    # The seeds are the same for both models.
+    other = read_cloud(demo_run / "normals_opa.ply")
+    np.testing.assert_array_equal(other.scalars["seed"], tracks.scalars["seed"])
+
+
+def test_library_and_one_worker_give_the_same_cloud(
+    demo_run: Path, demo_capture: Path, tmp_path: Path
+) -> None:
+    before = Workspace(demo_run).load()
+    intrinsics = tuple(before.options["sfm"]["intrinsics"])
+    options = Options(sfm=SfmOptions(intrinsics=intrinsics, sparse=demo_run / "sparse"))
+    job = Job(
+        capture=demo_capture, out=tmp_path / "out", options=options, how=RunOptions(workers=1)
+    )
+    outcome = reconstruct(job)
+    assert outcome.empty is None
+    first, again = read_cloud(demo_run / "ppa.ply"), read_cloud(tmp_path / "out" / "ppa.ply")
+    # The model is written anew from its views and tracks: the last digits differ.
+    assert len(again.points) == pytest.approx(len(first.points), rel=0.01)
+    before_cloud = ["capture", "sparse", "maps", "normals", "parts"]
+    assert stages_of(tmp_path / "out") == [*before_cloud, "densify_ppa", "mesh_ppa", "dense_ppa"]
+
+
+def test_16_bit_tiff_with_own_poses_and_names(
+    demo_run: Path, demo_capture: Path, tmp_path: Path, cli
+) -> None:
+    """Images are matched to the model and to the truth by name without suffix."""
+    capture, out = tmp_path / "capture", tmp_path / "out"
+    (capture / "raw").mkdir(parents=True)
+    for path in (demo_capture / "raw").glob("*.png"):
+        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(capture / "raw" / f"{path.stem}.tif"), raw.astype(np.uint16) * 257)
+    flags = ("--sparse", demo_run / "sparse", "--gt", demo_capture, "--models", "ppa")
+    status, _, err = cli("compare", capture, out, *flags, "--stride-px", 4)
+    assert (status, err) == (0, "")
+    found = metrics_of(out)["models"]["ppa"]["truth"]
+    assert found["alignment"]["num_cameras"] == 10
+    assert found["cloud"]["f_score"][2] > 0.9
+    assert not (out / "opa.ply").exists()
+
+
+def start(out: Path, *arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "polmvs", "demo", str(out), "--workers", "2", *arguments]
+    return subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    """Kill a run and its workers without notice."""
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate(timeout=60)
+
+
+def wait_until(holds, process: subprocess.Popen[str], timeout_s: float = 60) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not holds():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def stages_of(out: Path) -> list[str]:
+    return [stage.name for stage in Workspace(out).load().stages]
+
+
+def copy_until(demo_run: Path, out: Path, last: str) -> None:
+    """A run that was stopped after this stage."""
+    shutil.copytree(demo_run, out)
+    record = json.loads((out / "run.json").read_text())
+    record["stages"] = record["stages"][: STAGES.index(last) + 1]
+    record["finished"] = False
+    (out / "run.json").write_text(json.dumps(record))
+
+
+def test_killed_run_goes_on_to_the_same_result(demo_run: Path, tmp_path: Path, cli) -> None:
+    """Killed twice, in SfM and while it densifies; each time the finished stages stay."""
+    out = tmp_path / "out"
+    process = start(out)
+    wait_until((out / ".sfm.tmp").exists, process)
+    time.sleep(0.5)
+    kill(process)
+    assert not (out / "sparse").exists()
+    assert stages_of(out) == ["capture"]
+
+    process = start(out, "--resume")
+    wait_until((out / ".densify_opa.tmp").exists, process)
+    kill(process)
+    assert not (out / "opa.ply").exists()
+    assert stages_of(out) == BEFORE_CLOUDS
+
+    status, _, err = cli("demo", out, "--resume", "--workers", 2)
+    assert (status, err) == (0, "")
+    assert_same_results(out, demo_run)
+    assert_no_temporary_files(out)
+    assert stages_of(out) == STAGES
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_keeps_finished_stages_only(demo_run: Path, tmp_path: Path, number: int) -> None:
+    out = tmp_path / "out"
+    copy_until(demo_run, out, BEFORE_CLOUDS[-1])
+    process = start(out, "--resume")
+    wait_until((out / ".densify_opa.tmp").exists, process)
+    process.send_signal(number)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert stderr == ("polmvs demo: interrupted; finished stages are kept, go on with --resume\n")
+    assert stdout == ""
+    assert_no_temporary_files(out)
+    assert stages_of(out) == BEFORE_CLOUDS
+
+
+def test_stages_alone_give_the_same_result(
+    demo_run: Path, demo_capture: Path, tmp_path: Path, cli
+) -> None:
+    out = tmp_path / "out"
+    copy_until(demo_run, out, "sfm")
+    for name in RESULTS:
+        (out / name).unlink()
+    shutil.rmtree(out / "maps")
+    status, text, err = cli("normals", demo_capture, out)
+    assert (status, err) == (0, "")
+    assert "are seeds" in text
+    status, text, err = cli("densify", demo_capture, out)
+    assert (status, err) == (0, "")
+    assert text.startswith(f"{out / 'ppa.ply'}: ")
+    for name in ("normals.ply", "ppa.ply"):
+        assert (out / name).read_bytes() == (demo_run / name).read_bytes()
+    assert not (out / "opa.ply").exists()
+
+
+def test_stage_alone_is_done_again_only_with_overwrite(
+    demo_run: Path, demo_capture: Path, tmp_path: Path, cli
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(demo_run, out)
+    status, _, err = cli("densify", demo_capture, out)
+    assert status == 2
+    assert "is finished. Give --overwrite" in err
+    status, _, err = cli("densify", demo_capture, out, "--stride-px", 4, "--overwrite")
+    assert (status, err) == (0, "")
+    assert len(read_cloud(out / "ppa.ply").points) < 0.5 * len(
+        read_cloud(demo_run / "ppa.ply").points
+    )
+    # Figures of the old cloud do not stay beside the new one.
+    assert not (out / "metrics.json").exists()
+    assert (out / "opa.ply").read_bytes() == (demo_run / "opa.ply").read_bytes()
+
+
+def test_new_truth_is_measured_on_a_finished_run(
+    demo_run: Path, demo_capture: Path, tmp_path: Path, cli
+) -> None:
+    out = tmp_path / "out"
+    copy_until(demo_run, out, STAGES[-2])
+    record = json.loads((out / "run.json").read_text())
+    record["options"]["evaluation"]["gt"] = None
+    (out / "run.json").write_text(json.dumps(record))
+    status, text, _ = cli("compare", demo_capture, out, "--resume")
+    assert status == 0
+    assert "Chamfer" not in text
+    assert metrics_of(out)["phase"] is None
+    status, text, _ = cli("compare", demo_capture, out, "--resume", "--gt", demo_capture)
+    assert status == 0
+    assert "Chamfer" in text
+    assert metrics_of(out) == metrics_of(demo_run)
+
+
+def test_paper_contours_work_too(demo_run: Path, demo_capture: Path, tmp_path: Path, cli) -> None:
+    out = tmp_path / "out"
+    copy_until(demo_run, out, "parts")
+    args = ("--method", "contour", "--contour", "normals")
+    status, _, err = cli("densify", demo_capture, out, *args)
+    assert (status, err) == (0, "")
+    status, text, _ = cli(
+        "evaluate", out / "ppa.ply", "--gt", demo_capture, "--sparse", out / "sparse", "--json"
+    )
+    assert status == 0
+    assert json.loads(text)["cloud"]["f_score"][1] > 0.9
+    assert PropagationOptions().contour == "tangent"
+    assert PropagationOptions().method == "integrate"

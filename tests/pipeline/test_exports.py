@@ -1,0 +1,493 @@
+"""Mesh, COLMAP workspace and surroundings of the bundled capture, as a user gets them."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dense_scenes import fuse
+from helpers import content_of, cut_after, record_of, refused, stages_of
+from scipy.spatial import cKDTree
+
+from polmvs.cli import main
+from polmvs.colmap.dense_workspace import DenseWorkspace, open_dense_workspace
+from polmvs.colmap.kept_depth import kept_cloud
+from polmvs.colmap.maps import DepthNormals, read_depth_map, write_depth_map
+from polmvs.colmap.models import pycolmap, read_model
+from polmvs.colmap.sparse_model import write_model
+from polmvs.colmap.workspace_layout import map_files, write_maps
+from polmvs.geometry import SimilarityTransform
+from polmvs.io.clouds import read_cloud, read_mesh
+from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
+from polmvs.pipeline.own_files import DENSE_MARKER
+from polmvs.poses.metric_frame import transform_model
+from polmvs.surface.surroundings import Kind
+
+BOARD_HEIGHT_M = 0.012  # of the true plane z = const, in the capture's gt/scene.json
+# A pixel is 1.3 mm on the board; SfM's poses bend and shift it by some tenths of that.
+TOLERANCE_M = 0.001
+
+# Runs a command on a copy of the finished run that was cut short, and gives the copy.
+Continue = Callable[..., Path]
+
+
+@pytest.fixture(scope="module")
+def truth(demo_capture: Path) -> GroundTruth:
+    return open_ground_truth(demo_capture)
+
+
+@pytest.fixture(scope="module")
+def metric(demo_run: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's COLMAP model in the frame of the truth."""
+    out = tmp_path_factory.mktemp("metric") / "out"
+    flags = ["--sparse", demo_run / "sparse", "--reference", demo_capture / "gt" / "cameras.json"]
+    assert main(list(map(str, ["sfm", demo_capture, out, *flags, "--workers", 2]))) == 0
+    return out / "sparse"
+
+
+@pytest.fixture(scope="module")
+def run(metric: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output of ``reconstruct``; tests that change it take a copy."""
+    out = tmp_path_factory.mktemp("exports") / "out"
+    flags = ["--sparse", metric, "--stride-px", 4, "--workers", 2]
+    assert main(list(map(str, ["reconstruct", demo_capture, out, *flags]))) == 0
+    return out
+
+
+@pytest.fixture
+def go_on(run: Path, demo_capture: Path, tmp_path: Path, cli) -> Continue:
+    """A command on a copy of the run, stopped after a stage; it must succeed."""
+
+    def call(last: str, command: str, *flags: object) -> Path:
+        out = stopped(run, tmp_path / "out", last)
+        status, _, err = cli(command, demo_capture, out, *flags, "--workers", 1)
+        assert (status, err) == (0, "")
+        return out
+
+    return call
+
+
+def stopped(run: Path, out: Path, last: str) -> Path:
+    """A copy of the run, without the files of the stages after the last one."""
+    shutil.copytree(run, out)
+    cut_after(out, last)
+    shutil.rmtree(out / "dense")
+    (out / "ppa_mesh.ply").unlink()
+    if last != "densify_ppa":
+        (out / "ppa.ply").unlink()
+        shutil.rmtree(out / "views_ppa")
+    return out
+
+
+def surface_of(cloud):
+    return cloud.points[cloud.scalars["kind"] == Kind.SURFACE]
+
+
+def heights(points: np.ndarray) -> np.ndarray:
+    return np.abs(points[:, 2] - BOARD_HEIGHT_M)
+
+
+# What reconstruct leaves
+
+
+def test_files_and_their_record(run: Path) -> None:
+    names = {path.name for path in run.iterdir()}
+    assert {"ppa.ply", "ppa_mesh.ply", "dense", "normals.ply", "run.json"} <= names
+    record = record_of(run)
+    assert stages_of(run)[-3:] == ["densify_ppa", "mesh_ppa", "dense_ppa"]
+    assert Path(record["results"]["dense_ppa"]) == run / "dense"
+    assert record["results"]["num_triangles_ppa"] == len(read_mesh(run / "ppa_mesh.ply").triangles)
+
+
+def test_kinds_of_the_cloud(run: Path, truth: GroundTruth) -> None:
+    cloud = read_cloud(run / "ppa.ply")
+    kinds, results = cloud.scalars["kind"], record_of(run)["results"]
+    assert (kinds == Kind.SURFACE).sum() == results["num_points_ppa"] > 10_000
+    assert (kinds == Kind.SPARSE).sum() == results["num_surroundings_ppa"] > 500
+    assert np.quantile(heights(surface_of(cloud)), 0.99) < TOLERANCE_M
+    true = truth.surface_points()
+    distance = cKDTree(true.points).query(cloud.points[kinds == Kind.SPARSE])[0]
+    assert np.median(distance) < OTHER_SPACING_M
+
+
+def test_colmap_fuses_the_workspace(run: Path, tmp_path: Path, truth: GroundTruth) -> None:
+    shutil.copytree(run / "dense", tmp_path / "dense")
+    names = [view.name for view in read_model(run / "sparse").views]
+    stereo = tmp_path / "dense" / "stereo"
+    assert (stereo / "fusion.cfg").read_text().split() == names
+    sources = (stereo / "patch-match.cfg").read_text().splitlines()
+    assert sources[::2] == names
+    assert all(len(line.split(", ")) == 9 for line in sources[1::2])
+    reconstruction = pycolmap.Reconstruction(str(tmp_path / "dense" / "sparse"))
+    assert reconstruction.num_reg_images() == 10
+    cloud = fuse(tmp_path / "dense", min_num_pixels=3)
+    assert len(cloud.points) > 10_000
+    assert np.quantile(heights(cloud.points), 0.99) < TOLERANCE_M
+    assert cloud.normals is not None
+    assert np.median(cloud.normals[:, 2]) > np.cos(np.radians(1))
+    # The whole board: hardly a point of the truth is far from the fused cloud.
+    true = truth.surface_points()
+    distance = cKDTree(cloud.points).query(true.points[true.is_part])[0]
+    assert (distance < 0.003).mean() > 0.95
+
+
+def test_mesh_lies_on_the_board_and_near_the_cloud(run: Path) -> None:
+    mesh = read_mesh(run / "ppa_mesh.ply")
+    points = surface_of(read_cloud(run / "ppa.ply"))
+    assert len(mesh.triangles) > 1000
+    assert np.quantile(heights(mesh.vertices), 0.99) < TOLERANCE_M
+    assert np.median(mesh.normals[:, 2]) > np.cos(np.radians(1))
+    tree = cKDTree(points)
+    spacing = np.median(tree.query(points, k=2)[0][:, 1])
+    assert tree.query(mesh.vertices)[0].max() < 10 * spacing
+    # It has no holes that the cloud has not.
+    assert np.quantile(cKDTree(mesh.vertices).query(points)[0], 0.95) < 5 * spacing
+
+
+def test_open3d_reads_the_mesh_itself(run: Path) -> None:
+    import open3d
+
+    mesh = open3d.io.read_triangle_mesh(str(run / "ppa_mesh.ply"))
+    assert len(mesh.triangles) == len(read_mesh(run / "ppa_mesh.ply").triangles)
+    assert mesh.has_vertex_normals()
+
+
+# Options of the exports
+
+
+def test_no_mesh_and_no_colmap(go_on: Continue) -> None:
+    out = go_on("densify_ppa", "reconstruct", "--resume", "--no-mesh", "--no-colmap")
+    assert (out / "ppa.ply").is_file()
+    assert not (out / "ppa_mesh.ply").exists()
+    assert not (out / "dense").exists()
+    assert stages_of(out)[-1] == "densify_ppa"
+
+
+def test_export_alone(go_on: Continue, run: Path, demo_capture: Path, cli) -> None:
+    out = go_on("densify_ppa", "export")
+    assert (out / "ppa_mesh.ply").read_bytes() == (run / "ppa_mesh.ply").read_bytes()
+    assert content_of(out / "dense" / "stereo") == content_of(run / "dense" / "stereo")
+    refused_again = refused(cli("export", demo_capture, out), 2)
+    assert "is finished. Give --overwrite" in refused_again
+    (out / "dense" / "stereo" / "fusion.cfg").write_text("")
+    assert cli("export", demo_capture, out, "--overwrite")[0] == 0
+    assert content_of(out / "dense") == content_of(run / "dense")
+
+
+def test_export_before_the_cloud(run: Path, demo_capture: Path, tmp_path: Path, cli) -> None:
+    out = stopped(run, tmp_path / "out", "parts")
+    err = refused(cli("export", demo_capture, out))
+    assert "Run 'polmvs densify' first" in err
+
+
+@pytest.mark.parametrize("command", ["export", "densify", "reconstruct"])
+def test_users_file_in_the_workspace_is_not_deleted(
+    run: Path, demo_capture: Path, tmp_path: Path, cli, command: str
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(run, out)
+    own = out / "dense" / "stereo" / "fused.ply"
+    own.write_text("a day's work")
+    before = content_of(out / "dense")
+    flags = ("--sparse", record_of(run)["options"]["sfm"]["sparse"], "--overwrite")
+    err = refused(cli(command, demo_capture, out, *flags))
+    assert f"{own}: was not written by polmvs" in err
+    assert content_of(out / "dense") == before
+
+
+def test_mesh_command(run: Path, tmp_path: Path, cli) -> None:
+    target = tmp_path / "mesh.ply"
+    status, text, err = cli("mesh", run / "ppa.ply", target)
+    assert (status, err) == (0, "")
+    assert text.startswith(f"{target}: ")
+    assert target.read_bytes() == (run / "ppa_mesh.ply").read_bytes()
+    target.write_text("mine")
+    assert f"{target}: exists" in refused(cli("mesh", run / "ppa.ply", target), 2)
+    assert target.read_text() == "mine"
+    assert cli("mesh", run / "ppa.ply", target, "--overwrite")[0] == 0
+    assert len(read_mesh(target).triangles) > 1000
+
+
+def test_mesh_of_what_is_no_cloud(tmp_path: Path, cli) -> None:
+    (tmp_path / "text.ply").write_text("no cloud")
+    err = refused(cli("mesh", tmp_path / "text.ply", tmp_path / "mesh.ply"))
+    assert "text.ply: is no PLY file" in err
+    assert not (tmp_path / "mesh.ply").exists()
+
+
+# Options of the cloud
+
+
+def test_voxel_in_metres_thins(go_on: Continue, run: Path) -> None:
+    voxel = 0.01
+    points = surface_of(read_cloud(go_on("parts", "densify", "--voxel", voxel) / "ppa.ply"))
+    before = surface_of(read_cloud(run / "ppa.ply"))
+    cells = len(np.unique(np.floor(before / voxel), axis=0))
+    assert 0.5 * cells < len(points) < 1.5 * cells
+    assert np.quantile(heights(points), 0.99) < TOLERANCE_M
+
+
+def test_more_views_must_agree(go_on: Continue, run: Path) -> None:
+    cloud = read_cloud(go_on("parts", "densify", "--min-views", 6) / "ppa.ply")
+    on_surface = cloud.scalars["kind"] == Kind.SURFACE
+    assert cloud.scalars["num_views"][on_surface].min() >= 6
+    before = read_cloud(run / "ppa.ply")
+    fewer = before.scalars["num_views"][before.scalars["kind"] == Kind.SURFACE]
+    assert fewer.min() < 6
+    assert 0 < on_surface.sum() < len(fewer)
+
+
+def test_no_surroundings(go_on: Continue, run: Path) -> None:
+    cloud = read_cloud(go_on("parts", "densify", "--surroundings", "none") / "ppa.ply")
+    assert set(cloud.scalars["kind"]) == {Kind.SURFACE}
+    assert len(cloud.points) == record_of(run)["results"]["num_points_ppa"]
+
+
+def test_surroundings_by_stereo(go_on: Continue, run: Path, truth: GroundTruth) -> None:
+    cloud = read_cloud(go_on("parts", "densify", "--surroundings", "stereo") / "ppa.ply")
+    kinds = cloud.scalars["kind"]
+    assert set(kinds) == {Kind.SURFACE, Kind.STEREO}
+    around = cloud.points[kinds == Kind.STEREO]
+    assert len(around) > 3 * record_of(run)["results"]["num_surroundings_ppa"]
+    true = truth.surface_points()
+    distance = cKDTree(true.points).query(around)[0]
+    assert np.median(distance) < OTHER_SPACING_M
+    np.testing.assert_array_equal(
+        cloud.points[kinds == Kind.SURFACE], surface_of(read_cloud(run / "ppa.ply"))
+    )
+
+
+# A workspace that the user's COLMAP made
+
+
+@pytest.fixture(scope="module")
+def given(run: Path, truth: GroundTruth, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A workspace with the true depth of all but the board; tests do not change it."""
+    folder = tmp_path_factory.mktemp("given") / "workspace"
+    shutil.copytree(run / "dense", folder)
+    (folder / DENSE_MARKER).unlink()
+    workspace = open_dense_workspace(folder)
+    for item in workspace.views:
+        write_maps(workspace.stereo, item.view.name, true_surroundings(truth, item.view.name))
+    (folder / "fused.ply").write_text("the user's")
+    return folder
+
+
+def true_surroundings(truth: GroundTruth, name: str) -> DepthNormals:
+    """True depth beside the part; its normals from neighbouring pixels."""
+    camera = truth.views[name].camera
+    depth = np.where(truth.mask(name), np.nan, truth.depth(name)).astype(np.float64)
+    by_row, by_col = np.gradient(depth)
+    rows, cols = np.indices(depth.shape) + 0.5
+    # With z(u, v) the normal is across both tangents; it faces the camera.
+    normals = np.stack(
+        [
+            by_col * camera.fx / depth,
+            by_row * camera.fy / depth,
+            -1 - ((cols - camera.cx) * by_col + (rows - camera.cy) * by_row) / depth,
+        ],
+        axis=-1,
+    )
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    known = np.isfinite(normals).all(axis=-1) & (normals[..., 2] < -0.1)
+    return DepthNormals(
+        np.where(known, depth, 0).astype(np.float32),
+        np.where(known[..., None], normals, 0).astype(np.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def filled(given: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output of ``reconstruct --workspace``, whose poses are the workspace's."""
+    out = tmp_path_factory.mktemp("filled") / "out"
+    before = content_of(given)
+    flags = ["--workspace", given, "--stride-px", 4, "--workers", 2]
+    assert main(list(map(str, ["reconstruct", demo_capture, out, *flags]))) == 0
+    assert content_of(given) == before
+    return out
+
+
+def assert_filled(workspace: DenseWorkspace, given: DenseWorkspace) -> None:
+    """COLMAP's depth is untouched, and the holes on the board have depth."""
+    num_holes, num_board = 0, 0
+    for item, before in zip(workspace.views, given.views, strict=True):
+        maps, own = item.load_maps(), before.load_maps()
+        assert maps is not None
+        assert own is not None
+        valid = own.depth > 0
+        np.testing.assert_array_equal(maps.depth[valid], own.depth[valid])
+        np.testing.assert_array_equal(maps.normals[valid], own.normals[valid])
+        num_holes += int((~valid).sum())
+        num_board += int((maps.depth[~valid] > 0).sum())
+    assert num_board > 0.5 * num_holes
+
+
+def test_holes_of_a_copy_are_filled(filled: Path, given: Path, tmp_path: Path) -> None:
+    assert_filled(open_dense_workspace(filled / "dense"), open_dense_workspace(given))
+    assert not (filled / "dense" / "fused.ply").exists()  # made of the old maps
+    cloud = fuse_copy(filled / "dense", tmp_path)
+    true_height = heights(cloud.points)
+    # One fusion has both, the board and the table.
+    assert (true_height < TOLERANCE_M).sum() > 10_000
+    assert (true_height > 0.005).sum() > 10_000
+
+
+def fuse_copy(folder: Path, tmp_path: Path):
+    return fuse(shutil.copytree(folder, tmp_path / "fused"), min_num_pixels=3)
+
+
+def test_cloud_with_the_points_of_a_workspace(filled: Path, truth: GroundTruth) -> None:
+    cloud = read_cloud(filled / "ppa.ply")
+    kinds = cloud.scalars["kind"]
+    assert set(kinds) == {Kind.SURFACE, Kind.COLMAP}
+    around = cloud.points[kinds == Kind.COLMAP]
+    assert len(around) > 10_000
+    distance = cKDTree(truth.surface_points().points).query(around)[0]
+    assert np.quantile(distance, 0.9) < OTHER_SPACING_M
+    assert np.quantile(heights(surface_of(cloud)), 0.99) < TOLERANCE_M
+
+
+def test_poses_of_a_workspace(filled: Path, metric: Path) -> None:
+    for view, other in zip(
+        read_model(filled / "sparse").views, read_model(metric).views, strict=True
+    ):
+        assert view.name == other.name
+        np.testing.assert_allclose(view.center_in_world, other.center_in_world, atol=1e-9)
+
+
+@pytest.fixture
+def own(given: Path, tmp_path: Path) -> Path:
+    """A copy of the user's workspace to change."""
+    return shutil.copytree(given, tmp_path / "own")
+
+
+def test_in_place_changes_the_workspace_and_keeps_a_backup(
+    filled: Path, given: Path, own: Path, demo_capture: Path, tmp_path: Path, cli
+) -> None:
+    out = shutil.copytree(filled, tmp_path / "out")
+    flags = ("--workspace", own, "--workers", 1)
+    assert cli("densify", demo_capture, out, *flags, "--overwrite")[0] == 0
+    assert not (out / "dense").exists()
+    before = content_of(own)
+    status, text, err = cli("export", demo_capture, out, *flags, "--in-place")
+    assert (status, err) == (0, "")
+    assert f"{own}: COLMAP dense workspace" in text
+    assert not (out / "dense").exists()
+    assert_filled(open_dense_workspace(own), open_dense_workspace(given))
+    backup = own / "stereo.polmvs-backup-1"
+    assert record_of(out)["results"]["backup_ppa"] == str(backup)
+    saved = {f"stereo/{name}": content for name, content in content_of(backup).items()}
+    after = content_of(own)
+    changed = {name for name in before if after.get(name) != before[name]}
+    assert changed
+    assert {name: saved[name] for name in changed} == {name: before[name] for name in changed}
+    assert len([name for name in changed if "depth_maps" in name]) == 10
+    # A second time the fill cannot be told from COLMAP's own, and the user hears of it.
+    status, _, err = cli("densify", demo_capture, out, *flags, "--overwrite")
+    assert status == 0
+    assert f"{own}: was filled before" in err
+    assert backup.name in err
+
+
+def test_in_place_needs_a_workspace(demo_capture: Path, metric: Path, tmp_path: Path, cli) -> None:
+    flags = ("--sparse", metric, "--in-place")
+    err = refused(cli("reconstruct", demo_capture, tmp_path / "out", *flags), 2)
+    assert "--in-place needs a --workspace" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_maps_of_another_unit_are_noticed(own: Path, caplog: pytest.LogCaptureFixture) -> None:
+    workspace = open_dense_workspace(own)
+    none = np.zeros((0, 3))
+    assert len(kept_cloud(workspace, none).points) > 10_000
+    assert caplog.text == ""
+    for item in workspace.views:
+        maps = item.load_maps()
+        assert maps is not None
+        write_depth_map(map_files(workspace.stereo, item.view.name)[0], 10 * maps.depth)
+    kept_cloud(workspace, none)
+    assert f"{own}: two views agree on " in caplog.text
+
+
+# Workspaces that do not fit
+
+
+@pytest.fixture
+def refuses(own: Path, demo_capture: Path, metric: Path, tmp_path: Path, cli):
+    """``reconstruct --workspace``, which must fail in one line before it writes anything."""
+
+    def call(workspace: Path = own, *, sparse: Path = metric) -> str:
+        before, out = content_of(own), tmp_path / "new"
+        flags = ("--sparse", sparse, "--workspace", workspace, "--in-place")
+        err = refused(cli("reconstruct", demo_capture, out, *flags))
+        assert not out.exists()
+        assert content_of(own) == before
+        return err
+
+    return call
+
+
+def first_depth(workspace: Path) -> Path:
+    return map_files(workspace / "stereo", "000.png")[0]
+
+
+def test_workspace_that_is_missing(refuses, tmp_path: Path) -> None:
+    assert "nothing: no such folder" in refuses(tmp_path / "nothing")
+
+
+def test_workspace_without_stereo(refuses, own: Path) -> None:
+    shutil.rmtree(own / "stereo")
+    assert f"{own}: has no stereo folder" in refuses()
+
+
+def test_truncated_depth_map(refuses, own: Path) -> None:
+    path = first_depth(own)
+    path.write_bytes(path.read_bytes()[:-1000])
+    err = refuses()
+    assert f"{path}: " in err
+    assert "truncated" in err
+
+
+def test_depth_map_of_another_size(refuses, own: Path, run: Path) -> None:
+    camera = open_dense_workspace(run / "dense").views[0].camera
+    depth = read_depth_map(first_depth(run / "dense"), camera)
+    write_depth_map(first_depth(own), depth[::2, ::2])
+    err = refuses()
+    assert f"{first_depth(own)}: " in err
+    assert "459x384" in err
+
+
+def test_image_that_is_missing(refuses, own: Path) -> None:
+    (own / "images" / "003.png").unlink()
+    assert "lacks 1 of the model's 10 images: 003.png" in refuses()
+
+
+def test_workspace_in_another_frame(refuses, own: Path, metric: Path) -> None:
+    model = transform_model(
+        read_model(metric), SimilarityTransform(2.5, np.eye(3), np.array([1.0, 0.0, 0.0]))
+    )
+    shutil.rmtree(own / "sparse")
+    write_model(model, own / "sparse")
+    err = refuses()
+    assert "another frame" in err
+    assert "agree after a similarity (scale 2.5" in err
+    # The usual cause is a metric frame that the workspace was made without.
+    assert "without --reference, --aruco and --scale" in err
+
+
+def test_images_of_another_capture(
+    filled: Path, own: Path, demo_capture: Path, tmp_path: Path, cli
+) -> None:
+    """They are compared with the images of the run, so that its first stages are done by then."""
+    names = sorted(path.name for path in (own / "images").iterdir())
+    images = [(own / "images" / name).read_bytes() for name in names]
+    for name, image in zip(names, images[5:] + images[:5], strict=True):
+        (own / "images" / name).write_bytes(image)
+    before = content_of(own)
+    out = shutil.copytree(filled, tmp_path / "out")
+    err = refused(cli("densify", demo_capture, out, "--workspace", own, "--overwrite"))
+    assert f"{own / 'images' / '000.png'}: undistorted images do not match" in err
+    assert content_of(own) == before
+    assert not (out / "ppa.ply").exists()
+    assert stages_of(out)[-1] == "parts"

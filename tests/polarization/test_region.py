@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+
+from polmvs.polarization.region import find_region
+
+SHAPE = (120, 160)
+RNG = np.random.default_rng(0)
+
+
+def stokes_scene(dolp=0.6, phase=0.3):
+    """A dark polarised rectangle on a bright textured unpolarised ground."""
+    s0 = 0.5 + 0.3 * RNG.standard_normal(SHAPE)
+    s1, s2 = np.zeros(SHAPE), np.zeros(SHAPE)
+    part = np.zeros(SHAPE, bool)
+    part[30:90, 40:130] = True
+    s0[part] = 0.1
+    s1[part], s2[part] = 0.1 * dolp * np.cos(2 * phase), 0.1 * dolp * np.sin(2 * phase)
+    return s0, s1, s2, part
+
+
+def find(s0, s1, s2, valid=None, **options):
+    images = [np.asarray(a, np.float32) for a in (s0, s1, s2)]
+    valid = np.ones(SHAPE, bool) if valid is None else valid
+    return find_region(*images, valid, min_dolp=0.1, **options)
+
+
+def test_the_polarised_part_is_found():
+    s0, s1, s2, part = stokes_scene()
+    region = find(s0, s1, s2)
+    assert (region.inside & part).sum() > 0.95 * part.sum()
+    assert (region.inside & part).sum() > 0.9 * region.inside.sum()
+
+
+def test_no_polarisation_no_region():
+    s0, _, _, _ = stokes_scene()
+    assert not find(s0, np.zeros(SHAPE), np.zeros(SHAPE)).inside.any()
+
+
+def test_a_mark_is_inside_but_not_reliable():
+    s0, s1, s2, _ = stokes_scene()
+    mark = np.zeros(SHAPE, bool)
+    mark[55:63, 70:78] = True
+    s0[mark], s1[mark], s2[mark] = 0.6, 0, 0
+    region = find(s0, s1, s2)
+    assert region.inside[mark].all()
+    assert not region.reliable[mark].any()
+
+
+def test_a_textureless_unpolarised_spot_belongs_to_the_region_without_being_reliable():
+    s0, s1, s2, _ = stokes_scene()
+    spot = np.zeros(SHAPE, bool)
+    spot[40:80, 60:110] = True
+    s1[spot], s2[spot] = 0, 0
+    region = find(s0, s1, s2)
+    assert region.inside[spot].mean() > 0.99
+    assert not region.reliable[50:70, 70:100].any()
+
+
+def test_a_textured_hole_stays_a_hole():
+    s0, s1, s2, _ = stokes_scene()
+    hole = np.zeros(SHAPE, bool)
+    hole[38:84, 55:115] = True  # larger than any mark
+    s0[hole] = 0.5 + 0.3 * RNG.standard_normal(int(hole.sum()))
+    s1[hole], s2[hole] = 0, 0
+    region = find(s0, s1, s2)
+    assert region.inside[45:75, 65:105].mean() < 0.05
+
+
+def test_saturated_pixels_are_not_reliable():
+    s0, s1, s2, _ = stokes_scene()
+    valid = np.ones(SHAPE, bool)
+    valid[50:60, 60:70] = False
+    assert not find(s0, s1, s2, valid).reliable[50:60, 60:70].any()
+
+
+def test_a_crease_between_two_faces_is_an_edge():
+    s0, s1, s2, part = stokes_scene()
+    half = part.copy()
+    half[:, :85] = False
+    s1[half], s2[half] = 0.1 * 0.6 * np.cos(2 * 1.2), 0.1 * 0.6 * np.sin(2 * 1.2)
+    region = find(s0, s1, s2)
+    assert region.edges[35:85, 83:88].any(axis=1).all()
+    assert not region.edges[40:80, 50:75].any()
+    assert not region.edges[40:80, 95:120].any()
+
+
+def test_the_users_mask_replaces_the_search():
+    s0, s1, s2, _ = stokes_scene()
+    mask = np.zeros(SHAPE, bool)
+    mask[40:60, 50:100] = True
+    np.testing.assert_array_equal(find(s0, s1, s2, mask=mask).inside, mask)
+
+
+@pytest.mark.parametrize("shade", [1.0, 0.97])
+def test_growth_does_not_run_into_an_open_textureless_background(shade):
+    """A small polarised patch before a flat background of like brightness keeps its own extent."""
+    s0 = np.full(SHAPE, 0.1 * shade)
+    s1, s2 = np.zeros(SHAPE), np.zeros(SHAPE)
+    s0[50:70, 70:90], s1[50:70, 70:90] = 0.1, 0.06
+    region = find(s0, s1, s2)
+    assert region.inside[55:65, 75:85].all()
+    assert region.inside.sum() < 4 * 400

@@ -1,0 +1,212 @@
+"""Stokes images: known light, noise against simulation, masks, axial angles, real films."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polmvs.io.images import read_mosaic
+from polmvs.polarization.mosaic import clipped_cells, linearize, split_mosaic
+from polmvs.polarization.stokes import (
+    UNIFORM_SIGMA,
+    Stokes,
+    axial_difference,
+    axial_mean,
+    stokes_from_intensities,
+)
+
+FILMS = Path(__file__).parents[3] / "shared" / "data" / "real" / "polarizer_IMX250MZR.png"
+PATTERN = (90, 45, 135, 0)
+FULL_WELL = 10_000  # electrons
+
+
+def intensities_of(s0, dolp, aolp):
+    """Malus: what ideal polarizers at 0, 45, 90, 135 degrees let through, (4, ...)."""
+    angles = np.radians([0, 45, 90, 135]).reshape(4, *[1] * np.ndim(s0 * dolp * aolp))
+    return (0.5 * s0 * (1 + dolp * np.cos(2 * (aolp - angles)))).astype(np.float32)
+
+
+def exposed_mosaic(intensities, seed, read_noise=2.5):
+    """8-bit linear mosaic of intensities given at every raw pixel; read noise in electrons."""
+    rng = np.random.default_rng(seed)
+    clean = np.empty(intensities.shape[1:])
+    for cell, angle in enumerate(PATTERN):
+        site = (slice(cell // 2, None, 2), slice(cell % 2, None, 2))
+        clean[site] = intensities[angle // 45][site]
+    electrons = rng.poisson(clean * FULL_WELL) + rng.normal(0, read_noise, clean.shape)
+    return np.clip(np.rint(electrons / FULL_WELL * 255), 0, 255).astype(np.uint8)
+
+
+def stokes_of(raw):
+    return stokes_from_intensities(
+        split_mosaic(linearize(raw), PATTERN), clipped_cells(raw, 250), quantum=1 / 255
+    )
+
+
+def uniform(s0, s1, s2, sigma=0.01):
+    full = [np.full((2, 3), value, np.float32) for value in (s0, s1, s2, sigma)]
+    valid = np.ones((2, 3), bool)
+    return Stokes(s0=full[0], s1=full[1], s2=full[2], sigma=full[3], valid=valid)
+
+
+@pytest.mark.parametrize("aolp_deg", [0, 1, 45, 89, 90, 135, 179])
+@pytest.mark.parametrize("dolp", [0.05, 1.0])
+def test_known_light_is_recovered(aolp_deg, dolp):
+    aolp = np.full((4, 5), np.radians(aolp_deg))
+    stokes = stokes_from_intensities(intensities_of(0.8, dolp, aolp), np.zeros((4, 5), bool))
+    np.testing.assert_allclose(stokes.s0, 0.8, rtol=1e-6)
+    np.testing.assert_allclose(stokes.s1, 0.8 * dolp * np.cos(2 * aolp), atol=1e-6)
+    np.testing.assert_allclose(stokes.s2, 0.8 * dolp * np.sin(2 * aolp), atol=1e-6)
+    np.testing.assert_allclose(stokes.dolp, dolp, rtol=1e-5)
+    np.testing.assert_allclose(axial_difference(stokes.aolp, aolp), 0, atol=1e-5)
+    assert stokes.shape == (4, 5)
+    assert stokes.valid.all()
+    assert stokes.sigma.min() > 0
+    assert all(a.dtype == np.float32 for a in (stokes.s0, stokes.sigma, stokes.aolp, stokes.dolp))
+
+
+def test_aolp_range_is_half_open():
+    for s2 in (0.0, -0.0, -1e-30, -1e-9, 1e-9):
+        aolp = uniform(1.0, 0.5, s2).aolp
+        assert (aolp >= 0).all()
+        assert (aolp < np.pi).all()
+
+
+def test_sigma_aolp_formula_and_cap():
+    # sigma / (2 dolp s0)
+    assert uniform(0.8, 0.3, -0.4).sigma_aolp == pytest.approx(0.01 / (2 * 0.5), rel=1e-6)
+    assert uniform(0.8, 1e-5, 0).sigma_aolp == pytest.approx(UNIFORM_SIGMA)
+    assert uniform(0.8, 0, 0).sigma_aolp == pytest.approx(UNIFORM_SIGMA)
+    assert uniform(0, 0, 0).dolp == pytest.approx(0)
+
+
+@pytest.mark.parametrize("read_noise", [2.5, 40.0])
+def test_noise_matches_the_simulation_at_every_intensity(read_noise):
+    height, width = 512, 1024
+    s0 = np.broadcast_to(np.linspace(0.1, 1.5, width), (height, width))
+    dolp, aolp = 0.25, 0.4
+    raw = exposed_mosaic(intensities_of(s0, dolp, aolp), seed=0, read_noise=read_noise)
+    stokes = stokes_of(raw)
+    truth = 0.5 * (s0[::2, ::2] + s0[1::2, 1::2])
+    error = {
+        "s1": stokes.s1 - truth * dolp * np.cos(2 * aolp),
+        "s2": stokes.s2 - truth * dolp * np.sin(2 * aolp),
+    }
+    angle_error = axial_difference(stokes.aolp, aolp)
+    for band in np.split(np.arange(8, width // 2 - 8), 4):
+        region = np.ix_(range(4, height // 2 - 4), band)
+        assert stokes.valid[region].all()
+        sigma = np.sqrt(np.mean(stokes.sigma[region] ** 2))
+        for name in ("s1", "s2"):
+            assert sigma == pytest.approx(error[name][region].std(), rel=0.15), name
+        predicted = np.sqrt(np.mean(stokes.sigma_aolp[region] ** 2))
+        assert predicted == pytest.approx(angle_error[region].std(), rel=0.15)
+
+
+def test_texture_raises_sigma_where_it_is_and_nowhere_else():
+    rng = np.random.default_rng(1)
+    s0 = np.tile(np.linspace(0.2, 1.0, 512), (512, 1))
+    smooth = stokes_of(exposed_mosaic(intensities_of(s0, 0.3, 1.0), seed=2))
+    s0[256:] *= rng.uniform(0.7, 1.3, (256, 512))
+    half = stokes_of(exposed_mosaic(intensities_of(s0, 0.3, 1.0), seed=2))
+    upper, lower = slice(4, 120), slice(136, 252)
+    np.testing.assert_allclose(half.sigma[upper].mean(), smooth.sigma[upper].mean(), rtol=0.15)
+    truth = 0.25 * s0.reshape(256, 2, 256, 2).sum(axis=(1, 3)) * 0.3
+    error = half.s1[lower] - truth[lower] * np.cos(2.0)
+    assert error.std() > 5 * smooth.sigma[lower].mean()
+    assert np.sqrt(np.mean(half.sigma[lower] ** 2)) == pytest.approx(error.std(), rel=0.3)
+
+
+def test_noise_has_the_floor_of_quantisation():
+    flat = np.full((4, 80, 80), 0.25, np.float32)
+    for quantum in (1 / 255, 1 / 4095):
+        sigma = stokes_from_intensities(flat, np.zeros((80, 80), bool), quantum=quantum).sigma
+        # Two interpolated samples, each with 0.39 of the variance of a rounded one.
+        np.testing.assert_allclose(sigma, quantum * np.sqrt(2 * 0.390625 / 12), rtol=1e-4)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.3])
+def test_images_without_information_raise_no_warning(level):
+    for shape in ((1, 1), (4, 4), (80, 80)):
+        stokes = stokes_from_intensities(
+            np.full((4, *shape), level, np.float32), np.zeros(shape, bool), darkness=0, quantum=0
+        )
+        assert np.isfinite(stokes.sigma).all()
+        assert np.isfinite(stokes.sigma_aolp).all()
+
+
+def test_saturated_and_dark_pixels_are_invalid():
+    intensities = np.full((4, 20, 20), 0.3, np.float32)
+    intensities[:, :, 15:] = 0.003
+    # A polarizer at right angles to the light is black, yet the pixel is not dark.
+    intensities[:, 5:, 10:15] = np.array([0.0, 0.1, 0.2, 0.1])[:, None, None]
+    clipped = np.zeros((20, 20), bool)
+    clipped[2:4, 2:4] = True
+    valid = stokes_from_intensities(intensities, clipped, darkness=0.004).valid
+    assert not valid[2:4, 2:4].any()
+    assert not valid[:, 15:].any()
+    assert valid.sum() == 20 * 15 - 4
+
+
+def test_a_clipped_raw_sample_invalidates_what_it_enters():
+    raw = np.full((40, 40), 100, np.uint8)
+    raw[20, 20] = 255
+    assert np.argwhere(~stokes_of(raw).valid).tolist() == [[9, 9], [9, 10], [10, 9], [10, 10]]
+
+
+def test_wrong_shapes_are_a_callers_error():
+    with pytest.raises(ValueError, match="expected"):
+        stokes_from_intensities(np.zeros((3, 4, 4), np.float32), np.zeros((4, 4), bool))
+    with pytest.raises(ValueError, match="expected"):
+        stokes_from_intensities(np.zeros((4, 4, 4), np.float32), np.zeros((4, 5), bool))
+
+
+@pytest.mark.parametrize("shape", [(), (7,), (2, 3)])
+def test_axial_difference_ignores_half_turns(shape):
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(-10, 10, (2, *shape))
+    difference = axial_difference(a, b)
+    assert difference.shape == shape
+    assert np.all((difference >= -np.pi / 2) & (difference < np.pi / 2))
+    np.testing.assert_allclose(np.sin(difference - (a - b)), 0, atol=1e-12)
+    np.testing.assert_allclose(axial_difference(a + np.pi, b - 3 * np.pi), difference, atol=1e-12)
+
+
+def test_axial_difference_of_right_angles_is_the_lower_bound():
+    assert axial_difference(np.pi / 2, 0.0) == pytest.approx(-np.pi / 2)
+    assert axial_difference(-np.pi / 2, 1e-17) < np.pi / 2
+
+
+def test_axial_mean_crosses_the_seam():
+    assert axial_mean(np.radians([179.0, 3.0])) == pytest.approx(np.radians(1))
+    angles = np.radians([[10.0, 20.0, 170.0], [80.0, 100.0, 90.0]])
+    expected = axial_mean(angles, axis=1)
+    assert np.degrees(expected[1]) == pytest.approx(90)
+    turned = angles + np.pi * np.array([[1, -2, 0], [3, 0, -1]])
+    np.testing.assert_allclose(axial_mean(turned, axis=1), expected, rtol=1e-12)
+    shifted = axial_mean(angles + 0.7, axis=1)
+    np.testing.assert_allclose(axial_difference(shifted, expected + 0.7), 0, atol=1e-12)
+
+
+def test_axial_mean_weights_and_undefined_means():
+    angles = np.radians([20.0, 60.0, 110.0])
+    assert np.degrees(axial_mean(angles, np.array([1.0, 1.0, 0.0]))) == pytest.approx(40)
+    heavy = np.degrees(axial_mean(angles[:2], np.array([3.0, 1.0])))
+    assert 20 < heavy < 40
+    assert np.isnan(axial_mean(np.array([0.0, np.pi / 2])))
+    assert np.isnan(axial_mean(angles, np.zeros(3)))
+
+
+@pytest.mark.skipif(not FILMS.is_file(), reason=f"{FILMS} is absent")
+def test_real_polarizer_films_give_their_angles():
+    stokes = stokes_of(read_mosaic(FILMS))
+    centers = {83: (545, 192), 44: (547, 500), 175: (547, 777), 135: (553, 1053)}
+    for expected_deg, (row, col) in centers.items():
+        film = (slice(row - 40, row + 41), slice(col - 40, col + 41))
+        inside = stokes.valid[film]
+        mean = axial_mean(stokes.aolp[film][inside])
+        assert abs(np.degrees(axial_difference(mean, np.radians(expected_deg)))) < 1
+        assert np.median(stokes.dolp[film]) > 0.35  # 0.38 to 0.51: the window glares
+        spread = axial_difference(stokes.aolp[film][inside], mean)
+        assert np.degrees(np.median(np.abs(spread))) < 2
+    assert 0.13 < np.mean(~stokes.valid) < 0.17  # the saturated sky

@@ -1,0 +1,307 @@
+"""Markers rendered on a plane, of a size that is known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from polmvs.camera import Camera, PinholeCamera, View
+from polmvs.colmap.models import ColmapCamera, SparseModel
+from polmvs.config import ReferenceOptions
+from polmvs.errors import DataError, OptionError
+from polmvs.geometry import RigidTransform
+from polmvs.normals.tracks import Tracks
+from polmvs.polarization.capture import DISPLAY_GAMMA
+from polmvs.poses.marker_size import measure_markers
+from polmvs.poses.markers import Detection, detect_markers, find_markers, parse_marker_option
+from polmvs.poses.metric_sources import metric_frame
+from polmvs.poses.triangulation import intersect_rays, triangulate_together
+from polmvs.synthetic.captures import look_at, ring_of_views
+
+Array = NDArray[np.float64]
+
+DICT = cv2.aruco.DICT_4X4_50
+OPTION = "DICT_4X4_50:0.05"
+SIDE = 0.05
+PINHOLE = PinholeCamera(width=320, height=240, fx=330.0, fy=330.0, cx=158.3, cy=121.6)
+BARREL = ColmapCamera(
+    model="OPENCV",
+    width=320,
+    height=240,
+    params=(330.0, 331.0, 158.3, 121.6, -0.25, 0.06, 0.002, -0.001),
+)
+# id, centre (x, y), side, turn in the plane (rad)
+Marker = tuple[int, tuple[float, float], float, float]
+ONE: tuple[Marker, ...] = ((7, (0.01, -0.02), SIDE, 0.4),)
+SUPERSAMPLING = 5
+
+
+def true_corners(marker: Marker) -> Array:
+    """Corners in the world, in the detector's order, seen from above (z > 0)."""
+    _, center, side, turn = marker
+    square = side / 2 * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return np.column_stack([square @ rotation.T + center, np.zeros(4)])
+
+
+def paper(points: Array, markers: Sequence[Marker]) -> Array:
+    """Linear brightness of points on the plane z = 0: grey, with markers on white squares."""
+    brightness = np.full(points.shape[:-1], 0.3)
+    table = cv2.aruco.getPredefinedDictionary(DICT)
+    for marker_id, center, side, turn in markers:
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        local = (points[..., :2] - center) @ rotation / side  # the black square is +-0.5
+        texture = cv2.aruco.generateImageMarker(table, marker_id, 6)
+        col, row = np.floor((local[..., 0] + 0.5) * 6), np.floor((0.5 - local[..., 1]) * 6)
+        black = (np.abs(local) < 0.5).all(axis=-1)
+        index = (np.clip(row, 0, 5).astype(int), np.clip(col, 0, 5).astype(int))
+        value = np.where(black & (texture[index] == 0), 0.04, 0.8)
+        brightness = np.where((np.abs(local) < 0.7).all(axis=-1), value, brightness)
+    return brightness
+
+
+def render(view: View, markers: Sequence[Marker], noise: float = 0.0, blur: float = 0.5):
+    """8-bit image as SfM gets it: averaged over pixels in linear light, blurred, gamma 2.2."""
+    camera, n = view.camera, SUPERSAMPLING
+    ticks = [(np.arange(n * size) + 0.5) / n for size in (camera.width, camera.height)]
+    world_from_cam = view.cam_from_world.inverse()
+    rays = camera.rays(np.stack(np.meshgrid(*ticks), axis=-1)) @ world_from_cam.rotation.T
+    origin = world_from_cam.translation
+    points = origin - rays * (origin[2] / rays[..., 2])[..., None]
+    fine = paper(points, markers).reshape(camera.height, n, camera.width, n).mean(axis=(1, 3))
+    image = cv2.GaussianBlur(fine, (0, 0), blur)
+    image = image + np.random.default_rng(0).normal(0, noise, image.shape)
+    return np.rint(255 * np.clip(image, 0, 1) ** (1 / DISPLAY_GAMMA)).astype(np.uint8)
+
+
+def views_of(camera: Camera, num: int = 5) -> list[View]:
+    return ring_of_views(num, camera, distance=0.35, elevation_deg=50, roll_deg=15)
+
+
+def loader(views: Sequence[View], markers: Sequence[Marker], **options) -> Callable:
+    images = {view.name: render(view, markers, **options) for view in views}
+    return images.__getitem__
+
+
+def model_of(views: Sequence[View], scale: float = 1.0) -> SparseModel:
+    """A model of the views, ``scale`` units to the metre, and no points."""
+    scaled = [
+        replace(
+            view,
+            cam_from_world=RigidTransform(
+                view.cam_from_world.rotation, scale * view.cam_from_world.translation
+            ),
+        )
+        for view in views
+    ]
+    none = np.zeros(0, np.int64)
+    tracks = Tracks(
+        point3D_ids=none,
+        points_in_world=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
+        errors=np.zeros(0),
+        obs_track=none,
+        obs_view=none,
+        obs_xy=np.zeros((0, 2)),
+    )
+    return SparseModel(views=tuple(scaled), tracks=tracks, unregistered=())
+
+
+def exact(views: Sequence[View], markers: Sequence[Marker]) -> list[Detection]:
+    """Detections without any error."""
+    return [
+        Detection(m[0], k, np.asarray(v.camera.project(v.cam_from_world * true_corners(m))))
+        for k, v in enumerate(views)
+        for m in markers
+    ]
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, BARREL], ids=["pinhole", "distorted"])
+@pytest.mark.parametrize("blur", [0.3, 0.9])
+def test_corners_are_found_to_a_twentieth_of_a_pixel(camera: Camera, blur: float) -> None:
+    """No bias inwards, whatever the blur; half a pixel of shift would show ten times over."""
+    view = views_of(camera)[0]
+    found = find_markers(render(view, ONE, blur=blur), camera, DICT)
+    assert list(found) == [7]
+    truth = camera.project(view.cam_from_world * true_corners(ONE[0]))
+    np.testing.assert_allclose(found[7], truth, atol=0.08)
+    assert np.abs((found[7] - truth).mean(axis=0)).max() < 0.03
+    inwards = np.linalg.norm(found[7] - found[7].mean(0)) / np.linalg.norm(truth - truth.mean(0))
+    assert inwards == pytest.approx(1, abs=1e-3)
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, BARREL], ids=["pinhole", "distorted"])
+def test_scale_of_a_scrambled_world(camera: Camera) -> None:
+    views = views_of(camera, 3)
+    model = model_of(views, 7.0)
+    load = loader(views, ONE, noise=0.01)
+    frame = metric_frame(model, ReferenceOptions(aruco=OPTION), load)
+    assert frame is not None
+    assert frame.source == "aruco"
+    assert frame.scale == pytest.approx(1 / 7, rel=1.5e-3)
+    assert abs(7 * frame.scale - 1) < 4 * frame.relative_sigma < 0.02
+    assert (frame.num_used, frame.dropped) == (3, ())
+    assert frame.rms_residual < 0.1
+    np.testing.assert_array_equal(frame.metric_from_world.rotation, np.eye(3))
+    np.testing.assert_array_equal(frame.metric_from_world.translation, np.zeros(3))
+
+
+def test_exact_corners_give_the_exact_side() -> None:
+    for camera in (PINHOLE, BARREL):
+        views = views_of(camera)
+        measure = measure_markers(views, exact(views, ONE), source="test")
+        assert measure.side == pytest.approx(SIDE, rel=1e-9)
+        assert measure.rms_residual_px < 1e-6
+        assert measure.marker_ids == (7,)
+
+
+def test_standard_deviation_is_that_of_repeated_noise() -> None:
+    views = views_of(PINHOLE)
+    rng = np.random.default_rng(0)
+    sides, sigmas = [], []
+    for _ in range(100):
+        noisy = [
+            replace(d, corners=d.corners + rng.normal(0, 0.2, (4, 2))) for d in exact(views, ONE)
+        ]
+        measure = measure_markers(views, noisy, source="test")
+        sides.append(measure.side)
+        sigmas.append(measure.relative_sigma * measure.side)
+    # 100 draws tell a standard deviation to 7 %; the bound is three times that.
+    assert np.mean(sigmas) == pytest.approx(np.std(sides), rel=0.21)
+    assert np.mean(sides) == pytest.approx(SIDE, rel=1e-3)
+
+
+def test_a_wrong_view_is_rejected() -> None:
+    views = views_of(PINHOLE)
+    detections = exact(views, ONE)
+    detections[2] = replace(detections[2], corners=detections[2].corners + 9.0)
+    measure = measure_markers(views, detections, source="test")
+    assert measure.dropped == (f"marker 7 in {views[2].name}",)
+    assert measure.num_views == 4
+    assert measure.side == pytest.approx(SIDE, rel=1e-9)
+
+
+def test_views_that_contradict_each_other() -> None:
+    views = views_of(PINHOLE)
+    shifts = [[0, 0], [30, 0], [0, 30], [-30, 0], [0, -30]]
+    detections = [
+        replace(d, corners=d.corners + shift)
+        for d, shift in zip(exact(views, ONE), shifts, strict=True)
+    ]
+    with pytest.raises(DataError, match="the 5 views of marker 7 contradict each other"):
+        measure_markers(views, detections, source="test")
+
+
+def test_marker_in_a_single_view() -> None:
+    views = views_of(PINHOLE)
+    shown = loader(views[:1], ONE)(views[0].name)
+    blank = np.full_like(shown, 140)
+    load = lambda name: shown if name == views[0].name else blank  # noqa: E731
+    with pytest.raises(DataError, match=f"marker 7 is seen in one view only \\({views[0].name}"):
+        metric_frame(model_of(views), ReferenceOptions(aruco=OPTION), load)
+    # Beside a good marker it is left out.
+    pair = (*ONE, (9, (0.0, 0.03), SIDE, 0.0))
+    measure = measure_markers(views, [*exact(views, ONE), exact(views, pair)[1]], source="test")
+    assert measure.marker_ids == (7,)
+
+
+def test_no_marker() -> None:
+    views = views_of(PINHOLE, 2)
+    blank = np.full((PINHOLE.height, PINHOLE.width), 140, np.uint8)
+    with pytest.raises(DataError, match=r"--aruco DICT_4X4_50:0\.05: no such marker is found"):
+        metric_frame(model_of(views), ReferenceOptions(aruco=OPTION), lambda _: blank)
+
+
+def test_markers_of_contradictory_size() -> None:
+    views = views_of(PINHOLE, 3)
+    pair = ((3, (-0.04, 0.0), SIDE, 0.0), (5, (0.04, 0.01), 0.9 * SIDE, 0.8))
+    with pytest.raises(
+        DataError, match=r"markers 3 and 5 differ in size by a factor of 0\.(899|9)"
+    ):
+        metric_frame(model_of(views), ReferenceOptions(aruco=OPTION), loader(views, pair))
+
+
+def test_two_markers_of_one_size_are_surer_than_one() -> None:
+    views = views_of(PINHOLE, 3)
+    pair = ((3, (-0.04, 0.0), SIDE, 0.0), (5, (0.04, 0.01), SIDE, 0.8))
+    both = metric_frame(model_of(views), ReferenceOptions(aruco=OPTION), loader(views, pair))
+    assert both is not None
+    assert both.scale == pytest.approx(1, rel=2e-3)
+
+
+def test_stretched_marker() -> None:
+    views = views_of(PINHOLE)
+    corners = true_corners(ONE[0]) * [1.0, 1.1, 1.0]
+    detections = [
+        Detection(7, k, np.asarray(v.camera.project(v.cam_from_world * corners)))
+        for k, v in enumerate(views)
+    ]
+    with pytest.raises(DataError, match="marker 7 is not square"):
+        measure_markers(views, detections, source="test")
+
+
+def test_views_too_much_alike() -> None:
+    """Two views a millimetre apart see the marker's shape but not its distance."""
+    views = [
+        View(
+            name=f"{k}.png", camera=PINHOLE, cam_from_world=look_at([1e-3 * k, 0.2, 0.3], [0, 0, 0])
+        )
+        for k in range(2)
+    ]
+    with pytest.raises(DataError, match="too much alike"):
+        measure_markers(views, exact(views, ONE), source="test")
+
+
+def test_same_id_twice_in_an_image_is_left_out() -> None:
+    twins = ((3, (-0.04, 0.0), SIDE, 0.0), (3, (0.04, 0.01), SIDE, 0.8))
+    assert find_markers(render(views_of(PINHOLE)[0], twins), PINHOLE, DICT) == {}
+
+
+def test_image_of_another_size() -> None:
+    views = views_of(PINHOLE, 1)
+    with pytest.raises(DataError, match="rows of 320 px"):
+        detect_markers(views, DICT, lambda _: np.zeros((480, 640), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("DICT_4X4_51:0.05", "unknown dictionary 'DICT_4X4_51'; known are .*DICT_4X4_50"),
+        ("Board:0.05", "unknown dictionary"),
+        ("DICT_4X4_50", "needs DICT:SIZE"),
+        ("DICT_4X4_50:-0.05", "positive size"),
+        ("DICT_4X4_50:0", "positive size"),
+        ("DICT_4X4_50:nan", "positive size"),
+        ("DICT_4X4_50:5cm", "positive size"),
+    ],
+)
+def test_bad_options(option: str, message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        parse_marker_option(option)
+
+
+def test_intersection_of_rays() -> None:
+    rng = np.random.default_rng(0)
+    for shape in ((), (1,), (2, 3)):
+        points = rng.normal(size=(*shape, 3))
+        centers = rng.normal(size=(*shape, 4, 3))
+        rays = points[..., None, :] - centers
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        np.testing.assert_allclose(intersect_rays(centers, rays), points, atol=1e-9)
+    parallel = np.array([[0.0, 0.0, 1.0]] * 2)
+    assert np.isnan(intersect_rays(np.eye(3)[:2], parallel)).all()
+
+
+def test_points_behind_the_cameras_do_not_triangulate() -> None:
+    views = views_of(PINHOLE, 2)
+    away = [
+        replace(v, cam_from_world=look_at(v.center_in_world, 2 * v.center_in_world)) for v in views
+    ]
+    xy = np.full((2, 4, 2), 100.0)
+    assert triangulate_together(away, xy) is None
+    assert triangulate_together(views[:1], xy[:1]) is None

@@ -1,0 +1,190 @@
+"""What one dense view says about points of another."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import CAMERA, Scene, phase_map_of
+
+from polmvs.surface.consensus import ask_view, hidden_by, surface_of_others
+from polmvs.surface.dense_view import SurfaceSamples, dense_view, lattice_points
+from polmvs.synthetic.captures import Plane, Sphere, render_view, ring_of_views
+
+BALL = Sphere(center=np.array([0.0, 0.0, -0.3]), radius=0.35)
+BOARD = Plane(point=np.zeros(3), normal=np.array([0.1, -0.05, 1.0]), extent=(0.12, 0.15))
+SIGMA = 1e-3  # of the true views' ranges, as a share
+
+
+def scene_of(surface, num_views=3):
+    views = ring_of_views(
+        num_views, CAMERA, target=np.zeros(3), distance=0.5, elevation_deg=65, roll_deg=20
+    )
+    rendered = [render_view(v, surface, s0=0.2, background=0.6) for v in views]
+    return Scene(surface, views, rendered, [phase_map_of(r) for r in rendered])
+
+
+def true_samples(scene, k, stride=2):
+    """The surface at a view's lattice, and where the lattice hits it."""
+    view = scene.views[k]
+    everywhere = np.ones((view.camera.height // stride, view.camera.width // stride), bool)
+    xy = lattice_points(everywhere, stride)
+    rays = view.camera.rays(xy) @ view.cam_from_world.rotation
+    distance, normals = scene.surface.intersect(view.center_in_world, rays)
+    hit = np.isfinite(distance)
+    some = np.full(len(xy), SIGMA)
+    with np.errstate(invalid="ignore"):
+        log_range = np.log(distance)
+    samples = SurfaceSamples(xy, rays, log_range, normals, some, some, np.ones(len(xy)))
+    return samples[hit], hit.reshape(everywhere.shape)
+
+
+def true_view(scene, k, stride=2):
+    samples, hit = true_samples(scene, k, stride)
+    return dense_view(samples, hit, stride)
+
+
+def ask(scene, dense, away=0.0, turn=None):
+    """Opinion of the second view on the first one's true points, moved away from it."""
+    samples, _ = true_samples(scene, 0)
+    normals = samples.normals if turn is None else samples.normals @ turn.T
+    distance = np.exp(samples.log_range)
+    opinion = ask_view(
+        scene.maps[1],
+        dense,
+        scene.views[0].center_in_world,
+        samples.rays_in_world,
+        distance + away,
+        normals,
+    )
+    return samples, distance, opinion
+
+
+@pytest.mark.parametrize("surface", [BOARD, BALL], ids=["plane", "sphere"])
+@pytest.mark.parametrize("stride", [2, 8])
+def test_the_true_surface_is_met_where_it_is(surface, stride):
+    """Exactly, on spheres too: planes through the other's points would be met outside of them."""
+    scene = scene_of(surface)
+    _, distance, opinion = ask(scene, true_view(scene, 1, stride))
+    said = np.isfinite(opinion.place)
+    assert said.sum() > 0.6 * len(distance)
+    np.testing.assert_allclose(opinion.place[said], distance[said], rtol=3e-6)
+    assert (opinion.cosine[said] > 0.99).mean() > 0.7
+
+
+def test_a_point_away_from_the_surface_is_sent_back_to_it():
+    scene = scene_of(BOARD)
+    _, distance, opinion = ask(scene, true_view(scene, 1), away=0.02)
+    said = np.isfinite(opinion.place)
+    assert said.sum() > 500
+    np.testing.assert_allclose(opinion.place[said], distance[said], rtol=3e-6)
+    # Farther from the first view: behind the surface that the other sees.
+    assert (opinion.excess[said] < -0.005).all()
+    _, _, before = ask(scene, true_view(scene, 1), away=-0.02)
+    assert (before.excess[np.isfinite(before.place)] > 0.005).all()
+
+
+def test_a_deviation_counts_along_the_first_views_ray():
+    scene = scene_of(BOARD)
+    samples, distance, opinion = ask(scene, true_view(scene, 1))
+    said = np.isfinite(opinion.place)
+    slant = np.abs((samples.rays_in_world * samples.normals).sum(axis=-1))
+    to_point = scene.views[0].center_in_world + distance[:, None] * samples.rays_in_world
+    other_range = np.linalg.norm(to_point - scene.views[1].center_in_world, axis=-1)
+    expected = SIGMA * other_range / slant
+    np.testing.assert_allclose(opinion.sigma[said], expected[said], rtol=0.02)
+
+
+def test_normals_and_facing_are_those_of_the_point():
+    scene = scene_of(BOARD)
+    axis = np.array([[1, 0, 0], [0, np.cos(0.3), -np.sin(0.3)], [0, np.sin(0.3), np.cos(0.3)]])
+    samples, distance, opinion = ask(scene, true_view(scene, 1), turn=axis)
+    said = np.isfinite(opinion.place)
+    turned = samples.normals @ axis.T
+    np.testing.assert_allclose(
+        opinion.cosine[said], (samples.normals * turned).sum(-1)[said], atol=1e-5
+    )
+    np.testing.assert_allclose(opinion.normals[said], samples.normals[said], atol=1e-5)
+    points = scene.views[0].center_in_world + distance[:, None] * samples.rays_in_world
+    to_other = scene.views[1].center_in_world - points
+    to_other /= np.linalg.norm(to_other, axis=-1, keepdims=True)
+    np.testing.assert_allclose(opinion.facing, (to_other * turned).sum(-1), atol=1e-6)
+
+
+def test_a_view_that_knows_nothing_says_nothing():
+    scene = scene_of(BOARD)
+    full = true_view(scene, 1)
+    empty = replace(
+        full,
+        range_map=np.zeros_like(full.range_map),
+        normals_in_world=np.full_like(full.normals_in_world, np.nan),
+        sigma=np.full_like(full.sigma, np.nan),
+    )
+    _, _, opinion = ask(scene, empty)
+    assert np.isnan(opinion.place).all()
+    assert np.isnan(opinion.excess).all()
+    assert (opinion.normals == 0).all()
+
+
+def test_outside_is_what_the_image_shows_beside_the_region():
+    scene = scene_of(BOARD)
+    view, other = scene.views[0], scene.maps[1]
+    centre = np.zeros(3)
+    beside = np.array([0.16, 0.0, -0.016])  # in the image, past the board's edge
+    far = np.array([3.0, 0.0, 0.0])
+    behind = other.view.center_in_world * 2
+    points = np.array([centre, beside, far, behind])
+    to_point = points - view.center_in_world
+    distance = np.linalg.norm(to_point, axis=-1)
+    normals = np.broadcast_to([0.0, 0.0, 1.0], (4, 3))
+    opinion = ask_view(
+        other,
+        true_view(scene, 1),
+        view.center_in_world,
+        to_point / distance[:, None],
+        distance,
+        normals,
+    )
+    np.testing.assert_array_equal(opinion.outside, [False, True, False, False])
+    assert np.isnan(opinion.place[2:]).all()
+
+
+def test_the_others_surface_starts_a_view_that_knows_nothing():
+    scene = scene_of(BALL)
+    samples, _ = true_samples(scene, 0)
+    dense = [None, true_view(scene, 1), true_view(scene, 2)]
+    guess = surface_of_others(scene.maps, dense, samples.xy, 2.0)
+    found = np.isfinite(guess.log_range)
+    assert found.mean() > 0.7
+    # At the rim, where the range changes by much from pixel to pixel, it is a guess indeed.
+    error = np.abs(np.exp(guess.log_range) - np.exp(samples.log_range))[found]
+    slant = -(samples.rays_in_world * samples.normals).sum(axis=-1)[found]
+    assert error[slant > 0.4].max() < 0.004  # a footprint of half a metre
+    assert (guess.normals[found] * samples.normals[found]).sum(-1)[slant > 0.4].min() > 0.99
+
+
+def test_no_others_no_start():
+    scene = scene_of(BOARD)
+    xy = true_samples(scene, 0)[0].xy
+    assert surface_of_others(scene.maps, [None] * 3, xy, 2.0) is None
+    region = scene.maps[0].region
+    nowhere = replace(region, inside=np.zeros_like(region.inside))
+    hidden = replace(scene.maps[0], region=nowhere)
+    dense = [None, true_view(scene, 1), None]
+    assert surface_of_others([hidden, *scene.maps[1:]], dense, xy, 2.0) is None
+
+
+def test_what_lies_behind_another_surface_is_hidden():
+    scene = scene_of(BOARD)
+    dense, view = true_view(scene, 0), scene.views[0]
+    samples, _ = true_samples(scene, 0)
+    points = view.center_in_world + np.exp(samples.log_range)[:, None] * samples.rays_in_world
+    assert not hidden_by(dense, view, points, samples.normals).any()
+    left = samples.xy[:, 0] < 80
+    nearer = view.center_in_world + 0.9 * (points[left] - view.center_in_world)
+    hidden = hidden_by(dense, view, nearer, samples.normals[left])
+    columns = np.arange(hidden.shape[1]) * dense.stride_px + 1 < 80
+    np.testing.assert_array_equal(hidden, dense.known & columns)
+    # What shows the view its back, or lies farther off, hides nothing.
+    assert not hidden_by(dense, view, nearer, -samples.normals[left]).any()
+    farther = view.center_in_world + 1.1 * (points - view.center_in_world)
+    assert not hidden_by(dense, view, farther, samples.normals).any()

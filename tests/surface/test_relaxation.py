@@ -1,0 +1,345 @@
+"""One round of one view: who has a say on its nodes, and how certain the result is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import CAMERA, board_scene, phase_map_of
+from test_consensus import BALL, BOARD, scene_of, true_samples, true_view
+
+from polmvs.config import Model
+from polmvs.normals.tracks import Seeds, window_map
+from polmvs.polarization.phase_map import MODEL_SIGMA, _corrected, _with_doubt, as_tilted, turned
+from polmvs.surface.pixel_graph import Nodes, tie_seeds
+from polmvs.surface.relaxation import (
+    OPINION_REACH_PX,
+    open_lattice,
+    relax,
+    spread_nodes,
+    surface_at_seeds,
+    tie_opinions,
+)
+from polmvs.synthetic.captures import render_view, ring_of_views
+
+STRIDE = 4
+
+
+@pytest.fixture(scope="module")
+def board():
+    return board_scene(6)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """A board and the true dense views of it."""
+    scene = scene_of(BOARD, 5)
+    return scene, [true_view(scene, k) for k in range(5)]
+
+
+def nodes_of(scene, k=0, stride=STRIDE):
+    """True nodes of a view on the lattice of its region, joined to their neighbours."""
+    samples, hit = true_samples(scene, k, stride)
+    inside = scene.maps[k].shows_surface(samples.xy)
+    index = np.full(hit.shape, -1)
+    index[hit] = np.where(inside, np.cumsum(inside) - 1, -1)
+    pairs = [(index[:, :-1], index[:, 1:]), (index[:-1], index[1:])]
+    surface = samples[inside]
+    tail = np.concatenate([a[(a >= 0) & (b >= 0)] for a, b in pairs])
+    return Nodes(
+        surface=surface,
+        ray_z=scene.views[k].camera.rays(surface.xy)[:, 2],
+        spacing_px=float(stride),
+        tail=tail,
+        head=np.concatenate([b[(a >= 0) & (b >= 0)] for a, b in pairs]),
+        on_contour=np.zeros(len(tail), bool),
+    )
+
+
+def moved(dense, away):
+    """A dense view whose surface lies farther away."""
+    known = dense.range_map > 0
+    return replace(dense, range_map=np.where(known, dense.range_map + away, 0).astype(np.float32))
+
+
+def test_others_tie_the_nodes_to_their_common_surface(exact):
+    scene, dense = exact
+    nodes = nodes_of(scene)
+    ties = tie_opinions(scene.maps, dense, nodes)
+    assert len(ties.node) > 0.7 * len(nodes.surface.xy)
+    np.testing.assert_allclose(ties.value, nodes.surface.log_range[ties.node], atol=1e-5)
+    assert len(np.unique(ties.seed)) == len(ties.seed)
+
+
+def test_one_opinion_is_none(exact):
+    """Its error would come back to the view as another's agreement."""
+    scene, dense = exact
+    nodes = nodes_of(scene)
+    for others in ([None] * 4, [dense[1], None, None, None]):
+        assert len(tie_opinions(scene.maps, [dense[0], *others], nodes).node) == 0
+    assert len(tie_opinions(scene.maps, [None, dense[1], None, None, dense[4]], nodes).node) > 100
+
+
+def test_two_that_contradict_each_other_are_none(exact):
+    """By 20 times their deviation; the nearer one must not be taken for the truth."""
+    scene, dense = exact
+    nodes = nodes_of(scene)
+    # One alone can tell neither which of both is right nor whether it is.
+    two = [None, moved(dense[1], -0.01), None, None, dense[4]]
+    assert len(tie_opinions(scene.maps, two, nodes).node) == 0
+    within = [None, moved(dense[1], -0.0005), None, None, dense[4]]
+    assert len(tie_opinions(scene.maps, within, nodes).node) > 100
+
+
+@pytest.mark.parametrize("away", [-0.03, 0.03])
+def test_one_of_many_is_outvoted(exact, away):
+    scene, dense = exact
+    nodes = nodes_of(scene)
+    wrong = [dense[0], moved(dense[1], away), *dense[2:]]
+    ties = tie_opinions(scene.maps, wrong, nodes)
+    assert len(ties.node) > 0.5 * len(nodes.surface.xy)
+    error = np.abs(ties.value - nodes.surface.log_range[ties.node])
+    assert np.median(error) < 1e-5
+    assert (error < 1e-4).mean() > 0.9
+
+
+def test_an_opinion_on_another_surface_is_none(exact):
+    """30 degrees between the normals: it sees what hides the node, or what lies behind it."""
+    scene, dense = exact
+    nodes = nodes_of(scene)
+    cos, sin = np.cos(np.radians(30)), np.sin(np.radians(30))
+    turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+    turned = replace(nodes, surface=replace(nodes.surface, normals=nodes.surface.normals @ turn.T))
+    assert len(tie_opinions(scene.maps, dense, turned).node) == 0
+
+
+def test_opinions_within_reach_count_once(exact):
+    """On a denser lattice each tie is weaker, so that their sum over an area is the same."""
+    scene, dense = exact
+    sums = []
+    for stride in (2, 4):
+        ties = tie_opinions(scene.maps, dense, nodes_of(scene, stride=stride))
+        sums.append((1 / ties.sigma**2).sum())
+    assert sums[0] == pytest.approx(sums[1], rel=0.05)
+    nodes = nodes_of(scene, stride=4)
+    ties = tie_opinions(scene.maps, dense, nodes)
+    # Views that agree exactly: the deviation of one of them, along an oblique ray.
+    assert np.median(ties.sigma) == pytest.approx(1.2e-3 * OPINION_REACH_PX / 4, rel=0.25)
+
+
+def test_views_that_scatter_are_less_certain(exact):
+    scene, dense = exact
+    nodes = nodes_of(scene)
+    sharp = tie_opinions(scene.maps, dense, nodes)
+    spread = [moved(d, a) for d, a in zip(dense, (0, 0.004, -0.004, 0.002, -0.002), strict=True)]
+    blurred = tie_opinions(scene.maps, spread, nodes)
+    assert np.median(blurred.sigma) > 1.5 * np.median(sharp.sigma)
+
+
+def test_seeds_are_tied_along_chords_of_a_sphere():
+    """A tangent plane would put the nodes about a seed outside of the sphere."""
+    scene = scene_of(BALL)
+    nodes = nodes_of(scene, stride=8)
+    view = scene.views[0]
+    samples, _ = true_samples(scene, 0, 2)
+    slant = -(samples.rays_in_world * samples.normals).sum(axis=-1)
+    some = samples[np.flatnonzero(slant > 0.6)[::37]]
+    points = view.center_in_world + np.exp(some.log_range)[:, None] * some.rays_in_world
+    seeds = Seeds(points, some.normals, np.full(len(points), 1e-4))
+    ties = tie_seeds(scene.maps[0], nodes, seeds)
+    assert len(ties.node) > 2 * len(points) // 2
+    np.testing.assert_allclose(ties.value, nodes.surface.log_range[ties.node], atol=1e-9)
+
+
+def test_the_first_guess_is_the_median_of_near_seeds(board):
+    seeds = board.seeds(9)
+    view, points = board.views[0], seeds.points_in_world.copy()
+    center = view.center_in_world
+    points[0] = center + 0.7 * (points[0] - center)
+    one_wrong = replace(seeds, points_in_world=points)
+    xy = view.camera.project(view.cam_from_world * points)[:1]  # next to the wrong one
+    guess = surface_at_seeds(board.maps[0], one_wrong, xy)
+    distance = np.linalg.norm(seeds.points_in_world - board.views[0].center_in_world, axis=-1)
+    assert (np.exp(guess.log_range) >= distance.min()).all()
+    assert (np.exp(guess.log_range) <= distance.max()).all()
+    np.testing.assert_allclose(np.linalg.norm(guess.normals, axis=-1), 1)
+    assert (guess.confidence == 0).all()
+
+
+def test_no_visible_seed_no_guess(board):
+    xy = np.array([[80.0, 64.0]])
+    seeds = board.seeds(5)
+    behind = replace(seeds, normals_in_world=-seeds.normals_in_world)
+    assert surface_at_seeds(board.maps[0], behind, xy) is None
+    assert surface_at_seeds(board.maps[0], seeds, np.zeros((0, 2))) is None
+
+
+def relaxed(scene, maps, nodes=None, dense=None, **options):
+    nodes = nodes_of(scene) if nodes is None else nodes
+    dense = [None] * len(maps) if dense is None else dense
+    options = {"bending": 0.002, **options}
+    return relax(Model.PPA, maps, dense, nodes, scene.seeds(12), **options)
+
+
+def test_a_round_leaves_the_true_surface_where_it_is(board):
+    before = nodes_of(board).surface
+    after = relaxed(board, board.maps).surface
+    error = np.exp(after.log_range) - np.exp(before.log_range)
+    assert np.sqrt((error**2).mean()) < 0.04 * 0.5 / 120  # footprints; seeds are tied to 0.02
+    turn = np.degrees(np.arccos(np.clip((after.normals * before.normals).sum(-1), -1, 1)))
+    assert np.median(turn) < 0.1
+    assert turn.max() < 3  # the phase is smoothed up to the region's edge
+    assert np.isfinite(after.log_range_sigma).all()
+
+
+def with_wrong_phase(board, index):
+    """The maps with one view's phase 45 degrees off."""
+    wrong = board.maps[index]
+    cos, sin, precision = np.moveaxis(wrong.samples, -1, 0)
+    turned = replace(wrong, samples=np.dstack([-sin, cos, precision]), folder=None)
+    return [turned if m is wrong else m for m in board.maps]
+
+
+def test_confidence_is_the_share_of_views_that_agree(board):
+    """One where all do; a view whose phase is off is one of six, or of those facing."""
+    clean = relaxed(board, board.maps).surface.confidence
+    assert (clean == 1).mean() > 0.99
+    one_off = relaxed(board, with_wrong_phase(board, 3)).surface.confidence
+    assert np.median(one_off) == pytest.approx(5 / 6)
+
+
+def test_what_a_views_own_phase_denies_has_no_confidence(board):
+    """The others outvote it, on a surface that it does not see."""
+    own_off = relaxed(board, with_wrong_phase(board, 0)).surface.confidence
+    assert (own_off == 0).mean() > 0.99
+
+
+def test_nodes_of_unknown_place_take_no_rows(board):
+    """Other views may well show this one's camera: no row is read there."""
+    nodes = nodes_of(board)
+    lost = np.arange(len(nodes.surface.xy)) % 50 == 7
+    log_range = np.where(lost, np.nan, nodes.surface.log_range)
+    nodes = replace(nodes, surface=replace(nodes.surface, log_range=log_range))
+    above = ring_of_views(
+        5, CAMERA, target=board.views[0].center_in_world, distance=0.4, elevation_deg=60
+    )
+    watching = [_polarised(board.maps[0], view) for view in above]
+    surface = relaxed(board, [*board.maps, *watching], nodes).surface
+    assert (surface.confidence[lost] == 0).all()
+    assert (surface.normal_sigma[lost] > 0.05).all()  # filled from the neighbours
+    # Which put it in its place.
+    assert (surface.normals[lost] * nodes.surface.normals[lost]).sum(-1).min() > 0.99
+
+
+def _polarised(phase_map, view):
+    """Map of a view whose image shows polarised light all over."""
+    everywhere = np.ones_like(phase_map.region.inside)
+    # Planes of incidence that hold the vertical: all views agree on it as a normal.
+    samples = np.dstack([-0.3 * everywhere, 0.0 * everywhere, 1e4 * everywhere])
+    region = replace(phase_map.region, inside=everywhere)
+    return replace(phase_map, view=view, region=region, samples=samples.astype(np.float32))
+
+
+def test_the_origin_may_be_far(board):
+    """A world of national coordinates: a metre is lost in single precision at 10,000 km."""
+    shift = np.array([4e5, -5e6, 100.0])
+
+    def there(phase_map):
+        view, pose = phase_map.view, phase_map.view.cam_from_world
+        far = replace(pose, translation=pose.translation - pose.rotation @ shift)
+        return replace(phase_map, view=replace(view, cam_from_world=far))
+
+    seeds = board.seeds(12)
+    far_seeds = replace(seeds, points_in_world=seeds.points_in_world + shift)
+    nodes, none = nodes_of(board), [None] * 6
+    here = relax(Model.PPA, board.maps, none, nodes, seeds, bending=0.0)
+    far_maps = [there(m) for m in board.maps]
+    away = relax(Model.PPA, far_maps, none, nodes, far_seeds, bending=0.0)
+    np.testing.assert_allclose(away.surface.log_range, here.surface.log_range, atol=1e-5)
+
+
+def test_the_lattice_leaves_out_edges(board):
+    phase_map = board.maps[0]
+    inside = np.zeros_like(phase_map.region.inside)
+    inside[20:60, 30:90] = True
+    edges = np.zeros_like(inside)
+    edges[40:44] = True
+    region = replace(phase_map.region, inside=inside, edges=edges)
+    wanted = open_lattice(replace(phase_map, region=region), 4)
+    expected = np.zeros((32, 40), bool)
+    expected[5:15, 8:22] = True  # centres at 4 i + 2
+    expected[10] = False
+    np.testing.assert_array_equal(wanted[:, 8:22], expected[:, 8:22])
+    assert not wanted[:, 23:].any()
+    assert not wanted[:, :7].any()
+
+
+def test_nodes_are_spread_over_the_lattice(board):
+    nodes = nodes_of(board)
+    dense = spread_nodes(board.maps[0], nodes.surface, 2, 6.0)
+    truth, hit = true_samples(board, 0, 2)
+    known = dense.known & hit
+    assert known.sum() > 0.9 * open_lattice(board.maps[0], 2).sum()
+    ranges = np.zeros(hit.shape)
+    ranges[hit] = np.exp(truth.log_range)
+    np.testing.assert_allclose(dense.range_map[known], ranges[known], rtol=1e-5)
+    lost = replace(nodes.surface, log_range=np.full(len(nodes.surface.xy), np.nan))
+    assert spread_nodes(board.maps[0], lost, 2, 6.0) is None
+
+
+@pytest.fixture(scope="module")
+def oblique():
+    """A map of a wide lens whose polarizers are tilted: its phases turn by degrees."""
+    camera = replace(CAMERA, fx=80.0, fy=80.0)
+    board = replace(BOARD, extent=(0.3, 0.35))
+    view = ring_of_views(1, camera, target=np.zeros(3), distance=0.4, elevation_deg=50)[0]
+    return phase_map_of(render_view(view, board, sensor="tilted", s0=0.2, background=0.6))
+
+
+def without_doubt(phase_map):
+    return _with_doubt(phase_map, -1.0, _corrected(phase_map))
+
+
+def test_oblique_rays_count_less(oblique):
+    """By the square of the turn that a tilt would give them; frontal ones stay as they are."""
+    certain = without_doubt(oblique).samples[..., 2]
+    some = oblique.samples[..., 2] > 0
+    gain = np.where(some, certain / np.where(some, oblique.samples[..., 2], 1), np.nan)
+    assert np.nanmax(gain) > 3
+    assert gain[60:68, 76:84].max() < 1.1
+    assert np.nanmin(gain) >= 1 - 1e-4
+    assert (certain > 0).sum() == some.sum()
+
+
+def test_the_doubt_is_taken_back_as_it_was_added(oblique):
+    certain = without_doubt(oblique)
+    again = _with_doubt(certain, 1.0, _corrected(certain)).samples[..., 2]
+    np.testing.assert_allclose(again, oblique.samples[..., 2], rtol=1e-3)
+
+
+def test_the_tilted_model_knows_no_such_doubt(oblique):
+    """Its rows are as certain as noise and mixture leave them, at the image's corners too."""
+    tilted, certain = as_tilted(oblique).samples[..., 2], without_doubt(oblique)
+    some = oblique.region.inside & (certain.samples[..., 2] > 0)
+    turn_of_phase = _corrected(oblique).sigma[some] ** 2
+    np.testing.assert_allclose(
+        tilted[some] * turn_of_phase, certain.samples[..., 2][some], rtol=1e-3
+    )
+
+
+def test_turned_twice_is_as_before(oblique):
+    everywhere = np.ones_like(oblique.diffuse)
+    once = turned(oblique, everywhere)
+    some = oblique.samples[..., 2] > 0
+    np.testing.assert_allclose(once.samples[some, :2], -oblique.samples[some, :2], atol=1e-6)
+    assert once.diffuse.all()
+    twice = turned(once, everywhere)
+    np.testing.assert_allclose(twice.samples[some], oblique.samples[some], rtol=2e-3, atol=1e-6)
+    assert not twice.diffuse.any()
+
+
+def test_averages_lose_no_row_to_the_doubt_of_their_neighbours(oblique):
+    """The mean of precisions over a window may exceed what a pixel's own turn allows."""
+    window = window_map(oblique, 17)
+    assert (without_doubt(window).samples[..., 2] <= 1 / MODEL_SIGMA**2 * (1 + 1e-5)).all()
+    other = turned(window, np.ones_like(oblique.diffuse))
+    np.testing.assert_array_equal(other.samples[..., 2] > 0, window.samples[..., 2] > 0)
