@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.cli import main as run_polmvs
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.errors import PolmvsError
 from polmvs.evaluation.tables import format_table, stage_table
 from polmvs.normals.estimator import NUM_ROUNDS, solve_normals
 from polmvs.normals.single_view.plane import plane_normal
-from polmvs.pipeline.run_folder import RUN_FILE, Workspace
+from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
 
 Array = NDArray[np.float64]
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     elif flags:
         parser.error(f"unknown arguments: {' '.join(flags)}")
     try:
-        records = {str(out): asdict(Workspace(_folder(out)).load()) for out in args.runs}
+        records = {str(out): asdict(RunFolder(_folder(out)).load()) for out in args.runs}
     except PolmvsError as error:
         print(f"{parser.prog}: error: {error}", file=sys.stderr)
         return error.exit_status
@@ -86,17 +86,17 @@ def _planes(rng: np.random.Generator) -> list[tuple[str, float]]:
     rays = np.column_stack([offsets, np.ones(NUM_PIXELS)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     normal = np.array([0.3, -0.5, -0.8]) / np.linalg.norm([0.3, -0.5, -0.8])
-    phase = phase_from_normal(Model.PPA, np.broadcast_to(normal, rays.shape), rays)
+    phase = phase_from_normal(AngleModel.PPA, np.broadcast_to(normal, rays.shape), rays)
     phase = phase + rng.normal(scale=PHASE_SIGMA, size=NUM_PIXELS)
     axial = np.array([np.cos(2 * phase), np.sin(2 * phase)], np.float32)
     columns = np.ascontiguousarray(rays.T, np.float32)
     sigma = np.full(NUM_PIXELS, PHASE_SIGMA, np.float32)
 
     def estimate(robust: bool) -> Callable[[], object]:
-        return lambda: plane_normal(Model.PPA, axial, columns, sigma, robust=robust)
+        return lambda: plane_normal(AngleModel.PPA, axial, columns, sigma, robust=robust)
 
     def baseline() -> Array:
-        matrix = rows_from_phase(Model.PPA, phase, rays)
+        matrix = rows_from_phase(AngleModel.PPA, phase, rays)
         return np.asarray(np.linalg.eigh(matrix.T @ matrix)[1][:, 0])
 
     what = f"one plane, {NUM_PIXELS:,} pixels: "

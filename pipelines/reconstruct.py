@@ -13,7 +13,7 @@ from pathlib import Path
 
 from polmvs.cli.flags import GROUPS, add_flags, add_run_flags, options_from, run_options
 from polmvs.cli.terminal import Terminal, guarded
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.pipeline.jobs import Job, reconstruct
 
 
@@ -22,7 +22,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("capture", type=Path, help="folder of raw polarizer mosaics")
     parser.add_argument("out", type=Path, help="folder of the results")
-    parser.add_argument("--model", type=Model, choices=list(Model), default=Model.PPA)
+    parser.add_argument(
+        "--model", type=AngleModel, choices=list(AngleModel), default=AngleModel.PPA
+    )
     add_run_flags(parser)
     add_flags(parser, [name for name in GROUPS if name != "evaluation"])
     args = parser.parse_args(argv)

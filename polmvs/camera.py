@@ -14,8 +14,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.geometry import RigidTransform
-
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
@@ -136,24 +134,3 @@ class PinholeCamera:
             ],
             axis=-1,
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """One posed image.
-
-    Attributes
-    ----------
-    name : file name of the raw mosaic, also the image's name in the COLMAP model.
-    camera : of the half-size polarization image.
-    cam_from_world : pose.
-    """
-
-    name: str
-    camera: Camera
-    cam_from_world: RigidTransform
-
-    @property
-    def center_in_world(self) -> Array:
-        """Camera centre ``(3,)`` in the world."""
-        return self.cam_from_world.inverse().translation

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 
-class Model(StrEnum):
+class AngleModel(StrEnum):
     """Relation between the measured angle and the surface normal."""
 
     OPA = "opa"

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from polmvs.choices import AngleModel as AngleModel
 from polmvs.choices import Contour as Contour
 from polmvs.choices import Estimator as Estimator
 from polmvs.choices import Light as Light
 from polmvs.choices import Method as Method
-from polmvs.choices import Model as Model
 from polmvs.choices import Surroundings as Surroundings
 from polmvs.errors import OptionError
 

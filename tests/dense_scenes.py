@@ -4,13 +4,13 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from polmvs.camera import PinholeCamera, View, pixel_centers
+from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.colmap.dense_workspace import write_dense_workspace
 from polmvs.colmap.maps import DepthNormals, map_pixel_xy
-from polmvs.colmap.models import ColmapCamera, SparseModel, pycolmap
+from polmvs.colmap.models import ColmapCamera, pycolmap
 from polmvs.geometry import RigidTransform
 from polmvs.io.clouds import read_cloud
-from polmvs.normals.tracks import Tracks
+from polmvs.scene import SparseModel, Tracks, View
 from polmvs.surface.dense_view import DenseView
 from polmvs.synthetic.captures import Plane, ring_of_views
 

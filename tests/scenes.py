@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polmvs.camera import PinholeCamera, View
+from polmvs.camera import PinholeCamera
 from polmvs.config import Light
-from polmvs.normals.tracks import Seeds, Tracks
 from polmvs.polarization.phase_map import PhaseMap, build_phase_map
 from polmvs.polarization.region import find_region
+from polmvs.scene import Seeds, Tracks, View
 from polmvs.synthetic.captures import Plane, SyntheticView, render_view, ring_of_views
 
 CAMERA = PinholeCamera(width=160, height=128, fx=120.0, fy=120.0, cx=80.0, cy=64.0)

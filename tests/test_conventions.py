@@ -8,17 +8,11 @@ import pycolmap
 import pytest
 from scenes import CAMERA
 
-from polmvs.camera import (
-    PinholeCamera,
-    View,
-    pixel_centers,
-    sample_image,
-    xy_from_opencv,
-    xy_to_opencv,
-)
-from polmvs.config import Light, Model
+from polmvs.camera import PinholeCamera, pixel_centers, sample_image, xy_from_opencv, xy_to_opencv
+from polmvs.config import AngleModel, Light
 from polmvs.geometry import RigidTransform, align_points
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
+from polmvs.scene import View
 from polmvs.synthetic.captures import Plane, look_at, render_view
 
 RNG = np.random.default_rng(0)
@@ -110,7 +104,7 @@ def test_aolp_is_anticlockwise_as_displayed_and_specular_phase_is_turned_by_half
     # Towards the right the plane of incidence leans as the ray does: its trace in the image
     # turns clockwise as displayed, towards the vanishing point of the floor's normal.
     row = rows_from_phase(
-        Model.PPA, rendered.phase[middle], view.camera.rays(np.array([80.0, 64.0]))
+        AngleModel.PPA, rendered.phase[middle], view.camera.rays(np.array([80.0, 64.0]))
     )
     assert abs(row @ rendered.normals_in_cam[middle]) < 0.02
 
@@ -125,7 +119,7 @@ def test_rendered_phase_is_that_of_the_model(light):
     )
     rendered = render_view(view, plane, light=light.value, sensor="ppa")
     rays = CAMERA.rays(pixel_centers(CAMERA.width, CAMERA.height))
-    predicted = phase_from_normal(Model.PPA, rendered.normals_in_cam, rays)
+    predicted = phase_from_normal(AngleModel.PPA, rendered.normals_in_cam, rays)
     difference = np.sin(rendered.phase - predicted)[rendered.mask]
     assert np.nanmax(np.abs(difference)) < 1e-9
     turn = np.pi / 2 if light is Light.SPECULAR else 0.0

@@ -12,7 +12,7 @@ import polmvs
 from polmvs.camera import PinholeCamera
 from polmvs.cli.flags import options_from, recorded_options, run_options
 from polmvs.cli.terminal import Terminal
-from polmvs.config import EvaluationOptions, Model, Options, RunOptions, SfmOptions
+from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
 from polmvs.errors import OptionError
 from polmvs.evaluation.comparison import evaluate_file
 from polmvs.evaluation.tables import best_fit_lines, comparison_table, evaluation_text
@@ -123,7 +123,7 @@ def _job(
     )
 
 
-def _report_cloud(outcome: pipeline.Outcome, model: Model) -> int:
+def _report_cloud(outcome: pipeline.Outcome, model: AngleModel) -> int:
     results, workspace = outcome.results, outcome.workspace
     unit = "metres" if results.get("unit") == "m" else "the model's unit, not metric"
     print(

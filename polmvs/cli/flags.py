@@ -20,7 +20,7 @@ from polmvs.option_values import (
     parse_text,
     to_plain,
 )
-from polmvs.pipeline.run_folder import Workspace
+from polmvs.pipeline.run_folder import RunFolder
 
 T = TypeVar("T")
 
@@ -88,7 +88,7 @@ def options_from(args: argparse.Namespace, recorded: Mapping[str, Any] | None = 
 
 def recorded_options(out: Path) -> Mapping[str, Any]:
     """Options of the run in a folder; empty where there is none."""
-    workspace = Workspace(out)
+    workspace = RunFolder(out)
     if not workspace.run_file.is_file():
         return {}
     record = workspace.load()

@@ -11,7 +11,7 @@ import polmvs
 from polmvs.cli import commands
 from polmvs.cli.flags import GROUPS, Parser, add_flags, add_run_flags
 from polmvs.cli.terminal import Terminal
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.experiments.command import add_parser as add_experiment
 from polmvs.normals.single_view import command as plane_command
 from polmvs.pipeline import jobs as pipeline
@@ -70,9 +70,9 @@ def _add_job(
 def _add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model",
-        type=Model,
-        choices=list(Model),
-        default=Model.PPA,
+        type=AngleModel,
+        choices=list(AngleModel),
+        default=AngleModel.PPA,
         help="relation of measured angle and normal (default: %(default)s)",
     )
 
@@ -122,12 +122,13 @@ def _add_compare(subparsers: Any) -> None:
         type=_models,
         default=pipeline.COMPARED,
         metavar="MODEL,...",
-        help=f"what to compare, of {', '.join(Model)} (default: {','.join(pipeline.COMPARED)})",
+        help=f"what to compare, of {', '.join(AngleModel)} "
+        f"(default: {','.join(pipeline.COMPARED)})",
     )
 
 
-def _models(text: str) -> tuple[Model, ...]:
-    return tuple(dict.fromkeys(Model(name.strip()) for name in text.split(",")))
+def _models(text: str) -> tuple[AngleModel, ...]:
+    return tuple(dict.fromkeys(AngleModel(name.strip()) for name in text.split(",")))
 
 
 def _add_evaluate(subparsers: Any) -> None:

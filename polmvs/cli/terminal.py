@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from polmvs.errors import DataError, PolmvsError
 from polmvs.pipeline.run import Report
-from polmvs.pipeline.run_folder import Workspace
+from polmvs.pipeline.run_folder import RunFolder
 
 INTERRUPTED = 130  # as shells report a program ended by Ctrl-C
 FILE_ONLY = {"file_only": True}  # of records that the terminal gets in another form
@@ -41,7 +41,7 @@ class _LogFileHandler(logging.FileHandler):
 
 
 class Terminal:
-    """One call of the command: a :class:`polmvs.pipeline.run.Monitor` that shows and logs.
+    """One call of the command: a :class:`polmvs.pipeline.run.Watcher` that shows and logs.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class Terminal:
 
     def __init__(self, *, verbose: bool) -> None:
         self.verbose = verbose
-        self.workspace: Workspace | None = None
+        self.workspace: RunFolder | None = None
         self._handlers: list[logging.Handler] = []
 
     def __enter__(self) -> Terminal:
@@ -70,7 +70,7 @@ class Terminal:
             handler.close()
         self._handlers.clear()
 
-    def opened(self, workspace: Workspace) -> None:
+    def opened(self, workspace: RunFolder) -> None:
         """Log into the output folder from now on."""
         self.workspace = workspace
         try:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from polmvs.camera import PinholeCamera, View
+from polmvs.camera import PinholeCamera
 from polmvs.colmap.maps import (
     DepthNormals,
     check_depth_map,
@@ -24,7 +24,7 @@ from polmvs.colmap.maps import (
     read_depth_map,
     read_normal_map,
 )
-from polmvs.colmap.models import SparseModel, read_model
+from polmvs.colmap.models import read_model
 from polmvs.colmap.sparse_model import short_list, write_model
 from polmvs.colmap.undistort import undistorted_model, warp_dense_view, warp_image
 from polmvs.colmap.workspace_layout import (
@@ -46,7 +46,7 @@ from polmvs.colmap.workspace_layout import (
 )
 from polmvs.errors import DataError
 from polmvs.io.images import read_gray, write_png
-from polmvs.normals.tracks import Tracks
+from polmvs.scene import SparseModel, Tracks, View
 from polmvs.surface.dense_view import DenseView
 
 PathArg = str | PathLike[str]

@@ -18,11 +18,11 @@ import numpy as np
 import pycolmap as pycolmap  # re-exported, see above
 from numpy.typing import NDArray
 
-from polmvs.camera import Camera, PinholeCamera, View
+from polmvs.camera import Camera, PinholeCamera
 from polmvs.colmap.binary_check import check_binary_model
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
-from polmvs.normals.tracks import Tracks
+from polmvs.scene import SparseModel, Tracks, View
 
 Array = NDArray[np.float64]
 
@@ -159,22 +159,6 @@ def camera_from_colmap(camera: pycolmap.Camera) -> Camera:
         height=int(camera.height),
         params=tuple(map(float, camera.params)),
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SparseModel:
-    """Posed views and sparse points, free of pycolmap's types.
-
-    Attributes
-    ----------
-    views : registered images, sorted by name.
-    tracks : sparse points; ``obs_view`` counts in ``views``.
-    unregistered : names of images without a pose, sorted.
-    """
-
-    views: tuple[View, ...]
-    tracks: Tracks
-    unregistered: tuple[str, ...]
 
 
 def model_from_reconstruction(

@@ -19,10 +19,11 @@ import cv2
 
 from polmvs.camera import PinholeCamera
 from polmvs.colmap.bundle import MAX_REPROJ_ERROR_PX, refine
-from polmvs.colmap.models import SparseModel, model_from_reconstruction, pycolmap
+from polmvs.colmap.models import model_from_reconstruction, pycolmap
 from polmvs.colmap.sparse_model import short_list, write_reconstruction
 from polmvs.config import SfmOptions
 from polmvs.errors import DataError, OptionError
+from polmvs.scene import SparseModel
 
 logger = logging.getLogger(__name__)
 

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import Camera, PinholeCamera
-from polmvs.colmap.models import ColmapCamera, SparseModel, camera_to_colmap, pycolmap
+from polmvs.colmap.models import ColmapCamera, camera_to_colmap, pycolmap
 from polmvs.errors import DataError
-from polmvs.normals.tracks import Tracks
+from polmvs.scene import SparseModel, Tracks
 
 logger = logging.getLogger(__name__)
 

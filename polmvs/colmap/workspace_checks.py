@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import PinholeCamera, View
+from polmvs.camera import PinholeCamera
 from polmvs.colmap.dense_workspace import DenseWorkspace, ImageLoader, WorkspaceView
-from polmvs.colmap.models import SparseModel, camera_from_colmap, camera_to_colmap
+from polmvs.colmap.models import camera_from_colmap, camera_to_colmap
 from polmvs.colmap.sparse_model import matching_names as matching_names
 from polmvs.colmap.undistort import warp_image
 from polmvs.errors import DataError
 from polmvs.geometry import SimilarityTransform, align_points
+from polmvs.scene import SparseModel, View
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.float32]

@@ -8,9 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from polmvs.camera import View
 from polmvs.colmap.models import read_model
-from polmvs.config import Model, Options
+from polmvs.config import AngleModel, Options
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
 from polmvs.evaluation.map_errors import map_errors
 from polmvs.evaluation.phase_errors import phase_errors, stem_of
@@ -22,10 +21,11 @@ from polmvs.io.images import write_bytes
 from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
 from polmvs.pipeline.record import write_json
-from polmvs.pipeline.run_folder import Workspace
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.capture import open_maps
 from polmvs.pipeline.stages.clouds import open_dense_views
 from polmvs.polarization.capture import Capture
+from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView
 
 DenseViews = Sequence[DenseView | None]
@@ -65,9 +65,9 @@ def measure_against_truth(
 
 def compare_models(
     capture: Capture,
-    workspace: Workspace,
+    workspace: RunFolder,
     options: Options,
-    models: Sequence[Model],
+    models: Sequence[AngleModel],
     *,
     workers: Workers,
 ) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def compare_models(
     with ground truth, what :func:`phase_errors` gives. ``best_fit``: what
     :func:`best_fitting_model` says.
     """
-    maps = {model: open_maps(workspace, model) for model in (Model.PPA, *models)}
+    maps = {model: open_maps(workspace, model) for model in (AngleModel.PPA, *models)}
     clouds = {model: read_cloud(workspace.cloud(model)) for model in models}
     tracks = {model: read_cloud(workspace.normals(model)) for model in models}
     dense = {model: open_dense_views(workspace, model) for model in models}
@@ -87,9 +87,9 @@ def compare_models(
     gt = options.evaluation.gt
     if gt is not None:  # the longest first
         truth = open_ground_truth(gt)
-        views = [phase_map.view for phase_map in maps[Model.PPA]]
+        views = [phase_map.view for phase_map in maps[AngleModel.PPA]]
         tasks.append(partial(_measure_all, clouds, tracks, dense, views, truth))
-        tasks.append(partial(phase_errors, capture, maps[Model.PPA], truth))
+        tasks.append(partial(phase_errors, capture, maps[AngleModel.PPA], truth))
     tasks += [partial(measure_consistency, m, clouds[m], tracks[m], maps[m]) for m in models]
     done = list(workers.map(_call, tasks))
     consistencies: list[Consistency] = done[-len(models) :]
@@ -105,12 +105,12 @@ def compare_models(
 
 
 def _measure_all(
-    clouds: Mapping[Model, Cloud],
-    tracks: Mapping[Model, Cloud],
-    dense: Mapping[Model, DenseViews],
+    clouds: Mapping[AngleModel, Cloud],
+    tracks: Mapping[AngleModel, Cloud],
+    dense: Mapping[AngleModel, DenseViews],
     views: Sequence[View],
     truth: GroundTruth,
-) -> dict[Model, dict[str, Any]]:
+) -> dict[AngleModel, dict[str, Any]]:
     """All models together: sampling the true surface is most of the work."""
     return {m: measure_against_truth(clouds[m], tracks[m], views, truth, dense[m]) for m in clouds}
 
@@ -121,9 +121,9 @@ def _call(task: Callable[[], Any]) -> Any:
 
 def write_comparison(
     capture: Capture,
-    workspace: Workspace,
+    workspace: RunFolder,
     options: Options,
-    models: Sequence[Model],
+    models: Sequence[AngleModel],
     results: Mapping[str, Any],
     *,
     workers: Workers,

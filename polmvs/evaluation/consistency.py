@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.evaluation.metrics import AngleStats, axial_errors_deg
 from polmvs.io.clouds import Cloud
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.surface.surroundings import Kind
+from polmvs.scene import PointKind
 
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -49,7 +49,7 @@ class Consistency:
 
 
 def measure_consistency(
-    model: Model, cloud: Cloud, tracks: Cloud, maps: Sequence[PhaseMap]
+    model: AngleModel, cloud: Cloud, tracks: Cloud, maps: Sequence[PhaseMap]
 ) -> Consistency:
     """Compare the polarised surface of a cloud with the phase maps of all views.
 
@@ -94,7 +94,7 @@ def _polarised_surface(cloud: Cloud) -> Cloud:
     kind = cloud.scalars.get("kind")
     if kind is None:
         return cloud
-    kept = kind == Kind.SURFACE
+    kept = kind == PointKind.SURFACE
     return Cloud(
         points=cloud.points[kept],
         normals=None if cloud.normals is None else cloud.normals[kept],
@@ -152,7 +152,7 @@ def _region_cells(inside: Mask) -> Mask:
 
 
 def phase_residuals_deg(
-    model: Model, points: Floats, normals: Floats, phase_map: PhaseMap
+    model: AngleModel, points: Floats, normals: Floats, phase_map: PhaseMap
 ) -> NDArray[np.float64]:
     """Axial difference between predicted and measured phase at points, degrees.
 
@@ -174,7 +174,7 @@ def phase_residuals_deg(
     return np.where(counted, axial_errors_deg(measured, predicted), np.nan)
 
 
-def best_fitting_model(found: Mapping[Model, Consistency]) -> Model | None:
+def best_fitting_model(found: Mapping[AngleModel, Consistency]) -> AngleModel | None:
     """The model under which the planes of incidence of many views meet best in one normal.
 
     It is told by the sparse points on the surface alone, whose place no model has touched: the

@@ -14,12 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View, sample_image
+from polmvs.camera import sample_image
 from polmvs.errors import DataError
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.poses.alignment import align_to_truth
+from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView, lattice_xy
 
 Array = NDArray[np.float64]

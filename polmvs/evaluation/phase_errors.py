@@ -9,7 +9,7 @@ from pathlib import PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.evaluation.metrics import AngleStats
 from polmvs.evaluation.truth_errors import phase_errors_on_part
 from polmvs.io.ground_truth import GroundTruth
@@ -50,7 +50,7 @@ class LazyPhases(Mapping[str, Image]):
 
 def phase_errors(
     capture: Capture, maps: Sequence[PhaseMap], truth: GroundTruth
-) -> dict[str, dict[Model, AngleStats]]:
+) -> dict[str, dict[AngleModel, AngleStats]]:
     """Errors of the measured phase on the part, under each model with the true normals.
 
     Parameters
@@ -88,8 +88,8 @@ def phase_errors(
         phases, ppa_phases = LazyPhases(names, measured), LazyPhases(names, as_ppa)
         errors[source] = phase_errors_on_part(phases, phases.dolps, truth)
         # The corrected phase is one that PPA predicts.
-        of_tilted = phase_errors_on_part(ppa_phases, ppa_phases.dolps, truth)[Model.PPA]
-        errors[source][Model.TILTED] = of_tilted
+        of_tilted = phase_errors_on_part(ppa_phases, ppa_phases.dolps, truth)[AngleModel.PPA]
+        errors[source][AngleModel.TILTED] = of_tilted
     return errors
 
 

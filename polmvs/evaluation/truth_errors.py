@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View, pixel_centers
-from polmvs.config import Model
+from polmvs.camera import pixel_centers
+from polmvs.config import AngleModel
 from polmvs.evaluation.metrics import (
     THRESHOLDS_M,
     AngleStats,
@@ -23,6 +23,7 @@ from polmvs.io.ground_truth import GroundTruth
 from polmvs.neighbors import nearest_points
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.poses.alignment import AlignmentReport, align_to_truth
+from polmvs.scene import View
 
 __all__ = [
     "AlignmentReport",
@@ -164,7 +165,7 @@ def phase_errors_on_part(
     truth: GroundTruth,
     *,
     min_dolp: float = MIN_DOLP,
-) -> dict[Model, AngleStats]:
+) -> dict[AngleModel, AngleStats]:
     """Axial errors of the phases that each model predicts from the true normals.
 
     Parameters
@@ -177,7 +178,7 @@ def phase_errors_on_part(
     -------
     For OPA and PPA, the statistics over all pixels of the part in all images that have a truth.
     """
-    errors: dict[Model, list[Array]] = {Model.OPA: [], Model.PPA: []}
+    errors: dict[AngleModel, list[Array]] = {AngleModel.OPA: [], AngleModel.PPA: []}
     for name, phase in phases.items():
         view = truth.find(name)
         if view is None:

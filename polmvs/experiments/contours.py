@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.experiments.data import Scene, load_view, require_counted
 from polmvs.experiments.surfaces import TrueSurface
 from polmvs.experiments.two_views import second_view, step_with_normals
@@ -119,7 +119,7 @@ def measure_contours(
     """
     with TemporaryDirectory(prefix="polmvs-contours-") as name:
         folder = Path(name)
-        for model in (Model.PPA, Model.TILTED):
+        for model in (AngleModel.PPA, AngleModel.TILTED):
             (folder / model).mkdir()
         counts = []
         for counted in workers.map(partial(_store_maps, scene, folder), range(len(scene.views))):
@@ -158,7 +158,7 @@ def _store_maps(scene: Scene, folder: Path, index: int) -> int:
     """Store the phase maps of one view, as captured and corrected; the number of counted pixels."""
     data = load_view(scene, index)
     region = data.find_region(scene.region.min_dolp)
-    for model in (Model.PPA, Model.TILTED):
+    for model in (AngleModel.PPA, AngleModel.TILTED):
         store_phase_map(data.phase_map(model, region), folder / model)
     return int(data.counted.sum())
 
@@ -170,7 +170,7 @@ def trace_view(
 
     ``folder`` has the stored phase maps of all views.
     """
-    ppa_maps = [open_phase_map(view, folder / Model.PPA) for view in scene.views]
+    ppa_maps = [open_phase_map(view, folder / AngleModel.PPA) for view in scene.views]
     own = ppa_maps[index]
     ranges = np.nan_to_num(_true_ranges(scene, index))
     seeds_xy = edge_seeds(own.region.inside & (ranges > 0), num_seeds)
@@ -178,14 +178,18 @@ def trace_view(
     seeds = _to_world(own, seeds_xy, seed_range)
     lines = {}
     along: Floats
-    sources = (("opa", Model.OPA), ("ppa_tangent", Model.PPA), ("tilted_tangent", Model.TILTED))
+    sources = (
+        ("opa", AngleModel.OPA),
+        ("ppa_tangent", AngleModel.PPA),
+        ("tilted_tangent", AngleModel.TILTED),
+    )
     second = second_view(ppa_maps, index, seeds)
     for name, model in sources:
         phase_map = own
-        if model is Model.TILTED:
-            phase_map = open_phase_map(own.view, folder / Model.TILTED, tilted=True)
+        if model is AngleModel.TILTED:
+            phase_map = open_phase_map(own.view, folder / AngleModel.TILTED, tilted=True)
         paths = _trace(model, phase_map, seeds_xy, step_px, scene.region.min_dolp)
-        if model is Model.OPA:
+        if model is AngleModel.OPA:
             depths = seed_range * own.view.camera.rays(seeds_xy)[:, 2]
             along = depths[paths.curve] / own.view.camera.rays(paths.xy)[:, 2]
             stepped = np.full(len(paths.xy), np.nan)
@@ -233,7 +237,7 @@ def _thinned(
 
 
 def _trace(
-    model: Model, phase_map: PhaseMap, seeds_xy: Floats, step_px: float, min_dolp: float
+    model: AngleModel, phase_map: PhaseMap, seeds_xy: Floats, step_px: float, min_dolp: float
 ) -> Contours:
     """Contours of a model where the view shows the part, polarised over the threshold."""
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])

@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View
-from polmvs.config import Light, Model, RegionOptions
+from polmvs.config import AngleModel, Light, RegionOptions
 from polmvs.errors import DataError
 from polmvs.experiments.estimated_poses import estimated_views
 from polmvs.io.ground_truth import GroundTruth
@@ -26,6 +25,7 @@ from polmvs.polarization.region import Region, find_region, smooth
 from polmvs.polarization.stokes import Stokes
 from polmvs.polarization.tilted import correct_stokes
 from polmvs.poses.alignment import AlignmentReport
+from polmvs.scene import View
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -119,11 +119,11 @@ class ViewData:
     normals_in_cam: Image
     range_map: Image
 
-    def blurred_for(self, model: Model) -> Stokes:
+    def blurred_for(self, model: AngleModel) -> Stokes:
         """Blurred Stokes images as the model takes them: corrected under ``tilted``."""
         return self._for(model, self.blurred)
 
-    def axial(self, model: Model) -> Image:
+    def axial(self, model: AngleModel) -> Image:
         """``(s0 cos 2 phase, s0 sin 2 phase)`` times the DoLP of the blurred images, (H, W, 2)."""
         stokes = self.blurred_for(model)
         return phase_sign(self.light) * np.dstack([stokes.s1, stokes.s2])
@@ -139,22 +139,22 @@ class ViewData:
         spoiled = (self.part & ~region.reliable).astype(np.uint8)
         return np.asarray(cv2.dilate(spoiled, np.ones((size, size), np.uint8)) > 0)
 
-    def phase_map(self, model: Model, region: Region) -> PhaseMap:
+    def phase_map(self, model: AngleModel, region: Region) -> PhaseMap:
         """The package's own phase map: smoothed over the reliable pixels, with precisions."""
         s = self.sharp
         measured = build_phase_map(self.view, s.s0, s.s1, s.s2, s.sigma, region, self.light)
-        return as_tilted(measured) if model is Model.TILTED else measured
+        return as_tilted(measured) if model is AngleModel.TILTED else measured
 
-    def plain_map(self, model: Model) -> PhaseMap:
+    def plain_map(self, model: AngleModel) -> PhaseMap:
         """A phase map of the paper's kind: blurred pixels over the threshold, all alike."""
         axial = self.axial(model) / np.maximum(self.blurred.s0, 1e-6)[..., None]
         samples = np.dstack([axial, self.counted.astype(np.float32)])
         region = Region(self.part, self.counted, np.zeros_like(self.part))
-        base = self.phase_map(Model.PPA, region)
+        base = self.phase_map(AngleModel.PPA, region)
         return replace(base, samples=samples.astype(np.float32))
 
-    def _for(self, model: Model, stokes: Stokes) -> Stokes:
-        if model is not Model.TILTED:
+    def _for(self, model: AngleModel, stokes: Stokes) -> Stokes:
+        if model is not AngleModel.TILTED:
             return stokes
         return correct_stokes(stokes, self.rays, light=self.light)
 

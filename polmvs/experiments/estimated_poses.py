@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from polmvs.camera import View
 from polmvs.colmap.models import read_model
 from polmvs.colmap.sparse_model import match_model_to_capture, short_list
 from polmvs.errors import DataError
@@ -14,6 +13,7 @@ from polmvs.geometry import RigidTransform, SimilarityTransform
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.polarization.capture import Capture
 from polmvs.poses.alignment import AlignmentReport, align_to_truth
+from polmvs.scene import View
 
 
 def estimated_views(

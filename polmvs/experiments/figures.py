@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.experiments import style
 from polmvs.experiments.contours import METHODS, ViewContours
 from polmvs.experiments.phase import ANGLE_LIMITS_DEG, ANGLES, PhaseImages, PhaseResult
@@ -37,7 +37,7 @@ def draw_phase_density(result: PhaseResult) -> bytes:
     axes = figure.subplots(3, 3, sharey=True, sharex="col")
     norm = PowerNorm(0.4, vmin=0, vmax=0.5)
     image = None
-    for row, model in enumerate(Model):
+    for row, model in enumerate(AngleModel):
         for column, angle in enumerate(ANGLES):
             ax = axes[row, column]
             image = ax.imshow(
@@ -63,7 +63,11 @@ def draw_phase_density(result: PhaseResult) -> bytes:
 
 def draw_phase_maps(views: Sequence[PhaseImages]) -> bytes:
     """The paper's figure of measured and predicted phases, in cyclic colours with their wheel."""
-    titles = ["intensity", "measured phase", *(f"{style.MODEL_LABELS[m]} phase" for m in Model)]
+    titles = [
+        "intensity",
+        "measured phase",
+        *(f"{style.MODEL_LABELS[m]} phase" for m in AngleModel),
+    ]
     height, width = views[0].intensity.shape
     panel = 2.3
     figure = _figure(5 * panel + 1.2, len(views) * panel * height / width + 0.5)
@@ -122,7 +126,7 @@ def draw_plane(result: PlaneResult) -> bytes:
     left.set_ylabel("angular error of the normal (°)")
     left.grid(True, which="both", alpha=0.25)
     left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
-    places = np.arange(len(Model))
+    places = np.arange(len(AngleModel))
     for offset, values, label, color in (
         (-0.2, [a.rmse_deg for a in result.ambiguity.values()], "true normal", style.BLUE),
         (0.2, [a.rmse_turned_deg for a in result.ambiguity.values()], "turned by π", style.ORANGE),

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.experiments.statistics import ErrorTally, SignedStats, ratio
 from polmvs.parallel import Workers
@@ -45,9 +45,9 @@ class ViewPhase:
     """
 
     name: str
-    all_pixels: Mapping[Model, ErrorTally]
-    unmarked: Mapping[Model, ErrorTally]
-    counts: Mapping[Model, Density]
+    all_pixels: Mapping[AngleModel, ErrorTally]
+    unmarked: Mapping[AngleModel, ErrorTally]
+    counts: Mapping[AngleModel, Density]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,18 +65,18 @@ class PhaseResult:
         pixels of an angle's bin in each bin of the error; NaN where an angle has too few pixels.
     """
 
-    all_pixels: Mapping[Model, SignedStats]
-    unmarked: Mapping[Model, SignedStats]
-    per_view: Mapping[str, Mapping[Model, float]]
-    densities: Mapping[Model, Density]
+    all_pixels: Mapping[AngleModel, SignedStats]
+    unmarked: Mapping[AngleModel, SignedStats]
+    per_view: Mapping[str, Mapping[AngleModel, float]]
+    densities: Mapping[AngleModel, Density]
 
-    def ratio(self, model: Model) -> float:
+    def ratio(self, model: AngleModel) -> float:
         """Root mean square error over that of OPA, all pixels."""
-        return ratio(self.all_pixels[model].rmse_deg, self.all_pixels[Model.OPA].rmse_deg)
+        return ratio(self.all_pixels[model].rmse_deg, self.all_pixels[AngleModel.OPA].rmse_deg)
 
-    def ratio_unmarked(self, model: Model) -> float:
+    def ratio_unmarked(self, model: AngleModel) -> float:
         """Root mean square error over that of OPA, outside of marks."""
-        return ratio(self.unmarked[model].rmse_deg, self.unmarked[Model.OPA].rmse_deg)
+        return ratio(self.unmarked[model].rmse_deg, self.unmarked[AngleModel.OPA].rmse_deg)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,7 +96,7 @@ class PhaseImages:
     intensity: Image
     part: Mask
     measured: Array
-    predicted: Mapping[Model, Array]
+    predicted: Mapping[AngleModel, Array]
 
 
 def measure_phase(
@@ -113,13 +113,13 @@ def measure_phase(
     for view in workers.map(partial(measure_view, scene), range(len(scene.views))):
         views.append(view)
         report(1)
-    totals = {m: _total([view.all_pixels[m] for view in views]).stats() for m in Model}
-    require_counted(scene, totals[Model.OPA].num_pixels)
+    totals = {m: _total([view.all_pixels[m] for view in views]).stats() for m in AngleModel}
+    require_counted(scene, totals[AngleModel.OPA].num_pixels)
     return PhaseResult(
         all_pixels=totals,
-        unmarked={m: _total([view.unmarked[m] for view in views]).stats() for m in Model},
-        per_view={v.name: {m: v.all_pixels[m].stats().rmse_deg for m in Model} for v in views},
-        densities={m: _normalize(np.sum([v.counts[m] for v in views], axis=0)) for m in Model},
+        unmarked={m: _total([view.unmarked[m] for view in views]).stats() for m in AngleModel},
+        per_view={v.name: {m: v.all_pixels[m].stats().rmse_deg for m in AngleModel} for v in views},
+        densities={m: _normalize(np.sum([v.counts[m] for v in views], axis=0)) for m in AngleModel},
     )
 
 
@@ -129,7 +129,7 @@ def measure_view(scene: Scene, index: int) -> ViewPhase:
     marked = data.beside_marks(data.find_region(scene.region.min_dolp), scene.blur_px)
     unmarked = ~marked[data.counted]
     angles = _angles(data)
-    errors = {model: _errors_deg(data, model) for model in Model}
+    errors = {model: _errors_deg(data, model) for model in AngleModel}
     return ViewPhase(
         name=data.view.name,
         all_pixels={model: ErrorTally.of(error) for model, error in errors.items()},
@@ -141,11 +141,11 @@ def measure_view(scene: Scene, index: int) -> ViewPhase:
 def phase_images(scene: Scene, index: int) -> PhaseImages:
     """Intensity, measured and predicted phases of one view."""
     data = load_view(scene, index)
-    measured = _phase(data, Model.PPA)
+    measured = _phase(data, AngleModel.PPA)
     # What tilted polarizers turn the phase by is the same for the light's and the normal's.
-    turn = axial_difference(measured, _phase(data, Model.TILTED))
-    predicted = {m: phase_from_normal(m, data.normals_in_cam, data.rays) for m in Model}
-    predicted[Model.TILTED] = np.mod(predicted[Model.TILTED] + turn, np.pi)
+    turn = axial_difference(measured, _phase(data, AngleModel.TILTED))
+    predicted = {m: phase_from_normal(m, data.normals_in_cam, data.rays) for m in AngleModel}
+    predicted[AngleModel.TILTED] = np.mod(predicted[AngleModel.TILTED] + turn, np.pi)
     return PhaseImages(
         name=data.view.name,
         intensity=data.sharp.s0,
@@ -155,13 +155,13 @@ def phase_images(scene: Scene, index: int) -> PhaseImages:
     )
 
 
-def _phase(data: ViewData, model: Model) -> Array:
+def _phase(data: ViewData, model: AngleModel) -> Array:
     """Measured phase (H, W), rad in [0, pi), as the model takes it."""
     axial = data.axial(model)
     return np.asarray(np.mod(0.5 * np.arctan2(axial[..., 1], axial[..., 0]), np.pi), np.float64)
 
 
-def _errors_deg(data: ViewData, model: Model) -> Array:
+def _errors_deg(data: ViewData, model: AngleModel) -> Array:
     """Predicted minus measured phase of the counted pixels, (P,) degrees."""
     counted = data.counted
     predicted = phase_from_normal(model, data.normals_in_cam[counted], data.rays[counted])

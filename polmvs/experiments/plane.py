@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
@@ -50,12 +50,12 @@ class Weights(StrEnum):
 
 
 # Name of the estimate, its model, and its weights; "alike" is the paper's eigenvector.
-ESTIMATES: dict[str, tuple[Model, Weights]] = {
-    "algebraic": (Model.PPA, Weights.ALIKE),
-    "weighted_noise": (Model.PPA, Weights.NOISE),
-    "weighted": (Model.PPA, Weights.TILT_AWARE),
-    "tilted_algebraic": (Model.TILTED, Weights.ALIKE),
-    "tilted": (Model.TILTED, Weights.NOISE),
+ESTIMATES: dict[str, tuple[AngleModel, Weights]] = {
+    "algebraic": (AngleModel.PPA, Weights.ALIKE),
+    "weighted_noise": (AngleModel.PPA, Weights.NOISE),
+    "weighted": (AngleModel.PPA, Weights.TILT_AWARE),
+    "tilted_algebraic": (AngleModel.TILTED, Weights.ALIKE),
+    "tilted": (AngleModel.TILTED, Weights.NOISE),
 }
 
 
@@ -116,7 +116,7 @@ class PlaneResult:
     failed: Mapping[str, int]
     per_image: tuple[ImagePlane, ...]
     skipped: tuple[str, ...]
-    ambiguity: Mapping[Model, Ambiguity]
+    ambiguity: Mapping[AngleModel, Ambiguity]
 
     @property
     def spread_deg(self) -> float:
@@ -163,20 +163,20 @@ def measure_plane(
         failed={name: int(np.isnan(error).sum()) for name, error in errors.items()},
         per_image=tuple(kept),
         skipped=tuple(im.name for i, im in enumerate(images) if i not in used),
-        ambiguity={m: _pool([residuals[i][m] for i in used]) for m in Model},
+        ambiguity={m: _pool([residuals[i][m] for i in used]) for m in AngleModel},
     )
 
 
 def measure_image(
     scene: Scene, index: int, *, planar_deg: float
-) -> tuple[ImagePlane, dict[Model, Ambiguity]]:
+) -> tuple[ImagePlane, dict[AngleModel, Ambiguity]]:
     """Estimates of one view, and its share in the ambiguity."""
     data = load_view(scene, index)
     region, true_normal = planar_region(data, planar_deg)
-    pixels = {model: _pixels(data, model, region) for model in Model}
+    pixels = {model: _pixels(data, model, region) for model in AngleModel}
     estimates, seconds = {}, {}
     enough = int(region.sum()) >= MIN_PIXELS
-    turn = _tilt_turn(pixels[Model.PPA][0], pixels[Model.TILTED][0])
+    turn = _tilt_turn(pixels[AngleModel.PPA][0], pixels[AngleModel.TILTED][0])
     for name, (model, weights) in ESTIMATES.items() if enough else ():
         axial, rays, sigma = pixels[model]
         start = time.perf_counter()
@@ -193,7 +193,7 @@ def measure_image(
         sigma_deg={name: e.sigma_deg for name, e in estimates.items()},
         seconds=seconds,
     )
-    ambiguity = {m: _ambiguity(m, true_normal, *pixels[m]) for m in Model} if enough else {}
+    ambiguity = {m: _ambiguity(m, true_normal, *pixels[m]) for m in AngleModel} if enough else {}
     return image, ambiguity
 
 
@@ -217,7 +217,7 @@ def planar_region(data: ViewData, planar_deg: float) -> tuple[Mask, Array]:
     return region, mean / np.linalg.norm(mean)
 
 
-def _pixels(data: ViewData, model: Model, region: Mask) -> tuple[Floats, Floats, Floats]:
+def _pixels(data: ViewData, model: AngleModel, region: Mask) -> tuple[Floats, Floats, Floats]:
     """Axial pair (2, N), rays (3, N) and phase deviation (N,) of the region's pixels."""
     stokes: Stokes = data.blurred_for(model)
     axial = np.ascontiguousarray(data.axial(model)[region].T)
@@ -240,7 +240,7 @@ def _error_deg(estimate: PlaneEstimate, true_normal: Array) -> float:
 
 
 def _ambiguity(
-    model: Model, normal: Array, axial: Floats, rays: Floats, sigma: Floats
+    model: AngleModel, normal: Array, axial: Floats, rays: Floats, sigma: Floats
 ) -> Ambiguity:
     """Residuals of a normal and of its twin, and whether the rows tell them apart."""
     turned = normal * [-1.0, -1.0, 1.0]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 
-MODEL_LABELS = {Model.OPA: "OPA", Model.PPA: "PPA", Model.TILTED: "tilted"}
+MODEL_LABELS = {AngleModel.OPA: "OPA", AngleModel.PPA: "PPA", AngleModel.TILTED: "tilted"}
 
 # Okabe and Ito's palette, which people with any kind of colour blindness tell apart.
 VERMILLION, ORANGE, SKY, BLUE, GREEN, GREY = (

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.experiments import style
 from polmvs.experiments.contours import METHODS, LineStats, ViewContours
 from polmvs.experiments.phase import PhaseResult
@@ -21,12 +21,12 @@ def phase_json(result: PhaseResult) -> dict[str, Any]:
     """Content of ``phase.json`` beside the settings."""
     return {
         **{model.value: asdict(stats) for model, stats in result.all_pixels.items()},
-        "ratio_ppa_opa": result.ratio(Model.PPA),
-        "ratio_tilted_opa": result.ratio(Model.TILTED),
+        "ratio_ppa_opa": result.ratio(AngleModel.PPA),
+        "ratio_tilted_opa": result.ratio(AngleModel.TILTED),
         "outside_marks": {
             **{model.value: asdict(stats) for model, stats in result.unmarked.items()},
-            "ratio_ppa_opa": result.ratio_unmarked(Model.PPA),
-            "ratio_tilted_opa": result.ratio_unmarked(Model.TILTED),
+            "ratio_ppa_opa": result.ratio_unmarked(AngleModel.PPA),
+            "ratio_tilted_opa": result.ratio_unmarked(AngleModel.TILTED),
         },
         "rmse_deg_per_view": result.per_view,
     }
@@ -44,7 +44,7 @@ def phase_table(result: PhaseResult) -> str:
     return table(head, rows)
 
 
-def _phase_row(model: Model, stats: SignedStats, share: float) -> list[str]:
+def _phase_row(model: AngleModel, stats: SignedStats, share: float) -> list[str]:
     return [
         style.MODEL_LABELS[model],
         f"{stats.mean_deg:+.2f}°",

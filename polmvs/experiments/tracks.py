@@ -19,7 +19,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.evaluation.metrics import angular_errors_deg
 from polmvs.experiments.data import Scene, load_view, require_counted
 from polmvs.experiments.view_choice import Selection, check_k, order_at_random, order_by_angle
@@ -46,12 +46,12 @@ class Source(StrEnum):
 
 
 # Name of the estimator, the model and source of its rows; rows of maps are weighted and robust.
-ESTIMATORS: dict[str, tuple[Model, Source]] = {
-    "opa": (Model.OPA, Source.PIXELS),
-    "opa_weighted": (Model.OPA, Source.MAP),
-    "ppa_algebraic": (Model.PPA, Source.PIXELS),
-    "ppa_weighted": (Model.PPA, Source.MAP),
-    "tilted_weighted": (Model.TILTED, Source.MAP),
+ESTIMATORS: dict[str, tuple[AngleModel, Source]] = {
+    "opa": (AngleModel.OPA, Source.PIXELS),
+    "opa_weighted": (AngleModel.OPA, Source.MAP),
+    "ppa_algebraic": (AngleModel.PPA, Source.PIXELS),
+    "ppa_weighted": (AngleModel.PPA, Source.MAP),
+    "tilted_weighted": (AngleModel.TILTED, Source.MAP),
 }
 
 

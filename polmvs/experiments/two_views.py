@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.polarization.phase_map import PhaseMap
@@ -38,7 +38,7 @@ def second_view(maps: Sequence[PhaseMap], index: int, seeds: Array) -> int | Non
     """
     if len(seeds) == 0 or len(maps) < 2:
         return None
-    rows = gather_rows(Model.PPA, seeds, maps)
+    rows = gather_rows(AngleModel.PPA, seeds, maps)
     sine = np.linalg.norm(np.cross(rows.rows, rows.rows[:, index : index + 1], axis=0), axis=0)
     sine = np.where(np.isfinite(rows.sigma) & np.isfinite(sine), sine, np.nan)
     sine[index] = np.nan
@@ -113,6 +113,6 @@ def _normals(
 ) -> Array:
     """Normals (N, 3) in the frame of the first view, NaN where the views do not give one."""
     first = maps[0].view.cam_from_world
-    rows = gather_rows(Model.PPA, first.inverse() * points_in_cam, maps, range_maps)
+    rows = gather_rows(AngleModel.PPA, first.inverse() * points_in_cam, maps, range_maps)
     estimate = solve_normals(rows.rows, rows.rays, rows.sigma, robust=False)
     return np.asarray(estimate.normals @ first.rotation.T, np.float64)

@@ -19,10 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import PinholeCamera, View, pixel_centers
+from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
 from polmvs.neighbors import in_cells_beside, voxel_representatives
+from polmvs.scene import View
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

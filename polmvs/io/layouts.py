@@ -24,12 +24,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import PinholeCamera, View, pixel_centers, xy_from_opencv
+from polmvs.camera import PinholeCamera, pixel_centers, xy_from_opencv
 from polmvs.config import CaptureOptions
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
 from polmvs.io.images import write_bytes
 from polmvs.polarization.capture import Capture, open_capture
+from polmvs.scene import View
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

@@ -16,16 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import Model, NormalOptions
+from polmvs.config import AngleModel, NormalOptions
 from polmvs.normals.estimator import NormalEstimate
-from polmvs.normals.tracks import (
-    Tracks,
-    inside_shares,
-    normals_from_windows,
-    some_tracks,
-    window_map,
-)
+from polmvs.normals.tracks import inside_shares, normals_from_windows, some_tracks, window_map
 from polmvs.polarization.phase_map import PhaseMap, turned
+from polmvs.scene import Tracks
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -55,8 +50,8 @@ def find_diffuse(tracks: Tracks, maps: Sequence[PhaseMap]) -> list[Mask]:
     tracks = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
     windows = [window_map(phase_map, options.window_px) for phase_map in maps]
     opposite = [turned(m, np.ones(m.region.inside.shape, bool)) for m in windows]
-    specular = normals_from_windows(Model.PPA, tracks, windows, options.estimator)
-    diffuse = normals_from_windows(Model.PPA, tracks, opposite, options.estimator)
+    specular = normals_from_windows(AngleModel.PPA, tracks, windows, options.estimator)
+    diffuse = normals_from_windows(AngleModel.PPA, tracks, opposite, options.estimator)
     votes, voting = specular_votes(specular, diffuse)
     overall = float(votes[voting].sum()) + _dolp_votes(maps)
     return [_diffuse_parts(m, tracks, votes, voting, overall) for m in maps]

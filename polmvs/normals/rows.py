@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View, sample_image
-from polmvs.config import Model
+from polmvs.camera import sample_image
+from polmvs.config import AngleModel
 from polmvs.polarization.angle_models import rows_from_axial
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import View
 
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
@@ -33,7 +34,7 @@ class Rows:
 
 
 def gather_rows(
-    model: Model,
+    model: AngleModel,
     points_in_world: Floats,
     maps: Sequence[PhaseMap],
     range_maps: Sequence[Image | None] | None = None,
@@ -82,10 +83,10 @@ def sample_range(range_map: Image, view: View, xy: Floats) -> NDArray[np.float32
     return sample_image(range_map, xy / round(view.camera.width / range_map.shape[1]), nearest=True)
 
 
-def _row_and_turn(model: Model, samples: Image, rays: Floats) -> tuple[Floats, Floats]:
+def _row_and_turn(model: AngleModel, samples: Image, rays: Floats) -> tuple[Floats, Floats]:
     """Row in the camera frame, and how far it turns about the ray per turn of the phase."""
     row = rows_from_axial(model, samples[:, 0], samples[:, 1], rays)
-    if model is Model.OPA:
+    if model is AngleModel.OPA:
         return row, np.ones(len(row), np.float32)
     # v_z / (1 - (v . d)^2): the length of v x d is v_z over the row's length in the image plane.
     return row, (row[:, 0] ** 2 + row[:, 1] ** 2) / rays[:, 2]

@@ -8,17 +8,18 @@ projected point, in every view that sees it, not only in the views that matched 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View, sample_image
-from polmvs.config import Estimator, Model, NormalOptions
+from polmvs.camera import sample_image
+from polmvs.config import AngleModel, Estimator, NormalOptions
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import Seeds, Tracks, View
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,45 +33,6 @@ MAX_DOLP_SHARE = 0.85  # of a mark's DoLP in that of the surface about it
 CLEAR_DOLP = 0.15  # of the surface, for the comparison to tell
 MAX_SEED_SIGMA_DEG = 3.0
 MAX_SEED_RESIDUAL = 0.06  # sine; 3.4 deg between the normal and the planes of incidence
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """Sparse points and their observations as flat arrays.
-
-    Attributes
-    ----------
-    point3D_ids : (T,) int64
-    points_in_world : (T, 3) float64
-    colors : (T, 3) uint8
-    errors : (T,) float64, mean reprojection error, px
-    obs_track, obs_view : (O,) int64, indices of a track and of a view
-    obs_xy : (O, 2) float64, image coordinates
-    """
-
-    point3D_ids: NDArray[np.int64]
-    points_in_world: Array
-    colors: NDArray[np.uint8]
-    errors: Array
-    obs_track: NDArray[np.int64]
-    obs_view: NDArray[np.int64]
-    obs_xy: Array
-
-
-@dataclass(frozen=True)
-class Seeds:
-    """Points of known place on the surface.
-
-    Attributes
-    ----------
-    points_in_world : (S, 3) float64
-    normals_in_world : (S, 3) float64, unit; NaN where unknown.
-    sigma : (S,) float64, standard deviation of the place, world units.
-    """
-
-    points_in_world: Array
-    normals_in_world: Array
-    sigma: Array
 
 
 def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
@@ -87,7 +49,7 @@ def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
 
 
 def track_normals(
-    model: Model, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
+    model: AngleModel, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
 ) -> NormalEstimate:
     """Normals of all tracks in one batch (paper, eq. coeff_2).
 
@@ -103,7 +65,7 @@ def track_normals(
 
 
 def normals_from_windows(
-    model: Model, tracks: Tracks, windows: Sequence[PhaseMap], estimator: Estimator
+    model: AngleModel, tracks: Tracks, windows: Sequence[PhaseMap], estimator: Estimator
 ) -> NormalEstimate:
     """As :func:`track_normals`, from phase maps that are averaged already (:func:`window_map`).
 

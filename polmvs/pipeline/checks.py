@@ -7,19 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from polmvs.colmap.dense_workspace import open_dense_workspace
-from polmvs.colmap.models import SparseModel
 from polmvs.colmap.sfm import check_intrinsics
 from polmvs.colmap.workspace_checks import require_same_frame
-from polmvs.config import Model, Options, ReferenceOptions
+from polmvs.config import AngleModel, Options, ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.images import read_mask
 from polmvs.option_values import to_plain
 from polmvs.pipeline.record import Record
-from polmvs.pipeline.run_folder import Workspace
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.capture import find_mask, fit_model, image_names
 from polmvs.polarization.capture import Capture
 from polmvs.poses.metric_sources import check_reference
+from polmvs.scene import SparseModel
 
 EVALUATE = "evaluate"
 PARTS = "parts"
@@ -27,22 +27,22 @@ EXPORTS = ("mesh_", "dense_")  # how the stages begin that nothing follows
 POSES = ("sfm", "sparse")  # two ways to the same files
 
 
-def normals_stage(model: Model) -> str:
+def normals_stage(model: AngleModel) -> str:
     """Name of the stage of the track normals; PPA's is the first and selects the seeds."""
-    return "normals" if model is Model.PPA else f"normals_{model}"
+    return "normals" if model is AngleModel.PPA else f"normals_{model}"
 
 
-def densify_stage(model: Model) -> str:
+def densify_stage(model: AngleModel) -> str:
     """Name of the stage of the dense cloud."""
     return f"densify_{model}"
 
 
-def mesh_stage(model: Model) -> str:
+def mesh_stage(model: AngleModel) -> str:
     """Name of the stage of the mesh."""
     return f"mesh_{model}"
 
 
-def dense_stage(model: Model) -> str:
+def dense_stage(model: AngleModel) -> str:
     """Name of the stage of the COLMAP dense workspace."""
     return f"dense_{model}"
 
@@ -52,23 +52,23 @@ STAGE_OPTIONS: dict[str, tuple[str, ...]] = {
     "capture": ("capture",),
     **{name: ("sfm", "reference") for name in POSES},
     "maps": ("region",),
-    **{normals_stage(model): ("normals",) for model in Model},
+    **{normals_stage(model): ("normals",) for model in AngleModel},
     PARTS: ("normals",),
-    **{densify_stage(model): ("propagation", "fusion") for model in Model},
-    **{mesh_stage(model): () for model in Model},
-    **{dense_stage(model): ("fusion", "export") for model in Model},
+    **{densify_stage(model): ("propagation", "fusion") for model in AngleModel},
+    **{mesh_stage(model): () for model in AngleModel},
+    **{dense_stage(model): ("fusion", "export") for model in AngleModel},
     EVALUATE: ("evaluation",),
 }
 STAGE_RANK = {
     "capture": 0,
     **dict.fromkeys(POSES, 1),
     "maps": 2,
-    **{normals_stage(model): 5 for model in Model},
-    normals_stage(Model.PPA): 3,
+    **{normals_stage(model): 5 for model in AngleModel},
+    normals_stage(AngleModel.PPA): 3,
     PARTS: 4,
-    **{densify_stage(model): 6 for model in Model},
-    **{mesh_stage(model): 7 for model in Model},
-    **{dense_stage(model): 8 for model in Model},
+    **{densify_stage(model): 6 for model in AngleModel},
+    **{mesh_stage(model): 7 for model in AngleModel},
+    **{dense_stage(model): 8 for model in AngleModel},
     EVALUATE: 9,
 }
 
@@ -77,7 +77,7 @@ def command_of(name: str) -> str:
     """The command that does a stage alone."""
     if STAGE_RANK[name] <= STAGE_RANK["sfm"]:
         return "sfm"
-    if STAGE_RANK[name] < STAGE_RANK[densify_stage(Model.PPA)]:
+    if STAGE_RANK[name] < STAGE_RANK[densify_stage(AngleModel.PPA)]:
         return "normals"
     return "densify" if name.startswith("densify") else "export"
 
@@ -101,7 +101,7 @@ def followers(name: str) -> list[str]:
 
 def _model_of(name: str) -> str | None:
     """The model that a stage is of; None for those of all. PPA's normals select the seeds."""
-    return next((str(model) for model in Model if name.endswith(f"_{model}")), None)
+    return next((str(model) for model in AngleModel if name.endswith(f"_{model}")), None)
 
 
 def inputs_of(options: Options) -> list[Path]:
@@ -154,7 +154,7 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
     return None
 
 
-def require_same_capture(record: Record, identity: dict[str, Any], workspace: Workspace) -> None:
+def require_same_capture(record: Record, identity: dict[str, Any], workspace: RunFolder) -> None:
     """Finished stages must be of this capture."""
     same = all(record.capture.get(key) == identity[key] for key in ("width", "height", "bytes"))
     if record.stages and not same:
@@ -166,7 +166,7 @@ def require_same_capture(record: Record, identity: dict[str, Any], workspace: Wo
 
 
 def require_same_options(
-    record: Record, options: Options, uses: Collection[str], workspace: Workspace
+    record: Record, options: Options, uses: Collection[str], workspace: RunFolder
 ) -> None:
     """Finished stages that are taken over must be of these options."""
     for stage in record.stages:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.evaluation.comparison import write_comparison
 from polmvs.io.clouds import preload
 from polmvs.pipeline.checks import (
@@ -67,17 +67,17 @@ def plan_maps(run: Run) -> Stage:
     return Stage(name="maps", work=work, after=("sfm",), total=_num_views(run))
 
 
-def _normal_models(models: Sequence[Model]) -> list[Model]:
+def _normal_models(models: Sequence[AngleModel]) -> list[AngleModel]:
     """PPA first: it selects the seeds, which are the same for all models."""
-    return list(dict.fromkeys((Model.PPA, *models)))
+    return list(dict.fromkeys((AngleModel.PPA, *models)))
 
 
-def normal_names(models: Sequence[Model]) -> list[str]:
+def normal_names(models: Sequence[AngleModel]) -> list[str]:
     """Names of the stages of the normals."""
     return [normals_stage(model) for model in _normal_models(models)]
 
 
-def plan_normals(run: Run, models: Sequence[Model]) -> list[Stage]:
+def plan_normals(run: Run, models: Sequence[AngleModel]) -> list[Stage]:
     """Normals of the sparse points under each model, and the parts that have none."""
     first, *others = [_normal_stage(run, model) for model in _normal_models(models)]
     return [first, _part_stage(run), *others]
@@ -92,21 +92,21 @@ def _part_stage(run: Run) -> Stage:
             workers=run.workers,
         )
 
-    return Stage(name=PARTS, work=work, after=(normals_stage(Model.PPA),))
+    return Stage(name=PARTS, work=work, after=(normals_stage(AngleModel.PPA),))
 
 
-def _normal_stage(run: Run, model: Model) -> Stage:
+def _normal_stage(run: Run, model: AngleModel) -> Stage:
     def work(report: Report) -> stages.Facts:
         return cloud_stages.solve_tracks(
             model, run.workspace, run.options.normals, workers=run.workers
         )
 
-    first = normals_stage(Model.PPA)
-    after = "maps" if model is Model.PPA else first
+    first = normals_stage(AngleModel.PPA)
+    after = "maps" if model is AngleModel.PPA else first
     return Stage(name=normals_stage(model), work=work, after=(after,))
 
 
-def plan_densify(run: Run, model: Model) -> Stage:
+def plan_densify(run: Run, model: AngleModel) -> Stage:
     """Dense cloud of a model."""
     propagation, fusion = run.options.propagation, run.options.fusion
 
@@ -118,12 +118,12 @@ def plan_densify(run: Run, model: Model) -> Stage:
     return Stage(
         name=densify_stage(model),
         work=work,
-        after=(normals_stage(Model.PPA), PARTS, normals_stage(model)),
+        after=(normals_stage(AngleModel.PPA), PARTS, normals_stage(model)),
         total=cloud_stages.densify_steps(_num_views(run), propagation),
     )
 
 
-def plan_exports(run: Run, model: Model) -> list[Stage]:
+def plan_exports(run: Run, model: AngleModel) -> list[Stage]:
     """What the options ask for, of a cloud that has points."""
     options, given = run.options.export, run.options.fusion.workspace
     after = (densify_stage(model),)
@@ -146,7 +146,7 @@ def plan_exports(run: Run, model: Model) -> list[Stage]:
     return todo
 
 
-def plan_evaluation(run: Run, models: Sequence[Model]) -> Stage:
+def plan_evaluation(run: Run, models: Sequence[AngleModel]) -> Stage:
     """Figures of several models."""
 
     def work(report: Report) -> stages.Facts:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from polmvs.config import Model, Options, RunOptions
+from polmvs.config import AngleModel, Options, RunOptions
 from polmvs.errors import OptionError
 from polmvs.pipeline.checks import (
     PARTS,
@@ -27,11 +27,11 @@ from polmvs.pipeline.job_stages import (
     plan_normals,
     plan_poses,
 )
-from polmvs.pipeline.run import Monitor, Run, Stage, open_run
-from polmvs.pipeline.run_folder import Workspace
+from polmvs.pipeline.run import Run, Stage, Watcher, open_run
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages import capture as stages
 
-COMPARED = (Model.OPA, Model.PPA, Model.TILTED)
+COMPARED = (AngleModel.OPA, AngleModel.PPA, AngleModel.TILTED)
 MIN_SFM_IMAGES = 2
 BEFORE_MAPS = ("capture", *POSES)
 
@@ -61,7 +61,7 @@ class Outcome:
     empty : why a dense cloud has no points, and what to do; None where none is empty.
     """
 
-    workspace: Workspace
+    workspace: RunFolder
     results: dict[str, Any]
     empty: str | None
 
@@ -84,11 +84,11 @@ class Job:
     out: Path
     options: Options = Options()
     how: RunOptions = RunOptions()
-    monitor: Monitor | None = None
+    monitor: Watcher | None = None
     command_line: Sequence[str] = ()
 
 
-def reconstruct(job: Job, model: Model = Model.PPA) -> Outcome:
+def reconstruct(job: Job, model: AngleModel = AngleModel.PPA) -> Outcome:
     """The whole chain with one model: ``OUT/ppa.ply`` or ``OUT/opa.ply``.
 
     Raises
@@ -104,7 +104,7 @@ def reconstruct(job: Job, model: Model = Model.PPA) -> Outcome:
         return _close(run, (model,))
 
 
-def compare(job: Job, models: Sequence[Model] = COMPARED) -> Outcome:
+def compare(job: Job, models: Sequence[AngleModel] = COMPARED) -> Outcome:
     """Several models on the same poses, tracks, seeds and region, with ``OUT/metrics.json``.
 
     Raises
@@ -128,7 +128,7 @@ def find_poses(job: Job) -> Outcome:
         return _close(run, ())
 
 
-def solve_normals(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
+def solve_normals(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> Outcome:
     """Normals of the sparse points of a folder that has poses."""
     own = ("maps", PARTS, *normal_names(models))
     with _open(job, BEFORE_MAPS, own, goes_on=True) as run:
@@ -139,7 +139,7 @@ def solve_normals(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
         return _close(run, ())
 
 
-def densify(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
+def densify(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> Outcome:
     """Dense clouds of a folder that has normals."""
     before = _before_densify(models)
     with _open(job, before, [densify_stage(m) for m in models], goes_on=True) as run:
@@ -150,7 +150,7 @@ def densify(job: Job, models: Sequence[Model] = (Model.PPA,)) -> Outcome:
         return _close(run, models)
 
 
-def export(job: Job, model: Model = Model.PPA) -> Outcome:
+def export(job: Job, model: AngleModel = AngleModel.PPA) -> Outcome:
     """Mesh and COLMAP workspace of a folder that has a dense cloud."""
     before = (*_before_densify((model,)), densify_stage(model))
     own = (mesh_stage(model), dense_stage(model))
@@ -171,15 +171,15 @@ def _with_poses_of_workspace(job: Job) -> Job:
     return replace(job, options=replace(job.options, sfm=sfm))
 
 
-def _before_densify(models: Sequence[Model]) -> tuple[str, ...]:
+def _before_densify(models: Sequence[AngleModel]) -> tuple[str, ...]:
     return (*BEFORE_MAPS, "maps", PARTS, *normal_names(models))
 
 
-def _chain_names(models: Sequence[Model]) -> tuple[str, ...]:
+def _chain_names(models: Sequence[AngleModel]) -> tuple[str, ...]:
     return (*_before_densify(models), *map(densify_stage, models))
 
 
-def _chain(run: Run, models: Sequence[Model]) -> Iterator[Stage]:
+def _chain(run: Run, models: Sequence[AngleModel]) -> Iterator[Stage]:
     """The stages to the dense clouds; each is made when those before are done."""
     yield plan_capture(run)
     yield plan_poses(run)
@@ -211,7 +211,7 @@ def _open(
     )
 
 
-def _close(run: Run, models: Sequence[Model]) -> Outcome:
+def _close(run: Run, models: Sequence[AngleModel]) -> Outcome:
     run.save(finished=True)
     results = run.record.results
     empty = None

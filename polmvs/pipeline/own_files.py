@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Set
 from pathlib import Path
 
-from polmvs.choices import Model
+from polmvs.choices import AngleModel
 from polmvs.errors import DataError
 
 # What a run writes in its folders, by folder; images are known by name from the record.
 FOLDER_PATTERNS = {"sparse": ("*.bin",), "maps": ("*.npy",)} | {
-    f"views_{model}": ("*.npy",) for model in Model
+    f"views_{model}": ("*.npy",) for model in AngleModel
 }
-DENSE_FOLDERS = frozenset({"dense", *(f"dense_{model}" for model in Model)})
+DENSE_FOLDERS = frozenset({"dense", *(f"dense_{model}" for model in AngleModel)})
 DENSE_MARKER = "polmvs-files.txt"  # in a COLMAP workspace: the files that were written with it
 
 

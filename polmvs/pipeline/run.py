@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from polmvs.colmap.models import SparseModel
 from polmvs.config import Options, RunOptions
 from polmvs.errors import DataError, PolmvsError
 from polmvs.option_values import to_plain
@@ -32,10 +31,11 @@ from polmvs.pipeline.checks import (
     require_same_options,
 )
 from polmvs.pipeline.record import Record, StageRecord
-from polmvs.pipeline.run_folder import Workspace, prepare_output, require_apart
+from polmvs.pipeline.run_folder import RunFolder, prepare_output, require_apart
 from polmvs.pipeline.runtime import peak_rss_mb, versions
 from polmvs.pipeline.stages.capture import image_names
 from polmvs.polarization.capture import Capture, open_capture
+from polmvs.scene import SparseModel
 
 logger = logging.getLogger(__name__)
 
@@ -43,10 +43,10 @@ Report = Callable[[int], None]
 Facts = dict[str, Any]
 
 
-class Monitor(Protocol):
+class Watcher(Protocol):
     """Who watches a run."""
 
-    def opened(self, workspace: Workspace) -> None:
+    def opened(self, workspace: RunFolder) -> None:
         """The output folder is ready."""
 
     def stage(self, name: str, total: int | None) -> AbstractContextManager[Report]:
@@ -56,7 +56,7 @@ class Monitor(Protocol):
 class Silence:
     """Nobody watches."""
 
-    def opened(self, workspace: Workspace) -> None:
+    def opened(self, workspace: RunFolder) -> None:
         """Do nothing."""
 
     def stage(self, name: str, total: int | None) -> AbstractContextManager[Report]:
@@ -93,11 +93,11 @@ class Run:
     record : what is finished, as in ``run.json``.
     """
 
-    workspace: Workspace
+    workspace: RunFolder
     capture: Capture
     options: Options
     workers: Workers
-    monitor: Monitor
+    monitor: Watcher
     given_model: SparseModel | None
     record: Record
     _started: float = field(default_factory=time.perf_counter)
@@ -162,7 +162,7 @@ def open_run(
     min_images: int,
     uses: Collection[str],
     goes_on: bool = False,
-    monitor: Monitor | None = None,
+    monitor: Watcher | None = None,
     command_line: Sequence[str] = (),
 ) -> Iterator[Run]:
     """Check the input, make the output folder ready, and give the run.
@@ -186,7 +186,7 @@ def open_run(
         The input is unusable, or the output folder is.
     """
     monitor = monitor if monitor is not None else Silence()
-    workspace = Workspace(out)
+    workspace = RunFolder(out)
     require_apart(workspace, capture=capture_folder, others=inputs_of(options))
     capture = open_capture(capture_folder, options.capture)
     given_model = check_input(capture, options, min_images)

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError
 from polmvs.pipeline.own_files import require_own
 from polmvs.pipeline.record import Record, StageRecord, write_json
@@ -27,7 +27,7 @@ LOG_FILE = "polmvs.log"
 
 
 @dataclass(frozen=True)
-class Workspace:
+class RunFolder:
     """Paths of an output folder.
 
     Attributes
@@ -72,25 +72,25 @@ class Workspace:
         """Log of all calls."""
         return self.root / LOG_FILE
 
-    def normals(self, model: Model) -> Path:
+    def normals(self, model: AngleModel) -> Path:
         """Sparse points with normals: ``normals.ply`` is PPA's."""
-        return self.root / ("normals.ply" if model is Model.PPA else f"normals_{model}.ply")
+        return self.root / ("normals.ply" if model is AngleModel.PPA else f"normals_{model}.ply")
 
-    def cloud(self, model: Model) -> Path:
+    def cloud(self, model: AngleModel) -> Path:
         """Dense cloud."""
         return self.root / f"{model}.ply"
 
-    def views(self, model: Model) -> Path:
+    def views(self, model: AngleModel) -> Path:
         """Dense views: ranges, normals and deviations of each view."""
         return self.root / f"views_{model}"
 
-    def mesh(self, model: Model) -> Path:
+    def mesh(self, model: AngleModel) -> Path:
         """Poisson mesh of the dense cloud."""
         return self.root / f"{model}_mesh.ply"
 
-    def dense(self, model: Model) -> Path:
+    def dense(self, model: AngleModel) -> Path:
         """COLMAP dense workspace: ``dense/`` is PPA's."""
-        return self.root / ("dense" if model is Model.PPA else f"dense_{model}")
+        return self.root / ("dense" if model is AngleModel.PPA else f"dense_{model}")
 
     def files_of(self, stage: str) -> list[Path]:
         """Files, and a folder, that nothing but this stage writes; those of all stages left out."""
@@ -98,12 +98,12 @@ class Workspace:
             return [self.metrics, self.summary]
         kind, _, model = stage.partition("_")
         if kind == "normals":
-            return [self.normals(Model(model or Model.PPA))]
+            return [self.normals(AngleModel(model or AngleModel.PPA))]
         if kind == "densify":
-            return [self.cloud(Model(model))]
+            return [self.cloud(AngleModel(model))]
         if kind == "dense":
-            return [self.dense(Model(model))]
-        return [self.mesh(Model(model))] if kind == "mesh" else []
+            return [self.dense(AngleModel(model))]
+        return [self.mesh(AngleModel(model))] if kind == "mesh" else []
 
     def require_own(self, path: Path) -> None:
         """Refuse, by DataError, to delete a folder that holds more than a stage wrote."""
@@ -179,7 +179,7 @@ class Workspace:
         write_json(self.run_file, asdict(record))
 
 
-def prepare_output(workspace: Workspace, *, overwrite: bool, resume: bool) -> Record:
+def prepare_output(workspace: RunFolder, *, overwrite: bool, resume: bool) -> Record:
     """Make the output folder ready and give the record that the run starts from.
 
     Parameters
@@ -214,7 +214,7 @@ def prepare_output(workspace: Workspace, *, overwrite: bool, resume: bool) -> Re
     return Record()
 
 
-def require_apart(workspace: Workspace, *, capture: Path, others: Sequence[Path]) -> None:
+def require_apart(workspace: RunFolder, *, capture: Path, others: Sequence[Path]) -> None:
     """Refuse an output folder whose results would be mixed with the input, or delete it.
 
     Parameters
@@ -256,14 +256,14 @@ def has_content(folder: Path) -> bool:
 def result_names() -> list[str]:
     """Names of all files and folders that a run may write, the record last."""
     names = ["images", "sparse", "maps", "metrics.json", "summary.md", LOG_FILE]
-    for model in Model:
-        here = Workspace(Path())
+    for model in AngleModel:
+        here = RunFolder(Path())
         names += [here.normals(model).name, here.cloud(model).name, here.views(model).name]
         names += [here.mesh(model).name, here.dense(model).name]
     return [*names, RUN_FILE]
 
 
-def _remove_results(workspace: Workspace) -> None:
+def _remove_results(workspace: RunFolder) -> None:
     """Delete what an earlier run wrote; other files stay."""
     root = workspace.root
     present = [name for name in result_names() if os.path.lexists(root / name)]

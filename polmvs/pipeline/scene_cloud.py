@@ -19,23 +19,19 @@ from polmvs.config import FusionOptions, Surroundings
 from polmvs.io.clouds import Cloud
 from polmvs.io.images import read_gray
 from polmvs.parallel import Workers
-from polmvs.pipeline.run_folder import Workspace
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import PointKind
 from polmvs.surface.fusion import FusedCloud
-from polmvs.surface.surroundings import (
-    Kind,
-    SparseSurroundings,
-    sparse_surroundings,
-    stereo_surroundings,
-)
+from polmvs.surface.surroundings import SparseSurroundings, sparse_surroundings, stereo_surroundings
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T", bound=np.generic)
 
 
-def surface_cloud(cloud: FusedCloud, kind: Kind = Kind.SURFACE) -> Cloud:
+def surface_cloud(cloud: FusedCloud, kind: PointKind = PointKind.SURFACE) -> Cloud:
     """A fused cloud as it is written, with grey colours as in COLMAP's images.
 
     The brightest 1 % are white.
@@ -56,7 +52,7 @@ def surface_cloud(cloud: FusedCloud, kind: Kind = Kind.SURFACE) -> Cloud:
     )
 
 
-def open_given(workspace: Workspace, options: FusionOptions) -> DenseWorkspace | None:
+def open_given(workspace: RunFolder, options: FusionOptions) -> DenseWorkspace | None:
     """The COLMAP workspace of the options, found to be of the run's images and model.
 
     Raises
@@ -77,7 +73,7 @@ def open_given(workspace: Workspace, options: FusionOptions) -> DenseWorkspace |
     return given
 
 
-def open_checked(folder: Path, workspace: Workspace) -> DenseWorkspace:
+def open_checked(folder: Path, workspace: RunFolder) -> DenseWorkspace:
     """A user's COLMAP workspace, found to be of the run's images and model.
 
     Raises
@@ -92,7 +88,7 @@ def open_checked(folder: Path, workspace: Workspace) -> DenseWorkspace:
 
 
 def surroundings_cloud(
-    workspace: Workspace,
+    workspace: RunFolder,
     surface: FusedCloud,
     maps: Sequence[PhaseMap],
     options: FusionOptions,
@@ -112,11 +108,11 @@ def surroundings_cloud(
     folder : for what is kept on disk meanwhile.
     """
     if given is not None:
-        return surface_cloud(kept_cloud(given, surface.points), Kind.COLMAP)
+        return surface_cloud(kept_cloud(given, surface.points), PointKind.COLMAP)
     model = read_model(workspace.sparse)
     if options.surroundings is Surroundings.STEREO:
         return surface_cloud(
-            stereo_surroundings(model.tracks, maps, folder, workers=workers), Kind.STEREO
+            stereo_surroundings(model.tracks, maps, folder, workers=workers), PointKind.STEREO
         )
     if options.surroundings is Surroundings.SPARSE:
         return _sparse_cloud(sparse_surroundings(model.tracks, maps))
@@ -135,7 +131,7 @@ def _sparse_cloud(sparse: SparseSurroundings) -> Cloud:
             "num_views": sparse.num_views,
             "sigma": unknown,
             "sigma_deg": unknown,
-            "kind": np.full(num, Kind.SPARSE, np.float32),
+            "kind": np.full(num, PointKind.SPARSE, np.float32),
         },
     )
 

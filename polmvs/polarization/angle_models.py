@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Light, Model
+from polmvs.config import AngleModel, Light
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
@@ -18,9 +18,9 @@ Array = NDArray[np.float64]
 OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
 
 
-def model_rays(model: Model, rays_in_cam: Floats) -> Floats:
+def model_rays(model: AngleModel, rays_in_cam: Floats) -> Floats:
     """Rays as the model sees them: the optical axis under OPA, themselves under the others."""
-    if model is Model.OPA:
+    if model is AngleModel.OPA:
         return np.broadcast_to(OPTICAL_AXIS.astype(rays_in_cam.dtype), rays_in_cam.shape)
     return rays_in_cam
 
@@ -38,7 +38,7 @@ def phase_direction(phase: Floats) -> Array:
     return np.stack([np.cos(phase), -np.sin(phase), np.zeros_like(phase)], axis=-1)
 
 
-def phase_from_normal(model: Model, normals_in_cam: Floats, rays_in_cam: Floats) -> Array:
+def phase_from_normal(model: AngleModel, normals_in_cam: Floats, rays_in_cam: Floats) -> Array:
     """Predict the phase angle of a surface (paper, eqs. phi_ortho and phi_persp).
 
     Parameters
@@ -61,7 +61,7 @@ def phase_from_normal(model: Model, normals_in_cam: Floats, rays_in_cam: Floats)
     return np.where(np.hypot(x, y) > 1e-12, phase, np.nan)
 
 
-def rows_from_phase(model: Model, phase: Floats, rays_in_cam: Floats) -> Array:
+def rows_from_phase(model: AngleModel, phase: Floats, rays_in_cam: Floats) -> Array:
     """Unit constraint rows ``m`` with ``m . n = 0`` (paper, eqs. con_ortho and con_persp).
 
     Parameters
@@ -79,7 +79,7 @@ def rows_from_phase(model: Model, phase: Floats, rays_in_cam: Floats) -> Array:
     return np.asarray(rows_from_axial(model, cos2, sin2, rays_in_cam), np.float64)
 
 
-def rows_from_axial(model: Model, cos2: Floats, sin2: Floats, rays_in_cam: Floats) -> Floats:
+def rows_from_axial(model: AngleModel, cos2: Floats, sin2: Floats, rays_in_cam: Floats) -> Floats:
     """Rows from ``(cos 2 phase, sin 2 phase)`` of any common length; float32 stays float32.
 
     A pair of zero length (no polarisation) gives a NaN row.
@@ -101,7 +101,9 @@ def rows_from_axial(model: Model, cos2: Floats, sin2: Floats, rays_in_cam: Float
     return np.stack([x * scale, y * scale, z * scale], axis=-1)
 
 
-def normal_from_angles(model: Model, phase: Floats, zenith: Floats, rays_in_cam: Floats) -> Array:
+def normal_from_angles(
+    model: AngleModel, phase: Floats, zenith: Floats, rays_in_cam: Floats
+) -> Array:
     """Normal ``n = -exp(zenith a^) v`` of a phase and a zenith angle (paper, same table).
 
     Parameters

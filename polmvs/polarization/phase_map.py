@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View, pixel_centers, sample_image
+from polmvs.camera import pixel_centers, sample_image
 from polmvs.config import Light
 from polmvs.errors import DataError
 from polmvs.io.arrays import map_array, save_array
@@ -19,6 +19,7 @@ from polmvs.polarization.angle_models import phase_sign
 from polmvs.polarization.region import Region, smooth
 from polmvs.polarization.stokes import Stokes
 from polmvs.polarization.tilted import correct_stokes, stokes_solver
+from polmvs.scene import View
 
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]

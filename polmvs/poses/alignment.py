@@ -10,10 +10,10 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View
 from polmvs.errors import DataError
 from polmvs.geometry import SimilarityTransform, align_points
 from polmvs.io.ground_truth import GroundTruth
+from polmvs.scene import View
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

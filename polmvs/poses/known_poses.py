@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View
-from polmvs.colmap.models import SparseModel, read_model
+from polmvs.colmap.models import read_model
 from polmvs.colmap.sparse_model import match_model_to_capture, write_model
 from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import read_views as read_known_views
-from polmvs.normals.tracks import Tracks, some_tracks
+from polmvs.normals.tracks import some_tracks
 from polmvs.poses.metric_frame import match_names
 from polmvs.poses.triangulation import intersect_rays
+from polmvs.scene import SparseModel, Tracks, View
 
 Array = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View
 from polmvs.colmap.sparse_model import short_list
 from polmvs.errors import DataError
 from polmvs.poses.markers import Detection
 from polmvs.poses.triangulation import Triangulation, triangulate_together
+from polmvs.scene import View
 
 Array = NDArray[np.float64]
 

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
-from polmvs.camera import Camera, View, sample_image, xy_from_opencv
+from polmvs.camera import Camera, sample_image, xy_from_opencv
 from polmvs.errors import DataError, OptionError
 from polmvs.polarization.capture import DISPLAY_GAMMA
+from polmvs.scene import View
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.colmap.models import SparseModel
 from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError
 from polmvs.poses.marker_size import measure_markers
@@ -24,6 +23,7 @@ from polmvs.poses.metric_frame import (
     require_agreement,
     scaling,
 )
+from polmvs.scene import SparseModel
 
 Array = NDArray[np.float64]
 ImageLoader = Callable[[str], NDArray[np.uint8]]

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View
+from polmvs.scene import View
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

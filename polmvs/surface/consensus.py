@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View, sample_image
+from polmvs.camera import sample_image
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView, SurfaceSamples, extend_planes, view_samples
 
 Array = NDArray[np.float64]

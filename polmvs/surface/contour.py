@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.polarization.angle_models import rows_from_axial
 
 Floats = NDArray[np.floating]
@@ -44,7 +44,7 @@ class Contours:
     arc_px: NDArray[np.float32]
 
 
-def direction_field(model: Model, samples: Image, rays: Image, passable: Mask) -> Image:
+def direction_field(model: AngleModel, samples: Image, rays: Image, passable: Mask) -> Image:
     """Direction of the contour at every pixel, as an axial image that can be interpolated.
 
     Parameters

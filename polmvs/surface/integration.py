@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Model, PropagationOptions
-from polmvs.normals.tracks import Seeds
+from polmvs.config import AngleModel, PropagationOptions
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import Seeds
 from polmvs.surface.consensus import surface_of_others
 from polmvs.surface.dense_view import (
     DenseView,
@@ -43,7 +43,7 @@ MAX_GAP_STRIDES = 2.0  # from a point of the coarser lattice to those made of it
 
 
 def integrate(
-    model: Model,
+    model: AngleModel,
     maps: Sequence[PhaseMap],
     seeds: Seeds,
     options: PropagationOptions,
@@ -118,7 +118,7 @@ class _Task:
     path: Path
 
 
-def _round(model: Model, seeds: Seeds, bending: float, task: _Task) -> DenseView | None:
+def _round(model: AngleModel, seeds: Seeds, bending: float, task: _Task) -> DenseView | None:
     """One view's result on its lattice."""
     stride_px = task.plan.stride_px
     wanted = open_lattice(task.maps[0], stride_px)

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.normals.estimator import NormalEstimate
-from polmvs.normals.tracks import Seeds
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import Seeds
 from polmvs.surface.contour import Contours
 from polmvs.surface.dense_view import SurfaceSamples
 from polmvs.surface.log_range import Edges, SeedTies, log_range_increment, slope_sigma
@@ -127,7 +127,9 @@ def fill_normals(nodes: Nodes, estimate: NormalEstimate) -> tuple[Array, Array]:
     return normals, sigma
 
 
-def node_edges(model: Model, nodes: Nodes, own_sigma: Floats, *, along_contours: bool) -> Edges:
+def node_edges(
+    model: AngleModel, nodes: Nodes, own_sigma: Floats, *, along_contours: bool
+) -> Edges:
     """Increments from the nodes' normals on all edges, and the constancy along the contours.
 
     Parameters
@@ -156,7 +158,9 @@ def node_edges(model: Model, nodes: Nodes, own_sigma: Floats, *, along_contours:
     if not along_contours:
         return edges
     # Constant range (PPA) or depth (OPA); its slope errs by the turn of the row about the ray.
-    constant = np.log(nodes.ray_z[tail] / nodes.ray_z[head]) if model is Model.OPA else 0.0 * angle
+    constant = (
+        np.log(nodes.ray_z[tail] / nodes.ray_z[head]) if model is AngleModel.OPA else 0.0 * angle
+    )
     turn = 0.5 * (own_sigma[tail] + own_sigma[head])
     cosine = np.abs((mean * rays[tail]).sum(axis=-1))
     constant_sigma = (

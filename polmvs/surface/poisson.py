@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.errors import DataError
 from polmvs.io.clouds import Cloud, Mesh, solve_poisson
-from polmvs.surface.surroundings import Kind
+from polmvs.scene import PointKind
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -45,7 +45,7 @@ KIND = "kind"
 def poisson_mesh(
     cloud: Cloud,
     *,
-    kinds: Collection[int] = (Kind.SURFACE,),
+    kinds: Collection[int] = (PointKind.SURFACE,),
     max_depth: int = MAX_DEPTH,
     support_spacings: float = SUPPORT_SPACINGS,
     min_island_spacings: float = MIN_ISLAND_SPACINGS,
@@ -62,7 +62,7 @@ def poisson_mesh(
     ----------
     cloud : with normals that point away from the surface; if it has a scalar ``kind``, only
         points of the given kinds count. Points and normals that are not finite do not.
-    kinds : of points to use, see :class:`polmvs.surface.surroundings.Kind`.
+    kinds : of points to use, see :class:`polmvs.surface.surroundings.PointKind`.
     max_depth : of the octree, whatever the points' spacing; bounds memory.
     support_spacings : vertices farther than this from any point go, in spacings of the points.
     min_island_spacings : side of a square, in spacings; separate pieces of a smaller area go.

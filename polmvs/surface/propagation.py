@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Contour, Model, PropagationOptions
-from polmvs.normals.tracks import Seeds
+from polmvs.config import AngleModel, Contour, PropagationOptions
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap, view_rays
+from polmvs.scene import Seeds
 from polmvs.surface.contour import Contours, cover_with_contours, direction_field
 from polmvs.surface.dense_view import DenseView, store_dense_view
 from polmvs.surface.pixel_graph import Nodes, connect, visible_seeds
@@ -47,7 +47,7 @@ def choose_neighbors(maps: Sequence[PhaseMap], seeds: Seeds, max_neighbors: int)
 
 
 def propagate(
-    model: Model,
+    model: AngleModel,
     maps: Sequence[PhaseMap],
     seeds: Seeds,
     options: PropagationOptions,
@@ -105,10 +105,10 @@ def _chunks(maps: Sequence[PhaseMap]) -> list[Sequence[PhaseMap]]:
 
 
 def _start(
-    model: Model, seeds: Seeds, options: PropagationOptions, maps: Sequence[PhaseMap]
+    model: AngleModel, seeds: Seeds, options: PropagationOptions, maps: Sequence[PhaseMap]
 ) -> list[Nodes | None]:
     """Trace the contours of some views and give each node a first range from the seeds."""
-    path_model = Model.OPA if options.contour is Contour.NORMALS else model
+    path_model = AngleModel.OPA if options.contour is Contour.NORMALS else model
     fields, insides, seeds_xy = [], [], []
     top = 0.0
     for phase_map in maps:
@@ -171,7 +171,7 @@ class _Task:
 
 
 def _round(
-    model: Model, seeds: Seeds, options: PropagationOptions, task: _Task
+    model: AngleModel, seeds: Seeds, options: PropagationOptions, task: _Task
 ) -> tuple[Nodes | None, DenseView | None]:
     """Normals and ranges of one view's nodes, and the dense view that they make."""
     if task.nodes is None:

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
-from polmvs.normals.tracks import Seeds
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import Seeds
 from polmvs.surface.consensus import ask_view
 from polmvs.surface.dense_view import (
     DenseView,
@@ -83,7 +83,7 @@ def surface_at_seeds(phase_map: PhaseMap, seeds: Seeds, xy: Floats) -> SurfaceSa
 
 
 def relax(
-    model: Model,
+    model: AngleModel,
     maps: Sequence[PhaseMap],
     dense: Sequence[DenseView | None],
     nodes: Nodes,

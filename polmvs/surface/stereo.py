@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import PinholeCamera, View, pixel_centers, sample_image
+from polmvs.camera import PinholeCamera, pixel_centers, sample_image
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView, lattice_xy
 
 Array = NDArray[np.float64]

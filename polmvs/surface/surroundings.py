@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from enum import IntEnum
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View, sample_image
+from polmvs.camera import sample_image
 from polmvs.config import FusionOptions
-from polmvs.normals.tracks import KEYPOINT_SIGMA_PX, Tracks, point_sigmas, some_tracks
+from polmvs.normals.tracks import KEYPOINT_SIGMA_PX, point_sigmas, some_tracks
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map
+from polmvs.scene import Tracks, View
 from polmvs.surface.dense_view import DenseView, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse
 from polmvs.surface.stereo import stereo_view
@@ -41,15 +41,6 @@ MIN_BASELINE_ANGLE_DEG = 40.0  # between baseline and views: an epipole in the i
 PART_MARGIN_PX = 8  # by which a match may leak over a part's outline: a patch and its neighbours
 MAX_NORMAL_DIFFERENCE_DEG = 30.0  # of two views; planes of ten pixels' disparities are uncertain
 MIN_SHARED_POINTS = 20  # of two views, for their angle to be known and their overlap to be worth it
-
-
-class Kind(IntEnum):
-    """What a point of a cloud is: on a polarised part, or how it was found beside one."""
-
-    SURFACE = 0
-    SPARSE = 1
-    STEREO = 2
-    COLMAP = 3
 
 
 @dataclass(frozen=True)

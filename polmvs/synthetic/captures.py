@@ -16,8 +16,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from polmvs.camera import Camera, View, pixel_centers
+from polmvs.camera import Camera, pixel_centers
 from polmvs.geometry import RigidTransform
+from polmvs.scene import View
 from polmvs.synthetic.surfaces import Cylinder, Group, Plane, Sphere, Surface, unit
 
 __all__ = [

@@ -16,10 +16,9 @@ from polmvs.colmap.models import read_model
 from polmvs.colmap.sparse_model import write_model
 from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud
-from polmvs.normals.tracks import Tracks
 from polmvs.pipeline.stages import capture as stages
 from polmvs.polarization.capture import open_capture
-from polmvs.surface.surroundings import Kind
+from polmvs.scene import PointKind, Tracks
 
 INTRINSICS = "333.75,333.75,230.6475,196.608"  # of the bundled capture
 SIZE = (48, 64)
@@ -228,7 +227,7 @@ def without_points(model_folder: Path, target: Path) -> Path:
 
 def assert_finished_but_empty(out: Path) -> None:
     cloud = read_cloud(out / "ppa.ply")
-    assert not (cloud.scalars.get("kind", np.ones(0)) == Kind.SURFACE).any()
+    assert not (cloud.scalars.get("kind", np.ones(0)) == PointKind.SURFACE).any()
     record = json.loads((out / "run.json").read_text())
     assert record["finished"] is True
     assert record["results"]["num_points_ppa"] == 0

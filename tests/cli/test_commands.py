@@ -8,7 +8,7 @@ import pytest
 import polmvs
 from polmvs.cli.flags import GROUPS, options_from, run_options
 from polmvs.cli.parsers import build_parser
-from polmvs.config import Contour, Model, Options, RunOptions
+from polmvs.config import AngleModel, Contour, Options, RunOptions
 from polmvs.option_values import describe_fields, from_plain, to_plain
 from polmvs.pipeline.jobs import COMPARED
 
@@ -56,7 +56,7 @@ def test_defaults_are_those_of_the_options() -> None:
     args = build_parser().parse_args(["compare", "capture", "out"])
     assert run_options(args) == RunOptions()
     assert tuple(args.models) == COMPARED
-    assert COMPARED[:2] == (Model.OPA, Model.PPA)
+    assert COMPARED[:2] == (AngleModel.OPA, AngleModel.PPA)
 
 
 def test_flags_of_every_kind() -> None:

@@ -16,11 +16,12 @@ from dense_scenes import (
 
 from polmvs.camera import PinholeCamera
 from polmvs.colmap.dense_workspace import open_dense_workspace, source_order, write_dense_workspace
-from polmvs.colmap.models import SparseModel, pycolmap, read_model
+from polmvs.colmap.models import pycolmap, read_model
 from polmvs.colmap.sparse_model import write_model
 from polmvs.colmap.workspace_layout import map_files
 from polmvs.errors import DataError
 from polmvs.io.images import write_png
+from polmvs.scene import SparseModel
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,9 @@ import sys
 import numpy as np
 import pytest
 
-from polmvs.camera import PinholeCamera, View, pixel_centers
+from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.colmap.models import (
     ColmapCamera,
-    SparseModel,
     camera_from_colmap,
     camera_to_colmap,
     find_model,
@@ -24,7 +23,7 @@ from polmvs.colmap.models import (
 from polmvs.colmap.sparse_model import match_model_to_capture, write_model
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
-from polmvs.normals.tracks import Tracks
+from polmvs.scene import SparseModel, Tracks, View
 
 WIDTH, HEIGHT = 160, 120
 OPENCV = ColmapCamera(

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 import polmvs
-from polmvs.colmap.models import SparseModel, read_model
+from polmvs.colmap.models import read_model
 from polmvs.colmap.sfm import check_intrinsics, run_sfm
 from polmvs.config import SfmOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import align_points
 from polmvs.polarization.capture import intensity_image_8bit, open_capture
+from polmvs.scene import SparseModel
 
 DEMO = Path(polmvs.__file__).parent / "demo_capture"
 TRUTH = json.loads((DEMO / "gt" / "cameras.json").read_text())["images"]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scenes import Scene, board_scene
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.evaluation.consistency import Consistency, measure_consistency
 from polmvs.io.clouds import Cloud
-from polmvs.surface.surroundings import Kind
+from polmvs.scene import PointKind
 
 NO_TRACKS = Cloud(np.zeros((0, 3)))
 
@@ -22,27 +22,27 @@ def surface_of(scene: Scene) -> Cloud:
     return Cloud(points, normals, scalars={"num_views": np.full(2000, 4.0)})
 
 
-def with_surroundings(surface: Cloud, kind: Kind) -> Cloud:
+def with_surroundings(surface: Cloud, kind: PointKind) -> Cloud:
     """The surface and as many points of the surroundings, which hover before it."""
     num = len(surface.points)
     hovering = surface.points + np.array([0.0, 0.0, 0.02])
-    normals = np.zeros((num, 3)) if kind is Kind.SPARSE else surface.normals
+    normals = np.zeros((num, 3)) if kind is PointKind.SPARSE else surface.normals
     return Cloud(
         points=np.concatenate([hovering, surface.points]),
         normals=np.concatenate([normals, surface.normals]),
         scalars={
             "num_views": np.concatenate([np.zeros(num), surface.scalars["num_views"]]),
-            "kind": np.repeat(np.array([kind, Kind.SURFACE], np.float32), num),
+            "kind": np.repeat(np.array([kind, PointKind.SURFACE], np.float32), num),
         },
     )
 
 
 def measure(scene: Scene, cloud: Cloud) -> Consistency:
-    return measure_consistency(Model.PPA, cloud, NO_TRACKS, scene.maps)
+    return measure_consistency(AngleModel.PPA, cloud, NO_TRACKS, scene.maps)
 
 
-@pytest.mark.parametrize("kind", [Kind.SPARSE, Kind.STEREO])
-def test_only_the_polarised_surface_counts(scene: Scene, kind: Kind) -> None:
+@pytest.mark.parametrize("kind", [PointKind.SPARSE, PointKind.STEREO])
+def test_only_the_polarised_surface_counts(scene: Scene, kind: PointKind) -> None:
     surface = surface_of(scene)
     alone = measure(scene, surface)
     assert alone.num_points == 2000
@@ -57,7 +57,9 @@ def test_only_the_polarised_surface_counts(scene: Scene, kind: Kind) -> None:
 def test_surroundings_alone_are_no_points(scene: Scene) -> None:
     surface = surface_of(scene)
     cloud = Cloud(
-        surface.points, surface.normals, scalars={"kind": np.full(2000, Kind.SPARSE, np.float32)}
+        surface.points,
+        surface.normals,
+        scalars={"kind": np.full(2000, PointKind.SPARSE, np.float32)},
     )
     found = measure(scene, cloud)
     assert found.num_points == 0

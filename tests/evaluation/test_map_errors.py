@@ -10,12 +10,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from polmvs.camera import PinholeCamera, View
+from polmvs.camera import PinholeCamera
 from polmvs.errors import DataError
 from polmvs.evaluation.map_errors import map_errors
 from polmvs.evaluation.tables import summary_text
 from polmvs.geometry import RigidTransform
 from polmvs.io.ground_truth import GroundTruth
+from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.synthetic.captures import Group, Plane, Sphere, Surface, render_view, ring_of_views
 

@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import polmvs
-from polmvs.camera import View, pixel_centers
-from polmvs.config import Model
+from polmvs.camera import pixel_centers
+from polmvs.config import AngleModel
 from polmvs.errors import DataError
 from polmvs.evaluation.truth_errors import evaluate, phase_errors_on_part, track_normal_errors
 from polmvs.geometry import RigidTransform
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.poses.alignment import align_to_truth
+from polmvs.scene import View
 
 Array = NDArray[np.float64]
 DEMO = Path(polmvs.__file__).parent / "demo_capture"
@@ -153,13 +154,13 @@ def test_phase_made_by_a_model_fits_that_model_only(truth: GroundTruth) -> None:
     name = truth.names[0]
     camera = truth.views[name].camera
     rays = camera.rays(pixel_centers(camera.width, camera.height))
-    phase = phase_from_normal(Model.PPA, truth.normals(name), rays) + np.radians(1.0)
+    phase = phase_from_normal(AngleModel.PPA, truth.normals(name), rays) + np.radians(1.0)
     dolp = np.where(np.arange(camera.width) < camera.width // 2, 0.5, 0.05) * np.ones(phase.shape)
     errors = phase_errors_on_part({name: phase, "strange.png": phase}, {name: dolp}, truth)
-    assert errors[Model.PPA].median_deg == pytest.approx(1.0, abs=0.01)
-    assert errors[Model.PPA].count == (truth.mask(name) & (dolp > 0.1)).sum()
-    assert errors[Model.OPA].mean_deg > 3.0
+    assert errors[AngleModel.PPA].median_deg == pytest.approx(1.0, abs=0.01)
+    assert errors[AngleModel.PPA].count == (truth.mask(name) & (dolp > 0.1)).sum()
+    assert errors[AngleModel.OPA].mean_deg > 3.0
     empty = phase_errors_on_part({name: phase}, {name: 0 * dolp}, truth)
-    assert empty[Model.OPA].count == 0
+    assert empty[AngleModel.OPA].count == 0
     with pytest.raises(ValueError, match=r"phase\.shape"):
         phase_errors_on_part({name: phase[1:]}, {name: dolp}, truth)

@@ -13,7 +13,7 @@ from scenes import CAMERA
 
 import polmvs
 from polmvs.cli.flags import Parser
-from polmvs.config import Light, Model, RegionOptions
+from polmvs.config import AngleModel, Light, RegionOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.experiments import command, output
 from polmvs.experiments.contours import Lines, edge_seeds, measure_contours, pool_lines
@@ -80,13 +80,13 @@ def test_phase_of_the_sensors_own_model_is_exact(tmp_path, sensor):
         result = measure_phase(scene, workers)
     medians = {model: stats.median_deg for model, stats in result.all_pixels.items()}
     # Interpolating the mosaic of a curved phase field costs about 0.05 degrees.
-    assert medians[Model(sensor)] < 0.1
+    assert medians[AngleModel(sensor)] < 0.1
     assert min(m for model, m in medians.items() if model != sensor) > 0.2
-    assert result.ratio(Model.OPA) == 1
-    columns = result.densities[Model.PPA].sum(axis=-1)
+    assert result.ratio(AngleModel.OPA) == 1
+    columns = result.densities[AngleModel.PPA].sum(axis=-1)
     np.testing.assert_allclose(columns[np.isfinite(columns)], 1)
     images = phase_images(scene, 0)
-    assert np.isfinite(images.predicted[Model.TILTED][images.part]).mean() > 0.95
+    assert np.isfinite(images.predicted[AngleModel.TILTED][images.part]).mean() > 0.95
 
 
 def test_plane_estimates_on_a_tilted_sensor(tilted_scene):
@@ -97,7 +97,7 @@ def test_plane_estimates_on_a_tilted_sensor(tilted_scene):
     assert means["tilted"] < means["weighted"] < means["algebraic"]
     assert len(result.per_image) == 6
     assert result.is_planar
-    opa, ppa = result.ambiguity[Model.OPA], result.ambiguity[Model.PPA]
+    opa, ppa = result.ambiguity[AngleModel.OPA], result.ambiguity[AngleModel.PPA]
     np.testing.assert_allclose(opa.rmse_deg, opa.rmse_turned_deg)
     assert (opa.determined_share, ppa.determined_share) == (0, 1)
     assert ppa.rmse_turned_deg > 5 * ppa.rmse_deg

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes import CAMERA, Scene, board_scene, phase_map_of, tracks_at
 
-from polmvs.config import Light, Model, NormalOptions
+from polmvs.config import AngleModel, Light, NormalOptions
 from polmvs.evaluation.comparison import Consistency, best_fitting_model
 from polmvs.evaluation.metrics import AngleStats
 from polmvs.normals.light import find_diffuse
@@ -92,12 +92,12 @@ def test_rows_of_a_tilted_sensor_are_exact_once_corrected(light):
     points, truth = scene.surface_points(40)
     maps = scene.maps
     error = {}
-    for model, used in ((Model.PPA, maps), (Model.TILTED, [as_tilted(m) for m in maps])):
+    for model, used in ((AngleModel.PPA, maps), (AngleModel.TILTED, [as_tilted(m) for m in maps])):
         rows = gather_rows(model, points, used)
         residual = np.einsum("ikn,ni->kn", rows.rows, truth)[np.isfinite(rows.sigma)]
         error[model] = np.degrees(np.sqrt((residual**2).mean()))
-    assert error[Model.TILTED] < 0.2
-    assert error[Model.PPA] > 3 * error[Model.TILTED]
+    assert error[AngleModel.TILTED] < 0.2
+    assert error[AngleModel.PPA] > 3 * error[AngleModel.TILTED]
 
 
 def test_tilted_normals_of_a_tilted_sensor_are_nearer_to_the_truth():
@@ -106,13 +106,13 @@ def test_tilted_normals_of_a_tilted_sensor_are_nearer_to_the_truth():
     tracks = tracks_at(scene, points)
     mean = {}
     for model, used in (
-        (Model.PPA, scene.maps),
-        (Model.TILTED, [as_tilted(m) for m in scene.maps]),
+        (AngleModel.PPA, scene.maps),
+        (AngleModel.TILTED, [as_tilted(m) for m in scene.maps]),
     ):
         found = track_normals(model, tracks, used, NormalOptions(window_px=5))
         cosine = np.clip((found.normals * truth).sum(axis=-1), -1, 1)
         mean[model] = np.degrees(np.arccos(cosine)).mean()
-    assert mean[Model.TILTED] < 0.5 * mean[Model.PPA]
+    assert mean[AngleModel.TILTED] < 0.5 * mean[AngleModel.PPA]
 
 
 def test_a_stored_tilted_map_shares_its_region(board, tmp_path):
@@ -134,9 +134,9 @@ def test_the_residuals_tell_which_model_a_sensor_follows(sensor, tmp_path):
     tracks = tracks_at(scene, points)
     found = {}
     for model, used in (
-        (Model.OPA, scene.maps),
-        (Model.PPA, scene.maps),
-        (Model.TILTED, [as_tilted(m) for m in scene.maps]),
+        (AngleModel.OPA, scene.maps),
+        (AngleModel.PPA, scene.maps),
+        (AngleModel.TILTED, [as_tilted(m) for m in scene.maps]),
     ):
         estimate = track_normals(model, tracks, used, NormalOptions(window_px=5))
         residual = float(np.degrees(np.arcsin(np.nanmedian(estimate.residual))))
@@ -148,7 +148,7 @@ def test_the_residuals_tell_which_model_a_sensor_follows(sensor, tmp_path):
             agreement=0.0,
             track_residual_median_deg=residual,
         )
-    assert best_fitting_model(found) is Model(sensor)
+    assert best_fitting_model(found) is AngleModel(sensor)
 
 
 def test_without_points_no_model_fits_best():
@@ -159,4 +159,4 @@ def test_without_points_no_model_fits_best():
         agreement=float("nan"),
         track_residual_median_deg=float("nan"),
     )
-    assert best_fitting_model({Model.PPA: none}) is None
+    assert best_fitting_model({AngleModel.PPA: none}) is None

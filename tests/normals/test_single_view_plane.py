@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from polmvs.camera import PinholeCamera, View, pixel_centers
-from polmvs.config import Light, Model
+from polmvs.camera import PinholeCamera, pixel_centers
+from polmvs.config import AngleModel, Light
 from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.normals.single_view.command import add_parser
@@ -19,6 +19,7 @@ from polmvs.normals.single_view.plane import phase_residuals, plane_normal
 from polmvs.normals.single_view.search import find_planes
 from polmvs.polarization.angle_models import normal_from_angles, phase_from_normal
 from polmvs.polarization.capture import open_capture
+from polmvs.scene import View
 from polmvs.synthetic.captures import (
     Group,
     Plane,
@@ -50,7 +51,7 @@ def axial_of(phase, rng=None, sigma=0.0, outliers=0.0):
     return np.stack([np.cos(2 * phase), np.sin(2 * phase)])
 
 
-def plane_axial(normal=NORMAL, model=Model.PPA, **noise):
+def plane_axial(normal=NORMAL, model=AngleModel.PPA, **noise):
     return axial_of(phase_from_normal(model, normal, RAYS.T), **noise)
 
 
@@ -59,7 +60,7 @@ def error_deg(normal, truth):
 
 
 @BOTH
-@pytest.mark.parametrize("model", [Model.PPA, Model.TILTED])
+@pytest.mark.parametrize("model", [AngleModel.PPA, AngleModel.TILTED])
 @pytest.mark.parametrize("shift", [1.0, -3.0])
 def test_exact_phases_give_the_normal(robust, model, shift):
     sigma = np.full(RAYS.shape[1], 0.02)
@@ -77,7 +78,7 @@ def test_exact_phases_give_the_normal(robust, model, shift):
 def test_few_pixels_are_enough(robust, num):
     some = np.linspace(0, RAYS.shape[1] - 1, num).astype(int)
     axial = plane_axial()[:, some]
-    estimate = plane_normal(Model.PPA, axial, RAYS[:, some], np.full(num, 0.01), robust=robust)
+    estimate = plane_normal(AngleModel.PPA, axial, RAYS[:, some], np.full(num, 0.01), robust=robust)
     np.testing.assert_allclose(estimate.normal, NORMAL, atol=1e-7)
     assert 0.1 < estimate.sigma_deg < 10
 
@@ -87,8 +88,8 @@ def test_random_planes_and_turned_cameras():
     sigma = np.full(RAYS.shape[1], 0.02)
     for _ in range(20):
         zenith, phase = rng.uniform(0.1, 1.2), rng.uniform(0, np.pi)
-        normal = normal_from_angles(Model.PPA, np.array(phase), np.array(zenith), np.eye(3)[2])
-        estimate = plane_normal(Model.PPA, plane_axial(normal), RAYS, sigma)
+        normal = normal_from_angles(AngleModel.PPA, np.array(phase), np.array(zenith), np.eye(3)[2])
+        estimate = plane_normal(AngleModel.PPA, plane_axial(normal), RAYS, sigma)
         assert error_deg(estimate.normal, normal) < 1e-5
 
 
@@ -96,10 +97,10 @@ def test_noise_is_averaged_and_sigma_is_honest():
     rng = np.random.default_rng(1)
     some = np.linspace(0, RAYS.shape[1] - 1, 4000).astype(int)
     rays, sigma = RAYS[:, some], np.exp(rng.uniform(-4, -2.3, 4000))
-    phase = phase_from_normal(Model.PPA, NORMAL, rays.T)
+    phase = phase_from_normal(AngleModel.PPA, NORMAL, rays.T)
     ratios = []
     for _ in range(80):
-        estimate = plane_normal(Model.PPA, axial_of(phase, rng, sigma), rays, sigma)
+        estimate = plane_normal(AngleModel.PPA, axial_of(phase, rng, sigma), rays, sigma)
         ratios.append(error_deg(estimate.normal, NORMAL) / estimate.sigma_deg)
     # Error in two dimensions, deviation along the larger axis; the larger of two estimates of it.
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.3
@@ -112,7 +113,7 @@ def test_the_bias_of_the_eigenvector_is_not_in_the_robust_one():
     for _ in range(5):
         axial = plane_axial(rng=rng, sigma=0.15)
         for robust, found in errors.items():
-            estimate = plane_normal(Model.PPA, axial, RAYS, sigma, robust=robust)
+            estimate = plane_normal(AngleModel.PPA, axial, RAYS, sigma, robust=robust)
             found.append(error_deg(estimate.normal, NORMAL))
     assert np.mean(errors[True]) < 0.25
     assert np.mean(errors[False]) > 4 * np.mean(errors[True])
@@ -122,8 +123,8 @@ def test_outliers_lose():
     rng = np.random.default_rng(3)
     axial = plane_axial(rng=rng, sigma=0.02, outliers=0.3)
     sigma = np.full(RAYS.shape[1], 0.02)
-    robust = plane_normal(Model.PPA, axial, RAYS, sigma)
-    algebraic = plane_normal(Model.PPA, axial, RAYS, sigma, robust=False)
+    robust = plane_normal(AngleModel.PPA, axial, RAYS, sigma)
+    algebraic = plane_normal(AngleModel.PPA, axial, RAYS, sigma, robust=False)
     assert error_deg(robust.normal, NORMAL) < 0.1
     assert error_deg(algebraic.normal, NORMAL) > 2
     assert robust.outlier_share == pytest.approx(0.27, abs=0.03)
@@ -132,8 +133,8 @@ def test_outliers_lose():
 def test_opa_knows_the_azimuth_only():
     sigma = np.full(RAYS.shape[1], 0.02)
     for robust in (True, False):
-        axial = plane_axial(model=Model.OPA)
-        estimate = plane_normal(Model.OPA, axial, RAYS, sigma, robust=robust)
+        axial = plane_axial(model=AngleModel.OPA)
+        estimate = plane_normal(AngleModel.OPA, axial, RAYS, sigma, robust=robust)
         assert not estimate.valid
         assert estimate.conditioning < 1e-6
         assert estimate.sigma_deg == np.inf
@@ -141,16 +142,16 @@ def test_opa_knows_the_azimuth_only():
         expected = NORMAL[:2] / np.linalg.norm(NORMAL[:2])
         assert abs(estimate.normal[:2] @ expected) == pytest.approx(1, abs=1e-9)
     # Of phases that PPA made it leaves degrees.
-    estimate = plane_normal(Model.OPA, plane_axial(), RAYS, sigma)
+    estimate = plane_normal(AngleModel.OPA, plane_axial(), RAYS, sigma)
     assert estimate.rmse_deg > 5
-    best = plane_normal(Model.PPA, plane_axial(), RAYS, sigma)
+    best = plane_normal(AngleModel.PPA, plane_axial(), RAYS, sigma)
     assert best.rmse_deg < 1e-5
 
 
 def test_one_pixel_and_none_are_not_enough():
     for num in (0, 1):
         estimate = plane_normal(
-            Model.PPA, plane_axial()[:, :num], RAYS[:, :num], np.full(num, 0.01)
+            AngleModel.PPA, plane_axial()[:, :num], RAYS[:, :num], np.full(num, 0.01)
         )
         assert not estimate.valid
         assert np.isnan(estimate.normal).all()
@@ -161,8 +162,8 @@ def test_pixels_of_one_plane_of_incidence_are_not_enough():
     # On the image line through the foot of the normal all rows are the same.
     share = np.linspace(-0.4, 0.4, 50)
     rays = np.array([0.0, 0.0, 1.0])[:, None] + share * np.array([NORMAL[0], NORMAL[1], 0])[:, None]
-    axial = axial_of(phase_from_normal(Model.PPA, NORMAL, rays.T))
-    estimate = plane_normal(Model.PPA, axial, rays, np.full(50, 0.01))
+    axial = axial_of(phase_from_normal(AngleModel.PPA, NORMAL, rays.T))
+    estimate = plane_normal(AngleModel.PPA, axial, rays, np.full(50, 0.01))
     assert not estimate.valid
     assert estimate.rmse_deg < 1e-5
 
@@ -170,24 +171,24 @@ def test_pixels_of_one_plane_of_incidence_are_not_enough():
 def test_unknown_pixels_are_left_out():
     axial, sigma = plane_axial(), np.full(RAYS.shape[1], 0.02)
     axial[:, 0], axial[0, 1], sigma[2], sigma[3] = 0, np.nan, np.inf, 0
-    estimate = plane_normal(Model.PPA, axial, RAYS, sigma)
+    estimate = plane_normal(AngleModel.PPA, axial, RAYS, sigma)
     assert estimate.num_pixels == RAYS.shape[1] - 4
     assert error_deg(estimate.normal, NORMAL) < 1e-5
-    residuals = phase_residuals(Model.PPA, NORMAL, axial, RAYS)
+    residuals = phase_residuals(AngleModel.PPA, NORMAL, axial, RAYS)
     assert np.isnan(residuals[:2]).all()
     np.testing.assert_allclose(residuals[2:], 0, atol=1e-9)
 
 
 def test_residuals_are_measured_minus_predicted():
-    phase = phase_from_normal(Model.PPA, NORMAL, RAYS.T)
-    residuals = phase_residuals(Model.PPA, NORMAL, axial_of(phase + 0.3), RAYS)
+    phase = phase_from_normal(AngleModel.PPA, NORMAL, RAYS.T)
+    residuals = phase_residuals(AngleModel.PPA, NORMAL, axial_of(phase + 0.3), RAYS)
     np.testing.assert_allclose(residuals, 0.3, atol=1e-9)
-    assert not phase_residuals(Model.OPA, NORMAL, axial_of(phase), RAYS).max() < 0.05
+    assert not phase_residuals(AngleModel.OPA, NORMAL, axial_of(phase), RAYS).max() < 0.05
 
 
 def test_shapes_are_checked():
     with pytest.raises(ValueError, match="expected"):
-        plane_normal(Model.PPA, plane_axial()[:, :5], RAYS, np.ones(RAYS.shape[1]))
+        plane_normal(AngleModel.PPA, plane_axial()[:, :5], RAYS, np.ones(RAYS.shape[1]))
 
 
 # Several planes.
@@ -209,7 +210,7 @@ def render_corner(surface=CORNER, seed=0):
 def test_the_three_planes_of_a_corner_are_found():
     rendered, axial, sigma, mask = render_corner()
     rays = RAYS.reshape(3, *mask.shape)
-    planes = find_planes(Model.PPA, axial, rays, sigma, mask)
+    planes = find_planes(AngleModel.PPA, axial, rays, sigma, mask)
     assert len(planes) == 3
     assert sum(plane.mask.astype(int) for plane in planes).max() == 1
     assert sum(plane.mask.sum() for plane in planes) > 0.85 * mask.sum()
@@ -223,7 +224,7 @@ def test_the_three_planes_of_a_corner_are_found():
 def test_one_plane_is_one_plane_and_a_seed_repeats():
     rendered, axial, sigma, mask = render_corner(Plane([0, 0, 0], [0.1, 0.2, 1]))
     rays = RAYS.reshape(3, *mask.shape)
-    planes = [find_planes(Model.PPA, axial, rays, sigma, mask, seed=1) for _ in range(2)]
+    planes = [find_planes(AngleModel.PPA, axial, rays, sigma, mask, seed=1) for _ in range(2)]
     assert len(planes[0]) == 1
     np.testing.assert_array_equal(planes[0][0].mask, planes[1][0].mask)
     normal = rendered.normals_in_cam[mask][0]
@@ -235,14 +236,14 @@ def test_nothing_but_noise_has_no_plane():
     shape = (CAMERA.height, CAMERA.width)
     axial = axial_of(rng.uniform(0, np.pi, shape))
     rays, mask = RAYS.reshape(3, *shape), np.ones(shape, bool)
-    assert find_planes(Model.PPA, axial, rays, np.full(shape, 0.02), mask) == []
-    assert find_planes(Model.PPA, axial, rays, np.full(shape, 0.02), ~mask) == []
+    assert find_planes(AngleModel.PPA, axial, rays, np.full(shape, 0.02), mask) == []
+    assert find_planes(AngleModel.PPA, axial, rays, np.full(shape, 0.02), ~mask) == []
 
 
 def test_a_sphere_beside_a_plane_leaves_the_plane_alone():
     surface = Group([Plane([0, 0, 0], [0, 0, 1]), Sphere([0.1, 0.12, 0.1], 0.1)])
     rendered, axial, sigma, mask = render_corner(surface)
-    [largest, *_] = find_planes(Model.PPA, axial, RAYS.reshape(3, *mask.shape), sigma, mask)
+    [largest, *_] = find_planes(AngleModel.PPA, axial, RAYS.reshape(3, *mask.shape), sigma, mask)
     floor = rendered.view.cam_from_world.rotation @ [0, 0, 1]
     assert error_deg(largest.estimate.normal, floor) < 0.3
 
@@ -273,7 +274,7 @@ def test_the_focal_length_is_found_within_its_uncertainty(light):
     for seed in range(2):
         parameters, offsets, sigma, normal = focal_samples("tilted", light, seed)
         estimate = estimate_focal(
-            Model.TILTED, parameters, offsets, sigma, light=light, focal_range_px=(40, 800)
+            AngleModel.TILTED, parameters, offsets, sigma, light=light, focal_range_px=(40, 800)
         )
         assert estimate.observable
         assert estimate.sigma_px < 0.05 * CAMERA.fx
@@ -285,7 +286,7 @@ def test_the_focal_length_is_found_within_its_uncertainty(light):
 def test_under_ppa_every_focal_length_fits_alike():
     parameters, offsets, sigma, _ = focal_samples("ppa")
     estimate = estimate_focal(
-        Model.PPA, parameters, offsets, sigma, light=Light.SPECULAR, focal_range_px=(40, 800)
+        AngleModel.PPA, parameters, offsets, sigma, light=Light.SPECULAR, focal_range_px=(40, 800)
     )
     assert not estimate.observable
     assert estimate.sigma_px == np.inf
@@ -296,12 +297,17 @@ def test_a_ppa_sensor_has_no_focal_length_under_the_tilted_model():
     # Without tilt the least correction fits best: the longest focal length of any range.
     parameters, offsets, sigma, _ = focal_samples("ppa")
     estimate = estimate_focal(
-        Model.TILTED, parameters, offsets, sigma, light=Light.SPECULAR, focal_range_px=(40, 800)
+        AngleModel.TILTED,
+        parameters,
+        offsets,
+        sigma,
+        light=Light.SPECULAR,
+        focal_range_px=(40, 800),
     )
     assert not estimate.observable
     with pytest.raises(ValueError, match="focal_range_px"):
         estimate_focal(
-            Model.PPA, parameters, offsets, sigma, light=Light.SPECULAR, focal_range_px=(9, 2)
+            AngleModel.PPA, parameters, offsets, sigma, light=Light.SPECULAR, focal_range_px=(9, 2)
         )
 
 
@@ -461,12 +467,12 @@ def test_normals_of_the_board():
         normal /= np.linalg.norm(normal)
         mask = part & stokes.valid & (stokes.dolp > 0.1)
         view = PlaneView(stokes=stokes, mask=mask, light=Light.SPECULAR)
-        for model in (Model.PPA, Model.TILTED):
+        for model in (AngleModel.PPA, AngleModel.TILTED):
             for robust in (True, False):
                 estimate = view.plane(model, camera, robust=robust)
                 errors.setdefault((model, robust), []).append(error_deg(estimate.normal, normal))
     mean = {key: np.mean(values) for key, values in errors.items()}
-    assert mean[Model.PPA, False] < 2.4
-    assert mean[Model.PPA, True] < 1.5  # the tilt of the rendered polarizers
-    assert mean[Model.TILTED, False] < 1.7
-    assert mean[Model.TILTED, True] < 0.1
+    assert mean[AngleModel.PPA, False] < 2.4
+    assert mean[AngleModel.PPA, True] < 1.5  # the tilt of the rendered polarizers
+    assert mean[AngleModel.TILTED, False] < 1.7
+    assert mean[AngleModel.TILTED, True] < 0.1

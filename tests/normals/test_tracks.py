@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes import board_scene, tracks_at
 
-from polmvs.config import Estimator, Model, NormalOptions
+from polmvs.config import AngleModel, Estimator, NormalOptions
 from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import (
     dolp_shares,
@@ -36,8 +36,8 @@ def test_ppa_recovers_the_normals_of_a_perspective_view_and_opa_does_not(scene, 
     points, truth = scene.surface_points(60)
     tracks = tracks_at(scene, points)
     options = NormalOptions(estimator=estimator, window_px=5)
-    ppa = track_normals(Model.PPA, tracks, scene.maps, options)
-    opa = track_normals(Model.OPA, tracks, scene.maps, options)
+    ppa = track_normals(AngleModel.PPA, tracks, scene.maps, options)
+    opa = track_normals(AngleModel.OPA, tracks, scene.maps, options)
     assert ppa.valid.all()
     assert errors_deg(ppa.normals, truth).mean() < 0.4
     assert errors_deg(opa.normals, truth).mean() > 3
@@ -46,7 +46,7 @@ def test_ppa_recovers_the_normals_of_a_perspective_view_and_opa_does_not(scene, 
 
 def test_rows_of_a_true_point_are_perpendicular_to_its_normal(scene):
     points, truth = scene.surface_points(40)
-    rows = gather_rows(Model.PPA, points, scene.maps)
+    rows = gather_rows(AngleModel.PPA, points, scene.maps)
     residual = np.einsum("ikn,ni->kn", rows.rows, truth)
     counted = np.isfinite(rows.sigma)
     assert counted.mean() > 0.8
@@ -60,15 +60,15 @@ def test_an_occluded_point_gets_no_row(scene):
     for view, rendered in zip(scene.views, scene.rendered, strict=True):
         del view
         nearer.append(np.full(rendered.depth.shape, 0.1, np.float32))
-    rows = gather_rows(Model.PPA, points, scene.maps, nearer)
+    rows = gather_rows(AngleModel.PPA, points, scene.maps, nearer)
     assert not np.isfinite(rows.sigma).any()
     unknown = [np.zeros_like(n) for n in nearer]
-    assert np.isfinite(gather_rows(Model.PPA, points, scene.maps, unknown).sigma).any()
+    assert np.isfinite(gather_rows(AngleModel.PPA, points, scene.maps, unknown).sigma).any()
 
 
 def test_a_point_off_every_region_has_no_normal(scene):
     tracks = tracks_at(scene, np.array([[0.4, 0.4, 0.0], [0.0, 0.0, 3.0]]))
-    estimate = track_normals(Model.PPA, tracks, scene.maps, NormalOptions())
+    estimate = track_normals(AngleModel.PPA, tracks, scene.maps, NormalOptions())
     assert not estimate.valid.any()
     assert np.isnan(estimate.normals).all()
     assert not select_seeds(tracks, estimate, scene.maps)[1].any()
@@ -78,7 +78,7 @@ def test_seeds_lie_on_the_part_only(scene):
     on, _ = scene.surface_points(30)
     off = on + np.array([0.5, 0.0, 0.0])
     tracks = tracks_at(scene, np.concatenate([on, off]))
-    estimate = track_normals(Model.PPA, tracks, scene.maps, NormalOptions(window_px=5))
+    estimate = track_normals(AngleModel.PPA, tracks, scene.maps, NormalOptions(window_px=5))
     seeds, chosen = select_seeds(tracks, estimate, marked(scene.maps))
     assert chosen[:30].mean() > 0.5  # those near the border of a view are left out
     assert not chosen[30:].any()
@@ -153,7 +153,7 @@ def test_a_mirror_image_behind_the_surface_is_no_seed(scene):
     behind = on - 0.12 * normals
     # They are seen in the board in the views that look along the way to them.
     tracks = tracks_at(scene, behind)
-    estimate = track_normals(Model.PPA, tracks, scene.maps, NormalOptions(window_px=5))
+    estimate = track_normals(AngleModel.PPA, tracks, scene.maps, NormalOptions(window_px=5))
     shares = seen_shares(behind, np.nan_to_num(estimate.normals), scene.maps)
     assert np.median(seen_shares(on, normals, scene.maps)) > 0.9
     assert np.median(shares) < 0.7

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from polmvs.colmap.models import read_model
-from polmvs.config import Model, Options, PropagationOptions, RunOptions, SfmOptions
+from polmvs.config import AngleModel, Options, PropagationOptions, RunOptions, SfmOptions
 from polmvs.io.clouds import read_cloud
 from polmvs.pipeline.jobs import COMPARED, Job, reconstruct
-from polmvs.pipeline.run_folder import Workspace
-from polmvs.surface.surroundings import Kind
+from polmvs.pipeline.run_folder import RunFolder
+from polmvs.scene import PointKind
 
-OTHERS = [model for model in COMPARED if model is not Model.PPA]
+OTHERS = [model for model in COMPARED if model is not AngleModel.PPA]
 NORMAL_STAGES = ["normals", "parts", *[f"normals_{model}" for model in OTHERS]]
 BEFORE_CLOUDS = ["capture", "sfm", "maps", *NORMAL_STAGES]
 STAGES = [*BEFORE_CLOUDS, *[f"densify_{model}" for model in COMPARED], "evaluate"]
@@ -100,13 +100,13 @@ def test_clouds_carry_normals_colours_and_scalars(demo_run: Path) -> None:
     assert len(cloud.points) > 10_000
     assert cloud.normals is not None
     length = np.linalg.norm(cloud.normals, axis=1)
-    np.testing.assert_allclose(length, cloud.scalars["kind"] == Kind.SURFACE, atol=1e-4)
+    np.testing.assert_allclose(length, cloud.scalars["kind"] == PointKind.SURFACE, atol=1e-4)
     assert cloud.colors is not None
     assert cloud.colors.std() > 0
     assert set(cloud.scalars) == {"num_views", "sigma_deg", "sigma", "kind"}
     assert cloud.scalars["num_views"].min() >= 2
     kinds = cloud.scalars["kind"]
-    assert set(kinds.astype(int)) == {Kind.SURFACE, Kind.SPARSE}
+    assert set(kinds.astype(int)) == {PointKind.SURFACE, PointKind.SPARSE}
 
 
 def test_sparse_normals_carry_their_quality(demo_run: Path) -> None:
@@ -127,7 +127,7 @@ def test_sparse_normals_carry_their_quality(demo_run: Path) -> None:
 def test_library_and_one_worker_give_the_same_cloud(
     demo_run: Path, demo_capture: Path, tmp_path: Path
 ) -> None:
-    before = Workspace(demo_run).load()
+    before = RunFolder(demo_run).load()
     intrinsics = tuple(before.options["sfm"]["intrinsics"])
     options = Options(sfm=SfmOptions(intrinsics=intrinsics, sparse=demo_run / "sparse"))
     job = Job(
@@ -186,7 +186,7 @@ def wait_until(holds, process: subprocess.Popen[str], timeout_s: float = 60) -> 
 
 
 def stages_of(out: Path) -> list[str]:
-    return [stage.name for stage in Workspace(out).load().stages]
+    return [stage.name for stage in RunFolder(out).load().stages]
 
 
 def copy_until(demo_run: Path, out: Path, last: str) -> None:

@@ -22,7 +22,7 @@ from polmvs.io.clouds import read_cloud, read_mesh
 from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
 from polmvs.pipeline.own_files import DENSE_MARKER
 from polmvs.poses.metric_frame import transform_model
-from polmvs.surface.surroundings import Kind
+from polmvs.scene import PointKind
 
 BOARD_HEIGHT_M = 0.012  # of the true plane z = const, in the capture's gt/scene.json
 # A pixel is 1.3 mm on the board; SfM's poses bend and shift it by some tenths of that.
@@ -81,7 +81,7 @@ def stopped(run: Path, out: Path, last: str) -> Path:
 
 
 def surface_of(cloud):
-    return cloud.points[cloud.scalars["kind"] == Kind.SURFACE]
+    return cloud.points[cloud.scalars["kind"] == PointKind.SURFACE]
 
 
 def heights(points: np.ndarray) -> np.ndarray:
@@ -103,11 +103,11 @@ def test_files_and_their_record(run: Path) -> None:
 def test_kinds_of_the_cloud(run: Path, truth: GroundTruth) -> None:
     cloud = read_cloud(run / "ppa.ply")
     kinds, results = cloud.scalars["kind"], record_of(run)["results"]
-    assert (kinds == Kind.SURFACE).sum() == results["num_points_ppa"] > 10_000
-    assert (kinds == Kind.SPARSE).sum() == results["num_surroundings_ppa"] > 500
+    assert (kinds == PointKind.SURFACE).sum() == results["num_points_ppa"] > 10_000
+    assert (kinds == PointKind.SPARSE).sum() == results["num_surroundings_ppa"] > 500
     assert np.quantile(heights(surface_of(cloud)), 0.99) < TOLERANCE_M
     true = truth.surface_points()
-    distance = cKDTree(true.points).query(cloud.points[kinds == Kind.SPARSE])[0]
+    distance = cKDTree(true.points).query(cloud.points[kinds == PointKind.SPARSE])[0]
     assert np.median(distance) < OTHER_SPACING_M
 
 
@@ -230,31 +230,31 @@ def test_voxel_in_metres_thins(go_on: Continue, run: Path) -> None:
 
 def test_more_views_must_agree(go_on: Continue, run: Path) -> None:
     cloud = read_cloud(go_on("parts", "densify", "--min-views", 6) / "ppa.ply")
-    on_surface = cloud.scalars["kind"] == Kind.SURFACE
+    on_surface = cloud.scalars["kind"] == PointKind.SURFACE
     assert cloud.scalars["num_views"][on_surface].min() >= 6
     before = read_cloud(run / "ppa.ply")
-    fewer = before.scalars["num_views"][before.scalars["kind"] == Kind.SURFACE]
+    fewer = before.scalars["num_views"][before.scalars["kind"] == PointKind.SURFACE]
     assert fewer.min() < 6
     assert 0 < on_surface.sum() < len(fewer)
 
 
 def test_no_surroundings(go_on: Continue, run: Path) -> None:
     cloud = read_cloud(go_on("parts", "densify", "--surroundings", "none") / "ppa.ply")
-    assert set(cloud.scalars["kind"]) == {Kind.SURFACE}
+    assert set(cloud.scalars["kind"]) == {PointKind.SURFACE}
     assert len(cloud.points) == record_of(run)["results"]["num_points_ppa"]
 
 
 def test_surroundings_by_stereo(go_on: Continue, run: Path, truth: GroundTruth) -> None:
     cloud = read_cloud(go_on("parts", "densify", "--surroundings", "stereo") / "ppa.ply")
     kinds = cloud.scalars["kind"]
-    assert set(kinds) == {Kind.SURFACE, Kind.STEREO}
-    around = cloud.points[kinds == Kind.STEREO]
+    assert set(kinds) == {PointKind.SURFACE, PointKind.STEREO}
+    around = cloud.points[kinds == PointKind.STEREO]
     assert len(around) > 3 * record_of(run)["results"]["num_surroundings_ppa"]
     true = truth.surface_points()
     distance = cKDTree(true.points).query(around)[0]
     assert np.median(distance) < OTHER_SPACING_M
     np.testing.assert_array_equal(
-        cloud.points[kinds == Kind.SURFACE], surface_of(read_cloud(run / "ppa.ply"))
+        cloud.points[kinds == PointKind.SURFACE], surface_of(read_cloud(run / "ppa.ply"))
     )
 
 
@@ -340,8 +340,8 @@ def fuse_copy(folder: Path, tmp_path: Path):
 def test_cloud_with_the_points_of_a_workspace(filled: Path, truth: GroundTruth) -> None:
     cloud = read_cloud(filled / "ppa.ply")
     kinds = cloud.scalars["kind"]
-    assert set(kinds) == {Kind.SURFACE, Kind.COLMAP}
-    around = cloud.points[kinds == Kind.COLMAP]
+    assert set(kinds) == {PointKind.SURFACE, PointKind.COLMAP}
+    around = cloud.points[kinds == PointKind.COLMAP]
     assert len(around) > 10_000
     distance = cKDTree(truth.surface_points().points).query(around)[0]
     assert np.quantile(distance, 0.9) < OTHER_SPACING_M

@@ -5,26 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError
 from polmvs.pipeline.checks import followers
 from polmvs.pipeline.record import Record, StageRecord, write_json
-from polmvs.pipeline.run_folder import (
-    Workspace,
-    has_content,
-    prepare_output,
-    require_apart,
-)
+from polmvs.pipeline.run_folder import RunFolder, has_content, prepare_output, require_apart
 from polmvs.pipeline.runtime import peak_rss_mb, versions
 
 
-def finished_run(root: Path) -> Workspace:
+def finished_run(root: Path) -> RunFolder:
     """An output folder with one file of each kind."""
-    workspace = Workspace(root)
+    workspace = RunFolder(root)
     for folder, name in (("images", "a.png"), ("sparse", "cameras.bin"), ("maps", "a.npy")):
         (root / folder).mkdir(parents=True)
         (root / folder / name).write_bytes(b"x")
-    for model in Model:
+    for model in AngleModel:
         workspace.cloud(model).write_bytes(b"x")
         workspace.normals(model).write_bytes(b"x")
     workspace.metrics.write_text("{}")
@@ -48,13 +43,13 @@ def test_record_survives_writing_and_reading(tmp_path: Path) -> None:
 def test_damaged_record_is_one_clear_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(DataError, match=r"run\.json: is no record of a run"):
-        Workspace(tmp_path).load()
+        RunFolder(tmp_path).load()
 
 
 def test_json_has_null_for_what_is_no_number(tmp_path: Path) -> None:
     write_json(
         tmp_path / "a.json",
-        {"a": np.float32("nan"), "b": [float("inf"), np.int64(3)], "model": Model.PPA},
+        {"a": np.float32("nan"), "b": [float("inf"), np.int64(3)], "model": AngleModel.PPA},
     )
     content = json.loads((tmp_path / "a.json").read_text())
     assert content == {"a": None, "b": [None, 3], "model": "ppa"}
@@ -62,7 +57,7 @@ def test_json_has_null_for_what_is_no_number(tmp_path: Path) -> None:
 
 def test_new_and_empty_folders_are_taken(tmp_path: Path) -> None:
     for root in (tmp_path / "new" / "deep", tmp_path / "empty"):
-        workspace = Workspace(root)
+        workspace = RunFolder(root)
         assert not has_content(root)
         assert prepare_output(workspace, overwrite=False, resume=False) == Record()
         assert root.is_dir()
@@ -72,7 +67,7 @@ def test_occupied_folder_is_refused(tmp_path: Path) -> None:
     workspace = finished_run(tmp_path)
     with pytest.raises(OptionError, match=r"--overwrite .*--resume"):
         prepare_output(workspace, overwrite=False, resume=False)
-    assert workspace.cloud(Model.PPA).exists()
+    assert workspace.cloud(AngleModel.PPA).exists()
 
 
 def test_overwrite_deletes_results_only(tmp_path: Path) -> None:
@@ -101,7 +96,7 @@ def test_overwrite_needs_the_record_of_a_run(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "photo.png").write_bytes(b"x")
     with pytest.raises(DataError, match=r"images: was not written by polmvs"):
-        prepare_output(Workspace(tmp_path), overwrite=True, resume=False)
+        prepare_output(RunFolder(tmp_path), overwrite=True, resume=False)
     assert (tmp_path / "images" / "photo.png").exists()
 
 
@@ -124,40 +119,40 @@ def test_resume_keeps_results_and_clears_what_is_half_done(tmp_path: Path) -> No
     record = prepare_output(workspace, overwrite=False, resume=True)
     assert record.is_done("sfm")
     assert not list(tmp_path.glob(".*"))
-    assert workspace.cloud(Model.PPA).exists()
+    assert workspace.cloud(AngleModel.PPA).exists()
 
 
 def test_resume_without_a_run_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(DataError, match=r"no run of polmvs \(run.json is missing\)"):
-        prepare_output(Workspace(tmp_path), overwrite=False, resume=True)
+        prepare_output(RunFolder(tmp_path), overwrite=False, resume=True)
 
 
 def test_output_that_is_a_file_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
     for root in (tmp_path / "out", tmp_path / "out" / "deeper"):
         with pytest.raises(DataError, match=r"OUT must be a folder|cannot be (made|used)"):
-            prepare_output(Workspace(root), overwrite=True, resume=False)
+            prepare_output(RunFolder(root), overwrite=True, resume=False)
 
 
 @pytest.mark.parametrize("place", ["", "raw"])
 def test_output_may_not_be_the_capture(tmp_path: Path, place: str) -> None:
     with pytest.raises(OptionError, match="OUT is the capture's own folder"):
-        require_apart(Workspace(tmp_path / place), capture=tmp_path, others=())
+        require_apart(RunFolder(tmp_path / place), capture=tmp_path, others=())
 
 
 def test_input_may_not_lie_where_results_go(tmp_path: Path) -> None:
     for name in ("images", "sparse/0", "maps"):
         with pytest.raises(OptionError, match="lies where OUT's results go"):
-            require_apart(Workspace(tmp_path), capture=tmp_path / name, others=())
+            require_apart(RunFolder(tmp_path), capture=tmp_path / name, others=())
         with pytest.raises(OptionError, match="lies where OUT's results go"):
-            require_apart(Workspace(tmp_path), capture=tmp_path / "c", others=[tmp_path / name])
-    require_apart(Workspace(tmp_path / "out"), capture=tmp_path, others=[tmp_path / "model"])
-    require_apart(Workspace(tmp_path), capture=tmp_path / "capture", others=())
+            require_apart(RunFolder(tmp_path), capture=tmp_path / "c", others=[tmp_path / name])
+    require_apart(RunFolder(tmp_path / "out"), capture=tmp_path, others=[tmp_path / "model"])
+    require_apart(RunFolder(tmp_path), capture=tmp_path / "capture", others=())
 
 
 def test_replacing_a_folder_is_whole_or_not_at_all(tmp_path: Path) -> None:
-    workspace = Workspace(tmp_path)
+    workspace = RunFolder(tmp_path)
     with workspace.replacing(workspace.maps) as folder:
         (folder / "a.npy").write_bytes(b"1")
         assert not workspace.maps.exists()
@@ -171,7 +166,7 @@ def test_replacing_a_folder_is_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_names_of_the_files_of_a_stage(tmp_path: Path) -> None:
-    workspace = Workspace(tmp_path)
+    workspace = RunFolder(tmp_path)
     names = {
         "capture": [],
         "normals": ["normals.ply"],

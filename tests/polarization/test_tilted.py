@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.config import Light, Model
+from polmvs.config import AngleModel, Light
 from polmvs.polarization.angle_models import rows_from_phase
 from polmvs.polarization.stokes import Stokes
 from polmvs.polarization.tilted import (
@@ -57,7 +57,7 @@ def test_rows_are_exact(name, light):
     s0, s1, s2 = correct_intensities(rendered.intensities, RAYS, light=light)
     used = rendered.mask & (rendered.dolp > 1e-3)
     assert used.sum() > 300
-    rows = rows_from_phase(Model.TILTED, phase_of(s1, s2, light), RAYS)
+    rows = rows_from_phase(AngleModel.TILTED, phase_of(s1, s2, light), RAYS)
     assert sine_between(rows, true_rows(rendered))[used].max() < 1e-9
     np.testing.assert_allclose(s0[used], 0.8, rtol=1e-12)
     np.testing.assert_allclose(np.hypot(s1, s2)[used], 0.8 * rendered.dolp[used], rtol=1e-9)
@@ -66,7 +66,7 @@ def test_rows_are_exact(name, light):
 def test_without_correction_rows_are_degrees_off(light):
     rendered = render(SURFACES["plane"], light)
     _, s1, s2 = parameters_of(rendered.intensities)
-    rows = rows_from_phase(Model.PPA, phase_of(s1, s2, light), RAYS)
+    rows = rows_from_phase(AngleModel.PPA, phase_of(s1, s2, light), RAYS)
     assert sine_between(rows, true_rows(rendered)).max() > np.sin(np.radians(3))
 
 
@@ -123,7 +123,7 @@ def test_single_precision_with_a_solver_at_hand(light):
     assert solver.dtype == np.float32
     s0, s1, s2 = correct_intensities(intensities, rays, light=light, solver=solver)
     assert s0.dtype == s1.dtype == s2.dtype == np.float32
-    rows = rows_from_phase(Model.TILTED, phase_of(s1, s2, light), rays)
+    rows = rows_from_phase(AngleModel.TILTED, phase_of(s1, s2, light), rays)
     used = rendered.dolp > 0.02
     assert sine_between(rows, true_rows(rendered))[used].max() < 3e-5
 

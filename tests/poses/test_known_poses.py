@@ -10,13 +10,12 @@ import pytest
 from scenes import CAMERA, tracks_at
 from scipy.spatial.transform import Rotation
 
-from polmvs.camera import View
-from polmvs.colmap.models import SparseModel, read_model
+from polmvs.colmap.models import read_model
 from polmvs.colmap.sparse_model import write_model
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform
-from polmvs.normals.tracks import Tracks
 from polmvs.poses.known_poses import retriangulate, with_known_poses, write_known_poses
+from polmvs.scene import SparseModel, Tracks, View
 from polmvs.synthetic.captures import ring_of_views
 
 VIEWS = ring_of_views(6, CAMERA, target=np.zeros(3), distance=0.5, elevation_deg=45, roll_deg=20)

@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import polmvs
-from polmvs.camera import PinholeCamera, View
+from polmvs.camera import PinholeCamera
 from polmvs.cli import flags
-from polmvs.colmap.models import SparseModel
 from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform, SimilarityTransform
-from polmvs.normals.tracks import Tracks
 from polmvs.option_values import from_plain, to_plain
 from polmvs.poses.metric_frame import (
     Frame,
@@ -29,6 +27,7 @@ from polmvs.poses.metric_frame import (
     transform_model,
 )
 from polmvs.poses.metric_sources import check_reference, metric_frame, read_centers
+from polmvs.scene import SparseModel, Tracks, View
 from polmvs.synthetic.captures import ring_of_views
 
 Array = NDArray[np.float64]

@@ -3,7 +3,7 @@ import pytest
 from scenes import CAMERA, board_scene
 
 from polmvs.camera import pixel_centers
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.surface.contour import cover_with_contours, direction_field, trace_contours
 
 
@@ -41,7 +41,7 @@ def seeds_of(scene):
 
 
 def test_a_ppa_contour_keeps_the_range(scene):
-    contours = trace_contours(field_of(scene, Model.PPA), seeds_of(scene), step_px=0.5)
+    contours = trace_contours(field_of(scene, AngleModel.PPA), seeds_of(scene), step_px=0.5)
     spread = []
     for curve in np.unique(contours.curve):
         ranges = true_range(scene, contours.xy[contours.curve == curve])
@@ -53,7 +53,7 @@ def test_a_ppa_contour_keeps_the_range(scene):
 
 
 def test_an_opa_contour_keeps_neither_range_nor_depth_of_a_perspective_view(scene):
-    contours = trace_contours(field_of(scene, Model.OPA), seeds_of(scene), step_px=0.5)
+    contours = trace_contours(field_of(scene, AngleModel.OPA), seeds_of(scene), step_px=0.5)
     worst = 0.0
     for curve in np.unique(contours.curve):
         xy = contours.xy[contours.curve == curve]
@@ -63,7 +63,7 @@ def test_an_opa_contour_keeps_neither_range_nor_depth_of_a_perspective_view(scen
 
 
 def test_the_step_is_half_a_pixel_and_nodes_are_ordered(scene):
-    contours = trace_contours(field_of(scene, Model.PPA), seeds_of(scene)[:3], step_px=0.5)
+    contours = trace_contours(field_of(scene, AngleModel.PPA), seeds_of(scene)[:3], step_px=0.5)
     for curve in np.unique(contours.curve):
         mine = contours.curve == curve
         steps = np.linalg.norm(np.diff(contours.xy[mine], axis=0), axis=-1)
@@ -74,7 +74,9 @@ def test_the_step_is_half_a_pixel_and_nodes_are_ordered(scene):
 def test_contours_stop_at_the_edge_of_the_passable_pixels(scene):
     passable = scene.rendered[0].mask.copy()
     passable[:, 80:84] = False
-    contours = trace_contours(field_of(scene, Model.PPA, passable), seeds_of(scene), step_px=0.5)
+    contours = trace_contours(
+        field_of(scene, AngleModel.PPA, passable), seeds_of(scene), step_px=0.5
+    )
     col, row = contours.xy[:, 0].astype(int), contours.xy[:, 1].astype(int)
     assert passable[row, col].mean() > 0.98  # the last step may reach into the edge's half pixel
     for curve in np.unique(contours.curve):
@@ -95,7 +97,7 @@ def test_a_circular_field_gives_closed_curves_once():
 def test_covering_reaches_every_part_of_the_region_at_about_the_spacing(scene):
     mask = scene.rendered[0].mask
     contours = cover_with_contours(
-        field_of(scene, Model.PPA), np.zeros((0, 2)), mask, spacing_px=6.0
+        field_of(scene, AngleModel.PPA), np.zeros((0, 2)), mask, spacing_px=6.0
     )
     pixels = np.argwhere(mask)[:, ::-1] + 0.5
     gap = np.sqrt(((pixels[:, None] - contours.xy[None]) ** 2).sum(-1)).min(axis=1)

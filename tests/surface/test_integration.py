@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scenes import CAMERA, Scene, board_scene, phase_map_of
 
-from polmvs.config import FusionOptions, Model, PropagationOptions
+from polmvs.config import AngleModel, FusionOptions, PropagationOptions
 from polmvs.geometry import RigidTransform
-from polmvs.normals.tracks import Seeds
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import store_phase_map
+from polmvs.scene import Seeds
 from polmvs.surface.dense_view import SurfaceSamples
 from polmvs.surface.fusion import fuse
 from polmvs.surface.integration import REFINEMENTS, integrate, plan_rounds
@@ -30,7 +30,7 @@ def scene():
 @pytest.fixture(scope="module")
 def dense(scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("dense")
-    return integrate(Model.PPA, scene.maps, scene.seeds(8), OPTIONS, folder)
+    return integrate(AngleModel.PPA, scene.maps, scene.seeds(8), OPTIONS, folder)
 
 
 def truth_of(scene, k, dense):
@@ -71,7 +71,7 @@ def test_ppa_gives_the_board_within_the_seeds_ties(scene, dense):
 
 
 def test_opa_bends_the_board(scene, dense, tmp_path):
-    bent = integrate(Model.OPA, scene.maps, scene.seeds(8), OPTIONS, tmp_path)
+    bent = integrate(AngleModel.OPA, scene.maps, scene.seeds(8), OPTIONS, tmp_path)
     opa, ppa = errors_of(scene, bent), errors_of(scene, dense)
     assert rmse(opa[0]) > 50 * rmse(ppa[0])
     assert np.median(opa[1]) > 5
@@ -88,7 +88,7 @@ def test_wrong_seeds_lose(scene, tmp_path):
     points = seeds.points_in_world.copy()
     points[[3, 11, 17]] += 0.03 * np.array([[1], [-1], [1]]) * seeds.normals_in_world[[3, 11, 17]]
     bad = replace(seeds, points_in_world=points)
-    dense = integrate(Model.PPA, scene.maps, bad, OPTIONS, tmp_path)
+    dense = integrate(AngleModel.PPA, scene.maps, bad, OPTIONS, tmp_path)
     ranges, _, _ = errors_of(scene, dense)
     # Pixels that the lattice joins to no others go with the seed beside them; fusion drops them.
     good = np.abs(ranges) < 0.25 * FOOTPRINT
@@ -101,7 +101,7 @@ def test_wrong_seeds_lose(scene, tmp_path):
 
 def test_no_seeds_no_surface(scene, tmp_path):
     none = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    assert integrate(Model.PPA, scene.maps, none, OPTIONS, tmp_path) == [None] * 6
+    assert integrate(AngleModel.PPA, scene.maps, none, OPTIONS, tmp_path) == [None] * 6
 
 
 def only_right_half(scene, k):
@@ -126,7 +126,7 @@ def left_seeds(scene):
 
 def test_a_view_without_seeds_gets_its_surface_from_the_others(scene, tmp_path):
     maps = [only_right_half(scene, 2) if k == 2 else m for k, m in enumerate(scene.maps)]
-    dense = integrate(Model.PPA, maps, left_seeds(scene), OPTIONS, tmp_path)
+    dense = integrate(AngleModel.PPA, maps, left_seeds(scene), OPTIONS, tmp_path)
     distance, _, _ = truth_of(scene, 2, dense[2])
     known = dense[2].known & np.isfinite(distance)
     assert known.sum() > 0.8 * maps[2].region.inside[1::2, 1::2].sum()
@@ -137,10 +137,10 @@ def test_one_other_view_is_not_enough_for_a_view_without_seeds(scene, tmp_path):
     """Its error would come back to it as agreement."""
     maps = [only_right_half(scene, 2) if k == 2 else scene.maps[k] for k in range(3)]
     seeds = left_seeds(scene)
-    both = integrate(Model.PPA, maps, seeds, OPTIONS, tmp_path)
+    both = integrate(AngleModel.PPA, maps, seeds, OPTIONS, tmp_path)
     assert [d is not None for d in both] == [True, True, True]
     hidden = [only_right_half(scene, k) if k else scene.maps[k] for k in range(3)]
-    alone = integrate(Model.PPA, hidden, seeds, OPTIONS, tmp_path)
+    alone = integrate(AngleModel.PPA, hidden, seeds, OPTIONS, tmp_path)
     assert [d is not None for d in alone] == [True, False, False]
 
 
@@ -162,7 +162,9 @@ def test_frame_and_scale_of_the_world_do_not_matter(scene, dense, tmp_path):
         seeds.normals_in_world @ rotation.T,
         scale * seeds.sigma,
     )
-    there = integrate(Model.PPA, [moved(m) for m in scene.maps], other_seeds, OPTIONS, tmp_path)
+    there = integrate(
+        AngleModel.PPA, [moved(m) for m in scene.maps], other_seeds, OPTIONS, tmp_path
+    )
     for a, b in zip(dense, there, strict=True):
         np.testing.assert_array_equal(a.known, b.known)
         known = a.known
@@ -181,7 +183,7 @@ def test_workers_give_the_same_result_as_one_process_and_report_every_round(scen
     counts = []
     with Workers(2) as workers:
         parallel = integrate(
-            Model.PPA,
+            AngleModel.PPA,
             maps,
             scene.seeds(8),
             OPTIONS,
@@ -189,7 +191,7 @@ def test_workers_give_the_same_result_as_one_process_and_report_every_round(scen
             workers=workers,
             on_progress=counts.append,
         )
-    serial = integrate(Model.PPA, maps, scene.seeds(8), OPTIONS, tmp_path / "one")
+    serial = integrate(AngleModel.PPA, maps, scene.seeds(8), OPTIONS, tmp_path / "one")
     assert sum(counts) == len(maps) * len(plan_rounds(OPTIONS))
     for a, b in zip(serial, parallel, strict=True):
         for name in ("range_map", "normals_in_world", "sigma", "sigma_deg", "confidence"):
@@ -197,7 +199,7 @@ def test_workers_give_the_same_result_as_one_process_and_report_every_round(scen
 
 
 def test_the_same_twice(scene, dense, tmp_path):
-    again = integrate(Model.PPA, scene.maps, scene.seeds(8), OPTIONS, tmp_path)
+    again = integrate(AngleModel.PPA, scene.maps, scene.seeds(8), OPTIONS, tmp_path)
     for a, b in zip(dense, again, strict=True):
         np.testing.assert_array_equal(a.range_map, b.range_map)
         np.testing.assert_array_equal(a.sigma, b.sigma)
@@ -242,7 +244,7 @@ def test_a_sphere_neither_bulges_nor_flattens(tmp_path):
     """Tangent planes from lattice point to lattice point would add up outside of it."""
     scene = rendered_scene(Sphere((0, 0, -0.3), 0.35), 8, 70)
     options = PropagationOptions(num_rounds=3)
-    dense = integrate(Model.PPA, scene.maps, seeds_in_all_views(scene, 4), options, tmp_path)
+    dense = integrate(AngleModel.PPA, scene.maps, seeds_in_all_views(scene, 4), options, tmp_path)
     ranges, turns, found = errors_of(scene, dense, min_cosine=0.5)
     assert rmse(ranges) < SEED_TIE
     assert abs(np.median(ranges)) < 0.25 * SEED_TIE
@@ -257,7 +259,7 @@ UPPER = Plane((0.07, 0, 0.03), (0.4, 0, 1), (0.06, 0.1))
 def test_a_depth_jump_is_not_bridged(tmp_path):
     """Two boards one above the other, 22 degrees apart: 3 to 5 cm of depth in between."""
     scene = rendered_scene(Group([LOWER, UPPER]), 6, 60)
-    dense = integrate(Model.PPA, scene.maps, seeds_in_all_views(scene, 12), OPTIONS, tmp_path)
+    dense = integrate(AngleModel.PPA, scene.maps, seeds_in_all_views(scene, 12), OPTIONS, tmp_path)
     ranges, _, _ = errors_of(scene, dense, min_cosine=0.4)
     assert np.median(np.abs(ranges)) < SEED_TIE
     # A bridge of some pixels all along the outline would spoil a quarter of the smaller board.
@@ -292,7 +294,7 @@ def test_a_crease_joins_nothing_and_curvature_everything(scene, angle_deg, is_cr
     sigma, unknown = np.full(120, 1e-3), np.full(120, np.nan)
     surface = SurfaceSamples(xy, rays, np.zeros(120), normals, sigma, unknown, sigma)
     nodes = Nodes(surface, rays[:, 2], 2.0, tail, head, np.zeros(len(tail), bool))
-    edges = node_edges(Model.PPA, nodes, sigma, along_contours=False)
+    edges = node_edges(AngleModel.PPA, nodes, sigma, along_contours=False)
     across = (edges.tail % 20 == 9) & (edges.head % 20 == 10)
     assert across.sum() == (0 if is_crease else 6)
     assert len(edges.tail) == len(tail) - (6 if is_crease else 0)
@@ -306,7 +308,7 @@ def test_the_deviation_says_how_far_ranges_are_off(tmp_path):
         rng = np.random.default_rng(seed)
         scene = rendered_scene(Plane((0, 0, 0), (0.1, -0.05, 1), (0.12, 0.15)), 6, 45, rng)
         seeds = seeds_in_all_views(scene, 4, noise=5e-4, rng=rng)
-        dense = integrate(Model.PPA, scene.maps, seeds, OPTIONS, tmp_path)
+        dense = integrate(AngleModel.PPA, scene.maps, seeds, OPTIONS, tmp_path)
         for k, result in enumerate(dense):
             distance, _, _ = truth_of(scene, k, result)
             known = result.known & np.isfinite(distance)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scenes import CAMERA, Scene, board_scene, phase_map_of
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.geometry import RigidTransform
-from polmvs.normals.tracks import Seeds
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import store_phase_map
 from polmvs.polarization.region import Region
+from polmvs.scene import Seeds
 from polmvs.surface.parts.agreement import contradicted, join_seeds, most_agreeing
 from polmvs.surface.parts.misfit import Misfit
 from polmvs.surface.parts.outline import FAR_PX, find_pieces
@@ -33,7 +33,7 @@ def board():
 
 @pytest.fixture(scope="module")
 def board_result(board):
-    return find_part_seeds(Model.PPA, board.maps, NO_SEEDS, ABOUT)
+    return find_part_seeds(AngleModel.PPA, board.maps, NO_SEEDS, ABOUT)
 
 
 def heights(surface: Plane, points):
@@ -153,7 +153,7 @@ def test_a_board_without_seeds_is_found_within_a_fraction_of_a_pixel(board, boar
 def test_workers_give_the_same_result_as_one_process(board, board_result, tmp_path):
     stored = [store_phase_map(m, tmp_path) for m in board.maps]
     with Workers(2) as workers:
-        seeds, reports = find_part_seeds(Model.PPA, stored, NO_SEEDS, ABOUT, workers=workers)
+        seeds, reports = find_part_seeds(AngleModel.PPA, stored, NO_SEEDS, ABOUT, workers=workers)
     expected, (report,) = board_result
     np.testing.assert_allclose(seeds.points_in_world, expected.points_in_world, atol=1e-8)
     assert [r.num_agreeing for r in reports] == [report.num_agreeing]
@@ -171,7 +171,7 @@ def test_a_sphere_is_found_by_where_it_turns_away():
     views = ring_of_views(8, CAMERA, distance=0.5, elevation_deg=40)
     rendered = [render_view(v, sphere, s0=0.2, background=0.6) for v in views]
     maps = [phase_map_of(r) for r in rendered]
-    seeds, reports = find_part_seeds(Model.PPA, maps, NO_SEEDS, ABOUT)
+    seeds, reports = find_part_seeds(AngleModel.PPA, maps, NO_SEEDS, ABOUT)
     assert [r.doubt for r in reports] == [""]
     error = np.linalg.norm(seeds.points_in_world, axis=-1) - 0.13
     assert np.abs(np.median(error)) < min(0.75 * FOOTPRINT, 3 * reports[0].sigma)
@@ -183,14 +183,14 @@ def test_a_plane_that_fills_all_views_has_no_place():
     views = ring_of_views(6, CAMERA, distance=0.5, elevation_deg=55)
     maps = [phase_map_of(render_view(v, plane, s0=0.2)) for v in views]
     assert all(m.region.inside.mean() > 0.9 for m in maps)
-    seeds, reports = find_part_seeds(Model.PPA, maps, NO_SEEDS, ABOUT)
+    seeds, reports = find_part_seeds(AngleModel.PPA, maps, NO_SEEDS, ABOUT)
     assert len(seeds.sigma) == 0
     assert reports
     assert all(report.doubt for report in reports)
 
 
 def test_two_views_are_not_enough(board):
-    seeds, reports = find_part_seeds(Model.PPA, board.maps[:2], NO_SEEDS, ABOUT)
+    seeds, reports = find_part_seeds(AngleModel.PPA, board.maps[:2], NO_SEEDS, ABOUT)
     assert len(seeds.sigma) == 0
     assert reports
     assert all("fewer than 3 views" in report.doubt for report in reports)
@@ -199,7 +199,7 @@ def test_two_views_are_not_enough(board):
 def test_a_part_with_seeds_is_left_alone(board):
     """Even where only some of the views show the seeds."""
     seeds = board.seeds(3)
-    found, reports = find_part_seeds(Model.PPA, board.maps, seeds, ABOUT)
+    found, reports = find_part_seeds(AngleModel.PPA, board.maps, seeds, ABOUT)
     assert len(found.sigma) == 0
     assert reports == []
 
@@ -215,7 +215,7 @@ def test_a_part_that_one_view_shows_without_its_seeds_is_left_alone(board):
     inside = region.inside & ~disc(9.0, tuple(xy), region.inside.shape)
     away = replace(away, region=replace(region, inside=inside, reliable=region.reliable & inside))
     maps = [away, *board.maps[1:]]
-    found, reports = find_part_seeds(Model.PPA, maps, seeds, ABOUT)
+    found, reports = find_part_seeds(AngleModel.PPA, maps, seeds, ABOUT)
     assert len(found.sigma) == 0
     assert reports == []
 
@@ -224,7 +224,7 @@ def test_a_part_that_one_view_shows_without_its_seeds_is_left_alone(board):
 def test_a_lone_seed_is_held_against_the_outlines(board, offset):
     true = board.seeds(1)
     lone = replace(true, points_in_world=true.points_in_world + offset * true.normals_in_world)
-    found, reports = find_part_seeds(Model.PPA, board.maps, lone, ABOUT)
+    found, reports = find_part_seeds(AngleModel.PPA, board.maps, lone, ABOUT)
     assert [report.doubt for report in reports] == [""]
     assert contradicted(lone, found).tolist() == [offset > 0]
     shift = np.array([0.5, 0.0, 0.0])
@@ -243,7 +243,7 @@ def _fields(seeds: Seeds):
 def test_views_without_a_region_have_no_parts(board):
     nothing = np.zeros(board.maps[0].region.inside.shape, bool)
     maps = [replace(m, region=Region(nothing, nothing, nothing)) for m in board.maps]
-    seeds, reports = find_part_seeds(Model.PPA, maps, NO_SEEDS, ABOUT)
+    seeds, reports = find_part_seeds(AngleModel.PPA, maps, NO_SEEDS, ABOUT)
     assert len(seeds.sigma) == 0
     assert reports == []
 
@@ -263,7 +263,7 @@ def test_the_frame_and_scale_of_the_world_do_not_matter(board, board_result):
 
     maps = [replace(m, view=moved(m.view)) for m in board.maps]
     about = scale * ABOUT @ rotation.T + shift
-    seeds, reports = find_part_seeds(Model.PPA, maps, NO_SEEDS, about)
+    seeds, reports = find_part_seeds(AngleModel.PPA, maps, NO_SEEDS, about)
     _, (report,) = board_result
     assert reports[0].range == pytest.approx(scale * report.range, rel=1e-3)
     assert reports[0].sigma == pytest.approx(scale * report.sigma, rel=0.1)
@@ -273,7 +273,7 @@ def test_the_frame_and_scale_of_the_world_do_not_matter(board, board_result):
 
 def test_a_scene_without_points_has_no_bounds(board):
     with pytest.raises(ValueError, match="no bounds"):
-        find_part_seeds(Model.PPA, board.maps, NO_SEEDS, np.zeros((0, 3)))
+        find_part_seeds(AngleModel.PPA, board.maps, NO_SEEDS, np.zeros((0, 3)))
 
 
 def test_no_placements_agree_on_nothing():
@@ -289,7 +289,7 @@ def test_two_boards_are_two_parts():
     views = ring_of_views(6, CAMERA, distance=0.5, elevation_deg=60)
     rendered = [render_view(v, Group(boards), s0=0.2, background=0.6) for v in views]
     scene = Scene(None, views, rendered, [phase_map_of(r) for r in rendered])
-    seeds, reports = find_part_seeds(Model.PPA, scene.maps, NO_SEEDS, ABOUT)
+    seeds, reports = find_part_seeds(AngleModel.PPA, scene.maps, NO_SEEDS, ABOUT)
     assert [report.doubt for report in reports] == ["", ""]
     left = seeds.points_in_world[:, 0] < 0
     assert 0 < left.sum() < len(left)

@@ -3,6 +3,7 @@ import pytest
 
 from polmvs.errors import DataError
 from polmvs.io.clouds import Cloud, Mesh, read_mesh, write_mesh
+from polmvs.scene import PointKind
 from polmvs.surface.poisson import (
     boundary_edges,
     octree_depth,
@@ -11,7 +12,6 @@ from polmvs.surface.poisson import (
     triangle_areas,
     vertex_normals,
 )
-from polmvs.surface.surroundings import Kind
 
 SPACING = 0.01
 NUM = 80  # points along a side
@@ -117,11 +117,11 @@ def test_only_the_kinds_asked_for_count():
     both = Cloud(
         np.concatenate([cloud.points, other.points]),
         np.concatenate([cloud.normals, other.normals]),
-        scalars={"kind": np.repeat([Kind.SURFACE, Kind.STEREO], len(cloud.points))},
+        scalars={"kind": np.repeat([PointKind.SURFACE, PointKind.STEREO], len(cloud.points))},
     )
     assert np.abs(poisson_mesh(both).vertices @ axes[2]).max() < SPACING
-    assert (poisson_mesh(both, kinds=[Kind.STEREO]).vertices @ axes[2]).min() > 0.19
-    assert np.ptp(poisson_mesh(both, kinds=list(Kind)).vertices @ axes[2]) > 0.19
+    assert (poisson_mesh(both, kinds=[PointKind.STEREO]).vertices @ axes[2]).min() > 0.19
+    assert np.ptp(poisson_mesh(both, kinds=list(PointKind)).vertices @ axes[2]) > 0.19
 
 
 def test_outliers_and_islands_go():

@@ -5,9 +5,9 @@ import pytest
 from scenes import CAMERA, board_scene
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import Contour, FusionOptions, Model, PropagationOptions
-from polmvs.normals.tracks import Seeds
+from polmvs.config import AngleModel, Contour, FusionOptions, PropagationOptions
 from polmvs.parallel import Workers
+from polmvs.scene import Seeds
 from polmvs.surface.dense_view import DenseView, open_dense_view, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse, merge
 from polmvs.surface.propagation import propagate
@@ -29,7 +29,7 @@ def distances(scene, points):
 def test_ppa_covers_the_board_from_a_few_seeds_and_opa_bends_it(scene, tmp_path, contour):
     options = PropagationOptions(num_rounds=2, contour=contour)
     rmse = {}
-    for model in (Model.OPA, Model.PPA):
+    for model in (AngleModel.OPA, AngleModel.PPA):
         dense = propagate(model, scene.maps, scene.seeds(8), options, tmp_path / model)
         cloud = fuse(scene.maps, dense, FusionOptions())
         rmse[model] = np.sqrt((distances(scene, cloud.points) ** 2).mean())
@@ -37,8 +37,8 @@ def test_ppa_covers_the_board_from_a_few_seeds_and_opa_bends_it(scene, tmp_path,
             known = view.range_map > 0
             truth = rendered.mask[1::2, 1::2]
             assert (known & truth).sum() > 0.85 * truth.sum()
-    assert rmse[Model.PPA] < 0.0002  # 0.05 mm measured at half a metre, 4 mm a pixel
-    assert rmse[Model.OPA] > 10 * rmse[Model.PPA]
+    assert rmse[AngleModel.PPA] < 0.0002  # 0.05 mm measured at half a metre, 4 mm a pixel
+    assert rmse[AngleModel.OPA] > 10 * rmse[AngleModel.PPA]
 
 
 def test_a_wrong_seed_does_not_dent_the_surface(scene, tmp_path):
@@ -47,14 +47,14 @@ def test_a_wrong_seed_does_not_dent_the_surface(scene, tmp_path):
     points[3] += 0.03 * seeds.normals_in_world[3]
     bad = Seeds(points, seeds.normals_in_world, seeds.sigma)
     cloud = fuse(
-        scene.maps, propagate(Model.PPA, scene.maps, bad, OPTIONS, tmp_path), FusionOptions()
+        scene.maps, propagate(AngleModel.PPA, scene.maps, bad, OPTIONS, tmp_path), FusionOptions()
     )
     assert np.abs(distances(scene, cloud.points)).max() < 0.003
 
 
 def test_no_seed_no_surface(scene, tmp_path):
     none = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    dense = propagate(Model.PPA, scene.maps, none, OPTIONS, tmp_path)
+    dense = propagate(AngleModel.PPA, scene.maps, none, OPTIONS, tmp_path)
     assert dense == [None] * len(scene.maps)
     assert len(fuse(scene.maps, dense, FusionOptions()).points) == 0
 
@@ -82,8 +82,8 @@ def test_the_frame_and_scale_of_the_world_do_not_matter(scene, tmp_path):
         seeds.normals_in_world @ rotation.T,
         scale * seeds.sigma,
     )
-    here = propagate(Model.PPA, scene.maps, seeds, OPTIONS, tmp_path / "here")
-    there = propagate(Model.PPA, other_maps, other_seeds, OPTIONS, tmp_path / "there")
+    here = propagate(AngleModel.PPA, scene.maps, seeds, OPTIONS, tmp_path / "here")
+    there = propagate(AngleModel.PPA, other_maps, other_seeds, OPTIONS, tmp_path / "there")
     for a, b in zip(here, there, strict=True):
         known = a.range_map > 0
         np.testing.assert_allclose(b.range_map[known], scale * a.range_map[known], rtol=2e-4)
@@ -98,7 +98,7 @@ def test_workers_give_the_same_result_as_one_process(scene, tmp_path):
     counts = []
     with Workers(2) as workers:
         parallel = propagate(
-            Model.PPA,
+            AngleModel.PPA,
             maps,
             scene.seeds(8),
             OPTIONS,
@@ -106,7 +106,7 @@ def test_workers_give_the_same_result_as_one_process(scene, tmp_path):
             workers=workers,
             on_progress=counts.append,
         )
-    serial = propagate(Model.PPA, maps, scene.seeds(8), OPTIONS, tmp_path / "one")
+    serial = propagate(AngleModel.PPA, maps, scene.seeds(8), OPTIONS, tmp_path / "one")
     assert sum(counts) == len(maps) * (OPTIONS.num_rounds + 1)
     for a, b in zip(serial, parallel, strict=True):
         np.testing.assert_array_equal(a.range_map, b.range_map)

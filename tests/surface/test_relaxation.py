@@ -7,9 +7,10 @@ import pytest
 from scenes import CAMERA, board_scene, phase_map_of
 from test_consensus import BALL, BOARD, scene_of, true_samples, true_view
 
-from polmvs.config import Model
-from polmvs.normals.tracks import Seeds, window_map
+from polmvs.config import AngleModel
+from polmvs.normals.tracks import window_map
 from polmvs.polarization.phase_map import MODEL_SIGMA, _corrected, _with_doubt, as_tilted, turned
+from polmvs.scene import Seeds
 from polmvs.surface.pixel_graph import Nodes, tie_seeds
 from polmvs.surface.relaxation import (
     OPINION_REACH_PX,
@@ -177,7 +178,7 @@ def relaxed(scene, maps, nodes=None, dense=None, **options):
     nodes = nodes_of(scene) if nodes is None else nodes
     dense = [None] * len(maps) if dense is None else dense
     options = {"bending": 0.002, **options}
-    return relax(Model.PPA, maps, dense, nodes, scene.seeds(12), **options)
+    return relax(AngleModel.PPA, maps, dense, nodes, scene.seeds(12), **options)
 
 
 def test_a_round_leaves_the_true_surface_where_it_is(board):
@@ -251,9 +252,9 @@ def test_the_origin_may_be_far(board):
     seeds = board.seeds(12)
     far_seeds = replace(seeds, points_in_world=seeds.points_in_world + shift)
     nodes, none = nodes_of(board), [None] * 6
-    here = relax(Model.PPA, board.maps, none, nodes, seeds, bending=0.0)
+    here = relax(AngleModel.PPA, board.maps, none, nodes, seeds, bending=0.0)
     far_maps = [there(m) for m in board.maps]
-    away = relax(Model.PPA, far_maps, none, nodes, far_seeds, bending=0.0)
+    away = relax(AngleModel.PPA, far_maps, none, nodes, far_seeds, bending=0.0)
     np.testing.assert_allclose(away.surface.log_range, here.surface.log_range, atol=1e-5)
 
 

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
-from polmvs.camera import PinholeCamera, View, pixel_centers, sample_image
+from polmvs.camera import PinholeCamera, pixel_centers, sample_image
 from polmvs.colmap.models import ColmapCamera
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import Region, smooth
+from polmvs.scene import View
 from polmvs.surface.stereo import (
     combine_ranges,
     fit_planes,

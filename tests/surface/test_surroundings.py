@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from test_stereo import DISTANCE, map_of, plane_points, views_of
 
-from polmvs.normals.tracks import Tracks
 from polmvs.polarization.phase_map import store_phase_map
+from polmvs.scene import Tracks
 from polmvs.surface.surroundings import (
     _whole_view,
     choose_partners,

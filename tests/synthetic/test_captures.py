@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from polmvs.camera import PinholeCamera, View, pixel_centers
+from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.geometry import RigidTransform
+from polmvs.scene import View
 from polmvs.synthetic.captures import (
     ANGLES_DEG,
     Cylinder,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import CaptureOptions, Estimator, Light, Model, SfmOptions
+from polmvs.config import AngleModel, CaptureOptions, Estimator, Light, SfmOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.images import read_mask
 from polmvs.normals.single_view.focal import FocalEstimate
@@ -37,9 +37,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     _add_pixel_flags(parser)
     parser.add_argument(
         "--model",
-        type=Model,
-        choices=list(Model),
-        default=Model.PPA,
+        type=AngleModel,
+        choices=list(AngleModel),
+        default=AngleModel.PPA,
         help="angle and normal; 'tilted' presumes a lens not telecentric on the image side "
         "(default: %(default)s)",
     )
@@ -132,7 +132,7 @@ def run(args: argparse.Namespace, terminal: object = None) -> int:
     OptionError, DataError
         An option is unusable or does not fit the image, a file is, or no pixel counts.
     """
-    if args.find_planes and args.model is Model.OPA:
+    if args.find_planes and args.model is AngleModel.OPA:
         raise OptionError("--find-planes needs --model ppa or tilted: under OPA planes are lines.")
     stokes = load_stokes(args.image, _capture_options(args))
     view = PlaneView(stokes=stokes, mask=_select(args, stokes), light=args.light)
@@ -163,7 +163,7 @@ def _measure(args: argparse.Namespace, view: PlaneView, camera: PinholeCamera) -
             result["intrinsics_from"] = "estimated"
     result["intrinsics"] = [camera.fx, camera.fy, camera.cx, camera.cy]
     robust = args.estimator is Estimator.ROBUST
-    planes = {model: view.plane(model, camera, robust=robust) for model in Model}
+    planes = {model: view.plane(model, camera, robust=robust) for model in AngleModel}
     result["plane"] = _figures(planes[args.model])
     result["residuals"] = {
         str(model): {"rmse_deg": plane.rmse_deg, "median_deg": plane.median_deg}

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from polmvs.config import Light, Model
+from polmvs.config import AngleModel, Light
 from polmvs.normals.estimator import CAUCHY_SCALE
 from polmvs.normals.single_view.phase_errors import error_gradients, phase_errors, stack_samples
 from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal, robust_deviation, tangents
@@ -72,7 +72,7 @@ class _View:
     parameters: Floats
     offsets: Floats
     sigma: Floats
-    model: Model
+    model: AngleModel
     light: Light
 
     def phases(self, focal_px: float) -> tuple[Floats, Floats, Floats]:
@@ -85,7 +85,7 @@ class _View:
         rays = np.concatenate([self.offsets / self.offsets.dtype.type(focal_px), one])
         rays /= np.sqrt((rays * rays).sum(axis=0))
         parameters, sigma = self.parameters, self.sigma
-        if self.model is Model.TILTED:
+        if self.model is AngleModel.TILTED:
             parameters = correct_parameters(parameters, rays.T, light=self.light)
             sigma = sigma * sigma_scale(parameters[1], parameters[2], rays.T, light=self.light)
         return phase_sign(self.light) * parameters[1:], rays, sigma
@@ -101,7 +101,7 @@ class _View:
 
 
 def estimate_focal(
-    model: Model,
+    model: AngleModel,
     parameters: Floats,
     offsets_px: Floats,
     sigma: Floats,
@@ -152,7 +152,7 @@ def estimate_focal(
 
 
 def _pick(
-    model: Model, parameters: Floats, offsets_px: Floats, sigma: Floats, light: Light
+    model: AngleModel, parameters: Floats, offsets_px: Floats, sigma: Floats, light: Light
 ) -> _View:
     """Evenly spaced ones of the polarised pixels that are known."""
     if parameters.shape != (3, len(sigma)) or offsets_px.shape != (2, len(sigma)):

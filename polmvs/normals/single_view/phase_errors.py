@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.normals.estimator import CAUCHY_SCALE
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
@@ -44,7 +44,7 @@ class NormalEquations(NamedTuple):
     errors: Floats
 
 
-def stack_samples(model: Model, axial: Floats, rays: Floats, sigma: Floats) -> Floats:
+def stack_samples(model: AngleModel, axial: Floats, rays: Floats, sigma: Floats) -> Floats:
     """Samples (5, N) of the pixels that count: polarised, finite, with a sigma.
 
     Parameters
@@ -63,7 +63,7 @@ def stack_samples(model: Model, axial: Floats, rays: Floats, sigma: Floats) -> F
     if not usable.all():
         axial, rays = axial[:, usable], rays[:, usable]
         sigma, length = sigma[usable], length[usable]
-    xy = np.zeros_like(rays[:2]) if model is Model.OPA else rays[:2] / rays[2]
+    xy = np.zeros_like(rays[:2]) if model is AngleModel.OPA else rays[:2] / rays[2]
     return np.stack([*(axial / length), *xy, 1 / (sigma * sigma)])
 
 

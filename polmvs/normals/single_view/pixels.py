@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.config import CaptureOptions, Light, Model
+from polmvs.config import AngleModel, CaptureOptions, Light
 from polmvs.io.images import probe_mosaic
 from polmvs.normals.single_view.focal import FocalEstimate, estimate_focal
 from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal
@@ -42,7 +42,7 @@ class PlaneView:
     mask: Mask
     light: Light
 
-    def phase_map(self, model: Model, camera: PinholeCamera) -> tuple[Image, Image, Image]:
+    def phase_map(self, model: AngleModel, camera: PinholeCamera) -> tuple[Image, Image, Image]:
         """Phase as the estimators take it.
 
         Returns
@@ -53,18 +53,20 @@ class PlaneView:
         """
         rays = camera.rays(pixel_centers(camera.width, camera.height)).astype(np.float32)
         stokes = self.stokes
-        if model is Model.TILTED:
+        if model is AngleModel.TILTED:
             stokes = correct_stokes(stokes, rays, light=self.light)
         axial = phase_sign(self.light) * np.stack([stokes.s1, stokes.s2])
         return axial, np.ascontiguousarray(np.moveaxis(rays, -1, 0)), phase_sigma(stokes)
 
-    def plane(self, model: Model, camera: PinholeCamera, *, robust: bool = True) -> PlaneEstimate:
+    def plane(
+        self, model: AngleModel, camera: PinholeCamera, *, robust: bool = True
+    ) -> PlaneEstimate:
         """Best single normal of the pixels, by :func:`.plane.plane_normal`."""
         axial, rays, sigma = self.phase_map(model, camera)
         m = self.mask
         return plane_normal(model, axial[:, m], rays[:, m], sigma[m], robust=robust)
 
-    def planes(self, model: Model, camera: PinholeCamera) -> list[FoundPlane]:
+    def planes(self, model: AngleModel, camera: PinholeCamera) -> list[FoundPlane]:
         """All planes among the pixels, by :func:`.search.find_planes`."""
         axial, rays, sigma = self.phase_map(model, camera)
         return find_planes(model, axial, rays, sigma, self.mask)
@@ -80,7 +82,7 @@ class PlaneView:
         xy = pixel_centers(camera.width, camera.height)[mask]
         offsets = (xy - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy]
         return estimate_focal(
-            Model.TILTED,
+            AngleModel.TILTED,
             np.stack([stokes.s0[mask], stokes.s1[mask], stokes.s2[mask]]),
             np.ascontiguousarray(offsets.T, np.float32),
             phase_sigma(stokes)[mask],

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.normals.estimator import smallest_eigenvectors
 from polmvs.normals.single_view.phase_errors import (
     CHUNK,
@@ -77,7 +77,7 @@ class PlaneEstimate:
 
 
 def plane_normal(
-    model: Model,
+    model: AngleModel,
     axial: Floats,
     rays: Floats,
     sigma: Floats,
@@ -124,7 +124,7 @@ def plane_normal(
     return _describe(_facing(normal, samples), samples, scale)
 
 
-def phase_residuals(model: Model, normal: Floats, axial: Floats, rays: Floats) -> Floats:
+def phase_residuals(model: AngleModel, normal: Floats, axial: Floats, rays: Floats) -> Floats:
     """Measured phase minus that of a normal, rad in [-pi/2, pi/2].
 
     Parameters
@@ -147,10 +147,10 @@ def phase_residuals(model: Model, normal: Floats, axial: Floats, rays: Floats) -
     return residuals
 
 
-def _eigenvector(model: Model, samples: Floats) -> Array:
+def _eigenvector(model: AngleModel, samples: Floats) -> Array:
     """Eigenvector of the smallest eigenvalue of ``M^T M`` (paper, eq. coeff), ``(3,)``."""
     entries = row_products(samples)
-    if model is Model.OPA:  # no row has a z component: only the direction in the image counts
+    if model is AngleModel.OPA:  # no row has a z component: only the direction in the image counts
         entries[2] = entries[:2].sum()
     return smallest_eigenvectors(entries[:, None])[1][:, 0]
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.normals.single_view.phase_errors import phase_errors, stack_samples
 from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
 from polmvs.polarization.angle_models import rows_from_axial
@@ -53,7 +53,7 @@ class FoundPlane:
 class _Blocks:
     """Averages over blocks; (H', W') maps of what counts, arrays of the blocks that do."""
 
-    model: Model
+    model: AngleModel
     known: Mask
     axial: Floats
     rays: Floats
@@ -78,7 +78,7 @@ class _Blocks:
 
 
 def find_planes(
-    model: Model,
+    model: AngleModel,
     axial: Floats,
     rays: Floats,
     sigma: Floats,
@@ -130,7 +130,7 @@ def find_planes(
     return _finish(model, axial, rays, sigma, mask, labels)
 
 
-def _average(model: Model, axial: Floats, rays: Floats, sigma: Floats, mask: Mask) -> _Blocks:
+def _average(model: AngleModel, axial: Floats, rays: Floats, sigma: Floats, mask: Mask) -> _Blocks:
     """Average a phase map over blocks, weighted by precision; half a block has to be known."""
     length = np.hypot(axial[0], axial[1])
     usable = mask & (length > 0) & (sigma > 0) & np.isfinite(length + sigma)
@@ -248,7 +248,7 @@ def _mean_where(image: Floats, known: Mask) -> Floats:
 
 
 def _finish(
-    model: Model,
+    model: AngleModel,
     axial: Floats,
     rays: Floats,
     sigma: Floats,

@@ -14,17 +14,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from polmvs.camera import View
-from polmvs.colmap.models import SparseModel, read_model
+from polmvs.colmap.models import read_model
 from polmvs.colmap.sfm import run_sfm
 from polmvs.colmap.sparse_model import match_model_to_capture, short_list, write_model
-from polmvs.config import Light, Model, ReferenceOptions, RegionOptions, SfmOptions
+from polmvs.config import AngleModel, Light, ReferenceOptions, RegionOptions, SfmOptions
 from polmvs.errors import DataError
 from polmvs.io.images import read_gray, read_mask, write_png
 from polmvs.normals.light import find_diffuse
-from polmvs.normals.tracks import Tracks
 from polmvs.parallel import Workers
-from polmvs.pipeline.run_folder import Workspace
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.polarization.capture import Capture, intensity_image_8bit
 from polmvs.polarization.phase_map import (
     PhaseMap,
@@ -37,6 +35,7 @@ from polmvs.polarization.phase_map import (
 from polmvs.polarization.region import find_region
 from polmvs.poses.metric_frame import transform_model
 from polmvs.poses.metric_sources import metric_frame
+from polmvs.scene import SparseModel, Tracks, View
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +83,7 @@ def find_mask(folder: Path, image: str) -> Path:
 
 
 def write_images(
-    capture: Capture, workspace: Workspace, *, workers: Workers, report: Report
+    capture: Capture, workspace: RunFolder, *, workers: Workers, report: Report
 ) -> Facts:
     """Write the 8-bit intensity images that COLMAP sees."""
     names = image_names(capture)
@@ -102,7 +101,7 @@ def _write_image(capture: Capture, white: float, folder: Path, name: str, image:
 
 def find_poses(
     names: Sequence[str],
-    workspace: Workspace,
+    workspace: RunFolder,
     options: SfmOptions,
     reference: ReferenceOptions,
     *,
@@ -127,7 +126,7 @@ def fit_model(capture: Capture, source: Path) -> SparseModel:
 
 
 def take_poses(
-    model: SparseModel, workspace: Workspace, source: Path, reference: ReferenceOptions
+    model: SparseModel, workspace: RunFolder, source: Path, reference: ReferenceOptions
 ) -> Facts:
     """Write an existing model that was fitted to the capture; the original is not touched."""
     with workspace.scratch("sfm") as folder:
@@ -138,7 +137,7 @@ def take_poses(
 
 
 def _take_frame(
-    model: SparseModel, workspace: Workspace, options: ReferenceOptions, target: Path
+    model: SparseModel, workspace: RunFolder, options: ReferenceOptions, target: Path
 ) -> Facts:
     """Rewrite a model in the metric frame that the options give; without one it stays."""
     frame = metric_frame(model, options, lambda name: read_gray(workspace.images / name))
@@ -179,7 +178,7 @@ def _pose_facts(model: SparseModel, source: Path) -> Facts:
 
 def build_maps(
     capture: Capture,
-    workspace: Workspace,
+    workspace: RunFolder,
     options: RegionOptions,
     *,
     workers: Workers,
@@ -227,7 +226,7 @@ def _build_map(
     return int(region.inside.sum())
 
 
-def posed_views(workspace: Workspace) -> tuple[View, ...]:
+def posed_views(workspace: RunFolder) -> tuple[View, ...]:
     """Views of ``sparse/``.
 
     Raises
@@ -245,9 +244,9 @@ def posed_views(workspace: Workspace) -> tuple[View, ...]:
     return views
 
 
-def tilt_maps(workspace: Workspace, *, workers: Workers) -> None:
+def tilt_maps(workspace: RunFolder, *, workers: Workers) -> None:
     """Store beside each phase map the one that the tilted model needs."""
-    for _ in workers.map(partial(_tilt_map, workspace.maps), open_maps(workspace, Model.PPA)):
+    for _ in workers.map(partial(_tilt_map, workspace.maps), open_maps(workspace, AngleModel.PPA)):
         pass
 
 
@@ -255,7 +254,7 @@ def _tilt_map(folder: Path, phase_map: PhaseMap) -> None:
     store_phase_map(as_tilted(phase_map), folder)
 
 
-def open_maps(workspace: Workspace, model: Model) -> list[PhaseMap]:
+def open_maps(workspace: RunFolder, model: AngleModel) -> list[PhaseMap]:
     """Phase maps of all posed views for a model; their pixels stay on disk."""
-    tilted = model is Model.TILTED
+    tilted = model is AngleModel.TILTED
     return [open_phase_map(v, workspace.maps, tilted=tilted) for v in posed_views(workspace)]

@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model
-from polmvs.config import FusionOptions, Method, Model, NormalOptions, PropagationOptions
+from polmvs.config import AngleModel, FusionOptions, Method, NormalOptions, PropagationOptions
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.clouds import Cloud, write_cloud
 from polmvs.normals.estimator import NormalEstimate
-from polmvs.normals.tracks import Seeds, Tracks, select_seeds, track_normals
+from polmvs.normals.tracks import select_seeds, track_normals
 from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
-from polmvs.pipeline.run_folder import Workspace
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.scene_cloud import join_clouds, open_given, surface_cloud, surroundings_cloud
 from polmvs.pipeline.stages.capture import Facts, Report, open_maps, posed_views, tilt_maps
+from polmvs.scene import Seeds, Tracks
 from polmvs.surface.consensus import hidden_by
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
 from polmvs.surface.fusion import fuse, no_points
@@ -33,10 +34,10 @@ SEED_COLUMNS = 7  # place, normal, deviation
 
 
 def solve_tracks(
-    model: Model, workspace: Workspace, options: NormalOptions, *, workers: Workers
+    model: AngleModel, workspace: RunFolder, options: NormalOptions, *, workers: Workers
 ) -> Facts:
     """Normals of the sparse points under a model; PPA's also select the seeds."""
-    if model is Model.TILTED:
+    if model is AngleModel.TILTED:
         tilt_maps(workspace, workers=workers)
     tracks = read_model(workspace.sparse).tracks
     maps = open_maps(workspace, model)
@@ -45,7 +46,7 @@ def solve_tracks(
     else:
         estimate = track_normals(model, tracks, maps, options)
     facts: Facts = {f"num_normals_{model}": int(estimate.valid.sum())}
-    if model is Model.PPA:
+    if model is AngleModel.PPA:
         is_seed, sigma = np.zeros(len(tracks.point3D_ids), np.bool_), np.zeros(0)
         if len(tracks.point3D_ids):
             seeds, is_seed = select_seeds(tracks, estimate, maps)
@@ -61,20 +62,20 @@ def solve_tracks(
 
 
 def place_parts(
-    workspace: Workspace, options: NormalOptions, *, max_neighbors: int, workers: Workers
+    workspace: RunFolder, options: NormalOptions, *, max_neighbors: int, workers: Workers
 ) -> Facts:
     """Seeds for the parts on which none of the sparse points lies, from their outlines.
 
     They come from PPA and are the same for all models.
     """
-    seeds = load_seeds(Model.PPA, workspace)
+    seeds = load_seeds(AngleModel.PPA, workspace)
     reports: list[PartReport] = []
     points = read_model(workspace.sparse).tracks.points_in_world
     found = np.zeros((0, SEED_COLUMNS))
     if options.unseeded and len(points):
         new, reports = find_part_seeds(
-            Model.PPA,
-            open_maps(workspace, Model.PPA),
+            AngleModel.PPA,
+            open_maps(workspace, AngleModel.PPA),
             seeds,
             points,
             max_neighbors=max_neighbors,
@@ -99,7 +100,7 @@ def place_parts(
     }
 
 
-def _drop_seeds(workspace: Workspace, dropped: NDArray[np.bool_]) -> None:
+def _drop_seeds(workspace: RunFolder, dropped: NDArray[np.bool_]) -> None:
     """Take the name of a seed from tracks that the outlines contradict."""
     sigma = np.array(map_array(_seed_file(workspace)))
     index = np.flatnonzero(np.isfinite(sigma))
@@ -118,7 +119,7 @@ def _shared_sigma(seeds: Seeds) -> NDArray[np.float64]:
     return np.asarray(seeds.sigma * np.sqrt(count[part]))
 
 
-def _part_file(workspace: Workspace) -> Path:
+def _part_file(workspace: RunFolder) -> Path:
     """Seeds of the parts without sparse points: place, normal, deviation."""
     return workspace.maps / "parts.npy"
 
@@ -137,12 +138,12 @@ def _no_estimate(num_views: int) -> NormalEstimate:
     )
 
 
-def _seed_file(workspace: Workspace) -> Path:
+def _seed_file(workspace: RunFolder) -> Path:
     """Standard deviation of each track's place, NaN where it is no seed."""
     return workspace.maps / "seeds.npy"
 
 
-def _normal_file(workspace: Workspace, model: Model) -> Path:
+def _normal_file(workspace: RunFolder, model: AngleModel) -> Path:
     return workspace.maps / f"normals_{model}.npy"
 
 
@@ -162,7 +163,7 @@ def _track_cloud(tracks: Tracks, estimate: NormalEstimate, is_seed: NDArray[np.b
     )
 
 
-def load_seeds(model: Model, workspace: Workspace) -> Seeds:
+def load_seeds(model: AngleModel, workspace: RunFolder) -> Seeds:
     """Seeds with the normals of a model; which points they are is the same for all models."""
     points = read_model(workspace.sparse).tracks.points_in_world
     sigma = np.array(map_array(_seed_file(workspace)))
@@ -172,14 +173,14 @@ def load_seeds(model: Model, workspace: Workspace) -> Seeds:
     if not _part_file(workspace).is_file():
         return tracks
     parts = np.array(map_array(_part_file(workspace)))
-    if model is not Model.PPA:
+    if model is not AngleModel.PPA:
         parts[:, 3:6] = np.nan  # each model solves its own
     return join_seeds([tracks, Seeds(parts[:, :3], parts[:, 3:6], parts[:, 6])])
 
 
 def densify(
-    model: Model,
-    workspace: Workspace,
+    model: AngleModel,
+    workspace: RunFolder,
     propagation: PropagationOptions,
     fusion: FusionOptions,
     *,
@@ -232,7 +233,7 @@ def densify(
     }
 
 
-def open_dense_views(workspace: Workspace, model: Model) -> list[DenseView | None]:
+def open_dense_views(workspace: RunFolder, model: AngleModel) -> list[DenseView | None]:
     """Dense results of all posed views under a model, None where a view has none."""
     folder = workspace.views(model)
     names = [view.name for view in posed_views(workspace)]

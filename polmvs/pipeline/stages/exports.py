@@ -9,38 +9,38 @@ from pathlib import Path
 from polmvs.colmap.dense_workspace import write_dense_workspace
 from polmvs.colmap.filling import fill_workspace
 from polmvs.colmap.maps import DepthNormals
-from polmvs.colmap.models import SparseModel, read_model
+from polmvs.colmap.models import read_model
 from polmvs.colmap.undistort import warp_dense_view
 from polmvs.colmap.workspace_checks import common_views
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud, write_mesh
 from polmvs.io.images import read_gray
 from polmvs.pipeline.own_files import mark_own_workspace
-from polmvs.pipeline.run_folder import Workspace
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.scene_cloud import open_checked
 from polmvs.pipeline.stages.capture import Facts
 from polmvs.pipeline.stages.clouds import open_dense_views
+from polmvs.scene import PointKind, SparseModel
 from polmvs.surface.dense_view import DenseView
 from polmvs.surface.poisson import MIN_POINTS, poisson_mesh
-from polmvs.surface.surroundings import Kind
 
 DenseViews = dict[str, DenseView | None]
 
 
-def make_mesh(model: Model, workspace: Workspace) -> Facts:
+def make_mesh(model: AngleModel, workspace: RunFolder) -> Facts:
     """Mesh of the polarised surfaces; none, and a fact that says so, of too few points."""
     source = workspace.cloud(model)
     cloud = read_cloud(source)
     kinds = cloud.scalars.get("kind")
-    if kinds is None or int((kinds == Kind.SURFACE).sum()) < MIN_POINTS:
+    if kinds is None or int((kinds == PointKind.SURFACE).sum()) < MIN_POINTS:
         return {f"num_triangles_{model}": 0}
     mesh = poisson_mesh(cloud, source=source)
     write_mesh(workspace.mesh(model), mesh)
     return {f"num_triangles_{model}": len(mesh.triangles)}
 
 
-def write_workspace(model: Model, workspace: Workspace) -> Facts:
+def write_workspace(model: AngleModel, workspace: RunFolder) -> Facts:
     """A COLMAP workspace of the run's own undistorted images and maps."""
     sparse = read_model(workspace.sparse)
     dense = _by_name(sparse, workspace, model)
@@ -51,7 +51,7 @@ def write_workspace(model: Model, workspace: Workspace) -> Facts:
     return {f"dense_{model}": str(workspace.dense(model).absolute())}
 
 
-def fill_given(model: Model, workspace: Workspace, given: Path, *, in_place: bool) -> Facts:
+def fill_given(model: AngleModel, workspace: RunFolder, given: Path, *, in_place: bool) -> Facts:
     """A copy of the user's workspace, or that one itself, with the holes of its maps filled.
 
     Raises
@@ -80,7 +80,7 @@ def fill_given(model: Model, workspace: Workspace, given: Path, *, in_place: boo
 
 
 @contextmanager
-def _new_workspace(model: Model, workspace: Workspace) -> Iterator[Path]:
+def _new_workspace(model: AngleModel, workspace: RunFolder) -> Iterator[Path]:
     """Where to write a COLMAP workspace, which then takes the place of the model's last one."""
     with workspace.scratch(f"dense_{model}") as folder:
         target = folder / "dense"
@@ -89,7 +89,7 @@ def _new_workspace(model: Model, workspace: Workspace) -> Iterator[Path]:
         workspace.replace(target, workspace.dense(model))
 
 
-def _by_name(sparse: SparseModel, workspace: Workspace, model: Model) -> DenseViews:
+def _by_name(sparse: SparseModel, workspace: RunFolder, model: AngleModel) -> DenseViews:
     """Dense views by image name.
 
     Raises

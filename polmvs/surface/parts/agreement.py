@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from polmvs.camera import View
-from polmvs.normals.tracks import Seeds
+from polmvs.scene import Seeds, View
 from polmvs.surface.dense_view import extend_planes
 from polmvs.surface.parts.outline_range import MIN_COSINE, cosines, points_of
 from polmvs.surface.parts.placement import Placement

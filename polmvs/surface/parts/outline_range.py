@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import View
 from polmvs.surface.dense_view import SurfaceSamples, extend_planes
 from polmvs.surface.parts.misfit import Misfit
 from polmvs.surface.parts.outline import BORDER_PX, FAR_PX, OUTLINE_STEP, Piece

@@ -15,11 +15,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View
-from polmvs.config import Model
-from polmvs.normals.tracks import Seeds
+from polmvs.config import AngleModel
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import Seeds, View
 from polmvs.surface.parts.agreement import (
     MIN_OVERLAP,
     PartReport,
@@ -67,7 +66,7 @@ class _Member:
 
 
 def find_part_seeds(
-    model: Model,
+    model: AngleModel,
     maps: Sequence[PhaseMap],
     seeds: Seeds,
     points_in_world: Array,
@@ -123,7 +122,7 @@ class _Search:
 
     def __init__(
         self,
-        model: Model,
+        model: AngleModel,
         maps: Sequence[PhaseMap],
         pieces: Sequence[Sequence[Piece]],
         seeded: set[PieceId],

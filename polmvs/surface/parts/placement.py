@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from polmvs.config import Model
+from polmvs.config import AngleModel
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import gather_rows
-from polmvs.normals.tracks import Seeds
+from polmvs.scene import Seeds
 from polmvs.surface.dense_view import SurfaceSamples
 from polmvs.surface.parts.misfit import FINE_SCALE_PX, Misfit
 from polmvs.surface.parts.outline_range import (
@@ -94,7 +94,7 @@ class _State:
     log_range: float
 
 
-def place_piece(model: Model, reference: Reference, bounds: tuple[float, float]) -> Placement:
+def place_piece(model: AngleModel, reference: Reference, bounds: tuple[float, float]) -> Placement:
     """Find the range of a piece within bounds.
 
     Parameters
@@ -146,7 +146,7 @@ def _nowhere(reference: Reference, nodes: Nodes) -> Placement:
 
 
 def _sweep(
-    model: Model, reference: Reference, nodes: Nodes, bounds: tuple[float, float]
+    model: AngleModel, reference: Reference, nodes: Nodes, bounds: tuple[float, float]
 ) -> tuple[list[_State], Array]:
     """States over all ranges and what they cost."""
     num_shapes = max(int(np.ceil((bounds[1] - bounds[0]) / SHAPE_STEP)), 1)
@@ -186,7 +186,7 @@ def _minima(costs: Array) -> list[int]:
 
 
 def _solve_shape(
-    model: Model, reference: Reference, nodes: Nodes, log_range: float
+    model: AngleModel, reference: Reference, nodes: Nodes, log_range: float
 ) -> _State | None:
     """The piece's shape with its middle at a range; None where no normals are found."""
     surface = nodes.surface
@@ -225,7 +225,7 @@ def _misfit(reference: Reference, state: _State) -> Misfit:
     return find_misfit(reference, state.nodes, state.rim, with_slopes=True)
 
 
-def _refine(model: Model, reference: Reference, state: _State) -> _State | None:
+def _refine(model: AngleModel, reference: Reference, state: _State) -> _State | None:
     """Follow a minimum down: the shape anew and a closer look, again and again."""
     for reach, step, scale in REFINEMENTS:
         solved = _solve_shape(model, reference, state.nodes, state.log_range)
@@ -250,7 +250,7 @@ def _has_rival(refined: Sequence[tuple[float, _State]], apart: float) -> bool:
     )
 
 
-def _describe(model: Model, reference: Reference, state: _State) -> Placement:
+def _describe(model: AngleModel, reference: Reference, state: _State) -> Placement:
     """The state with its uncertainty, and the doubts that it gives rise to itself."""
     misfit = _misfit(reference, state)
     surface = state.nodes.surface[np.flatnonzero(known(state.nodes.surface))]
