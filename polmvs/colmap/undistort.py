@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from polmvs.camera import Camera, PinholeCamera, pixel_centers, sample_image
 from polmvs.colmap.maps import DepthNormals, map_pixel_xy
 from polmvs.colmap.models import camera_from_colmap, camera_to_colmap, pycolmap
-from polmvs.normals.tracks import some_tracks
-from polmvs.scene import SparseModel, View
+from polmvs.scene import SparseModel, View, some_tracks
 from polmvs.surface.dense_view import DenseView
 from polmvs.surface.log_range import MAX_GRAZING, log_range_increment
 

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, NormalOptions
 from polmvs.normals.estimator import NormalEstimate
-from polmvs.normals.tracks import inside_shares, normals_from_windows, some_tracks, window_map
+from polmvs.normals.tracks import inside_shares, normals_from_windows, window_map
 from polmvs.polarization.phase_map import PhaseMap, turned
-from polmvs.scene import Tracks
+from polmvs.scene import Tracks, some_tracks
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -18,10 +18,9 @@ from polmvs.colmap.models import read_model
 from polmvs.colmap.sparse_model import match_model_to_capture, write_model
 from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import read_views as read_known_views
-from polmvs.normals.tracks import some_tracks
 from polmvs.poses.metric_frame import match_names
 from polmvs.poses.triangulation import intersect_rays
-from polmvs.scene import SparseModel, Tracks, View
+from polmvs.scene import SparseModel, Tracks, View, some_tracks
 
 Array = NDArray[np.float64]
 

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from polmvs.colmap.sparse_model import short_list
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform, SimilarityTransform
-from polmvs.normals.tracks import point_sigmas, some_tracks
 from polmvs.poses.alignment import align_cameras, align_residuals
-from polmvs.scene import SparseModel
+from polmvs.scene import SparseModel, point_sigmas, some_tracks
 
 Array = NDArray[np.float64]
 

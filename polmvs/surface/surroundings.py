@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
 from polmvs.config import FusionOptions
-from polmvs.normals.tracks import KEYPOINT_SIGMA_PX, point_sigmas, some_tracks
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map
-from polmvs.scene import Tracks, View
+from polmvs.scene import KEYPOINT_SIGMA_PX, Tracks, View, point_sigmas, some_tracks
 from polmvs.surface.dense_view import DenseView, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse
 from polmvs.surface.stereo import stereo_view
