@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from polmvs.colmap.dense_workspace import DenseWorkspace, open_dense_workspace
 from polmvs.colmap.filling import previous_backups
-from polmvs.colmap.kept_depth import kept_cloud
 from polmvs.colmap.models import read_model
 from polmvs.colmap.workspace_checks import require_matching_images, require_same_frame
 from polmvs.config import FusionOptions, Surroundings
@@ -24,6 +23,7 @@ from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind
 from polmvs.surface.fusion import FusedCloud
+from polmvs.surface.kept_depth import kept_cloud
 from polmvs.surface.surroundings import SparseSurroundings, sparse_surroundings, stereo_surroundings
 
 logger = logging.getLogger(__name__)

@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 
 from polmvs.cli import main
 from polmvs.colmap.dense_workspace import DenseWorkspace, open_dense_workspace
-from polmvs.colmap.kept_depth import kept_cloud
 from polmvs.colmap.maps import DepthNormals, read_depth_map, write_depth_map
 from polmvs.colmap.models import pycolmap, read_model
 from polmvs.colmap.sparse_model import write_model
@@ -23,6 +22,7 @@ from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_tru
 from polmvs.pipeline.own_files import DENSE_MARKER
 from polmvs.poses.metric_frame import transform_model
 from polmvs.scene import PointKind
+from polmvs.surface.kept_depth import kept_cloud
 
 BOARD_HEIGHT_M = 0.012  # of the true plane z = const, in the capture's gt/scene.json
 # A pixel is 1.3 mm on the board; SfM's poses bend and shift it by some tenths of that.
