@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from polmvs.colmap.models import read_model
-from polmvs.colmap.sparse_model import match_model_to_capture, short_list
+from polmvs.colmap.models import match_model_to_capture, read_model
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, SimilarityTransform
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.polarization.capture import Capture
 from polmvs.poses.alignment import AlignmentReport, align_to_truth
-from polmvs.scene import View
+from polmvs.scene import View, short_list
 
 
 def estimated_views(

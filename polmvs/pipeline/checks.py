@@ -6,9 +6,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from polmvs.colmap.dense_workspace import open_dense_workspace
+from polmvs.colmap.dense_workspace import open_dense_workspace, require_same_frame
 from polmvs.colmap.sfm import check_intrinsics
-from polmvs.colmap.workspace_checks import require_same_frame
 from polmvs.config import AngleModel, Options, ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import open_ground_truth

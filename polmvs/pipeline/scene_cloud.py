@@ -10,10 +10,14 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.colmap.dense_workspace import DenseWorkspace, open_dense_workspace
+from polmvs.colmap.dense_workspace import (
+    DenseWorkspace,
+    open_dense_workspace,
+    require_matching_images,
+    require_same_frame,
+)
 from polmvs.colmap.filling import previous_backups
 from polmvs.colmap.models import read_model
-from polmvs.colmap.workspace_checks import require_matching_images, require_same_frame
 from polmvs.config import FusionOptions, Surroundings
 from polmvs.io.clouds import Cloud
 from polmvs.io.images import read_gray

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.colmap.models import read_model
-from polmvs.colmap.sparse_model import match_model_to_capture, write_model
+from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import read_views as read_known_views
 from polmvs.poses.metric_frame import match_names

@@ -10,11 +10,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.colmap.sparse_model import short_list
 from polmvs.errors import DataError
 from polmvs.poses.markers import Detection
 from polmvs.poses.triangulation import Triangulation, triangulate_together
-from polmvs.scene import View
+from polmvs.scene import View, short_list
 
 Array = NDArray[np.float64]
 

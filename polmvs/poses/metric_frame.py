@@ -13,11 +13,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.colmap.sparse_model import short_list
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform, SimilarityTransform
 from polmvs.poses.alignment import align_cameras, align_residuals
-from polmvs.scene import SparseModel, point_sigmas, some_tracks
+from polmvs.scene import SparseModel, point_sigmas, short_list, some_tracks
 
 Array = NDArray[np.float64]
 

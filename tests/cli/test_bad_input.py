@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from polmvs.colmap.models import read_model
-from polmvs.colmap.sparse_model import write_model
+from polmvs.colmap.models import read_model, write_model
 from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud
 from polmvs.pipeline.stages import capture as stages

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from polmvs.camera import Camera, PinholeCamera
-from polmvs.colmap.models import ColmapCamera
+from polmvs.colmap.cameras import ColmapCamera
 from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform

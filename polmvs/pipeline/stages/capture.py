@@ -14,9 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from polmvs.colmap.models import read_model
+from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.sfm import run_sfm
-from polmvs.colmap.sparse_model import match_model_to_capture, short_list, write_model
 from polmvs.config import AngleModel, Light, ReferenceOptions, RegionOptions, SfmOptions
 from polmvs.errors import DataError
 from polmvs.io.images import read_gray, read_mask, write_png
@@ -35,7 +34,7 @@ from polmvs.polarization.phase_map import (
 from polmvs.polarization.region import find_region
 from polmvs.poses.metric_frame import transform_model
 from polmvs.poses.metric_sources import metric_frame
-from polmvs.scene import SparseModel, Tracks, View
+from polmvs.scene import SparseModel, Tracks, View, short_list
 
 logger = logging.getLogger(__name__)
 

@@ -6,12 +6,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from polmvs.colmap.dense_workspace import write_dense_workspace
+from polmvs.colmap.dense_workspace import common_views
 from polmvs.colmap.filling import fill_workspace
 from polmvs.colmap.maps import DepthNormals
 from polmvs.colmap.models import read_model
-from polmvs.colmap.undistort import warp_dense_view
-from polmvs.colmap.workspace_checks import common_views
 from polmvs.config import AngleModel
 from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud, write_mesh
@@ -23,6 +21,7 @@ from polmvs.pipeline.stages.capture import Facts
 from polmvs.pipeline.stages.clouds import open_dense_views
 from polmvs.scene import PointKind, SparseModel
 from polmvs.surface.dense_view import DenseView
+from polmvs.surface.map_export import export_dense_workspace, warp_dense_view
 from polmvs.surface.poisson import MIN_POINTS, poisson_mesh
 
 DenseViews = dict[str, DenseView | None]
@@ -45,7 +44,7 @@ def write_workspace(model: AngleModel, workspace: RunFolder) -> Facts:
     sparse = read_model(workspace.sparse)
     dense = _by_name(sparse, workspace, model)
     with _new_workspace(model, workspace) as target:
-        write_dense_workspace(
+        export_dense_workspace(
             target, sparse, lambda name: read_gray(workspace.images / name), dense.__getitem__
         )
     return {f"dense_{model}": str(workspace.dense(model).absolute())}

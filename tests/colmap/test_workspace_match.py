@@ -9,14 +9,14 @@ import pytest
 from dense_scenes import board_scene
 from test_conventions import random_rotation
 
-from polmvs.colmap.dense_workspace import open_dense_workspace
-from polmvs.colmap.undistort import undistorted_camera, warp_image
-from polmvs.colmap.workspace_checks import (
+from polmvs.colmap.dense_workspace import (
     common_views,
     image_correlation,
+    open_dense_workspace,
     require_matching_images,
     require_same_frame,
 )
+from polmvs.colmap.undistort import undistorted_camera, warp_image
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
 from polmvs.io.images import write_png
