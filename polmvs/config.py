@@ -109,6 +109,11 @@ class NormalOptions:
     estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
     window_px: int = option(17, "side of the window of rows about a track's point, px")
     unseeded: bool = option(True, "place parts without a sparse point by their outlines")
+    tilt_aware_weights: bool = option(
+        True,
+        "OPA and PPA: rows of oblique rays count less, by the turn that a tilt of the polarizers "
+        "would give their phase; without it the models are pure",
+    )
 
     def __post_init__(self) -> None:
         _require(

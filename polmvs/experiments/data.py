@@ -18,12 +18,11 @@ from polmvs.experiments.estimated_poses import estimated_views
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.io.images import read_mask
 from polmvs.pipeline.stages.capture import find_mask
-from polmvs.polarization.angle_models import phase_sign
+from polmvs.polarization.angle_models import correct_stokes, phase_sign
 from polmvs.polarization.capture import Capture
 from polmvs.polarization.phase_map import PhaseMap, as_tilted, build_phase_map, view_rays
 from polmvs.polarization.region import Region, find_region, smooth
 from polmvs.polarization.stokes import Stokes
-from polmvs.polarization.tilted import correct_stokes
 from polmvs.poses.alignment import AlignmentReport
 from polmvs.scene import View
 
@@ -156,7 +155,7 @@ class ViewData:
     def _for(self, model: AngleModel, stokes: Stokes) -> Stokes:
         if model is not AngleModel.TILTED:
             return stokes
-        return correct_stokes(stokes, self.rays, light=self.light)
+        return correct_stokes(stokes, self.rays, diffuse=self.light is Light.DIFFUSE)
 
 
 def open_scene(

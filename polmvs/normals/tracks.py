@@ -57,21 +57,28 @@ def track_normals(
     model : OPA, PPA or tilted.
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps of the views.
-    options : window and estimator.
+    options : window, estimator and weights.
     """
     windows = [window_map(phase_map, options.window_px) for phase_map in maps]
-    return normals_from_windows(model, tracks, windows, options.estimator)
+    return normals_from_windows(
+        model, tracks, windows, options.estimator, tilt_aware=options.tilt_aware_weights
+    )
 
 
 def normals_from_windows(
-    model: AngleModel, tracks: Tracks, windows: Sequence[PhaseMap], estimator: Estimator
+    model: AngleModel,
+    tracks: Tracks,
+    windows: Sequence[PhaseMap],
+    estimator: Estimator,
+    *,
+    tilt_aware: bool = True,
 ) -> NormalEstimate:
     """As :func:`track_normals`, from phase maps that are averaged already (:func:`window_map`).
 
     First from the views that matched the point, which surely see it, then from every view that
     faces it.
     """
-    rows = gather_rows(model, tracks.points_in_world, windows)
+    rows = gather_rows(model, tracks.points_in_world, windows, tilt_aware=tilt_aware)
     matched = np.zeros(rows.sigma.shape, bool)
     matched[tracks.obs_view, tracks.obs_track] = True
     robust = estimator is Estimator.ROBUST

@@ -53,7 +53,7 @@ STAGE_OPTIONS: dict[str, tuple[str, ...]] = {
     "maps": ("region",),
     **{normals_stage(model): ("normals",) for model in AngleModel},
     PARTS: ("normals",),
-    **{densify_stage(model): ("propagation", "fusion") for model in AngleModel},
+    **{densify_stage(model): ("normals", "propagation", "fusion") for model in AngleModel},
     **{mesh_stage(model): () for model in AngleModel},
     **{dense_stage(model): ("fusion", "export") for model in AngleModel},
     EVALUATE: ("evaluation",),

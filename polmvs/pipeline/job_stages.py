@@ -112,7 +112,13 @@ def plan_densify(run: Run, model: AngleModel) -> Stage:
 
     def work(report: Report) -> stages.Facts:
         return cloud_stages.densify(
-            model, run.workspace, propagation, fusion, workers=run.workers, report=report
+            model,
+            run.workspace,
+            propagation,
+            fusion,
+            tilt_aware=run.options.normals.tilt_aware_weights,
+            workers=run.workers,
+            report=report,
         )
 
     return Stage(

@@ -49,6 +49,7 @@ def integrate(
     options: PropagationOptions,
     folder: Path,
     *,
+    tilt_aware: bool = True,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> list[DenseView | None]:
@@ -60,6 +61,7 @@ def integrate(
     maps : phase maps of the posed views.
     seeds : points on the surface.
     folder : for the dense views, which stay on disk; existing files are replaced.
+    tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done, once per view and round.
 
@@ -82,7 +84,8 @@ def integrate(
             for k, near in enumerate(neighbors)
         ]
         dense = []
-        for result in workers.map(partial(_round, model, seeds, options.bending), tasks):
+        solve = partial(_round, model, seeds, options.bending, tilt_aware)
+        for result in workers.map(solve, tasks):
             dense.append(result)
             if on_progress is not None:
                 on_progress(1)
@@ -118,7 +121,9 @@ class _Task:
     path: Path
 
 
-def _round(model: AngleModel, seeds: Seeds, bending: float, task: _Task) -> DenseView | None:
+def _round(
+    model: AngleModel, seeds: Seeds, bending: float, tilt_aware: bool, task: _Task
+) -> DenseView | None:
     """One view's result on its lattice."""
     stride_px = task.plan.stride_px
     wanted = open_lattice(task.maps[0], stride_px)
@@ -132,6 +137,7 @@ def _round(model: AngleModel, seeds: Seeds, bending: float, task: _Task) -> Dens
         _lattice_nodes(task.maps[0], surface, wanted, stride_px),
         seeds,
         bending=bending,
+        tilt_aware=tilt_aware,
         use_opinions=task.plan.use_opinions,
     )
     dense = dense_view(nodes.surface, wanted, stride_px)

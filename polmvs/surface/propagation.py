@@ -53,6 +53,7 @@ def propagate(
     options: PropagationOptions,
     folder: Path,
     *,
+    tilt_aware: bool = True,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> list[DenseView | None]:
@@ -64,6 +65,7 @@ def propagate(
     maps : phase maps of the posed views.
     seeds : points on the surface.
     folder : for the dense views, which stay on disk; existing files are replaced.
+    tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done, ``(num_rounds + 1)`` times per view.
 
@@ -92,7 +94,8 @@ def propagate(
             )
             for k, near in enumerate(neighbors)
         ]
-        for k, result in enumerate(workers.map(partial(_round, model, seeds, options), tasks)):
+        solve = partial(_round, model, seeds, options, tilt_aware)
+        for k, result in enumerate(workers.map(solve, tasks)):
             nodes[k], dense[k] = result
             report(1)
     return dense
@@ -171,7 +174,7 @@ class _Task:
 
 
 def _round(
-    model: AngleModel, seeds: Seeds, options: PropagationOptions, task: _Task
+    model: AngleModel, seeds: Seeds, options: PropagationOptions, tilt_aware: bool, task: _Task
 ) -> tuple[Nodes | None, DenseView | None]:
     """Normals and ranges of one view's nodes, and the dense view that they make."""
     if task.nodes is None:
@@ -183,6 +186,7 @@ def _round(
         task.nodes,
         seeds,
         bending=options.bending,
+        tilt_aware=tilt_aware,
         along_contours=options.contour is Contour.TANGENT,
     )
     dense = spread_nodes(task.maps[0], nodes.surface, task.stride_px, 2 * options.spacing_px)

@@ -90,6 +90,7 @@ def relax(
     seeds: Seeds,
     *,
     bending: float,
+    tilt_aware: bool = True,
     along_contours: bool = False,
     use_opinions: bool = False,
 ) -> Nodes:
@@ -103,6 +104,7 @@ def relax(
     nodes : of the first view, with the ranges and normals of the round before.
     seeds : points on the surface.
     bending : deviation of the smooth modes, as a share of the distance; 0: none.
+    tilt_aware : of the rows' weights.
     along_contours : ranges (OPA: depths) are constant along the nodes' contours.
     use_opinions : the surfaces that the other views see tie the nodes, too.
     """
@@ -112,7 +114,7 @@ def relax(
     unknown = ~np.isfinite(surface.log_range)
     points[unknown] = center  # anywhere
     range_maps = [d.range_map if d is not None else None for d in dense]
-    rows = gather_rows(model, points, maps, range_maps)
+    rows = gather_rows(model, points, maps, range_maps, tilt_aware=tilt_aware)
     rows.sigma[:, unknown] = np.inf  # other views may see this one's camera: no rows
     estimate = solve_normals(rows.rows, rows.rays, rows.sigma, initial_normals=surface.normals.T)
     normals, normal_sigma = fill_normals(nodes, estimate)

@@ -90,7 +90,7 @@ def plane_normal(
     Parameters
     ----------
     model : OPA, PPA, or tilted (then ``axial`` is of corrected images,
-    :mod:`polmvs.polarization.tilted`).
+    :mod:`polmvs.polarization.angle_models`).
     axial : (2, N), ``(cos 2 phase, sin 2 phase)`` times any positive number.
     rays : (3, N), camera frame, of any length.
     sigma : (N,), standard deviation of the phase, rad.

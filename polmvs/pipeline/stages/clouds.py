@@ -79,6 +79,7 @@ def place_parts(
             seeds,
             points,
             max_neighbors=max_neighbors,
+            tilt_aware=options.tilt_aware_weights,
             workers=workers,
         )
         found = np.column_stack([new.points_in_world, new.normals_in_world, _shared_sigma(new)])
@@ -184,12 +185,13 @@ def densify(
     propagation: PropagationOptions,
     fusion: FusionOptions,
     *,
+    tilt_aware: bool = True,
     workers: Workers,
     report: Report,
 ) -> Facts:
     """Spread the seeds over the region of every view and fuse the views into one cloud.
 
-    Without a region or seeds the surface has no points.
+    Without a region or seeds the surface has no points. ``tilt_aware`` as in ``NormalOptions``.
     """
     maps = open_maps(workspace, model)
     seeds = load_seeds(model, workspace)
@@ -203,7 +205,14 @@ def densify(
         else:
             spread = integrate if propagation.method is Method.INTEGRATE else propagate
             dense = spread(
-                model, maps, seeds, propagation, folder, workers=workers, on_progress=report
+                model,
+                maps,
+                seeds,
+                propagation,
+                folder,
+                tilt_aware=tilt_aware,
+                workers=workers,
+                on_progress=report,
             )
 
             confirmed: dict[int, NDArray[np.bool_]] = {}

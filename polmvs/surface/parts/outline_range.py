@@ -44,11 +44,13 @@ class Reference:
     maps : of the views, the piece's own first.
     pieces : of each view.
     index : of the piece among those of the first view.
+    tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
     """
 
     maps: Sequence[PhaseMap]
     pieces: Sequence[Sequence[Piece]]
     index: int
+    tilt_aware: bool = True
 
     @property
     def piece(self) -> Piece:

@@ -72,6 +72,7 @@ def find_part_seeds(
     points_in_world: Array,
     *,
     max_neighbors: int = 15,
+    tilt_aware: bool = True,
     workers: Workers | None = None,
 ) -> tuple[Seeds, list[PartReport]]:
     """Place the parts on which no seed lies, and put seeds on them.
@@ -84,6 +85,7 @@ def find_part_seeds(
         other views show it so.
     points_in_world : (N, 3), points of the scene; they bound the range of the parts.
     max_neighbors : other views that place a piece.
+    tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
     workers : processes to share the views among; None: this one.
 
     Returns
@@ -97,6 +99,7 @@ def find_part_seeds(
     pieces = list(workers.map(_pieces_of, maps))
     seeded = _seeded_pieces(maps, pieces, seeds)
     search = _Search(model, maps, pieces, seeded, points_in_world, max_neighbors, workers)
+    search.tilt_aware = tilt_aware
     return search.run()
 
 
@@ -132,6 +135,7 @@ class _Search:
     ) -> None:
         self.model, self.maps, self.pieces, self.done = model, maps, pieces, set(seeded)
         self.points, self.max_neighbors, self.workers = points_in_world, max_neighbors, workers
+        self.tilt_aware = True
         unseeded = {(k, i) for k, found in enumerate(pieces) for i in range(len(found))} - seeded
         self.left = sorted(unseeded, key=self._rank)
         self.tries = dict.fromkeys(self.left, 0)
@@ -168,7 +172,8 @@ class _Search:
         references, bounds = [], []
         for lead, near, middle in zip(leads, views, middles, strict=True):
             chosen = [self.pieces[k] for k in near]
-            references.append(Reference([self.maps[k] for k in near], chosen, lead[1]))
+            maps = [self.maps[k] for k in near]
+            references.append(Reference(maps, chosen, lead[1], self.tilt_aware))
             low, high = self._bounds(lead[0])
             if middle is not None:
                 low, high = middle - FOLLOWER_BOUNDS, middle + FOLLOWER_BOUNDS

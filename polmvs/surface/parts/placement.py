@@ -197,7 +197,15 @@ def _solve_shape(
     place = points_of(surface[np.array([pivot])], center)  # a seed that holds the middle
     held = Seeds(place, np.full((1, 3), np.nan), np.full(1, 1e-4 * np.exp(log_range)))
     blind = [None] * len(reference.maps)
-    nodes = relax(model, reference.maps, blind, replace(nodes, surface=surface), held, bending=0.0)
+    nodes = relax(
+        model,
+        reference.maps,
+        blind,
+        replace(nodes, surface=surface),
+        held,
+        bending=0.0,
+        tilt_aware=reference.tilt_aware,
+    )
     if not known(nodes.surface)[pivot]:
         return None
     return _State(nodes, rim_of(reference, nodes), log_range)
@@ -256,7 +264,7 @@ def _describe(model: AngleModel, reference: Reference, state: _State) -> Placeme
     surface = state.nodes.surface[np.flatnonzero(known(state.nodes.surface))]
     center = reference.maps[0].view.center_in_world
     points = points_of(surface, center)
-    rows = gather_rows(model, points, reference.maps)
+    rows = gather_rows(model, points, reference.maps, tilt_aware=reference.tilt_aware)
     estimate = solve_normals(rows.rows, rows.rays, rows.sigma, initial_normals=surface.normals.T)
     used = np.isfinite(rows.sigma)
     outliers = float((1 - estimate.row_weights)[used].mean()) if used.any() else 1.0
