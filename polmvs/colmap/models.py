@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -39,12 +40,15 @@ BORDER_SAMPLES = 64  # along each side of the image
 MODEL_FILES = ("cameras", "images", "points3D")  # rigs and frames came with COLMAP 3.12
 
 
-def set_verbosity(verbose: bool) -> None:
-    """Let COLMAP's own log through to stderr, or keep it quiet."""
-    pycolmap.logging.minloglevel = 0 if verbose else 3
-
-
-set_verbosity(False)  # pycolmap logs every step by default
+@contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """Keep COLMAP's own log off stderr, which says every step; afterwards it is as it was."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 3
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
 
 
 @dataclass(frozen=True, kw_only=True)
