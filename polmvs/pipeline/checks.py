@@ -17,7 +17,7 @@ from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.capture import find_mask, fit_model, image_names
 from polmvs.polarization.capture import Capture
-from polmvs.poses.metric_sources import check_reference
+from polmvs.poses.metric_frame import check_reference
 from polmvs.scene import SparseModel
 
 EVALUATE = "evaluate"

@@ -32,8 +32,7 @@ from polmvs.polarization.phase_map import (
     turned,
 )
 from polmvs.polarization.region import find_region
-from polmvs.poses.metric_frame import transform_model
-from polmvs.poses.metric_sources import metric_frame
+from polmvs.poses.metric_frame import metric_frame, transform_model
 from polmvs.scene import SparseModel, Tracks, View, short_list
 
 logger = logging.getLogger(__name__)
