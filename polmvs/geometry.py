@@ -109,3 +109,25 @@ def align_points(source: Array, target: Array) -> SimilarityTransform:
     scale = float((singular * sign).sum() / (source_centered**2).sum())
     translation = target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
     return SimilarityTransform(scale, rotation, translation)
+
+
+def intersect_rays(centers: Array, rays: Array) -> Array:
+    """Points nearest to rays in the least-squares sense.
+
+    Parameters
+    ----------
+    centers : (..., V, 3), where the rays begin.
+    rays : (..., V, 3), unit.
+
+    Returns
+    -------
+    (..., 3) float64
+        NaN where the rays are parallel.
+    """
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    matrix = across.sum(axis=-3)
+    target = np.einsum("...vij,...vj->...i", across, centers)
+    parallel = np.linalg.eigvalsh(matrix)[..., 0] < 1e-12
+    matrix = np.where(parallel[..., None, None], np.eye(3), matrix)
+    points = np.linalg.solve(matrix, target[..., None])[..., 0]
+    return np.where(parallel[..., None], np.nan, points)

@@ -17,7 +17,7 @@ from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.maps import find_mask
 from polmvs.pipeline.stages.poses import fit_model
 from polmvs.polarization.capture import Capture
-from polmvs.poses.metric_sources import check_reference
+from polmvs.poses.metric_frame import check_reference
 from polmvs.scene import SparseModel
 
 
