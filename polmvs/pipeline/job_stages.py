@@ -90,9 +90,11 @@ def _part_stage(run: Run) -> Stage:
             run.options.normals,
             max_neighbors=run.options.propagation.max_neighbors,
             workers=run.workers,
+            report=report,
         )
 
-    return Stage(name=PARTS, work=work, after=(normals_stage(AngleModel.PPA),))
+    after = (normals_stage(AngleModel.PPA),)
+    return Stage(name=PARTS, work=work, after=after, total=_num_views(run))
 
 
 def _normal_stage(run: Run, model: AngleModel) -> Stage:

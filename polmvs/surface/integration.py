@@ -32,8 +32,8 @@ from polmvs.surface.dense_view import (
     view_samples,
 )
 from polmvs.surface.pixel_graph import Nodes, uncrossed
-from polmvs.surface.propagation import choose_neighbors
 from polmvs.surface.relaxation import open_lattice, relax, surface_at_seeds
+from polmvs.surface.view_selection import choose_neighbors
 
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]

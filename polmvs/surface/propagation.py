@@ -24,6 +24,7 @@ from polmvs.surface.contour import Contours, cover_with_contours, direction_fiel
 from polmvs.surface.dense_view import DenseView, store_dense_view
 from polmvs.surface.pixel_graph import Nodes, connect, visible_seeds
 from polmvs.surface.relaxation import relax, spread_nodes, surface_at_seeds
+from polmvs.surface.view_selection import choose_neighbors
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
@@ -32,18 +33,6 @@ Image = NDArray[np.float32]
 
 MIN_CONTOUR_DOLP = 0.05  # smoothed; contours stop under it
 MAX_STACKED_VIEWS = 8  # whose contours are traced together
-
-
-def choose_neighbors(maps: Sequence[PhaseMap], seeds: Seeds, max_neighbors: int) -> list[list[int]]:
-    """For each view, itself first, then the views that share most seeds with it."""
-    seen = np.array([visible_seeds(m, seeds)[0] for m in maps], float).reshape(len(maps), -1)
-    shared = seen @ seen.T
-    neighbors = []
-    for k in range(len(maps)):
-        shared[k, k] = np.inf
-        order = np.argsort(-shared[k], kind="stable")
-        neighbors.append([int(j) for j in order[: max_neighbors + 1]])
-    return neighbors
 
 
 def propagate(

@@ -62,7 +62,12 @@ def solve_tracks(
 
 
 def place_parts(
-    workspace: RunFolder, options: NormalOptions, *, max_neighbors: int, workers: Workers
+    workspace: RunFolder,
+    options: NormalOptions,
+    *,
+    max_neighbors: int,
+    workers: Workers,
+    report: Report,
 ) -> Facts:
     """Seeds for the parts on which none of the sparse points lies, from their outlines.
 
@@ -81,6 +86,7 @@ def place_parts(
             max_neighbors=max_neighbors,
             tilt_aware=options.tilt_aware_weights,
             workers=workers,
+            on_progress=report,
         )
         found = np.column_stack([new.points_in_world, new.normals_in_world, _shared_sigma(new)])
         _drop_seeds(workspace, contradicted(seeds, new))

@@ -8,7 +8,7 @@ other views, each from its own phases and outline, put the same surface at the s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -42,6 +42,7 @@ FOLLOWER_BOUNDS = 0.12  # of log range about where the first view puts the part
 MAX_FOLLOWERS = 6  # views that place a part again
 MAX_TRIES = 3  # first views for what may be one part
 NUM_PART_SEEDS = 48
+PLACEMENTS_PER_VIEW = 6  # bounds the search's time; five parts of a whole capture take two
 MIN_SEEDS = 3  # on a piece: fewer cannot bear each other out, and one false track is enough
 
 
@@ -73,7 +74,9 @@ def find_part_seeds(
     *,
     max_neighbors: int = 15,
     tilt_aware: bool = True,
+    placements_per_view: int = PLACEMENTS_PER_VIEW,
     workers: Workers | None = None,
+    on_progress: Callable[[int], None] | None = None,
 ) -> tuple[Seeds, list[PartReport]]:
     """Place the parts on which no seed lies, and put seeds on them.
 
@@ -86,7 +89,10 @@ def find_part_seeds(
     points_in_world : (N, 3), points of the scene; they bound the range of the parts.
     max_neighbors : other views that place a piece.
     tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
+    placements_per_view : after as many times the number of views the search ends; pieces that it
+        has not come to, the smallest ones, are reported as not tried. One costs half a second.
     workers : processes to share the views among; None: this one.
+    on_progress : called with 1 as many times as there are views, as pieces are decided.
 
     Returns
     -------
@@ -100,7 +106,8 @@ def find_part_seeds(
     seeded = _seeded_pieces(maps, pieces, seeds)
     search = _Search(model, maps, pieces, seeded, points_in_world, max_neighbors, workers)
     search.tilt_aware = tilt_aware
-    return search.run()
+    search.placements_left = placements_per_view * len(maps)
+    return search.run(_Progress(len(search.left), len(maps), on_progress))
 
 
 def _pieces_of(phase_map: PhaseMap) -> list[Piece]:
@@ -120,6 +127,23 @@ def _seeded_pieces(
     return seeded
 
 
+class _Progress:
+    """Tells of a number of steps, in proportion to the pieces that are decided."""
+
+    def __init__(
+        self, num_pieces: int, num_steps: int, on_progress: Callable[[int], None] | None
+    ) -> None:
+        self.num_pieces, self.num_steps, self.told = num_pieces, num_steps, 0
+        self.on_progress = on_progress
+
+    def left(self, num_left: int) -> None:
+        """So many pieces are not decided yet."""
+        share = 1 - num_left / max(self.num_pieces, 1) if num_left else 1.0
+        while self.on_progress is not None and self.told < int(share * self.num_steps):
+            self.told += 1
+            self.on_progress(1)
+
+
 class _Search:
     """Pieces still to be placed, and what was found."""
 
@@ -136,6 +160,7 @@ class _Search:
         self.model, self.maps, self.pieces, self.done = model, maps, pieces, set(seeded)
         self.points, self.max_neighbors, self.workers = points_in_world, max_neighbors, workers
         self.tilt_aware = True
+        self.placements_left = PLACEMENTS_PER_VIEW * len(maps)
         unseeded = {(k, i) for k, found in enumerate(pieces) for i in range(len(found))} - seeded
         self.left = sorted(unseeded, key=self._rank)
         self.tries = dict.fromkeys(self.left, 0)
@@ -146,10 +171,11 @@ class _Search:
         found = self.pieces[piece[0]][piece[1]]
         return -found.num_px * (1 - found.cut_share)
 
-    def run(self) -> tuple[Seeds, list[PartReport]]:
+    def run(self, progress: _Progress) -> tuple[Seeds, list[PartReport]]:
         """Place part after part."""
         parts, reports = [], []
-        while self.left:
+        while self.left and self.placements_left > 0:
+            progress.left(len(self.left))
             lead = self.left.pop(0)
             first = self._place([lead], [None])[0]
             members, doubt = self._agreement(first)
@@ -164,6 +190,9 @@ class _Search:
             reports.append(report)
             self._drop(set().union(*(member.pieces for member in members)) | {lead})
         reports += [report for _, report in self.failures]
+        if self.left:
+            reports.append(self._not_tried())
+        progress.left(0)
         return join_seeds(parts), reports
 
     def _place(self, leads: list[PieceId], middles: Sequence[float | None]) -> list[_Member]:
@@ -178,6 +207,7 @@ class _Search:
             if middle is not None:
                 low, high = middle - FOLLOWER_BOUNDS, middle + FOLLOWER_BOUNDS
             bounds.append((low, high))
+        self.placements_left -= len(leads)
         placements = self.workers.map(partial(place_piece, self.model), references, bounds)
         return [_Member(*each) for each in zip(leads, views, placements, strict=True)]
 
@@ -270,6 +300,22 @@ class _Search:
             sigma=placement.sigma * normal_depth(placement),
             outline_px=placement.outline_px,
             phase_deg=placement.phase_deg,
+        )
+
+    def _not_tried(self) -> PartReport:
+        """What is left when the search ends, by the largest of it."""
+        k, index = self.left[0]
+        others = f", nor were {len(self.left) - 1} smaller ones" if len(self.left) > 1 else ""
+        return PartReport(
+            view=self.maps[k].view.name,
+            num_px=self.pieces[k][index].num_px,
+            num_views=0,
+            num_agreeing=0,
+            doubt=f"it was not tried{others}: too many pieces without sparse points",
+            range=np.nan,
+            sigma=np.nan,
+            outline_px=np.nan,
+            phase_deg=np.nan,
         )
 
     def _fail(self, member: _Member, doubt: str) -> None:
