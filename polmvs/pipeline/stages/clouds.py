@@ -21,12 +21,11 @@ from polmvs.pipeline.scene_cloud import join_clouds, open_given, surface_cloud, 
 from polmvs.pipeline.stages.capture import Facts, Report, open_maps, posed_views, tilt_maps
 from polmvs.scene import Seeds, Tracks
 from polmvs.surface.consensus import hidden_by
+from polmvs.surface.contour import propagate
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
 from polmvs.surface.fusion import fuse, no_points
 from polmvs.surface.integration import integrate, plan_rounds
-from polmvs.surface.parts.agreement import PartReport, contradicted, join_seeds
-from polmvs.surface.parts.pieces import find_part_seeds
-from polmvs.surface.propagation import propagate
+from polmvs.surface.parts import PartReport, contradicted, find_part_seeds, join_seeds
 
 logger = logging.getLogger(__name__)
 

@@ -12,13 +12,15 @@ from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import store_phase_map
 from polmvs.polarization.region import Region
 from polmvs.scene import Seeds
-from polmvs.surface.parts import pieces
-from polmvs.surface.parts.agreement import contradicted, join_seeds, most_agreeing
-from polmvs.surface.parts.misfit import Misfit
-from polmvs.surface.parts.outline import FAR_PX, find_pieces
-from polmvs.surface.parts.outline_range import piece_nodes
-from polmvs.surface.parts.pieces import find_part_seeds
-from polmvs.surface.parts.placement import Placement
+from polmvs.surface.outlines import FAR_PX, Misfit, find_pieces, piece_nodes
+from polmvs.surface.parts import (
+    Placement,
+    contradicted,
+    find_part_seeds,
+    join_seeds,
+    most_agreeing,
+    pieces,
+)
 from polmvs.surface.pixel_graph import visible_seeds
 from polmvs.synthetic.captures import Plane, render_view, ring_of_views
 from polmvs.synthetic.surfaces import Group, Sphere
