@@ -12,8 +12,7 @@ from polmvs.config import AngleModel
 from polmvs.normals.rows import gather_rows
 from polmvs.polarization.phase_map import as_tilted, turned
 from polmvs.scene import Seeds
-from polmvs.surface.pixel_graph import Nodes, tie_seeds
-from polmvs.surface.relaxation import (
+from polmvs.surface.integration import (
     OPINION_REACH_PX,
     open_lattice,
     relax,
@@ -21,6 +20,7 @@ from polmvs.surface.relaxation import (
     surface_at_seeds,
     tie_opinions,
 )
+from polmvs.surface.pixel_graph import Nodes, tie_seeds
 from polmvs.synthetic.captures import render_view, ring_of_views
 
 STRIDE = 4

@@ -6,7 +6,7 @@ from polmvs.colmap.cameras import ColmapCamera
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import Region, smooth
 from polmvs.scene import View
-from polmvs.surface.stereo import (
+from polmvs.surface.surroundings import (
     combine_ranges,
     fit_planes,
     match,

@@ -24,8 +24,15 @@ from scipy.optimize import minimize_scalar
 
 from polmvs.config import AngleModel, Light
 from polmvs.normals.estimator import CAUCHY_SCALE
-from polmvs.normals.single_view.phase_errors import error_gradients, phase_errors, stack_samples
-from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal, robust_deviation, tangents
+from polmvs.normals.single_view.plane import (
+    PlaneEstimate,
+    error_gradients,
+    phase_errors,
+    plane_normal,
+    robust_deviation,
+    stack_samples,
+    tangents,
+)
 from polmvs.polarization.angle_models import correct_parameters, phase_sign, sigma_scale
 
 Floats: TypeAlias = NDArray[np.floating[Any]]

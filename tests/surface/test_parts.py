@@ -12,10 +12,15 @@ from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import store_phase_map
 from polmvs.polarization.region import Region
 from polmvs.scene import Seeds
-from polmvs.surface.parts.agreement import contradicted, join_seeds, most_agreeing
-from polmvs.surface.parts.misfit import Misfit
-from polmvs.surface.parts.outline import FAR_PX, find_pieces
-from polmvs.surface.parts.pieces import find_part_seeds
+from polmvs.surface.outlines import FAR_PX, Misfit, find_pieces, piece_nodes
+from polmvs.surface.parts import (
+    Placement,
+    contradicted,
+    find_part_seeds,
+    join_seeds,
+    most_agreeing,
+    pieces,
+)
 from polmvs.surface.pixel_graph import visible_seeds
 from polmvs.synthetic.captures import Plane, render_view, ring_of_views
 from polmvs.synthetic.surfaces import Group, Sphere
@@ -274,6 +279,30 @@ def test_the_frame_and_scale_of_the_world_do_not_matter(board, board_result):
 def test_a_scene_without_points_has_no_bounds(board):
     with pytest.raises(ValueError, match="no bounds"):
         find_part_seeds(AngleModel.PPA, board.maps, NO_SEEDS, np.zeros((0, 3)))
+
+
+def test_the_search_is_bounded_and_says_so(board, monkeypatch):
+    """Weak polarisation breaks a scene into hundreds of pieces; each costs half a second."""
+    placed, told = [], []
+
+    def nowhere(model, reference, bounds):
+        placed.append(reference.index)
+        matched = np.full(len(reference.maps), -1)
+        matched[0] = reference.index
+        nodes = piece_nodes(reference.maps[0], reference.piece)
+        surface = nodes.surface[np.zeros(0, int)]
+        return Placement(surface, np.zeros(3), np.nan, np.inf, matched, np.nan, np.nan, "lost")
+
+    found = {id(m): find_pieces(m.region, m.intensity) for m in board.maps}
+    monkeypatch.setattr(pieces, "_pieces_of", lambda phase_map: 40 * found[id(phase_map)])
+    monkeypatch.setattr(pieces, "place_piece", nowhere)
+    seeds, reports = find_part_seeds(
+        AngleModel.PPA, board.maps, NO_SEEDS, ABOUT, placements_per_view=3, on_progress=told.append
+    )
+    assert len(seeds.sigma) == 0
+    assert len(placed) == 3 * len(board.maps)
+    assert "not tried" in reports[-1].doubt
+    assert told == [1] * len(board.maps)
 
 
 def test_no_placements_agree_on_nothing():
