@@ -54,7 +54,7 @@ def read_mosaic(path: PathArg) -> Mosaic:
     DataError
         The file is missing, truncated, no image, in colour, of odd size or of another type.
     """
-    image = _decode(path, _read_bytes(path))
+    image = decode_image(path, read_bytes(path))
     if image.ndim != 2:
         raise DataError(
             path,
@@ -79,9 +79,9 @@ def probe_mosaic(path: PathArg) -> MosaicHeader:
     DataError
         As :func:`read_mosaic`.
     """
-    data = _read_bytes(path)
+    data = read_bytes(path)
     if data.startswith(PNG_SIGNATURE):
-        _check_png(path, data)
+        check_png(path, data)
         width, height, bit_depth, colour_type = struct.unpack_from(">IIBB", data, 16)
         if colour_type == PNG_GRAY and bit_depth in (8, 16):
             _require_even(path, width=width, height=height)
@@ -108,7 +108,7 @@ def read_mask(path: PathArg, shape: tuple[int, int]) -> NDArray[np.bool_]:
     DataError
         The file is missing, truncated, no image or of another size.
     """
-    image = _decode(path, _read_bytes(path))
+    image = decode_image(path, read_bytes(path))
     height, width = image.shape[:2]
     if (height, width) != tuple(shape):
         raise DataError(
@@ -129,7 +129,7 @@ def read_gray(path: PathArg) -> NDArray[np.uint8]:
     DataError
         The file is missing, truncated, no image or not of 8 bit.
     """
-    image = _decode(path, _read_bytes(path))
+    image = decode_image(path, read_bytes(path))
     if image.dtype != np.uint8:
         raise DataError(path, "is no 8-bit image.")
     gray = image if image.ndim == 2 else np.rint(image[..., :3].mean(axis=-1))
@@ -187,7 +187,7 @@ def _remove_quietly(path: Path) -> None:
         return
 
 
-def _read_bytes(path: PathArg) -> bytes:
+def read_bytes(path: PathArg) -> bytes:
     """A file's content, or a ``DataError`` with the system's reason."""
     try:
         data = Path(path).read_bytes()
@@ -206,10 +206,10 @@ def _set_log_level(level: int) -> int:
     return int(setter(level))
 
 
-def _decode(path: PathArg, data: bytes) -> NDArray[Any]:
+def decode_image(path: PathArg, data: bytes) -> NDArray[Any]:
     """Pixels of an encoded image, unchanged; OpenCV's own complaints are kept off the terminal."""
     if data.startswith(PNG_SIGNATURE):
-        _check_png(path, data)
+        check_png(path, data)
     level = _set_log_level(SILENT)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -222,7 +222,7 @@ def _decode(path: PathArg, data: bytes) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def _check_png(path: PathArg, data: bytes) -> None:
+def check_png(path: PathArg, data: bytes) -> None:
     """Walk the chunks to IEND: OpenCV may fill the missing part of a truncated PNG with zeros."""
     view = memoryview(data)
     position = len(PNG_SIGNATURE)
