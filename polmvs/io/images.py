@@ -1,4 +1,4 @@
-"""Image files at the edge: raw mosaics and masks in, PNG out; every fault is a ``DataError``."""
+"""Image files at the edge: decoding, masks in, PNG out; every fault is a ``DataError``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import struct
 import zlib
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -16,79 +16,10 @@ from numpy.typing import NDArray
 from polmvs.errors import DataError
 
 PathArg: TypeAlias = str | PathLike[str]
-Mosaic: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 SILENT = 0  # OpenCV's log level
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_GRAY = 0  # colour type of a monochrome PNG without alpha
 BROKEN = "Copy it again from the camera or take it out of the folder."
-
-
-class MosaicHeader(NamedTuple):
-    """What is known of a mosaic before its pixels are used.
-
-    Attributes
-    ----------
-    width, height : of the raw mosaic, px.
-    bit_depth : of the file's samples, 8 or 16.
-    """
-
-    width: int
-    height: int
-    bit_depth: int
-
-
-def read_mosaic(path: PathArg) -> Mosaic:
-    """Read a raw polarizer mosaic as it was stored.
-
-    Parameters
-    ----------
-    path : an 8- or 16-bit monochrome PNG, TIFF, BMP or PGM.
-
-    Returns
-    -------
-    (H, W) uint8 or uint16, H and W even.
-
-    Raises
-    ------
-    DataError
-        The file is missing, truncated, no image, in colour, of odd size or of another type.
-    """
-    image = decode_image(path, read_bytes(path))
-    if image.ndim != 2:
-        raise DataError(
-            path,
-            f"has {image.shape[2]} channels; a monochrome polarizer mosaic is expected. "
-            "Record the camera's raw format (Mono8 to Mono16), not a colour or processed one.",
-        )
-    if image.dtype not in (np.uint8, np.uint16):
-        raise DataError(
-            path, f"has {image.dtype} samples; export the raw mosaic as 8- or 16-bit integers."
-        )
-    _require_even(path, width=image.shape[1], height=image.shape[0])
-    return image
-
-
-def probe_mosaic(path: PathArg) -> MosaicHeader:
-    """Check a mosaic as :func:`read_mosaic` does, without decoding its pixels where it is a PNG.
-
-    The checksums of a PNG are verified, so that it will decode later. Other formats are decoded.
-
-    Raises
-    ------
-    DataError
-        As :func:`read_mosaic`.
-    """
-    data = read_bytes(path)
-    if data.startswith(PNG_SIGNATURE):
-        check_png(path, data)
-        width, height, bit_depth, colour_type = struct.unpack_from(">IIBB", data, 16)
-        if colour_type == PNG_GRAY and bit_depth in (8, 16):
-            _require_even(path, width=width, height=height)
-            return MosaicHeader(width, height, bit_depth)
-    del data
-    raw = read_mosaic(path)
-    return MosaicHeader(raw.shape[1], raw.shape[0], 8 * raw.dtype.itemsize)
 
 
 def read_mask(path: PathArg, shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -241,13 +172,3 @@ def check_png(path: PathArg, data: bytes) -> None:
         if zlib.crc32(view[position + 4 : end - 4]) != checksum:
             raise DataError(path, f"is damaged: wrong checksum at byte {position}. {BROKEN}")
         position = end
-
-
-def _require_even(path: PathArg, *, width: int, height: int) -> None:
-    """A mosaic is made of whole 2x2 cells."""
-    if width % 2 or height % 2 or not width or not height:
-        raise DataError(
-            path,
-            f"is {width}x{height} px; a polarizer mosaic has an even width and height. "
-            "Set the camera's region of interest to even offsets and sizes.",
-        )

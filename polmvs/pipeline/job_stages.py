@@ -28,7 +28,7 @@ def plan_capture(run: Run) -> Stage:
     def work(report: Report) -> stages.Facts:
         return stages.write_images(run.capture, run.workspace, workers=run.workers, report=report)
 
-    return Stage(name="capture", work=work, total=len(run.capture.paths))
+    return Stage(name="capture", work=work, total=len(run.capture.names))
 
 
 def plan_poses(run: Run) -> Stage:
@@ -167,4 +167,4 @@ def plan_evaluation(run: Run, models: Sequence[AngleModel]) -> Stage:
 
 
 def _num_views(run: Run) -> int:
-    return int(run.record.results.get("num_views", len(run.capture.paths)))
+    return int(run.record.results.get("num_views", len(run.capture.names)))

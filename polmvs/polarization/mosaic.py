@@ -101,7 +101,11 @@ def split_mosaic_full(raw: NDArray[Any], pattern: tuple[int, int, int, int]) -> 
 
 
 def split_colour_mosaic(
-    raw: NDArray[Any], pattern: tuple[int, int, int, int], bayer: BayerOrder
+    raw: NDArray[Any],
+    pattern: tuple[int, int, int, int],
+    bayer: BayerOrder,
+    *,
+    full: bool = False,
 ) -> Image:
     """Four angle images of each colour at the centres of the 2x2 cells, bilinear.
 
@@ -110,23 +114,25 @@ def split_colour_mosaic(
     raw : (H, W), H and W multiples of 4, linear.
     pattern : polarizer angles of a 2x2 cell, row by row, degrees.
     bayer : colours of the 2x2 cells, row by row.
+    full : at the mosaic's own pixels instead.
 
     Returns
     -------
-    (3, 4, H/2, W/2) float32: red, green, blue; angles 0, 45, 90, 135 degrees.
+    (3, 4, H/2, W/2) float32, in full (3, 4, H, W): red, green, blue; 0, 45, 90, 135 degrees.
     """
     _require_cells(raw)
     _require_pattern(pattern)
     if raw.shape[0] % 4 or raw.shape[1] % 4:
         raise ValueError(f"{raw.shape=} but expected multiples of 4.")
-    half = (raw.shape[0] // 2, raw.shape[1] // 2)
-    images = np.zeros((3, 4, *half), np.float32)
+    shape = (raw.shape[0], raw.shape[1]) if full else (raw.shape[0] // 2, raw.shape[1] // 2)
+    first = (0.0, 0.0) if full else (0.5, 0.5)
+    images = np.zeros((3, 4, *shape), np.float32)
     for block, colour in enumerate(bayer):
         channel = "rgb".index(colour)
         for cell, angle in enumerate(pattern):
             row = 2 * (block // 2) + cell // 2
             col = 2 * (block % 2) + cell % 2
-            filled = _fill_lattice(raw, row, col, 4, half, (0.5, 0.5))
+            filled = _fill_lattice(raw, row, col, 4, shape, first)
             images[channel, ANGLES_DEG.index(angle)] += filled
     images[1] *= np.float32(0.5)  # two of the four blocks are green
     return images
@@ -167,25 +173,35 @@ def turned_pattern(
     return tuple(int(angle) % 180 for angle in cell.ravel())  # type: ignore[return-value]
 
 
-def clipped_cells(raw: NDArray[Any], threshold: float) -> NDArray[np.bool_]:
-    """Half-size pixels to which a clipped raw sample contributes.
+def clipped_cells(
+    raw: NDArray[Any], threshold: float, *, colour: bool = False, full: bool = False
+) -> NDArray[np.bool_]:
+    """Pixels of the polarization images to which a clipped raw sample contributes.
 
     Parameters
     ----------
     raw : (H, W), H and W even.
     threshold : raw value from which a sample counts as clipped.
+    colour, full : of a colour mosaic, in full resolution; see :func:`split_colour_mosaic`.
 
     Returns
     -------
-    (H/2, W/2) bool: a sample of the 4x4 raw px about the cell's centre is clipped.
+    (H/2, W/2) bool, in full (H, W): a sample that is interpolated from is clipped. Of a monochrome
+    mosaic in half resolution that is the 4x4 raw px about the cell's centre.
     """
     _require_cells(raw)
     clipped = np.asarray(raw >= threshold, np.uint8)
+    step = 1 if full else 2
     if not clipped.any():
-        return np.zeros((raw.shape[0] // 2, raw.shape[1] // 2), np.bool_)
-    # With this anchor pixel (r, c) covers rows r - 1 to r + 2, the reach of cell (r / 2, c / 2).
-    reach = cv2.dilate(clipped, np.ones((4, 4), np.uint8), anchor=(1, 1))
-    return np.asarray(reach[::2, ::2] != 0)
+        return np.zeros((raw.shape[0] // step, raw.shape[1] // step), np.bool_)
+    # Samples of one lattice lie 2 px apart, of one colour 4: a pixel is between two of them. With
+    # the anchor of half resolution, pixel (r, c) covers rows r - 1 to r + 2, the reach of cell
+    # (r / 2, c / 2); in colour r - 3 to r + 4.
+    reach_px = 3 if colour else 1
+    size = 2 * reach_px + step
+    kernel = np.ones((size, size), np.uint8)
+    reach = cv2.dilate(clipped, kernel, anchor=(reach_px, reach_px))
+    return np.asarray(reach[::step, ::step] != 0)
 
 
 def _taps(offset: int) -> NDArray[np.float32]:

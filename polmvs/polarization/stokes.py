@@ -37,7 +37,7 @@ of the AoLP is within one stated deviation for 33 % of the pixels without this t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, NamedTuple, TypeAlias
 
@@ -253,8 +253,24 @@ def stokes_from_maps(
     """
     images = [np.asarray(image, np.float32) for image in (s0, s1, s2)]
     none = np.empty((0, *images[0].shape), np.float32)
-    variance = _variance(*images, none, valid, quantum**2 / 12.0, interpolated=False)
-    return Stokes(s0=images[0], s1=images[1], s2=images[2], sigma=np.sqrt(variance), valid=valid)
+    planes = (images[0], images[1], images[2])
+    variance = _variance(*planes, none, valid, quantum**2 / 12.0, interpolated=False)
+    return Stokes(s0=planes[0], s1=planes[1], s2=planes[2], sigma=np.sqrt(variance), valid=valid)
+
+
+def turned_axes(stokes: Stokes, *, zero_deg: float = 0.0, clockwise: bool = False) -> Stokes:
+    """Stokes images whose angles counted from another direction or the other way round.
+
+    Parameters
+    ----------
+    zero_deg : direction that they counted from, anticlockwise from +x as displayed.
+    clockwise : they counted clockwise as displayed.
+    """
+    if not clockwise and zero_deg == 0:
+        return stokes
+    s2 = -stokes.s2 if clockwise else stokes.s2
+    cos, sin = (np.float32(f(2 * np.radians(zero_deg))) for f in (np.cos, np.sin))
+    return replace(stokes, s1=cos * stokes.s1 - sin * s2, s2=sin * stokes.s1 + cos * s2)
 
 
 def combine(images: list[Stokes]) -> Stokes:
