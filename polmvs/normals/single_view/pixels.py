@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.config import AngleModel, CaptureOptions, Light
-from polmvs.io.images import probe_mosaic
 from polmvs.normals.single_view.focal import FocalEstimate, estimate_focal
 from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal
 from polmvs.normals.single_view.search import FoundPlane, find_planes
+<<<<<<< HEAD
 from polmvs.polarization.angle_models import correct_stokes, phase_sign
 from polmvs.polarization.capture import Capture, _full_scale_16
+=======
+from polmvs.polarization.angle_models import phase_sign
+from polmvs.polarization.capture import open_image
+>>>>>>> formats
 from polmvs.polarization.phase_map import MIXTURE_SIGMA, MODEL_SIGMA
 from polmvs.polarization.stokes import Stokes
 
@@ -98,17 +102,7 @@ def load_stokes(path: Path, options: CaptureOptions) -> Stokes:
     DataError
         The file is missing, damaged or no monochrome mosaic.
     """
-    header = probe_mosaic(path)
-    capture = Capture(
-        folder=path.parent,
-        paths=(path,),
-        width=header.width // 2,
-        height=header.height // 2,
-        bit_depth=header.bit_depth,
-        full_scale=255 if header.bit_depth == 8 else _full_scale_16([path]),
-        options=options,
-    )
-    return capture.load(path.name)
+    return open_image(path, options).load(path.name)
 
 
 def phase_sigma(stokes: Stokes) -> Image:
