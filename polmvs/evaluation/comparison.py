@@ -15,7 +15,7 @@ from polmvs.errors import DataError
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
 from polmvs.evaluation.map_errors import MapErrors, map_errors
 from polmvs.evaluation.metrics import AngleStats, CloudMetrics
-from polmvs.evaluation.phase_errors import phase_errors, stem_of
+from polmvs.evaluation.phase_errors import phase_errors
 from polmvs.evaluation.tables import best_fit_lines, comparison_table
 from polmvs.evaluation.truth_errors import TrackNormalErrors, evaluate, track_normal_errors
 from polmvs.io.clouds import Cloud, read_cloud
@@ -24,8 +24,8 @@ from polmvs.io.typed_json import from_json
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import Capture
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.poses.alignment import AlignmentReport
-from polmvs.scene import View
+from polmvs.poses.alignment import Alignment
+from polmvs.scene import View, stem_of
 from polmvs.surface.dense_view import DenseView
 
 DenseViews = Sequence[DenseView | None]
@@ -46,7 +46,7 @@ class TruthFigures:
     """
 
     cloud: CloudMetrics
-    alignment: AlignmentReport
+    alignment: Alignment
     tracks: TrackNormalErrors | None = None
     maps: MapErrors | None = None
 

@@ -165,6 +165,7 @@ def _find_seeds(run: StageInput) -> seeds.SeedsResult:
         max_neighbors=run.options.propagation.max_neighbors,
         tilt_aware=run.options.normals.tilt_aware_weights,
         workers=run.workers,
+        on_progress=run.on_progress,
     )
 
 
@@ -246,7 +247,7 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             decides=("capture",),
             work=_write_images,
             result=images.ImagesResult,
-            num_steps=lambda run: len(run.capture.paths),
+            num_steps=lambda run: len(run.capture.names),
         ),
         StageSpec(
             name="poses",
@@ -290,6 +291,7 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             ),
             work=_find_seeds,
             result=seeds.SeedsResult,
+            num_steps=lambda run: run.num_views if run.options.normals.unseeded else None,
         ),
     ]
     for model in AngleModel:

@@ -14,13 +14,8 @@ from polmvs.config import AngleModel, CaptureOptions, Light
 from polmvs.normals.single_view.focal import FocalEstimate, estimate_focal
 from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal
 from polmvs.normals.single_view.search import FoundPlane, find_planes
-<<<<<<< HEAD
 from polmvs.polarization.angle_models import correct_stokes, phase_sign
-from polmvs.polarization.capture import Capture, _full_scale_16
-=======
-from polmvs.polarization.angle_models import phase_sign
 from polmvs.polarization.capture import open_image
->>>>>>> formats
 from polmvs.polarization.phase_map import MIXTURE_SIGMA, MODEL_SIGMA
 from polmvs.polarization.stokes import Stokes
 

@@ -34,11 +34,11 @@ from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind, Seeds
 from polmvs.surface.consensus import hidden_by
+from polmvs.surface.contour import propagate
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse, no_points
 from polmvs.surface.integration import integrate, plan_rounds
 from polmvs.surface.kept_depth import kept_cloud
-from polmvs.surface.propagation import propagate
 from polmvs.surface.surroundings import SparseSurroundings, sparse_surroundings, stereo_surroundings
 
 logger = logging.getLogger(__name__)

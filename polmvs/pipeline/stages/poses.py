@@ -18,8 +18,7 @@ from polmvs.pipeline.monitor import OnProgress, no_progress
 from polmvs.pipeline.run_folder import replace_folder, scratch
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture
-from polmvs.poses.metric_frame import transform_model
-from polmvs.poses.metric_sources import metric_frame
+from polmvs.poses.metric_frame import metric_frame, transform_model
 from polmvs.scene import SparseModel, short_list
 
 logger = logging.getLogger(__name__)

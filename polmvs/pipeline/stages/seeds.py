@@ -18,11 +18,11 @@ from polmvs.config import AngleModel
 from polmvs.io.arrays import map_array, save_array
 from polmvs.normals.tracks import select_seeds
 from polmvs.parallel import Workers
+from polmvs.pipeline.monitor import OnProgress, no_progress
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.normals import load_track_normals
 from polmvs.scene import Seeds
-from polmvs.surface.parts.agreement import PartReport, contradicted
-from polmvs.surface.parts.pieces import find_part_seeds
+from polmvs.surface.parts import PartReport, contradicted, find_part_seeds
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +68,7 @@ def find_seeds(
     max_neighbors: int,
     tilt_aware: bool = True,
     workers: Workers | None = None,
+    on_progress: OnProgress = no_progress,
 ) -> SeedsResult:
     """Choose the seeds among the sparse points, and place the parts that have none.
 
@@ -99,6 +100,7 @@ def find_seeds(
             max_neighbors=max_neighbors,
             tilt_aware=tilt_aware,
             workers=workers,
+            on_progress=on_progress,
         )
         reports = tuple(found)
         on_parts = _rows(new, np.full(len(new.sigma), NO_TRACK))
