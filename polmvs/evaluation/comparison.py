@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Options
+from polmvs.config import AngleModel, Options, to_plain
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
 from polmvs.evaluation.map_errors import map_errors
 from polmvs.evaluation.phase_errors import phase_errors, stem_of
@@ -18,7 +18,6 @@ from polmvs.evaluation.truth_errors import evaluate, track_normal_errors
 from polmvs.io.clouds import Cloud, read_cloud
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.images import write_bytes
-from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
 from polmvs.pipeline.record import write_json
 from polmvs.pipeline.run_folder import RunFolder

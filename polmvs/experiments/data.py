@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel, Light, RegionOptions
+from polmvs.config import AngleModel, ExperimentOptions, Light, RegionOptions
 from polmvs.errors import DataError
 from polmvs.experiments.estimated_poses import estimated_views
 from polmvs.io.ground_truth import GroundTruth
@@ -30,7 +30,6 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-DEFAULT_BLUR_PX = 1.5  # the paper blurs its images and does not say how much; ours are half as wide
 BLUR_REACH = 2.0  # deviations of the blur within which a mark spoils a pixel
 
 
@@ -74,7 +73,7 @@ class Scene:
     views: tuple[View, ...]
     raw_names: tuple[str, ...]
     region: RegionOptions
-    blur_px: float = DEFAULT_BLUR_PX
+    blur_px: float = ExperimentOptions.blur_px
     alignment: AlignmentReport | None = None
 
     def settings(self) -> dict[str, Any]:
@@ -163,7 +162,7 @@ def open_scene(
     truth: Truth,
     region: RegionOptions,
     *,
-    blur_px: float = DEFAULT_BLUR_PX,
+    blur_px: float = ExperimentOptions.blur_px,
     sparse: Path | None = None,
 ) -> Scene:
     """Match a capture with its truth, and with estimated poses where they are given.
@@ -270,7 +269,7 @@ def require_counted(scene: Scene, num_counted: Sequence[int] | int) -> None:
         raise DataError(
             scene.capture.folder,
             f"no pixel of the part has a DoLP above {scene.region.min_dolp}; "
-            "give a lower --min-dolp, or the mask of a polarised surface.",
+            "give a lower `region.min_dolp`, or the mask of a polarised surface.",
         )
 
 

@@ -17,7 +17,7 @@ from polmvs.cli import flags
 from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform, SimilarityTransform
-from polmvs.option_values import from_plain, to_plain
+from polmvs.config import from_plain, to_plain
 from polmvs.poses.metric_frame import (
     Frame,
     find_name,
