@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +25,12 @@ from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel, EvaluationOptions, OptionGroup, RunOptions, option
 from polmvs.errors import OptionError
-from polmvs.evaluation.tables import format_table, stage_table
+from polmvs.evaluation.tables import format_table
 from polmvs.normals.estimator import NUM_ROUNDS, solve_normals
 from polmvs.normals.single_view.plane import plane_normal
 from polmvs.pipeline.jobs import Job, compare
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
+from polmvs.pipeline.runner import load_record, timing_table
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
 
 Array = NDArray[np.float64]
@@ -65,14 +66,14 @@ def _benchmark(call: Call, terminal: Terminal) -> int:
             capture=given.capture,
             out=given.runs[0],
             options=call.options(),
-            how=call.get(RunOptions),
+            run_options=call.get(RunOptions),
             monitor=terminal,
             command_line=call.command_line,
         )
         compare(job)
-    records = {str(out): asdict(RunFolder(_folder(out)).load()) for out in given.runs}
+    records = {str(out): load_record(RunFolder(_folder(out))) for out in given.runs}
     if records:
-        print(stage_table(records))
+        print(timing_table(records))
     return 0
 
 

@@ -7,7 +7,6 @@ A capture that holds a ``gt`` folder is measured against it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from polmvs.cli.flags import Command
 from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
 from polmvs.config import OptionGroup, RunOptions, option, replace_option
-from polmvs.evaluation.tables import comparison_table
 from polmvs.pipeline.jobs import Job, compare
 
 
@@ -38,7 +36,7 @@ def _compare(call: Call, terminal: Terminal) -> int:
         capture=arguments.out,
         out=arguments.out,
         options=call.options(),
-        how=call.get(RunOptions),
+        run_options=call.get(RunOptions),
         monitor=terminal,
     )
     for capture in arguments.captures:
@@ -46,8 +44,8 @@ def _compare(call: Call, terminal: Terminal) -> int:
         options = replace_option(job.options, "evaluation.gt", gt)
         out = arguments.out / capture.resolve().name
         outcome = compare(replace(job, capture=capture, out=out, options=options))
-        metrics = json.loads(outcome.workspace.metrics.read_text(encoding="utf-8"))
-        print(f"{capture}\n{comparison_table(metrics)}\n")
+        assert outcome.comparison is not None
+        print(f"{capture}\n{outcome.comparison.table()}\n")
         status = status if outcome.empty is None else 3
     return status
 

@@ -33,8 +33,8 @@ from polmvs.experiments.inputs import check_options, open_experiment, require_ap
 from polmvs.experiments.output import NAMES, Report, write_files, write_report
 from polmvs.experiments.reports import num_steps, run_experiment
 from polmvs.parallel import Workers
+from polmvs.pipeline.record import peak_rss_mb, versions
 from polmvs.pipeline.run_folder import has_content
-from polmvs.pipeline.runtime import peak_rss_mb, versions
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,13 +17,14 @@ from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
 from polmvs.config import ExportOptions
 from polmvs.pipeline.jobs import reconstruct
+from polmvs.pipeline.stages.densify import DensifyResult
 
 
 def _reconstruct(call: Call, terminal: Terminal) -> int:
     model = call.get(ModelChoice).angle_model
     outcome = reconstruct(job_of(call, terminal), model)
-    cloud = outcome.workspace.cloud(model)
-    print(outcome.empty or f"{cloud}: {outcome.results[f'num_points_{model}']:,} points")
+    cloud = outcome.run_folder.cloud(model)
+    print(outcome.empty or f"{cloud}: {outcome.result(DensifyResult, model)}")
     return 0 if outcome.empty is None else 3
 
 

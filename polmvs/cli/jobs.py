@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +13,17 @@ from polmvs.cli.commands import ComparedModels, DemoArguments, JobArguments, Mod
 from polmvs.cli.flags import in_flags
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
-from polmvs.evaluation.tables import best_fit_lines, comparison_table
+from polmvs.evaluation.tables import best_fit_lines
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.pipeline import jobs as pipeline
+from polmvs.pipeline.record import read_options
 from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.stages.dense_workspace import DenseWorkspaceResult
+from polmvs.pipeline.stages.densify import DensifyResult
+from polmvs.pipeline.stages.mesh import MeshResult
+from polmvs.pipeline.stages.normals import NormalsResult
+from polmvs.pipeline.stages.poses import PosesResult
+from polmvs.pipeline.stages.seeds import SeedsResult
 
 EMPTY_STATUS = 3
 DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"
@@ -37,7 +42,7 @@ def demo(call: Call, terminal: Terminal) -> int:
         capture=DEMO_CAPTURE,
         out=call.get(DemoArguments).out,
         options=options,
-        how=call.get(RunOptions),
+        run_options=call.get(RunOptions),
         monitor=terminal,
         command_line=call.command_line,
     )
@@ -59,10 +64,9 @@ def compare(call: Call, terminal: Terminal) -> int:
 def sfm(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs sfm``."""
     outcome = pipeline.find_poses(job_of(call, terminal))
-    results = outcome.results
+    num_tracks = outcome.result(PosesResult).num_tracks
     text = (
-        f"{outcome.workspace.sparse}: {_views(results)} have a pose, "
-        f"{results['num_tracks']:,} sparse points"
+        f"{outcome.run_folder.sparse}: {_views(outcome)} have a pose, {num_tracks:,} sparse points"
     )
     terminal.show(text, _content(outcome, terminal))
     return 0
@@ -71,11 +75,11 @@ def sfm(call: Call, terminal: Terminal) -> int:
 def normals(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs normals``."""
     model = call.get(ModelChoice).angle_model
-    outcome = pipeline.solve_normals(job_of(call, terminal, goes_on=True), (model,))
-    results = outcome.results
+    outcome = pipeline.solve_normals(job_of(call, terminal, continues=True), (model,))
+    found, seeds = outcome.result(NormalsResult, model), outcome.result(SeedsResult)
     text = (
-        f"{outcome.workspace.normals(model)}: {results[f'num_normals_{model}']:,} of "
-        f"{results['num_tracks']:,} sparse points have a normal, {results['num_seeds']:,} are seeds"
+        f"{outcome.run_folder.sparse_cloud(model)}: {found.num_normals:,} of "
+        f"{found.num_tracks:,} sparse points have a normal, {seeds.num_track_seeds:,} are seeds"
     )
     terminal.show(text, _content(outcome, terminal))
     return 0
@@ -84,83 +88,78 @@ def normals(call: Call, terminal: Terminal) -> int:
 def densify(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs densify``."""
     model = call.get(ModelChoice).angle_model
-    outcome = pipeline.densify(job_of(call, terminal, goes_on=True), (model,))
+    outcome = pipeline.densify(job_of(call, terminal, continues=True), (model,))
     return _show_cloud(outcome, model, terminal)
 
 
 def export(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs export``."""
     model = call.get(ModelChoice).angle_model
-    outcome = pipeline.export(job_of(call, terminal, goes_on=True), model)
+    outcome = pipeline.export(job_of(call, terminal, continues=True), model)
     return _show_cloud(outcome, model, terminal)
 
 
-def job_of(call: Call, terminal: Terminal, *, goes_on: bool = False) -> pipeline.Job:
+def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeline.Job:
     """The job; one that goes on takes the options of the run in OUT where none are given."""
-    arguments, how = call.get(JobArguments), call.get(RunOptions)
-    recorded = recorded_options(arguments.out) if how.resume or goes_on else None
+    arguments, run_options = call.get(JobArguments), call.get(RunOptions)
+    recorded = None
+    if run_options.resume or continues:
+        recorded = read_options(RunFolder(arguments.out))
     return pipeline.Job(
         capture=arguments.capture,
         out=arguments.out,
         options=call.options(recorded),
-        how=how,
+        run_options=run_options,
         monitor=terminal,
         command_line=call.command_line,
     )
 
 
-def recorded_options(out: Path) -> Mapping[str, Any]:
-    """Options of the run in a folder; empty where there is none."""
-    run_folder = RunFolder(out)
-    if not run_folder.run_file.is_file():
-        return {}
-    record = run_folder.load()
-    return record.options if record.stages else {}
-
-
-def _show_cloud(outcome: pipeline.Outcome, model: AngleModel, terminal: Terminal) -> int:
-    results, workspace = outcome.results, outcome.workspace
-    unit = "metres" if results.get("unit") == "m" else "the model's unit, not metric"
+def _show_cloud(outcome: pipeline.JobOutcome, model: AngleModel, terminal: Terminal) -> int:
+    folder, cloud = outcome.run_folder, outcome.result(DensifyResult, model)
+    metric = outcome.result(PosesResult).is_metric
+    unit = "metres" if metric else "the model's unit, not metric"
     lines = [
-        f"{workspace.cloud(model)}: {results[f'num_points_{model}']:,} points from "
-        f"{_views(results)}, and {results[f'num_surroundings_{model}']:,} of the surroundings; "
-        f"in {unit}"
+        f"{folder.cloud(model)}: {cloud.num_points:,} points from {_views(outcome)}, and "
+        f"{cloud.num_surroundings:,} of the surroundings; in {unit}"
     ]
-    if workspace.mesh(model).is_file():
-        lines.append(f"{workspace.mesh(model)}: {results[f'num_triangles_{model}']:,} triangles")
-    dense = results.get(f"dense_{model}")
-    if dense is not None and Path(dense).is_dir():
-        lines.append(f"{dense}: COLMAP dense workspace")
+    mesh = outcome.find(MeshResult, model)
+    if mesh is not None and mesh.num_triangles:
+        lines.append(f"{folder.mesh(model)}: {mesh.num_triangles:,} triangles")
+    dense = outcome.find(DenseWorkspaceResult, model)
+    if dense is not None and dense.folder is not None:
+        lines.append(f"{dense.folder}: COLMAP dense workspace")
     terminal.show("\n".join(lines), _content(outcome, terminal))
     return _status(outcome)
 
 
-def _show_comparison(outcome: pipeline.Outcome, terminal: Terminal) -> int:
-    metrics = json.loads(outcome.workspace.metrics.read_text(encoding="utf-8"))
-    clouds = ", ".join(f"{model}.ply" for model in metrics["models"])
-    last = f"{outcome.workspace.root}: {clouds}, metrics.json, summary.md; "
-    lines = [comparison_table(metrics), *best_fit_lines(metrics), last + _views(outcome.results)]
-    terminal.show("\n".join(lines), {**_content(outcome, terminal), "metrics": metrics})
+def _show_comparison(outcome: pipeline.JobOutcome, terminal: Terminal) -> int:
+    comparison = outcome.comparison
+    assert comparison is not None
+    clouds = ", ".join(f"{model}.ply" for model in comparison.models)
+    last = f"{outcome.run_folder.root}: {clouds}, metrics.json, summary.md; {_views(outcome)}"
+    lines = [comparison.table(), *best_fit_lines(comparison), last]
+    terminal.show("\n".join(lines), {**_content(outcome, terminal), "metrics": comparison})
     return _status(outcome)
 
 
-def _content(outcome: pipeline.Outcome, terminal: Terminal) -> dict[str, Any]:
+def _content(outcome: pipeline.JobOutcome, terminal: Terminal) -> dict[str, Any]:
     """The outcome for machines."""
     return {
-        "out": outcome.workspace.root,
-        "results": outcome.results,
+        "out": outcome.run_folder.root,
+        "results": {stage.name: stage.result for stage in outcome.record.stages},
         "empty": outcome.empty,
         "stages": terminal.stages,
         "warnings": terminal.warnings,
     }
 
 
-def _views(results: dict[str, Any]) -> str:
-    num_views = results["num_views"]
-    return f"{num_views} of {num_views + len(results['unregistered'])} views"
+def _views(outcome: pipeline.JobOutcome) -> str:
+    poses = outcome.result(PosesResult)
+    return f"{poses.num_views} of {poses.num_views + len(poses.unregistered)} views"
 
 
-def _status(outcome: pipeline.Outcome) -> int:
+def _status(outcome: pipeline.JobOutcome) -> int:
     if outcome.empty is None:
         return 0
     print(f"polmvs: {in_flags(outcome.empty)}", file=sys.stderr)

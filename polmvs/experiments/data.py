@@ -17,7 +17,7 @@ from polmvs.errors import DataError
 from polmvs.experiments.estimated_poses import estimated_views
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.io.images import read_mask
-from polmvs.pipeline.stages.capture import find_mask
+from polmvs.pipeline.stages.maps import find_mask
 from polmvs.polarization.angle_models import correct_stokes, phase_sign
 from polmvs.polarization.capture import Capture
 from polmvs.polarization.phase_map import PhaseMap, as_tilted, build_phase_map, view_rays

@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 from dense_scenes import fuse
 from helpers import content_of, cut_after, record_of, refused, stages_of
+from polmvs.pipeline.own_files import DENSE_MARKER
 from scipy.spatial import cKDTree
 
 from polmvs.cli import main
@@ -23,7 +24,6 @@ from polmvs.colmap.models import read_model, write_model
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.clouds import read_cloud, read_mesh
 from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
-from polmvs.pipeline.own_files import DENSE_MARKER
 from polmvs.poses.metric_frame import transform_model
 from polmvs.scene import PointKind
 from polmvs.surface.kept_depth import kept_cloud
