@@ -278,6 +278,10 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             result=maps.TiltedMapsResult,
             num_steps=lambda run: run.num_views,
         ),
+    ]
+    for same_kind in zip(*map(_model_stages, AngleModel), strict=True):
+        table += same_kind
+    table += [
         StageSpec(
             name="seeds",
             command=NORMALS,
@@ -287,10 +291,6 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             work=_find_seeds,
             result=seeds.SeedsResult,
         ),
-    ]
-    for model in AngleModel:
-        table += _model_stages(model)
-    table.append(
         StageSpec(
             name="evaluation",
             command=COMPARE,
@@ -308,8 +308,8 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             work=partial(_evaluate, compared),
             result=evaluation.EvaluationResult,
             is_redone=True,
-        )
-    )
+        ),
+    ]
     return _in_order(table)
 
 
