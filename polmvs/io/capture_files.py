@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from polmvs.choices import CaptureKind
+from polmvs.config import CaptureKind
 from polmvs.errors import DataError, OptionError
 from polmvs.io.raw_formats import DUMP_SUFFIXES, FLOAT_SUFFIXES, LOSSY_SUFFIXES, SUFFIXES
 

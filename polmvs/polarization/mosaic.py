@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.choices import BayerOrder
+from polmvs.config import BayerOrder
 
 Image: TypeAlias = NDArray[np.float32]
 
