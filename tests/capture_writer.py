@@ -296,7 +296,7 @@ FORMATS: dict[str, Callable[[Path, Mosaics], Written]] = {
     "angles by ending": four_images("{stem}_{angle:03d}.png"),
     "angles by folder": four_images("pol{angle:03d}/{stem}.png"),
     "angles by view": four_images("{stem}/I{angle}.png"),
-    "angles by template": four_images("{angle}deg-of-{stem}.tif", naming="{angle}deg-of-{view}.tif"),
+    "angles by template": four_images("{angle}deg-{stem}.tif", naming="{angle}deg-{view}.tif"),
     "angles 0 60 120": rotated_polarizer("{stem}_{angle}.png", (0, 60, 120)),
     "angles every 20": rotated_polarizer("{stem}-{angle}.png", range(0, 180, 20)),
     "angles by index": rotated_polarizer(

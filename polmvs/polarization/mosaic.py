@@ -26,9 +26,7 @@ NEAR, FAR = 0.75, 0.25
 INTERPOLATION_NOISE_GAIN: Final = (NEAR**2 + FAR**2) ** 2
 
 
-def linearize(
-    raw: NDArray[Any], *, gamma: float = 1.0, full_scale: float | None = None
-) -> Image:
+def linearize(raw: NDArray[Any], *, gamma: float = 1.0, full_scale: float | None = None) -> Image:
     """Raw samples in units of full scale, proportional to the light: ``(raw / full) ** (1 / g)``.
 
     Parameters

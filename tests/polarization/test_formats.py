@@ -134,7 +134,7 @@ def test_the_given_full_scale_is_taken(tmp_path):
 @pytest.mark.parametrize("pattern", [(0, 45, 90, 135), (0, 90, 45, 135), (45, 135, 90, 0)])
 def test_a_swapped_pattern_is_refused_with_one_that_fits(tmp_path, mosaics, pattern):
     FORMATS["png, 8 bits"](tmp_path, mosaics)
-    with pytest.raises(OptionError, match="does not fit.*--pattern 90,45,135,0"):
+    with pytest.raises(OptionError, match=r"does not fit.*--pattern 90,45,135,0"):
         open_capture(tmp_path, CaptureOptions(pattern=pattern))
 
 
