@@ -12,9 +12,8 @@ from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, Options
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
 from polmvs.evaluation.map_errors import map_errors
-from polmvs.evaluation.phase_errors import phase_errors, stem_of
 from polmvs.evaluation.tables import summary_text
-from polmvs.evaluation.truth_errors import evaluate, track_normal_errors
+from polmvs.evaluation.truth_errors import evaluate, phase_errors, track_normal_errors
 from polmvs.io.clouds import Cloud, read_cloud
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.images import write_bytes
@@ -25,7 +24,7 @@ from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.capture import open_maps
 from polmvs.pipeline.stages.clouds import open_dense_views
 from polmvs.polarization.capture import Capture
-from polmvs.scene import View
+from polmvs.scene import View, match_names
 from polmvs.surface.dense_view import DenseView
 
 DenseViews = Sequence[DenseView | None]
@@ -33,8 +32,8 @@ DenseViews = Sequence[DenseView | None]
 
 def named_as_truth(views: Sequence[View], truth: GroundTruth) -> list[View]:
     """Views under the truth's names, which may have another suffix."""
-    by_stem = {stem_of(name): name for name in truth.names}
-    return [replace(view, name=by_stem.get(stem_of(view.name), view.name)) for view in views]
+    matched = match_names([view.name for view in views], truth.names)
+    return [replace(view, name=matched.get(view.name, view.name)) for view in views]
 
 
 def measure_against_truth(
