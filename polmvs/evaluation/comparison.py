@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Options
+from polmvs.config import AngleModel, Options, to_plain
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
 from polmvs.evaluation.map_errors import map_errors
 from polmvs.evaluation.tables import summary_text
@@ -17,7 +17,6 @@ from polmvs.evaluation.truth_errors import evaluate, phase_errors, track_normal_
 from polmvs.io.clouds import Cloud, read_cloud
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.images import write_bytes
-from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
 from polmvs.pipeline.record import write_json
 from polmvs.pipeline.run_folder import RunFolder

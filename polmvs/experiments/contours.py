@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, ExperimentOptions
 from polmvs.experiments.data import Scene, load_view, require_counted
 from polmvs.experiments.surfaces import TrueSurface
 from polmvs.experiments.two_views import second_view, step_with_normals
@@ -32,8 +32,6 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-DEFAULT_NUM_SEEDS = 20
-DEFAULT_STEP_PX = 0.5
 INSET_PX = 4  # of the seeds: nearer to the edge the blurred light of the background is mixed in
 MEASURED_PX = 1.0  # distance between the points of a contour that are measured
 
@@ -101,8 +99,8 @@ def measure_contours(
     workers: Workers,
     report: Callable[[int], None] = lambda count: None,
     *,
-    num_seeds: int = DEFAULT_NUM_SEEDS,
-    step_px: float = DEFAULT_STEP_PX,
+    num_seeds: int = ExperimentOptions.num_seeds,
+    step_px: float = ExperimentOptions.step_px,
 ) -> list[ViewContours]:
     """Contours of some views; all views may give the second rows.
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import match_model_to_capture, read_model
-from polmvs.config import AngleModel, Light, RegionOptions
+from polmvs.config import AngleModel, ExperimentOptions, Light, RegionOptions
 from polmvs.errors import DataError
 from polmvs.io.images import read_mask
 from polmvs.pipeline.stages.capture import find_mask
@@ -29,7 +29,6 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-DEFAULT_BLUR_PX = 1.5  # the paper blurs its images and does not say how much; ours are half as wide
 BLUR_REACH = 2.0  # deviations of the blur within which a mark spoils a pixel
 
 
@@ -73,7 +72,7 @@ class Scene:
     views: tuple[View, ...]
     raw_names: tuple[str, ...]
     region: RegionOptions
-    blur_px: float = DEFAULT_BLUR_PX
+    blur_px: float = ExperimentOptions.blur_px
     alignment: Alignment | None = None
 
     def settings(self) -> dict[str, Any]:
@@ -162,7 +161,7 @@ def open_scene(
     truth: Truth,
     region: RegionOptions,
     *,
-    blur_px: float = DEFAULT_BLUR_PX,
+    blur_px: float = ExperimentOptions.blur_px,
     sparse: Path | None = None,
 ) -> Scene:
     """Match a capture with its truth, and with estimated poses where they are given.
@@ -290,5 +289,5 @@ def require_counted(scene: Scene, num_counted: Sequence[int] | int) -> None:
         raise DataError(
             scene.capture.folder,
             f"no pixel of the part has a DoLP above {scene.region.min_dolp}; "
-            "give a lower --min-dolp, or the mask of a polarised surface.",
+            "give a lower `region.min_dolp`, or the mask of a polarised surface.",
         )

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, ExperimentOptions
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
@@ -29,7 +29,6 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 
-DEFAULT_PLANAR_DEG = 5.0
 NUM_CANDIDATES = 64  # normals tried as the middle of a patch
 MIN_PIXELS = 100
 MAX_SPREAD_DEG = 0.2  # of the true normals of a plane; 16-bit maps have less
@@ -134,7 +133,7 @@ def measure_plane(
     workers: Workers,
     report: Callable[[int], None] = lambda count: None,
     *,
-    planar_deg: float = DEFAULT_PLANAR_DEG,
+    planar_deg: float = ExperimentOptions.planar_deg,
 ) -> PlaneResult:
     """Single-view normals of all views.
 

@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from polmvs.config import ExperimentOptions
 from polmvs.experiments import figures, tables
-from polmvs.experiments.contours import (
-    DEFAULT_NUM_SEEDS,
-    DEFAULT_STEP_PX,
-    METHODS,
-    ViewContours,
-    measure_contours,
-    pool_lines,
-)
+from polmvs.experiments.contours import METHODS, ViewContours, measure_contours, pool_lines
 from polmvs.experiments.data import Scene
+from polmvs.experiments.inputs import view_indices
 from polmvs.experiments.lines_io import line_set_bytes
 from polmvs.experiments.output import Report
 from polmvs.experiments.phase import measure_phase, phase_images
-from polmvs.experiments.plane import DEFAULT_PLANAR_DEG, TILT_FACTOR, measure_plane
+from polmvs.experiments.plane import TILT_FACTOR, measure_plane
 from polmvs.experiments.surfaces import open_surface
-from polmvs.experiments.tracks import TrackOptions, measure_tracks
-from polmvs.experiments.view_choice import check_k
+from polmvs.experiments.tracks import measure_tracks
 from polmvs.parallel import Workers
 
 Progress = Callable[[int], None]
@@ -38,25 +31,6 @@ PAPER = {
     "tracks": "under 25° with K = 3: PPA 80 %, OPA 26 %",
     "contours": "PPA with two-view normals 2.2 mm RMSE, OPA 9.6 mm, ratio 23 %",
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExperimentOptions:
-    """What the experiments can be told; each takes its own.
-
-    Attributes
-    ----------
-    views : indices of the views that are traced and shown; None: all, and a few.
-    planar_deg : spread of the normals of a planar region, degrees.
-    tracks : what the track experiment samples.
-    num_seeds, step_px : of the contours.
-    """
-
-    views: tuple[int, ...] | None = None
-    planar_deg: float = DEFAULT_PLANAR_DEG
-    tracks: TrackOptions = field(default_factory=TrackOptions)
-    num_seeds: int = DEFAULT_NUM_SEEDS
-    step_px: float = DEFAULT_STEP_PX
 
 
 def run_experiment(
@@ -83,13 +57,15 @@ def num_steps(name: str, scene: Scene, options: ExperimentOptions) -> int:
     num = len(scene.views)
     if name != "contours":
         return num
-    return num + (num if options.views is None else len(options.views))
+    chosen = view_indices(options.views, scene)
+    return num + (num if chosen is None else len(chosen))
 
 
 def figure_views(scene: Scene, options: ExperimentOptions) -> tuple[int, ...]:
     """Indices of the views that are shown: the user's, or a few evenly spread."""
-    if options.views is not None:
-        return options.views
+    chosen = view_indices(options.views, scene)
+    if chosen is not None:
+        return chosen
     num = min(NUM_FIGURE_VIEWS, len(scene.views))
     return tuple((np.arange(num) * len(scene.views) // num).tolist())
 
@@ -162,17 +138,16 @@ def _run_plane(
 def _run_tracks(
     scene: Scene, options: ExperimentOptions, workers: Workers, progress: Progress
 ) -> Report:
-    result = measure_tracks(scene, options.tracks, workers, progress)
-    chosen = options.tracks
+    result = measure_tracks(scene, options, workers, progress)
     settings = {
         **scene.settings(),
-        "num_points": chosen.num_points,
-        "selection": chosen.selection,
-        "seed": chosen.seed,
+        "num_points": options.num_points,
+        "selection": options.select,
+        "seed": options.seed,
     }
     text = (
-        f"Angle between multi-view and true normals of {chosen.num_points} random pixels of the "
-        f"part, from K views ({chosen.selection}) that see them with a DoLP above "
+        f"Angle between multi-view and true normals of {options.num_points} random pixels of the "
+        f"part, from K views ({options.select}) that see them with a DoLP above "
         f"{scene.region.min_dolp:g}; a point without so many views is left out. Eigenvector: "
         f"single pixels, {_blur(scene)}, all alike. Weighted robust: the package's phase maps, "
         f"smoothed over reliable pixels. {_poses(scene)} {_paper('tracks')}\n\n"
@@ -205,7 +180,8 @@ def _run_contours(
     scene: Scene, options: ExperimentOptions, workers: Workers, progress: Progress
 ) -> Report:
     surface = open_surface(scene.truth)
-    indices = range(len(scene.views)) if options.views is None else options.views
+    chosen = view_indices(options.views, scene)
+    indices = range(len(scene.views)) if chosen is None else chosen
     views = measure_contours(
         scene,
         surface,
@@ -249,18 +225,6 @@ def _typical(views: Sequence[ViewContours]) -> ViewContours:
     """The view whose OPA contours have the median error."""
     errors = [np.nan_to_num(view.lines["opa"].rmse_mm, nan=-1.0) for view in views]
     return views[int(np.argsort(errors)[len(views) // 2])]
-
-
-def check_options(scene: Scene, options: ExperimentOptions, names: Sequence[str]) -> None:
-    """Refuse what cannot be done before anything is measured.
-
-    Raises
-    ------
-    OptionError
-        More views are asked for than there are.
-    """
-    if "tracks" in names:
-        check_k(options.tracks.k, len(scene.views))
 
 
 def _pixels(scene: Scene) -> str:

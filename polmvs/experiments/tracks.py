@@ -19,10 +19,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, ExperimentOptions, Selection
 from polmvs.evaluation.metrics import angular_errors_deg
 from polmvs.experiments.data import Scene, load_view, require_counted
-from polmvs.experiments.view_choice import Selection, check_k, order_at_random, order_by_angle
+from polmvs.experiments.view_choice import check_k, order_at_random, order_by_angle
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.parallel import Workers
@@ -32,7 +32,6 @@ Floats = NDArray[np.floating]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-DEFAULT_NUM_POINTS = 10_000
 UNDER_DEG = 25.0  # the paper's limit
 MIN_POINTS = 10  # of a K: fewer make no statistics
 CHUNK_ROWS = 200_000  # solved at a time: bounds the memory of many views
@@ -53,24 +52,6 @@ ESTIMATORS: dict[str, tuple[AngleModel, Source]] = {
     "ppa_weighted": (AngleModel.PPA, Source.MAP),
     "tilted_weighted": (AngleModel.TILTED, Source.MAP),
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrackOptions:
-    """What is sampled.
-
-    Attributes
-    ----------
-    num_points : surface points.
-    k : numbers of views; None: 2 to 20, as far as the capture goes.
-    selection : how views are chosen.
-    seed : of the random numbers.
-    """
-
-    num_points: int = DEFAULT_NUM_POINTS
-    k: tuple[int, ...] | None = None
-    selection: Selection = Selection.RANDOM
-    seed: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,7 +110,7 @@ class SurfacePoints:
 
 def measure_tracks(
     scene: Scene,
-    options: TrackOptions,
+    options: ExperimentOptions,
     workers: Workers,
     report: Callable[[int], None] = lambda count: None,
 ) -> TrackResult:
@@ -152,7 +133,7 @@ def measure_tracks(
     rows = {name: _stack([part[name] for part in parts]) for name in ESTIMATORS}
     usable = np.isfinite(rows["ppa_algebraic"].sigma)
     require_counted(scene, int(usable.sum()))
-    if options.selection is Selection.ANGLE:
+    if options.select is Selection.ANGLE:
         order = order_by_angle(rows["opa"].rays, usable, max(ks), rng)
     else:
         order = order_at_random(usable, rng)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +14,6 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 DEFAULT_K = tuple(range(2, 21))
-
-
-class Selection(StrEnum):
-    """How K views are chosen for a point."""
-
-    RANDOM = "random"
-    ANGLE = "angle"
 
 
 def check_k(k: Sequence[int] | None, num_views: int) -> tuple[int, ...]:
@@ -38,8 +30,9 @@ def check_k(k: Sequence[int] | None, num_views: int) -> tuple[int, ...]:
         return tuple(value for value in DEFAULT_K if value <= num_views)
     if not k or min(k) < 2 or max(k) > num_views:
         raise OptionError(
-            f"--k must lie in 2 to {num_views}, the views of this capture with truth and pose, "
-            f"not {','.join(map(str, k))}."
+            f"must lie in 2 to {num_views}, the views of this capture with truth and pose, "
+            f"not {','.join(map(str, k))}.",
+            field="experiment.k",
         )
     return tuple(sorted(set(k)))
 

@@ -8,11 +8,10 @@ from typing import Any
 
 from polmvs.colmap.dense_workspace import open_dense_workspace, require_same_frame
 from polmvs.colmap.sfm import check_intrinsics
-from polmvs.config import AngleModel, Options, ReferenceOptions
+from polmvs.config import AngleModel, Options, ReferenceOptions, to_plain
 from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.images import read_mask
-from polmvs.option_values import to_plain
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.capture import find_mask, fit_model, image_names

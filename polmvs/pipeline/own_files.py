@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Set
 from pathlib import Path
 
-from polmvs.choices import AngleModel
+from polmvs.config import AngleModel
 from polmvs.errors import DataError
 
 # What a run writes in its folders, by folder; images are known by name from the record.

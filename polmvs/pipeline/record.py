@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from polmvs.config import to_plain
 from polmvs.io.images import write_bytes
-from polmvs.option_values import to_plain
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,9 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from polmvs.config import Options, RunOptions
+from polmvs.config import Options, RunOptions, to_plain
 from polmvs.errors import DataError, PolmvsError
-from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
 from polmvs.pipeline.checks import (
     alternatives,

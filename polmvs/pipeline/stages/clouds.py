@@ -9,12 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, FusionOptions, Method, NormalOptions, PropagationOptions
+from polmvs.config import (
+    AngleModel,
+    FusionOptions,
+    Method,
+    NormalOptions,
+    PropagationOptions,
+    to_plain,
+)
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.clouds import Cloud, write_cloud
 from polmvs.normals.estimator import NormalEstimate
 from polmvs.normals.tracks import select_seeds, track_normals
-from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.scene_cloud import join_clouds, open_given, surface_cloud, surroundings_cloud
