@@ -29,9 +29,9 @@ from polmvs.config import (
     to_plain,
 )
 from polmvs.errors import OptionError
-from polmvs.experiments.inputs import check_options, open_experiment, require_apart
+from polmvs.experiments.data import open_experiment, require_apart
 from polmvs.experiments.output import NAMES, Report, write_files, write_report
-from polmvs.experiments.reports import num_steps, run_experiment
+from polmvs.experiments.report import check_options, num_steps, run_experiment
 from polmvs.parallel import Workers
 from polmvs.pipeline.record import peak_rss_mb, versions
 from polmvs.pipeline.run_folder import has_content

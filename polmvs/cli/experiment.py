@@ -6,9 +6,9 @@ from polmvs.cli.call import Call
 from polmvs.cli.commands import ExperimentArguments, ExperimentRun
 from polmvs.cli.terminal import Terminal
 from polmvs.config import CaptureOptions, ExperimentOptions, RegionOptions
-from polmvs.experiments.inputs import check_options, open_experiment, require_apart
+from polmvs.experiments.data import open_experiment, require_apart
 from polmvs.experiments.output import check_output, write_report
-from polmvs.experiments.reports import num_steps, run_experiment
+from polmvs.experiments.report import check_options, num_steps, run_experiment
 from polmvs.parallel import Workers
 
 

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import AngleModel, ExperimentOptions, Selection
+from polmvs.errors import OptionError
 from polmvs.evaluation.metrics import angular_errors_deg
-from polmvs.experiments.data import Scene, load_view, require_counted
-from polmvs.experiments.view_choice import check_k, order_at_random, order_by_angle
+from polmvs.experiments.data import OnProgress, Scene, load_view, require_counted
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.parallel import Workers
@@ -51,6 +51,14 @@ ESTIMATORS: dict[str, tuple[AngleModel, Source]] = {
     "ppa_algebraic": (AngleModel.PPA, Source.PIXELS),
     "ppa_weighted": (AngleModel.PPA, Source.MAP),
     "tilted_weighted": (AngleModel.TILTED, Source.MAP),
+}
+
+TRACK_LABELS = {
+    "opa": "OPA, eigenvector",
+    "opa_weighted": "OPA, weighted robust",
+    "ppa_algebraic": "PPA, eigenvector (paper)",
+    "ppa_weighted": "PPA, weighted robust",
+    "tilted_weighted": "tilted, weighted robust",
 }
 
 
@@ -112,7 +120,7 @@ def measure_tracks(
     scene: Scene,
     options: ExperimentOptions,
     workers: Workers,
-    report: Callable[[int], None] = lambda count: None,
+    on_progress: OnProgress = lambda count: None,
 ) -> TrackResult:
     """Errors of normals from K views for every estimator and K.
 
@@ -129,7 +137,7 @@ def measure_tracks(
     parts = []
     for part in workers.map(partial(view_rows, scene, sample.points), range(len(scene.views))):
         parts.append(part)
-        report(1)
+        on_progress(1)
     rows = {name: _stack([part[name] for part in parts]) for name in ESTIMATORS}
     usable = np.isfinite(rows["ppa_algebraic"].sigma)
     require_counted(scene, int(usable.sum()))
@@ -232,3 +240,56 @@ def _errors_deg(name: str, rows: Rows, true_normals: Array) -> Array:
         for start in range(0, num_points, size)
     ]
     return angular_errors_deg(np.concatenate(normals), true_normals)
+
+
+DEFAULT_K = tuple(range(2, 21))
+
+
+def check_k(k: Sequence[int] | None, num_views: int) -> tuple[int, ...]:
+    """Numbers of views in ascending order; those of the default that the capture has.
+
+    Raises
+    ------
+    OptionError
+        One is under 2 or over ``num_views``, or the capture has fewer than two views.
+    """
+    if num_views < 2:
+        raise OptionError(f"normals from tracks need 2 views or more, this capture has {num_views}")
+    if k is None:
+        return tuple(value for value in DEFAULT_K if value <= num_views)
+    if not k or min(k) < 2 or max(k) > num_views:
+        raise OptionError(
+            f"must lie in 2 to {num_views}, the views of this capture with truth and pose, "
+            f"not {','.join(map(str, k))}.",
+            field="experiment.k",
+        )
+    return tuple(sorted(set(k)))
+
+
+def order_at_random(usable: Mask, rng: np.random.Generator) -> Indices:
+    """Views of each point (V, N) in random order, those that do not count last."""
+    keys = np.where(usable, rng.random(usable.shape), 2.0)
+    return np.argsort(keys, axis=0, kind="stable")
+
+
+def order_by_angle(rays: Floats, usable: Mask, num: int, rng: np.random.Generator) -> Indices:
+    """Views of each point (num, N): a random one, then each the farthest in angle from the others.
+
+    Parameters
+    ----------
+    rays : (3, V, N), unit, world, from the views to the points.
+    usable : (V, N) bool; views that do not count come last.
+    num : views to choose.
+    """
+    points = np.arange(usable.shape[1])
+    order = order_at_random(usable, rng)[:num]
+    # Largest cosine to a chosen view; 3: not usable, 2: chosen already.
+    closest = np.where(usable, -1.0, 3.0)
+    for step in range(1, num):
+        chosen = order[step - 1]
+        cosine = np.einsum("ivn,in->vn", rays, rays[:, chosen, points])
+        closest = np.where(usable, np.maximum(closest, cosine), 3.0)
+        for earlier in order[:step]:
+            closest[earlier, points] = np.maximum(closest[earlier, points], 2.0)
+        order[step] = closest.argmin(axis=0)
+    return order

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from helpers import cut_after, record_of, refused, result_of, stages_of
 from polmvs.colmap.sparse_model import write_model
-from polmvs.config import to_plain
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Options, PropagationOptions, RunOptions, SfmOptions
+from polmvs.config import AngleModel, Options, PropagationOptions, RunOptions, SfmOptions, to_plain
 from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud
 from polmvs.normals.tracks import some_tracks
