@@ -18,7 +18,8 @@ import re
 import shutil
 import struct
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -58,23 +59,47 @@ def read_model(path: PathArg) -> SparseModel:
         The model is missing, damaged or without a registered image.
     """
     folder = find_model(path)
-    if _model_suffix(folder) == ".bin":
-        check_binary_model(folder)
-    try:
-        with quiet_colmap():
-            model = model_from_reconstruction(pycolmap.Reconstruction(str(folder)))
-    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OverflowError) as error:
-        # COLMAP's own words, shortened and without the place in its source.
-        reason = re.sub(r"\[[\w.]+:\d+\]", "", " ".join(str(error).split()))[:120].strip()
-        raise DataError(
-            folder, f"is no sound COLMAP model ({reason or 'no reason given'}). Export it again."
-        ) from error
+    with _as_data_error(folder):
+        model = model_from_reconstruction(_open(folder))
     if not model.views:
         raise DataError(folder, "has no registered image. Run COLMAP again or leave out --sparse.")
     numbers = [view.cam_from_world.translation for view in model.views]
     if not all(np.isfinite(array).all() for array in (*numbers, model.tracks.points_in_world)):
         raise DataError(folder, "is no sound COLMAP model (not all numbers in it are finite).")
     return model
+
+
+def read_reconstruction(path: PathArg) -> pycolmap.Reconstruction:
+    """Read a COLMAP model as pycolmap's own type, for users of pycolmap.
+
+    Raises
+    ------
+    DataError
+        The model is missing or damaged.
+    """
+    folder = find_model(path)
+    with _as_data_error(folder):
+        return _open(folder)
+
+
+def _open(folder: Path) -> pycolmap.Reconstruction:
+    if _model_suffix(folder) == ".bin":
+        check_binary_model(folder)
+    with quiet_colmap():
+        return pycolmap.Reconstruction(str(folder))
+
+
+@contextmanager
+def _as_data_error(folder: Path) -> Iterator[None]:
+    """What pycolmap says of a damaged model as one line."""
+    try:
+        yield
+    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OverflowError) as error:
+        # COLMAP's own words, shortened and without the place in its source.
+        reason = re.sub(r"\[[\w.]+:\d+\]", "", " ".join(str(error).split()))[:120].strip()
+        raise DataError(
+            folder, f"is no sound COLMAP model ({reason or 'no reason given'}). Export it again."
+        ) from error
 
 
 def find_model(path: PathArg) -> Path:
