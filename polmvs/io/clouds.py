@@ -43,6 +43,15 @@ class Cloud:
     colors: NDArray[np.uint8] | None = None
     scalars: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
+    def only(self, kept: NDArray[np.bool_]) -> Cloud:
+        """The ``kept`` (N,) points as a cloud of their own."""
+        return Cloud(
+            points=self.points[kept],
+            normals=None if self.normals is None else self.normals[kept],
+            colors=None if self.colors is None else self.colors[kept],
+            scalars={name: values[kept] for name, values in self.scalars.items()},
+        )
+
 
 @dataclass(frozen=True)
 class Mesh:
