@@ -61,6 +61,8 @@ from polmvs.scene import SparseModel
 
 logger = logging.getLogger(__name__)
 
+FILE_ONLY = {"file_only": True}  # of records that a monitor is told of as well
+
 
 @dataclass(kw_only=True)
 class Run:
@@ -98,7 +100,7 @@ class Run:
         """
         finished = self.record.stage(spec.name)
         if finished is not None and not (spec.is_redone and self._has_changed(spec, finished)):
-            logger.info("%s: finished earlier", spec.name)
+            logger.info("%s: finished earlier", spec.name, extra=FILE_ONLY)
             self.monitor.skipped(spec.name)
             return
         for other in needed_by(spec, self.table):
@@ -119,7 +121,7 @@ class Run:
         with self.monitor.stage(spec.name, spec.num_steps(self._input())) as on_progress:
             result = spec.work(self._input(on_progress))
         seconds = round(time.perf_counter() - start, 3)
-        logger.info("%s: %.1f s, %s", spec.name, seconds, result)
+        logger.info("%s: %.1f s, %s", spec.name, seconds, result, extra=FILE_ONLY)
         finished = StageRecord(
             name=spec.name,
             angle_model=spec.angle_model,
