@@ -13,11 +13,8 @@ from __future__ import annotations
 
 import logging
 import mmap
-import os
 import re
-import shutil
 import struct
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -37,6 +34,7 @@ from polmvs.colmap.cameras import (
 )
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
+from polmvs.io.folders import new_folder
 from polmvs.scene import SparseModel, Tracks, View, match_names, short_list
 
 PathArg = str | PathLike[str]
@@ -62,7 +60,9 @@ def read_model(path: PathArg) -> SparseModel:
     with _as_data_error(folder):
         model = model_from_reconstruction(_open(folder))
     if not model.views:
-        raise DataError(folder, "has no registered image. Run COLMAP again or leave out --sparse.")
+        raise DataError(
+            folder, "has no registered image. Run COLMAP again or leave out `sfm.sparse`."
+        )
     numbers = [view.cam_from_world.translation for view in model.views]
     if not all(np.isfinite(array).all() for array in (*numbers, model.tracks.points_in_world)):
         raise DataError(folder, "is no sound COLMAP model (not all numbers in it are finite).")
@@ -311,28 +311,10 @@ def write_model(model: SparseModel, folder: str | PathLike[str]) -> None:
     write_reconstruction(_reconstruction(model), folder)
 
 
-def write_reconstruction(
-    reconstruction: pycolmap.Reconstruction, folder: str | PathLike[str]
-) -> None:
+def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: PathArg) -> None:
     """Write a reconstruction as COLMAP binary, whole or not at all."""
-    target = Path(folder)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    try:
-        temporary.chmod(0o777 & ~_umask())
-        reconstruction.write_binary(str(temporary))
-        if target.exists():
-            shutil.rmtree(target)
-        temporary.rename(target)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    with new_folder(folder, overwrite=True) as root:
+        reconstruction.write_binary(str(root))
 
 
 def _reconstruction(model: SparseModel) -> pycolmap.Reconstruction:
