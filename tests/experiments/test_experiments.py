@@ -1,9 +1,6 @@
 """The paper's experiments: exact on analytic scenes, their statistics, output and bad input."""
 
-import argparse
-import importlib.util
 import json
-import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,10 +9,16 @@ import pytest
 from scenes import CAMERA
 
 import polmvs
-from polmvs.cli.flags import Parser
-from polmvs.config import AngleModel, Light, RegionOptions
-from polmvs.errors import DataError, OptionError
-from polmvs.experiments import command, output
+from polmvs.config import (
+    AngleModel,
+    CaptureOptions,
+    ExperimentOptions,
+    Light,
+    Poses,
+    RegionOptions,
+)
+from polmvs.errors import OptionError
+from polmvs.experiments import output
 from polmvs.experiments.contours import (
     Lines,
     PlaneSurface,
@@ -25,16 +28,10 @@ from polmvs.experiments.contours import (
     measure_contours,
     pool_lines,
 )
-from polmvs.experiments.data import Scene, load_view, open_scene
+from polmvs.experiments.data import Scene, load_view, open_experiment, open_scene
 from polmvs.experiments.phase import ErrorTally, measure_phase, phase_images
 from polmvs.experiments.plane import measure_plane
-from polmvs.experiments.tracks import (
-    TrackOptions,
-    check_k,
-    measure_tracks,
-    order_at_random,
-    order_by_angle,
-)
+from polmvs.experiments.tracks import check_k, measure_tracks, order_at_random, order_by_angle
 from polmvs.io.clouds import _open3d
 from polmvs.io.images import write_png
 from polmvs.parallel import Workers
@@ -121,7 +118,7 @@ def test_plane_of_diffuse_light(tmp_path):
 
 
 def test_tracks_on_a_tilted_sensor(tilted_scene):
-    options = TrackOptions(num_points=300, k=(3, 2))
+    options = ExperimentOptions(num_points=300, k=(3, 2))
     with Workers(1) as workers:
         result = measure_tracks(tilted_scene, options, workers)
         again = measure_tracks(tilted_scene, options, workers)
@@ -197,7 +194,7 @@ def test_order_by_angle_takes_the_farthest():
 
 @pytest.mark.parametrize("k", [(1, 2), (3, 9), ()])
 def test_k_beyond_the_views(k):
-    with pytest.raises(OptionError, match="--k must lie in 2 to 8"):
+    with pytest.raises(OptionError, match=r"`experiment\.k` must lie in 2 to 8"):
         check_k(k, 8)
     assert check_k(None, 4) == (2, 3, 4)
     with pytest.raises(OptionError, match="2 views"):
@@ -228,123 +225,15 @@ def test_line_sets_open_in_open3d(tmp_path):
     assert b"element vertex 0" in line_set_bytes([empty])
 
 
-def run_command(*words: object) -> int:
-    parser = Parser(prog="polmvs")
-    command.add_parser(parser.add_subparsers(required=True))
-    args: argparse.Namespace = parser.parse_args(["experiment", *map(str, words)])
-    return int(args.run(args))
-
-
-FAST = ("--num-points", 300, "--k", "2,3", "--num-seeds", 6, "--workers", 1)
-
-
-def test_all_experiments_on_the_bundled_capture(tmp_path, capsys):
-    out = tmp_path / "out"
-    for name in output.NAMES:
-        views = ("--views", "000,004.png") if name in ("phase", "contours") else ()
-        assert run_command(name, DEMO, out, "--gt", DEMO / "gt", *FAST, *views) == 0
-    assert "tilted" in capsys.readouterr().out
-    content = {name: json.loads((out / f"{name}.json").read_text()) for name in output.NAMES}
-    # The issue's targets for a board, with some room: this capture is smaller and noisier.
-    phase = content["phase"]
-    assert phase["ppa"]["rmse_deg"] / phase["opa"]["rmse_deg"] < 0.25
-    assert phase["tilted"]["rmse_deg"] < phase["ppa"]["rmse_deg"]
-    assert content["plane"]["weighted"]["mean_deg"] < 0.8
-    assert content["plane"]["weighted"]["mean_deg"] < content["plane"]["algebraic"]["mean_deg"]
-    assert len(content["plane"]["per_image"]) == 10
-    tracks = content["tracks"]
-    assert tracks["k"] == [2, 3]
-    assert tracks["ppa_weighted"]["mean_deg"][1] < 2
-    assert set(tracks["opa"]) >= {"mean_deg", "median_deg", "p80_deg", "under_25"}
-    contours = content["contours"]
-    assert contours["ppa_tangent"]["rmse_mm"] < 0.2 * contours["opa"]["rmse_mm"]
-    assert contours["ppa_normals"]["rmse_mm"] < 0.3 * contours["opa"]["rmse_mm"]
-    for path in out.glob("*.md"):
-        assert all((out / name).is_file() for name in _links(path.read_text()))
-    assert not [path for path in out.iterdir() if path.name.startswith(".")]
-    with pytest.raises(OptionError, match="--overwrite"):
-        run_command("phase", DEMO, out)
-
-
-def _links(markdown):
-    return [part.split(")")[0] for part in markdown.split("](")[1:]]
-
-
-def demo_copy(tmp_path):
-    return Path(shutil.copytree(DEMO, tmp_path / "capture"))
-
-
-def assert_refused(tmp_path, match, *words, error=DataError):
-    out = tmp_path / "refused"
-    with pytest.raises(error, match=match) as caught:
-        run_command(*words[:2], out, "--workers", 1, *words[2:])
-    assert "\n" not in str(caught.value)
-    assert not out.exists()
-
-
-def test_missing_truth(tmp_path):
-    capture = demo_copy(tmp_path)
-    shutil.rmtree(capture / "gt")
-    assert_refused(tmp_path, "missing", "phase", capture)
-    assert_refused(tmp_path, "no such folder", "phase", capture, "--gt", tmp_path / "none")
-
-
-def test_truth_of_other_images(tmp_path):
-    capture = demo_copy(tmp_path)
-    for path in (capture / "raw").iterdir():
-        path.rename(path.with_name(f"other{path.name}"))
-    assert_refused(tmp_path, "none match", "tracks", capture)
-
-
-def test_mask_of_another_size(tmp_path):
-    masks = tmp_path / "masks"
-    masks.mkdir()
-    for index in range(10):
-        write_png(masks / f"{index:03d}.png", np.full((20, 30), 255, np.uint8))
-    assert_refused(tmp_path, "30x20", "plane", DEMO, "--mask", masks)
-    capture = demo_copy(tmp_path)
-    write_png(capture / "gt" / "000_mask.png", np.ones((20, 30), np.uint8))
-    assert_refused(tmp_path, "30x20", "phase", capture)
-
-
-def test_no_pixel_over_the_threshold(tmp_path):
-    masks = tmp_path / "masks"
-    masks.mkdir()
-    shape = (open_capture(DEMO).height, open_capture(DEMO).width)
-    for index in range(10):
-        write_png(masks / f"{index:03d}.png", np.zeros(shape, np.uint8))
-    for name in output.NAMES:
-        assert_refused(tmp_path, "--min-dolp", name, DEMO, "--mask", masks)
-
-
-def test_options_that_cannot_be(tmp_path):
-    for words, match in (
-        (("--k", "2,30"), "--k"),
-        (("--k", "two"), "--k"),
-        (("--views", "nine"), "--views"),
-        (("--poses", "sfm"), "--sparse"),
-        (("--blur-px", "-1"), "--blur-px"),
-        (("--num-seeds", "0"), "--num-seeds"),
-    ):
-        assert_refused(tmp_path, match, "tracks", DEMO, *words, error=OptionError)
-
-
-def test_poses_of_other_images(tmp_path):
-    sparse = tmp_path / "sparse"
-    sparse.mkdir()
-    (sparse / "cameras.txt").write_text("1 PINHOLE 459 384 330 330 229.5 192\n")
-    (sparse / "images.txt").write_text(
-        "".join(f"{i} 1 0 0 0 {i} 0 0 1 cat{i}.png\n\n" for i in range(1, 5))
-    )
-    (sparse / "points3D.txt").write_text("")
-    assert_refused(tmp_path, "match", "phase", DEMO, "--poses", "sfm", "--sparse", sparse)
+def open_demo(options: ExperimentOptions = ExperimentOptions()) -> Scene:  # noqa: B008
+    return open_experiment(DEMO, options, CaptureOptions(), RegionOptions())
 
 
 def test_true_poses_as_a_model_give_the_same(tmp_path):
     """A model in another frame and scale, with the true cameras, changes nothing."""
     sparse = tmp_path / "sparse"
     sparse.mkdir()
-    scene = command.scene_from(_arguments(DEMO))
+    scene = open_demo()
     camera = scene.views[0].camera
     (sparse / "cameras.txt").write_text(
         f"1 PINHOLE {camera.width} {camera.height} "
@@ -357,7 +246,7 @@ def test_true_poses_as_a_model_give_the_same(tmp_path):
         lines.append(f"{i} {w!r} {x!r} {y!r} {z!r} {t[0]!r} {t[1]!r} {t[2]!r} 1 {view.name}\n\n")
     (sparse / "images.txt").write_text("".join(lines).replace("np.float64(", "").replace(")", ""))
     (sparse / "points3D.txt").write_text("")
-    aligned = command.scene_from(_arguments(DEMO, "--poses", "sfm", "--sparse", sparse))
+    aligned = open_demo(ExperimentOptions(poses=Poses.SFM, sparse=sparse))
     for one, other in zip(scene.views, aligned.views, strict=True):
         assert one.name == other.name
         np.testing.assert_allclose(one.center_in_world, other.center_in_world, atol=1e-9)
@@ -365,12 +254,6 @@ def test_true_poses_as_a_model_give_the_same(tmp_path):
             one.cam_from_world.rotation, other.cam_from_world.rotation, atol=1e-9
         )
     assert aligned.settings()["poses"] == "sfm"
-
-
-def _arguments(capture, *words):
-    parser = Parser(prog="polmvs")
-    command.add_parser(parser.add_subparsers(required=True))
-    return parser.parse_args(["experiment", "phase", str(capture), "out", *map(str, words)])
 
 
 def _quaternion(rotation):
@@ -398,37 +281,3 @@ def test_overwrite_replaces_own_results_only(tmp_path):
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(OptionError):
         output.check_output(tmp_path, "tracks", overwrite=False)
-
-
-@pytest.fixture
-def page():
-    """The script ``pipelines/paper.py`` as a module."""
-    path = Path(__file__).parents[2] / "pipelines" / "paper.py"
-    spec = importlib.util.spec_from_file_location("paper", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_page_of_the_paper(tmp_path, monkeypatch, page):
-    def report(name, scene, options, workers, progress):
-        figures = {f"{name}.png": ("seen", b"png")}
-        return output.Report(
-            name=name, title=name, content={"value": 1.5}, text="text", figures=figures, lines={}
-        )
-
-    monkeypatch.setattr(page, "run_experiment", report)
-    out = tmp_path / "page"
-    assert page.main([str(out), str(DEMO), "--workers", "1"]) == 0
-    content = json.loads((out / "paper.json").read_text())
-    assert content["captures"]["demo_capture"]["tracks"] == {"value": 1.5}
-    links = _links((out / "paper.md").read_text())
-    assert len(links) == 4
-    assert all((out / link).is_file() for link in links)
-
-
-def test_page_refuses(tmp_path, capsys, page):
-    assert page.main([str(tmp_path / "page"), str(tmp_path / "none")]) == 1
-    assert page.main([str(tmp_path / "page"), str(DEMO), str(DEMO)]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 2
-    assert not (tmp_path / "page").exists()

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import cut_after, record_of, refused, result_of, stages_of
-from polmvs.colmap.sparse_model import write_model
 
 from polmvs.colmap.models import read_model, write_model
 from polmvs.config import (
