@@ -150,9 +150,15 @@ class ViewData:
         return as_tilted(measured) if angle_model is AngleModel.TILTED else measured
 
     def plain_map(self, angle_model: AngleModel) -> PhaseMap:
-        """A phase map of the paper's kind: blurred pixels over the threshold, all alike."""
-        axial = self.axial(angle_model) / np.maximum(self.blurred.s0, 1e-6)[..., None]
-        samples = np.dstack([axial, self.counted.astype(np.float32)])
+        """A phase map of the paper's kind: blurred pixels over the threshold, single.
+
+        Their precision is that of the pixel before the blur; the paper's estimator takes all rows
+        alike, and it tells whether they leave a direction of the normal open.
+        """
+        stokes = self.blurred_for(angle_model)
+        axial = self.axial(angle_model) / np.maximum(stokes.s0, 1e-6)[..., None]
+        precision = self.counted / np.square(np.maximum(stokes.sigma_aolp, 1e-6))
+        samples = np.dstack([axial, precision])
         region = Region(self.part, self.counted, np.zeros_like(self.part))
         base = self.phase_map(AngleModel.PPA, region)
         return replace(base, samples=samples.astype(np.float32))
