@@ -44,7 +44,7 @@ class Cloud:
     scalars: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def only(self, kept: NDArray[np.bool_]) -> Cloud:
-        """The ``kept`` (N,) points, as a cloud of their own."""
+        """The ``kept`` (N,) points as a cloud of their own."""
         return Cloud(
             points=self.points[kept],
             normals=None if self.normals is None else self.normals[kept],
