@@ -179,16 +179,16 @@ def open_dense_workspace(folder: PathArg) -> DenseWorkspace:
         raise DataError(root, "is no folder." if root.exists() else "no such folder.")
     if not (root / STEREO).is_dir():
         raise DataError(root, "has no stereo folder. Give what COLMAP's image_undistorter wrote.")
-    model = read_model(root / SPARSE)
-    missing = [v.name for v in model.views if not member(root / IMAGES, v.name).is_file()]
+    sparse_model = read_model(root / SPARSE)
+    missing = [v.name for v in sparse_model.views if not member(root / IMAGES, v.name).is_file()]
     if missing:
         raise DataError(
             root / IMAGES,
-            f"lacks {len(missing)} of the model's {len(model.views)} images: "
+            f"lacks {len(missing)} of the model's {len(sparse_model.views)} images: "
             f"{short_list(missing)}. Run COLMAP's image_undistorter again.",
         )
-    views = tuple(_open_view(root, view) for view in model.views)
-    return DenseWorkspace(folder=root, views=views, tracks=model.tracks)
+    views = tuple(_open_view(root, view) for view in sparse_model.views)
+    return DenseWorkspace(folder=root, views=views, tracks=sparse_model.tracks)
 
 
 def _open_view(root: Path, view: View) -> WorkspaceView:
@@ -211,7 +211,7 @@ def _open_view(root: Path, view: View) -> WorkspaceView:
 
 def write_dense_workspace(
     folder: PathArg,
-    model: SparseModel,
+    sparse_model: SparseModel,
     load_image: ImageLoader,
     load_maps: MapsLoader,
     *,
@@ -223,7 +223,7 @@ def write_dense_workspace(
     Parameters
     ----------
     folder : to make; it may exist if it is empty.
-    model : of the sensor's pixels.
+    sparse_model : of the sensor's pixels.
     load_image : gives an image's (H, W) uint8 intensity by name.
     load_maps : gives a view's depth and normals at the pixels of its undistorted camera, None for
         a view without; such a view has no maps and is not in ``fusion.cfg``.
@@ -234,14 +234,16 @@ def write_dense_workspace(
     DataError
         The folder is in use or cannot be written, or an image's name leads out of it.
     """
-    undistorted = undistorted_model(model, blank_pixels=blank_pixels, max_image_size=max_image_size)
+    undistorted = undistorted_model(
+        sparse_model, blank_pixels=blank_pixels, max_image_size=max_image_size
+    )
     with new_folder(folder) as root:
         stereo = root / STEREO
         for name in (DEPTH_MAPS, NORMAL_MAPS, GRAPHS):
             (stereo / name).mkdir(parents=True)
         write_model(undistorted, root / SPARSE)
         fused = []
-        for view, target in zip(model.views, undistorted.views, strict=True):
+        for view, target in zip(sparse_model.views, undistorted.views, strict=True):
             assert isinstance(target.camera, PinholeCamera)
             image, _ = warp_image(load_image(view.name), view.camera, target.camera)
             path = member(root / IMAGES, view.name)
@@ -255,16 +257,16 @@ def write_dense_workspace(
         write_lines(stereo / PATCH_MATCH_FILE, _patch_match_lines(undistorted))
 
 
-def source_order(model: SparseModel) -> list[list[int]]:
+def source_order(sparse_model: SparseModel) -> list[list[int]]:
     """For each view the other views, by shared sparse points and then by nearness."""
-    tracks, num_views = model.tracks, len(model.views)
+    tracks, num_views = sparse_model.tracks, len(sparse_model.views)
     seen = sparse.csr_matrix(
         (np.ones(len(tracks.obs_view)), (tracks.obs_view, tracks.obs_track)),
         shape=(num_views, len(tracks.point3D_ids)),
     )
     seen.data[:] = 1  # a view that observes a point twice shares it once
     shared = (seen @ seen.T).toarray()
-    centers = np.array([view.center_in_world for view in model.views])
+    centers = np.array([view.center_in_world for view in sparse_model.views])
     orders = []
     for index in range(num_views):
         distance = np.linalg.norm(centers - centers[index], axis=1)
@@ -273,11 +275,11 @@ def source_order(model: SparseModel) -> list[list[int]]:
     return orders
 
 
-def _patch_match_lines(model: SparseModel) -> list[str]:
+def _patch_match_lines(sparse_model: SparseModel) -> list[str]:
     """An image and its sources in turn; the names outright, which is all that OpenMVS reads."""
-    names = [view.name for view in model.views]
+    names = [view.name for view in sparse_model.views]
     lines = []
-    for name, order in zip(names, source_order(model), strict=True):
+    for name, order in zip(names, source_order(sparse_model), strict=True):
         # A name with a comma cannot be listed.
         sources = [names[other] for other in order if "," not in names[other]][:NUM_SOURCES]
         if sources:
@@ -323,7 +325,7 @@ class CommonView(NamedTuple):
     view: View
 
 
-def common_views(workspace: DenseWorkspace, model: SparseModel) -> list[CommonView]:
+def common_views(workspace: DenseWorkspace, sparse_model: SparseModel) -> list[CommonView]:
     """Views of the workspace and of the model with the same name, else the same stem.
 
     Raises
@@ -331,7 +333,7 @@ def common_views(workspace: DenseWorkspace, model: SparseModel) -> list[CommonVi
     DataError
         There are none.
     """
-    by_name = {view.name: view for view in model.views}
+    by_name = {view.name: view for view in sparse_model.views}
     names = [item.view.name for item in workspace.views]
     matched = require_matches(names, list(by_name), workspace.folder)
     return [
@@ -343,7 +345,7 @@ def common_views(workspace: DenseWorkspace, model: SparseModel) -> list[CommonVi
 
 def require_same_frame(
     workspace: DenseWorkspace,
-    model: SparseModel,
+    sparse_model: SparseModel,
     *,
     tolerances: MatchTolerances = MatchTolerances(),
 ) -> None:
@@ -358,7 +360,7 @@ def require_same_frame(
         They differ, or no view is common. The message names the worst view, and says whether the
         two agree after a similarity.
     """
-    pairs = common_views(workspace, model)
+    pairs = common_views(workspace, sparse_model)
     distances = _scene_distances(pairs, workspace)
     errors = _pose_errors_px(pairs, distances, None)
     worst = int(errors.argmax())
@@ -427,7 +429,7 @@ def _scene_distances(pairs: Sequence[CommonView], workspace: DenseWorkspace) -> 
 
 def require_matching_images(
     workspace: DenseWorkspace,
-    model: SparseModel,
+    sparse_model: SparseModel,
     load_image: ImageLoader,
     *,
     tolerances: MatchTolerances = MatchTolerances(),
@@ -439,7 +441,7 @@ def require_matching_images(
 
     Parameters
     ----------
-    workspace, model : of the same frame, see :func:`require_same_frame`.
+    workspace, sparse_model : of the same frame, see :func:`require_same_frame`.
     load_image : gives an image of the capture, (H, W) uint8, by its name in the model.
 
     Returns
@@ -451,7 +453,7 @@ def require_matching_images(
     DataError
         An image does not match, or no view is common.
     """
-    pairs = common_views(workspace, model)
+    pairs = common_views(workspace, sparse_model)
     step = -(-len(pairs) // tolerances.max_compared_views)
     lowest = 1.0
     for item, view in pairs[::step]:

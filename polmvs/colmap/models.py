@@ -58,15 +58,17 @@ def read_model(path: PathArg) -> SparseModel:
     """
     folder = find_model(path)
     with _as_data_error(folder):
-        model = model_from_reconstruction(_open(folder))
-    if not model.views:
+        sparse_model = model_from_reconstruction(_open(folder))
+    if not sparse_model.views:
         raise DataError(
             folder, "has no registered image. Run COLMAP again or leave out `sfm.sparse`."
         )
-    numbers = [view.cam_from_world.translation for view in model.views]
-    if not all(np.isfinite(array).all() for array in (*numbers, model.tracks.points_in_world)):
+    numbers = [view.cam_from_world.translation for view in sparse_model.views]
+    if not all(
+        np.isfinite(array).all() for array in (*numbers, sparse_model.tracks.points_in_world)
+    ):
         raise DataError(folder, "is no sound COLMAP model (not all numbers in it are finite).")
-    return model
+    return sparse_model
 
 
 def read_reconstruction(path: PathArg) -> pycolmap.Reconstruction:
@@ -188,7 +190,7 @@ def _tracks(reconstruction: pycolmap.Reconstruction, images: list[pycolmap.Image
 
 
 def match_model_to_capture(
-    model: SparseModel,
+    sparse_model: SparseModel,
     names: Sequence[str],
     width: int,
     height: int,
@@ -204,7 +206,7 @@ def match_model_to_capture(
 
     Parameters
     ----------
-    model : as read.
+    sparse_model : as read.
     names : of the capture's images.
     width, height : of the polarization images, px.
     source : where the model came from, for messages.
@@ -219,7 +221,7 @@ def match_model_to_capture(
     DataError
         No image matches, or a camera has another aspect ratio.
     """
-    model_names = [view.name for view in model.views]
+    model_names = [view.name for view in sparse_model.views]
     matched = require_matches(model_names, names, source)
     kept = [i for i, name in enumerate(model_names) if name in matched]
     if dropped := [name for name in model_names if name not in matched]:
@@ -231,18 +233,18 @@ def match_model_to_capture(
         )
     kept.sort(key=lambda i: matched[model_names[i]])
     views = []
-    scales = np.ones((len(model.views), 2))
+    scales = np.ones((len(sparse_model.views), 2))
     for i in kept:
-        camera = model.views[i].camera
+        camera = sparse_model.views[i].camera
         fitted = _fit_camera(camera, width, height, source)
         scales[i] = fitted.width / camera.width, fitted.height / camera.height
-        views.append(replace(model.views[i], name=matched[model_names[i]], camera=fitted))
+        views.append(replace(sparse_model.views[i], name=matched[model_names[i]], camera=fitted))
     if (scales != 1).any():
         logger.info("%s: cameras are rescaled to %dx%d px.", source, width, height)
     registered = {view.name for view in views}
     return SparseModel(
         views=tuple(views),
-        tracks=_select_tracks(model.tracks, kept, scales),
+        tracks=_select_tracks(sparse_model.tracks, kept, scales),
         unregistered=tuple(sorted(set(names) - registered)),
     )
 
@@ -302,13 +304,13 @@ def _select_tracks(tracks: Tracks, kept: Sequence[int], scales: NDArray[np.float
     )
 
 
-def write_model(model: SparseModel, folder: str | PathLike[str]) -> None:
+def write_model(sparse_model: SparseModel, folder: str | PathLike[str]) -> None:
     """Write a model as COLMAP binary, whole or not at all; a folder of that name is replaced.
 
     Keypoints without a track and images without a pose are not part of a :class:`SparseModel`
     and are not written. Each view becomes an image with its own frame.
     """
-    write_reconstruction(_reconstruction(model), folder)
+    write_reconstruction(_reconstruction(sparse_model), folder)
 
 
 def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: PathArg) -> None:
@@ -317,20 +319,20 @@ def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: PathAr
         reconstruction.write_binary(str(root))
 
 
-def _reconstruction(model: SparseModel) -> pycolmap.Reconstruction:
+def _reconstruction(sparse_model: SparseModel) -> pycolmap.Reconstruction:
     """The model in pycolmap's types; ids of points are kept."""
     reconstruction = pycolmap.Reconstruction()
-    cameras = list(dict.fromkeys(view.camera for view in model.views))
+    cameras = list(dict.fromkeys(view.camera for view in sparse_model.views))
     for index, camera in enumerate(cameras):
         colmap_camera = camera_to_colmap(camera)
         colmap_camera.camera_id = index + 1
         reconstruction.add_camera_with_trivial_rig(colmap_camera)
-    tracks = model.tracks
+    tracks = sparse_model.tracks
     # Index of an observation among those of its image.
     order = np.argsort(tracks.obs_view, kind="stable")
-    starts = np.searchsorted(tracks.obs_view[order], np.arange(len(model.views) + 1))
+    starts = np.searchsorted(tracks.obs_view[order], np.arange(len(sparse_model.views) + 1))
     point2D_idx = np.empty(len(order), np.int64)
-    for index, view in enumerate(model.views):
+    for index, view in enumerate(sparse_model.views):
         own = order[starts[index] : starts[index + 1]]
         point2D_idx[own] = np.arange(len(own))
         image = pycolmap.Image(
@@ -429,8 +431,8 @@ def _check_file(path: Path, record_end: Reader) -> None:
 def _camera_end(data: mmap.mmap, start: int) -> int:
     _, model_id, _, _ = CAMERA.unpack_from(data, start)
     # ValueError where pycolmap does not know the model.
-    model = pycolmap.CameraModelId(model_id)
-    params = pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params
+    camera_model = pycolmap.CameraModelId(model_id)
+    params = pycolmap.Camera.create_from_model_id(1, camera_model, 1.0, 1, 1).params
     return start + CAMERA.size + params.nbytes
 
 

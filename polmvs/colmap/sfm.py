@@ -130,9 +130,9 @@ def run_sfm(
             single_camera=options.single_camera,
         )
     write_reconstruction(reconstruction, sparse_folder)
-    model = model_from_reconstruction(reconstruction, names)
-    _log_result(model, reconstruction.compute_mean_reprojection_error())
-    return model
+    sparse_model = model_from_reconstruction(reconstruction, names)
+    _log_result(sparse_model, reconstruction.compute_mean_reprojection_error())
+    return sparse_model
 
 
 def check_intrinsics(
@@ -290,7 +290,7 @@ def _map(
     if not found:
         raise DataError(image_folder, f"SfM finds no model of these images. {NO_MODEL_REMEDY}")
     largest: pycolmap.Reconstruction = max(
-        found.values(), key=lambda model: (model.num_reg_images(), model.num_points3D())
+        found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D())
     )
     if largest.num_reg_images() < 2:
         raise DataError(image_folder, f"SfM registers one image only. {NO_MODEL_REMEDY}")
@@ -364,18 +364,18 @@ def _principal_points_plausible(
     )
 
 
-def _log_result(model: SparseModel, error_px: float) -> None:
+def _log_result(sparse_model: SparseModel, error_px: float) -> None:
     """Headline numbers, and the views that are missing."""
-    num_points = len(model.tracks.point3D_ids)
+    num_points = len(sparse_model.tracks.point3D_ids)
     logger.info(
         "SfM: %d views, %d points, reprojection error %.2f px.",
-        len(model.views),
+        len(sparse_model.views),
         num_points,
         error_px,
     )
-    if model.unregistered:
+    if sparse_model.unregistered:
         logger.warning(
             "SfM: %d views have no pose and are left out: %s.",
-            len(model.unregistered),
-            short_list(model.unregistered),
+            len(sparse_model.unregistered),
+            short_list(sparse_model.unregistered),
         )

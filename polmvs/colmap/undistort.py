@@ -52,7 +52,7 @@ def undistort_xy(xy: NDArray[np.floating], source: Camera, target: PinholeCamera
 
 
 def undistorted_model(
-    model: SparseModel, *, blank_pixels: float = 0.0, max_image_size: int | None = None
+    sparse_model: SparseModel, *, blank_pixels: float = 0.0, max_image_size: int | None = None
 ) -> SparseModel:
     """The model with undistorted cameras and its observations moved to their pixels.
 
@@ -60,11 +60,11 @@ def undistorted_model(
     """
     cameras = {
         camera: undistorted_camera(camera, blank_pixels=blank_pixels, max_image_size=max_image_size)
-        for camera in {view.camera for view in model.views}
+        for camera in {view.camera for view in sparse_model.views}
     }
-    views = tuple(replace(view, camera=cameras[view.camera]) for view in model.views)
-    tracks, obs_xy = model.tracks, np.full(model.tracks.obs_xy.shape, np.nan)
-    for index, view in enumerate(model.views):
+    views = tuple(replace(view, camera=cameras[view.camera]) for view in sparse_model.views)
+    tracks, obs_xy = sparse_model.tracks, np.full(sparse_model.tracks.obs_xy.shape, np.nan)
+    for index, view in enumerate(sparse_model.views):
         own = tracks.obs_view == index
         obs_xy[own] = undistort_xy(tracks.obs_xy[own], view.camera, cameras[view.camera])
     kept = np.isfinite(obs_xy).all(axis=-1)
@@ -75,7 +75,7 @@ def undistorted_model(
         obs_xy=obs_xy[kept],
     )
     seen = np.bincount(tracks.obs_track, minlength=len(tracks.point3D_ids)) > 0
-    return replace(model, views=views, tracks=some_tracks(tracks, seen))
+    return replace(sparse_model, views=views, tracks=some_tracks(tracks, seen))
 
 
 def warp_image(

@@ -167,6 +167,6 @@ def best_fitting_model(found: Mapping[AngleModel, Consistency]) -> AngleModel | 
     It is told by the sparse points on the surface alone, whose place no model has touched: the
     median angle between their normals and their planes of incidence. None without such points.
     """
-    residuals = {model: one.track_residual_median_deg for model, one in found.items()}
-    known = {model: value for model, value in residuals.items() if np.isfinite(value)}
-    return min(known, key=lambda model: known[model]) if known else None
+    residuals = {angle_model: one.track_residual_median_deg for angle_model, one in found.items()}
+    known = {angle_model: value for angle_model, value in residuals.items() if np.isfinite(value)}
+    return min(known, key=lambda angle_model: known[angle_model]) if known else None

@@ -136,8 +136,8 @@ def measure_contours(
     """
     with TemporaryDirectory(prefix="polmvs-contours-") as name:
         folder = Path(name)
-        for model in (AngleModel.PPA, AngleModel.TILTED):
-            (folder / model).mkdir()
+        for angle_model in (AngleModel.PPA, AngleModel.TILTED):
+            (folder / angle_model).mkdir()
         counts = []
         for counted in workers.map(partial(_store_maps, scene, folder), range(len(scene.views))):
             counts.append(counted)
@@ -175,8 +175,8 @@ def _store_maps(scene: Scene, folder: Path, index: int) -> int:
     """Store the phase maps of one view, as captured and corrected; the number of counted pixels."""
     data = load_view(scene, index)
     region = data.find_region(scene.region.min_dolp)
-    for model in (AngleModel.PPA, AngleModel.TILTED):
-        store_phase_map(data.phase_map(model, region), folder / model)
+    for angle_model in (AngleModel.PPA, AngleModel.TILTED):
+        store_phase_map(data.phase_map(angle_model, region), folder / angle_model)
     return int(data.counted.sum())
 
 
@@ -201,12 +201,12 @@ def trace_view(
         ("tilted_tangent", AngleModel.TILTED),
     )
     second = second_view(ppa_maps, index, seeds)
-    for name, model in sources:
+    for name, angle_model in sources:
         phase_map = own
-        if model is AngleModel.TILTED:
+        if angle_model is AngleModel.TILTED:
             phase_map = open_phase_map(own.view, folder / AngleModel.TILTED, tilted=True)
-        paths = _trace(model, phase_map, seeds_xy, step_px, scene.region.min_dolp)
-        if model is AngleModel.OPA:
+        paths = _trace(angle_model, phase_map, seeds_xy, step_px, scene.region.min_dolp)
+        if angle_model is AngleModel.OPA:
             depths = seed_range * own.view.camera.rays(seeds_xy)[:, 2]
             along = depths[paths.curve] / own.view.camera.rays(paths.xy)[:, 2]
             stepped = np.full(len(paths.xy), np.nan)
@@ -254,12 +254,12 @@ def _thinned(
 
 
 def _trace(
-    model: AngleModel, phase_map: PhaseMap, seeds_xy: Floats, step_px: float, min_dolp: float
+    angle_model: AngleModel, phase_map: PhaseMap, seeds_xy: Floats, step_px: float, min_dolp: float
 ) -> Contours:
     """Contours of a model where the view shows the part, polarised over the threshold."""
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
     passable = phase_map.region.inside & ~phase_map.region.edges & (dolp > min_dolp)
-    field = direction_field(model, phase_map.samples, view_rays(phase_map.view), passable)
+    field = direction_field(angle_model, phase_map.samples, view_rays(phase_map.view), passable)
     return trace_contours(field, seeds_xy, step_px=step_px)
 
 

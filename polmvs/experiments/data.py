@@ -123,13 +123,13 @@ class ViewData:
     normals_in_cam: Image
     range_map: Image
 
-    def blurred_for(self, model: AngleModel) -> Stokes:
+    def blurred_for(self, angle_model: AngleModel) -> Stokes:
         """Blurred Stokes images as the model takes them: corrected under ``tilted``."""
-        return self._for(model, self.blurred)
+        return self._for(angle_model, self.blurred)
 
-    def axial(self, model: AngleModel) -> Image:
+    def axial(self, angle_model: AngleModel) -> Image:
         """``(s0 cos 2 phase, s0 sin 2 phase)`` times the DoLP of the blurred images, (H, W, 2)."""
-        stokes = self.blurred_for(model)
+        stokes = self.blurred_for(angle_model)
         return phase_sign(self.light) * np.dstack([stokes.s1, stokes.s2])
 
     def find_region(self, min_dolp: float) -> Region:
@@ -143,22 +143,28 @@ class ViewData:
         spoiled = (self.part & ~region.reliable).astype(np.uint8)
         return np.asarray(cv2.dilate(spoiled, np.ones((size, size), np.uint8)) > 0)
 
-    def phase_map(self, model: AngleModel, region: Region) -> PhaseMap:
+    def phase_map(self, angle_model: AngleModel, region: Region) -> PhaseMap:
         """The package's own phase map: smoothed over the reliable pixels, with precisions."""
         s = self.sharp
         measured = build_phase_map(self.view, s.s0, s.s1, s.s2, s.sigma, region, self.light)
-        return as_tilted(measured) if model is AngleModel.TILTED else measured
+        return as_tilted(measured) if angle_model is AngleModel.TILTED else measured
 
-    def plain_map(self, model: AngleModel) -> PhaseMap:
-        """A phase map of the paper's kind: blurred pixels over the threshold, all alike."""
-        axial = self.axial(model) / np.maximum(self.blurred.s0, 1e-6)[..., None]
-        samples = np.dstack([axial, self.counted.astype(np.float32)])
+    def plain_map(self, angle_model: AngleModel) -> PhaseMap:
+        """A phase map of the paper's kind: blurred pixels over the threshold, single.
+
+        Their precision is that of the pixel before the blur; the paper's estimator takes all rows
+        alike, and it tells whether they leave a direction of the normal open.
+        """
+        stokes = self.blurred_for(angle_model)
+        axial = self.axial(angle_model) / np.maximum(stokes.s0, 1e-6)[..., None]
+        precision = self.counted / np.square(np.maximum(stokes.sigma_aolp, 1e-6))
+        samples = np.dstack([axial, precision])
         region = Region(self.part, self.counted, np.zeros_like(self.part))
         base = self.phase_map(AngleModel.PPA, region)
         return replace(base, samples=samples.astype(np.float32))
 
-    def _for(self, model: AngleModel, stokes: Stokes) -> Stokes:
-        if model is not AngleModel.TILTED:
+    def _for(self, angle_model: AngleModel, stokes: Stokes) -> Stokes:
+        if angle_model is not AngleModel.TILTED:
             return stokes
         return correct_stokes(stokes, self.rays, diffuse=self.light is Light.DIFFUSE)
 

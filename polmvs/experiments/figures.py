@@ -70,11 +70,11 @@ def draw_phase_density(result: PhaseResult) -> bytes:
     axes = figure.subplots(3, 3, sharey=True, sharex="col")
     norm = PowerNorm(0.4, vmin=0, vmax=0.5)
     image = None
-    for row, model in enumerate(AngleModel):
+    for row, angle_model in enumerate(AngleModel):
         for column, angle in enumerate(ANGLES):
             ax = axes[row, column]
             image = ax.imshow(
-                result.densities[model][column].T,
+                result.densities[angle_model][column].T,
                 origin="lower",
                 extent=(0, ANGLE_LIMITS_DEG[angle], -90, 90),
                 aspect="auto",
@@ -86,8 +86,8 @@ def draw_phase_density(result: PhaseResult) -> bytes:
             ax.set_yticks((-90, -45, 0, 45, 90))
             if row == 2:
                 ax.set_xlabel(f"{ANGLE_NAMES[angle]} (°)")
-        rmse = result.all_pixels[model].rmse_deg
-        axes[row, 0].set_ylabel(f"{MODEL_LABELS[model]}, RMSE {rmse:.1f}°\nphase error (°)")
+        rmse = result.all_pixels[angle_model].rmse_deg
+        axes[row, 0].set_ylabel(f"{MODEL_LABELS[angle_model]}, RMSE {rmse:.1f}°\nphase error (°)")
     if image is not None:
         bar = figure.colorbar(image, ax=axes, shrink=0.7, extend="max", pad=0.02)
         bar.set_label("density of each column (1/°); grey: too few pixels")

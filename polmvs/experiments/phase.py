@@ -72,13 +72,15 @@ class PhaseResult:
     per_view: Mapping[str, Mapping[AngleModel, float]]
     densities: Mapping[AngleModel, Density]
 
-    def ratio(self, model: AngleModel) -> float:
+    def ratio(self, angle_model: AngleModel) -> float:
         """Root mean square error over that of OPA, all pixels."""
-        return ratio(self.all_pixels[model].rmse_deg, self.all_pixels[AngleModel.OPA].rmse_deg)
+        return ratio(
+            self.all_pixels[angle_model].rmse_deg, self.all_pixels[AngleModel.OPA].rmse_deg
+        )
 
-    def ratio_unmarked(self, model: AngleModel) -> float:
+    def ratio_unmarked(self, angle_model: AngleModel) -> float:
         """Root mean square error over that of OPA, outside of marks."""
-        return ratio(self.unmarked[model].rmse_deg, self.unmarked[AngleModel.OPA].rmse_deg)
+        return ratio(self.unmarked[angle_model].rmse_deg, self.unmarked[AngleModel.OPA].rmse_deg)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,12 +133,14 @@ def measure_view(scene: Scene, index: int) -> ViewPhase:
     marked = data.beside_marks(data.find_region(scene.region.min_dolp), scene.blur_px)
     unmarked = ~marked[data.counted]
     angles = _angles(data)
-    errors = {model: _errors_deg(data, model) for model in AngleModel}
+    errors = {angle_model: _errors_deg(data, angle_model) for angle_model in AngleModel}
     return ViewPhase(
         name=data.view.name,
-        all_pixels={model: ErrorTally.of(error) for model, error in errors.items()},
-        unmarked={model: ErrorTally.of(error[unmarked]) for model, error in errors.items()},
-        counts={model: _histograms(angles, error) for model, error in errors.items()},
+        all_pixels={angle_model: ErrorTally.of(error) for angle_model, error in errors.items()},
+        unmarked={
+            angle_model: ErrorTally.of(error[unmarked]) for angle_model, error in errors.items()
+        },
+        counts={angle_model: _histograms(angles, error) for angle_model, error in errors.items()},
     )
 
 
@@ -157,17 +161,17 @@ def phase_images(scene: Scene, index: int) -> PhaseImages:
     )
 
 
-def _phase(data: ViewData, model: AngleModel) -> Array:
+def _phase(data: ViewData, angle_model: AngleModel) -> Array:
     """Measured phase (H, W), rad in [0, pi), as the model takes it."""
-    axial = data.axial(model)
+    axial = data.axial(angle_model)
     return np.asarray(np.mod(0.5 * np.arctan2(axial[..., 1], axial[..., 0]), np.pi), np.float64)
 
 
-def _errors_deg(data: ViewData, model: AngleModel) -> Array:
+def _errors_deg(data: ViewData, angle_model: AngleModel) -> Array:
     """Predicted minus measured phase of the counted pixels, (P,) degrees."""
     counted = data.counted
-    predicted = phase_from_normal(model, data.normals_in_cam[counted], data.rays[counted])
-    return np.degrees(axial_difference(predicted, _phase(data, model)[counted]))
+    predicted = phase_from_normal(angle_model, data.normals_in_cam[counted], data.rays[counted])
+    return np.degrees(axial_difference(predicted, _phase(data, angle_model)[counted]))
 
 
 def _angles(data: ViewData) -> dict[str, Array]:

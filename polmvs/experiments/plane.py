@@ -180,17 +180,17 @@ def measure_image(
     """Estimates of one view, and its share in the ambiguity."""
     data = load_view(scene, index)
     region, true_normal = planar_region(data, planar_deg)
-    pixels = {model: _pixels(data, model, region) for model in AngleModel}
+    pixels = {angle_model: _pixels(data, angle_model, region) for angle_model in AngleModel}
     estimates, seconds = {}, {}
     enough = int(region.sum()) >= MIN_PIXELS
     turn = _tilt_turn(pixels[AngleModel.PPA][0], pixels[AngleModel.TILTED][0])
-    for name, (model, weights) in ESTIMATES.items() if enough else ():
-        axial, rays, sigma = pixels[model]
+    for name, (angle_model, weights) in ESTIMATES.items() if enough else ():
+        axial, rays, sigma = pixels[angle_model]
         start = time.perf_counter()
         if weights is Weights.TILT_AWARE:
             sigma = np.hypot(sigma, TILT_FACTOR * turn)
         robust = weights is not Weights.ALIKE
-        estimates[name] = plane_normal(model, axial, rays, sigma, robust=robust)
+        estimates[name] = plane_normal(angle_model, axial, rays, sigma, robust=robust)
         seconds[name] = time.perf_counter() - start
     image = ImagePlane(
         name=data.view.name,
@@ -224,10 +224,10 @@ def planar_region(data: ViewData, planar_deg: float) -> tuple[Mask, Array]:
     return region, mean / np.linalg.norm(mean)
 
 
-def _pixels(data: ViewData, model: AngleModel, region: Mask) -> tuple[Floats, Floats, Floats]:
+def _pixels(data: ViewData, angle_model: AngleModel, region: Mask) -> tuple[Floats, Floats, Floats]:
     """Axial pair (2, N), rays (3, N) and phase deviation (N,) of the region's pixels."""
-    stokes: Stokes = data.blurred_for(model)
-    axial = np.ascontiguousarray(data.axial(model)[region].T)
+    stokes: Stokes = data.blurred_for(angle_model)
+    axial = np.ascontiguousarray(data.axial(angle_model)[region].T)
     rays = np.ascontiguousarray(data.rays[region].T)
     return axial, rays, stokes.sigma_aolp[region]
 
@@ -247,15 +247,15 @@ def _error_deg(estimate: PlaneEstimate, true_normal: Array) -> float:
 
 
 def _ambiguity(
-    model: AngleModel, normal: Array, axial: Floats, rays: Floats, sigma: Floats
+    angle_model: AngleModel, normal: Array, axial: Floats, rays: Floats, sigma: Floats
 ) -> Ambiguity:
     """Residuals of a normal and of its twin, and whether the rows tell them apart."""
     turned = normal * [-1.0, -1.0, 1.0]
     rmse = [
-        float(np.degrees(np.sqrt(np.nanmean(phase_residuals(model, n, axial, rays) ** 2))))
+        float(np.degrees(np.sqrt(np.nanmean(phase_residuals(angle_model, n, axial, rays) ** 2))))
         for n in (normal, turned)
     ]
-    determined = plane_normal(model, axial, rays, sigma, robust=False).valid
+    determined = plane_normal(angle_model, axial, rays, sigma, robust=False).valid
     return Ambiguity(rmse_deg=rmse[0], rmse_turned_deg=rmse[1], determined_share=float(determined))
 
 

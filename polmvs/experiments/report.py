@@ -293,11 +293,11 @@ def _poses(scene: Scene) -> str:
 def phase_json(result: PhaseResult) -> dict[str, Any]:
     """Content of ``phase.json`` beside the settings."""
     return {
-        **{model.value: asdict(stats) for model, stats in result.all_pixels.items()},
+        **{angle_model.value: asdict(stats) for angle_model, stats in result.all_pixels.items()},
         "ratio_ppa_opa": result.ratio(AngleModel.PPA),
         "ratio_tilted_opa": result.ratio(AngleModel.TILTED),
         "outside_marks": {
-            **{model.value: asdict(stats) for model, stats in result.unmarked.items()},
+            **{angle_model.value: asdict(stats) for angle_model, stats in result.unmarked.items()},
             "ratio_ppa_opa": result.ratio_unmarked(AngleModel.PPA),
             "ratio_tilted_opa": result.ratio_unmarked(AngleModel.TILTED),
         },
@@ -317,9 +317,9 @@ def phase_table(result: PhaseResult) -> str:
     return _table(head, rows)
 
 
-def _phase_row(model: AngleModel, stats: SignedStats, share: float) -> list[str]:
+def _phase_row(angle_model: AngleModel, stats: SignedStats, share: float) -> list[str]:
     return [
-        MODEL_LABELS[model],
+        MODEL_LABELS[angle_model],
         f"{stats.mean_deg:+.2f}°",
         f"{stats.rmse_deg:.2f}°",
         f"{stats.median_deg:.2f}°",
@@ -343,7 +343,9 @@ def plane_json(result: PlaneResult) -> dict[str, Any]:
         **estimates,
         "per_image": [asdict(image) for image in result.per_image],
         "skipped": list(result.skipped),
-        "pi_ambiguity": {model.value: asdict(a) for model, a in result.ambiguity.items()},
+        "pi_ambiguity": {
+            angle_model.value: asdict(a) for angle_model, a in result.ambiguity.items()
+        },
     }
 
 
@@ -363,12 +365,12 @@ def plane_table(result: PlaneResult) -> str:
     errors = _table(["estimate", "mean", "RMSE", "median", "time", "images"], rows)
     twins = [
         [
-            MODEL_LABELS[model],
+            MODEL_LABELS[angle_model],
             f"{a.rmse_deg:.2f}°",
             f"{a.rmse_turned_deg:.2f}°",
             f"{100 * a.determined_share:.0f} %",
         ]
-        for model, a in result.ambiguity.items()
+        for angle_model, a in result.ambiguity.items()
     ]
     head = ["model", "residual of the true normal", "of its twin turned by π", "views determined"]
     return f"{errors}\n{_table(head, twins)}"

@@ -194,12 +194,12 @@ def view_rows(scene: Scene, points: Array, index: int) -> dict[str, Rows]:
     data = load_view(scene, index)
     region = data.find_region(scene.region.min_dolp)
     rows = {}
-    for name, (model, source) in ESTIMATORS.items():
+    for name, (angle_model, source) in ESTIMATORS.items():
         if source is Source.PIXELS:
-            phase_map = data.plain_map(model)
+            phase_map = data.plain_map(angle_model)
         else:
-            phase_map = data.phase_map(model, region)
-        rows[name] = gather_rows(model, points, [phase_map], [data.range_map])
+            phase_map = data.phase_map(angle_model, region)
+        rows[name] = gather_rows(angle_model, points, [phase_map], [data.range_map])
     return rows
 
 

@@ -43,7 +43,7 @@ class WarpTolerances:
 
 def export_dense_workspace(
     folder: str | PathLike[str],
-    model: SparseModel,
+    sparse_model: SparseModel,
     load_image: ImageLoader,
     load_dense: DenseLoader,
     *,
@@ -56,7 +56,7 @@ def export_dense_workspace(
     ----------
     load_dense : gives an image's dense result by name, None for a view without; such a view has
         no maps and is not in ``fusion.cfg``.
-    folder, model, load_image, blank_pixels, max_image_size : see
+    folder, sparse_model, load_image, blank_pixels, max_image_size : see
         :func:`polmvs.colmap.dense_workspace.write_dense_workspace`.
 
     Raises
@@ -71,7 +71,7 @@ def export_dense_workspace(
 
     write_dense_workspace(
         folder,
-        model,
+        sparse_model,
         load_image,
         load_maps,
         blank_pixels=blank_pixels,

@@ -31,12 +31,7 @@ from polmvs.experiments.contours import (
 from polmvs.experiments.data import Scene, load_view, open_experiment, open_scene
 from polmvs.experiments.phase import ErrorTally, measure_phase, phase_images
 from polmvs.experiments.plane import measure_plane
-from polmvs.experiments.tracks import (
-    check_k,
-    measure_tracks,
-    order_at_random,
-    order_by_angle,
-)
+from polmvs.experiments.tracks import check_k, measure_tracks, order_at_random, order_by_angle
 from polmvs.io.clouds import _open3d
 from polmvs.io.images import write_png
 from polmvs.parallel import Workers
