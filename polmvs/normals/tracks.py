@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, Estimator, NormalOptions
-from polmvs.normals.estimator import NormalEstimate, solve_at_own_noise, solve_normals
+from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds, Tracks, point_sigmas
@@ -86,10 +86,7 @@ def normals_from_windows(
     cosine = np.einsum("ikn,ni->kn", rows.rays, np.nan_to_num(own.normals))
     facing = cosine < -MIN_FACING_COSINE
     sigma = np.where(matched | facing, rows.sigma, np.inf)
-    start = own.normals.T
-    if not robust:
-        return solve_normals(rows.rows, rows.rays, sigma, robust=False, initial_normals=start)
-    return solve_at_own_noise(rows.rows, rows.rays, sigma, initial_normals=start)[0]
+    return solve_normals(rows.rows, rows.rays, sigma, robust=robust, initial_normals=own.normals.T)
 
 
 def inside_shares(

@@ -21,10 +21,10 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 
-# Systematic error of multi-view normals, rad, between nodes REFERENCE_SPACING_PX apart. Errors of
-# edges count as independent: that of denser ones must be larger to add up to the same.
+# Systematic error of multi-view normals, rad, between nodes this angle apart. Errors of edges count
+# as independent: that of denser ones must be larger to add up to the same.
 NORMAL_SIGMA_FLOOR = 0.012
-REFERENCE_SPACING_PX = 6.0
+REFERENCE_ANGLE = 0.0135  # rad; 6 px of the captures that it was measured on
 MAX_SEED_DISTANCE_PX = 12.0  # from a seed to the nodes it is tied to
 NUM_TIES = 4
 MIN_SEED_COSINE = 0.995  # 5.7 deg between the normals of a seed and of a node it is tied to
@@ -44,6 +44,7 @@ class Nodes:
     surface : the nodes with what is known of the surface there; NaN where unknown.
     ray_z : (N,), z component of the nodes' rays in the camera frame.
     spacing_px : distance between neighbouring nodes.
+    focal_px : of the view.
     tail, head : (E,) indices of the nodes that an edge joins.
     on_contour : (E,) bool, edges between consecutive nodes of a contour.
     """
@@ -51,9 +52,15 @@ class Nodes:
     surface: SurfaceSamples
     ray_z: Floats
     spacing_px: float
+    focal_px: float
     tail: Indices
     head: Indices
     on_contour: NDArray[np.bool_]
+
+    @property
+    def spacing(self) -> float:
+        """Angle between neighbouring nodes, rad."""
+        return self.spacing_px / self.focal_px
 
 
 def visible_seeds(phase_map: PhaseMap, seeds: Seeds) -> tuple[NDArray[np.bool_], Array]:
@@ -129,7 +136,7 @@ def node_edges(
     along_contours : use that constancy.
     """
     surface = nodes.surface
-    floor = NORMAL_SIGMA_FLOOR * np.sqrt(REFERENCE_SPACING_PX / nodes.spacing_px)
+    floor = NORMAL_SIGMA_FLOOR * np.sqrt(REFERENCE_ANGLE / nodes.spacing)
     sigma = np.hypot(surface.normal_sigma, floor)
     joined = _smooth_edges(nodes, surface.normals, sigma)
     tail, head = nodes.tail[joined], nodes.head[joined]
