@@ -10,10 +10,9 @@ angles, with photon and read noise; then it sees the ball once, 12 bits.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import MISSING, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera
-from polmvs.cli.terminal import Terminal, guarded
-from polmvs.config import CaptureOptions
+from polmvs.cli.call import Call, TerminalOptions
+from polmvs.cli.flags import Command
+from polmvs.cli.running import run
+from polmvs.cli.terminal import Terminal
+from polmvs.config import CaptureOptions, OptionGroup, option
 from polmvs.polarization.calibration import measure_response, write_calibration
 from polmvs.polarization.capture import open_capture
 from polmvs.polarization.stokes import axial_difference
@@ -42,26 +44,37 @@ MIN_DOLP = 0.05
 BANDS = (0.05, 0.1, 0.2, 0.4, 1.0)  # of DoLP, whose errors are told apart
 
 
+@dataclass(frozen=True, kw_only=True)
+class Arguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    figure: Path = option(MISSING, "PNG to write", positional=True)
+
+
+def _calibration(call: Call, terminal: Terminal) -> int:
+    errors, dolp = measure()
+    lines = []
+    for name, error in errors.items():
+        bands = "  ".join(
+            f"{low:g}-{high:g}: {_rms(error[(dolp >= low) & (dolp < high)]):.2f}"
+            for low, high in pairwise(BANDS)
+        )
+        lines.append(f"{name:<12} rms AoLP error, deg, by DoLP  {bands}  all: {_rms(error):.2f}")
+    draw(call.get(Arguments).figure, errors)
+    terminal.show("\n".join(lines), {name: _rms(error) for name, error in errors.items()})
+    return 0
+
+
+COMMAND = Command(
+    help_text="AoLP error of a faulty sensor before and after its calibration",
+    run=_calibration,
+    groups=(Arguments, TerminalOptions),
+)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the script; the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("figure", type=Path, metavar="FIGURE", help="PNG to write")
-    args = parser.parse_args(argv)
-
-    def run() -> int:
-        errors, dolp = measure()
-        for name, error in errors.items():
-            bands = "  ".join(
-                f"{low:g}-{high:g}: {_rms(error[(dolp >= low) & (dolp < high)]):.2f}"
-                for low, high in pairwise(BANDS)
-            )
-            print(f"{name:<12} rms AoLP error, deg, by DoLP  {bands}  all: {_rms(error):.2f}")
-        draw(args.figure, errors)
-        print(args.figure)
-        return 0
-
-    with Terminal(verbose=False) as terminal:
-        return guarded(run, terminal, parser.prog)
+    return run((COMMAND,), "calibration.py", argv)
 
 
 def measure() -> tuple[dict[str, Array], Array]:
