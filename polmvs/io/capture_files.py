@@ -196,8 +196,8 @@ def _flat(
                 return _assemble(folder, its_kind, named)
     raise DataError(
         place,
-        f"its files' names are not those of a capture of kind {kind}. Say by `capture.naming` how its "
-        "files are named.",
+        f"its files' names are not those of a capture of kind {kind}. Say by `capture.naming` how "
+        "its files are named.",
     )
 
 

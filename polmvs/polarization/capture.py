@@ -428,8 +428,8 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
         calibration = read_calibration(options.calibration)
         if calibration.pattern != options.pattern:
             raise OptionError(
-                f"`capture.calibration` {options.calibration} is of the pattern {calibration.pattern}, "
-                f"`capture.pattern` says {options.pattern}."
+                f"is of the pattern {calibration.pattern}, `capture.pattern` is {options.pattern}.",
+                field="capture.calibration",
             )
     capture = Capture(
         folder=files.folder,

@@ -70,10 +70,10 @@ class PatternCheck:
         if self.fits:
             return f"`capture.pattern` {text} fits, or a turned or mirrored one"
         likely = ",".join(map(str, self.fitting[0]))
+        pairs = PAIRING_NAMES[int(np.argmin(self.disagreement))]
         return (
-            f"`capture.pattern` {text} does not fit: its perpendicular samples do not sum alike. Those on "
-            f"the {PAIRING_NAMES[int(np.argmin(self.disagreement))]} of a cell do, as in "
-            f"`capture.pattern` {likely}"
+            f"`capture.pattern` {text} does not fit: its perpendicular samples do not sum alike. "
+            f"Those on the {pairs} of a cell do, as in `capture.pattern` {likely}"
         )
 
 
