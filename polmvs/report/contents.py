@@ -22,6 +22,7 @@ from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.stokes import Stokes
 from polmvs.report import pictures
+from polmvs.report.page import Picture, ViewPage
 from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView
 
@@ -32,43 +33,6 @@ MAX_RESIDUAL_DEG = 20.0  # top of the colour scales: OPA's phase errors on obliq
 MAX_DEPTH_ERROR_M = 0.005
 MAX_NORMAL_ERROR_DEG = 15.0
 MAX_SAMPLES_A_VIEW = 4000  # of errors for the plots: quartiles of 16 views then err by under 1 %
-
-
-@dataclass(frozen=True, kw_only=True)
-class Picture:
-    """One picture of a view.
-
-    Attributes
-    ----------
-    title : under the thumbnail.
-    alt : for who cannot see it.
-    uri : the coded picture.
-    scale : (lowest, highest, unit, colour map) of the legend; None without one.
-    wheel : its legend is the wheel of angles.
-    """
-
-    title: str
-    alt: str
-    uri: str
-    scale: tuple[str, str, str] | None = None
-    wheel: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewPage:
-    """All pictures of a view.
-
-    Attributes
-    ----------
-    name : of the view.
-    pictures : in reading order.
-    wipe : two pictures that a slider wipes between, the first model's and the second's.
-    wipe_titles : their names.
-    """
-
-    name: str
-    pictures: tuple[Picture, ...]
-    wipe: tuple[Picture, Picture] | None
 
 
 @dataclass(kw_only=True)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from polmvs.report.pictures import hex_palette
 from polmvs.scene import PointKind, View
@@ -26,6 +27,7 @@ FULL = 65535
 FRUSTUM_SHARE = 0.08  # depth of a drawn camera, of the distance from the target
 EYE_DISTANCE = 3.2  # from the target, in radii of the part: all of it in a field of view of 40 deg
 EYE_ELEVATION_DEG = 35.0
+SPACING_SAMPLES = 2000  # points whose nearest neighbour is looked up; their median errs by 1 %
 KIND_COLORS = ("#0072b2", "#999999", "#e69f00", "#009e73")  # by PointKind
 
 
@@ -150,11 +152,12 @@ def pack_scene(
         "extent": extent,
         "layers": described,
         "channels": {
-            "normal": {"label": "normal", "note": "red, green, blue: x, y, z of the normal"},
+            "normal": {"label": "normal", "note": "red and green: sideways, blue: up; grey: no normal"},
             **{name: _channel_json(channel) for name, channel in channels.items()},
         },
         "target": target.tolist(),
         "up": up.tolist(),
+        "basis": np.concatenate([side, np.cross(up, side), up]).tolist(),
         "eye": eye.tolist(),
         "radius": radius,
         "frusta": _frusta(views, target),
@@ -216,12 +219,13 @@ def _channel_json(channel: Channel) -> dict[str, Any]:
 
 
 def _spacing(layer: Layer) -> float:
-    """Mean distance of neighbouring points, as if they covered their box's largest two sides."""
-    if not len(layer.points):
+    """Typical distance of neighbouring points; of a mesh it is not used."""
+    points = layer.points
+    if layer.triangles is not None or len(points) < 2:
         return 1.0
-    low, high = np.percentile(layer.points, (2, 98), axis=0)
-    longest = np.sort(high - low)[1:]
-    return float(np.sqrt(max(longest.prod(), 1e-300) / len(layer.points)))
+    chosen = points[:: max(1, len(points) // SPACING_SAMPLES)]
+    distance, _ = cKDTree(points).query(chosen, k=2)
+    return float(np.median(distance[:, 1]))
 
 
 def _pose_of_part(layer: Layer, views: Sequence[View]) -> tuple[Array, Array, float]:

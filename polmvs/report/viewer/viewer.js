@@ -11,6 +11,7 @@ import {
   DoubleSide,
   LineBasicMaterial,
   LineSegments,
+  Matrix3,
   Mesh,
   PerspectiveCamera,
   Points,
@@ -48,6 +49,7 @@ uniform sampler2D palette;
 uniform int mode;
 uniform float shading;
 uniform bool isPoint;
+uniform mat3 basis;
 varying float vValue;
 varying vec3 vNormal;
 varying vec3 vWorldNormal;
@@ -55,7 +57,7 @@ varying vec3 vEye;
 void main() {
   if (isPoint && length(gl_PointCoord - 0.5) > 0.5) discard;
   vec3 color = mode == 2 ? vec3(vValue)
-    : mode == 1 ? 0.5 + 0.5 * normalize(vWorldNormal)
+    : mode == 1 ? (length(vWorldNormal) > 0.1 ? 0.5 + 0.5 * basis * normalize(vWorldNormal) : vec3(0.6))
     : texture2D(palette, vec2((vValue * 255.0 + 0.5) / 256.0, 0.5)).rgb;
   float size = length(vNormal);
   float facing = size > 0.1 ? abs(dot(vNormal / size, normalize(vEye))) : 0.8;
@@ -102,6 +104,7 @@ async function buildLayer(layer, scene) {
       pointSize: { value: 1 },
       shading: { value: 1 },
       isPoint: { value: !layer.triangles },
+      basis: { value: new Matrix3().set(...scene.basis) },
     },
   });
   const object = layer.triangles ? new Mesh(geometry, material) : new Points(geometry, material);
@@ -167,7 +170,7 @@ class Pane {
     this.object.geometry.setAttribute("value", values);
     uniforms.mode.value = name === "normal" ? MODES.normal : has && channel.colors ? MODES.palette : MODES.grey;
     uniforms.palette.value = has && channel.colors ? this.view.palette(name) : this.view.blank;
-    uniforms.shading.value = name === "intensity" ? 0.35 : 1;
+    uniforms.shading.value = name === "intensity" ? 0.35 : 0.6;
     this.element.querySelector(".without").hidden = has;
   }
 
@@ -186,7 +189,7 @@ class Pane {
     if (this.object) {
       const focal = (0.5 * height * ratio) / Math.tan((0.5 * camera.fov * Math.PI) / 180);
       this.object.material.uniforms.pointSize.value =
-        1.5 * this.built.layer.spacing * focal * this.view.pointScale;
+        2 * this.built.layer.spacing * focal * this.view.pointScale;
     }
     this.renderer.setClearColor(getComputedStyle(this.element).getPropertyValue("--canvas").trim() || "#ffffff", 1);
     this.renderer.render(this.scene, camera);
@@ -214,6 +217,7 @@ class View {
     this.frusta.visible = false;
     this.reset();
     this.panes = [...root.querySelectorAll(".pane")].map((element) => new Pane(element, this));
+    this.reset(); // the controls looked at the origin when they were made
     this.bind();
   }
 
