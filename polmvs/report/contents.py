@@ -104,10 +104,12 @@ def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[Pictu
     """What the camera saw, and where a polarised surface was found."""
     inside = phase_map.region.inside
     intensity = phase_map.intensity
+    aolp: Floats
+    dolp: Floats
     if given.stokes is not None:
-        aolp, dolp = given.stokes.aolp, given.stokes.dolp
-        unknown = ~given.stokes.valid
-        aolp, dolp = np.where(unknown, np.nan, aolp), np.where(unknown, np.nan, dolp)
+        valid = given.stokes.valid
+        aolp = np.where(valid, given.stokes.aolp, np.nan)
+        dolp = np.where(valid, given.stokes.dolp, np.nan)
     else:  # of the region alone, smoothed
         samples = phase_map.samples
         sign = np.where(phase_map.diffuse, 1, -1)
@@ -233,5 +235,3 @@ def _picture(
     wheel: bool = False,
 ) -> Picture:
     return Picture(title=title, alt=alt, uri=pictures.data_uri(rgb), scale=scale, wheel=wheel)
-
-

@@ -28,6 +28,7 @@ FRUSTUM_SHARE = 0.08  # depth of a drawn camera, of the distance from the target
 EYE_DISTANCE = 3.2  # from the target, in radii of the part: all of it in a field of view of 40 deg
 EYE_ELEVATION_DEG = 35.0
 SPACING_SAMPLES = 2000  # points whose nearest neighbour is looked up; their median errs by 1 %
+NORMAL_NOTE = "red and green: sideways, blue: up; grey: no normal"
 KIND_COLORS = ("#0072b2", "#999999", "#e69f00", "#009e73")  # by PointKind
 
 
@@ -152,7 +153,10 @@ def pack_scene(
         "extent": extent,
         "layers": described,
         "channels": {
-            "normal": {"label": "normal", "note": "red and green: sideways, blue: up; grey: no normal"},
+            "normal": {
+                "label": "normal",
+                "note": "red and green: sideways, blue: up; grey: no normal",
+            },
             **{name: _channel_json(channel) for name, channel in channels.items()},
         },
         "target": target.tolist(),

@@ -100,9 +100,7 @@ def outline_picture(intensity: Floats, white: float, inside: Mask) -> Rgb:
 def _colored(share: Floats, colors: Rgb) -> Rgb:
     known = np.isfinite(share)
     index = np.clip(np.where(known, share, 0) * len(colors), 0, len(colors) - 1).astype(np.intp)
-    picture = colors[index]
-    picture[~known] = NOTHING
-    return picture
+    return np.where(known[..., None], colors[index], np.uint8(NOTHING))
 
 
 def data_uri(picture: NDArray[np.uint8]) -> str:

@@ -127,8 +127,8 @@ def _svg(figure: Figure, title: str) -> str:
     for axes in figure.axes:
         legend = axes.get_legend()
         if legend is not None:
-            for text in legend.get_texts():
-                text.set_color(INK)
+            for label in legend.get_texts():
+                label.set_color(INK)
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": title}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})

@@ -25,6 +25,7 @@ import { TrackballControls } from "three/examples/jsm/controls/TrackballControls
 
 const TYPES = { uint8: Uint8Array, int8: Int8Array, uint16: Uint16Array, uint32: Uint32Array };
 const TURN = 0.12; // rad for each press of an arrow key
+const FIELD_DEG = 40;
 const MODES = { palette: 0, normal: 1, grey: 2 };
 
 const VERTEX = `
@@ -185,6 +186,12 @@ class Pane {
     }
     const camera = this.view.camera;
     camera.aspect = width / height;
+    // The narrower side spans the field of view, so that a tall pane shows the whole part too.
+    camera.fov = FIELD_DEG;
+    if (camera.aspect < 1) {
+      const half = Math.tan((0.5 * FIELD_DEG * Math.PI) / 180) / camera.aspect;
+      camera.fov = (360 / Math.PI) * Math.atan(half);
+    }
     camera.updateProjectionMatrix();
     if (this.object) {
       const focal = (0.5 * height * ratio) / Math.tan((0.5 * camera.fov * Math.PI) / 180);
@@ -206,7 +213,7 @@ class View {
     this.blank = paletteTexture(["#888888"]);
     this.color = "normal";
     this.pointScale = 1;
-    this.camera = new PerspectiveCamera(40, 1, 0.01 * this.description.radius, 100 * this.description.radius);
+    this.camera = new PerspectiveCamera(FIELD_DEG, 1, 0.01 * this.description.radius, 100 * this.description.radius);
     this.frusta = new LineSegments(
       new BufferGeometry().setAttribute(
         "position",
