@@ -42,7 +42,7 @@ def error_curves(errors: Mapping[AngleModel, Floats], unit: str, title: str) -> 
     right.set_xscale("log")
     left.set(xlabel=f"{title}, {unit}", ylabel="points in each bin, %")
     right.set(xlabel=f"{title}, {unit} (log)", ylabel="points below, %", ylim=(0, 100))
-    right.legend(frameon=False)
+    _add_legend(right)
     return _svg(figure, f"Histogram and cumulative curve of the {title}")
 
 
@@ -73,7 +73,7 @@ def error_against(
         axes.fill_between(middle, found[:, 0], found[:, 2], color=COLORS[model], alpha=0.15, lw=0)
     axes.set(xlabel=names[0], ylabel=names[1])
     axes.set_ylim(bottom=0)
-    axes.legend(frameon=False)
+    _add_legend(axes)
     return _svg(figure, f"{names[1]} against {names[0]}")
 
 
@@ -111,6 +111,12 @@ def _figure(num: int, height: float = 2.9) -> tuple[Figure, list[Axes]]:
     return figure, axes
 
 
+def _add_legend(axes: Axes) -> None:
+    """A legend, where anything is drawn that has a name."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(frameon=False, labelcolor=INK)
+
+
 def _style(model: AngleModel) -> dict[str, Any]:
     return {
         "color": COLORS[model],
@@ -124,11 +130,6 @@ def _svg(figure: Figure, title: str) -> str:
     """SVG with text as text, a title for screen readers, and the page's ink."""
     import matplotlib
 
-    for axes in figure.axes:
-        legend = axes.get_legend()
-        if legend is not None:
-            for label in legend.get_texts():
-                label.set_color(INK)
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": title}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
