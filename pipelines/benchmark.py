@@ -14,7 +14,6 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +22,11 @@ from numpy.typing import NDArray
 from polmvs.cli import main as run_polmvs
 from polmvs.config import AngleModel
 from polmvs.errors import PolmvsError
-from polmvs.evaluation.tables import format_table, stage_table
+from polmvs.evaluation.tables import format_table
 from polmvs.normals.estimator import NUM_ROUNDS, solve_normals
 from polmvs.normals.single_view.plane import plane_normal
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
+from polmvs.pipeline.runner import load_record, timing_table
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
 
 Array = NDArray[np.float64]
@@ -59,11 +59,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     elif flags:
         parser.error(f"unknown arguments: {' '.join(flags)}")
     try:
-        records = {str(out): asdict(RunFolder(_folder(out)).load()) for out in args.runs}
+        records = {str(out): load_record(RunFolder(_folder(out))) for out in args.runs}
     except PolmvsError as error:
         print(f"{parser.prog}: error: {error}", file=sys.stderr)
         return error.exit_status
-    print(stage_table(records))
+    print(timing_table(records))
     return 0
 
 

@@ -8,7 +8,6 @@ A capture that holds a ``gt`` folder is measured against it.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,6 @@ from pathlib import Path
 from polmvs.cli.flags import GROUPS, add_flags, add_run_flags, options_from, run_options
 from polmvs.cli.terminal import Terminal, guarded
 from polmvs.config import EvaluationOptions
-from polmvs.evaluation.tables import comparison_table
 from polmvs.pipeline.jobs import Job, compare
 
 
@@ -37,12 +35,12 @@ def main(argv: Sequence[str] | None = None) -> int:
                 capture=capture,
                 out=args.out / capture.resolve().name,
                 options=replace(options, evaluation=EvaluationOptions(gt=gt)),
-                how=run_options(args),
+                run_options=run_options(args),
                 monitor=terminal,
             )
             outcome = compare(job)
-            metrics = json.loads(outcome.workspace.metrics.read_text(encoding="utf-8"))
-            print(f"{capture}\n{comparison_table(metrics)}\n")
+            assert outcome.comparison is not None
+            print(f"{capture}\n{outcome.comparison.table()}\n")
             status = status if outcome.empty is None else 3
         return status
 

@@ -29,8 +29,8 @@ from polmvs.experiments.output import NAMES, Report, write_files, write_report
 from polmvs.experiments.reports import num_steps, run_experiment
 from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
+from polmvs.pipeline.record import peak_rss_mb, versions
 from polmvs.pipeline.run_folder import has_content
-from polmvs.pipeline.runtime import peak_rss_mb, versions
 
 
 def main(argv: Sequence[str] | None = None) -> int:

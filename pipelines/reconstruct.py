@@ -15,6 +15,7 @@ from polmvs.cli.flags import GROUPS, add_flags, add_run_flags, options_from, run
 from polmvs.cli.terminal import Terminal, guarded
 from polmvs.config import AngleModel
 from polmvs.pipeline.jobs import Job, reconstruct
+from polmvs.pipeline.stages.densify import DensifyResult
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,12 +35,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             capture=args.capture,
             out=args.out,
             options=options_from(args),
-            how=run_options(args),
+            run_options=run_options(args),
             monitor=terminal,
         )
         outcome = reconstruct(job, args.model)
-        cloud = outcome.workspace.cloud(args.model)
-        print(outcome.empty or f"{cloud}: {outcome.results[f'num_points_{args.model}']:,} points")
+        cloud = outcome.run_folder.cloud(args.model)
+        print(outcome.empty or f"{cloud}: {outcome.result(DensifyResult, args.model)}")
         return 0 if outcome.empty is None else 3
 
     with Terminal(verbose=True) as terminal:

@@ -71,6 +71,35 @@ def sample_image(
     return np.asarray(flat.reshape(*xy.shape[:-1], *channels), np.float32)
 
 
+def depth_buffer(
+    xy: NDArray[np.floating],
+    distances: NDArray[np.floating],
+    width: int,
+    height: int,
+    *,
+    cell_px: int = 1,
+) -> tuple[Array, Array]:
+    """Smallest distance in each cell of an image, and that of each point's own cell.
+
+    Parameters
+    ----------
+    xy : (N, 2), image coordinates within the image, COLMAP convention, px.
+    distances : (N,) from the camera.
+    width, height : of the image, px.
+    cell_px : side of a square cell, px; those of the right and lower border may be cut.
+
+    Returns
+    -------
+    nearest : (rows, cols) float64, inf in cells that no point falls into.
+    own : (N,) float64, ``nearest`` of the cell of each point.
+    """
+    shape = -(-height // cell_px), -(-width // cell_px)
+    cols, rows = np.floor(np.asarray(xy, np.float64) / cell_px).astype(np.intp).T
+    nearest = np.full(shape, np.inf)
+    np.minimum.at(nearest, (rows, cols), distances)
+    return nearest, nearest[rows, cols]
+
+
 class Camera(Protocol):
     """What the rest of the package needs of a camera: rays of pixels and pixels of points."""
 
@@ -91,6 +120,11 @@ class Camera(Protocol):
 
     def project(self, points_in_cam: NDArray[np.floating]) -> NDArray[np.floating]:
         """Image coordinates ``(..., 2)`` of camera-frame points; NaN behind the camera."""
+
+
+def in_image(camera: Camera, xy: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Whether image coordinates ``(..., 2)`` lie in the camera's image; not where NaN."""
+    return np.asarray(((xy >= 0) & (xy < (camera.width, camera.height))).all(axis=-1), np.bool_)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -47,3 +47,48 @@ class Estimator(StrEnum):
 
     ROBUST = "robust"
     ALGEBRAIC = "algebraic"
+
+
+class Packing(StrEnum):
+    """How a dump without a header holds its samples."""
+
+    MONO8 = "mono8"
+    MONO16 = "mono16"
+    MONO10P = "mono10p"
+    MONO12P = "mono12p"
+    MONO10PACKED = "mono10packed"
+    MONO12PACKED = "mono12packed"
+
+
+class CaptureKind(StrEnum):
+    """What the files of a capture hold."""
+
+    MOSAIC = "mosaic"
+    ANGLES = "angles"
+    STOKES = "stokes"
+    AOLP = "aolp"
+
+
+class BayerOrder(StrEnum):
+    """Colours of the 2x2 blocks of polarizers of a colour sensor, row by row."""
+
+    RGGB = "rggb"
+    GRBG = "grbg"
+    GBRG = "gbrg"
+    BGGR = "bggr"
+
+
+class Channel(StrEnum):
+    """Which colour the Stokes images are made of."""
+
+    COMBINED = "combined"
+    RED = "red"
+    GREEN = "green"
+    BLUE = "blue"
+
+
+class Resolution(StrEnum):
+    """Size of the polarization images of a mosaic."""
+
+    HALF = "half"
+    FULL = "full"

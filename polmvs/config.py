@@ -13,10 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from polmvs.choices import AngleModel as AngleModel
+from polmvs.choices import BayerOrder as BayerOrder
+from polmvs.choices import CaptureKind as CaptureKind
+from polmvs.choices import Channel as Channel
 from polmvs.choices import Contour as Contour
 from polmvs.choices import Estimator as Estimator
 from polmvs.choices import Light as Light
 from polmvs.choices import Method as Method
+from polmvs.choices import Packing as Packing
+from polmvs.choices import Resolution as Resolution
 from polmvs.choices import Surroundings as Surroundings
 from polmvs.errors import OptionError
 
@@ -41,7 +46,7 @@ def _require(holds: bool, message: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureOptions:
-    """How raw mosaics become polarization images."""
+    """What a capture's files hold, and how they become polarization images."""
 
     pattern: tuple[int, int, int, int] = option(
         (90, 45, 135, 0), "polarizer angles of a 2x2 cell in degrees, row by row"
@@ -49,6 +54,46 @@ class CaptureOptions:
     gamma: float = option(1.0, "encoding gamma: linear = (raw / full scale) ** (1 / gamma)")
     saturation: float = option(0.98, "share of full scale from which a sample counts as clipped")
     darkness: float = option(0.004, "share of full scale under which a pixel counts as dark")
+    full_scale: float | None = option(
+        None, "value of a saturated sample; by default decided from the samples of all files"
+    )
+    kind: CaptureKind | None = option(
+        None,
+        "what the files hold: raw mosaics, an image for each polarizer angle, Stokes images, or "
+        "angle and degree of polarization; by default told by their names",
+    )
+    naming: str | None = option(
+        None,
+        "file names below CAPTURE, with {view} and where they apply {angle} (degrees), {index}, "
+        "{stokes} (s0 s1 s2), {map} (aolp dolp intensity), {exposure} (seconds, or with ms or "
+        "us), {any}: for example '{view}/I{angle}.tif'",
+    )
+    angles: tuple[float, ...] | None = option(
+        None, "polarizer angles in degrees of the images of a view, in the order of {index}"
+    )
+    bayer: BayerOrder | None = option(
+        None, "colours of a colour sensor's 2x2 blocks of polarizers, row by row"
+    )
+    channel: Channel = option(
+        Channel.COMBINED, "one colour of a colour capture, or all, weighted by their noise"
+    )
+    resolution: Resolution = option(
+        Resolution.HALF, "size of a mosaic's polarization images: half or all of its own"
+    )
+    clockwise: bool = option(
+        False, "angles of polarizers, Stokes or AoLP images are counted clockwise as displayed"
+    )
+    zero_deg: float = option(
+        0.0, "direction that angles are counted from, degrees anticlockwise from +x as displayed"
+    )
+    calibration: Path | None = option(
+        None, "TOML file of 'polmvs calibrate polarizers': gains, angles, dark frame, flat field"
+    )
+    width: int | None = option(None, "width of .raw and .bin dumps, px")
+    height: int | None = option(None, "height of .raw and .bin dumps, px")
+    packing: Packing | None = option(
+        None, "how dumps hold their samples; by default told by their length where only one fits"
+    )
 
     def __post_init__(self) -> None:
         _require(
@@ -60,6 +105,20 @@ class CaptureOptions:
             0 < self.saturation <= 1, f"--saturation must lie in 0 to 1, not {self.saturation}"
         )
         _require(0 <= self.darkness < 0.5, f"--darkness must lie in 0 to 0.5, not {self.darkness}.")
+        _require(
+            self.full_scale is None or 0 < self.full_scale < math.inf,
+            f"--full-scale must be positive, not {self.full_scale}.",
+        )
+        _require(
+            self.naming is None or "{view}" in self.naming,
+            f"--naming needs {{view}}, not {self.naming!r}.",
+        )
+        _require(
+            self.angles is None or len({angle % 180 for angle in self.angles}) >= 3,
+            f"--angles needs three or more different angles, not {self.angles}.",
+        )
+        for name, side in (("--width", self.width), ("--height", self.height)):
+            _require(side is None or 0 < side < 1 << 16, f"{name} must be positive, not {side}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +168,11 @@ class NormalOptions:
     estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
     window_px: int = option(17, "side of the window of rows about a track's point, px")
     unseeded: bool = option(True, "place parts without a sparse point by their outlines")
+    tilt_aware_weights: bool = option(
+        True,
+        "OPA and PPA: rows of oblique rays count less, by the turn that a tilt of the polarizers "
+        "would give their phase; without it the models are pure",
+    )
 
     def __post_init__(self) -> None:
         _require(

@@ -1,13 +1,46 @@
-"""Rigid and similarity transforms, mirroring ``pycolmap.Rigid3d`` and ``Sim3d``."""
+"""Directions, rotations, and rigid and similarity transforms.
+
+The transforms mirror ``pycolmap.Rigid3d`` and ``Sim3d``.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+
+ROTATION_TOLERANCE = 1e-3  # of R R^T from the identity: poses are often written with few digits
+
+
+def unit(vectors: ArrayLike) -> Array:
+    """Vectors ``(..., 3)`` scaled to unit length; NaN where they have none."""
+    array = np.asarray(vectors, np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(array / np.linalg.norm(array, axis=-1, keepdims=True))
+
+
+def nearest_rotation(matrix: Array) -> Array | None:
+    """The rotation ``(3, 3)`` nearest to a matrix that is one up to a text file's rounding.
+
+    None where it is none: not finite, not orthonormal to 1e-3, or a mirror.
+    """
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return None
+    deviation = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if deviation > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
+        return None
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ right, np.float64)
+
+
+def rotation_angle(first: Array, second: Array) -> float:
+    """Angle between two orientations ``(3, 3)``, rad; exact for small angles too."""
+    # |R - S| (Frobenius) is 2 sqrt(2) sin(angle / 2).
+    chord = float(np.linalg.norm(first - second))
+    return float(2.0 * np.arcsin(min(chord / np.sqrt(8.0), 1.0)))
 
 
 @dataclass(frozen=True)
@@ -45,6 +78,12 @@ class SimilarityTransform:
         """Transform points ``(..., 3)``."""
         return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation
 
+    def pose(self, cam_from_source: RigidTransform) -> RigidTransform:
+        """``cam_from_target`` of a camera of the source; its frame takes the target's unit."""
+        rotation = cam_from_source.rotation @ self.rotation.T
+        translation = self.scale * cam_from_source.translation - rotation @ self.translation
+        return RigidTransform(rotation, translation)
+
 
 def align_points(source: Array, target: Array) -> SimilarityTransform:
     """Least-squares similarity that takes ``source`` to ``target`` (Umeyama 1991).
@@ -70,3 +109,25 @@ def align_points(source: Array, target: Array) -> SimilarityTransform:
     scale = float((singular * sign).sum() / (source_centered**2).sum())
     translation = target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
     return SimilarityTransform(scale, rotation, translation)
+
+
+def intersect_rays(centers: Array, rays: Array) -> Array:
+    """Points nearest to rays in the least-squares sense.
+
+    Parameters
+    ----------
+    centers : (..., V, 3), where the rays begin.
+    rays : (..., V, 3), unit.
+
+    Returns
+    -------
+    (..., 3) float64
+        NaN where the rays are parallel.
+    """
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    matrix = across.sum(axis=-3)
+    target = np.einsum("...vij,...vj->...i", across, centers)
+    parallel = np.linalg.eigvalsh(matrix)[..., 0] < 1e-12
+    matrix = np.where(parallel[..., None, None], np.eye(3), matrix)
+    points = np.linalg.solve(matrix, target[..., None])[..., 0]
+    return np.where(parallel[..., None], np.nan, points)

@@ -1,4 +1,4 @@
-"""Thinning of large clouds to voxels, and nearest neighbours among them."""
+"""Voxels of large clouds, thinning to them, and nearest neighbours."""
 
 from __future__ import annotations
 
@@ -9,6 +9,19 @@ from scipy.spatial import cKDTree
 Array = NDArray[np.float64]
 
 _AXIS_BITS = 21
+_SHIFT = 0.37  # surfaces like to lie at round coordinates: shifted voxels do not split them in two
+
+
+def voxel_of_each(points: Array, side: float) -> NDArray[np.intp]:
+    """Index ``(N,)`` of the occupied voxel that each point lies in, counted from 0 without gaps.
+
+    Parameters
+    ----------
+    points : (N, 3), finite
+    side : of a voxel, in the unit of the points.
+    """
+    keys = _cell_keys(np.floor(points / side + _SHIFT))
+    return np.asarray(np.unique(keys, return_inverse=True)[1].reshape(-1), np.intp)
 
 
 def voxel_representatives(points: Array, side: float) -> NDArray[np.intp]:
@@ -21,8 +34,7 @@ def voxel_representatives(points: Array, side: float) -> NDArray[np.intp]:
     """
     if len(points) == 0:
         return np.zeros(0, np.intp)
-    # Surfaces like to lie at round coordinates: shifted voxels do not split them in two.
-    scaled = points / side + 0.37
+    scaled = points / side + _SHIFT
     cells = np.floor(scaled)
     order = np.argsort(((scaled - cells - 0.5) ** 2).sum(axis=1))
     _, first = np.unique(_cell_keys(cells)[order], return_index=True)
@@ -37,9 +49,9 @@ def in_cells_beside(points: Array, others: Array, side: float) -> NDArray[np.boo
     """
     occupied = others[voxel_representatives(others, side)]
     steps = np.stack(np.meshgrid(*3 * [np.arange(-1.0, 2.0)]), axis=-1).reshape(-1, 1, 3)
-    cells = np.floor(occupied / side + 0.37) + steps
+    cells = np.floor(occupied / side + _SHIFT) + steps
     grown = np.unique(_cell_keys(cells.reshape(-1, 3)))
-    keys = _cell_keys(np.floor(points / side + 0.37))
+    keys = _cell_keys(np.floor(points / side + _SHIFT))
     found = np.searchsorted(grown, keys)
     return np.asarray(np.append(grown, -1)[found] == keys, np.bool_)
 

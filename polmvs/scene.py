@@ -1,9 +1,12 @@
-"""The nouns that all stages share: views, sparse points, seeds, and kinds of points."""
+"""The nouns that all stages share: views, names of images, sparse points, seeds, point kinds."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +15,14 @@ from polmvs.camera import Camera
 from polmvs.geometry import RigidTransform
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+KEYPOINT_SIGMA_PX = 0.5  # of a keypoint of SfM: the usual reprojection error after adjustment
+# Between a normal and the direction to the camera. A surface seen flatter than 6 degrees shows a
+# tenth of its pixels, and its range changes by ten footprints a pixel.
+MIN_FACING_COSINE = 0.1
+MAX_NAMES_SHOWN = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +44,80 @@ class View:
     def center_in_world(self) -> Array:
         """Camera centre ``(3,)`` in the world."""
         return self.cam_from_world.inverse().translation
+
+    def rays_in_world(self, xy: Floats) -> Array:
+        """Unit rays ``(..., 3)`` in the world of image coordinates ``(..., 2)``."""
+        return np.asarray(self.camera.rays(xy) @ self.cam_from_world.rotation, np.float64)
+
+    def project(self, points: Floats) -> Floats:
+        """Image coordinates ``(..., 2)`` of world points; NaN behind the camera."""
+        return self.camera.project(self.cam_from_world * points)
+
+    def ranges(self, points: Floats) -> Array:
+        """Distances ``(...)`` of world points from the camera's centre."""
+        return np.asarray(np.linalg.norm(points - self.center_in_world, axis=-1), np.float64)
+
+    def points_at(self, xy: Floats, ranges: Floats) -> Array:
+        """World points ``(..., 3)`` at distances ``(...)`` along the rays of coordinates."""
+        in_cam = self.camera.rays(xy) * np.asarray(ranges, np.float64)[..., None]
+        return np.asarray(self.cam_from_world.inverse() * in_cam, np.float64)
+
+    def facing_cosines(self, points: Floats, normals: Floats) -> Array:
+        """Cosine ``(...)`` between normals and the direction to the camera; NaN where unknown.
+
+        Parameters
+        ----------
+        points, normals : (..., 3), world, normals unit.
+        """
+        to_camera = self.center_in_world - points
+        return np.asarray((to_camera * normals).sum(axis=-1) / self.ranges(points), np.float64)
+
+    def faces(
+        self, points: Floats, normals: Floats, *, min_cosine: float = MIN_FACING_COSINE
+    ) -> Mask:
+        """Whether surface points ``(..., 3)`` with unit normals face the camera; not where NaN."""
+        return np.asarray(self.facing_cosines(points, normals) > min_cosine, np.bool_)
+
+
+def stem_of(name: str) -> str:
+    """Name of an image without folder and suffix."""
+    return PurePosixPath(name).stem
+
+
+def match_names(names: Sequence[str], known: Iterable[str]) -> dict[str, str]:
+    """Which of the known names each image has; images without one are left out.
+
+    The same name goes before the only one of the same stem. A known name is used once, so that
+    ``a/0.png`` and ``b/0.png`` do not share a ``0.png``.
+
+    Parameters
+    ----------
+    names : of the images.
+    known : among which each is looked for.
+    """
+    available = list(dict.fromkeys(known))
+    exact = {name: name for name in names if name in set(available)}
+    left = [other for other in available if other not in exact]
+    stems = Counter(map(stem_of, available))
+    own_stems = Counter(map(stem_of, names))
+    by_stem = {stem_of(other): other for other in left if stems[stem_of(other)] == 1}
+    matched = {
+        name: by_stem[stem_of(name)]
+        for name in names
+        if name not in exact and stem_of(name) in by_stem and own_stems[stem_of(name)] == 1
+    }
+    return {name: other for name in names if (other := exact.get(name) or matched.get(name))}
+
+
+def find_name(name: str, known: Iterable[str]) -> str | None:
+    """The one of some names that is meant: the same, else the only one with the same stem."""
+    return match_names([name], known).get(name)
+
+
+def short_list(names: Sequence[str]) -> str:
+    """The first few names, and how many more there are."""
+    more = len(names) - MAX_NAMES_SHOWN
+    return ", ".join(names[:MAX_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 @dataclass(frozen=True)
@@ -56,6 +141,36 @@ class Tracks:
     obs_track: NDArray[np.int64]
     obs_view: NDArray[np.int64]
     obs_xy: Array
+
+
+def some_tracks(tracks: Tracks, chosen: Mask) -> Tracks:
+    """The chosen ``(T,)`` tracks with their observations."""
+    index = np.cumsum(chosen) - 1
+    kept = chosen[tracks.obs_track]
+    return Tracks(
+        point3D_ids=tracks.point3D_ids[chosen],
+        points_in_world=tracks.points_in_world[chosen],
+        colors=tracks.colors[chosen],
+        errors=tracks.errors[chosen],
+        obs_track=index[tracks.obs_track[kept]],
+        obs_view=tracks.obs_view[kept],
+        obs_xy=tracks.obs_xy[kept],
+    )
+
+
+def point_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
+    """Standard deviation ``(T,)`` of the points along their least certain axis, world units."""
+    information = np.zeros((len(tracks.points_in_world), 3, 3))
+    for k, view in enumerate(views):
+        seen = tracks.obs_track[tracks.obs_view == k]
+        to_point = tracks.points_in_world[seen] - view.center_in_world
+        distance = np.linalg.norm(to_point, axis=-1)
+        ray = to_point / distance[:, None]
+        precision = (view.camera.mean_focal_px / (KEYPOINT_SIGMA_PX * distance)) ** 2
+        across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+        information[seen] += precision[:, None, None] * across
+    smallest = np.maximum(np.linalg.eigvalsh(information)[:, 0], 1e-300)
+    return np.asarray(1 / np.sqrt(smallest), np.float64)
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,16 @@
 from dataclasses import dataclass, fields
 
 import numpy as np
+import pycolmap
 
 from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.colmap.dense_workspace import write_dense_workspace
+from polmvs.colmap.cameras import ColmapCamera
 from polmvs.colmap.maps import DepthNormals, map_pixel_xy
-from polmvs.colmap.models import ColmapCamera, pycolmap
 from polmvs.geometry import RigidTransform
 from polmvs.io.clouds import read_cloud
 from polmvs.scene import SparseModel, Tracks, View
 from polmvs.surface.dense_view import DenseView
+from polmvs.surface.map_export import export_dense_workspace
 from polmvs.synthetic.captures import Plane, ring_of_views
 
 PINHOLE = PinholeCamera(width=160, height=128, fx=120.0, fy=121.0, cx=79.0, cy=63.0)
@@ -94,7 +95,7 @@ class DenseScene:
 
     def write(self, folder, dense=None, **options):
         dense = self.dense if dense is None else dense
-        write_dense_workspace(folder, self.model, self.image, dense, **options)
+        export_dense_workspace(folder, self.model, self.image, dense, **options)
         return folder
 
 

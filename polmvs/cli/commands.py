@@ -6,7 +6,6 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import polmvs
 from polmvs.camera import PinholeCamera
@@ -15,10 +14,17 @@ from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
 from polmvs.errors import OptionError
 from polmvs.evaluation.comparison import evaluate_file
-from polmvs.evaluation.tables import best_fit_lines, comparison_table, evaluation_text
+from polmvs.evaluation.tables import best_fit_lines, evaluation_text
 from polmvs.io.clouds import read_cloud, write_mesh
 from polmvs.io.ground_truth import open_ground_truth
+from polmvs.option_values import to_plain
 from polmvs.pipeline import jobs as pipeline
+from polmvs.pipeline.stages.dense_workspace import DenseWorkspaceResult
+from polmvs.pipeline.stages.densify import DensifyResult
+from polmvs.pipeline.stages.mesh import MeshResult
+from polmvs.pipeline.stages.normals import NormalsResult
+from polmvs.pipeline.stages.poses import PosesResult
+from polmvs.pipeline.stages.seeds import SeedsResult
 from polmvs.surface.poisson import poisson_mesh
 
 EMPTY_STATUS = 3
@@ -53,41 +59,41 @@ def compare(args: argparse.Namespace, terminal: Terminal) -> int:
 def evaluate(args: argparse.Namespace, terminal: Terminal) -> int:
     """Run ``polmvs evaluate``."""
     figures = evaluate_file(args.cloud, args.gt, args.sparse)
-    print(json.dumps(figures, indent=1) if args.json else evaluation_text(figures))
+    print(json.dumps(to_plain(figures), indent=1) if args.json else evaluation_text(figures))
     return 0
 
 
 def sfm(args: argparse.Namespace, terminal: Terminal) -> int:
     """Run ``polmvs sfm``."""
     outcome = pipeline.find_poses(_job_from(args, terminal))
-    results = outcome.results
+    poses = outcome.result(PosesResult)
     print(
-        f"{outcome.workspace.sparse}: {_views(results)} have a pose, "
-        f"{results['num_tracks']:,} sparse points"
+        f"{outcome.run_folder.sparse}: {_views(outcome)} have a pose, "
+        f"{poses.num_tracks:,} sparse points"
     )
     return 0
 
 
 def normals(args: argparse.Namespace, terminal: Terminal) -> int:
     """Run ``polmvs normals``."""
-    outcome = pipeline.solve_normals(_job_from(args, terminal, goes_on=True), (args.model,))
-    results = outcome.results
+    outcome = pipeline.solve_normals(_job_from(args, terminal, continues=True), (args.model,))
+    found, seeds = outcome.result(NormalsResult, args.model), outcome.result(SeedsResult)
     print(
-        f"{outcome.workspace.normals(args.model)}: {results[f'num_normals_{args.model}']:,} of "
-        f"{results['num_tracks']:,} sparse points have a normal, {results['num_seeds']:,} are seeds"
+        f"{outcome.run_folder.sparse_cloud(args.model)}: {found.num_normals:,} of "
+        f"{found.num_tracks:,} sparse points have a normal, {seeds.num_track_seeds:,} are seeds"
     )
     return 0
 
 
 def densify(args: argparse.Namespace, terminal: Terminal) -> int:
     """Run ``polmvs densify``."""
-    outcome = pipeline.densify(_job_from(args, terminal, goes_on=True), (args.model,))
+    outcome = pipeline.densify(_job_from(args, terminal, continues=True), (args.model,))
     return _report_cloud(outcome, args.model)
 
 
 def export(args: argparse.Namespace, terminal: Terminal) -> int:
     """Run ``polmvs export``."""
-    outcome = pipeline.export(_job_from(args, terminal, goes_on=True), args.model)
+    outcome = pipeline.export(_job_from(args, terminal, continues=True), args.model)
     return _report_cloud(outcome, args.model)
 
 
@@ -102,11 +108,11 @@ def mesh(args: argparse.Namespace, terminal: Terminal) -> int:
 
 
 def _job_from(
-    args: argparse.Namespace, terminal: Terminal, *, goes_on: bool = False
+    args: argparse.Namespace, terminal: Terminal, *, continues: bool = False
 ) -> pipeline.Job:
     """The job; one that goes on takes the options of the run in OUT where none are given."""
     how = run_options(args)
-    recorded = recorded_options(args.out) if how.resume or goes_on else None
+    recorded = recorded_options(args.out) if how.resume or continues else None
     return _job(args, terminal, args.capture, options_from(args, recorded), how)
 
 
@@ -117,44 +123,44 @@ def _job(
         capture=capture,
         out=args.out,
         options=options,
-        how=how,
+        run_options=how,
         monitor=terminal,
         command_line=args.command_line,
     )
 
 
-def _report_cloud(outcome: pipeline.Outcome, model: AngleModel) -> int:
-    results, workspace = outcome.results, outcome.workspace
-    unit = "metres" if results.get("unit") == "m" else "the model's unit, not metric"
+def _report_cloud(outcome: pipeline.JobOutcome, model: AngleModel) -> int:
+    folder, cloud = outcome.run_folder, outcome.result(DensifyResult, model)
+    metric = outcome.result(PosesResult).is_metric
+    unit = "metres" if metric else "the model's unit, not metric"
     print(
-        f"{workspace.cloud(model)}: {results[f'num_points_{model}']:,} points from "
-        f"{_views(results)}, and {results[f'num_surroundings_{model}']:,} of the surroundings; "
-        f"in {unit}"
+        f"{folder.cloud(model)}: {cloud.num_points:,} points from {_views(outcome)}, and "
+        f"{cloud.num_surroundings:,} of the surroundings; in {unit}"
     )
-    if workspace.mesh(model).is_file():
-        print(f"{workspace.mesh(model)}: {results[f'num_triangles_{model}']:,} triangles")
-    dense = results.get(f"dense_{model}")
-    if dense is not None and Path(dense).is_dir():
-        print(f"{dense}: COLMAP dense workspace")
+    mesh = outcome.find(MeshResult, model)
+    if mesh is not None and mesh.num_triangles:
+        print(f"{folder.mesh(model)}: {mesh.num_triangles:,} triangles")
+    dense = outcome.find(DenseWorkspaceResult, model)
+    if dense is not None and dense.folder is not None:
+        print(f"{dense.folder}: COLMAP dense workspace")
     return _status(outcome)
 
 
-def _report_comparison(outcome: pipeline.Outcome) -> int:
-    metrics = json.loads(outcome.workspace.metrics.read_text(encoding="utf-8"))
-    print("\n".join([comparison_table(metrics), *best_fit_lines(metrics)]))
-    clouds = ", ".join(f"{model}.ply" for model in metrics["models"])
-    print(
-        f"{outcome.workspace.root}: {clouds}, metrics.json, summary.md; {_views(outcome.results)}"
-    )
+def _report_comparison(outcome: pipeline.JobOutcome) -> int:
+    comparison = outcome.comparison
+    assert comparison is not None
+    print("\n".join([comparison.table(), *best_fit_lines(comparison)]))
+    clouds = ", ".join(f"{model}.ply" for model in comparison.models)
+    print(f"{outcome.run_folder.root}: {clouds}, metrics.json, summary.md; {_views(outcome)}")
     return _status(outcome)
 
 
-def _views(results: dict[str, Any]) -> str:
-    num_views = results["num_views"]
-    return f"{num_views} of {num_views + len(results['unregistered'])} views"
+def _views(outcome: pipeline.JobOutcome) -> str:
+    poses = outcome.result(PosesResult)
+    return f"{poses.num_views} of {poses.num_views + len(poses.unregistered)} views"
 
 
-def _status(outcome: pipeline.Outcome) -> int:
+def _status(outcome: pipeline.JobOutcome) -> int:
     if outcome.empty is None:
         return 0
     print(f"polmvs: {outcome.empty}", file=sys.stderr)

@@ -20,6 +20,7 @@ from polmvs.option_values import (
     parse_text,
     to_plain,
 )
+from polmvs.pipeline.record import read_options
 from polmvs.pipeline.run_folder import RunFolder
 
 T = TypeVar("T")
@@ -88,11 +89,7 @@ def options_from(args: argparse.Namespace, recorded: Mapping[str, Any] | None = 
 
 def recorded_options(out: Path) -> Mapping[str, Any]:
     """Options of the run in a folder; empty where there is none."""
-    workspace = RunFolder(out)
-    if not workspace.run_file.is_file():
-        return {}
-    record = workspace.load()
-    return record.options if record.stages else {}
+    return read_options(RunFolder(out))
 
 
 def read_config(path: Path, groups: Iterable[str]) -> dict[str, dict[str, Any]]:

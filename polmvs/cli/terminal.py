@@ -7,13 +7,14 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import TracebackType
 
 from tqdm import tqdm
 
+from polmvs.colmap.cameras import quiet_colmap
 from polmvs.errors import DataError, PolmvsError
-from polmvs.pipeline.run import Report
+from polmvs.pipeline.monitor import OnProgress
 from polmvs.pipeline.run_folder import RunFolder
 
 INTERRUPTED = 130  # as shells report a program ended by Ctrl-C
@@ -41,7 +42,7 @@ class _LogFileHandler(logging.FileHandler):
 
 
 class Terminal:
-    """One call of the command: a :class:`polmvs.pipeline.run.Watcher` that shows and logs.
+    """One call of the command: a :class:`polmvs.pipeline.monitor.Monitor` that shows and logs.
 
     Parameters
     ----------
@@ -50,10 +51,12 @@ class Terminal:
 
     def __init__(self, *, verbose: bool) -> None:
         self.verbose = verbose
-        self.workspace: RunFolder | None = None
+        self.run_folder: RunFolder | None = None
         self._handlers: list[logging.Handler] = []
+        self._scope = ExitStack()
 
     def __enter__(self) -> Terminal:
+        self._scope.enter_context(quiet_colmap())
         handler = _TerminalHandler(logging.INFO if self.verbose else logging.WARNING)
         self._add(handler)
         package_logger.setLevel(logging.DEBUG if self.verbose else logging.INFO)
@@ -65,33 +68,40 @@ class Terminal:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._scope.close()
         for handler in self._handlers:
             package_logger.removeHandler(handler)
             handler.close()
         self._handlers.clear()
 
-    def opened(self, workspace: RunFolder) -> None:
+    def opened(self, run_folder: RunFolder) -> None:
         """Log into the output folder from now on."""
-        self.workspace = workspace
+        self.run_folder = run_folder
         try:
-            handler = _LogFileHandler(workspace.log, encoding="utf-8")
+            handler = _LogFileHandler(run_folder.log, encoding="utf-8")
         except OSError as error:
             reason = f"cannot be written: {error.strerror or error}."
-            raise DataError(workspace.log, reason) from error
+            raise DataError(run_folder.log, reason) from error
         handler.setFormatter(logging.Formatter(LOG_FORMAT))
         self._add(handler)
 
     @contextmanager
-    def stage(self, name: str, total: int | None) -> Iterator[Report]:
+    def stage(self, name: str, total: int | None) -> Iterator[OnProgress]:
         """Show a bar, if this is a terminal."""
         with tqdm(
             total=total, desc=name, disable=None, leave=False, file=sys.stderr, mininterval=0.2
         ) as bar:
 
-            def report(count: int) -> None:
+            def on_progress(count: int) -> None:
                 bar.update(count)
 
-            yield report
+            yield on_progress
+
+    def finished(self, name: str, seconds: float, summary: str) -> None:
+        """The log says it."""
+
+    def skipped(self, name: str) -> None:
+        """The log says it."""
 
     def _add(self, handler: logging.Handler) -> None:
         self._handlers.append(handler)
@@ -111,7 +121,7 @@ def guarded(command: Callable[[], int], terminal: Terminal, name: str) -> int:
         return command()
     except KeyboardInterrupt:
         kept = "; finished stages are kept, go on with --resume"
-        _complain(name, "interrupted" + (kept if terminal.workspace is not None else ""))
+        _complain(name, "interrupted" + (kept if terminal.run_folder is not None else ""))
         return INTERRUPTED
     except PolmvsError as error:
         logger.debug("where it happened:", exc_info=True, extra=FILE_ONLY)
@@ -131,7 +141,7 @@ def guarded(command: Callable[[], int], terminal: Terminal, name: str) -> int:
         return 1
     except Exception as error:
         logger.critical("internal error", exc_info=True, extra=FILE_ONLY)
-        where = f"; see {terminal.workspace.log}" if terminal.workspace is not None else ""
+        where = f"; see {terminal.run_folder.log}" if terminal.run_folder is not None else ""
         text = " ".join(f"{type(error).__name__}: {error}".split())
         _complain(name, f"internal error: {text}{where}")
         return 1

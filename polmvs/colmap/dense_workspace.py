@@ -2,58 +2,87 @@
 
 ``images/``, ``sparse/`` (pinhole cameras), ``stereo/depth_maps/``, ``stereo/normal_maps/`` with
 ``<image>.geometric.bin`` or ``<image>.photometric.bin``, ``stereo/fusion.cfg`` and
-``stereo/patch-match.cfg``. COLMAP's fusion and its GUI read it, and OpenMVS.
+``stereo/patch-match.cfg``. COLMAP's fusion and its GUI read it, and OpenMVS. A workspace that a
+user gives must belong to the capture: the same frame, the same images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
 from polmvs.camera import PinholeCamera
+from polmvs.colmap.cameras import rescaled_camera
 from polmvs.colmap.maps import (
     DepthNormals,
     check_depth_map,
     check_normal_map,
     read_depth_map,
     read_normal_map,
+    write_depth_map,
+    write_normal_map,
 )
-from polmvs.colmap.models import read_model
-from polmvs.colmap.sparse_model import short_list, write_model
-from polmvs.colmap.undistort import undistorted_model, warp_dense_view, warp_image
-from polmvs.colmap.workspace_layout import (
-    DEPTH_MAPS,
-    FUSION_FILE,
-    GEOMETRIC,
-    GRAPHS,
-    IMAGES,
-    NORMAL_MAPS,
-    PATCH_MATCH_FILE,
-    PHOTOMETRIC,
-    SPARSE,
-    STEREO,
-    map_files,
-    member,
-    new_folder,
-    write_lines,
-    write_maps,
-)
+from polmvs.colmap.models import read_model, require_matches, write_model
+from polmvs.colmap.undistort import undistorted_model, warp_image
 from polmvs.errors import DataError
-from polmvs.io.images import read_gray, write_png
-from polmvs.scene import SparseModel, Tracks, View
-from polmvs.surface.dense_view import DenseView
+from polmvs.geometry import SimilarityTransform, align_points, rotation_angle
+from polmvs.io.images import read_gray, write_bytes, write_png
+from polmvs.scene import SparseModel, Tracks, View, short_list
 
 PathArg = str | PathLike[str]
+Array = NDArray[np.float64]
+Gray = NDArray[np.float32]
 ImageLoader = Callable[[str], NDArray[np.uint8]]
-DenseLoader = Callable[[str], DenseView | None]
+# Maps of a view at the pixels of its undistorted camera, None for none.
+MapsLoader = Callable[[View, PinholeCamera], DepthNormals | None]
 
+IMAGES, SPARSE, STEREO = "images", "sparse", "stereo"
+DEPTH_MAPS, NORMAL_MAPS, GRAPHS = "depth_maps", "normal_maps", "consistency_graphs"
+FUSION_FILE, PATCH_MATCH_FILE = "fusion.cfg", "patch-match.cfg"
+GEOMETRIC, PHOTOMETRIC = "geometric", "photometric"
 NUM_SOURCES = 20  # as many as COLMAP's own undistorter asks for
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchTolerances:
+    """When a workspace is of the same frame and images as a capture.
+
+    Attributes
+    ----------
+    max_pose_error_px : by which a pose may move a point of the scene; derived: depth cannot tell
+        poses apart by less than half a pixel, and models that went through text files differ by
+        their rounding.
+    min_correlation : of the local contrast of two images; derived: from here each explains half
+        of the other one's variance. Images of other things explain nothing, the same image nearly
+        all, whatever its exposure.
+    max_compared_px : longest side of the compared images; a guess, bounds the time.
+    max_compared_views : spread over the workspace; a guess, bounds the time.
+    fine_sigma_px, coarse_sigma_px : band of the contrast, compared pixels; a guess, from what the
+        shrinking leaves to a thirtieth of the image.
+    dark_level : grey levels added before the logarithm; a guess: under it lies noise, and what
+        gamma curves treat differently.
+    min_common_share : of the compared image that both must show; a guess.
+    """
+
+    max_pose_error_px: float = 0.5
+    min_correlation: float = float(np.sqrt(0.5))
+    max_compared_px: int = 256
+    max_compared_views: int = 8
+    fine_sigma_px: float = 1.0
+    coarse_sigma_px: float = 8.0
+    dark_level: float = 4.0
+    min_common_share: float = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,7 +215,7 @@ def write_dense_workspace(
     folder: PathArg,
     model: SparseModel,
     load_image: ImageLoader,
-    load_dense: DenseLoader,
+    load_maps: MapsLoader,
     *,
     blank_pixels: float = 0.0,
     max_image_size: int | None = None,
@@ -198,8 +227,8 @@ def write_dense_workspace(
     folder : to make; it may exist if it is empty.
     model : of the sensor's pixels.
     load_image : gives an image's (H, W) uint8 intensity by name.
-    load_dense : gives an image's dense result by name, None for a view without; such a view has
-        no maps and is not in ``fusion.cfg``.
+    load_maps : gives a view's depth and normals at the pixels of its undistorted camera, None for
+        a view without; such a view has no maps and is not in ``fusion.cfg``.
     blank_pixels, max_image_size : see :func:`polmvs.colmap.undistort.undistorted_camera`.
 
     Raises
@@ -220,9 +249,9 @@ def write_dense_workspace(
             path = member(root / IMAGES, view.name)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_png(path, np.rint(image).astype(np.uint8))
-            dense = load_dense(view.name)
-            if dense is not None:
-                write_maps(stereo, view.name, warp_dense_view(dense, view, target.camera))
+            maps = load_maps(view, target.camera)
+            if maps is not None:
+                write_maps(stereo, view.name, maps)
                 fused.append(view.name)
         write_lines(stereo / FUSION_FILE, fused)
         write_lines(stereo / PATCH_MATCH_FILE, _patch_match_lines(undistorted))
@@ -256,3 +285,275 @@ def _patch_match_lines(model: SparseModel) -> list[str]:
         if sources:
             lines += [name, ", ".join(sources)]
     return lines
+
+
+def member(folder: Path, name: str) -> Path:
+    """A file in a folder by an image's name, which may have sub-folders.
+
+    Names come with a model that may be a stranger's: they must not lead out of the folder.
+    """
+    relative = PurePosixPath(name)
+    if relative.is_absolute() or ".." in relative.parts or not relative.parts:
+        raise DataError(folder, f"{name!r} is no name of an image in it. Rename it in the model.")
+    return folder / relative
+
+
+def map_files(stereo: Path, name: str, kind: str = GEOMETRIC) -> tuple[Path, Path]:
+    """Depth and normal map of an image in a stereo folder, whether they exist or not."""
+    file = f"{name}.{kind}.bin"
+    return member(stereo / DEPTH_MAPS, file), member(stereo / NORMAL_MAPS, file)
+
+
+def write_maps(stereo: Path, name: str, maps: DepthNormals) -> None:
+    """Write the geometric maps of an image into a stereo folder."""
+    depth, normals = map_files(stereo, name)
+    for path in (depth, normals):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_depth_map(depth, maps.depth)
+    write_normal_map(normals, maps.normals)
+
+
+def write_lines(path: Path, lines: Sequence[str]) -> None:
+    """Write a text file whole or not at all."""
+    write_bytes(path, "".join(f"{line}\n" for line in lines).encode())
+
+
+@contextmanager
+def new_folder(folder: PathArg) -> Iterator[Path]:
+    """A temporary folder beside a new one, which takes its name when all went well, else goes.
+
+    Raises
+    ------
+    DataError
+        The folder exists and is not empty, or the system refuses.
+    """
+    target = Path(folder)
+    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
+        raise DataError(target, "exists already. Remove it or choose another folder.")
+    temporary: Path | None = None
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        # mkdtemp's folder is the owner's alone; one that mkdir makes has the usual rights.
+        content = temporary / "content"
+        content.mkdir()
+        yield content
+        if target.exists():
+            target.rmdir()
+        content.rename(target)
+    except OSError as error:
+        raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
+    finally:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+class CommonView(NamedTuple):
+    """A view of the workspace and the same of the capture's model."""
+
+    item: WorkspaceView
+    view: View
+
+
+def common_views(workspace: DenseWorkspace, model: SparseModel) -> list[CommonView]:
+    """Views of the workspace and of the model with the same name, else the same stem.
+
+    Raises
+    ------
+    DataError
+        There are none.
+    """
+    by_name = {view.name: view for view in model.views}
+    names = [item.view.name for item in workspace.views]
+    matched = require_matches(names, list(by_name), workspace.folder)
+    return [
+        CommonView(item, by_name[matched[item.view.name]])
+        for item in workspace.views
+        if item.view.name in matched
+    ]
+
+
+def require_same_frame(
+    workspace: DenseWorkspace,
+    model: SparseModel,
+    *,
+    tolerances: MatchTolerances = MatchTolerances(),
+) -> None:
+    """Refuse a workspace whose poses are not those of the capture's model.
+
+    Views of the same name must agree in centre and rotation so well that a point at the scene's
+    distance moves by less than ``max_pose_error_px`` in the workspace's image.
+
+    Raises
+    ------
+    DataError
+        They differ, or no view is common. The message names the worst view, and says whether the
+        two agree after a similarity.
+    """
+    pairs = common_views(workspace, model)
+    distances = _scene_distances(pairs, workspace)
+    errors = _pose_errors_px(pairs, distances, None)
+    worst = int(errors.argmax())
+    if errors[worst] <= tolerances.max_pose_error_px:
+        return
+    hint = _after_similarity(pairs, distances, tolerances.max_pose_error_px)
+    raise DataError(
+        workspace.folder,
+        f"its poses are in another frame than those of the capture's model: the scene lies "
+        f"{errors[worst]:.3g} px apart in {pairs[worst].item.view.name}, the worst of "
+        f"{len(pairs)} views{hint}. "
+        "Give the model that the workspace was made from as --sparse, without --reference, --aruco "
+        "and --scale.",
+    )
+
+
+def _after_similarity(pairs: Sequence[CommonView], distances: Array, max_error_px: float) -> str:
+    """What to say of the two models after a similarity."""
+    ours = np.array([pair.view.center_in_world for pair in pairs])
+    theirs = np.array([pair.item.view.center_in_world for pair in pairs])
+    try:
+        theirs_from_ours = align_points(ours, theirs)
+    except ValueError:  # too few views, or all on a line
+        return ""
+    errors = _pose_errors_px(pairs, distances, theirs_from_ours)
+    if not errors.max() <= max_error_px:
+        return f" (after a similarity still {errors.max():.3g} px)"
+    turn = rotation_angle(theirs_from_ours.rotation, np.eye(3))
+    return (
+        f"; they agree after a similarity (scale {theirs_from_ours.scale:.6g}, rotation "
+        f"{np.degrees(turn):.3g} degrees)"
+    )
+
+
+def _pose_errors_px(
+    pairs: Sequence[CommonView], distances: Array, theirs_from_ours: SimilarityTransform | None
+) -> Array:
+    """By how many pixels of the workspace (N,) the scene moves between two poses of each view."""
+    errors = np.empty(len(pairs))
+    for i, (item, view) in enumerate(pairs):
+        center, rotation = view.center_in_world, view.cam_from_world.rotation
+        if theirs_from_ours is not None:
+            center = theirs_from_ours * center
+            rotation = rotation @ theirs_from_ours.rotation.T
+        shift = np.linalg.norm(item.view.center_in_world - center) / distances[i]
+        turn = rotation_angle(item.view.cam_from_world.rotation, rotation)
+        errors[i] = (shift + turn) * item.camera.mean_focal_px
+    return errors
+
+
+def _scene_distances(pairs: Sequence[CommonView], workspace: DenseWorkspace) -> Array:
+    """Median distance (N,) from each view of the workspace to the points it observes."""
+    tracks = workspace.tracks
+    index = {item.view.name: i for i, item in enumerate(workspace.views)}
+    centers = np.array([pair.item.view.center_in_world for pair in pairs])
+    distances = np.full(len(pairs), np.nan)
+    for i, pair in enumerate(pairs):
+        seen = tracks.obs_track[tracks.obs_view == index[pair.item.view.name]]
+        if len(seen):
+            distances[i] = np.median(pair.item.view.ranges(tracks.points_in_world[seen]))
+    # A view without points: as far as the others, or as the cameras are from each other.
+    spread = max(float(np.linalg.norm(np.ptp(centers, axis=0))), 1e-9)
+    known = distances[np.isfinite(distances)]
+    return np.where(np.isfinite(distances), distances, np.median(known) if len(known) else spread)
+
+
+def require_matching_images(
+    workspace: DenseWorkspace,
+    model: SparseModel,
+    load_image: ImageLoader,
+    *,
+    tolerances: MatchTolerances = MatchTolerances(),
+) -> float:
+    """Refuse a workspace whose undistorted images do not show what the capture shows.
+
+    The capture's intensity images are warped to the workspace's cameras, whatever their size, and
+    the local contrast of both is compared, over a few views.
+
+    Parameters
+    ----------
+    workspace, model : of the same frame, see :func:`require_same_frame`.
+    load_image : gives an image of the capture, (H, W) uint8, by its name in the model.
+
+    Returns
+    -------
+    The lowest correlation.
+
+    Raises
+    ------
+    DataError
+        An image does not match, or no view is common.
+    """
+    pairs = common_views(workspace, model)
+    step = -(-len(pairs) // tolerances.max_compared_views)
+    lowest = 1.0
+    for item, view in pairs[::step]:
+        correlation = image_correlation(
+            item.load_image(), item.camera, load_image(view.name), view, tolerances=tolerances
+        )
+        if not correlation >= tolerances.min_correlation:
+            raise DataError(
+                item.image,
+                "undistorted images do not match the polarization images (correlation "
+                f"{correlation:.2f} with {view.name}, {tolerances.min_correlation:.2f} is "
+                "expected). "
+                "Undistort the images of this capture with its own model.",
+            )
+        lowest = min(lowest, correlation)
+    return lowest
+
+
+def image_correlation(
+    undistorted: NDArray[np.uint8],
+    camera: PinholeCamera,
+    image: NDArray[np.uint8],
+    view: View,
+    *,
+    tolerances: MatchTolerances = MatchTolerances(),
+) -> float:
+    """Correlation of the local contrast of an undistorted image and one of the sensor.
+
+    In the logarithm of the image a gamma is a factor and an exposure an offset; a band of it is
+    blind to both.
+
+    Parameters
+    ----------
+    undistorted : (H, W), of ``camera``.
+    image : (h, w), of ``view.camera``, which has the same pose.
+
+    Returns
+    -------
+    From -1 to 1; 0 where the two have too few pixels in common or no contrast.
+    """
+    share = min(1.0, tolerances.max_compared_px / max(camera.width, camera.height))
+    size = max(1, round(camera.width * share)), max(1, round(camera.height * share))
+    compared = rescaled_camera(camera, *size)
+    assert isinstance(compared, PinholeCamera)  # it was one
+    shrunk = cv2.resize(_log(undistorted, tolerances), size, interpolation=cv2.INTER_AREA)
+    # A pixel of the comparison covers many of the sensor's: average before sampling.
+    ratio = view.camera.mean_focal_px / (camera.mean_focal_px * share)
+    smooth = cv2.GaussianBlur(_log(image, tolerances), (0, 0), max(0.5 * ratio, 0.1))
+    warped, mask = warp_image(smooth, view.camera, compared)
+    if np.count_nonzero(mask) < tolerances.min_common_share * mask.size:
+        return 0.0
+    one = _contrast(np.asarray(shrunk, np.float32), mask, tolerances)
+    two = _contrast(warped, mask, tolerances)
+    norm = float(np.sqrt((one**2).sum() * (two**2).sum()))
+    return float((one * two).sum() / norm) if norm > 0 else 0.0
+
+
+def _log(image: NDArray[np.uint8], tolerances: MatchTolerances) -> Gray:
+    return np.asarray(np.log(image.astype(np.float32) + np.float32(tolerances.dark_level)))
+
+
+def _contrast(image: Gray, mask: NDArray[np.bool_], tolerances: MatchTolerances) -> Array:
+    """Band-passed image at the pixels of the mask (N,), blurred within the mask only."""
+    sigmas = (tolerances.fine_sigma_px, tolerances.coarse_sigma_px)
+    fine, coarse = (_masked_blur(image, mask, sigma) for sigma in sigmas)
+    band = (fine - coarse)[mask].astype(np.float64)
+    return np.asarray(band - band.mean(), np.float64)
+
+
+def _masked_blur(image: Gray, mask: NDArray[np.bool_], sigma: float) -> Gray:
+    weight = mask.astype(np.float32)
+    total = cv2.GaussianBlur(image * weight, (0, 0), sigma)
+    return np.asarray(total / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-6), np.float32)

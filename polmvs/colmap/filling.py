@@ -17,19 +17,20 @@ from pathlib import Path
 
 import numpy as np
 
-from polmvs.colmap.dense_workspace import DenseWorkspace, WorkspaceView
-from polmvs.colmap.maps import DepthNormals
-from polmvs.colmap.workspace_layout import (
+from polmvs.colmap.dense_workspace import (
     FUSION_FILE,
     GEOMETRIC,
     IMAGES,
     SPARSE,
     STEREO,
+    DenseWorkspace,
+    WorkspaceView,
     map_files,
     new_folder,
     write_lines,
     write_maps,
 )
+from polmvs.colmap.maps import DepthNormals
 from polmvs.errors import DataError, OptionError
 
 # Depth and normals of an image in the workspace's pixels by name, None for none.

@@ -29,13 +29,12 @@ Image = NDArray[np.float32]
 PathArg = str | PathLike[str]
 
 HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
-HEADER_BYTES = 32  # three numbers of at most nine digits, and the signs behind them
-SAMPLE_BYTES = 4
-DEPTH_CHANNELS = 1
-NORMAL_CHANNELS = 3
-MAX_LENGTH_ERROR = 0.01  # of a unit normal; far above float32's rounding
+HEADER_BYTES = 3 * len("999999999&")
+SAMPLE = np.dtype("<f4")
+CHANNELS = {"depth": 1, "normal": 3}
+MAX_LENGTH_ERROR = 0.01  # of a unit normal; a guess, far above float32's rounding
 # COLMAP writes no normal that is not unit or looks away from the camera. Of normals in another
-# order of memory at least a third are, those of a single plane included.
+# order of memory at least a third are, those of a single plane included: between, a guess.
 MAX_ODD_NORMALS = 0.1
 AGAIN = "Run the stereo stage that wrote it again."
 
@@ -93,7 +92,7 @@ def write_normal_map(path: PathArg, normals: Image) -> None:
     DataError
         The system refuses.
     """
-    if normals.ndim != 3 or normals.shape[2] != NORMAL_CHANNELS:
+    if normals.ndim != 3 or normals.shape[2] != 3:
         raise ValueError(f"{normals.shape=} but expected (H, W, 3).")
     known = np.isfinite(normals).all(axis=-1, keepdims=True)
     normals = np.where(known, normals, 0)
@@ -148,39 +147,39 @@ def check_depth_map(path: PathArg, camera: PinholeCamera) -> None:
     DataError
         The file is missing, truncated, no depth map or of another size.
     """
-    _check(path, (camera.width, camera.height, DEPTH_CHANNELS))
+    _check(path, camera, "depth")
 
 
 def check_normal_map(path: PathArg, camera: PinholeCamera) -> None:
     """As :func:`check_depth_map`, for a normal map."""
-    _check(path, (camera.width, camera.height, NORMAL_CHANNELS))
+    _check(path, camera, "normal")
 
 
 def _write(path: PathArg, channels: NDArray[np.floating]) -> None:
     """Write ``(C, H, W)``."""
     depth, height, width = channels.shape
     header = f"{width}&{height}&{depth}&".encode("ascii")
-    write_bytes(path, header + np.ascontiguousarray(channels, "<f4").tobytes())
+    write_bytes(path, header + np.ascontiguousarray(channels, SAMPLE).tobytes())
 
 
-def _check(path: PathArg, expected: tuple[int, int, int]) -> None:
-    """Whether a file announces and holds the expected width, height and channels."""
+def _check(path: PathArg, camera: PinholeCamera, kind: str) -> None:
+    """Whether a file announces and holds a map of this kind and of the camera's size."""
     (width, height, channels), start, num_bytes = _read_header(path)
-    kind = {DEPTH_CHANNELS: "depth", NORMAL_CHANNELS: "normal"}
-    if channels != expected[2]:
-        found = kind.get(channels, f"{channels}-channel")
+    if channels != CHANNELS[kind]:
+        kinds = {number: name for name, number in CHANNELS.items()}
+        found = kinds.get(channels, f"{channels}-channel")
         raise DataError(
             path,
-            f"is a {found} map where a {kind[expected[2]]} map is expected. Put the files of "
+            f"is a {found} map where a {kind} map is expected. Put the files of "
             "depth_maps and normal_maps back into their own folders.",
         )
-    if (width, height) != expected[:2]:
+    if (width, height) != (camera.width, camera.height):
         raise DataError(
             path,
-            f"is {width}x{height} px but its camera {expected[0]}x{expected[1]} px. "
+            f"is {width}x{height} px but its camera {camera.width}x{camera.height} px. "
             "Limit the size in COLMAP's image_undistorter, not in patch_match_stereo.",
         )
-    if num_bytes != start + width * height * channels * SAMPLE_BYTES:
+    if num_bytes != start + width * height * channels * SAMPLE.itemsize:
         raise DataError(
             path,
             f"is damaged: {num_bytes} bytes do not make {width}x{height}x{channels} samples. "
@@ -209,7 +208,7 @@ def _read(path: PathArg) -> Image:
     """Samples ``(C, H, W)`` of a file that was checked."""
     (width, height, channels), start, _ = _read_header(path)
     try:
-        samples = np.fromfile(path, "<f4", offset=start)
+        samples = np.fromfile(path, SAMPLE, offset=start)
     except OSError as error:
         raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
     if not np.isfinite(samples).all():

@@ -1,164 +1,111 @@
-"""COLMAP's cameras and sparse models; the only file that imports pycolmap.
+"""COLMAP's sparse models: read, fitted to a capture, and written.
 
-The rest of the package sees :class:`polmvs.camera.Camera` and :class:`SparseModel` and no type of
-pycolmap, but for ``sfm.py`` and ``sparse_model.py``, which take the module from here.
+A user's model is never modified; what is written is the model as it is used. The rest of the
+package sees :class:`polmvs.scene.SparseModel` and no type of pycolmap.
+
+Binary files say nowhere that they are complete, and pycolmap 4.2 reads one that ends early without
+a word: it repeats the last record, or runs forever where that one is a point. So their records are
+walked through first: they must follow each other to the file's last byte. That is a cheap and
+sharp test, half a second for a million points.
 """
 
 from __future__ import annotations
 
 import logging
+import mmap
 import os
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import lru_cache
+import shutil
+import struct
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
-import pycolmap as pycolmap  # re-exported, see above
+import pycolmap
 from numpy.typing import NDArray
 
-from polmvs.camera import Camera, PinholeCamera
-from polmvs.colmap.binary_check import check_binary_model
+from polmvs.camera import Camera
+from polmvs.colmap.cameras import (
+    camera_from_colmap,
+    camera_to_colmap,
+    quiet_colmap,
+    rescaled_camera,
+)
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
-from polmvs.scene import SparseModel, Tracks, View
+from polmvs.scene import SparseModel, Tracks, View, match_names, short_list
 
-Array = NDArray[np.float64]
+PathArg = str | PathLike[str]
 
 logger = logging.getLogger(__name__)
 
-# Models that are a pinhole camera where all their distortion is zero. Fisheye models are not.
-PERSPECTIVE_MODELS = frozenset(
-    {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
-)
-# Distortion polynomials fold far points back into the image; beyond the border's widest ray
-# times this they are declared invisible.
-FIELD_MARGIN = 1.05
-BORDER_SAMPLES = 64  # along each side of the image
 MODEL_FILES = ("cameras", "images", "points3D")  # rigs and frames came with COLMAP 3.12
 
 
-def set_verbosity(verbose: bool) -> None:
-    """Let COLMAP's own log through to stderr, or keep it quiet."""
-    pycolmap.logging.minloglevel = 0 if verbose else 3
+def read_model(path: PathArg) -> SparseModel:
+    """Read a COLMAP model, binary or text, of three or of five files.
 
-
-set_verbosity(False)  # pycolmap logs every step by default
-
-
-@dataclass(frozen=True, kw_only=True)
-class ColmapCamera:
-    """A camera of any COLMAP model; implements :class:`polmvs.camera.Camera`.
-
-    Attributes
+    Parameters
     ----------
-    model : name of the COLMAP model, such as ``OPENCV_FISHEYE``.
-    width, height : px
-    params : in COLMAP's order, COLMAP's pixel convention.
+    path : the model's folder or a parent, see :func:`find_model`.
+
+    Raises
+    ------
+    DataError
+        The model is missing, damaged or without a registered image.
     """
-
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-    @property
-    def mean_focal_px(self) -> float:
-        """Mean of the focal lengths, px."""
-        return float(_pycolmap_camera(self).mean_focal_length())
-
-    def rays(self, xy: NDArray[np.floating]) -> Array:
-        """Unit rays ``(..., 3)`` in the camera frame of image coordinates ``(..., 2)``.
-
-        NaN where the distortion has no inverse and for pixels that look sideways or backwards.
-        """
-        xy = np.asarray(xy, np.float64)
-        camera = _pycolmap_camera(self)
-        flat = np.ascontiguousarray(xy.reshape(-1, 2))
-        if hasattr(camera, "cam_ray_from_img"):
-            rays = np.asarray(camera.cam_ray_from_img(flat), np.float64)
-        else:  # pycolmap 4.0
-            plane = np.asarray(camera.cam_from_img(flat), np.float64)
-            rays = np.column_stack([plane, np.ones(len(plane))])
-        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        rays[~(rays[:, 2] > 0)] = np.nan
-        return np.asarray(rays.reshape(*xy.shape[:-1], 3), np.float64)
-
-    def project(self, points_in_cam: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Image coordinates ``(..., 2)`` of camera-frame points.
-
-        NaN behind the camera and more than 5 % further from the axis than the widest ray.
-        """
-        points = np.asarray(points_in_cam, np.float64)
-        flat = np.ascontiguousarray(points.reshape(-1, 3))
-        angle = np.arctan2(np.hypot(flat[:, 0], flat[:, 1]), flat[:, 2])
-        seen = (flat[:, 2] > 0) & (angle <= _widest_angle(self))
-        xy = np.full((len(flat), 2), np.nan)
-        if seen.any():
-            xy[seen] = _pycolmap_camera(self).img_from_cam(flat[seen])
-        return xy.reshape(*points.shape[:-1], 2)
-
-    def rescaled(self, width: int, height: int) -> ColmapCamera:
-        """The same camera with its images resized, px."""
-        camera = camera_to_colmap(self)
-        camera.rescale(width, height)
-        return ColmapCamera(
-            model=self.model, width=width, height=height, params=tuple(map(float, camera.params))
-        )
+    folder = find_model(path)
+    if _model_suffix(folder) == ".bin":
+        check_binary_model(folder)
+    try:
+        with quiet_colmap():
+            model = model_from_reconstruction(pycolmap.Reconstruction(str(folder)))
+    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OverflowError) as error:
+        # COLMAP's own words, shortened and without the place in its source.
+        reason = re.sub(r"\[[\w.]+:\d+\]", "", " ".join(str(error).split()))[:120].strip()
+        raise DataError(
+            folder, f"is no sound COLMAP model ({reason or 'no reason given'}). Export it again."
+        ) from error
+    if not model.views:
+        raise DataError(folder, "has no registered image. Run COLMAP again or leave out --sparse.")
+    numbers = [view.cam_from_world.translation for view in model.views]
+    if not all(np.isfinite(array).all() for array in (*numbers, model.tracks.points_in_world)):
+        raise DataError(folder, "is no sound COLMAP model (not all numbers in it are finite).")
+    return model
 
 
-def camera_to_colmap(camera: Camera) -> pycolmap.Camera:
-    """A fresh ``pycolmap.Camera``."""
-    if isinstance(camera, PinholeCamera):
-        model = "PINHOLE"
-        params: tuple[float, ...] = (camera.fx, camera.fy, camera.cx, camera.cy)
-    elif isinstance(camera, ColmapCamera):
-        model, params = camera.model, camera.params
-    else:
-        raise TypeError(f"{type(camera).__name__} has no counterpart in COLMAP.")
-    return pycolmap.Camera(
-        model=model, width=camera.width, height=camera.height, params=np.array(params)
+def find_model(path: PathArg) -> Path:
+    """Folder of a COLMAP model: the given one, or its ``0``, ``sparse`` or ``sparse/0``.
+
+    Raises
+    ------
+    DataError
+        No such folder, or no complete model in it.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise DataError(root, "is no folder." if root.exists() else "no such folder.")
+    for folder in (root, root / "0", root / "sparse", root / "sparse" / "0"):
+        if _model_suffix(folder) is not None:
+            if folder.name == "0" and (folder.parent / "1").is_dir():
+                logger.warning("%s: holds several models; 0 is used.", folder.parent)
+            return folder
+    raise DataError(
+        root,
+        "holds no COLMAP model. Its cameras, images and points3D files (.bin or .txt) are "
+        "expected in it, in 0/, in sparse/ or in sparse/0/.",
     )
 
 
-@lru_cache(maxsize=4096)
-def _pycolmap_camera(camera: ColmapCamera) -> pycolmap.Camera:
-    """The wrapped camera, never modified; outside the dataclass so that that one pickles."""
-    return camera_to_colmap(camera)
-
-
-@lru_cache(maxsize=4096)
-def _widest_angle(camera: ColmapCamera) -> float:
-    """Angle from the optical axis of the widest ray of the image's border, with margin, rad."""
-    along = np.linspace(0, 1, BORDER_SAMPLES)
-    share = [np.stack([along, np.full_like(along, side)], axis=-1) for side in (0, 1)]
-    border = np.concatenate([*share, *(pair[:, ::-1] for pair in share)])
-    z = camera.rays(border * (camera.width, camera.height))[:, 2]
-    inside = z[np.isfinite(z)]
-    # Where the border reaches beyond the fold, the last rays before it are the bound themselves.
-    margin = FIELD_MARGIN if len(inside) == len(z) else 1.0
-    return float(margin * np.arccos(inside.min(initial=1.0) if len(inside) else 0.0))
-
-
-def camera_from_colmap(camera: pycolmap.Camera) -> Camera:
-    """A ``pycolmap.Camera`` as this package's; the fast pinhole where it is one."""
-    model = str(camera.model_name)
-    if model in PERSPECTIVE_MODELS and camera.is_undistorted():
-        return PinholeCamera(
-            width=int(camera.width),
-            height=int(camera.height),
-            fx=float(camera.focal_length_x),
-            fy=float(camera.focal_length_y),
-            cx=float(camera.principal_point_x),
-            cy=float(camera.principal_point_y),
-        )
-    return ColmapCamera(
-        model=model,
-        width=int(camera.width),
-        height=int(camera.height),
-        params=tuple(map(float, camera.params)),
-    )
+def _model_suffix(folder: Path) -> str | None:
+    """``.bin`` or ``.txt``, whichever of COLMAP's forms the folder holds whole."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{name}{suffix}").is_file() for name in MODEL_FILES):
+            return suffix
+    return None
 
 
 def model_from_reconstruction(
@@ -215,69 +162,293 @@ def _tracks(reconstruction: pycolmap.Reconstruction, images: list[pycolmap.Image
     )
 
 
-def find_model(path: str | os.PathLike[str]) -> Path:
-    """Folder of a COLMAP model: the given one, or its ``0``, ``sparse`` or ``sparse/0``.
+def match_model_to_capture(
+    model: SparseModel,
+    names: Sequence[str],
+    width: int,
+    height: int,
+    *,
+    source: PathArg = "sparse model",
+) -> SparseModel:
+    """Fit a model to a capture: its names, and the size of its polarization images.
 
-    Raises
-    ------
-    DataError
-        No such folder, or no complete model in it.
-    """
-    root = Path(path)
-    if not root.is_dir():
-        raise DataError(root, "is no folder." if root.exists() else "no such folder.")
-    for folder in (root, root / "0", root / "sparse", root / "sparse" / "0"):
-        if _model_suffix(folder) is not None:
-            if folder.name == "0" and (folder.parent / "1").is_dir():
-                logger.warning("%s: holds several models; 0 is used.", folder.parent)
-            return folder
-    raise DataError(
-        root,
-        "holds no COLMAP model. Its cameras, images and points3D files (.bin or .txt) are "
-        "expected in it, in 0/, in sparse/ or in sparse/0/.",
-    )
-
-
-def _model_suffix(folder: Path) -> str | None:
-    """``.bin`` or ``.txt``, whichever of COLMAP's forms the folder holds whole."""
-    for suffix in (".bin", ".txt"):
-        if all((folder / f"{name}{suffix}").is_file() for name in MODEL_FILES):
-            return suffix
-    return None
-
-
-def read_model(path: str | os.PathLike[str]) -> SparseModel:
-    """Read a COLMAP model, binary or text, of three or of five files.
+    Images are matched by name, else by name without folder and suffix where that is unambiguous.
+    Views that the capture lacks are dropped, and tracks that no view is left of. Cameras of
+    another size with the same aspect ratio are rescaled together with their observations; those
+    of the raw mosaic, which has exactly twice the size, thus get ``K / 2``.
 
     Parameters
     ----------
-    path : the model's folder or a parent, see :func:`find_model`.
+    model : as read.
+    names : of the capture's images.
+    width, height : of the polarization images, px.
+    source : where the model came from, for messages.
+
+    Returns
+    -------
+    SparseModel
+        Views have the capture's names; ``unregistered`` are the capture's images without a pose.
 
     Raises
     ------
     DataError
-        The model is missing, damaged or without a registered image.
+        No image matches, or a camera has another aspect ratio.
     """
-    folder = find_model(path)
-    if _model_suffix(folder) == ".bin":
-        check_binary_model(folder, _num_params)
-    try:
-        model = model_from_reconstruction(pycolmap.Reconstruction(str(folder)))
-    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OverflowError) as error:
-        # COLMAP's own words, shortened and without the place in its source.
-        reason = re.sub(r"\[[\w.]+:\d+\]", "", " ".join(str(error).split()))[:120].strip()
+    model_names = [view.name for view in model.views]
+    matched = require_matches(model_names, names, source)
+    kept = [i for i, name in enumerate(model_names) if name in matched]
+    if dropped := [name for name in model_names if name not in matched]:
+        logger.warning(
+            "%s: %d views are not in the capture and are left out: %s.",
+            source,
+            len(dropped),
+            short_list(dropped),
+        )
+    kept.sort(key=lambda i: matched[model_names[i]])
+    views = []
+    scales = np.ones((len(model.views), 2))
+    for i in kept:
+        camera = model.views[i].camera
+        fitted = _fit_camera(camera, width, height, source)
+        scales[i] = fitted.width / camera.width, fitted.height / camera.height
+        views.append(replace(model.views[i], name=matched[model_names[i]], camera=fitted))
+    if (scales != 1).any():
+        logger.info("%s: cameras are rescaled to %dx%d px.", source, width, height)
+    registered = {view.name for view in views}
+    return SparseModel(
+        views=tuple(views),
+        tracks=_select_tracks(model.tracks, kept, scales),
+        unregistered=tuple(sorted(set(names) - registered)),
+    )
+
+
+def require_matches(
+    model_names: Sequence[str], names: Sequence[str], source: PathArg
+) -> dict[str, str]:
+    """The capture's name of each of the model's images that has one; see :func:`match_names`.
+
+    Raises
+    ------
+    DataError
+        None has one.
+    """
+    matched = match_names(model_names, names)
+    if not matched:
         raise DataError(
-            folder, f"is no sound COLMAP model ({reason or 'no reason given'}). Export it again."
-        ) from error
-    if not model.views:
-        raise DataError(folder, "has no registered image. Run COLMAP again or leave out --sparse.")
-    numbers = [view.cam_from_world.translation for view in model.views]
-    if not all(np.isfinite(array).all() for array in (*numbers, model.tracks.points_in_world)):
-        raise DataError(folder, "is no sound COLMAP model (not all numbers in it are finite).")
-    return model
+            source,
+            f"its images are named like {model_names[0]!r} but the capture's like "
+            f"{min(names)!r}; none match. Give the model of this capture.",
+        )
+    if any(name != other for name, other in matched.items()):
+        logger.warning("%s: images are matched by name without folder and suffix.", source)
+    return matched
 
 
-def _num_params(model_id: int) -> int:
-    """Number of parameters of a camera model; ValueError where pycolmap does not know it."""
+def _fit_camera(camera: Camera, width: int, height: int, source: PathArg) -> Camera:
+    """The camera at the polarization images' size."""
+    if (camera.width, camera.height) == (width, height):
+        return camera
+    # Tools that resize round each side to a pixel of their own.
+    if abs(camera.width * height / width - camera.height) > max(1.0, height / width):
+        raise DataError(
+            source,
+            f"its camera is {camera.width}x{camera.height} px, the polarization images are "
+            f"{width}x{height} px: another aspect ratio. Give the model of this capture.",
+        )
+    return rescaled_camera(camera, width, height)
+
+
+def _select_tracks(tracks: Tracks, kept: Sequence[int], scales: NDArray[np.float64]) -> Tracks:
+    """Observations in the kept views and the tracks that have any, in the new pixels."""
+    new_view = np.full(len(scales), -1)
+    new_view[list(kept)] = np.arange(len(kept))
+    obs = np.flatnonzero(new_view[tracks.obs_view] >= 0)
+    used = np.zeros(len(tracks.point3D_ids), bool)
+    used[tracks.obs_track[obs]] = True
+    mean_scale = float(scales[list(kept)].mean())
+    return Tracks(
+        point3D_ids=tracks.point3D_ids[used],
+        points_in_world=tracks.points_in_world[used],
+        colors=tracks.colors[used],
+        errors=tracks.errors[used] * mean_scale,
+        obs_track=(np.cumsum(used) - 1)[tracks.obs_track[obs]],
+        obs_view=new_view[tracks.obs_view[obs]],
+        obs_xy=tracks.obs_xy[obs] * scales[tracks.obs_view[obs]],
+    )
+
+
+def write_model(model: SparseModel, folder: str | PathLike[str]) -> None:
+    """Write a model as COLMAP binary, whole or not at all; a folder of that name is replaced.
+
+    Keypoints without a track and images without a pose are not part of a :class:`SparseModel`
+    and are not written. Each view becomes an image with its own frame.
+    """
+    write_reconstruction(_reconstruction(model), folder)
+
+
+def write_reconstruction(
+    reconstruction: pycolmap.Reconstruction, folder: str | PathLike[str]
+) -> None:
+    """Write a reconstruction as COLMAP binary, whole or not at all."""
+    target = Path(folder)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    try:
+        temporary.chmod(0o777 & ~_umask())
+        reconstruction.write_binary(str(temporary))
+        if target.exists():
+            shutil.rmtree(target)
+        temporary.rename(target)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _reconstruction(model: SparseModel) -> pycolmap.Reconstruction:
+    """The model in pycolmap's types; ids of points are kept."""
+    reconstruction = pycolmap.Reconstruction()
+    cameras = list(dict.fromkeys(view.camera for view in model.views))
+    for index, camera in enumerate(cameras):
+        colmap_camera = camera_to_colmap(camera)
+        colmap_camera.camera_id = index + 1
+        reconstruction.add_camera_with_trivial_rig(colmap_camera)
+    tracks = model.tracks
+    # Index of an observation among those of its image.
+    order = np.argsort(tracks.obs_view, kind="stable")
+    starts = np.searchsorted(tracks.obs_view[order], np.arange(len(model.views) + 1))
+    point2D_idx = np.empty(len(order), np.int64)
+    for index, view in enumerate(model.views):
+        own = order[starts[index] : starts[index + 1]]
+        point2D_idx[own] = np.arange(len(own))
+        image = pycolmap.Image(
+            name=view.name,
+            keypoints=tracks.obs_xy[own],
+            camera_id=cameras.index(view.camera) + 1,
+            image_id=index + 1,
+        )
+        pose = view.cam_from_world
+        matrix = np.column_stack([pose.rotation, pose.translation])
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
+    _add_points(reconstruction, tracks, point2D_idx)
+    return reconstruction
+
+
+def _add_points(
+    reconstruction: pycolmap.Reconstruction, tracks: Tracks, point2D_idx: NDArray[np.int64]
+) -> None:
+    """Add all tracks; ``point2D_idx`` is each observation's index in its image."""
+    order = np.argsort(tracks.obs_track, kind="stable")
+    starts = np.searchsorted(tracks.obs_track[order], np.arange(len(tracks.point3D_ids) + 1))
+    for index, point3D_id in enumerate(tracks.point3D_ids):
+        own = order[starts[index] : starts[index + 1]].tolist()
+        elements = [
+            pycolmap.TrackElement(int(tracks.obs_view[i]) + 1, int(point2D_idx[i])) for i in own
+        ]
+        point = pycolmap.Point3D(
+            xyz=tracks.points_in_world[index],
+            color=tracks.colors[index],
+            error=float(tracks.errors[index]),
+            track=pycolmap.Track(elements),
+        )
+        reconstruction.add_point3D_with_id(int(point3D_id), point)
+
+
+# Records of the binary files, from COLMAP's reconstruction_io_binary.cc. A pose is a quaternion and
+# a translation.
+COUNT = struct.Struct("<Q")
+CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
+RIG = struct.Struct("<II")  # id, number of sensors; then the sensors, all but the first with poses
+SENSOR = struct.Struct("<ii")  # type, id
+HAS_POSE = struct.Struct("<B")
+POSE = struct.Struct("<7d")
+FRAME = struct.Struct("<II7dI")  # id, rig, pose, number of data; then the data
+DATUM = struct.Struct("<iiQ")  # sensor, id
+IMAGE = struct.Struct("<I7dI")  # id, pose, camera; then the name, and the keypoints
+KEYPOINT = struct.Struct("<ddQ")  # place, point
+POINT = struct.Struct("<Q3d3Bd")  # id, place, colour, error; then the track
+TRACK_ELEMENT = struct.Struct("<II")  # image, keypoint
+
+Reader = Callable[[mmap.mmap, int], int]
+
+
+def check_binary_model(folder: Path) -> None:
+    """Refuse a binary model of which a file is truncated or has another format.
+
+    Files that the folder lacks are passed over.
+
+    Raises
+    ------
+    DataError
+        Names the file at fault.
+    """
+    readers: dict[str, Reader] = {
+        "cameras": _camera_end,
+        "rigs": _rig_end,
+        "frames": _frame_end,
+        "images": _image_end,
+        "points3D": _point_end,
+    }
+    for name, reader in readers.items():
+        path = folder / f"{name}.bin"
+        if path.is_file():
+            _check_file(path, reader)
+
+
+def _check_file(path: Path, record_end: Reader) -> None:
+    """Whether the announced records fill the file."""
+    try:
+        with (
+            path.open("rb") as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+        ):
+            position = COUNT.size
+            for _ in range(COUNT.unpack_from(data)[0]):
+                position = record_end(data, position)
+            complete = position == len(data)
+    except OSError as error:
+        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+    except (ValueError, struct.error):  # an empty file, a record past the end, no such model
+        complete = False
+    if not complete:
+        raise DataError(path, "is truncated or no file of COLMAP's. Export the model again.")
+
+
+def _camera_end(data: mmap.mmap, start: int) -> int:
+    _, model_id, _, _ = CAMERA.unpack_from(data, start)
+    # ValueError where pycolmap does not know the model.
     model = pycolmap.CameraModelId(model_id)
-    return len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params)
+    params = pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params
+    return start + CAMERA.size + params.nbytes
+
+
+def _rig_end(data: mmap.mmap, start: int) -> int:
+    _, num_sensors = RIG.unpack_from(data, start)
+    end = start + RIG.size + (SENSOR.size if num_sensors else 0)
+    for _ in range(num_sensors - 1):
+        (has_pose,) = HAS_POSE.unpack_from(data, end + SENSOR.size)
+        end += SENSOR.size + HAS_POSE.size + (POSE.size if has_pose else 0)
+    return end
+
+
+def _frame_end(data: mmap.mmap, start: int) -> int:
+    num_data = FRAME.unpack_from(data, start)[-1]
+    return int(start + FRAME.size + num_data * DATUM.size)
+
+
+def _image_end(data: mmap.mmap, start: int) -> int:
+    name_end = data.find(b"\0", start + IMAGE.size)
+    if name_end < 0:
+        raise ValueError("name without end")
+    (num_points,) = COUNT.unpack_from(data, name_end + 1)
+    return int(name_end + 1 + COUNT.size + num_points * KEYPOINT.size)
+
+
+def _point_end(data: mmap.mmap, start: int) -> int:
+    (length,) = COUNT.unpack_from(data, start + POINT.size)
+    return int(start + POINT.size + COUNT.size + length * TRACK_ELEMENT.size)

@@ -10,35 +10,70 @@ principal point, which COLMAP leaves at the image's centre: 6 px off, there, tur
 
 from __future__ import annotations
 
+import copy
 import logging
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
+import pycolmap
 
 from polmvs.camera import PinholeCamera
-from polmvs.colmap.bundle import MAX_REPROJ_ERROR_PX, refine
-from polmvs.colmap.models import model_from_reconstruction, pycolmap
-from polmvs.colmap.sparse_model import short_list, write_reconstruction
+from polmvs.colmap.cameras import quiet_colmap
+from polmvs.colmap.models import model_from_reconstruction, write_reconstruction
 from polmvs.config import SfmOptions
 from polmvs.errors import DataError, OptionError
-from polmvs.scene import SparseModel
+from polmvs.io.images import read_gray
+from polmvs.scene import SparseModel, short_list
 
 logger = logging.getLogger(__name__)
 
-MAX_EXHAUSTIVE_IMAGES = 200  # 20,000 pairs, some minutes on two cores
-SEQUENTIAL_OVERLAP = 20
-# With few images most tracks have two views only; with more those are mostly mismatches.
-MAX_IMAGES_TWO_VIEW_TRACKS = 5
-MIN_FOCAL, MAX_FOCAL = 0.2, 10.0  # of the image's width
-MOSAIC_TOLERANCE = 0.15  # a full mosaic's centre lies in the corner of the half-size image
 NO_MODEL_REMEDY = (
     "The surroundings of the part need texture and neighbouring views more overlap; give "
     "--intrinsics where they are known, or a COLMAP model with --sparse."
 )
 
-Progress = Callable[[str], None]
+OnProgress = Callable[[str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmTolerances:
+    """What is asked of features, tracks and the camera beside COLMAP's own defaults.
+
+    Measured: by the median error of the cameras' centres on the captures board, dome and demo, as
+    the head of this module says. Errors in px are those of keypoints, which do not scale with the
+    focal length.
+
+    Attributes
+    ----------
+    max_reproj_error_px : of an observation that is kept; measured, of 1, 2 and 4.
+    min_tri_angle_deg : of a point that is kept; COLMAP's own.
+    loss_scale_px : of the last adjustment's Cauchy loss; measured, about twice the error of a good
+        keypoint.
+    min_views_principal_point : from which the principal point is freed; measured: of three views
+        two captures of three got worse, of four none.
+    max_principal_point_shift : of the image's width; a guess, more is an estimate gone astray.
+    max_exhaustive_images : that are matched in all pairs; a guess, 20,000 pairs take some minutes
+        on two cores.
+    sequential_overlap : neighbours that each image of more is matched with; a guess.
+    max_images_two_view_tracks : up to which tracks of two views count; a guess: with few images
+        most tracks have two views only, with more those are mostly mismatches.
+    focal_range : focal lengths that are believed, in widths of the image: 136 to 6 degrees.
+    corner_tolerance : of a principal point from the image's lower right corner, in sides of the
+        image; a guess. Intrinsics of the full mosaic have it there.
+    """
+
+    max_reproj_error_px: float = 2.0
+    min_tri_angle_deg: float = 1.5
+    loss_scale_px: float = 0.5
+    min_views_principal_point: int = 4
+    max_principal_point_shift: float = 0.1
+    max_exhaustive_images: int = 200
+    sequential_overlap: int = 20
+    max_images_two_view_tracks: int = 5
+    focal_range: tuple[float, float] = (0.2, 10.0)
+    corner_tolerance: float = 0.15
 
 
 def run_sfm(
@@ -47,7 +82,9 @@ def run_sfm(
     work_folder: Path,
     sparse_folder: Path,
     options: SfmOptions,
-    on_progress: Progress | None = None,
+    on_progress: OnProgress = lambda name: None,
+    *,
+    tolerances: SfmTolerances = SfmTolerances(),
 ) -> SparseModel:
     """Find the poses of the images and their sparse points.
 
@@ -71,32 +108,40 @@ def run_sfm(
     """
     names = sorted(image_names)
     width, height = _image_size(image_folder, names)
-    reader = _reader_options(options, width, height)
-    report = on_progress if on_progress is not None else logger.debug
+    reader = _reader_options(options, width, height, tolerances)
     work_folder.mkdir(parents=True, exist_ok=True)
     database = work_folder / "database.db"
     for left_over in work_folder.glob("database.db*"):
         left_over.unlink()
     pycolmap.set_random_seed(options.seed)
-    report("features")
-    _extract_features(database, image_folder, names, reader, options)
-    report("matching")
-    _match(database, len(names), options.seed)
-    report("mapping")
-    reconstruction = _map(database, image_folder, work_folder / "models", len(names), options)
-    report("bundle adjustment")
-    reconstruction = refine(
-        reconstruction,
-        free_intrinsics=options.intrinsics is None,
-        single_camera=options.single_camera,
-    )
+    with quiet_colmap():
+        on_progress("features")
+        _extract_features(database, image_folder, names, reader, options)
+        on_progress("matching")
+        _match(database, len(names), options.seed, tolerances)
+        on_progress("mapping")
+        mapper = _mapper_options(len(names), options, tolerances)
+        reconstruction = _map(database, image_folder, work_folder / "models", mapper)
+        on_progress("bundle adjustment")
+        reconstruction = _refine(
+            reconstruction,
+            tolerances,
+            free_intrinsics=options.intrinsics is None,
+            single_camera=options.single_camera,
+        )
     write_reconstruction(reconstruction, sparse_folder)
     model = model_from_reconstruction(reconstruction, names)
     _log_result(model, reconstruction.compute_mean_reprojection_error())
     return model
 
 
-def check_intrinsics(intrinsics: Sequence[float], width: int, height: int) -> PinholeCamera:
+def check_intrinsics(
+    intrinsics: Sequence[float],
+    width: int,
+    height: int,
+    *,
+    tolerances: SfmTolerances = SfmTolerances(),
+) -> PinholeCamera:
     """The camera of ``fx, fy, cx, cy``, px, if it can be that of images of this size.
 
     Raises
@@ -105,7 +150,7 @@ def check_intrinsics(intrinsics: Sequence[float], width: int, height: int) -> Pi
         The principal point or a focal length is out of range; the message names the remedy.
     """
     fx, fy, cx, cy = intrinsics
-    if max(abs(cx / width - 1), abs(cy / height - 1)) < MOSAIC_TOLERANCE:
+    if max(abs(cx / width - 1), abs(cy / height - 1)) < tolerances.corner_tolerance:
         half = ",".join(f"{value / 2:.10g}" for value in intrinsics)
         raise OptionError(
             f"--intrinsics: the principal point {cx:g},{cy:g} lies in the corner of the "
@@ -117,11 +162,11 @@ def check_intrinsics(intrinsics: Sequence[float], width: int, height: int) -> Pi
             f"--intrinsics: the principal point {cx:g},{cy:g} lies outside the {width}x{height} "
             "px polarization images. Give fx,fy,cx,cy in pixels of that size."
         )
-    if not all(MIN_FOCAL * width <= focal <= MAX_FOCAL * width for focal in (fx, fy)):
+    least, most = tolerances.focal_range
+    if not all(least * width <= focal <= most * width for focal in (fx, fy)):
         raise OptionError(
-            f"--intrinsics: focal lengths {fx:g},{fy:g} are not within {MIN_FOCAL:g} to "
-            f"{MAX_FOCAL:g} times the image's width of {width} px. Give them in pixels of the "
-            "half-size images."
+            f"--intrinsics: focal lengths {fx:g},{fy:g} are not within {least:g} to {most:g} "
+            f"times the image's width of {width} px. Give them in pixels of the half-size images."
         )
     return PinholeCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
@@ -132,20 +177,20 @@ def _image_size(folder: Path, names: Sequence[str]) -> tuple[int, int]:
         raise DataError(folder, f"has {len(names)} images; SfM needs two or more, better ten.")
     sizes = {}
     for name in names:
-        image = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise DataError(folder / name, "is no image that can be read.")
+        image = read_gray(folder / name)
         sizes[image.shape[1], image.shape[0]] = name
     if len(sizes) > 1:
         raise DataError(folder, f"images differ in size: {', '.join(sorted(sizes.values()))}.")
     return next(iter(sizes))
 
 
-def _reader_options(options: SfmOptions, width: int, height: int) -> pycolmap.ImageReaderOptions:
+def _reader_options(
+    options: SfmOptions, width: int, height: int, tolerances: SfmTolerances
+) -> pycolmap.ImageReaderOptions:
     """The camera that COLMAP starts from."""
     reader = pycolmap.ImageReaderOptions()
     if options.intrinsics is not None:
-        check_intrinsics(options.intrinsics, width, height)
+        check_intrinsics(options.intrinsics, width, height, tolerances=tolerances)
         reader.camera_model = "PINHOLE"
         reader.camera_params = ",".join(repr(float(value)) for value in options.intrinsics)
         return reader
@@ -180,12 +225,12 @@ def _extract_features(
     )
 
 
-def _match(database: Path, num_images: int, seed: int) -> None:
+def _match(database: Path, num_images: int, seed: int, tolerances: SfmTolerances) -> None:
     """Match all pairs, or neighbours in the order of names where there are too many."""
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     cpu = pycolmap.Device.cpu
-    if num_images <= MAX_EXHAUSTIVE_IMAGES:
+    if num_images <= tolerances.max_exhaustive_images:
         logger.info("SfM: %d images, all pairs are matched.", num_images)
         pycolmap.match_exhaustive(database, verification_options=verification, device=cpu)
         return
@@ -193,16 +238,18 @@ def _match(database: Path, num_images: int, seed: int) -> None:
         "SfM: %d images are too many for all pairs: each is matched with its %d neighbours. "
         "Their names must be in the order of recording.",
         num_images,
-        SEQUENTIAL_OVERLAP,
+        tolerances.sequential_overlap,
     )
     pairing = pycolmap.SequentialPairingOptions()
-    pairing.overlap = SEQUENTIAL_OVERLAP
+    pairing.overlap = tolerances.sequential_overlap
     pycolmap.match_sequential(
         database, pairing_options=pairing, verification_options=verification, device=cpu
     )
 
 
-def _mapper_options(num_images: int, options: SfmOptions) -> pycolmap.IncrementalPipelineOptions:
+def _mapper_options(
+    num_images: int, options: SfmOptions, tolerances: SfmTolerances
+) -> pycolmap.IncrementalPipelineOptions:
     """Options of the incremental mapper."""
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.min_model_size = min(3, num_images)
@@ -213,7 +260,7 @@ def _mapper_options(num_images: int, options: SfmOptions) -> pycolmap.Incrementa
     # ten views either way. Extraction and matching are the larger part and use all cores.
     pipeline.num_threads = 1
     pipeline.mapper.num_threads = 1
-    two_view_tracks = num_images <= MAX_IMAGES_TWO_VIEW_TRACKS
+    two_view_tracks = num_images <= tolerances.max_images_two_view_tracks
     pipeline.triangulation.ignore_two_view_tracks = not two_view_tracks
     if options.intrinsics is not None:
         pipeline.ba_refine_focal_length = False
@@ -221,21 +268,20 @@ def _mapper_options(num_images: int, options: SfmOptions) -> pycolmap.Incrementa
         pipeline.mapper.abs_pose_refine_focal_length = False
         pipeline.mapper.abs_pose_refine_extra_params = False
         # With a camera still to be found the errors are larger at first: COLMAP's 4 px stay.
-        pipeline.mapper.filter_max_reproj_error = MAX_REPROJ_ERROR_PX
-        pipeline.triangulation.complete_max_reproj_error = MAX_REPROJ_ERROR_PX
-        pipeline.triangulation.merge_max_reproj_error = MAX_REPROJ_ERROR_PX
+        error_px = tolerances.max_reproj_error_px
+        pipeline.mapper.filter_max_reproj_error = error_px
+        pipeline.triangulation.complete_max_reproj_error = error_px
+        pipeline.triangulation.merge_max_reproj_error = error_px
     return pipeline
 
 
 def _map(
-    database: Path, image_folder: Path, models: Path, num_images: int, options: SfmOptions
+    database: Path, image_folder: Path, models: Path, options: pycolmap.IncrementalPipelineOptions
 ) -> pycolmap.Reconstruction:
     """The largest model that the incremental mapper makes."""
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
-    found = pycolmap.incremental_mapping(
-        database, image_folder, models, _mapper_options(num_images, options)
-    )
+    found = pycolmap.incremental_mapping(database, image_folder, models, options)
     shutil.rmtree(models)
     if not found:
         raise DataError(image_folder, f"SfM finds no model of these images. {NO_MODEL_REMEDY}")
@@ -247,6 +293,71 @@ def _map(
     if len(found) > 1:
         logger.warning("SfM: the images fall into %d models; the largest is used.", len(found))
     return largest
+
+
+def _refine(
+    reconstruction: pycolmap.Reconstruction,
+    tolerances: SfmTolerances,
+    *,
+    free_intrinsics: bool,
+    single_camera: bool,
+) -> pycolmap.Reconstruction:
+    """The last bundle adjustment, more careful than those on its way; then filter the points.
+
+    Parameters
+    ----------
+    reconstruction : from the mapper; adjusted in place, or left aside for the result.
+    free_intrinsics : estimate the cameras too.
+    single_camera : all images share one; its principal point is then freed as well where there
+        are views enough, and kept at the centre where the estimate goes astray.
+    """
+    num_views = reconstruction.num_reg_images()
+    if free_intrinsics and single_camera and num_views >= tolerances.min_views_principal_point:
+        with_point = copy.deepcopy(reconstruction)
+        _adjust(with_point, tolerances, free_intrinsics=True, free_principal_point=True)
+        if _principal_points_plausible(with_point, tolerances):
+            return with_point
+        logger.warning("SfM: the principal point cannot be estimated; the centre is kept.")
+    _adjust(reconstruction, tolerances, free_intrinsics=free_intrinsics, free_principal_point=False)
+    return reconstruction
+
+
+def _adjust(
+    reconstruction: pycolmap.Reconstruction,
+    tolerances: SfmTolerances,
+    *,
+    free_intrinsics: bool,
+    free_principal_point: bool,
+) -> None:
+    """Bundle adjustment in place on one thread, then drop what is beyond the thresholds."""
+    bundle = pycolmap.BundleAdjustmentOptions()
+    bundle.refine_focal_length = free_intrinsics
+    bundle.refine_extra_params = free_intrinsics
+    bundle.refine_principal_point = free_principal_point
+    bundle.print_summary = False
+    bundle.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    bundle.ceres.loss_function_scale = tolerances.loss_scale_px
+    bundle.ceres.solver_options.num_threads = 1  # sums over threads depend on their timing
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not pycolmap.bundle_adjustment: release 4.2 turns the log level back to INFO in it.
+    pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
+    observations = pycolmap.ObservationManager(reconstruction)
+    observations.filter_all_points3D(tolerances.max_reproj_error_px, tolerances.min_tri_angle_deg)
+    reconstruction.update_point_3d_errors()
+
+
+def _principal_points_plausible(
+    reconstruction: pycolmap.Reconstruction, tolerances: SfmTolerances
+) -> bool:
+    """Whether every camera's principal point stayed near the centre of its image."""
+    return all(
+        max(abs(c.principal_point_x - c.width / 2), abs(c.principal_point_y - c.height / 2))
+        < tolerances.max_principal_point_shift * c.width
+        for c in reconstruction.cameras.values()
+    )
 
 
 def _log_result(model: SparseModel, error_px: float) -> None:

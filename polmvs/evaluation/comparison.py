@@ -2,39 +2,204 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Options
+from polmvs.config import AngleModel
+from polmvs.errors import DataError
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
-from polmvs.evaluation.map_errors import map_errors
-from polmvs.evaluation.phase_errors import phase_errors, stem_of
-from polmvs.evaluation.tables import summary_text
-from polmvs.evaluation.truth_errors import evaluate, track_normal_errors
+from polmvs.evaluation.map_errors import MapErrors, map_errors
+from polmvs.evaluation.metrics import AngleStats, CloudMetrics
+from polmvs.evaluation.phase_errors import phase_errors
+from polmvs.evaluation.tables import best_fit_lines, comparison_table
+from polmvs.evaluation.truth_errors import TrackNormalErrors, evaluate, track_normal_errors
 from polmvs.io.clouds import Cloud, read_cloud
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
-from polmvs.io.images import write_bytes
-from polmvs.option_values import to_plain
+from polmvs.io.typed_json import from_json
 from polmvs.parallel import Workers
-from polmvs.pipeline.record import write_json
-from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.stages.capture import open_maps
-from polmvs.pipeline.stages.clouds import open_dense_views
 from polmvs.polarization.capture import Capture
-from polmvs.scene import View
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.poses.alignment import Alignment
+from polmvs.scene import View, stem_of
 from polmvs.surface.dense_view import DenseView
 
 DenseViews = Sequence[DenseView | None]
 
+SCHEMA_VERSION = 2  # of ``metrics.json``; 1: the first releases, which did not name it
 
-def named_as_truth(views: Sequence[View], truth: GroundTruth) -> list[View]:
-    """Views under the truth's names, which may have another suffix."""
-    by_stem = {stem_of(name): name for name in truth.names}
-    return [replace(view, name=by_stem.get(stem_of(view.name), view.name)) for view in views]
+
+@dataclass(frozen=True, kw_only=True)
+class TruthFigures:
+    """What a model came to, against ground truth.
+
+    Attributes
+    ----------
+    cloud : of the dense cloud.
+    alignment : how the estimated cameras were brought onto the true ones.
+    tracks : of the normals of the sparse points; None where they were not measured.
+    maps : of the dense depth and normal maps; None where they were not measured.
+    """
+
+    cloud: CloudMetrics
+    alignment: Alignment
+    tracks: TrackNormalErrors | None = None
+    maps: MapErrors | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelFigures:
+    """What a model came to.
+
+    Attributes
+    ----------
+    consistency : how well its cloud fits the capture that it was made from.
+    truth : how well it fits the ground truth; None without one.
+    """
+
+    consistency: Consistency
+    truth: TruthFigures | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhaseFigures:
+    """Errors of the measured phase on the part, under each model with the true normals.
+
+    Attributes
+    ----------
+    maps : of the phase maps, which the geometry uses.
+    pixels : of the single pixels of the capture, those neither clipped nor dark.
+    """
+
+    maps: Mapping[AngleModel, AngleStats]
+    pixels: Mapping[AngleModel, AngleStats]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SparseFigures:
+    """What all models started from.
+
+    Attributes
+    ----------
+    num_views : images with a pose.
+    unregistered : names of those without.
+    num_tracks : sparse points.
+    num_seeds : those of them that are seeds.
+    """
+
+    num_views: int
+    unregistered: tuple[str, ...]
+    num_tracks: int
+    num_seeds: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Several models on the same poses and seeds; ``metrics.json`` is its serialisation.
+
+    Attributes
+    ----------
+    schema_version : of the file.
+    capture : folder of the raw mosaics.
+    sparse : what all models started from.
+    models : figures of each model.
+    phase : errors of the phase itself; None without ground truth.
+    best_fit : the model that the phases fit best; None where nothing tells.
+    """
+
+    schema_version: int = SCHEMA_VERSION
+    capture: str
+    sparse: SparseFigures
+    models: Mapping[AngleModel, ModelFigures]
+    phase: PhaseFigures | None
+    best_fit: AngleModel | None
+
+    def table(self) -> str:
+        """The figures, a column for each model, in Markdown."""
+        return comparison_table(self)
+
+    def summary(self) -> str:
+        """The figures as a page, in Markdown."""
+        sparse = self.sparse
+        missing = sparse.unregistered
+        lines = [
+            f"# {self.capture}",
+            "",
+            f"{sparse.num_views} of {sparse.num_views + len(missing)} views have a pose"
+            + (f"; without one: {', '.join(missing)}" if missing else "")
+            + f". {sparse.num_tracks} sparse points, {sparse.num_seeds} of them seeds.",
+            "",
+            self.table(),
+            *best_fit_lines(self),
+        ]
+        return "\n".join(lines) + "\n"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelEstimate:
+    """What a model came to, as it is measured.
+
+    Attributes
+    ----------
+    cloud : dense cloud.
+    tracks : sparse points with normals, quality and ``seed``.
+    maps : phase maps of all views for the model.
+    dense : dense depth and normals of the same views.
+    """
+
+    cloud: Cloud
+    tracks: Cloud
+    maps: Sequence[PhaseMap]
+    dense: DenseViews
+
+
+def compare_models(
+    capture: Capture,
+    sparse: SparseFigures,
+    maps: Sequence[PhaseMap],
+    estimates: Mapping[AngleModel, ModelEstimate],
+    truth: GroundTruth | None,
+    *,
+    workers: Workers | None = None,
+) -> Comparison:
+    """Measure what several models came to.
+
+    Parameters
+    ----------
+    capture : raw mosaics.
+    sparse : what all models started from.
+    maps : phase maps as OPA and PPA use them.
+    estimates : of each model, in the world of its maps' views.
+    truth : ground truth, if there is one.
+    """
+    tasks: list[Callable[[], Any]] = []
+    if truth is not None:  # the longest first
+        tasks.append(partial(_measure_all, estimates, truth))
+        tasks.append(partial(phase_errors, capture, maps, truth))
+    tasks += [
+        partial(measure_consistency, m, e.cloud, e.tracks, e.maps) for m, e in estimates.items()
+    ]
+    done = list((workers or Workers()).map(_call, tasks))
+    found: list[Consistency] = done[len(done) - len(estimates) :]
+    consistency = dict(zip(estimates, found, strict=True))
+    against_truth: Mapping[AngleModel, TruthFigures] = done[0] if truth is not None else {}
+    phase = None
+    if truth is not None:
+        phase = PhaseFigures(maps=done[1]["maps"], pixels=done[1]["pixels"])
+    return Comparison(
+        capture=str(capture.folder),
+        sparse=sparse,
+        models={
+            model: ModelFigures(consistency=consistency[model], truth=against_truth.get(model))
+            for model in estimates
+        },
+        phase=phase,
+        best_fit=best_fitting_model(consistency),
+    )
 
 
 def measure_against_truth(
@@ -43,7 +208,7 @@ def measure_against_truth(
     views: Sequence[View],
     truth: GroundTruth,
     dense: DenseViews | None = None,
-) -> dict[str, Any]:
+) -> TruthFigures:
     """Figures of a dense cloud, of the normals of sparse points and of the views' dense maps.
 
     Parameters
@@ -54,89 +219,26 @@ def measure_against_truth(
     """
     named = named_as_truth(views, truth)
     metrics, alignment = evaluate(cloud.points, cloud.normals, named, truth)
-    figures: dict[str, Any] = {"cloud": metrics, "alignment": alignment}
+    track_errors = None
     if tracks is not None and tracks.normals is not None:
         valid = tracks.scalars["valid"] > 0
-        figures["tracks"] = track_normal_errors(tracks.points, tracks.normals, valid, named, truth)
-    if dense is not None:
-        figures["maps"] = map_errors(named, dense, truth)
-    return figures
+        track_errors = track_normal_errors(tracks.points, tracks.normals, valid, named, truth)
+    return TruthFigures(
+        cloud=metrics,
+        alignment=alignment,
+        tracks=track_errors,
+        maps=None if dense is None else map_errors(named, dense, truth),
+    )
 
 
-def compare_models(
-    capture: Capture,
-    workspace: RunFolder,
-    options: Options,
-    models: Sequence[AngleModel],
-    *,
-    workers: Workers,
-) -> dict[str, Any]:
-    """Measure the clouds of an output folder, in terms of JSON.
-
-    Returns
-    -------
-    ``models``: for each its ``consistency`` and, with ground truth, its ``truth``. ``phase``:
-    with ground truth, what :func:`phase_errors` gives. ``best_fit``: what
-    :func:`best_fitting_model` says.
-    """
-    maps = {model: open_maps(workspace, model) for model in (AngleModel.PPA, *models)}
-    clouds = {model: read_cloud(workspace.cloud(model)) for model in models}
-    tracks = {model: read_cloud(workspace.normals(model)) for model in models}
-    dense = {model: open_dense_views(workspace, model) for model in models}
-    tasks: list[Callable[[], Any]] = []
-    gt = options.evaluation.gt
-    if gt is not None:  # the longest first
-        truth = open_ground_truth(gt)
-        views = [phase_map.view for phase_map in maps[AngleModel.PPA]]
-        tasks.append(partial(_measure_all, clouds, tracks, dense, views, truth))
-        tasks.append(partial(phase_errors, capture, maps[AngleModel.PPA], truth))
-    tasks += [partial(measure_consistency, m, clouds[m], tracks[m], maps[m]) for m in models]
-    done = list(workers.map(_call, tasks))
-    consistencies: list[Consistency] = done[-len(models) :]
-    figures: dict[str, Any] = {
-        model: {"consistency": found} for model, found in zip(models, consistencies, strict=True)
-    }
-    if gt is not None:
-        for model in models:
-            figures[model]["truth"] = done[0][model]
-    phase = done[1] if gt is not None else None
-    best = best_fitting_model(dict(zip(models, consistencies, strict=True)))
-    return dict(to_plain({"models": figures, "phase": phase, "best_fit": best}))
+def named_as_truth(views: Sequence[View], truth: GroundTruth) -> list[View]:
+    """Views under the truth's names, which may have another suffix."""
+    by_stem = {stem_of(name): name for name in truth.names}
+    return [replace(view, name=by_stem.get(stem_of(view.name), view.name)) for view in views]
 
 
-def _measure_all(
-    clouds: Mapping[AngleModel, Cloud],
-    tracks: Mapping[AngleModel, Cloud],
-    dense: Mapping[AngleModel, DenseViews],
-    views: Sequence[View],
-    truth: GroundTruth,
-) -> dict[AngleModel, dict[str, Any]]:
-    """All models together: sampling the true surface is most of the work."""
-    return {m: measure_against_truth(clouds[m], tracks[m], views, truth, dense[m]) for m in clouds}
-
-
-def _call(task: Callable[[], Any]) -> Any:
-    return task()
-
-
-def write_comparison(
-    capture: Capture,
-    workspace: RunFolder,
-    options: Options,
-    models: Sequence[AngleModel],
-    results: Mapping[str, Any],
-    *,
-    workers: Workers,
-) -> None:
-    """Write ``metrics.json`` and ``summary.md``."""
-    metrics = {"capture": str(capture.folder), "results": dict(results)}
-    metrics |= compare_models(capture, workspace, options, models, workers=workers)
-    write_json(workspace.metrics, metrics)
-    write_bytes(workspace.summary, summary_text(metrics).encode())
-
-
-def evaluate_file(cloud: Path, gt: Path, sparse: Path) -> dict[str, Any]:
-    """Figures of a cloud file against the truth, in terms of JSON.
+def evaluate_file(cloud: Path, gt: Path, sparse: Path) -> TruthFigures:
+    """Figures of a cloud file against the truth.
 
     Parameters
     ----------
@@ -145,5 +247,43 @@ def evaluate_file(cloud: Path, gt: Path, sparse: Path) -> dict[str, Any]:
     sparse : COLMAP model; its camera centres are brought onto the true ones.
     """
     truth = open_ground_truth(gt)
-    figures = measure_against_truth(read_cloud(cloud), None, read_model(sparse).views, truth)
-    return dict(to_plain(figures))
+    return measure_against_truth(read_cloud(cloud), None, read_model(sparse).views, truth)
+
+
+def read_comparison(path: Path) -> Comparison:
+    """Read a ``metrics.json``.
+
+    Raises
+    ------
+    DataError
+        It is missing, no such file, or of another version.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        found = content.get("schema_version", 1)
+        if found != SCHEMA_VERSION:
+            raise DataError(
+                path,
+                f"has schema version {found}; this polmvs reads {SCHEMA_VERSION}. Compare again.",
+            )
+        return from_json(Comparison, content)
+    except OSError as error:
+        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+    except (ValueError, AttributeError) as error:
+        raise DataError(path, f"holds no figures of a comparison ({error}).") from error
+
+
+def _measure_all(
+    estimates: Mapping[AngleModel, ModelEstimate], truth: GroundTruth
+) -> dict[AngleModel, TruthFigures]:
+    """All models together: sampling the true surface is most of the work."""
+    return {
+        model: measure_against_truth(
+            one.cloud, one.tracks, [m.view for m in one.maps], truth, one.dense
+        )
+        for model, one in estimates.items()
+    }
+
+
+def _call(task: Callable[[], Any]) -> Any:
+    return task()

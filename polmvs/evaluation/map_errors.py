@@ -19,7 +19,7 @@ from polmvs.errors import DataError
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.ground_truth import GroundTruth
-from polmvs.poses.alignment import align_to_truth
+from polmvs.poses.alignment import align_views
 from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView, lattice_xy
 
@@ -106,7 +106,7 @@ def map_errors(
     DataError
         When the cameras do not fix the alignment, or the truth's maps have another size.
     """
-    truth_from_world, _ = align_to_truth(views, truth)
+    truth_from_world, _ = align_views(views, truth.views, source=truth.cameras)
     strides = [one.stride_px for one in dense if one is not None]
     stride_px = strides[0] if strides else 1
     found = [

@@ -13,8 +13,9 @@ from polmvs.config import AngleModel
 from polmvs.evaluation.metrics import AngleStats
 from polmvs.evaluation.truth_errors import phase_errors_on_part
 from polmvs.io.ground_truth import GroundTruth
+from polmvs.polarization.angle_models import correct_stokes
 from polmvs.polarization.capture import Capture
-from polmvs.polarization.phase_map import PhaseMap, as_tilted, correct_for_tilt, view_rays
+from polmvs.polarization.phase_map import PhaseMap, as_tilted, view_rays
 
 Image = NDArray[np.float32]
 Load = Callable[[str], tuple[Image, Image]]  # phase and DoLP (H, W) of an image, by its name
@@ -74,7 +75,8 @@ def phase_errors(
         phase_map = stored[stem_of(name)]
         stokes = capture.load(raw[stem_of(name)])
         if tilted:
-            stokes = correct_for_tilt(stokes, view_rays(phase_map.view), phase_map.diffuse)
+            rays = view_rays(phase_map.view)
+            stokes = correct_stokes(stokes, rays, diffuse=phase_map.diffuse)
         turn = np.where(phase_map.diffuse, np.float32(0), np.float32(np.pi / 2))
         return np.where(stokes.valid, stokes.aolp + turn, np.float32(np.nan)), stokes.dolp
 

@@ -1,9 +1,17 @@
-"""Figures as tables to read; they come from ``metrics.json`` and ``run.json`` as they are."""
+"""Figures as tables to read."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from polmvs.config import AngleModel
+from polmvs.evaluation.metrics import AngleStats, CloudMetrics
+
+if TYPE_CHECKING:
+    from polmvs.evaluation.comparison import Comparison, ModelFigures, PhaseFigures, TruthFigures
 
 NONE = "-"
 
@@ -23,164 +31,123 @@ def _line(row: Sequence[str], widths: Sequence[int]) -> str:
     return "| " + " | ".join([first, *rest]) + " |"
 
 
-def summary_text(metrics: Mapping[str, Any]) -> str:
-    """The summary of a comparison, Markdown."""
-    results = metrics["results"]
-    missing = results.get("unregistered", [])
-    lines = [
-        f"# {metrics['capture']}",
-        "",
-        f"{results['num_views']} of {results['num_views'] + len(missing)} views have a pose"
-        + (f"; without one: {', '.join(missing)}" if missing else "")
-        + f". {results['num_tracks']} sparse points, {results['num_seeds']} of them seeds.",
-        "",
-        comparison_table(metrics),
-        *best_fit_lines(metrics),
-    ]
-    return "\n".join(lines) + "\n"
+def number(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
+    """A number with fixed digits, a dash for none."""
+    if value is None or not np.isfinite(value):
+        return NONE
+    return f"{factor * value:.{digits}f}"
 
 
-def best_fit_lines(metrics: Mapping[str, Any]) -> list[str]:
+def pair(first: float | None, second: float | None) -> str:
+    """Two numbers."""
+    return f"{number(first)} / {number(second)}"
+
+
+def best_fit_lines(comparison: Comparison) -> list[str]:
     """Which model the capture's phases fit best, if there is anything to tell it by."""
-    best = metrics.get("best_fit")
+    best = comparison.best_fit
     if best is None:
         return []
-    residual = dig(metrics["models"], best, "consistency", "track_residual_median_deg")
+    residual = comparison.models[best].consistency.track_residual_median_deg
     return ["", f"The phases fit {best.upper()} best: {number(residual)} deg at the seeds."]
 
 
-def comparison_table(metrics: Mapping[str, Any]) -> str:
+def comparison_table(comparison: Comparison) -> str:
     """One column for each model."""
-    models: Mapping[str, Any] = metrics["models"]
+    models = comparison.models
+
+    def row(name: str, cell: Callable[[ModelFigures], str]) -> list[str]:
+        return [name, *map(cell, models.values())]
+
     rows = [
-        ["points", *[f"{m['consistency']['num_points']:,}" for m in models.values()]],
-        ["part of the region covered, %", *_each(models, ("coverage",), 100, 1)],
-        ["agreement of the views that see a point, %", *_each(models, ("agreement",), 100, 1)],
-        [
+        row("points", lambda m: f"{m.consistency.num_points:,}"),
+        row("part of the region covered, %", lambda m: number(m.consistency.coverage, 100, 1)),
+        row(
+            "agreement of the views that see a point, %",
+            lambda m: number(m.consistency.agreement, 100, 1),
+        ),
+        row(
             "phase residual over all views, RMSE / median, deg",
-            *_pairs(models, ("consistency", "phase_residual"), "rmse_deg", "median_deg"),
-        ],
-        [
+            lambda m: rmse_and_median(m.consistency.phase_residual),
+        ),
+        row(
             "phase residual of the seeds, median, deg",
-            *_each(models, ("track_residual_median_deg",), 1, 2),
-        ],
+            lambda m: number(m.consistency.track_residual_median_deg),
+        ),
     ]
-    if all("truth" in model for model in models.values()):
-        rows += _truth_rows(models, metrics.get("phase") or {})
+    truth = {model: figures.truth for model, figures in models.items() if figures.truth is not None}
+    if len(truth) == len(models):
+        rows += _truth_rows(truth, comparison.phase)
     return format_table(["", *[name.upper() for name in models]], rows)
 
 
-def _each(models: Mapping[str, Any], keys: Sequence[str], factor: float, digits: int) -> list[str]:
-    return [number(dig(m["consistency"], *keys), factor, digits) for m in models.values()]
+def rmse_and_median(stats: AngleStats | None) -> str:
+    """RMSE and median of angles, degrees."""
+    return pair(*((stats.rmse_deg, stats.median_deg) if stats is not None else (None, None)))
 
 
-def _pairs(models: Mapping[str, Any], keys: Sequence[str], first: str, second: str) -> list[str]:
-    return [_pair(dig(model, *keys), first, second) for model in models.values()]
+def mean_and_median(stats: AngleStats | None) -> str:
+    """Mean and median of angles, degrees."""
+    return pair(*((stats.mean_deg, stats.median_deg) if stats is not None else (None, None)))
 
 
-def _pair(stats: Any, first: str, second: str) -> str:
-    return f"{number(dig(stats, first))} / {number(dig(stats, second))}"
-
-
-def _truth_rows(models: Mapping[str, Any], phase: Mapping[str, Any]) -> list[list[str]]:
+def _truth_rows(
+    models: Mapping[AngleModel, TruthFigures], phase: PhaseFigures | None
+) -> list[list[str]]:
     """Rows of the measures against the truth."""
-    rows = [
-        *[
-            [
-                f"phase error on the part, {what}, RMSE / median, deg",
-                *[_pair(dig(phase, source, name), "rmse_deg", "median_deg") for name in models],
-            ]
-            for source, what in (("maps", "smoothed"), ("pixels", "single pixels"))
-        ],
+    rows = []
+    if phase is not None:
+        for what, errors in (("smoothed", phase.maps), ("single pixels", phase.pixels)):
+            cells = [rmse_and_median(errors.get(model)) for model in models]
+            rows.append([f"phase error on the part, {what}, RMSE / median, deg", *cells])
+    figures = list(models.values())
+    rows.append(
         [
             "error of the sparse normals, mean / median, deg",
-            *_pairs(models, ("truth", "tracks", "errors"), "mean_deg", "median_deg"),
+            *[mean_and_median(f.tracks.errors if f.tracks else None) for f in figures],
+        ]
+    )
+    maps = [f.maps for f in figures]
+    rows += [
+        ["depth maps, RMSE, mm", *[number(m.depth_rmse_m if m else None, 1e3) for m in maps]],
+        [
+            "depth maps within 1 mm, %",
+            *[number(m.depth_within_1mm if m else None, 100, 1) for m in maps],
         ],
-    ]
-    rows += _map_rows(models)
-    columns = [cloud_rows(model["truth"]["cloud"]) for model in models.values()]
-    for cells in zip(*columns, strict=True):
-        rows.append([cells[0][0], *[cell[1] for cell in cells]])
-    return rows
-
-
-def _map_rows(models: Mapping[str, Any]) -> list[list[str]]:
-    """Rows of the dense depth and normal maps."""
-    maps = [dig(model, "truth", "maps") for model in models.values()]
-    return [
-        ["depth maps, RMSE, mm", *[number(dig(m, "depth_rmse_m"), 1e3) for m in maps]],
-        ["depth maps within 1 mm, %", *[number(dig(m, "depth_within_1mm"), 100, 1) for m in maps]],
         [
             "normal maps, mean / median error, deg",
-            *[_pair(dig(m, "normals"), "mean_deg", "median_deg") for m in maps],
+            *[mean_and_median(m.normals if m else None) for m in maps],
         ],
     ]
-
-
-def cloud_rows(cloud: Mapping[str, Any]) -> list[list[str]]:
-    """Name and figure of every measure of a cloud against the truth."""
-    rows = []
-    for key, name in (
-        ("f_score", "F-score"),
-        ("accuracy", "accuracy"),
-        ("completeness", "completeness"),
-    ):
-        for threshold, share in zip(cloud["thresholds_m"], cloud[key], strict=True):
-            rows.append([f"{name} at {1e3 * threshold:g} mm, %", number(share, 100, 1)])
-    rows.append(["Chamfer distance, mm", number(cloud["chamfer_m"], 1e3, 2)])
-    rows.append(["normal error, mean / median, deg", _pair(cloud, *NORMAL_KEYS)])
-    rows.append(["points off every surface, %", number(cloud["off_surface_share"], 100, 1)])
+    for same in zip(*(cloud_rows(f.cloud) for f in figures), strict=True):
+        rows.append([same[0][0], *[row[1] for row in same]])
     return rows
 
 
-NORMAL_KEYS = ("normal_mean_deg", "normal_median_deg")
-
-
-def evaluation_text(figures: Mapping[str, Any]) -> str:
-    """Table of one cloud against the truth, and how it was aligned."""
-    alignment = figures["alignment"]
-    return (
-        format_table(["", "value"], cloud_rows(figures["cloud"]))
-        + f"\n{figures['cloud']['num_points']:,} points, {figures['cloud']['num_on_part']:,} on "
-        f"the part. Aligned by {alignment['num_cameras']} cameras, "
-        f"{alignment['rms_residual_mm']:.2f} mm RMS."
+def cloud_rows(cloud: CloudMetrics) -> list[list[str]]:
+    """Name and figure of every measure of a cloud against the truth."""
+    rows = []
+    for name, shares in (
+        ("F-score", cloud.f_score),
+        ("accuracy", cloud.accuracy),
+        ("completeness", cloud.completeness),
+    ):
+        for threshold, share in zip(cloud.thresholds_m, shares, strict=True):
+            rows.append([f"{name} at {1e3 * threshold:g} mm, %", number(share, 100, 1)])
+    rows.append(["Chamfer distance, mm", number(cloud.chamfer_m, 1e3, 2)])
+    rows.append(
+        ["normal error, mean / median, deg", pair(cloud.normal_mean_deg, cloud.normal_median_deg)]
     )
+    rows.append(["points off every surface, %", number(cloud.off_surface_share, 100, 1)])
+    return rows
 
 
-def stage_table(runs: Mapping[str, Mapping[str, Any]]) -> str:
-    """Seconds and memory of the stages of one or more ``run.json``, one column pair each."""
-    names = list(dict.fromkeys(s["name"] for run in runs.values() for s in run["stages"]))
-    header = ["stage"]
-    for run in runs:
-        header += [f"{run}, s", "peak MB"]
-    rows = [[name, *_stage_cells(name, runs)] for name in names]
-    total, rest, wall = ["all stages"], ["all but SfM"], ["wall clock"]
-    for content in runs.values():
-        seconds = {s["name"]: s["seconds"] for s in content["stages"]}
-        peak = max((s["peak_rss_mb"] for s in content["stages"]), default=None)
-        total += [number(sum(seconds.values())), number(peak, 1, 0)]
-        rest += [number(sum(t for name, t in seconds.items() if name != "sfm")), ""]
-        wall += [number(content.get("wall_s")), ""]
-    return format_table(header, [*rows, total, rest, wall])
-
-
-def _stage_cells(name: str, runs: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    cells = []
-    for run in runs.values():
-        stage = next((s for s in run["stages"] if s["name"] == name), None)
-        cells += [number(dig(stage, "seconds")), number(dig(stage, "peak_rss_mb"), 1, 0)]
-    return cells
-
-
-def dig(content: Any, *keys: str) -> Any:
-    """Value at a path of keys; None where a step is missing."""
-    for key in keys:
-        if not isinstance(content, Mapping):
-            return None
-        content = content.get(key)
-    return content
-
-
-def number(value: Any, factor: float = 1.0, digits: int = 2) -> str:
-    """A number with fixed digits, a dash for none."""
-    return NONE if value is None else f"{factor * value:.{digits}f}"
+def evaluation_text(figures: TruthFigures) -> str:
+    """Table of one cloud against the truth, and how it was aligned."""
+    cloud, alignment = figures.cloud, figures.alignment
+    return (
+        format_table(["", "value"], cloud_rows(cloud))
+        + f"\n{cloud.num_points:,} points, {cloud.num_on_part:,} on "
+        f"the part. Aligned by {alignment.num_cameras} cameras, "
+        f"{alignment.rms_residual_mm:.2f} mm RMS."
+    )

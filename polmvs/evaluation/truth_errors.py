@@ -22,13 +22,13 @@ from polmvs.evaluation.metrics import (
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.neighbors import nearest_points
 from polmvs.polarization.angle_models import phase_from_normal
-from polmvs.poses.alignment import AlignmentReport, align_to_truth
+from polmvs.poses.alignment import Alignment, align_views
 from polmvs.scene import View
 
 __all__ = [
-    "AlignmentReport",
+    "Alignment",
     "TrackNormalErrors",
-    "align_to_truth",
+    "align_views",
     "evaluate",
     "phase_errors_on_part",
     "points_on_part",
@@ -69,7 +69,7 @@ def evaluate(
     truth: GroundTruth,
     *,
     thresholds_m: tuple[float, ...] = THRESHOLDS_M,
-) -> tuple[CloudMetrics, AlignmentReport]:
+) -> tuple[CloudMetrics, Alignment]:
     """Align a cloud by its cameras and compare it with the truth.
 
     Parameters
@@ -84,7 +84,7 @@ def evaluate(
     DataError
         When the cameras do not fix the alignment.
     """
-    truth_from_world, report = align_to_truth(views, truth)
+    truth_from_world, report = align_views(views, truth.views, source=truth.cameras)
     surface = truth.surface_points()
     finite = np.isfinite(cloud_points).all(axis=1)
     metrics = evaluate_cloud(
@@ -121,7 +121,7 @@ def track_normal_errors(
     """
     if normals.shape != points.shape or valid.shape != points.shape[:1]:
         raise ValueError(f"{points.shape=}, {normals.shape=}, {valid.shape=} do not fit.")
-    truth_from_world, _ = align_to_truth(views, truth)
+    truth_from_world, _ = align_views(views, truth.views, source=truth.cameras)
     counted = valid & np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
     points_in_truth = truth_from_world * points[counted]
     on_part = points_on_part(points_in_truth, truth)

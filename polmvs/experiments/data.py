@@ -5,27 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.colmap.models import match_model_to_capture, read_model
 from polmvs.config import AngleModel, Light, RegionOptions
 from polmvs.errors import DataError
-from polmvs.experiments.estimated_poses import estimated_views
-from polmvs.io.ground_truth import GroundTruth
 from polmvs.io.images import read_mask
-from polmvs.pipeline.stages.capture import find_mask
-from polmvs.polarization.angle_models import phase_sign
+from polmvs.pipeline.stages.maps import find_mask
+from polmvs.polarization.angle_models import correct_stokes, phase_sign
 from polmvs.polarization.capture import Capture
 from polmvs.polarization.phase_map import PhaseMap, as_tilted, build_phase_map, view_rays
 from polmvs.polarization.region import Region, find_region, smooth
 from polmvs.polarization.stokes import Stokes
-from polmvs.polarization.tilted import correct_stokes
-from polmvs.poses.alignment import AlignmentReport
-from polmvs.scene import View
+from polmvs.poses.alignment import Alignment, align_views
+from polmvs.scene import View, match_names, short_list
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -76,7 +74,7 @@ class Scene:
     raw_names: tuple[str, ...]
     region: RegionOptions
     blur_px: float = DEFAULT_BLUR_PX
-    alignment: AlignmentReport | None = None
+    alignment: Alignment | None = None
 
     def settings(self) -> dict[str, Any]:
         """What the results depend on, for their record."""
@@ -156,7 +154,7 @@ class ViewData:
     def _for(self, model: AngleModel, stokes: Stokes) -> Stokes:
         if model is not AngleModel.TILTED:
             return stokes
-        return correct_stokes(stokes, self.rays, light=self.light)
+        return correct_stokes(stokes, self.rays, diffuse=self.light is Light.DIFFUSE)
 
 
 def open_scene(
@@ -189,9 +187,7 @@ def open_scene(
             )
     alignment = None
     if sparse is not None:
-        # The alignment asks for cameras only, which every truth has.
-        true_cameras = GroundTruth(folder=truth.folder, views=truth.views)
-        views, alignment = estimated_views(sparse, capture, true_cameras, list(raw_of))
+        views, alignment = _estimated_views(sparse, capture, truth, list(raw_of))
     return Scene(
         capture=capture,
         truth=truth,
@@ -203,10 +199,33 @@ def open_scene(
     )
 
 
+def _estimated_views(
+    sparse: Path, capture: Capture, truth: Truth, names: Sequence[str]
+) -> tuple[list[View], Alignment]:
+    """Views of a COLMAP model in the world of the truth, aligned by the camera centres.
+
+    ``names`` are those of the truth's images that the capture has; views come in their order.
+    """
+    sparse_model = match_model_to_capture(
+        read_model(sparse), names, capture.width, capture.height, source=sparse
+    )
+    truth_from_world, alignment = align_views(sparse_model.views, truth.views, source=truth.folder)
+    if alignment.dropped:
+        raise DataError(
+            sparse,
+            f"poses of {short_list(alignment.dropped)} do not match the true ones; give a model "
+            "of this capture without wrongly registered images.",
+        )
+    views = [
+        replace(view, cam_from_world=truth_from_world.pose(view.cam_from_world))
+        for view in sparse_model.views
+    ]
+    return sorted(views, key=lambda view: names.index(view.name)), alignment
+
+
 def _raw_names(capture: Capture, truth: Truth) -> dict[str, str]:
     """Mosaic of each image of the truth, by name without suffix; images without one left out."""
-    by_stem = {_stem(name): name for name in capture.names}
-    found = {name: by_stem[_stem(name)] for name in truth.views if _stem(name) in by_stem}
+    found = match_names(list(truth.views), capture.names)
     if not found:
         raise DataError(
             truth.folder,
@@ -273,7 +292,3 @@ def require_counted(scene: Scene, num_counted: Sequence[int] | int) -> None:
             f"no pixel of the part has a DoLP above {scene.region.min_dolp}; "
             "give a lower --min-dolp, or the mask of a polarised surface.",
         )
-
-
-def _stem(name: str) -> str:
-    return PurePosixPath(name).stem

@@ -34,10 +34,10 @@ NUM_CANDIDATES = 64  # normals tried as the middle of a patch
 MIN_PIXELS = 100
 MAX_SPREAD_DEG = 0.2  # of the true normals of a plane; 16-bit maps have less
 
-# A lens may or may not tilt the polarizers (:mod:`polmvs.polarization.tilted`), and PPA leaves
-# that out: what
-# it would turn a pixel's phase by is part of the phase's uncertainty. It is common to a whole part
-# of the image and does not average out as noise does over the pixels, hence the factor.
+# A lens may or may not tilt the polarizers (:mod:`polmvs.polarization.angle_models`), and PPA
+# leaves that out: what it would turn a pixel's phase by is part of the phase's uncertainty. It is
+# common to a whole part of the image and does not average out as noise does over the pixels, hence
+# the factor.
 TILT_FACTOR = 4.0
 
 

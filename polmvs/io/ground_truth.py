@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.errors import DataError
-from polmvs.geometry import RigidTransform
+from polmvs.geometry import RigidTransform, nearest_rotation
 from polmvs.neighbors import in_cells_beside, voxel_representatives
-from polmvs.scene import View
+from polmvs.scene import View, find_name, stem_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -72,13 +72,19 @@ class GroundTruth:
     )
 
     @property
+    def cameras(self) -> Path:
+        """File of the cameras, for messages."""
+        return self.folder / "cameras.json"
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Image names in the file's order."""
         return tuple(self.views)
 
     def find(self, name: str) -> View | None:
-        """True view of an image, looked up by its name or by the last part of it."""
-        return self.views.get(name) or self.views.get(PurePosixPath(name).name)
+        """True view of an image by its name, else by the only one of the same stem."""
+        found = find_name(name, self.views)
+        return None if found is None else self.views[found]
 
     def mask(self, name: str) -> Mask:
         """Whether each pixel shows the part, ``(H, W)``."""
@@ -175,7 +181,7 @@ def open_ground_truth(folder: str | Path) -> GroundTruth:
 
 
 def _map_path(folder: Path, name: str, kind: str) -> Path:
-    return folder / f"{PurePosixPath(name).stem}_{kind}.png"
+    return folder / f"{stem_of(name)}_{kind}.png"
 
 
 def _read_png(path: Path) -> NDArray[np.generic]:
@@ -217,18 +223,13 @@ def _parse_view(path: Path, name: str, entry: Any, width: int, height: int) -> V
         raise DataError(path, f"K of {name} must be 3x3 with positive focal lengths; {_REMEDY}.")
     if np.abs(K - [[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]]).max() > 1e-9:
         raise DataError(path, f"K of {name} must be without skew; {_REMEDY}.")
-    if pose.shape != (3, 4) or not _is_rotation(pose[:, :3]) or not np.isfinite(pose).all():
+    rotation = nearest_rotation(pose[:, :3]) if pose.shape == (3, 4) else None
+    if rotation is None or not np.isfinite(pose).all():
         raise DataError(path, f"cam_from_world of {name} must be a 3x4 rigid motion; {_REMEDY}.")
     camera = PinholeCamera(
         width=width, height=height, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2]
     )
-    return View(
-        name=name, camera=camera, cam_from_world=RigidTransform(pose[:, :3].copy(), pose[:, 3])
-    )
-
-
-def _is_rotation(matrix: Array) -> bool:
-    return bool(np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-5) and np.linalg.det(matrix) > 0)
+    return View(name=name, camera=camera, cam_from_world=RigidTransform(rotation, pose[:, 3]))
 
 
 def _sample_surfaces(truth: GroundTruth, spacing_m: float, other_spacing_m: float) -> SurfacePoints:
@@ -271,13 +272,12 @@ def _back_project(
     view = truth.views[name]
     depth, mask = truth.depth(name).astype(np.float64), truth.mask(name)
     wanted = np.isfinite(depth) & (mask & _is_smooth(depth) if part else ~mask)
-    rays = view.camera.rays(pixel_centers(view.camera.width, view.camera.height)[wanted])
-    world_from_cam = view.cam_from_world.inverse()
-    points = world_from_cam * (rays * (depth[wanted] / rays[..., 2])[..., None])
+    xy = pixel_centers(view.camera.width, view.camera.height)[wanted]
+    points = view.points_at(xy, depth[wanted] / view.camera.rays(xy)[..., 2])
     if not part:
-        return np.asarray(points), np.zeros((0, 3), np.float32)
-    normals = truth.normals(name)[wanted] @ world_from_cam.rotation.T.astype(np.float32)
-    return np.asarray(points), np.asarray(normals, np.float32)
+        return points, np.zeros((0, 3), np.float32)
+    normals = truth.normals(name)[wanted] @ view.cam_from_world.rotation.astype(np.float32)
+    return points, np.asarray(normals, np.float32)
 
 
 def _is_smooth(depth: Array) -> Mask:

@@ -1,4 +1,4 @@
-"""Image files at the edge: raw mosaics and masks in, PNG out; every fault is a ``DataError``."""
+"""Image files at the edge: decoding, masks in, PNG out; every fault is a ``DataError``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import struct
 import zlib
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -16,79 +16,10 @@ from numpy.typing import NDArray
 from polmvs.errors import DataError
 
 PathArg: TypeAlias = str | PathLike[str]
-Mosaic: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 SILENT = 0  # OpenCV's log level
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_GRAY = 0  # colour type of a monochrome PNG without alpha
 BROKEN = "Copy it again from the camera or take it out of the folder."
-
-
-class MosaicHeader(NamedTuple):
-    """What is known of a mosaic before its pixels are used.
-
-    Attributes
-    ----------
-    width, height : of the raw mosaic, px.
-    bit_depth : of the file's samples, 8 or 16.
-    """
-
-    width: int
-    height: int
-    bit_depth: int
-
-
-def read_mosaic(path: PathArg) -> Mosaic:
-    """Read a raw polarizer mosaic as it was stored.
-
-    Parameters
-    ----------
-    path : an 8- or 16-bit monochrome PNG, TIFF, BMP or PGM.
-
-    Returns
-    -------
-    (H, W) uint8 or uint16, H and W even.
-
-    Raises
-    ------
-    DataError
-        The file is missing, truncated, no image, in colour, of odd size or of another type.
-    """
-    image = _decode(path, _read_bytes(path))
-    if image.ndim != 2:
-        raise DataError(
-            path,
-            f"has {image.shape[2]} channels; a monochrome polarizer mosaic is expected. "
-            "Record the camera's raw format (Mono8 to Mono16), not a colour or processed one.",
-        )
-    if image.dtype not in (np.uint8, np.uint16):
-        raise DataError(
-            path, f"has {image.dtype} samples; export the raw mosaic as 8- or 16-bit integers."
-        )
-    _require_even(path, width=image.shape[1], height=image.shape[0])
-    return image
-
-
-def probe_mosaic(path: PathArg) -> MosaicHeader:
-    """Check a mosaic as :func:`read_mosaic` does, without decoding its pixels where it is a PNG.
-
-    The checksums of a PNG are verified, so that it will decode later. Other formats are decoded.
-
-    Raises
-    ------
-    DataError
-        As :func:`read_mosaic`.
-    """
-    data = _read_bytes(path)
-    if data.startswith(PNG_SIGNATURE):
-        _check_png(path, data)
-        width, height, bit_depth, colour_type = struct.unpack_from(">IIBB", data, 16)
-        if colour_type == PNG_GRAY and bit_depth in (8, 16):
-            _require_even(path, width=width, height=height)
-            return MosaicHeader(width, height, bit_depth)
-    del data
-    raw = read_mosaic(path)
-    return MosaicHeader(raw.shape[1], raw.shape[0], 8 * raw.dtype.itemsize)
 
 
 def read_mask(path: PathArg, shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -108,7 +39,7 @@ def read_mask(path: PathArg, shape: tuple[int, int]) -> NDArray[np.bool_]:
     DataError
         The file is missing, truncated, no image or of another size.
     """
-    image = _decode(path, _read_bytes(path))
+    image = decode_image(path, read_bytes(path))
     height, width = image.shape[:2]
     if (height, width) != tuple(shape):
         raise DataError(
@@ -129,7 +60,7 @@ def read_gray(path: PathArg) -> NDArray[np.uint8]:
     DataError
         The file is missing, truncated, no image or not of 8 bit.
     """
-    image = _decode(path, _read_bytes(path))
+    image = decode_image(path, read_bytes(path))
     if image.dtype != np.uint8:
         raise DataError(path, "is no 8-bit image.")
     gray = image if image.ndim == 2 else np.rint(image[..., :3].mean(axis=-1))
@@ -187,7 +118,7 @@ def _remove_quietly(path: Path) -> None:
         return
 
 
-def _read_bytes(path: PathArg) -> bytes:
+def read_bytes(path: PathArg) -> bytes:
     """A file's content, or a ``DataError`` with the system's reason."""
     try:
         data = Path(path).read_bytes()
@@ -206,10 +137,10 @@ def _set_log_level(level: int) -> int:
     return int(setter(level))
 
 
-def _decode(path: PathArg, data: bytes) -> NDArray[Any]:
+def decode_image(path: PathArg, data: bytes) -> NDArray[Any]:
     """Pixels of an encoded image, unchanged; OpenCV's own complaints are kept off the terminal."""
     if data.startswith(PNG_SIGNATURE):
-        _check_png(path, data)
+        check_png(path, data)
     level = _set_log_level(SILENT)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -222,7 +153,7 @@ def _decode(path: PathArg, data: bytes) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def _check_png(path: PathArg, data: bytes) -> None:
+def check_png(path: PathArg, data: bytes) -> None:
     """Walk the chunks to IEND: OpenCV may fill the missing part of a truncated PNG with zeros."""
     view = memoryview(data)
     position = len(PNG_SIGNATURE)
@@ -241,13 +172,3 @@ def _check_png(path: PathArg, data: bytes) -> None:
         if zlib.crc32(view[position + 4 : end - 4]) != checksum:
             raise DataError(path, f"is damaged: wrong checksum at byte {position}. {BROKEN}")
         position = end
-
-
-def _require_even(path: PathArg, *, width: int, height: int) -> None:
-    """A mosaic is made of whole 2x2 cells."""
-    if width % 2 or height % 2 or not width or not height:
-        raise DataError(
-            path,
-            f"is {width}x{height} px; a polarizer mosaic has an even width and height. "
-            "Set the camera's region of interest to even offsets and sizes.",
-        )

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
@@ -17,11 +18,22 @@ Array = NDArray[np.float64]
 MIN_VISIBLE_COSINE = 0.03  # between normal and viewing direction; flatter sight is no sight
 MIN_SIN_ZENITH = 0.1  # a row of a nearly frontal surface says little: its weight is capped here
 CAUCHY_SCALE = 2.385  # 95 % efficiency on Gaussian residuals
+COUNTED_WEIGHT = 0.25  # robust weight over which a row counts: four deviations off
 NUM_ROUNDS = 5  # of reweighting; the change of later ones is below 0.01 deg
 DOUBTFUL_LOSS = 0.25  # from which a point is tried again; about 0.12 without outliers
 NUM_PAIRS = 24  # of rows that a doubtful point is started from again
 MIN_ROWS_TO_DOUBT = 7  # that count; of fewer, some agree by chance
+NUM_NOISE_ROUNDS = 3  # in which a model's own error is found
+NOISE_CHANGE = 0.1  # of that error, under which no further round follows
+MIN_NOISE_ROWS = 300  # whose median says what a model's error is: to 8 %
+MAX_NOISE_ROWS = 50_000
+MEDIAN_OF_SQUARE = 0.455  # of a normal deviate
 MIN_PAIR_SINE = 0.05  # of the angle between the two rows
+# Spread of the rows over the variance of their noise. Where all planes of incidence are one (camera
+# centres and normal in one plane, as on a linear rail) the noise alone spreads them, and their mean
+# variance exceeds this many times the expected one at fewer than 1 in 1000 of three rows (derived:
+# chi-squared of 3, over 3, is 5.4 there).
+MIN_SPREAD = 6.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +43,8 @@ class NormalEstimate:
     Attributes
     ----------
     normals : (N, 3) float64, unit, frame of the rows, facing the viewers; NaN where not valid.
-    valid : (N,) bool
+    valid : (N,) bool. Not so where fewer than two rows count, or just two of more that were given,
+        which any two do; and where the rows leave a direction open, or only their noise does not.
     conditioning : (N,) ratio of the middle to the largest singular value of the weighted rows,
         0 for rows of rank 1, at most 1.
     sigma_deg : (N,) standard deviation along the larger axis of the covariance, degrees.
@@ -134,7 +147,7 @@ def solve_normals(
     rows = np.where(usable, rows, 0)
     precision = np.where(usable, 1 / np.where(usable, sigma, 1) ** 2, 0)
     weights = precision if robust else usable.astype(rows.dtype)
-    outlier_weights = usable.astype(rows.dtype)
+    facing, outlier_weights = usable, usable.astype(rows.dtype)
     if initial_normals is not None:
         cosine = _dot(rays, initial_normals)
         weights = weights * ~(cosine > 0)  # NaN: unknown, kept
@@ -144,11 +157,75 @@ def solve_normals(
         normals = problem.iterate(normals)
         normals = problem.try_again(normals)
         weights, outlier_weights = problem.weights(normals, CAUCHY_SCALE)
+        facing = outlier_weights > 0
     estimate = _describe(rows, rays, weights, outlier_weights, min_rows, min_conditioning)
+    kept = precision * (outlier_weights > COUNTED_WEIGHT)
+    determined = _spread(rows, kept, alike=not robust) > MIN_SPREAD
+    determined &= (estimate.num_rows > 2) | (facing.sum(axis=0) <= 2)
+    estimate = _only(estimate, determined)
     if robust:
         return estimate
     sigma = _algebraic_sigma(rows, rays, precision, estimate.normals.T)
     return replace(estimate, sigma_deg=np.degrees(sigma, dtype=np.float64))
+
+
+def solve_at_own_noise(
+    rows: Floats, rays: Floats, sigma: Floats, *, initial_normals: Floats | None = None
+) -> tuple[NormalEstimate, Floats]:
+    """As :func:`solve_normals`, robust, with deviations that the rows' own residuals bear out.
+
+    An angle model that leaves something out (OPA the perspective, PPA the tilt of polarizers) errs
+    by more than the noise of its phases. Held against that noise all its rows were outliers, and
+    the loss would keep those few that happen to agree. One variance, that of the model's error, is
+    added for all points of a call, so large that the median residual is that of a normal
+    distribution; none if it is that already. Every model is treated alike.
+
+    Returns
+    -------
+    estimate : of the points.
+    sigma : (K, N), with the model's error.
+    """
+    estimate = solve_normals(rows, rays, sigma, initial_normals=initial_normals)
+    total, error = sigma, 0.0
+    for _ in range(NUM_NOISE_ROUNDS):
+        before = error
+        error = model_error(rows, rays, sigma, estimate)
+        if error <= (1 + NOISE_CHANGE) * before:
+            break
+        total = np.hypot(sigma, np.asarray(error, sigma.dtype))
+        estimate = solve_normals(rows, rays, total, initial_normals=initial_normals)
+    return estimate, total
+
+
+def model_error(rows: Floats, rays: Floats, sigma: Floats, estimate: NormalEstimate) -> float:
+    """Deviation of the rows' turns that their sigma leaves unexplained, rad; 0 for few rows.
+
+    Parameters
+    ----------
+    rows, rays, sigma : as in :func:`solve_normals`.
+    estimate : of their normals. Points of fewer than ``MIN_ROWS_TO_DOUBT`` rows do not count.
+    """
+    normals = np.nan_to_num(estimate.normals.T)
+    cosine = _dot(rays, normals)
+    used = np.isfinite(sigma) & np.isfinite(rows).all(axis=0) & (cosine < -MIN_VISIBLE_COSINE)
+    count = used.sum(axis=0)
+    used &= estimate.valid & (count >= MIN_ROWS_TO_DOUBT)
+    if used.sum() < MIN_NOISE_ROWS:
+        return 0.0
+    step = max(1, int(used.sum()) // MAX_NOISE_ROWS)
+    k, n = (index[::step] for index in np.nonzero(used))
+    sin2 = np.maximum(1 - cosine[k, n] ** 2, MIN_SIN_ZENITH**2)
+    product = (rows[:, k, n] * normals[:, n].astype(rows.dtype)).sum(axis=0)
+    # Two of a point's residuals go into its normal.
+    turn2 = product**2 / sin2 * (count[n] / (count[n] - 2))
+    variance = np.square(sigma[k, n])
+
+    def excess(added: float) -> float:
+        return float(np.median(turn2 / (variance + added))) - MEDIAN_OF_SQUARE
+
+    if excess(0.0) <= 0:
+        return 0.0
+    return float(np.sqrt(brentq(excess, 0.0, float(turn2.max()) / MEDIAN_OF_SQUARE, rtol=1e-3)))
 
 
 @dataclass(frozen=True)
@@ -256,7 +333,7 @@ def _describe(
 ) -> NormalEstimate:
     """Final solution with its sign, conditioning, covariance and validity."""
     eigenvalues, normals = _smallest(rows, weights)
-    num_rows = (outlier_weights > 0.25).sum(axis=0)
+    num_rows = (outlier_weights > COUNTED_WEIGHT).sum(axis=0)
     total = weights.sum(axis=0, dtype=np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         conditioning = np.sqrt(np.maximum(eigenvalues[1], 0) / eigenvalues[2])
@@ -274,6 +351,32 @@ def _describe(
         residual=np.where(valid, residual, np.nan),
         num_rows=num_rows,
         row_weights=outlier_weights,
+    )
+
+
+def _spread(rows: Floats, precision: Floats, *, alike: bool) -> Array:
+    """Middle eigenvalue (N,) of the mean of ``m m^T`` over the variance of the rows' noise.
+
+    Rows are weighted by their precision, or alike, but not by their angle to the normal: under
+    those weights the noise of frontal rows would pass for spread.
+    """
+    counted = precision > 0
+    weights = counted.astype(rows.dtype) if alike else precision
+    variance = np.divide(weights, precision, out=np.zeros_like(weights), where=counted)
+    noise = variance.sum(axis=0, dtype=np.float64)
+    middle = _smallest(rows, weights)[0][1]
+    return np.asarray(np.divide(middle, noise, out=np.zeros_like(middle), where=noise > 0))
+
+
+def _only(estimate: NormalEstimate, kept: NDArray[np.bool_]) -> NormalEstimate:
+    """The estimate with no normal at other points."""
+    valid = estimate.valid & kept
+    return replace(
+        estimate,
+        normals=np.where(valid[:, None], estimate.normals, np.nan),
+        valid=valid,
+        sigma_deg=np.where(valid, estimate.sigma_deg, np.nan),
+        residual=np.where(valid, estimate.residual, np.nan),
     )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
-from polmvs.polarization.angle_models import rows_from_axial
+from polmvs.polarization.angle_models import rows_from_axial, tilt_turn
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
 
@@ -34,23 +34,28 @@ class Rows:
 
 
 def gather_rows(
-    model: AngleModel,
+    angle_model: AngleModel,
     points_in_world: Floats,
     maps: Sequence[PhaseMap],
     range_maps: Sequence[Image | None] | None = None,
     *,
     range_tolerance: float = 0.02,
+    tilt_aware: bool = True,
 ) -> Rows:
     """Rows of points from all views that see them (paper, eq. coeff_2, before stacking).
 
     Parameters
     ----------
-    model : which rows.
+    angle_model : which rows.
     points_in_world : (N, 3).
     maps : K phase maps.
     range_maps : per view ``(h, w)`` distances from the camera centre, 0 where unknown: a point
         that lies behind its view's map by more than ``range_tolerance`` (relative) is occluded.
+    tilt_aware : add to the variance of OPA's and PPA's phases the square of the turn that a tilt
+        of the polarizers would give them (:func:`polmvs.polarization.angle_models.tilt_turn`):
+        oblique rays count less. Without it a row's weight comes from the phase map alone.
     """
+    tilt_aware = tilt_aware and angle_model is not AngleModel.TILTED
     points = np.asarray(points_in_world, np.float64)  # the origin may be far
     num_views, num_points = len(maps), len(points)
     rows = np.full((3, num_views, num_points), np.nan, np.float32)
@@ -65,16 +70,19 @@ def gather_rows(
         precision = samples[:, 2]
         range_map = range_maps[k] if range_maps is not None else None
         if range_map is not None:
-            seen = sample_range(range_map, phase_map.view, xy)
+            shown = sample_range(range_map, phase_map.view, xy)
             precision = np.where(
-                (seen > 0) & (distance > (1 + range_tolerance) * seen), 0, precision
+                (shown > 0) & (distance > (1 + range_tolerance) * shown), 0, precision
             )
-        row, turn = _row_and_turn(model, samples, ray)
+        row, turn = _row_and_turn(angle_model, samples, ray)
         rotation = phase_map.view.cam_from_world.rotation.astype(np.float32)
         rows[:, k] = (row @ rotation).T
         rays[:, k] = (ray @ rotation).T
-        with np.errstate(divide="ignore"):
-            sigma[k] = np.where(precision > 0, turn / np.sqrt(precision), np.inf)
+        seen = np.flatnonzero(precision > 0)
+        variance = 1 / precision[seen]
+        if tilt_aware:
+            variance += np.square(_tilt_turns(phase_map, samples[seen], ray[seen], xy[seen]))
+        sigma[k, seen] = turn[seen] * np.sqrt(variance)
     return Rows(rows, rays, sigma)
 
 
@@ -83,10 +91,18 @@ def sample_range(range_map: Image, view: View, xy: Floats) -> NDArray[np.float32
     return sample_image(range_map, xy / round(view.camera.width / range_map.shape[1]), nearest=True)
 
 
-def _row_and_turn(model: AngleModel, samples: Image, rays: Floats) -> tuple[Floats, Floats]:
+def _tilt_turns(phase_map: PhaseMap, samples: Image, rays: Image, xy: Floats) -> Floats:
+    """Turn (N,) of sampled phases by a tilt of the polarizers, rad."""
+    diffuse: NDArray[np.bool_] | bool = False
+    if phase_map.diffuse.any():
+        diffuse = sample_image(phase_map.diffuse.astype(np.float32), xy, nearest=True) > 0
+    return tilt_turn(samples[:, 0], samples[:, 1], rays, diffuse=diffuse)
+
+
+def _row_and_turn(angle_model: AngleModel, samples: Image, rays: Floats) -> tuple[Floats, Floats]:
     """Row in the camera frame, and how far it turns about the ray per turn of the phase."""
-    row = rows_from_axial(model, samples[:, 0], samples[:, 1], rays)
-    if model is AngleModel.OPA:
+    row = rows_from_axial(angle_model, samples[:, 0], samples[:, 1], rays)
+    if angle_model is AngleModel.OPA:
         return row, np.ones(len(row), np.float32)
     # v_z / (1 - (v . d)^2): the length of v x d is v_z over the row's length in the image plane.
     return row, (row[:, 0] ** 2 + row[:, 1] ** 2) / rays[:, 2]

@@ -16,16 +16,15 @@ from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, Estimator, NormalOptions
-from polmvs.normals.estimator import NormalEstimate, solve_normals
+from polmvs.normals.estimator import NormalEstimate, solve_at_own_noise, solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Seeds, Tracks, View
+from polmvs.scene import Seeds, Tracks, point_sigmas
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 BORDER_MARGIN_PX = 7  # points nearer to the region's border may lie on the background
-KEYPOINT_SIGMA_PX = 0.5
 MIN_FACING_COSINE = 0.2  # between normal and viewing direction, for a view to have a say
 MIN_INSIDE_SHARE = 0.8  # of a track's views that must see it in their region
 MIN_SEEN_SHARE = 0.7  # of the views that a point faces, to show the surface at its place
@@ -58,21 +57,28 @@ def track_normals(
     model : OPA, PPA or tilted.
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps of the views.
-    options : window and estimator.
+    options : window, estimator and weights.
     """
     windows = [window_map(phase_map, options.window_px) for phase_map in maps]
-    return normals_from_windows(model, tracks, windows, options.estimator)
+    return normals_from_windows(
+        model, tracks, windows, options.estimator, tilt_aware=options.tilt_aware_weights
+    )
 
 
 def normals_from_windows(
-    model: AngleModel, tracks: Tracks, windows: Sequence[PhaseMap], estimator: Estimator
+    model: AngleModel,
+    tracks: Tracks,
+    windows: Sequence[PhaseMap],
+    estimator: Estimator,
+    *,
+    tilt_aware: bool = True,
 ) -> NormalEstimate:
     """As :func:`track_normals`, from phase maps that are averaged already (:func:`window_map`).
 
     First from the views that matched the point, which surely see it, then from every view that
     faces it.
     """
-    rows = gather_rows(model, tracks.points_in_world, windows)
+    rows = gather_rows(model, tracks.points_in_world, windows, tilt_aware=tilt_aware)
     matched = np.zeros(rows.sigma.shape, bool)
     matched[tracks.obs_view, tracks.obs_track] = True
     robust = estimator is Estimator.ROBUST
@@ -80,22 +86,10 @@ def normals_from_windows(
     own = solve_normals(rows.rows, rows.rays, own_sigma, robust=robust)
     facing = np.einsum("ikn,ni->kn", rows.rays, np.nan_to_num(own.normals)) < -0.05
     sigma = np.where(matched | facing, rows.sigma, np.inf)
-    return solve_normals(rows.rows, rows.rays, sigma, robust=robust, initial_normals=own.normals.T)
-
-
-def some_tracks(tracks: Tracks, chosen: Mask) -> Tracks:
-    """The chosen ``(T,)`` tracks with their observations."""
-    index = np.cumsum(chosen) - 1
-    kept = chosen[tracks.obs_track]
-    return Tracks(
-        point3D_ids=tracks.point3D_ids[chosen],
-        points_in_world=tracks.points_in_world[chosen],
-        colors=tracks.colors[chosen],
-        errors=tracks.errors[chosen],
-        obs_track=index[tracks.obs_track[kept]],
-        obs_view=tracks.obs_view[kept],
-        obs_xy=tracks.obs_xy[kept],
-    )
+    start = own.normals.T
+    if not robust:
+        return solve_normals(rows.rows, rows.rays, sigma, robust=False, initial_normals=start)
+    return solve_at_own_noise(rows.rows, rows.rays, sigma, initial_normals=start)[0]
 
 
 def inside_shares(
@@ -112,21 +106,6 @@ def inside_shares(
         inside[here] = sample_image(eroded, tracks.obs_xy[here], nearest=True) > 0
     count = np.bincount(tracks.obs_track, minlength=num_tracks)
     return np.asarray(np.bincount(tracks.obs_track, inside, num_tracks) / np.maximum(count, 1))
-
-
-def point_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
-    """Standard deviation ``(T,)`` of the points along their least certain axis, world units."""
-    information = np.zeros((len(tracks.points_in_world), 3, 3))
-    for k, view in enumerate(views):
-        seen = tracks.obs_track[tracks.obs_view == k]
-        to_point = tracks.points_in_world[seen] - view.center_in_world
-        distance = np.linalg.norm(to_point, axis=-1)
-        ray = to_point / distance[:, None]
-        precision = (view.camera.mean_focal_px / (KEYPOINT_SIGMA_PX * distance)) ** 2
-        across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
-        information[seen] += precision[:, None, None] * across
-    smallest = np.maximum(np.linalg.eigvalsh(information)[:, 0], 1e-300)
-    return np.asarray(1 / np.sqrt(smallest), np.float64)
 
 
 def seen_shares(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> Array:

@@ -1,111 +1,28 @@
-"""What must hold before a run begins, and the stages that a run may have."""
+"""What must hold before a run begins: that the input is usable, and apart from the output."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
-from polmvs.colmap.dense_workspace import open_dense_workspace
+from polmvs.colmap.dense_workspace import open_dense_workspace, require_same_frame
 from polmvs.colmap.sfm import check_intrinsics
-from polmvs.colmap.workspace_checks import require_same_frame
-from polmvs.config import AngleModel, Options, ReferenceOptions
+from polmvs.config import Options, ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.images import read_mask
-from polmvs.option_values import to_plain
-from polmvs.pipeline.record import Record
+from polmvs.pipeline.record import CaptureIdentity, Record
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.stages.capture import find_mask, fit_model, image_names
+from polmvs.pipeline.stages.images import image_names
+from polmvs.pipeline.stages.maps import find_mask
+from polmvs.pipeline.stages.poses import fit_model
 from polmvs.polarization.capture import Capture
-from polmvs.poses.metric_sources import check_reference
+from polmvs.poses.metric_frame import check_reference
 from polmvs.scene import SparseModel
-
-EVALUATE = "evaluate"
-PARTS = "parts"
-EXPORTS = ("mesh_", "dense_")  # how the stages begin that nothing follows
-POSES = ("sfm", "sparse")  # two ways to the same files
-
-
-def normals_stage(model: AngleModel) -> str:
-    """Name of the stage of the track normals; PPA's is the first and selects the seeds."""
-    return "normals" if model is AngleModel.PPA else f"normals_{model}"
-
-
-def densify_stage(model: AngleModel) -> str:
-    """Name of the stage of the dense cloud."""
-    return f"densify_{model}"
-
-
-def mesh_stage(model: AngleModel) -> str:
-    """Name of the stage of the mesh."""
-    return f"mesh_{model}"
-
-
-def dense_stage(model: AngleModel) -> str:
-    """Name of the stage of the COLMAP dense workspace."""
-    return f"dense_{model}"
-
-
-# Groups of options that decide the result of a stage, and the order in which stages follow.
-STAGE_OPTIONS: dict[str, tuple[str, ...]] = {
-    "capture": ("capture",),
-    **{name: ("sfm", "reference") for name in POSES},
-    "maps": ("region",),
-    **{normals_stage(model): ("normals",) for model in AngleModel},
-    PARTS: ("normals",),
-    **{densify_stage(model): ("propagation", "fusion") for model in AngleModel},
-    **{mesh_stage(model): () for model in AngleModel},
-    **{dense_stage(model): ("fusion", "export") for model in AngleModel},
-    EVALUATE: ("evaluation",),
-}
-STAGE_RANK = {
-    "capture": 0,
-    **dict.fromkeys(POSES, 1),
-    "maps": 2,
-    **{normals_stage(model): 5 for model in AngleModel},
-    normals_stage(AngleModel.PPA): 3,
-    PARTS: 4,
-    **{densify_stage(model): 6 for model in AngleModel},
-    **{mesh_stage(model): 7 for model in AngleModel},
-    **{dense_stage(model): 8 for model in AngleModel},
-    EVALUATE: 9,
-}
-
-
-def command_of(name: str) -> str:
-    """The command that does a stage alone."""
-    if STAGE_RANK[name] <= STAGE_RANK["sfm"]:
-        return "sfm"
-    if STAGE_RANK[name] < STAGE_RANK[densify_stage(AngleModel.PPA)]:
-        return "normals"
-    return "densify" if name.startswith("densify") else "export"
-
-
-def alternatives(name: str) -> tuple[str, ...]:
-    """The stage, or the two of which one finds the poses."""
-    return POSES if name in POSES else (name,)
-
-
-def followers(name: str) -> list[str]:
-    """A stage, and those that read what it writes: not another model's, and nothing of exports."""
-    if name.startswith(EXPORTS):
-        return [name]
-    model, rank = _model_of(name), STAGE_RANK[name]
-    later = [other for other, its_rank in STAGE_RANK.items() if its_rank > rank]
-    return [
-        *alternatives(name),
-        *(other for other in later if model is None or _model_of(other) in (model, None)),
-    ]
-
-
-def _model_of(name: str) -> str | None:
-    """The model that a stage is of; None for those of all. PPA's normals select the seeds."""
-    return next((str(model) for model in AngleModel if name.endswith(f"_{model}")), None)
 
 
 def inputs_of(options: Options) -> list[Path]:
-    """Folders that are read beside the capture."""
+    """Files and folders that are read beside the capture."""
     paths = (
         options.sfm.sparse,
         options.reference.reference,
@@ -116,18 +33,72 @@ def inputs_of(options: Options) -> list[Path]:
     return [path for path in paths if path is not None]
 
 
-def identity_of(capture: Capture) -> dict[str, Any]:
-    """What tells this capture from another one, as in ``run.json``."""
-    return {
-        "folder": str(capture.folder.absolute()),
-        "width": capture.width,
-        "height": capture.height,
-        "bytes": {path.name: path.stat().st_size for path in capture.paths},
-    }
+def require_apart(
+    run_folder: RunFolder, *, capture: Path, others: Sequence[Path], written: Iterable[str]
+) -> None:
+    """Refuse a run folder whose results would be mixed with the input, or delete it.
+
+    Parameters
+    ----------
+    capture : folder of the raw mosaics.
+    others : further files and folders that are read.
+    written : names of what a run may write in its folder.
+
+    Raises
+    ------
+    OptionError
+        The run folder is the capture's, or the input lies where results go.
+    """
+    root = run_folder.root.resolve()
+    if root in (capture.resolve(), (capture / "raw").resolve()):
+        raise OptionError(f"{run_folder.root}: OUT is the capture's own folder. Give another OUT.")
+    places = [root / name for name in written]
+    for path in (capture, *others):
+        resolved = path.resolve()
+        if any(resolved == place or place in resolved.parents for place in places):
+            raise OptionError(f"{path}: lies where OUT's results go. Give another OUT.")
+
+
+def identity_of(capture: Capture) -> CaptureIdentity:
+    """What tells this capture from another one."""
+    return CaptureIdentity(
+        folder=capture.folder.absolute(),
+        width=capture.width,
+        height=capture.height,
+        bytes={path.name: path.stat().st_size for path in capture.paths},
+    )
+
+
+def require_same_capture(record: Record, identity: CaptureIdentity, run_folder: RunFolder) -> None:
+    """Finished stages must be of this capture.
+
+    Raises
+    ------
+    DataError
+        They are of another one.
+    """
+    before = record.capture
+    if record.stages and (before is None or not before.is_same(identity)):
+        folder = before.folder if before is not None else "unknown"
+        raise DataError(
+            run_folder.root,
+            f"holds a run of another capture ({folder}), or its images have changed. Give another "
+            "OUT, or --overwrite.",
+        )
 
 
 def check_input(capture: Capture, options: Options, min_images: int) -> SparseModel | None:
-    """All that can be known to be wrong before the work begins; gives the model of ``--sparse``."""
+    """All that can be known to be wrong before the work begins.
+
+    Returns
+    -------
+    The model of ``options.sfm.sparse``, fitted to the capture; None where it names none.
+
+    Raises
+    ------
+    DataError, OptionError
+        The input or an option is unusable.
+    """
     num_images = len(image_names(capture))
     if num_images < min_images:
         raise DataError(
@@ -152,45 +123,3 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
     if options.sfm.intrinsics is not None:
         check_intrinsics(options.sfm.intrinsics, capture.width, capture.height)
     return None
-
-
-def require_same_capture(record: Record, identity: dict[str, Any], workspace: RunFolder) -> None:
-    """Finished stages must be of this capture."""
-    same = all(record.capture.get(key) == identity[key] for key in ("width", "height", "bytes"))
-    if record.stages and not same:
-        raise DataError(
-            workspace.root,
-            f"holds a run of another capture ({record.capture.get('folder')}), or its images have "
-            "changed. Give another OUT, or --overwrite.",
-        )
-
-
-def require_same_options(
-    record: Record, options: Options, uses: Collection[str], workspace: RunFolder
-) -> None:
-    """Finished stages that are taken over must be of these options."""
-    for stage in record.stages:
-        if stage.name not in uses:
-            continue
-        before = record.stage_options.get(stage.name, {})
-        for group, now in options_of(stage.name, options).items():
-            for key, value in now.items():
-                earlier = before.get(group, {}).get(key)
-                if earlier != value:
-                    flag = "--" + key.replace("_", "-")
-                    raise OptionError(
-                        f"{flag} is {_text(value)} but the finished stage {stage.name!r} in "
-                        f"{workspace.root} used {_text(earlier)}. Give the same value, or "
-                        "--overwrite."
-                    )
-
-
-def options_of(stage: str, options: Options) -> dict[str, Any]:
-    """Options that decide the result of a stage, by group, in terms of JSON."""
-    return {group: to_plain(getattr(options, group)) for group in STAGE_OPTIONS[stage]}
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, list):
-        return ",".join(str(item) for item in value)
-    return "not set" if value is None else str(value)

@@ -1,39 +1,38 @@
-"""The jobs: reconstruct, compare, and each stage alone."""
+"""The jobs: reconstruct, compare, and each stage alone; the stage table says what each runs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from polmvs.config import AngleModel, Options, RunOptions
 from polmvs.errors import OptionError
-from polmvs.pipeline.checks import (
-    PARTS,
-    POSES,
-    dense_stage,
-    densify_stage,
-    mesh_stage,
-)
-from polmvs.pipeline.job_stages import (
-    normal_names,
-    plan_capture,
-    plan_densify,
-    plan_evaluation,
-    plan_exports,
-    plan_maps,
-    plan_normals,
-    plan_poses,
-)
-from polmvs.pipeline.run import Run, Stage, Watcher, open_run
+from polmvs.evaluation.comparison import Comparison, read_comparison
+from polmvs.pipeline.monitor import Monitor
+from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.stages import capture as stages
+from polmvs.pipeline.runner import Run, open_run
+from polmvs.pipeline.stage_table import (
+    COMPARE,
+    DENSIFY,
+    EXPORT,
+    NORMALS,
+    SFM,
+    StageSpec,
+    stage_table,
+    with_needed,
+)
+from polmvs.pipeline.stages.densify import DensifyResult
+from polmvs.pipeline.stages.maps import MIN_VIEWS, MapsResult
+from polmvs.pipeline.stages.seeds import SeedsResult
+
+R = TypeVar("R")
 
 COMPARED = (AngleModel.OPA, AngleModel.PPA, AngleModel.TILTED)
 MIN_SFM_IMAGES = 2
-BEFORE_MAPS = ("capture", *POSES)
 
 NO_REGION = (
     "no polarised region: no view shows a surface with polarised light. Lower --min-dolp, check "
@@ -51,31 +50,15 @@ NO_POINTS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """What a run came to.
-
-    Attributes
-    ----------
-    workspace : where the results lie.
-    results : numbers of views, points and seeds, and the names of unregistered views.
-    empty : why a dense cloud has no points, and what to do; None where none is empty.
-    """
-
-    workspace: RunFolder
-    results: dict[str, Any]
-    empty: str | None
-
-
-@dataclass(frozen=True, kw_only=True)
 class Job:
     """What every job is called with.
 
     Attributes
     ----------
     capture : folder of raw mosaics.
-    out : output folder.
+    out : run folder.
     options : of all stages.
-    how : workers, overwrite and resume.
+    run_options : workers, overwrite and resume.
     monitor : who watches, if anybody.
     command_line : for the record.
     """
@@ -83,28 +66,53 @@ class Job:
     capture: Path
     out: Path
     options: Options = Options()
-    how: RunOptions = RunOptions()
-    monitor: Watcher | None = None
+    run_options: RunOptions = RunOptions()
+    monitor: Monitor | None = None
     command_line: Sequence[str] = ()
 
 
-def reconstruct(job: Job, model: AngleModel = AngleModel.PPA) -> Outcome:
-    """The whole chain with one model: ``OUT/ppa.ply`` or ``OUT/opa.ply``.
+@dataclass(frozen=True, kw_only=True)
+class JobOutcome:
+    """What a job came to.
+
+    Attributes
+    ----------
+    run_folder : where the results lie.
+    record : of all finished stages, with what they found.
+    empty : why a dense cloud has no points, and what to do; None where none is empty.
+    comparison : figures of the models, of :func:`compare`.
+    """
+
+    run_folder: RunFolder
+    record: Record
+    empty: str | None = None
+    comparison: Comparison | None = None
+
+    def result(self, kind: type[R], model: AngleModel | None = None) -> R:
+        """What the stage that gives this type found; KeyError where it is not finished."""
+        return self.record.result(kind, model)
+
+    def find(self, kind: type[R], model: AngleModel | None = None) -> R | None:
+        """As :meth:`result`; None where the stage is not finished."""
+        return self.record.find(kind, model)
+
+
+def reconstruct(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
+    """The whole chain with one model: ``OUT/ppa.ply`` or another model's.
 
     Raises
     ------
     PolmvsError
-        The input is unusable or a stage fails; finished stages stay in the output folder.
+        The input is unusable or a stage fails; finished stages stay in the run folder.
     """
     job = _with_poses_of_workspace(job)
-    names = (*_chain_names((model,)), mesh_stage(model), dense_stage(model))
-    with _open(job, names) as run:
-        for stage in (*_chain(run, (model,)), *plan_exports(run, model)):
-            run.do(stage)
+    last = _of_models((NORMALS, DENSIFY, EXPORT), (model,), stage_table())
+    with _open(job, last) as run:
+        _do_all(run, last)
         return _close(run, (model,))
 
 
-def compare(job: Job, models: Sequence[AngleModel] = COMPARED) -> Outcome:
+def compare(job: Job, models: Sequence[AngleModel] = COMPARED) -> JobOutcome:
     """Several models on the same poses, tracks, seeds and region, with ``OUT/metrics.json``.
 
     Raises
@@ -113,53 +121,76 @@ def compare(job: Job, models: Sequence[AngleModel] = COMPARED) -> Outcome:
         As :func:`reconstruct`.
     """
     job = _with_poses_of_workspace(job)
-    with _open(job, _chain_names(models)) as run:
-        for stage in _chain(run, models):
-            run.do(stage)
-        run.do(plan_evaluation(run, models))
-        return _close(run, models)
+    table = stage_table(tuple(models))
+    last = _of_models((NORMALS, DENSIFY, COMPARE), models, table)
+    with _open(job, last, table=table) as run:
+        _do_all(run, last)
+        outcome = _close(run, models)
+    return replace(outcome, comparison=read_comparison(outcome.run_folder.metrics))
 
 
-def find_poses(job: Job) -> Outcome:
+def find_poses(job: Job) -> JobOutcome:
     """SfM alone: ``OUT/images`` and ``OUT/sparse``."""
-    with _open(job, BEFORE_MAPS, min_images=MIN_SFM_IMAGES) as run:
-        run.do(plan_capture(run))
-        run.do(plan_poses(run))
+    last = _of_models((SFM,), (), stage_table())
+    with _open(job, last, min_images=MIN_SFM_IMAGES) as run:
+        _do_all(run, last)
         return _close(run, ())
 
 
-def solve_normals(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> Outcome:
+def solve_normals(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> JobOutcome:
     """Normals of the sparse points of a folder that has poses."""
-    own = ("maps", PARTS, *normal_names(models))
-    with _open(job, BEFORE_MAPS, own, goes_on=True) as run:
-        todo = [plan_maps(run), *plan_normals(run, models)]
-        _begin_again(run, todo, job.how)
-        for stage in todo:
-            run.do(stage)
-        return _close(run, ())
+    return _do_alone(job, NORMALS, models, ())
 
 
-def densify(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> Outcome:
+def densify(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> JobOutcome:
     """Dense clouds of a folder that has normals."""
-    before = _before_densify(models)
-    with _open(job, before, [densify_stage(m) for m in models], goes_on=True) as run:
-        todo = [plan_densify(run, model) for model in models]
-        _begin_again(run, todo, job.how)
-        for stage in todo:
-            run.do(stage)
-        return _close(run, models)
+    return _do_alone(job, DENSIFY, models, models)
 
 
-def export(job: Job, model: AngleModel = AngleModel.PPA) -> Outcome:
+def export(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
     """Mesh and COLMAP workspace of a folder that has a dense cloud."""
-    before = (*_before_densify((model,)), densify_stage(model))
-    own = (mesh_stage(model), dense_stage(model))
-    with _open(job, before, own, goes_on=True) as run:
-        todo = plan_exports(run, model)
-        _begin_again(run, todo, job.how)
-        for stage in todo:
-            run.do(stage)
-        return _close(run, (model,))
+    return _do_alone(job, EXPORT, (model,), (model,))
+
+
+def _do_alone(
+    job: Job, command: str, models: Sequence[AngleModel], dense: Sequence[AngleModel]
+) -> JobOutcome:
+    """The stages of a command, in a folder where those that they need are finished.
+
+    Finished ones are done again only if that is asked for.
+
+    Raises
+    ------
+    OptionError
+        All are finished, and the run options ask neither for ``overwrite`` nor for ``resume``.
+    """
+    last = _of_models((command,), models, stage_table())
+    all_needed = with_needed((spec.name for spec in last), stage_table())
+    own = [spec for spec in all_needed if spec.command == command]
+    wanted = [spec for spec in own if spec.is_wanted(job.options)]
+    names = {spec.name for spec in own}
+    again = job.run_options.overwrite
+    taken_over = {spec.name for spec in all_needed if not (again and spec.name in names)}
+    with _open(job, all_needed, taken_over=taken_over, continues=True) as run:
+        if again:
+            run.forget([spec.name for spec in wanted])
+        elif wanted and not job.run_options.resume and all(map(run.is_finished, wanted)):
+            raise OptionError(
+                f"{run.run_folder.root}: the stage {wanted[-1].name!r} is finished. Give "
+                "--overwrite to do it again."
+            )
+        for spec in wanted:
+            run.do(spec)
+        return _close(run, dense)
+
+
+def _of_models(
+    commands: Sequence[str], models: Sequence[AngleModel], table: Sequence[StageSpec]
+) -> list[StageSpec]:
+    """The stages of commands that are of these angle models or of all."""
+    return [
+        spec for spec in table if spec.command in commands and spec.angle_model in (None, *models)
+    ]
 
 
 def _with_poses_of_workspace(job: Job) -> Job:
@@ -171,66 +202,50 @@ def _with_poses_of_workspace(job: Job) -> Job:
     return replace(job, options=replace(job.options, sfm=sfm))
 
 
-def _before_densify(models: Sequence[AngleModel]) -> tuple[str, ...]:
-    return (*BEFORE_MAPS, "maps", PARTS, *normal_names(models))
-
-
-def _chain_names(models: Sequence[AngleModel]) -> tuple[str, ...]:
-    return (*_before_densify(models), *map(densify_stage, models))
-
-
-def _chain(run: Run, models: Sequence[AngleModel]) -> Iterator[Stage]:
-    """The stages to the dense clouds; each is made when those before are done."""
-    yield plan_capture(run)
-    yield plan_poses(run)
-    yield plan_maps(run)
-    yield from plan_normals(run, models)
-    for model in models:
-        yield plan_densify(run, model)
-
-
+@contextmanager
 def _open(
     job: Job,
-    uses: Sequence[str],
-    own: Sequence[str] = (),
+    last: Sequence[StageSpec],
     *,
-    min_images: int = stages.MIN_VIEWS,
-    goes_on: bool = False,
-) -> AbstractContextManager[Run]:
-    """Open the run; ``own`` stages of one that goes on are done again if that is asked for."""
-    return open_run(
+    table: Sequence[StageSpec] | None = None,
+    taken_over: set[str] | None = None,
+    min_images: int = MIN_VIEWS,
+    continues: bool = False,
+) -> Iterator[Run]:
+    """Open the run; what it needs is taken over where it is finished."""
+    table = table or stage_table()
+    if taken_over is None:
+        taken_over = {spec.name for spec in with_needed((s.name for s in last), table)}
+    with open_run(
         job.capture,
         job.out,
         job.options,
-        job.how,
+        job.run_options,
+        table=table,
         min_images=min_images,
-        uses=uses if job.how.overwrite else (*uses, *own),
-        goes_on=goes_on,
+        taken_over=taken_over,
+        continues=continues,
         monitor=job.monitor,
         command_line=job.command_line,
-    )
+    ) as run:
+        yield run
 
 
-def _close(run: Run, models: Sequence[AngleModel]) -> Outcome:
+def _do_all(run: Run, last: Sequence[StageSpec]) -> None:
+    """Do stages that the options ask for, and all that they need."""
+    wanted = [spec.name for spec in last if spec.is_wanted(run.options)]
+    for spec in with_needed(wanted, run.table):
+        run.do(spec)
+
+
+def _close(run: Run, models: Sequence[AngleModel]) -> JobOutcome:
     run.save(finished=True)
-    results = run.record.results
-    empty = None
-    if any(results.get(f"num_points_{model}") == 0 for model in models):
+    record, empty = run.record, None
+    if any(record.result(DensifyResult, model).num_points == 0 for model in models):
         empty = NO_POINTS
-        if results.get("num_seeds") == 0 and not results.get("num_part_seeds"):
+        seeds = record.result(SeedsResult)
+        if seeds.num_track_seeds == 0 and seeds.num_part_seeds == 0:
             empty = NO_SEEDS
-        if results.get("num_region_px") == 0:
+        if record.result(MapsResult).num_region_px == 0:
             empty = NO_REGION
-    return Outcome(workspace=run.workspace, results=results, empty=empty)
-
-
-def _begin_again(run: Run, todo: Sequence[Stage], how: RunOptions) -> None:
-    """A stage called alone that is finished: to be done again only if that is asked for."""
-    if how.overwrite:
-        for stage in todo:
-            run.forget(stage.name)
-    elif not how.resume and all(run.record.is_done(stage.name) for stage in todo):
-        raise OptionError(
-            f"{run.workspace.root}: the stage {todo[-1].name!r} is finished. Give --overwrite to "
-            "do it again."
-        )
+    return JobOutcome(run_folder=run.run_folder, record=record, empty=empty)

@@ -1,15 +1,34 @@
-"""What ``run.json`` holds: the record of a run."""
+"""The record of a run, ``run.json``: what is finished, what it found, and on what machine."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import os
+import platform
+import sys
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from multiprocessing import active_children
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from polmvs.io.images import write_bytes
-from polmvs.option_values import to_plain
+from polmvs._version import __version__
+from polmvs.config import AngleModel
+from polmvs.errors import DataError
+from polmvs.io.typed_json import from_json, write_json
+from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+R = TypeVar("R")
+
+# Of ``run.json``. 1: the first releases, which did not name it. 2: stages with their results.
+SCHEMA_VERSION = 2
+PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pycolmap", "open3d")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,13 +38,43 @@ class StageRecord:
     Attributes
     ----------
     name : of the stage.
+    angle_model : that it is of; None for those of all.
+    reads : what it was made from, paths in the run folder.
+    options : values of the options that decided its result, by path, in terms of JSON.
     seconds : wall time.
     peak_rss_mb : largest memory so far of the run's processes together.
+    result : what it found, of the type that the stage table says.
     """
 
     name: str
+    angle_model: AngleModel | None = None
+    reads: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
     seconds: float
     peak_rss_mb: float
+    result: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureIdentity:
+    """What tells a capture from another one.
+
+    Attributes
+    ----------
+    folder : of the raw mosaics.
+    width, height : of the polarization images, px.
+    bytes : size of each file by its name.
+    """
+
+    folder: Path
+    width: int
+    height: int
+    bytes: Mapping[str, int]
+
+    def is_same(self, other: CaptureIdentity) -> bool:
+        """Whether the images are the same, wherever they lie."""
+        mine, others = (self.width, self.height), (other.width, other.height)
+        return mine == others and self.bytes == other.bytes
 
 
 @dataclass(kw_only=True)
@@ -34,41 +83,197 @@ class Record:
 
     Attributes
     ----------
-    command_line : how the run was last called.
-    capture : the capture's folder, its size in px, and the size in bytes of each file by name.
+    schema_version : of the file.
+    command_line : how the run was last called; empty where a script did.
+    capture : the images that it is of.
     images : names of the files in ``images/``.
-    options : resolved options of the last call.
-    stage_options : those that each finished stage used.
+    options : resolved options of the last call, in terms of JSON.
     versions : of the software.
     stages : finished ones, in order.
-    results : what the stages found: numbers of views, points and seeds.
     wall_s : seconds of all calls together.
-    finished : whether the command that was asked for has come to its end.
+    finished : whether what was asked for has come to its end.
     """
 
-    command_line: list[str] = field(default_factory=list)
-    capture: dict[str, Any] = field(default_factory=dict)
-    images: list[str] = field(default_factory=list)
-    options: dict[str, Any] = field(default_factory=dict)
-    stage_options: dict[str, dict[str, Any]] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=dict)
-    stages: list[StageRecord] = field(default_factory=list)
-    results: dict[str, Any] = field(default_factory=dict)
+    schema_version: int = SCHEMA_VERSION
+    command_line: tuple[str, ...] = ()
+    capture: CaptureIdentity | None = None
+    images: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    stages: tuple[StageRecord, ...] = ()
     wall_s: float = 0.0
     finished: bool = False
 
-    def is_done(self, *names: str) -> bool:
-        """Whether one of some stages is finished."""
-        return any(stage.name in names for stage in self.stages)
+    def stage(self, name: str) -> StageRecord | None:
+        """A finished stage by its name."""
+        return next((stage for stage in self.stages if stage.name == name), None)
 
-    def forget(self, names: Sequence[str]) -> None:
+    def forget(self, names: Iterable[str]) -> None:
         """Drop stages that are to be done again."""
-        self.stages = [stage for stage in self.stages if stage.name not in names]
-        for name in names:
-            self.stage_options.pop(name, None)
+        dropped = set(names)
+        self.stages = tuple(stage for stage in self.stages if stage.name not in dropped)
+
+    def find(self, kind: type[R], model: AngleModel | None = None) -> R | None:
+        """Result of the finished stage that gives this type; None where it is not finished.
+
+        Parameters
+        ----------
+        kind : type of the result; each belongs to one stage, or to one stage of each angle model.
+        model : of the stage, if it is of one.
+        """
+        for stage in self.stages:
+            if isinstance(stage.result, kind) and stage.angle_model is model:
+                return stage.result
+        return None
+
+    def result(self, kind: type[R], model: AngleModel | None = None) -> R:
+        """As :meth:`find`; KeyError where the stage is not finished."""
+        found = self.find(kind, model)
+        if found is None:
+            raise KeyError(f"no stage with a {kind.__name__} {model or ''} is finished")
+        return found
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON whole or not at all; NaN becomes null."""
-    text = json.dumps(to_plain(content), indent=1, allow_nan=False)
-    write_bytes(path, (text + "\n").encode())
+def write_record(run_folder: RunFolder, record: Record) -> None:
+    """Write ``run.json``."""
+    write_json(run_folder.run_file, record)
+
+
+def read_record(run_folder: RunFolder, result_types: Mapping[str, type]) -> Record:
+    """Read ``run.json``.
+
+    Parameters
+    ----------
+    result_types : type of the result of each stage by its name.
+
+    Raises
+    ------
+    DataError
+        It is missing, no record of a run, or one of another version.
+    """
+    content = _read_current(run_folder)
+    try:
+        record = from_json(Record, content)
+        record.stages = tuple(_with_result(stage, result_types) for stage in record.stages)
+    except ValueError as error:
+        raise _no_record(run_folder, error) from error
+    return record
+
+
+def _with_result(stage: StageRecord, result_types: Mapping[str, type]) -> StageRecord:
+    if stage.name not in result_types:
+        raise ValueError(f"its stage {stage.name!r} is unknown")
+    result: Any = from_json(result_types[stage.name], stage.result, f"{stage.name}.result")
+    return StageRecord(**{**vars(stage), "result": result})
+
+
+def read_options(run_folder: RunFolder) -> Mapping[str, Any]:
+    """Options of the run in a folder, in terms of JSON; empty where none has a finished stage.
+
+    Raises
+    ------
+    DataError
+        ``run.json`` is no record of a run, or one of another version.
+    """
+    if not run_folder.run_file.is_file():
+        return {}
+    content = _read_current(run_folder)
+    options, stages = content.get("options"), content.get("stages")
+    if not isinstance(options, dict) or not isinstance(stages, list):
+        raise _no_record(run_folder, "it has no options or stages")
+    return options if stages else {}
+
+
+def read_image_names(run_folder: RunFolder) -> frozenset[str]:
+    """Names of the files in ``images/``, from a record of any version.
+
+    Raises
+    ------
+    DataError
+        ``run.json`` is no record of a run.
+    """
+    images = _read_content(run_folder).get("images")
+    if not isinstance(images, list):
+        raise _no_record(run_folder, "it names no images")
+    return frozenset(map(str, images))
+
+
+def _read_current(run_folder: RunFolder) -> dict[str, Any]:
+    """Content of a ``run.json`` of this version."""
+    content = _read_content(run_folder)
+    if "stages" not in content:
+        raise _no_record(run_folder, "it lists no stages")
+    found = content.get("schema_version", 1)
+    if found != SCHEMA_VERSION:
+        versions = content.get("versions")
+        program = versions.get("polmvs", "unknown") if isinstance(versions, dict) else "unknown"
+        raise DataError(
+            run_folder.root,
+            f"holds a run of polmvs {program}, whose {RUN_FILE} has schema version {found}; this "
+            f"is polmvs {__version__}, which reads version {SCHEMA_VERSION} and cannot go on with "
+            "it. Give another OUT, or --overwrite to delete that run.",
+        )
+    return content
+
+
+def _read_content(run_folder: RunFolder) -> dict[str, Any]:
+    try:
+        content = json.loads(run_folder.run_file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DataError(
+            run_folder.root, f"holds no run of polmvs ({RUN_FILE} is missing)."
+        ) from error
+    except (OSError, ValueError) as error:
+        raise _no_record(run_folder, error) from error
+    if not isinstance(content, dict):
+        raise _no_record(run_folder, "it is no table")
+    return content
+
+
+def _no_record(run_folder: RunFolder, why: object) -> DataError:
+    return DataError(run_folder.run_file, f"is no record of a run ({why}). Give another OUT.")
+
+
+# The machine and the software
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this package and what it stands on."""
+    found = {"polmvs": __version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "unknown"
+    return found
+
+
+def peak_rss_mb() -> float:
+    """Largest resident memory so far of this process and of its live workers, summed, MB.
+
+    An upper bound: the processes need not have had their peaks at the same time, and what they
+    share counts for each.
+    """
+    children = [_peak_of(child.pid) for child in active_children() if child.pid is not None]
+    return _own_peak() + sum(children)
+
+
+def _own_peak() -> float:
+    # getrusage starts from the peak of the process that started this one: the second choice.
+    peak = _peak_of(os.getpid())
+    if peak or resource is None:
+        return peak
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return largest / 1e6 if sys.platform == "darwin" else largest / 1e3
+
+
+def _peak_of(pid: int) -> float:
+    """High-water mark of another process, MB; 0 where the system does not tell."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return 0.0
+    for line in status.splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) / 1e3
+    return 0.0

@@ -1,7 +1,15 @@
-"""A capture: a folder of raw mosaics of one camera, checked as a whole, loaded one by one."""
+"""A capture: a folder of one camera's polarization images, checked as a whole, loaded one by one.
+
+Which files make which view is told by their names (:mod:`polmvs.io.capture_files`), what a
+sample's value means by the samples of all files (:mod:`polmvs.polarization.bit_depth`). What was
+decided is kept in :class:`Capture` and said by its ``notes``.
+"""
 
 from __future__ import annotations
 
+import logging
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -10,65 +18,174 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import CaptureOptions
-from polmvs.errors import DataError
-from polmvs.io.images import Mosaic, MosaicHeader, probe_mosaic, read_mosaic
-from polmvs.polarization.mosaic import clipped_cells, linearize, split_mosaic
-from polmvs.polarization.stokes import Stokes, stokes_from_intensities
+from polmvs.config import CaptureKind, CaptureOptions, Channel, Resolution
+from polmvs.errors import DataError, OptionError
+from polmvs.io.capture_files import CaptureFiles, ViewFiles, find_capture
+from polmvs.io.raw_formats import (
+    FLOAT_SUFFIXES,
+    UPRIGHT,
+    DumpSize,
+    RawHeader,
+    RawImage,
+    probe_raw,
+    read_raw,
+)
+from polmvs.polarization.bit_depth import LevelCounts, Levels, decide_levels
+from polmvs.polarization.calibration import PolarizerCalibration, read_calibration
+from polmvs.polarization.exposures import merge_exposures
+from polmvs.polarization.lossy import find_quantization, lossy_variance
+from polmvs.polarization.mosaic import (
+    clipped_cells,
+    linearize,
+    split_colour_mosaic,
+    split_mosaic,
+    split_mosaic_full,
+)
+from polmvs.polarization.pattern_check import PatternCheck, check_pattern
+from polmvs.polarization.stokes import (
+    Stokes,
+    combine,
+    ideal_analyzers,
+    stokes_by_least_squares,
+    stokes_from_intensities,
+    stokes_from_maps,
+    turned_axes,
+)
 
-SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp", ".pgm"})
-LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg"})
+logger = logging.getLogger(__name__)
+
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
 DISPLAY_GAMMA = 2.2
 WHITE_PERCENTILE = 99.5
 WHITE_IMAGES = 32  # images that the white level is taken from, evenly spread over the capture
 WHITE_SAMPLES = 20_000  # cells of each
+CHECKED_IMAGES = 3  # that are looked at for lossy compression and the pattern, evenly spread
+CLEARLY_WRONG = 0.5  # disagreement of the best pairing over that of the pattern: refused below
+# A camera that records 16 bits hardly needs 1/65536 to tell its levels apart; floats say nothing.
+FLOAT_QUANTUM = 2.0**-16
+EVEN = "Set the camera's region of interest to even offsets and sizes."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Capture:
-    """Mosaics of one camera at one setting; nothing of their pixels is held.
+    """Polarization images of one camera at one setting; nothing of their pixels is held.
 
     Attributes
     ----------
     folder : as given by the user.
-    paths : of the raw mosaics, sorted by name.
-    width, height : of the half-size polarization images, px.
-    bit_depth : of the files' samples, 8 or 16.
-    full_scale : raw value of a saturated sample: 255 or 65535, or 1023 or 4095 where 16-bit
-        files hold right-aligned 10- or 12-bit samples.
-    options : how mosaics become polarization images.
+    files : its views and what their files hold.
+    header : size and type of each file's samples.
+    width, height : of the polarization images, px.
+    levels : what a sample's value means.
+    options : how samples become polarization images.
+    calibration : of the polarizers, if there is one.
+    lossy_steps : (64,) steps of the JPEG that the samples were, row by row; None if none.
+    orientations : TIFF orientations that occur; the samples are as stored.
+    pattern_check : of a monochrome mosaic's pattern; None for others.
     """
 
     folder: Path
-    paths: tuple[Path, ...]
+    files: CaptureFiles
+    header: RawHeader
     width: int
     height: int
-    bit_depth: int
-    full_scale: int
+    levels: Levels
     options: CaptureOptions
+    calibration: PolarizerCalibration | None = None
+    lossy_steps: tuple[float, ...] | None = None
+    orientations: tuple[int, ...] = (UPRIGHT,)
+    pattern_check: PatternCheck | None = None
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All files, view by view."""
+        return self.files.paths
 
     @property
     def names(self) -> tuple[str, ...]:
-        """File names of the mosaics, which are also the images' names in the COLMAP model."""
-        return tuple(path.name for path in self.paths)
+        """Names of the views: of single mosaics their file names."""
+        return tuple(view.name for view in self.files.views)
+
+    @property
+    def bit_depth(self) -> int:
+        """Of the samples; 0 for floats."""
+        return self.levels.bit_depth
+
+    @property
+    def full_scale(self) -> float:
+        """Value of a saturated sample."""
+        return self.levels.full_scale
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was recognised and decided, one line each."""
+        files, header = self.files, self.header
+        what = {
+            CaptureKind.MOSAIC: "raw mosaics",
+            CaptureKind.ANGLES: "an image for each polarizer angle "
+            + ", ".join(f"{angle:g}" for angle in files.angles_deg),
+            CaptureKind.STOKES: "Stokes images",
+            CaptureKind.AOLP: "maps of angle and degree of polarization",
+        }[files.kind]
+        if self.options.bayer is not None:
+            what = f"colour mosaics ({self.options.bayer}, {self.options.channel})"
+        lines = [
+            f"{len(files.views)} views, {what}; files of {header.width}x{header.height} px, "
+            f"{header.dtype}",
+            self.levels.reason,
+        ]
+        if len(files.exposures_s) > 1:
+            times = ", ".join(f"{1e3 * time:g}" for time in files.exposures_s)
+            lines.append(f"{len(files.exposures_s)} exposures a view, {times} ms, are merged")
+        if self.orientations != (UPRIGHT,):
+            tags = ", ".join(map(str, self.orientations))
+            lines.append(
+                f"TIFF orientation {tags} is not applied: polarization images stay as the sensor "
+                "recorded them"
+            )
+        if self.lossy_steps is not None:
+            lines.append(
+                "compressed with loss (JPEG), which blurs the polarizers into each other; the "
+                "stated noise is widened by it. Record PNG or TIFF"
+            )
+        if self.pattern_check is not None:
+            lines.append(self.pattern_check.message)
+        return tuple(lines)
 
     def load(self, name: str) -> Stokes:
-        """Read a mosaic and turn it into Stokes images ``(height, width)``.
+        """Read a view and turn it into Stokes images ``(height, width)``.
 
         Raises
         ------
         DataError
-            The file is gone, damaged or has changed since the capture was opened.
+            A file is gone, damaged or has changed since the capture was opened.
         """
-        raw = self._read(self._path(name))
-        clipped = clipped_cells(raw, self.options.saturation * self.full_scale)
-        linear = linearize(raw, gamma=self.options.gamma, full_scale=self.full_scale)
-        return stokes_from_intensities(
-            split_mosaic(linear, self.options.pattern),
-            clipped,
-            darkness=self.options.darkness,
-            quantum=1.0 / self.full_scale,
-        )
+        view = self._view(name)
+        match self.files.kind:
+            case CaptureKind.MOSAIC:
+                stokes = self._from_mosaic(view)
+            case CaptureKind.ANGLES:
+                stokes = self._from_angles(view)
+            case CaptureKind.STOKES:
+                stokes = self._from_stokes(view)
+            case CaptureKind.AOLP:
+                stokes = self._from_maps(view)
+        options = self.options
+        return turned_axes(stokes, zero_deg=options.zero_deg, clockwise=options.clockwise)
+
+    def load_mosaic(self, name: str) -> Image:
+        """Linear samples of a view's mosaic (H, W), shares of full scale, exposures merged.
+
+        Raises
+        ------
+        DataError
+            As :meth:`load`; or the capture holds no mosaics.
+        """
+        if self.files.kind is not CaptureKind.MOSAIC:
+            raise DataError(self.folder, f"holds {self.files.kind} images, no mosaics.")
+        return self._linear(self._view(name).files[0])[0]
 
     def exposure(self) -> float:
         """White level of s0 for the whole capture, units of full scale: its 99.5 percentile.
@@ -80,92 +197,252 @@ class Capture:
         DataError
             The images are black.
         """
-        step = -(-len(self.paths) // WHITE_IMAGES)
-        samples = [self._intensity_samples(path) for path in self.paths[::step]]
+        views = self.files.views
+        step = -(-len(views) // WHITE_IMAGES)
+        samples = [self._intensity_samples(view) for view in views[::step]]
         white = float(np.percentile(np.concatenate(samples), WHITE_PERCENTILE))
-        if white <= 0:
+        if not white > 0:
             raise DataError(self.folder, "the images are black. Check exposure and lens cap.")
         return white
 
-    def _path(self, name: str) -> Path:
-        for path in self.paths:
-            if path.name == name:
-                return path
+    def _view(self, name: str) -> ViewFiles:
+        for view in self.files.views:
+            if view.name == name:
+                return view
         raise ValueError(f"{name=} is not an image of {self.folder}.")
 
-    def _read(self, path: Path) -> Mosaic:
-        """A mosaic of the size and type that the capture was opened with."""
-        raw = read_mosaic(path)
-        found = (raw.shape[1] // 2, raw.shape[0] // 2, 8 * raw.dtype.itemsize)
-        if found != (self.width, self.height, self.bit_depth):
+    def _read(self, path: Path) -> NDArray[Any]:
+        """Samples of the size and type that the capture was opened with."""
+        raw = read_raw(path, _dump_size(self.options))
+        if raw.header != self.header and self.files.kind is not CaptureKind.AOLP:
             raise DataError(path, "has changed since the run began. Start the run again.")
-        return raw
+        return raw.samples
 
-    def _intensity_samples(self, path: Path) -> NDArray[np.float32]:
+    def _linear(self, paths: Sequence[Path]) -> tuple[Image, NDArray[Any], float]:
+        """Linear samples; what is clipped of them: an array, and the value from which it is."""
+        threshold = self.options.saturation * min(self.levels.full_scale, self.levels.clip_level)
+        if self.levels.clip_level == math.inf:
+            threshold = math.inf
+        images, raws = [], []
+        for path in paths:
+            raw = self._read(path)
+            linear = linearize(raw, gamma=self.options.gamma, full_scale=self.full_scale)
+            if self.calibration is not None:
+                linear = self.calibration.correct(linear)
+            images.append(linear)
+            raws.append(raw)
+        if len(paths) == 1:
+            return images[0], raws[0], threshold
+        clipped = [raw >= threshold for raw in raws]
+        merged, nowhere = merge_exposures(images, clipped, self.files.exposures_s)
+        return merged, nowhere.astype(np.uint8), 1.0
+
+    def _from_mosaic(self, view: ViewFiles) -> Stokes:
+        linear, raw, threshold = self._linear(view.files[0])
+        options = self.options
+        full = options.resolution is Resolution.FULL
+        clipped = clipped_cells(raw, threshold, colour=options.bayer is not None, full=full)
+        if options.bayer is not None:
+            colours = split_colour_mosaic(linear, options.pattern, options.bayer, full=full)
+            return self._one_colour([self._stokes(colour, clipped) for colour in colours])
+        split = split_mosaic_full if full else split_mosaic
+        return self._stokes(split(linear, options.pattern), clipped)
+
+    def _stokes(self, images: Image, clipped: Mask) -> Stokes:
+        """Stokes images of a mosaic's four angle images."""
+        darkness, quantum, lossy = self.options.darkness, self._quantum, self._lossy_variance
+        if self.calibration is None:
+            return stokes_from_intensities(
+                images, clipped, darkness=darkness, quantum=quantum, lossy_variance=lossy
+            )
+        shape = (self.header.height, self.header.width)
+        return stokes_by_least_squares(
+            images,
+            self.calibration.analyzers(shape, full=self.options.resolution is Resolution.FULL),
+            clipped,
+            darkness=darkness,
+            quantum=quantum,
+            interpolated=True,
+            lossy_variance=lossy,
+            gains_known=True,
+        )
+
+    def _from_angles(self, view: ViewFiles) -> Stokes:
+        linear, clipped = [], []
+        for paths in view.files:
+            image, raw, threshold = self._linear(paths)
+            linear.append(image)
+            clipped.append(raw >= threshold)
+        stack, spoiled = np.stack(linear), np.logical_or.reduce(clipped)
+        if spoiled.ndim == 3:
+            spoiled = spoiled.any(axis=-1)
+        planes = [stack] if stack.ndim == 3 else [stack[..., c] for c in range(stack.shape[3])]
+        return self._one_colour(
+            [
+                stokes_by_least_squares(
+                    np.ascontiguousarray(plane),
+                    ideal_analyzers(self.files.angles_deg),
+                    spoiled,
+                    darkness=self.options.darkness,
+                    quantum=self._quantum,
+                    # Of neighbouring samples, in a mosaic; here rounding errs in each image alone.
+                    lossy_variance=self._lossy_variance,
+                )
+                for plane in planes
+            ]
+        )
+
+    def _from_stokes(self, view: ViewFiles) -> Stokes:
+        arrays = [self._read(role[0]) for role in view.files]
+        if len(arrays) == 1:
+            arrays = list(_planes_of_stokes(view.paths[0], arrays[0]))
+        s0, s1, s2 = (array.astype(np.float32) / np.float32(self.full_scale) for array in arrays)
+        colours = [(s0, s1, s2)]
+        if s0.ndim == 3:
+            colours = [(s0[..., c], s1[..., c], s2[..., c]) for c in range(s0.shape[2])]
+        return self._one_colour([self._given_stokes(*planes) for planes in colours])
+
+    def _from_maps(self, view: ViewFiles) -> Stokes:
+        intensity, aolp, dolp = (self._read(r[0]) if r else None for r in view.files)
+        path = view.files[1][0]
+        if aolp is None or aolp.ndim != 2:
+            raise DataError(path, "an AoLP map has one channel.")
+        angle, step = _angle_of(path, aolp)
+        degree = np.ones(angle.shape, np.float32) if dolp is None else _share(view, 2, dolp)
+        s0 = np.ones(angle.shape, np.float32) if intensity is None else _share(view, 0, intensity)
+        for other, role in ((degree, 2), (s0, 0)):
+            if other.shape != angle.shape:
+                raise DataError(view.files[role][0], f"is not of the size of {path.name}.")
+        polarized = s0 * degree
+        quantum = 2.0 * step * float(np.nanmean(polarized)) if step else FLOAT_QUANTUM
+        return self._given_stokes(
+            s0, polarized * np.cos(2 * angle), polarized * np.sin(2 * angle), quantum=quantum
+        )
+
+    def _given_stokes(self, s0: Image, s1: Image, s2: Image, quantum: float = 0.0) -> Stokes:
+        """Stokes images of given maps, invalid where dark or not finite."""
+        finite = np.isfinite(s0) & np.isfinite(s1) & np.isfinite(s2)
+        valid = finite & (s0 >= 2.0 * self.options.darkness)
+        clean = [np.where(finite, image, 0).astype(np.float32) for image in (s0, s1, s2)]
+        quantum = max(quantum, self._quantum)
+        return stokes_from_maps(clean[0], clean[1], clean[2], valid, quantum=quantum)
+
+    def _one_colour(self, colours: list[Stokes]) -> Stokes:
+        if len(colours) == 1:
+            return colours[0]
+        if self.options.channel is Channel.COMBINED:
+            return combine(colours)
+        return colours[[Channel.RED, Channel.GREEN, Channel.BLUE].index(self.options.channel)]
+
+    @property
+    def _quantum(self) -> float:
+        return self.levels.quantum if self.levels.step else FLOAT_QUANTUM
+
+    @property
+    def _lossy_variance(self) -> float:
+        if self.lossy_steps is None:
+            return 0.0
+        steps = np.array(self.lossy_steps).reshape(8, 8)
+        return lossy_variance(steps, scale=self._quantum)
+
+    def _intensity_samples(self, view: ViewFiles) -> NDArray[np.float32]:
         """Intensity s0 of evenly spread cells of one image, ``(N,)``."""
-        raw = self._read(path)
         step = max(1, int(np.sqrt(self.width * self.height / WHITE_SAMPLES)))
+        options = self.options
+        plain = options.bayer is None and options.resolution is Resolution.HALF
+        if self.files.kind is not CaptureKind.MOSAIC or not plain or len(view.paths) > 1:
+            s0 = self.load(view.name).s0[step // 2 :: step, step // 2 :: step]
+            return np.asarray(s0.ravel(), np.float32)
+        raw = self._read(view.paths[0])
         rows = np.arange(step // 2, self.height, step) * 2
         cols = np.arange(step // 2, self.width, step) * 2
         sites = [np.ix_(rows + i, cols + j) for i in (0, 1) for j in (0, 1)]
-        cells: NDArray[np.unsignedinteger[Any]] = np.stack([raw[site] for site in sites])
-        linear = linearize(cells, gamma=self.options.gamma, full_scale=self.full_scale)
+        cells: NDArray[Any] = np.stack([raw[site] for site in sites])
+        linear = linearize(cells, gamma=options.gamma, full_scale=self.full_scale)
         return np.asarray(0.5 * linear.sum(axis=0).ravel(), np.float32)
 
 
-def find_mosaics(folder: str | PathLike[str]) -> list[Path]:
-    """Images directly in a folder, or in its ``raw`` where it has none, sorted by name.
-
-    Raises
-    ------
-    DataError
-        The folder is missing or holds no mosaics.
-    """
-    root = Path(folder)
-    if not root.is_dir():
-        raise DataError(root, "is no folder." if root.exists() else "no such folder.")
-    lossy = False
-    for place in (root, root / "raw"):
-        files = _files(place)
-        mosaics = [path for path in files if path.suffix.lower() in SUFFIXES]
-        if mosaics:
-            return mosaics
-        lossy |= any(path.suffix.lower() in LOSSY_SUFFIXES for path in files)
-    if lossy:
-        raise DataError(root, "holds JPEG images only, which spoil a mosaic. Record PNG or TIFF.")
-    kinds = ", ".join(sorted(SUFFIXES))
-    raise DataError(root, f"no images in it or in its raw/. Raw mosaics ({kinds}) are expected.")
-
-
 def open_capture(folder: str | PathLike[str], options: CaptureOptions | None = None) -> Capture:
-    """Check every mosaic of a folder and describe the capture.
+    """Tell what a folder holds, check every file of it, and describe the capture.
 
-    8-bit PNGs are checked without decoding them; 16-bit files are decoded, one at a time, to see
-    how their samples are aligned.
+    8-bit PNGs are checked without decoding them, but for three; all other files are decoded, one
+    at a time, to see what their samples' values mean.
 
     Parameters
     ----------
-    folder : see :func:`find_mosaics`.
+    folder : see :mod:`polmvs.io.capture_files`.
     options : None for the defaults.
 
     Raises
     ------
     DataError
-        There is no mosaic, one is unusable, or two differ in size or bit depth.
+        There is no image, one is unusable, two differ in size or type, or a view lacks one.
+    OptionError
+        An option contradicts the files, as a pattern that does not fit.
     """
-    paths = find_mosaics(folder)
-    first = probe_mosaic(paths[0])
-    for path in paths[1:]:
-        _require_same(paths[0], first, path, probe_mosaic(path))
-    return Capture(
-        folder=Path(folder),
-        paths=tuple(paths),
-        width=first.width // 2,
-        height=first.height // 2,
-        bit_depth=first.bit_depth,
-        full_scale=255 if first.bit_depth == 8 else _full_scale_16(paths),
-        options=CaptureOptions() if options is None else options,
+    chosen = CaptureOptions() if options is None else options
+    files = find_capture(Path(folder), kind=chosen.kind, naming=chosen.naming, angles=chosen.angles)
+    return _open(files, chosen)
+
+
+def open_image(path: Path, options: CaptureOptions | None = None) -> Capture:
+    """A capture of one raw mosaic.
+
+    Raises
+    ------
+    DataError
+        The file is missing, damaged or no monochrome mosaic.
+    """
+    view = ViewFiles(name=path.name, files=((path,),))
+    files = CaptureFiles(
+        folder=path.parent,
+        kind=CaptureKind.MOSAIC,
+        angles_deg=(),
+        exposures_s=(1.0,),
+        views=(view,),
     )
+    return _open(files, CaptureOptions() if options is None else options)
+
+
+def open_files(files: CaptureFiles, options: CaptureOptions | None = None) -> Capture:
+    """As :func:`open_capture`, of files whose views are known, as those of a data set."""
+    return _open(files, CaptureOptions() if options is None else options)
+
+
+def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
+    _require_fitting_options(files, options)
+    header, levels, orientations, sampled = _survey(files, options)
+    steps = _lossy_steps(sampled)
+    divisor = 1
+    if files.kind is CaptureKind.MOSAIC:
+        divisor = 1 if options.resolution is Resolution.FULL else 2
+    calibration = None
+    if options.calibration is not None:
+        calibration = read_calibration(options.calibration)
+        if calibration.pattern != options.pattern:
+            raise OptionError(
+                f"--calibration {options.calibration} is of the pattern {calibration.pattern}, "
+                f"--pattern says {options.pattern}."
+            )
+    capture = Capture(
+        folder=files.folder,
+        files=files,
+        header=header,
+        width=header.width // divisor,
+        height=header.height // divisor,
+        levels=levels,
+        options=options,
+        calibration=calibration,
+        lossy_steps=steps,
+        orientations=orientations,
+        pattern_check=_check_pattern(files, options, levels, sampled),
+    )
+    if steps is not None or orientations != (UPRIGHT,):
+        for note in capture.notes[2:]:
+            logger.warning("%s: %s.", files.folder, note)
+    else:
+        logger.info("%s: %s", files.folder, "; ".join(capture.notes))
+    return capture
 
 
 def intensity_image_8bit(stokes: Stokes, white: float) -> NDArray[np.uint8]:
@@ -187,42 +464,177 @@ def intensity_image_8bit(stokes: Stokes, white: float) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.float32(255) * encoded), np.uint8)
 
 
-def _files(folder: Path) -> list[Path]:
-    """Plain files of a folder by name, hidden ones left out; none where it does not exist."""
-    try:
-        found = sorted(folder.iterdir()) if folder.is_dir() else []
-    except OSError as error:
-        raise DataError(folder, f"cannot be read: {error.strerror or error}.") from error
-    return [path for path in found if path.is_file() and not path.name.startswith(".")]
+def _dump_size(options: CaptureOptions) -> DumpSize:
+    return DumpSize(options.width, options.height, options.packing)
 
 
-def _require_same(first_path: Path, first: MosaicHeader, path: Path, header: MosaicHeader) -> None:
-    """All mosaics of a capture come from one camera at one setting."""
+def _require_fitting_options(files: CaptureFiles, options: CaptureOptions) -> None:
+    """Options that say nothing of this kind of files are not ignored."""
+    if files.kind is CaptureKind.MOSAIC:
+        return
+    defaults = CaptureOptions()
+    for name in ("pattern", "bayer", "resolution", "calibration"):
+        if getattr(options, name) != getattr(defaults, name):
+            raise OptionError(
+                f"--{name} is of raw mosaics; {files.folder} holds {files.kind} images."
+            )
+
+
+def _survey(
+    files: CaptureFiles, options: CaptureOptions
+) -> tuple[RawHeader, Levels, tuple[int, ...], list[RawImage]]:
+    """Header and levels of all files, their orientations, and a few of them decoded."""
+    counts = LevelCounts()
+    orientations: set[int] = set()
+    looked_at = {
+        files.paths[int(k)]
+        for k in np.linspace(0, len(files.paths) - 1, min(CHECKED_IMAGES, len(files.paths)))
+    }
+    first: tuple[Path, RawHeader] | None = None
+    sampled = []
+    for view in files.views:
+        for role, paths in enumerate(view.files):
+            for path in paths:
+                header = probe_raw(path, _dump_size(options))
+                if header is None or header.dtype != "uint8" or path in looked_at:
+                    raw = read_raw(path, _dump_size(options))
+                    header = raw.header
+                    orientations.add(raw.orientation)
+                    # Of Stokes images s0 has the scale; the maps have each their own.
+                    if (files.kind is not CaptureKind.AOLP and role == 0) or _has_levels(files):
+                        counts.add(raw.samples, raw.declared_bits)
+                    if path in looked_at:
+                        sampled.append(raw)
+                _require_usable(files.kind, path, header, options)
+                if first is None:
+                    first = (path, header)
+                elif files.kind is not CaptureKind.AOLP or header[:2] != first[1][:2]:
+                    _require_same(*first, path, header)
+    if first is None:
+        raise DataError(files.folder, "holds no views.")
+    levels = decide_levels(counts, options.full_scale)
+    if files.kind is CaptureKind.AOLP:
+        levels = Levels(
+            bit_depth=0,
+            full_scale=1.0,
+            clip_level=math.inf,
+            step=0.0,
+            reason="maps of polarization",
+        )
+    return first[1], levels, tuple(sorted(orientations)) or (UPRIGHT,), sampled
+
+
+def _has_levels(files: CaptureFiles) -> bool:
+    """Whether every file holds intensities."""
+    return files.kind in (CaptureKind.MOSAIC, CaptureKind.ANGLES)
+
+
+def _require_usable(
+    kind: CaptureKind, path: Path, header: RawHeader, options: CaptureOptions
+) -> None:
+    """A file may hold what the capture's kind says."""
+    if kind is CaptureKind.MOSAIC:
+        if header.channels != 1:
+            raise DataError(
+                path,
+                f"has {header.channels} channels; a monochrome polarizer mosaic is expected. "
+                "Record the camera's raw format (Mono8 to Mono16), not a colour or processed one.",
+            )
+        cell = 2 if options.bayer is None else 4
+        if header.width % cell or header.height % cell or not header.width or not header.height:
+            what = "an even width and height" if cell == 2 else "sides that are multiples of 4"
+            raise DataError(
+                path,
+                f"is {header.width}x{header.height} px; a polarizer mosaic has {what}. {EVEN}",
+            )
+        if header.dtype == "float32" and path.suffix.lower() not in FLOAT_SUFFIXES | {".npy"}:
+            raise DataError(
+                path, "has float32 samples; export the raw mosaic as 8- or 16-bit integers."
+            )
+    if kind is CaptureKind.STOKES and header.dtype != "float32":
+        raise DataError(path, f"has {header.dtype} samples; Stokes images are floats.")
+
+
+def _require_same(first_path: Path, first: RawHeader, path: Path, header: RawHeader) -> None:
+    """All files of a capture come from one camera at one setting."""
     if header[:2] != first[:2]:
         raise DataError(
             path,
             f"is {header.width}x{header.height} px but {first_path.name} is "
-            f"{first.width}x{first.height} px. A capture holds mosaics of one size.",
+            f"{first.width}x{first.height} px. A capture holds images of one size.",
         )
-    if header.bit_depth != first.bit_depth:
+    if header != first:
         raise DataError(
             path,
-            f"has {header.bit_depth} bits a sample but {first_path.name} has "
-            f"{first.bit_depth}. A capture holds mosaics of one bit depth.",
+            f"has {_type_text(header)} but {first_path.name} has {_type_text(first)}. "
+            "A capture holds images of one type.",
         )
 
 
-def _full_scale_16(paths: list[Path]) -> int:
-    """Value of a saturated sample in 16-bit files, from all their samples.
+def _type_text(header: RawHeader) -> str:
+    bits = {"uint8": "8 bits a sample", "uint16": "16 bits a sample"}.get(header.dtype, "floats")
+    return bits if header.channels == 1 else f"{header.channels} channels of {bits}"
 
-    Left-aligned 10- or 12-bit samples leave the low bits zero and have the container's scale
-    however dark they are; right-aligned ones never reach the high bits.
-    """
-    bits = 0
-    for path in paths:
-        bits |= int(np.bitwise_or.reduce(read_mosaic(path), axis=None))
-        if bits >= 1 << 12:
-            return 65535
-    if bits & 0xF == 0:
-        return 65535
-    return 1023 if bits < 1 << 10 else 4095
+
+def _lossy_steps(sampled: Sequence[RawImage]) -> tuple[float, ...] | None:
+    """Steps of a JPEG in the samples that were looked at, the largest of all; None if none."""
+    found: NDArray[np.float64] | None = None
+    for raw in sampled:
+        steps = raw.quantization
+        if steps is None and raw.samples.dtype == np.uint8 and raw.samples.ndim == 2:
+            steps = find_quantization(raw.samples)
+        if steps is None and raw.lossy:  # a JPEG in a TIFF whose steps stay unknown: quality 50
+            steps = np.full((8, 8), 64.0)
+        if steps is not None:
+            found = steps if found is None else np.maximum(found, steps)
+    return None if found is None else tuple(map(float, found.ravel()))
+
+
+def _check_pattern(
+    files: CaptureFiles, options: CaptureOptions, levels: Levels, sampled: Sequence[RawImage]
+) -> PatternCheck | None:
+    """Check the pattern of a monochrome mosaic; one that clearly does not fit is refused."""
+    if files.kind is not CaptureKind.MOSAIC or options.bayer is not None:
+        return None
+    linear = [
+        linearize(raw.samples, gamma=options.gamma, full_scale=levels.full_scale) for raw in sampled
+    ]
+    check = check_pattern(linear, options.pattern, clip=options.saturation)
+    if check.fits is False:
+        own = check.disagreement[check.pairing]
+        if min(check.disagreement) < CLEARLY_WRONG * own:
+            raise OptionError(f"{files.folder}: {check.message}.")
+        logger.warning("%s: %s.", files.folder, check.message)
+    return check
+
+
+def _planes_of_stokes(path: Path, array: NDArray[Any]) -> NDArray[Any]:
+    """The planes (3, H, W) of an array (H, W, 3) or (3, H, W)."""
+    if array.ndim == 3 and array.shape[0] in (3, 4) and array.shape[2] not in (3, 4):
+        return array[:3]
+    if array.ndim == 3 and array.shape[2] in (3, 4):
+        return np.moveaxis(array[..., :3], -1, 0)
+    raise DataError(path, f"is {array.shape}; Stokes images are (3, H, W) or (H, W, 3).")
+
+
+def _angle_of(path: Path, values: NDArray[Any]) -> tuple[Image, float]:
+    """An AoLP map in rad, and its step: integers cover half a turn, floats are rad or degrees."""
+    if values.dtype.kind == "u":
+        step = math.pi / np.iinfo(values.dtype).max
+        return np.asarray(values * step, np.float32), step
+    largest = float(np.nanmax(np.abs(values))) if values.size else 0.0
+    if largest <= math.pi + 1e-3:
+        return np.asarray(values, np.float32), 0.0
+    if largest <= 180.5:
+        return np.asarray(np.radians(values), np.float32), 0.0
+    raise DataError(path, f"has angles up to {largest:g}, neither rad nor degrees of half a turn.")
+
+
+def _share(view: ViewFiles, role: int, values: NDArray[Any]) -> Image:
+    """A map of 0 to 1: integers of their largest, the mean of colours."""
+    scale = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
+    plane = values if values.ndim == 2 else values.mean(axis=-1)
+    share = np.asarray(plane / scale, np.float32)
+    if role == 2 and np.nanmax(share, initial=0.0) > 1.5:
+        raise DataError(view.files[role][0], "has a degree of polarization far above 1.")
+    return share

@@ -15,10 +15,9 @@ from polmvs.camera import pixel_centers, sample_image
 from polmvs.config import Light
 from polmvs.errors import DataError
 from polmvs.io.arrays import map_array, save_array
-from polmvs.polarization.angle_models import phase_sign
+from polmvs.polarization.angle_models import correct_stokes, phase_sign
 from polmvs.polarization.region import Region, smooth
 from polmvs.polarization.stokes import Stokes
-from polmvs.polarization.tilted import correct_stokes, stokes_solver
 from polmvs.scene import View
 
 Floats = NDArray[np.floating]
@@ -40,8 +39,8 @@ class PhaseMap:
     ----------
     view : camera, pose and name.
     region : where the view shows a polarised surface.
-    samples : (H, W, 3) float32: ``dolp cos 2 phase``, ``dolp sin 2 phase`` and the inverse
-        variance of the row's turn about its ray (1 / rad^2; 0: no phase here).
+    samples : (H, W, 3) float32: ``dolp cos 2 phase``, ``dolp sin 2 phase`` and the phase's inverse
+        variance (1 / rad^2; 0: no phase here): noise and mixed light, whatever the angle model.
     intensity : (H, W) float32, s0 in units of full scale.
     diffuse : (H, W) bool, pixels whose light is diffuse-dominant; the others' is specular.
     lowest_dolp : (H, W) uint8, lowest DoLP of single pixels next to each pixel, in 1/255: what
@@ -108,8 +107,7 @@ def build_phase_map(
     np.nan_to_num(samples, copy=False, nan=0.0)
     diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
     intensity = np.asarray(s0, np.float32)
-    sharp = PhaseMap(view, region, samples, intensity, diffuse, _lowest_dolp(stokes))
-    return _with_doubt(sharp, 1.0, _corrected(sharp))
+    return PhaseMap(view, region, samples, intensity, diffuse, _lowest_dolp(stokes))
 
 
 def _lowest_dolp(stokes: Image) -> NDArray[np.uint8]:
@@ -121,93 +119,37 @@ def _lowest_dolp(stokes: Image) -> NDArray[np.uint8]:
     return np.asarray(lowest, np.uint8)
 
 
-def correct_for_tilt(stokes: Stokes, rays: Floats, diffuse: Mask) -> Stokes:
-    """Stokes images that a sensor obeying PPA would have given, each pixel by its kind of light.
-
-    Parameters
-    ----------
-    stokes : (H, W) images.
-    rays : (H, W, 3), unit, camera frame.
-    diffuse : (H, W) bool, pixels whose light is diffuse-dominant.
-    """
-    solver = stokes_solver(rays)
-    corrected = correct_stokes(stokes, rays, light=Light.SPECULAR, solver=solver)
-    if not diffuse.any():
-        return corrected
-    other = correct_stokes(stokes, rays, light=Light.DIFFUSE, solver=solver)
-    return Stokes(
-        s0=np.where(diffuse, other.s0, corrected.s0),
-        s1=np.where(diffuse, other.s1, corrected.s1),
-        s2=np.where(diffuse, other.s2, corrected.s2),
-        sigma=np.where(diffuse, other.sigma, corrected.sigma),
-        valid=stokes.valid,
-    )
-
-
 def as_tilted(phase_map: PhaseMap) -> PhaseMap:
     """The phase map that a sensor obeying PPA would have given, not stored.
 
-    Presumes that the polarizers are tilted for oblique rays (:mod:`polmvs.polarization.tilted`).
-    The
-    correction is linear in the Stokes parameters and varies slowly over the image, so that it may
-    follow the smoothing.
+    Presumes that the polarizers are tilted for oblique rays
+    (:mod:`polmvs.polarization.angle_models`). The correction is linear in the Stokes parameters
+    and varies slowly over the image, so that it may follow the smoothing.
     """
-    corrected = _corrected(phase_map)
-    sign = _signs(phase_map)
+    sign = np.where(phase_map.diffuse, phase_sign(Light.DIFFUSE), phase_sign(Light.SPECULAR))
+    cos, sin, precision = np.moveaxis(phase_map.samples, -1, 0)
+    measured = Stokes(
+        s0=np.ones_like(sign),
+        s1=sign * cos,
+        s2=sign * sin,
+        sigma=np.ones_like(sign),
+        valid=precision > 0,
+    )
+    corrected = correct_stokes(measured, view_rays(phase_map.view), diffuse=phase_map.diffuse)
     scale = sign / np.maximum(corrected.s0, 1e-6)
     # The turn of a row about its ray stays as certain as it was; that of the phase changes.
-    certain = _with_doubt(phase_map, -1.0, corrected).samples[..., 2]
-    precision = certain / np.square(corrected.sigma)
+    precision = precision / np.square(corrected.sigma)
     samples = np.dstack([scale * corrected.s1, scale * corrected.s2, precision])
     clean = np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
     return replace(phase_map, samples=clean, folder=None, tilted=True)
 
 
-def _signs(phase_map: PhaseMap) -> Image:
-    """Factor (H, W) from twice the AoLP to twice the phase, by each pixel's kind of light."""
-    return np.where(phase_map.diffuse, phase_sign(Light.DIFFUSE), phase_sign(Light.SPECULAR))
-
-
-def _corrected(phase_map: PhaseMap) -> Stokes:
-    """The map's samples as Stokes images of intensity one, corrected for the tilt."""
-    sign = _signs(phase_map)
-    one = np.ones(sign.shape, np.float32)
-    measured = Stokes(
-        s0=one,
-        s1=sign * phase_map.samples[..., 0],
-        s2=sign * phase_map.samples[..., 1],
-        sigma=one,
-        valid=phase_map.samples[..., 2] > 0,
-    )
-    return correct_for_tilt(measured, view_rays(phase_map.view), phase_map.diffuse)
-
-
-def _with_doubt(phase_map: PhaseMap, share: float, corrected: Stokes) -> PhaseMap:
-    """Widen (share 1) each phase's variance by what a tilt of the polarizers would turn it.
-
-    A model that leaves the tilt out does not know whether the lens makes it, so that the turn is a
-    deviation of its phase: oblique rays count less. -1 takes the widening back; from averages of
-    widened phases, whose turns differ, never more than to the least variance there is.
-    """
-    sign = _signs(phase_map)
-    cos, sin, precision = np.moveaxis(phase_map.samples, -1, 0)
-    real = sign * (cos * corrected.s1 + sin * corrected.s2)
-    imaginary = sign * (sin * corrected.s1 - cos * corrected.s2)
-    turn = 0.5 * np.arctan2(imaginary, real)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        variance = np.maximum(1 / precision + share * turn**2, MODEL_SIGMA**2)
-        widened = np.where(precision > 0, 1 / variance, 0)
-    samples = np.dstack([cos, sin, widened]).astype(np.float32)
-    return replace(phase_map, samples=samples, folder=None)
-
-
 def turned(phase_map: PhaseMap, where: Mask) -> PhaseMap:
     """The map with the other kind of light on some pixels, their phase turned; not stored."""
-    sign = np.where(where, -1, 1).astype(np.float32)
-    certain = _with_doubt(phase_map, -1.0, _corrected(phase_map))
-    certain.samples[..., :2] *= sign[..., None]
-    other = replace(certain, diffuse=phase_map.diffuse ^ where)
-    return _with_doubt(other, 1.0, _corrected(other))
+    sign = np.where(where, -1, 1).astype(np.float32)[..., None]
+    axial, precision = phase_map.samples[..., :2], phase_map.samples[..., 2:]
+    samples = np.concatenate([sign * axial, precision], axis=-1)
+    return replace(phase_map, samples=samples, diffuse=phase_map.diffuse ^ where, folder=None)
 
 
 def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:

@@ -1,31 +1,47 @@
-"""Alignment of an estimated world with the true one by the camera centres."""
+"""Alignment of an estimated world with a known one by the camera centres."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
+from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError
-from polmvs.geometry import SimilarityTransform, align_points
-from polmvs.io.ground_truth import GroundTruth
-from polmvs.scene import View
+from polmvs.fitting import like_most
+from polmvs.geometry import SimilarityTransform, align_points, rotation_angle
+from polmvs.scene import View, match_names
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-OUTLIER_RATIO = 5.0  # a camera this many times the median residual off is misregistered
-OUTLIER_FLOOR = 0.005  # ... but never for less than this share of the cameras' spread
-MIN_ROBUST_CAMERAS = 5
-MAX_TRIPLES = 500
+MIN_CAMERAS = 3  # that fix a similarity
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlignmentReport:
+class AlignmentTolerances:
+    """Which cameras count as misregistered; see :func:`polmvs.fitting.like_most`.
+
+    Attributes
+    ----------
+    outlier_floor : residual that is always allowed, as a share of the cameras' spread; a guess,
+        centres are usually good to 0.1 %.
+    min_robust_cameras : from which cameras are left out; derived: of four any three agree.
+    max_triples : of cameras from which the search starts; a guess, bounds the time. Of cameras
+        half of which are wrong one triple in eight is right.
+    """
+
+    outlier_floor: float = 0.005
+    min_robust_cameras: int = 5
+    max_triples: int = 500
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alignment:
     """How the estimated cameras were brought onto the true ones.
 
     Attributes
@@ -50,53 +66,65 @@ class AlignmentReport:
         return len(self.dropped)
 
 
-def align_to_truth(
-    views: Sequence[View], truth: GroundTruth
-) -> tuple[SimilarityTransform, AlignmentReport]:
+def align_views(
+    views: Sequence[View],
+    true_views: Mapping[str, View],
+    *,
+    source: str | PathLike[str] = "known poses",
+    tolerances: AlignmentTolerances = AlignmentTolerances(),
+) -> tuple[SimilarityTransform, Alignment]:
     """Similarity ``truth_from_world`` that takes the estimated camera centres to the true ones.
 
     With five cameras or more, those whose residual exceeds five times the median (and 0.5 % of
     the cameras' spread) are left out; the search starts from the best of many triples, so that
     one camera far away does not hide itself.
 
+    Parameters
+    ----------
+    views : of the estimated world.
+    true_views : by image name, metres; names match exactly, else by stem.
+    source : where the true ones came from, for messages.
+
     Raises
     ------
     DataError
         When fewer than three names match or the centres lie on one line.
     """
-    path = truth.folder / "cameras.json"
-    pairs = [(view, true) for view in views if (true := truth.find(view.name)) is not None]
-    if len(pairs) < 3:
+    matched = match_names([view.name for view in views], true_views)
+    pairs = [(view, true_views[matched[view.name]]) for view in views if view.name in matched]
+    if len(pairs) < MIN_CAMERAS:
         raise DataError(
-            path,
+            source,
             f"knows {len(pairs)} of the {len(views)} reconstructed images by name, alignment needs "
-            "3; give the ground truth of this capture.",
+            f"{MIN_CAMERAS}; give the ground truth of this capture.",
         )
     centers = np.array([view.center_in_world for view, _ in pairs])
     true_centers = np.array([true.center_in_world for _, true in pairs])
     try:
-        truth_from_world, used = align_cameras(centers, true_centers)
+        truth_from_world, used = align_cameras(centers, true_centers, tolerances=tolerances)
     except ValueError as error:
-        raise DataError(path, f"cameras cannot be aligned: {error}") from error
+        raise DataError(source, f"cameras cannot be aligned: {error}") from error
     residuals = align_residuals(truth_from_world, centers[used], true_centers[used])
-    rotation_errors = [
-        _rotation_error_deg(view, true, truth_from_world)
+    turns = [
+        rotation_angle(
+            view.cam_from_world.rotation, true.cam_from_world.rotation @ truth_from_world.rotation
+        )
         for (view, true), is_used in zip(pairs, used, strict=True)
         if is_used
     ]
-    report = AlignmentReport(
+    names = [view.name for view, _ in pairs]
+    return truth_from_world, Alignment(
         scale=truth_from_world.scale,
         rms_residual_mm=1e3 * float(np.sqrt((residuals**2).mean())),
         num_cameras=int(used.sum()),
-        dropped=tuple(
-            view.name for (view, _), is_used in zip(pairs, used, strict=True) if not is_used
-        ),
-        rotation_error_median_deg=float(np.median(rotation_errors)),
+        dropped=tuple(name for name, is_used in zip(names, used, strict=True) if not is_used),
+        rotation_error_median_deg=float(np.degrees(np.median(turns))),
     )
-    return truth_from_world, report
 
 
-def align_cameras(centers: Array, true_centers: Array) -> tuple[SimilarityTransform, Mask]:
+def align_cameras(
+    centers: Array, true_centers: Array, *, tolerances: AlignmentTolerances = AlignmentTolerances()
+) -> tuple[SimilarityTransform, Mask]:
     """Least-squares similarity from the camera centres that one similarity explains.
 
     Parameters
@@ -115,7 +143,7 @@ def align_cameras(centers: Array, true_centers: Array) -> tuple[SimilarityTransf
     ValueError
         For fewer than three cameras, or centres on one line.
     """
-    used = _consistent_cameras(centers, true_centers)
+    used = _consistent_cameras(centers, true_centers, tolerances)
     return align_points(centers[used], true_centers[used]), used
 
 
@@ -124,30 +152,31 @@ def align_residuals(transform: SimilarityTransform, source: Array, target: Array
     return np.asarray(np.linalg.norm(transform * source - target, axis=1))
 
 
-def _consistent_cameras(centers: Array, true_centers: Array) -> Mask:
-    """Which cameras one similarity explains; all of them when there are fewer than five."""
+def _consistent_cameras(
+    centers: Array, true_centers: Array, tolerances: AlignmentTolerances
+) -> Mask:
+    """Which cameras one similarity explains; all of them when there are few."""
     used = np.ones(len(centers), np.bool_)
-    if len(centers) < MIN_ROBUST_CAMERAS:
+    if len(centers) < tolerances.min_robust_cameras:
         return used
     spread = float(np.sqrt(((true_centers - true_centers.mean(axis=0)) ** 2).sum(1).mean()))
-    used = _best_majority(centers, true_centers)
-    for _ in range(10):
-        residuals = align_residuals(
-            align_points(centers[used], true_centers[used]), centers, true_centers
-        )
-        limit = max(OUTLIER_RATIO * float(np.median(residuals)), OUTLIER_FLOOR * spread)
-        if np.array_equal(residuals <= limit, used):
+    used = _best_majority(centers, true_centers, tolerances.max_triples)
+    for _ in range(len(centers)):
+        transform = align_points(centers[used], true_centers[used])
+        residuals = align_residuals(transform, centers, true_centers)
+        again = like_most(residuals, floor=tolerances.outlier_floor * spread)
+        if np.array_equal(again, used):
             break
-        used = residuals <= limit
+        used = again
     return used
 
 
-def _best_majority(centers: Array, true_centers: Array) -> Mask:
+def _best_majority(centers: Array, true_centers: Array, max_triples: int) -> Mask:
     """The majority of cameras that the alignment of some three of them explains best."""
     num = len(centers)
-    majority = max(num // 2 + 1, 4)  # three alone would always agree well enough
+    majority = max(num // 2 + 1, MIN_CAMERAS + 1)  # three alone would always agree well enough
     best, best_residuals = np.inf, np.zeros(num)
-    for triple in _triples(num):
+    for triple in _triples(num, max_triples):
         try:
             transform = align_points(centers[triple], true_centers[triple])
         except ValueError:
@@ -159,16 +188,9 @@ def _best_majority(centers: Array, true_centers: Array) -> Mask:
     return best_residuals <= best
 
 
-def _triples(num: int) -> list[list[int]]:
+def _triples(num: int, most: int) -> list[list[int]]:
     """All triples of indices, or a fixed random choice of them."""
-    if comb(num, 3) <= MAX_TRIPLES:
-        return [list(triple) for triple in combinations(range(num), 3)]
+    if comb(num, MIN_CAMERAS) <= most:
+        return [list(triple) for triple in combinations(range(num), MIN_CAMERAS)]
     rng = np.random.default_rng(0)
-    return [rng.choice(num, 3, replace=False).tolist() for _ in range(MAX_TRIPLES)]
-
-
-def _rotation_error_deg(view: View, true: View, truth_from_world: SimilarityTransform) -> float:
-    """Angle between the estimated orientation and the true one, degrees."""
-    expected = true.cam_from_world.rotation @ truth_from_world.rotation
-    chord = float(np.linalg.norm(view.cam_from_world.rotation - expected))
-    return float(np.degrees(2.0 * np.arcsin(min(chord / np.sqrt(8.0), 1.0))))
+    return [rng.choice(num, MIN_CAMERAS, replace=False).tolist() for _ in range(most)]

@@ -14,20 +14,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.colmap.models import read_model
-from polmvs.colmap.sparse_model import match_model_to_capture, write_model
+from polmvs.colmap.models import match_model_to_capture, read_model, write_model
+from polmvs.colmap.sfm import SfmTolerances
 from polmvs.errors import DataError, OptionError
+from polmvs.geometry import intersect_rays
 from polmvs.io.ground_truth import read_views as read_known_views
-from polmvs.normals.tracks import some_tracks
-from polmvs.poses.metric_frame import match_names
-from polmvs.poses.triangulation import intersect_rays
-from polmvs.scene import SparseModel, Tracks, View
+from polmvs.scene import SparseModel, Tracks, View, match_names, some_tracks
 
 Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-MAX_ERROR_PX = 2.0  # mean of a track: several times a keypoint's noise, less than a wrong match
+# Mean of a track, px: as SfM asks of its own, several keypoints' noise and less than a mismatch.
+MAX_ERROR_PX = SfmTolerances().max_reproj_error_px
 
 
 def write_known_poses(sparse: Path, cameras: Path, new: Path) -> SparseModel:
@@ -50,19 +49,19 @@ def write_known_poses(sparse: Path, cameras: Path, new: Path) -> SparseModel:
     if new.exists():
         raise OptionError(f"{new}: exists. Give another NEW_MODEL.")
     known = read_known_views(cameras)
-    model = with_known_poses(read_model(sparse), known, source=cameras)
-    write_model(model, new)
-    return model
+    sparse_model = with_known_poses(read_model(sparse), known, source=cameras)
+    write_model(sparse_model, new)
+    return sparse_model
 
 
 def with_known_poses(
-    model: SparseModel, known: Mapping[str, View], *, source: str | Path = "known poses"
+    sparse_model: SparseModel, known: Mapping[str, View], *, source: str | Path = "known poses"
 ) -> SparseModel:
     """Put known views in the place of a model's and triangulate its tracks anew.
 
     Parameters
     ----------
-    model : of the same images; its cameras may have another size of the same aspect ratio.
+    sparse_model : of the same images; its cameras may have another size of the same aspect ratio.
     known : views by image name, all of one size; names match exactly, else by stem.
     source : where they came from, for messages.
 
@@ -77,8 +76,8 @@ def with_known_poses(
     DataError
         Fewer than two images are known, or no track fits the poses.
     """
-    names = [view.name for view in model.views]
-    num_known = len(match_names(list(known), names))
+    names = [view.name for view in sparse_model.views]
+    num_known = len(match_names(names, known))
     if num_known < 2:
         raise DataError(
             source,
@@ -86,10 +85,12 @@ def with_known_poses(
             f"are like {next(iter(known), '')!r}, the model's like {names[0]!r}.",
         )
     camera = next(iter(known.values())).camera
-    fitted = match_model_to_capture(model, list(known), camera.width, camera.height, source=source)
+    fitted = match_model_to_capture(
+        sparse_model, list(known), camera.width, camera.height, source=source
+    )
     views = tuple(known[view.name] for view in fitted.views)
     tracks = retriangulate(views, fitted.tracks)
-    num_tracks, num_before = len(tracks.point3D_ids), len(model.tracks.point3D_ids)
+    num_tracks, num_before = len(tracks.point3D_ids), len(sparse_model.tracks.point3D_ids)
     if num_tracks == 0:
         raise DataError(
             source,
@@ -129,7 +130,7 @@ def _intersect(views: Sequence[View], tracks: Tracks) -> Array:
     for k, view in enumerate(views):
         own = tracks.obs_view == k
         centers[own] = view.center_in_world
-        rays[own] = view.camera.rays(tracks.obs_xy[own]) @ view.cam_from_world.rotation
+        rays[own] = view.rays_in_world(tracks.obs_xy[own])
     points = np.full((len(tracks.point3D_ids), 3), np.nan)
     # Tracks of equally many observations make a batch; their rays lie together once sorted.
     order = np.argsort(tracks.obs_track, kind="stable")
@@ -147,7 +148,7 @@ def _mean_errors(views: Sequence[View], points: Array, tracks: Tracks) -> Array:
     errors = np.zeros(len(tracks.obs_view))
     for k, view in enumerate(views):
         own = tracks.obs_view == k
-        xy = view.camera.project(view.cam_from_world * points[tracks.obs_track[own]])
+        xy = view.project(points[tracks.obs_track[own]])
         errors[own] = np.linalg.norm(xy - tracks.obs_xy[own], axis=1)
     count = np.bincount(tracks.obs_track, minlength=len(points))
     total = np.bincount(tracks.obs_track, errors, len(points))

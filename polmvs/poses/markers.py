@@ -1,4 +1,4 @@
-"""Printed ArUco markers in the images, their corners to a fraction of a pixel.
+"""Printed ArUco markers: found in the images, triangulated, and measured, which gives the scale.
 
 The detector gives corners to about a pixel, and OpenCV's refinement pulls those of a blurred
 square inwards by several tenths of a pixel, all alike, which would make the scale wrong by a
@@ -9,8 +9,10 @@ does not bend them.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -19,19 +21,81 @@ from scipy.integrate import trapezoid
 
 from polmvs.camera import Camera, sample_image, xy_from_opencv
 from polmvs.errors import DataError, OptionError
+from polmvs.fitting import MEDIAN_OF_NORMAL, cauchy_weights, like_most
+from polmvs.geometry import intersect_rays
 from polmvs.polarization.capture import DISPLAY_GAMMA
-from polmvs.scene import View
+from polmvs.scene import View, short_list
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Gray = NDArray[np.uint8]
+
+logger = logging.getLogger(__name__)
 
 NUM_PROFILES = 32  # across each edge
 NUM_SAMPLES = 25  # of a profile
-EDGE_SHARE = 0.15  # of an edge's length beside each corner, where the other edge's blur reaches
-MIN_REACH_PX, MAX_REACH_PX = 1.5, 3.0  # of a profile to each side; covers blur and first error
-MIN_CONTRAST = 0.02  # of white, in linear light; half a step of 8 bits there is 0.002
-REFINEMENTS = 4
-ROBUST_ROUNDS = 4
+ROUNDS = 8  # of a fit; each converges in three or four
+DIFFERENCE = 1e-6  # step of numerical derivatives, as a share of the depth
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeTolerances:
+    """How the edges of a marker are found; lengths in px, which are those of the lens's blur.
+
+    Attributes
+    ----------
+    corner_share : of an edge's length beside each corner that is left out; a guess, there the
+        blur of the other edge reaches.
+    reach_px : of a profile to each side, least and most; a guess: it covers the blur and the
+        error of the detector's corners, and ends half-way into the marker's outer module.
+    min_contrast : of white, in linear light; a guess: half a step of 8 bits is 0.002 there.
+    """
+
+    corner_share: float = 0.15
+    reach_px: tuple[float, float] = (1.5, 3.0)
+    min_contrast: float = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class TriangulationTolerances:
+    """Which views agree on a marker, and what a corner's error is; px, those of a keypoint.
+
+    Attributes
+    ----------
+    max_pairs : of views from which the search starts; a guess, bounds the time.
+    outlier_floor_px : error that is always allowed; a guess, that of a good pose.
+    max_residual_px : error that never is; COLMAP too drops observations beyond this.
+    huber_px : of the robust loss; a guess, beyond the noise of a refined corner (0.1 px) and of
+        a usual pose (0.3 px).
+    min_sigma_px : of a corner; a guess: few residuals can be small by chance.
+    """
+
+    max_pairs: int = 200
+    outlier_floor_px: float = 1.0
+    max_residual_px: float = 4.0
+    huber_px: float = 0.5
+    min_sigma_px: float = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleTolerances:
+    """When two measures of one length agree, and when one is too uncertain to be of use.
+
+    Attributes
+    ----------
+    num_sigmas : standard deviations that they may differ by; derived: one pair in 16,000 of
+        normal errors does.
+    floor : relative difference that is always allowed; a guess, paper and print are no better.
+    max_relative_sigma : of a marker's side; a guess.
+    """
+
+    num_sigmas: float = 4.0
+    floor: float = 0.01
+    max_relative_sigma: float = 0.1
+
+    def allowed(self, relative_sigma: float) -> float:
+        """Relative difference that is allowed at a standard deviation of it."""
+        return max(self.num_sigmas * relative_sigma, self.floor)
 
 
 @dataclass(frozen=True)
@@ -127,7 +191,12 @@ def find_markers(image: Gray, camera: Camera, dictionary: int) -> dict[int, Arra
 
 
 def refine_corners(
-    linear: NDArray[np.float32], camera: Camera, corners: NDArray[np.floating], num_modules: int
+    linear: NDArray[np.float32],
+    camera: Camera,
+    corners: NDArray[np.floating],
+    num_modules: int,
+    *,
+    tolerances: EdgeTolerances = EdgeTolerances(),
 ) -> Array:
     """Corners of a black square on white from lines fitted to its four edges.
 
@@ -143,10 +212,10 @@ def refine_corners(
         NaN where an edge is not found or leaves the image, or a corner moved out of reach.
     """
     sides_px = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
-    reach = float(np.clip(sides_px.min() / num_modules / 2, MIN_REACH_PX, MAX_REACH_PX))
+    reach = float(np.clip(sides_px.min() / num_modules / 2, *tolerances.reach_px))
     rays = camera.rays(corners)
-    for _ in range(REFINEMENTS):
-        edge_xy = _edge_points(linear, camera, rays, reach)
+    for _ in range(ROUNDS):
+        edge_xy = _edge_points(linear, camera, rays, reach, tolerances)
         planes = _fit_planes(camera.rays(edge_xy))
         # The corner lies on the edge that ends in it and on the one that begins there.
         rays = np.cross(np.roll(planes, 1, axis=0), planes)
@@ -158,9 +227,16 @@ def refine_corners(
     return refined if (moved <= np.sqrt(2) * reach).all() else np.full((4, 2), np.nan)
 
 
-def _edge_points(linear: NDArray[np.float32], camera: Camera, rays: Array, reach: float) -> Array:
+def _edge_points(
+    linear: NDArray[np.float32],
+    camera: Camera,
+    rays: Array,
+    reach: float,
+    tolerances: EdgeTolerances,
+) -> Array:
     """Points ``(4, P, 2)`` on the edges between the corners' rays ``(4, 3)``; NaN where none."""
-    along = np.linspace(EDGE_SHARE, 1 - EDGE_SHARE, NUM_PROFILES)[:, None]
+    beside = tolerances.corner_share
+    along = np.linspace(beside, 1 - beside, NUM_PROFILES)[:, None]
     between = (1 - along) * rays[:, None] + along * np.roll(rays, -1, axis=0)[:, None]
     xy = np.asarray(camera.project(between), np.float64)  # (4, P, 2)
     tangent = np.gradient(xy, axis=1)
@@ -174,7 +250,7 @@ def _edge_points(linear: NDArray[np.float32], camera: Camera, rays: Array, reach
     profiles = sample_image(linear, places).astype(np.float64)
     dark = profiles[..., :2].sum(axis=-1) / 2  # the inner end
     bright = profiles[..., -2:].sum(axis=-1) / 2
-    step = np.where(inside & (bright - dark > MIN_CONTRAST), bright - dark, np.nan)
+    step = np.where(inside & (bright - dark > tolerances.min_contrast), bright - dark, np.nan)
     # A step at x, however blurred, has the area reach - x under its profile.
     area = trapezoid((profiles - dark[..., None]) / step[..., None], offsets, axis=-1)
     return np.asarray(xy + (reach - area)[..., None] * outward)
@@ -190,10 +266,343 @@ def _fit_planes(rays: Array) -> Array:
         return np.full((4, 3), np.nan)
     rays = np.where(valid[..., None], rays, 0.0)
     weights = valid.astype(np.float64)
-    for _ in range(ROBUST_ROUNDS):
+    for _ in range(ROUNDS):
         normals = np.linalg.svd(weights[..., None] * rays, full_matrices=False)[2][:, -1]
         residuals = np.abs(np.einsum("epk,ek->ep", rays, normals))
-        scale = 3 * np.nanmedian(np.where(valid, residuals, np.nan), axis=1)
-        share = residuals / np.maximum(scale, 1e-9).reshape(-1, 1)
-        weights = np.where(valid, 1 / (1 + share**2), 0.0)  # Geman and McClure
+        median = np.nanmedian(np.where(valid, residuals, np.nan), axis=1, keepdims=True)
+        # The scale of the Cauchy loss in medians; rays are unit, exact edges have no residual.
+        squares = np.square(residuals / np.maximum(median / MEDIAN_OF_NORMAL, 1e-9))
+        weights = np.where(valid, cauchy_weights(squares), 0.0)
     return np.asarray(normals)
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """Points seen together by several views.
+
+    Attributes
+    ----------
+    points : (K, 3) float64, world.
+    covariances : (K, 3, 3) float64, of the points, world units squared; errors of the poses count
+        as far as they show in the residuals.
+    used : (V,) bool, views that agree.
+    rms_px : RMS distance between the points' projections and where the used views show them.
+    """
+
+    points: Array
+    covariances: Array
+    used: Mask
+    rms_px: float
+
+
+def triangulate_together(
+    views: Sequence[View],
+    xy: Array,
+    *,
+    tolerances: TriangulationTolerances = TriangulationTolerances(),
+) -> Triangulation | None:
+    """Triangulate points from the majority of views that agree on all of them.
+
+    The start is the pair of views whose intersection the majority confirms best; least squares
+    on pixels follows, with a robust loss.
+
+    Parameters
+    ----------
+    views : V views.
+    xy : (V, K, 2), image coordinates of K points in each.
+
+    Returns
+    -------
+    Triangulation or None
+        None where fewer than two views, or no majority of them, agree.
+    """
+    num = len(views)
+    if xy.ndim != 3 or len(xy) != num or xy.shape[2] != 2:
+        raise ValueError(f"{xy.shape=} but expected ({num}, K, 2).")
+    start = _best_pair(views, xy, tolerances) if num >= 2 else None
+    if start is None:
+        return None
+    points, used = start, _agreeing(_errors(views, start, xy), tolerances)
+    for _ in range(ROUNDS):
+        if used.sum() < 2 or 2 * used.sum() <= num:
+            return None
+        points = _refine(views, points, xy, used, tolerances)
+        again = _agreeing(_errors(views, points, xy), tolerances)
+        if np.array_equal(again, used):
+            break
+        used = again
+    if used.sum() < 2 or 2 * used.sum() <= num:
+        return None
+    return _with_uncertainty(views, points, xy, used, tolerances)
+
+
+def _best_pair(
+    views: Sequence[View], xy: Array, tolerances: TriangulationTolerances
+) -> Array | None:
+    """Points ``(K, 3)`` from the two views that the majority agrees with best."""
+    centers = np.array([view.center_in_world for view in views])
+    rays = np.array([view.rays_in_world(own) for view, own in zip(views, xy, strict=True)])
+    pairs = np.array(list(combinations(range(len(views)), 2)))
+    if len(pairs) > tolerances.max_pairs:
+        pairs = np.random.default_rng(0).choice(pairs, tolerances.max_pairs, replace=False)
+    pair_rays = rays[pairs].swapaxes(1, 2)  # (P, K, 2, 3)
+    pair_centers = np.broadcast_to(centers[pairs][:, None], pair_rays.shape)
+    points = intersect_rays(pair_centers, pair_rays)  # (P, K, 3)
+    errors = np.array([_errors(views, candidate, xy) for candidate in points])
+    majority = max(len(views) // 2 + 1, 2)
+    scores = np.partition(errors, majority - 1, axis=1)[:, majority - 1]
+    best = int(scores.argmin())
+    return points[best] if np.isfinite(scores[best]) else None
+
+
+def _errors(views: Sequence[View], points: Array, xy: Array) -> Array:
+    """RMS distance ``(V,)`` of the points' projections, px; infinite where one is not visible."""
+    offsets = np.array([view.project(points) for view in views], np.float64) - xy
+    rms = np.sqrt(np.square(offsets).sum(axis=-1).mean(axis=-1))
+    return np.where(np.isfinite(rms), rms, np.inf)
+
+
+def _agreeing(errors: Array, tolerances: TriangulationTolerances) -> Mask:
+    """Views whose error is like that of most."""
+    return like_most(errors, floor=tolerances.outlier_floor_px, ceiling=tolerances.max_residual_px)
+
+
+def _refine(
+    views: Sequence[View],
+    points: Array,
+    xy: Array,
+    used: Mask,
+    tolerances: TriangulationTolerances,
+) -> Array:
+    """A few rounds of Gauss-Newton on the pixels of the used views."""
+    for _ in range(ROUNDS):
+        information, gradient, _ = _normal_equations(views, points, xy, used, tolerances.huber_px)
+        points = points - np.linalg.solve(information, gradient[..., None])[..., 0]
+    return points
+
+
+def _normal_equations(
+    views: Sequence[View], points: Array, xy: Array, used: Mask, huber_px: float
+) -> tuple[Array, Array, Array]:
+    """Information ``(K, 3, 3)``, gradient ``(K, 3)`` and squared errors ``(V, K)``, weighted."""
+    information = np.zeros((len(points), 3, 3))
+    gradient = np.zeros((len(points), 3))
+    squared = np.zeros(xy.shape[:2])
+    for k in map(int, np.flatnonzero(used)):
+        residuals, jacobian = _residuals(views[k], points, xy[k])
+        error = np.linalg.norm(residuals, axis=-1)
+        weight = huber_px / np.maximum(error, huber_px)
+        information += np.einsum("k,kai,kaj->kij", weight, jacobian, jacobian)
+        gradient += np.einsum("k,kai,ka->ki", weight, jacobian, residuals)
+        squared[k] = weight * error**2
+    # Rays nearly parallel: a touch of damping keeps the solution finite, the covariance tells.
+    trace = np.trace(information, axis1=1, axis2=2)
+    return information + 1e-12 * trace[:, None, None] * np.eye(3), gradient, squared
+
+
+def _residuals(view: View, points: Array, xy: Array) -> tuple[Array, Array]:
+    """Errors ``(K, 2)``, px, and their derivatives ``(K, 2, 3)`` by the points in the world."""
+    in_cam = np.asarray(view.cam_from_world * points)
+    step = DIFFERENCE * np.abs(in_cam[:, 2])
+    shifts = step[:, None, None] * np.eye(3)
+    ahead = view.camera.project(in_cam[:, None] + shifts)
+    behind = view.camera.project(in_cam[:, None] - shifts)
+    by_cam = ((ahead - behind) / (2 * step[:, None, None])).swapaxes(1, 2)
+    residuals = np.asarray(view.camera.project(in_cam) - xy, np.float64)
+    return residuals, np.asarray(by_cam @ view.cam_from_world.rotation, np.float64)
+
+
+def _with_uncertainty(
+    views: Sequence[View],
+    points: Array,
+    xy: Array,
+    used: Mask,
+    tolerances: TriangulationTolerances,
+) -> Triangulation:
+    information, _, squared = _normal_equations(views, points, xy, used, tolerances.huber_px)
+    num_free = 2 * int(used.sum()) * len(points) - 3 * len(points)
+    sigma = max(float(np.sqrt(squared.sum() / num_free)), tolerances.min_sigma_px)
+    errors = _errors(views, points, xy)[used]
+    return Triangulation(
+        points=points,
+        covariances=np.asarray(sigma**2 * np.linalg.inv(information), np.float64),
+        used=used,
+        rms_px=float(np.sqrt((errors**2).mean())),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerMeasure:
+    """Side of the markers in the model.
+
+    Attributes
+    ----------
+    side : world units.
+    relative_sigma : its standard deviation as a share of it.
+    rms_residual_px : of the corners, px.
+    marker_ids : measured markers.
+    num_views : that show at least one of them.
+    dropped : what is left out, as ``marker ID in NAME``.
+    """
+
+    side: float
+    relative_sigma: float
+    rms_residual_px: float
+    marker_ids: tuple[int, ...]
+    num_views: int
+    dropped: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Square:
+    """One triangulated marker; ``lengths`` and ``sigmas`` (6,): four sides, two diagonals / √2."""
+
+    marker_id: int
+    views: tuple[int, ...]
+    rejected: tuple[int, ...]
+    rms_px: float
+    side: float
+    side_sigma: float
+    lengths: Array
+    sigmas: Array
+
+
+def measure_markers(
+    views: Sequence[View],
+    detections: Sequence[Detection],
+    *,
+    source: str,
+    tolerances: ScaleTolerances = ScaleTolerances(),
+) -> MarkerMeasure:
+    """Common side of the markers, each triangulated from all views that show it.
+
+    Parameters
+    ----------
+    views : posed.
+    detections : of one printed size.
+    source : the option, for messages.
+
+    Raises
+    ------
+    DataError
+        No marker is seen from two views that agree, one is not square by more than its
+        uncertainty and 1 %, two differ in size by more than that, or the size is not known to
+        10 %.
+    """
+    by_id: dict[int, list[Detection]] = {}
+    for detection in detections:
+        by_id.setdefault(detection.marker_id, []).append(detection)
+    if not by_id:
+        raise DataError(
+            source,
+            f"no such marker is found in the {len(views)} images. Check the dictionary; a marker "
+            "needs a white margin and some 20 px or more.",
+        )
+    squares, faults = [], []
+    for marker_id, seen in sorted(by_id.items()):
+        square = _measure(views, marker_id, seen, tolerances)
+        if isinstance(square, str):
+            faults.append(square)
+        else:
+            squares.append(square)
+    if not squares:
+        raise DataError(source, f"{faults[0]}. Take more images of it, from several sides.")
+    for fault in faults:
+        logger.warning("%s: %s; it is left out.", source, fault)
+    _require_square(squares, source, tolerances)
+    _require_one_size(squares, source, tolerances)
+    return _combine(views, squares, source)
+
+
+def _measure(
+    views: Sequence[View], marker_id: int, seen: Sequence[Detection], tolerances: ScaleTolerances
+) -> _Square | str:
+    """The triangulated marker, or what is wrong with it."""
+    names = [views[d.view].name for d in seen]
+    if len(seen) < 2:
+        return f"marker {marker_id} is seen in one view only ({names[0]})"
+    result = triangulate_together(
+        [views[d.view] for d in seen], np.array([d.corners for d in seen])
+    )
+    if result is None:
+        return f"the {len(seen)} views of marker {marker_id} contradict each other"
+    square = _square(marker_id, seen, result)
+    relative_sigma = square.side_sigma / square.side
+    if not relative_sigma <= tolerances.max_relative_sigma:
+        return (
+            f"the size of marker {marker_id} is known to {100 * relative_sigma:.0f} % only, its "
+            f"{int(result.used.sum())} views ({short_list(names)}) are too much alike"
+        )
+    return square
+
+
+def _square(marker_id: int, seen: Sequence[Detection], result: Triangulation) -> _Square:
+    """Lengths of a triangulated marker, with their standard deviations."""
+    ends = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)])
+    shrink = np.array([1.0, 1.0, 1.0, 1.0, np.sqrt(0.5), np.sqrt(0.5)])  # a square's diagonals
+    offsets = result.points[ends[:, 1]] - result.points[ends[:, 0]]
+    distances = np.linalg.norm(offsets, axis=1)
+    along = offsets / distances[:, None]
+    covariances = result.covariances[ends].sum(axis=1)
+    sigmas = np.sqrt(np.einsum("li,lij,lj->l", along, covariances, along))
+    # Each corner moves the two sides that meet in it.
+    pull = (np.roll(along[:4], 1, axis=0) - along[:4]) / 4
+    side_variance = np.einsum("ki,kij,kj->", pull, result.covariances, pull)
+    return _Square(
+        marker_id=marker_id,
+        views=tuple(d.view for d, used in zip(seen, result.used, strict=True) if used),
+        rejected=tuple(d.view for d, used in zip(seen, result.used, strict=True) if not used),
+        rms_px=result.rms_px,
+        side=float(distances[:4].mean()),
+        side_sigma=float(np.sqrt(side_variance)),
+        lengths=distances * shrink,
+        sigmas=sigmas * shrink,
+    )
+
+
+def _require_square(squares: Sequence[_Square], source: str, tolerances: ScaleTolerances) -> None:
+    for square in squares:
+        allowed = np.maximum(tolerances.num_sigmas * square.sigmas, tolerances.floor * square.side)
+        if (np.abs(square.lengths - square.side) > allowed).any():
+            shares = ", ".join(f"{100 * share:.1f}" for share in square.lengths / square.side)
+            raise DataError(
+                source,
+                f"marker {square.marker_id} is not square: its sides and its diagonals / √2 are "
+                f"{shares} % of the mean side. Print it flat and unstretched, or leave it out.",
+            )
+
+
+def _require_one_size(squares: Sequence[_Square], source: str, tolerances: ScaleTolerances) -> None:
+    for one, two in combinations(squares, 2):
+        sigma = np.hypot(one.side_sigma / one.side, two.side_sigma / two.side)
+        ratio = two.side / one.side
+        if abs(np.log(ratio)) > tolerances.allowed(float(sigma)):
+            raise DataError(
+                source,
+                f"markers {one.marker_id} and {two.marker_id} differ in size by a factor of "
+                f"{ratio:.4g}, their scales contradict each other. Leave out one of them.",
+            )
+
+
+def _combine(views: Sequence[View], squares: Sequence[_Square], source: str) -> MarkerMeasure:
+    """Mean of the markers, weighted by their certainty."""
+    weights = np.array([square.side_sigma**-2 for square in squares])
+    sides = np.array([square.side for square in squares])
+    side = float((weights * sides).sum() / weights.sum())
+    num_views = np.array([len(square.views) for square in squares])
+    squared = np.array([square.rms_px**2 for square in squares])
+    dropped = tuple(
+        f"marker {square.marker_id} in {views[k].name}"
+        for square in squares
+        for k in square.rejected
+    )
+    if dropped:
+        logger.warning("%s: does not fit and is left out: %s.", source, short_list(dropped))
+    return MarkerMeasure(
+        side=side,
+        relative_sigma=float(weights.sum() ** -0.5) / side,
+        rms_residual_px=float(np.sqrt((num_views * squared).sum() / num_views.sum())),
+        marker_ids=tuple(square.marker_id for square in squares),
+        num_views=len({k for square in squares for k in square.views}),
+        dropped=dropped,
+    )

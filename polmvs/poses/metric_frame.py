@@ -6,30 +6,60 @@ only, and the frame's origin and axes stay. Several sources must agree in scale.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import json
+import logging
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.colmap.sparse_model import short_list
+from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError, OptionError
-from polmvs.geometry import RigidTransform, SimilarityTransform
-from polmvs.normals.tracks import point_sigmas, some_tracks
-from polmvs.poses.alignment import align_cameras, align_residuals
-from polmvs.scene import SparseModel
+from polmvs.geometry import SimilarityTransform, nearest_rotation
+from polmvs.poses.alignment import MIN_CAMERAS, align_cameras, align_residuals
+from polmvs.poses.markers import (
+    ScaleTolerances,
+    detect_markers,
+    measure_markers,
+    parse_marker_option,
+)
+from polmvs.scene import (
+    SparseModel,
+    find_name,
+    match_names,
+    point_sigmas,
+    short_list,
+    some_tracks,
+)
 
 Array = NDArray[np.float64]
+ImageLoader = Callable[[str], NDArray[np.uint8]]
 
-MIN_CAMERAS = 3
-# Rotation about the line through the cameras: centres are good to about 0.1 % of their spread, so
-# that a breadth of 1 % leaves it uncertain by 0.1 rad.
-MIN_BREADTH = 0.01  # breadth of the camera centres over their length
-MAX_TURN_SIGMA = 0.1  # rad, of the same rotation as the residuals tell it
-MAX_MISFIT = 0.2  # RMS residual over the cameras' spread; unrelated centres give about 1
-SIGMA_LIMIT = 4.0  # standard deviations that two scales may differ by
-AGREEMENT_FLOOR = 0.01  # relative difference of two scales that is always allowed
+logger = logging.getLogger(__name__)
+
+SCALE_TOLERANCES = ScaleTolerances()
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameTolerances:
+    """When known camera centres fix a frame.
+
+    Attributes
+    ----------
+    min_breadth : breadth of the camera centres over their length; derived: centres are good to
+        about 0.1 % of their spread, so that 1 % leaves the rotation about the line through them
+        uncertain by 0.1 rad.
+    max_turn_sigma : rad, of the same rotation as the residuals tell it; likewise.
+    max_relative_rms : RMS residual over the cameras' spread; a guess, unrelated centres give
+        about 1.
+    """
+
+    min_breadth: float = 0.01
+    max_turn_sigma: float = 0.1
+    max_relative_rms: float = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,33 +92,87 @@ class Frame:
         return self.metric_from_world.scale
 
 
-def find_name(name: str, names: Iterable[str]) -> str | None:
-    """The one of some names that is meant: the same, else the only one with the same stem."""
-    available = set(names)
-    if name in available:
-        return name
-    stem = PurePosixPath(name).stem
-    same = [other for other in available if PurePosixPath(other).stem == stem]
-    return same[0] if len(same) == 1 else None
+def check_reference(options: ReferenceOptions) -> None:
+    """Refuse what is wrong with the options or the file, before a model is there.
 
-
-def match_names(known: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """Which of the known names each image has; images without one are left out.
-
-    A known name is used once, so that ``a/0.png`` and ``b/0.png`` do not share a ``0.png``.
+    Raises
+    ------
+    DataError, OptionError
+        The file is unusable, or the dictionary of markers is unknown.
     """
-    found = {name: find_name(name, known) for name in names}
-    matched = {name: other for name, other in found.items() if other is not None}
-    owners: dict[str, list[str]] = {}
-    for name, other in matched.items():
-        owners.setdefault(other, []).append(name)
-    return {
-        name: other for name, other in matched.items() if name == other or len(owners[other]) == 1
-    }
+    if options.reference is not None:
+        read_centers(options.reference)
+    if options.aruco is not None:
+        parse_marker_option(options.aruco)
+
+
+def metric_frame(
+    sparse_model: SparseModel, options: ReferenceOptions, load_image: ImageLoader
+) -> Frame | None:
+    """Metric frame from the sources that the options name; None where they name none.
+
+    Parameters
+    ----------
+    sparse_model : in its own frame.
+    options : sources; the first of reference, aruco and scale decides, the others check it.
+    load_image : gives the 8-bit intensity image ``(H, W)`` of a view by its name; used for
+        markers only.
+
+    Raises
+    ------
+    DataError
+        A source does not fix the scale (too few cameras, no marker, contradictory markers, ...).
+    OptionError
+        An option is malformed, names what the model lacks, or two sources contradict each other.
+    """
+    check_reference(options)
+    frames = []
+    if options.reference is not None:
+        centers = read_centers(options.reference)
+        frames.append(frame_from_centers(sparse_model, centers, options.reference))
+    if options.aruco is not None:
+        frames.append(frame_from_markers(sparse_model, options.aruco, load_image))
+    if options.scale is not None:
+        frames.append(frame_from_distance(sparse_model, *options.scale))
+    if not frames:
+        return None
+    first, *others = frames
+    for other in others:
+        require_agreement(first, other)
+    frame = replace(first, checked_by=tuple((other.source, other.scale) for other in others))
+    logger.info("metric scale %.6g m per unit, from %s.", frame.scale, frame.source)
+    return frame
+
+
+def frame_from_markers(sparse_model: SparseModel, option: str, load_image: ImageLoader) -> Frame:
+    """Scale from printed ArUco markers, ``option`` being ``DICT:SIZE`` with the side in metres.
+
+    Raises
+    ------
+    DataError
+        No marker is found in two views, or markers contradict themselves or each other.
+    OptionError
+        The option is malformed or the dictionary unknown.
+    """
+    dictionary, size_m = parse_marker_option(option)
+    detections = detect_markers(sparse_model.views, dictionary, load_image)
+    result = measure_markers(sparse_model.views, detections, source=f"--aruco {option}")
+    return Frame(
+        metric_from_world=scaling(size_m / result.side),
+        source="aruco",
+        relative_sigma=result.relative_sigma,
+        rms_residual=result.rms_residual_px,
+        num_used=result.num_views,
+        dropped=result.dropped,
+    )
 
 
 def frame_from_centers(
-    model: SparseModel, known_centers: Mapping[str, Array], source: str | Path
+    sparse_model: SparseModel,
+    known_centers: Mapping[str, Array],
+    source: str | Path,
+    *,
+    tolerances: FrameTolerances = FrameTolerances(),
 ) -> Frame:
     """Whole similarity from known camera centres.
 
@@ -102,25 +186,25 @@ def frame_from_centers(
     DataError
         Fewer than three names match, the centres lie on one line, or they do not fit.
     """
-    matched = match_names(list(known_centers), [view.name for view in model.views])
-    views = [view for view in model.views if view.name in matched]
+    matched = match_names([view.name for view in sparse_model.views], known_centers)
+    views = [view for view in sparse_model.views if view.name in matched]
     if len(views) < MIN_CAMERAS:
         raise DataError(
             source,
-            f"knows {len(views)} of the {len(model.views)} reconstructed images by name, "
+            f"knows {len(views)} of the {len(sparse_model.views)} reconstructed images by name, "
             f"{MIN_CAMERAS} are needed; its names are like {next(iter(known_centers))!r}, the "
-            f"images' like {model.views[0].name!r}.",
+            f"images' like {sparse_model.views[0].name!r}.",
         )
     centers = np.array([view.center_in_world for view in views])
     known = np.array([known_centers[matched[view.name]] for view in views])
-    _require_breadth(centers, known, source)
+    _require_breadth(centers, known, source, tolerances)
     try:
         transform, used = align_cameras(centers, known)
     except ValueError as error:
         raise DataError(source, f"cameras cannot be aligned: {error}") from error
-    _require_breadth(centers[used], known[used], source)
+    _require_breadth(centers[used], known[used], source, tolerances)
     residuals = align_residuals(transform, centers[used], known[used])
-    spread, sigma = _fit_quality(residuals, known[used], source)
+    spread, sigma = _fit_quality(residuals, known[used], source, tolerances)
     return Frame(
         metric_from_world=transform,
         source="reference",
@@ -137,11 +221,13 @@ def _extents(points: Array) -> Array:
     return np.asarray(np.linalg.svd(np.vstack([centered, np.zeros((3, 3))]), compute_uv=False))
 
 
-def _require_breadth(centers: Array, known: Array, source: str | Path) -> None:
+def _require_breadth(
+    centers: Array, known: Array, source: str | Path, tolerances: FrameTolerances
+) -> None:
     """The cameras must not lie on one line, in neither frame."""
     for points, name in ((known, "known"), (centers, "reconstructed")):
         length, breadth, _ = _extents(points)
-        if not breadth > MIN_BREADTH * length:
+        if not breadth > tolerances.min_breadth * length:
             raise DataError(
                 source,
                 f"the {name} centres of the {len(points)} cameras lie on one line (or in one "
@@ -149,14 +235,16 @@ def _require_breadth(centers: Array, known: Array, source: str | Path) -> None:
             )
 
 
-def _fit_quality(residuals: Array, known: Array, source: str | Path) -> tuple[float, float]:
+def _fit_quality(
+    residuals: Array, known: Array, source: str | Path, tolerances: FrameTolerances
+) -> tuple[float, float]:
     """RMS distance of the cameras from their mean, and standard deviation of a coordinate."""
     num = len(known)
     _, breadth, _ = _extents(known)
     spread = float(np.sqrt(((known - known.mean(axis=0)) ** 2).sum(axis=1).mean()))
     rms = float(np.sqrt((residuals**2).mean()))
     sigma = float(np.sqrt((residuals**2).sum() / (3 * num - 7)))  # a similarity has 7 parameters
-    if rms > MAX_MISFIT * spread or sigma > MAX_TURN_SIGMA * breadth:
+    if rms > tolerances.max_relative_rms * spread or sigma > tolerances.max_turn_sigma * breadth:
         raise DataError(
             source,
             f"the known centres do not fit the {num} reconstructed cameras: RMS {rms:.4g} m at a "
@@ -165,7 +253,9 @@ def _fit_quality(residuals: Array, known: Array, source: str | Path) -> tuple[fl
     return spread, sigma
 
 
-def frame_from_distance(model: SparseModel, first: str, second: str, distance_m: float) -> Frame:
+def frame_from_distance(
+    sparse_model: SparseModel, first: str, second: str, distance_m: float
+) -> Frame:
     """Scale from the distance between two cameras (image names) or sparse points (ids).
 
     Raises
@@ -175,13 +265,13 @@ def frame_from_distance(model: SparseModel, first: str, second: str, distance_m:
     """
     if not 0 < distance_m < np.inf:
         raise OptionError(f"--scale needs a positive distance, not {distance_m}.")
-    ends = [_end_of_distance(model, text) for text in (first, second)]
+    ends = [_end_of_distance(sparse_model, text) for text in (first, second)]
     offset = ends[1][0] - ends[0][0]
     distance = float(np.linalg.norm(offset))
     # Coordinates are of the size of the scene: below this their difference is rounding.
     rounding = 1e-9 * max(float(np.abs(end).max()) for end, _ in ends)
     if not distance > rounding:
-        raise OptionError(f"--scale: {first} and {second} are at one place in the model.")
+        raise OptionError(f"--scale: {first} and {second} are at one place in the sparse_model.")
     sigmas = [sigma for _, sigma in ends]
     known = [sigma**2 for sigma in sigmas if sigma is not None]
     return Frame(
@@ -193,18 +283,20 @@ def frame_from_distance(model: SparseModel, first: str, second: str, distance_m:
     )
 
 
-def _end_of_distance(model: SparseModel, text: str) -> tuple[Array, float | None]:
+def _end_of_distance(sparse_model: SparseModel, text: str) -> tuple[Array, float | None]:
     """Place of a camera or a sparse point, and its standard deviation where it is known."""
-    views = {view.name: view for view in model.views}
+    views = {view.name: view for view in sparse_model.views}
     name = find_name(text, views)
     if name is not None:
         return views[name].center_in_world, None
     if text.isdecimal():
-        chosen = model.tracks.point3D_ids == int(text)
+        chosen = sparse_model.tracks.point3D_ids == int(text)
         if chosen.any():
-            point = model.tracks.points_in_world[chosen][0]
-            return point, float(point_sigmas(some_tracks(model.tracks, chosen), model.views)[0])
-    if find_name(text, model.unregistered) is not None:
+            point = sparse_model.tracks.points_in_world[chosen][0]
+            return point, float(
+                point_sigmas(some_tracks(sparse_model.tracks, chosen), sparse_model.views)[0]
+            )
+    if find_name(text, sparse_model.unregistered) is not None:
         raise OptionError(f"--scale: the image {text} has no pose; name another one.")
     raise OptionError(
         f"--scale: {text} is neither a reconstructed image (such as "
@@ -217,7 +309,9 @@ def scaling(scale: float) -> SimilarityTransform:
     return SimilarityTransform(scale, np.eye(3), np.zeros(3))
 
 
-def require_agreement(first: Frame, other: Frame) -> None:
+def require_agreement(
+    first: Frame, other: Frame, *, tolerances: ScaleTolerances = SCALE_TOLERANCES
+) -> None:
     """Two sources must give one scale, within what their uncertainties allow and 1 %.
 
     Raises
@@ -226,7 +320,7 @@ def require_agreement(first: Frame, other: Frame) -> None:
         They contradict each other.
     """
     sigma = np.hypot(first.relative_sigma or 0.0, other.relative_sigma or 0.0)
-    allowed = max(SIGMA_LIMIT * float(sigma), AGREEMENT_FLOOR)
+    allowed = tolerances.allowed(float(sigma))
     # The logarithm makes it the same whichever comes first.
     if not abs(np.log(other.scale / first.scale)) <= allowed:
         raise OptionError(
@@ -235,29 +329,121 @@ def require_agreement(first: Frame, other: Frame) -> None:
         )
 
 
-def transform_model(model: SparseModel, target_from_world: SimilarityTransform) -> SparseModel:
+def transform_model(
+    sparse_model: SparseModel, target_from_world: SimilarityTransform
+) -> SparseModel:
     """The model in another frame; poses stay rigid, so depths scale, and pixels stay.
 
     Parameters
     ----------
-    model : in its own frame.
+    sparse_model : in its own frame.
     target_from_world : such as :attr:`Frame.metric_from_world`.
     """
     views = tuple(
-        replace(view, cam_from_world=_transform_pose(view.cam_from_world, target_from_world))
-        for view in model.views
+        replace(view, cam_from_world=target_from_world.pose(view.cam_from_world))
+        for view in sparse_model.views
     )
-    points = target_from_world * model.tracks.points_in_world
-    return replace(model, views=views, tracks=replace(model.tracks, points_in_world=points))
+    points = target_from_world * sparse_model.tracks.points_in_world
+    return replace(
+        sparse_model, views=views, tracks=replace(sparse_model.tracks, points_in_world=points)
+    )
 
 
-def _transform_pose(
-    cam_from_world: RigidTransform, target_from_world: SimilarityTransform
-) -> RigidTransform:
-    """``cam_from_target``, its camera frame in the target's unit."""
-    rotation = cam_from_world.rotation @ target_from_world.rotation.T
-    translation = (
-        target_from_world.scale * cam_from_world.translation
-        - rotation @ target_from_world.translation
-    )
-    return RigidTransform(rotation, translation)
+def read_centers(path: str | Path) -> dict[str, Array]:
+    """Read known camera centres by image name.
+
+    Parameters
+    ----------
+    path : ``.json``: ``{"images": {name: {"center": [x, y, z]}}}``, or with ``cam_from_world``
+        (3x4) in the place of ``center``, or ``{name: [x, y, z]}``. ``.txt``: lines
+        ``name x y z``; empty lines and those that begin with ``#`` are skipped.
+
+    Returns
+    -------
+    dict
+        Centres ``(3,)`` float64 in the file's frame and unit, metres by convention.
+
+    Raises
+    ------
+    DataError
+        The file is missing, malformed, names an image twice, or a number is not finite.
+    """
+    path = Path(path)
+    parse = {".json": _parse_json, ".txt": _parse_lines}.get(path.suffix.lower())
+    if parse is None:
+        raise DataError(
+            path, "is neither .json nor .txt; give known camera centres as one of both."
+        )
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise DataError(path, f"cannot be read: {reason}.") from error
+    centers = parse(path, text)
+    if not centers:
+        raise DataError(path, "names no camera; give at least three.")
+    return centers
+
+
+def _parse_json(path: Path, text: str) -> dict[str, Array]:
+    try:
+        content = json.loads(text, object_pairs_hook=_unique_pairs)
+    except (ValueError, RecursionError) as error:
+        raise DataError(path, f"cannot be read as JSON ({error}).") from error
+    images = content.get("images", content) if isinstance(content, dict) else None
+    if not isinstance(images, dict):
+        raise DataError(path, "must map image names to camera centres.")
+    return {str(name): _center(path, str(name), entry) for name, entry in images.items()}
+
+
+def _unique_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; ValueError where a key occurs twice, which JSON itself lets pass."""
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"{twice!r} occurs twice")
+    return content
+
+
+def _center(path: Path, name: str, entry: Any) -> Array:
+    """Camera centre of one image's entry."""
+    if not isinstance(entry, dict):
+        return _numbers(path, name, entry, (3,))
+    if "center" in entry:
+        return _numbers(path, name, entry["center"], (3,))
+    if "cam_from_world" not in entry:
+        raise DataError(path, f"{name} has neither center nor cam_from_world.")
+    pose = _numbers(path, name, entry["cam_from_world"], (3, 4))
+    rotation = nearest_rotation(pose[:, :3])
+    if rotation is None:
+        raise DataError(path, f"cam_from_world of {name} is no rigid motion.")
+    return np.asarray(-rotation.T @ pose[:, 3])
+
+
+def _numbers(path: Path, name: str, value: Any, shape: tuple[int, ...]) -> Array:
+    wanted = "x".join(map(str, shape))
+    try:
+        array = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DataError(path, f"{name} needs {wanted} numbers.") from error
+    if array.shape != shape:
+        raise DataError(path, f"{name} needs {wanted} numbers.")
+    if not np.isfinite(array).all():
+        raise DataError(path, f"{name} has a number that is not finite.")
+    return array
+
+
+def _parse_lines(path: Path, text: str) -> dict[str, Array]:
+    centers: dict[str, Array] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        parts = line.rsplit(maxsplit=3)  # names may hold spaces
+        if len(parts) != 4:
+            raise DataError(path, f"line {number} is not of the form: name x y z.")
+        name = parts[0].strip()
+        if name in centers:
+            raise DataError(path, f"line {number} names {name} a second time.")
+        centers[name] = _numbers(path, f"line {number}", parts[1:], (3,))
+    return centers

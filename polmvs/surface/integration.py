@@ -5,41 +5,73 @@ from the phases of all views say how it changes from pixel to pixel, seeds where
 the other views see, of the round before, ties the views to one surface. Where a view sees the
 surface at a grazing angle, a small error of its normals is a large one of its ranges; others see
 the same place better. Views depend on each other through the round before only.
+
+Normals need the nodes' places in the other views and ranges come from the normals, so the two
+alternate (:func:`relax`); normals depend on the places weakly and few rounds suffice. Contour
+propagation (:mod:`polmvs.surface.contour`) differs only in which nodes it joins.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from polmvs.camera import sample_image
 from polmvs.config import AngleModel, PropagationOptions
+from polmvs.normals.estimator import NormalEstimate, solve_at_own_noise
+from polmvs.normals.rows import gather_rows
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
-from polmvs.surface.consensus import surface_of_others
+from polmvs.surface.consensus import ask_view, surface_of_others
 from polmvs.surface.dense_view import (
     DenseView,
     SurfaceSamples,
     dense_view,
     extend_planes,
     lattice_points,
+    lattice_xy,
     store_dense_view,
     view_samples,
 )
-from polmvs.surface.pixel_graph import Nodes, uncrossed
-from polmvs.surface.propagation import choose_neighbors
-from polmvs.surface.relaxation import open_lattice, relax, surface_at_seeds
+from polmvs.surface.log_range import SeedTies, solve_log_ranges
+from polmvs.surface.pixel_graph import (
+    Nodes,
+    bending_modes,
+    fill_normals,
+    node_edges,
+    tie_seeds,
+    uncrossed,
+    visible_seeds,
+)
+from polmvs.surface.view_selection import choose_neighbors
 
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 REFINEMENTS = (4, 2, 1)  # strides of the coarsest lattice and those that follow, of the last one's
 MAX_GAP_STRIDES = 2.0  # from a point of the coarser lattice to those made of it
+
+Array = NDArray[np.float64]
+
+NUM_STARTING_SEEDS = 5
+MIN_OPINIONS = 2  # one view's error must not return to it as another's agreement
+MIN_OPINION_COSINE = 0.9  # 26 deg between the normals of a node and of the surface another sees
+MAX_OPINION_OUTLIER = 3.0  # deviations from the views' median
+# Errors of another view's map are alike over about this distance: its points within it are worth
+# one.
+OPINION_REACH_PX = 24.0
+# Share of an opinion's deviation that all opinions of a view have in common, as the views share
+# seeds and rows. On a curved part the stated deviations came out half of the errors at 0 and
+# twice the errors at 1.
+COMMON_SHARE = 0.5
+MIN_OWN_WEIGHT = 0.25  # robust weight of a row 4 deviations off
 
 
 def integrate(
@@ -49,6 +81,7 @@ def integrate(
     options: PropagationOptions,
     folder: Path,
     *,
+    tilt_aware: bool = True,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> list[DenseView | None]:
@@ -60,6 +93,7 @@ def integrate(
     maps : phase maps of the posed views.
     seeds : points on the surface.
     folder : for the dense views, which stay on disk; existing files are replaced.
+    tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done, once per view and round.
 
@@ -82,7 +116,8 @@ def integrate(
             for k, near in enumerate(neighbors)
         ]
         dense = []
-        for result in workers.map(partial(_round, model, seeds, options.bending), tasks):
+        solve = partial(_round, model, seeds, options.bending, tilt_aware)
+        for result in workers.map(solve, tasks):
             dense.append(result)
             if on_progress is not None:
                 on_progress(1)
@@ -118,7 +153,9 @@ class _Task:
     path: Path
 
 
-def _round(model: AngleModel, seeds: Seeds, bending: float, task: _Task) -> DenseView | None:
+def _round(
+    model: AngleModel, seeds: Seeds, bending: float, tilt_aware: bool, task: _Task
+) -> DenseView | None:
     """One view's result on its lattice."""
     stride_px = task.plan.stride_px
     wanted = open_lattice(task.maps[0], stride_px)
@@ -132,6 +169,7 @@ def _round(model: AngleModel, seeds: Seeds, bending: float, task: _Task) -> Dens
         _lattice_nodes(task.maps[0], surface, wanted, stride_px),
         seeds,
         bending=bending,
+        tilt_aware=tilt_aware,
         use_opinions=task.plan.use_opinions,
     )
     dense = dense_view(nodes.surface, wanted, stride_px)
@@ -168,3 +206,193 @@ def _lattice_nodes(
         head=head[clear],
         on_contour=np.zeros(len(tail[clear]), np.bool_),
     )
+
+
+def surface_at_seeds(phase_map: PhaseMap, seeds: Seeds, xy: Floats) -> SurfaceSamples | None:
+    """A first guess of the surface at some pixels: range and normal of the nearest seeds.
+
+    None where the view sees no seed.
+    """
+    visible, seed_xy = visible_seeds(phase_map, seeds)
+    if not visible.any() or not len(xy):
+        return None
+    view = phase_map.view
+    distance = np.linalg.norm(seeds.points_in_world[visible] - view.center_in_world, axis=-1)
+    k = min(NUM_STARTING_SEEDS, len(distance))
+    nearest = cKDTree(seed_xy[visible]).query(xy, k=k)[1].reshape(len(xy), k)
+    unknown = np.full(len(xy), np.nan)
+    return SurfaceSamples(
+        xy=xy,
+        rays_in_world=view.camera.rays(xy) @ view.cam_from_world.rotation,
+        # The median of some: one wrong seed does not spoil it.
+        log_range=np.median(np.log(distance)[nearest], axis=1),
+        normals=seeds.normals_in_world[visible][nearest[:, 0]],
+        normal_sigma=unknown,
+        log_range_sigma=unknown,
+        confidence=np.zeros(len(xy)),
+    )
+
+
+def relax(
+    model: AngleModel,
+    maps: Sequence[PhaseMap],
+    dense: Sequence[DenseView | None],
+    nodes: Nodes,
+    seeds: Seeds,
+    *,
+    bending: float,
+    tilt_aware: bool = True,
+    along_contours: bool = False,
+    use_opinions: bool = False,
+) -> Nodes:
+    """Solve the normals at a view's nodes from all views, then the ranges of the nodes.
+
+    Parameters
+    ----------
+    model : of the rows.
+    maps, dense : phase maps, and dense views of the round before where there are any, the view's
+        own first.
+    nodes : of the first view, with the ranges and normals of the round before.
+    seeds : points on the surface.
+    bending : deviation of the smooth modes, as a share of the distance; 0: none.
+    tilt_aware : of the rows' weights.
+    along_contours : ranges (OPA: depths) are constant along the nodes' contours.
+    use_opinions : the surfaces that the other views see tie the nodes, too.
+    """
+    center = maps[0].view.center_in_world
+    surface = nodes.surface
+    points = center + np.exp(surface.log_range)[:, None] * surface.rays_in_world
+    unknown = ~np.isfinite(surface.log_range)
+    points[unknown] = center  # anywhere
+    range_maps = [d.range_map if d is not None else None for d in dense]
+    rows = gather_rows(model, points, maps, range_maps, tilt_aware=tilt_aware)
+    rows.sigma[:, unknown] = np.inf  # other views may see this one's camera: no rows
+    start = surface.normals.T
+    estimate, row_sigma = solve_at_own_noise(
+        rows.rows, rows.rays, rows.sigma, initial_normals=start
+    )
+    normals, normal_sigma = fill_normals(nodes, estimate)
+    surface = replace(
+        surface,
+        normals=normals,
+        normal_sigma=normal_sigma,
+        confidence=_agreement(row_sigma, rows.rays, estimate),
+    )
+    nodes = replace(nodes, surface=surface)
+    ties, num_known = tie_seeds(maps[0], nodes, seeds), len(seeds.sigma)
+    if use_opinions:
+        ties = _joined(ties, tie_opinions(maps, dense, nodes), num_known)
+        num_known += len(normals)
+    solution = solve_log_ranges(
+        len(normals),
+        node_edges(model, nodes, row_sigma[0], along_contours=along_contours),
+        ties,
+        num_known,
+        modes=bending_modes(surface.xy) if bending > 0 else None,
+        mode_sigma=bending,
+    )
+    surface = replace(surface, log_range=solution.log_range, log_range_sigma=solution.sigma)
+    return replace(nodes, surface=surface)
+
+
+def _agreement(sigma: Floats, rays: Floats, estimate: NormalEstimate) -> Array:
+    """Share (N,) of the rows that face a node which its normal explains.
+
+    0 where the view's own row, the first, is an outlier: it sees another surface there, such as
+    one in front of that which the other views agree on.
+    """
+    cosine = np.einsum("ikn,ni->kn", rays, np.nan_to_num(estimate.normals))
+    facing = np.isfinite(sigma) & (cosine < 0)
+    agree = facing & (estimate.row_weights > 0.5)
+    denied = facing[0] & (estimate.row_weights[0] < MIN_OWN_WEIGHT)
+    return np.where(denied, 0, agree.sum(axis=0) / np.maximum(facing.sum(axis=0), 1))
+
+
+def tie_opinions(
+    maps: Sequence[PhaseMap], dense: Sequence[DenseView | None], nodes: Nodes
+) -> SeedTies:
+    """Tie the nodes of the first view to the surface on which the other views agree.
+
+    Each tie is a seed of its own.
+    """
+    surface, center = nodes.surface, maps[0].view.center_in_world
+    distance = np.exp(surface.log_range)
+    said, deviations = [], []
+    for phase_map, other in zip(maps[1:], dense[1:], strict=True):
+        if other is None:
+            continue
+        opinion = ask_view(
+            phase_map, other, center, surface.rays_in_world, distance, surface.normals
+        )
+        with np.errstate(invalid="ignore"):
+            counts = (opinion.cosine > MIN_OPINION_COSINE) & (opinion.place > 0)
+        said.append(np.where(counts, opinion.place, np.nan))
+        deviations.append(np.where(counts, opinion.sigma, np.nan))
+    if not said:
+        none = np.zeros(0, np.int64)
+        return SeedTies(
+            node=none, seed=none, value=np.zeros(0), sigma=np.zeros(0), common=np.zeros(0)
+        )
+    place, sigma, count = _consensus(np.array(said), np.array(deviations))
+    node = np.flatnonzero((count >= MIN_OPINIONS) & np.isfinite(place) & np.isfinite(sigma))
+    alike = max(OPINION_REACH_PX / nodes.spacing_px, 1.0)
+    relative = sigma[node] / place[node]
+    return SeedTies(
+        node=node,
+        seed=node,
+        value=np.log(place[node]),
+        sigma=alike * relative,
+        common=COMMON_SHARE * relative,
+    )
+
+
+def _consensus(places: Array, sigmas: Array) -> tuple[Array, Array, Array]:
+    """Robust weighted mean (N,) of what K views say (K, N), NaN: nothing.
+
+    With it its deviation, which the number of views does not narrow because their errors are not
+    independent, and how many agree.
+    """
+    order = np.sort(places, axis=0)  # NaN last
+    count = np.isfinite(places).sum(axis=0)
+    columns = np.arange(places.shape[1])
+    median = order[np.maximum(count - 1, 0) // 2, columns]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        gap = np.abs(places - median)
+        spread = np.sort(gap, axis=0)[np.maximum(count - 1, 0) // 2, columns]
+        near = gap <= MAX_OPINION_OUTLIER * np.maximum(1.5 * spread, sigmas)
+        weight = np.where(near, 1 / sigmas**2, 0)
+        total = weight.sum(axis=0)
+        place = (weight * np.where(near, places, 0)).sum(axis=0) / total
+        own = np.sqrt(near.sum(axis=0) / total)
+    return place, np.hypot(own, spread), near.sum(axis=0)
+
+
+def _joined(first: SeedTies, second: SeedTies, num_first: int) -> SeedTies:
+    return SeedTies(
+        node=np.concatenate([first.node, second.node]),
+        seed=np.concatenate([first.seed, num_first + second.seed]),
+        value=np.concatenate([first.value, second.value]),
+        sigma=np.concatenate([first.sigma, second.sigma]),
+        common=np.concatenate([first.common, second.common]),
+    )
+
+
+def open_lattice(phase_map: PhaseMap, stride_px: int) -> Mask:
+    """Lattice points (h, w) in the region and on none of its edges."""
+    camera = phase_map.view.camera
+    xy = lattice_xy(camera.height // stride_px, camera.width // stride_px, stride_px)
+    open_pixels = (phase_map.region.inside & ~phase_map.region.edges).astype(np.float32)
+    return np.asarray(sample_image(open_pixels, xy, nearest=True) > 0)
+
+
+def spread_nodes(
+    phase_map: PhaseMap, surface: SurfaceSamples, stride_px: int, max_gap_px: float
+) -> DenseView | None:
+    """Ranges and normals on the lattice of the region, from the planes of the nearest nodes."""
+    good = np.isfinite(surface.log_range) & np.isfinite(surface.normals).all(axis=-1)
+    if not good.any():
+        return None
+    wanted = open_lattice(phase_map, stride_px)
+    xy = lattice_points(wanted, stride_px)
+    rays = phase_map.view.camera.rays(xy) @ phase_map.view.cam_from_world.rotation
+    return dense_view(extend_planes(surface[good], xy, rays, max_gap_px), wanted, stride_px)

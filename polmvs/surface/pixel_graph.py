@@ -13,7 +13,6 @@ from polmvs.config import AngleModel
 from polmvs.normals.estimator import NormalEstimate
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
-from polmvs.surface.contour import Contours
 from polmvs.surface.dense_view import SurfaceSamples
 from polmvs.surface.log_range import Edges, SeedTies, log_range_increment, slope_sigma
 
@@ -33,7 +32,6 @@ MIN_CREASE_ANGLE = 0.03  # rad, between neighbouring normals
 # A crease turns the normal this much more than noise or local curvature does. On a cylinder half
 # of a lattice's edges turn: their local mean is a quarter of a turn, which must pass.
 CREASE_FACTOR = 5.0
-NUM_NEIGHBORS = 6
 FILLED_SIGMA = 0.1  # rad, of a normal taken from the neighbours
 
 
@@ -66,27 +64,6 @@ def visible_seeds(phase_map: PhaseMap, seeds: Seeds) -> tuple[NDArray[np.bool_],
     facing = (to_point * seeds.normals_in_world).sum(-1) < -0.1 * np.linalg.norm(to_point, axis=-1)
     known = np.isfinite(seeds.normals_in_world).all(axis=-1)
     return phase_map.shows_surface(xy) & (facing | ~known), np.asarray(xy, np.float64)
-
-
-def connect(
-    contours: Contours, phase_map: PhaseMap, spacing_px: float
-) -> tuple[Indices, Indices, NDArray[np.bool_]]:
-    """Edges between consecutive nodes of a curve and between neighbouring nodes of all curves."""
-    xy = contours.xy
-    num = len(xy)
-    follows = contours.curve[1:] == contours.curve[:-1]
-    along = np.stack([np.flatnonzero(follows), np.flatnonzero(follows) + 1], axis=1)
-    k = min(NUM_NEIGHBORS + 1, num)
-    distance, index = cKDTree(xy).query(xy, k=k, distance_upper_bound=2.2 * spacing_px)
-    tails = np.repeat(np.arange(num), k)
-    heads, near = index.reshape(-1), distance.reshape(-1)
-    cross = (heads < num) & (heads != tails) & (near > 0)
-    pairs = np.unique(np.sort(np.stack([tails[cross], heads[cross]], axis=1), axis=1), axis=0)
-    is_along = np.isin(pairs[:, 0] * num + pairs[:, 1], along[:, 0] * num + along[:, 1])
-    pairs = np.concatenate([along, pairs[~is_along]])
-    on_contour = np.arange(len(pairs)) < len(along)
-    clear = uncrossed(phase_map, xy[pairs[:, 0]], xy[pairs[:, 1]])
-    return pairs[clear, 0], pairs[clear, 1], on_contour[clear]
 
 
 def uncrossed(phase_map: PhaseMap, start_xy: Floats, end_xy: Floats) -> NDArray[np.bool_]:

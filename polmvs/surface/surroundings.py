@@ -1,14 +1,19 @@
-"""What lies about the polarised parts: which sparse points to keep, and which views to pair.
+"""What lies about the polarised parts: sparse points, and stereo of textured surfaces.
 
 The surroundings are textured and unpolarised, so that matching features and patches works there
 and on the parts it does not: a glossy surface shows mirror images, which make sparse points as
 good as any, behind it. Where a view shows a part is known, and what is seen there is left out.
+
+Stereo is OpenCV's semi-global matching on rectified pairs of views. Any camera model is rectified
+through its rays: both views are turned into one frame whose x axis is the baseline, and resampled
+by pinholes of that frame. A turned pinhole has the view's own rays, so that what is matched is the
+range of the view's own pixels and nothing is reprojected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,15 +22,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import sample_image
+from polmvs.camera import PinholeCamera, pixel_centers, sample_image
 from polmvs.config import FusionOptions
-from polmvs.normals.tracks import KEYPOINT_SIGMA_PX, point_sigmas, some_tracks
 from polmvs.parallel import Workers
+from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map
-from polmvs.scene import Tracks, View
-from polmvs.surface.dense_view import DenseView, store_dense_view
+from polmvs.scene import KEYPOINT_SIGMA_PX, Tracks, View, point_sigmas, some_tracks
+from polmvs.surface.dense_view import DenseView, lattice_xy, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse
-from polmvs.surface.stereo import stereo_view
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -41,6 +45,23 @@ MIN_BASELINE_ANGLE_DEG = 40.0  # between baseline and views: an epipole in the i
 PART_MARGIN_PX = 8  # by which a match may leak over a part's outline: a patch and its neighbours
 MAX_NORMAL_DIFFERENCE_DEG = 30.0  # of two views; planes of ten pixels' disparities are uncertain
 MIN_SHARED_POINTS = 20  # of two views, for their angle to be known and their overlap to be worth it
+
+Floats = NDArray[np.floating]
+Image = NDArray[np.float32]
+
+BLOCK_PX = 5  # side of the patches that are compared
+BORDER_PX = 4  # a patch and the filter before it look this far
+TEXTURE_PX = 2 * BORDER_PX + 1  # side of the window in which texture must show
+MIN_TEXTURE = 2.0  # standard deviation, grey levels; noise of a full well of 10,000 e- makes 0.6
+DISPARITY_SIGMA_PX = 0.5  # of a match; half of it the bias towards whole pixels
+MIN_RAY_Z = 0.5  # rays more than 60 deg from the rectified axis would be stretched fourfold
+RANGE_PERCENTILES = (1.0, 99.0)  # of the sparse points' distances; few of them are wrong
+RANGE_MARGIN = 0.15  # of the disparities beyond those of the sparse points
+MAX_DISPARITIES = 512  # searched; more means that the sparse points are no guide
+MIN_POINTS = 10  # in a view, for the range to search
+WINDOW = 5  # lattice points along a side of the planes that are fitted
+MIN_WINDOW_SHARE = 0.6  # of a window's lattice points that are known
+MIN_COSINE = 0.1  # between a plane's normal and the ray; steeper ones are steps of the range
 
 
 @dataclass(frozen=True)
@@ -266,3 +287,263 @@ def _match_view(folder: Path, stride_px: int, maps: Sequence[PhaseMap], points: 
     excluded = grow_mask(maps[0].region.inside, PART_MARGIN_PX)
     dense = stereo_view(maps[0], maps[1:], points, excluded, stride_px)
     return store_dense_view(dense, folder / f"{maps[0].view.name}.stereo")
+
+
+@dataclass(frozen=True)
+class RectifiedPair:
+    """Two virtual pinholes of one frame, whose rows correspond.
+
+    Attributes
+    ----------
+    rect_from_world : (3, 3), rotation into the frame; its x axis runs from left to right.
+    left, right : pinholes of the same size; they differ in ``cx``, so that disparities start at 0.
+    baseline : distance of the centres, world units.
+    num_disparities : to search, a multiple of 16.
+    """
+
+    rect_from_world: Array
+    left: PinholeCamera
+    right: PinholeCamera
+    baseline: float
+    num_disparities: int
+
+    @property
+    def offset_px(self) -> float:
+        """To add to a disparity: with it, depth z is ``fx * baseline / disparity``."""
+        return self.right.cx - self.left.cx
+
+
+def rectify_pair(view: View, other: View, points: Floats) -> RectifiedPair | None:
+    """Virtual cameras at the centres of two views that see what both see.
+
+    Parameters
+    ----------
+    view, other : the left and the right one, whatever their roll.
+    points : (N, 3), world, that the view sees; they bound the depths to search.
+
+    Returns
+    -------
+    RectifiedPair, or None where the views share no rows or the range of depths is of no use.
+    """
+    baseline = other.center_in_world - view.center_in_world
+    length = float(np.linalg.norm(baseline))
+    forward = view.cam_from_world.rotation[2] + other.cam_from_world.rotation[2]
+    if np.linalg.norm(np.cross(baseline, forward)) <= 1e-6 * length:
+        return None  # one view stands before the other, or where it stands
+    x = baseline / length
+    z = forward - (forward @ x) * x
+    z /= np.linalg.norm(z)
+    rotation = np.stack([x, np.cross(z, x), z])
+    depth = (np.asarray(points, np.float64) - view.center_in_world) @ z
+    depth = depth[depth > 0]
+    boxes = [_plane_box(v, rotation) for v in (view, other)]
+    low, high = np.maximum(boxes[0][0], boxes[1][0]), np.minimum(boxes[0][1], boxes[1][1])
+    if len(depth) < MIN_POINTS or not high[1] > low[1]:
+        return None
+    focal = view.camera.mean_focal_px
+    far, near = focal * length / np.percentile(depth, RANGE_PERCENTILES[::-1])
+    margin = RANGE_MARGIN * (near - far) + 4 * DISPARITY_SIGMA_PX
+    lowest = max(far - margin, 0.0)
+    num = 16 * int(np.ceil((near + margin - lowest) / 16))
+    if num > MAX_DISPARITIES:
+        return None
+    left = PinholeCamera(
+        width=num + int(np.ceil(focal * (boxes[0][1][0] - boxes[0][0][0]))),
+        height=int(np.ceil(focal * (high[1] - low[1]))),
+        fx=focal,
+        fy=focal,
+        cx=num - focal * boxes[0][0][0],  # matches end where their disparity leaves the image
+        cy=-focal * low[1],
+    )
+    return RectifiedPair(rotation, left, replace(left, cx=left.cx + lowest), length, num)
+
+
+def _plane_box(view: View, rect_from_world: Array) -> tuple[Array, Array]:
+    """Lowest and highest ``(x, y) / z`` of a view's rays in the rectified frame."""
+    size = view.camera.width, view.camera.height
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 33)]), axis=-1).reshape(-1, 2)
+    rays = view.camera.rays(grid * size) @ (rect_from_world @ view.cam_from_world.rotation.T).T
+    plane = rays[rays[:, 2] > MIN_RAY_Z]
+    plane = plane[:, :2] / plane[:, 2:]
+    return plane.min(axis=0, initial=np.inf), plane.max(axis=0, initial=-np.inf)
+
+
+def warp(image: Image, view: View, camera: PinholeCamera, rotation: Array) -> tuple[Image, Mask]:
+    """Resample an image of a view for a virtual camera at its centre, and where it has pixels."""
+    rays = camera.rays(pixel_centers(camera.width, camera.height))
+    xy = view.camera.project(rays @ (view.cam_from_world.rotation @ rotation.T).T)
+    margin, size = BORDER_PX, np.array([view.camera.width, view.camera.height])
+    inside = ((xy >= margin) & (xy <= size - margin)).all(axis=-1)
+    return sample_image(image, xy), np.asarray(inside)
+
+
+def match(pair: RectifiedPair, left: PhaseMap, right: PhaseMap) -> Image:
+    """Disparities ``(H, W)`` of the left virtual camera, px, less the pair's offset; NaN: none."""
+    white = max(float(np.percentile(m.intensity, 99)) for m in (left, right))
+    sides = []
+    for phase_map, camera in ((left, pair.left), (right, pair.right)):
+        shown = np.clip(phase_map.intensity / max(white, 1e-9), 0, 1) ** (1 / DISPLAY_GAMMA)
+        grey_levels = 255 * shown.astype(np.float32)
+        grey, inside = warp(grey_levels, phase_map.view, camera, pair.rect_from_world)
+        sides.append((np.rint(grey).astype(np.uint8), inside))
+    matcher = cv2.StereoSGBM.create(
+        numDisparities=pair.num_disparities,
+        blockSize=BLOCK_PX,
+        P1=8 * BLOCK_PX**2,  # OpenCV's recommendation
+        P2=32 * BLOCK_PX**2,
+        disp12MaxDiff=1,
+        preFilterCap=31,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=1,
+    )
+    disparity = matcher.compute(sides[0][0], sides[1][0]).astype(np.float32) / 16
+    xy = pixel_centers(pair.left.width, pair.left.height)
+    xy[..., 0] -= disparity
+    matched = sample_image(sides[1][1].astype(np.float32), xy, nearest=True) > 0
+    good = (disparity >= 0) & sides[0][1] & matched & _is_textured(sides[0][0])
+    return np.where(good, disparity, np.nan).astype(np.float32)
+
+
+def _is_textured(grey: NDArray[np.uint8]) -> Mask:
+    """Where an image varies by more than noise; elsewhere a match only continues others."""
+    image, size = grey.astype(np.float32), (TEXTURE_PX, TEXTURE_PX)
+    variance = cv2.boxFilter(image * image, -1, size) - cv2.boxFilter(image, -1, size) ** 2
+    return np.asarray(variance > MIN_TEXTURE**2)
+
+
+def ranges_from_disparity(
+    pair: RectifiedPair, disparity: Image, rays_in_world: Floats
+) -> tuple[Image, Image]:
+    """Distances of the left view's rays, and their relative deviations.
+
+    Parameters
+    ----------
+    disparity : as from :func:`match`.
+    rays_in_world : (..., 3), unit, world axes.
+
+    Returns
+    -------
+    (...) float32 each; the distance is 0 where no disparity is known, or where those of the four
+    pixels about the ray differ by more than the match is uncertain.
+    """
+    rays = rays_in_world @ pair.rect_from_world.T
+    xy = pair.left.project(np.where(rays[..., 2:] > 0, rays, np.nan))
+    known = np.isfinite(disparity)
+    filled = np.where(known, disparity, 0).astype(np.float32)
+    moments = np.dstack([known.astype(np.float32), filled, filled * filled])
+    share, mean, square = np.moveaxis(sample_image(moments, xy), -1, 0)
+    smooth = square - mean * mean < DISPARITY_SIGMA_PX**2
+    total = mean + np.float32(pair.offset_px)
+    good = (share > 0.999) & smooth & (total > 0)
+    total = np.where(good, total, 1)
+    depth = pair.left.fx * pair.baseline / total
+    distance = np.where(good, depth / np.where(good, rays[..., 2], 1), 0)
+    return distance.astype(np.float32), (DISPARITY_SIGMA_PX / total).astype(np.float32)
+
+
+def combine_ranges(ranges: Image, sigmas: Image) -> tuple[Image, Image]:
+    """One range of each pixel from those of several pairs ``(P, h, w)``, and its deviation.
+
+    The weighted mean of the largest group that agrees within two deviations. Where there are
+    several and none agree, none is known (0).
+    """
+    known = ranges > 0
+    log_range = np.log(np.where(known, ranges, 1), dtype=np.float64)
+    weight = np.where(known, 1 / sigmas.astype(np.float64) ** 2, 0)
+    best = np.zeros(ranges.shape[1:])
+    place, lone = np.zeros(ranges.shape[1:]), known.sum(axis=0) < 2
+    for i in range(len(ranges)):
+        limit = 2 * np.hypot(sigmas, sigmas[i])
+        agrees = known & known[i] & (np.abs(log_range - log_range[i]) < limit)
+        total = np.where((agrees.sum(axis=0) >= 2) | lone, (weight * agrees).sum(axis=0), 0)
+        mean = (weight * agrees * log_range).sum(axis=0) / np.maximum(total, 1e-300)
+        place = np.where(total > best, mean, place)
+        best = np.maximum(best, total)
+    found = best > 0
+    sigma = np.where(found, 1 / np.sqrt(np.where(found, best, 1)), 0)
+    return np.where(found, np.exp(place), 0).astype(np.float32), sigma.astype(np.float32)
+
+
+def fit_planes(inverse_ranges: Floats, rays: Floats) -> tuple[Array, Array]:
+    """Planes about every lattice point: on one, the inverse range is linear in the ray.
+
+    Parameters
+    ----------
+    inverse_ranges : (h, w), 0 where unknown.
+    rays : (h, w, 3), unit.
+
+    Returns
+    -------
+    slope : (h, w, 3), the normal over the plane's distance from the camera, pointing away from
+        it; ``1 / range = slope . ray``. NaN where too little of the window is known.
+    deviation : (h, w), RMS of the window's inverse ranges from the plane, relative to the centre's.
+    """
+    known = (inverse_ranges > 0) & np.isfinite(rays).all(axis=-1)
+    v = np.where(known[..., None], rays, 0.0).astype(np.float64)
+    u = np.where(known, inverse_ranges, 0.0).astype(np.float64)
+    outer = (v[..., :, None] * v[..., None, :]).reshape(*known.shape, 9)
+    columns = [outer, v * u[..., None], (u * u)[..., None], known[..., None].astype(np.float64)]
+    moments, border = np.concatenate(columns, axis=-1), cv2.BORDER_CONSTANT
+    sums = cv2.boxFilter(moments, -1, (WINDOW, WINDOW), normalize=False, borderType=border)
+    used = known & (sums[..., 13] >= MIN_WINDOW_SHARE * WINDOW**2 - 0.5)
+    matrix, right = sums[used, :9].reshape(-1, 3, 3), sums[used, 9:12]
+    solved = np.linalg.solve(matrix, right[..., None])[..., 0]
+    residual = sums[used, 12] - (solved * right).sum(axis=-1)
+    freedom = np.maximum(sums[used, 13] - 3, 1)
+    slope, deviation = np.full((*known.shape, 3), np.nan), np.full(known.shape, np.nan)
+    slope[used] = solved
+    deviation[used] = np.sqrt(np.maximum(residual, 0) / freedom) / u[used]
+    return slope, deviation
+
+
+def stereo_view(
+    phase_map: PhaseMap, partners: Sequence[PhaseMap], points: Floats, part: Mask, stride_px: int
+) -> DenseView:
+    """Ranges and normals of one view's pixels, matched with its partners.
+
+    Parameters
+    ----------
+    phase_map : of the view; its intensity is matched.
+    partners : of the views to match it with.
+    points : (N, 3), world, that the view sees; they bound the depths to search.
+    part : (H, W) bool, pixels to leave out: polarised parts and what is beside them.
+    stride_px : of the lattice.
+    """
+    view = phase_map.view
+    shape = view.camera.height // stride_px, view.camera.width // stride_px
+    xy = lattice_xy(*shape, stride_px)
+    rays = view.camera.rays(xy) @ view.cam_from_world.rotation
+    found = []
+    for partner in partners:
+        pair = rectify_pair(view, partner.view, points)
+        if pair is not None:
+            found.append(ranges_from_disparity(pair, match(pair, phase_map, partner), rays))
+    found.append((np.zeros(shape, np.float32), np.ones(shape, np.float32)))  # if there is no pair
+    ranges, sigma = combine_ranges(*(np.stack(kind) for kind in zip(*found, strict=True)))
+    ranges[sample_image(part.astype(np.float32), xy, nearest=True) > 0] = 0
+    return _on_planes(ranges, sigma, rays, view, stride_px)
+
+
+def _on_planes(ranges: Image, sigma: Image, rays: Array, view: View, stride_px: int) -> DenseView:
+    """Ranges moved onto the planes through their windows, where a plane explains the window."""
+    inverse = 1 / np.where(ranges > 0, ranges, np.inf)
+    slope, deviation = fit_planes(inverse, rays)
+    length = np.linalg.norm(slope, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        fitted = 1 / (slope * rays).sum(axis=-1)
+        cosine = 1 / (fitted * length)
+        good = (np.abs(fitted / ranges - 1) < 2 * sigma) & (deviation < 2 * sigma)
+        good &= cosine > MIN_COSINE
+        # The normal of a plane through errors of the window's points, seen under this angle.
+        spread = WINDOW * stride_px / np.sqrt(12) / view.camera.mean_focal_px
+        turn = deviation / (WINDOW * spread) * cosine**2
+    normals = np.where(good[..., None], -slope / length[..., None], np.nan)
+    return DenseView(
+        stride_px=stride_px,
+        range_map=np.where(good, fitted, 0).astype(np.float32),
+        normals_in_world=normals.astype(np.float32),
+        sigma_deg=np.where(good, np.degrees(turn), np.nan).astype(np.float32),
+        sigma=np.where(good, sigma * ranges, np.nan).astype(np.float32),
+        confidence=good.astype(np.float32),
+    )

@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from polmvs.colmap.models import read_model
-from polmvs.colmap.sparse_model import write_model
+from polmvs.colmap.models import read_model, write_model
 from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud
 from polmvs.pipeline.stages import capture as stages
@@ -472,7 +471,7 @@ def test_internal_error_is_one_line_and_the_rest_is_in_the_log(
     def fail(*args: object, **kwargs: object) -> None:
         raise RuntimeError("a fault\nof two lines")
 
-    monkeypatch.setattr("polmvs.pipeline.stages.capture.write_images", fail)
+    monkeypatch.setattr("polmvs.pipeline.stages.images.write_images", fail)
     out = tmp_path / "out"
     status, text, err = cli("sfm", capture, out)
     assert (status, text) == (1, "")
@@ -488,7 +487,7 @@ def test_traceback_of_a_user_error_is_in_the_log_if_asked_for(
     def fail(*args: object, **kwargs: object) -> None:
         raise DataError("file", "is broken.")
 
-    monkeypatch.setattr("polmvs.pipeline.stages.capture.write_images", fail)
+    monkeypatch.setattr("polmvs.pipeline.stages.images.write_images", fail)
     for flags, expected in (((), False), (("-v",), True)):
         out = tmp_path / f"out{expected}"
         status, _, err = cli("sfm", capture, out, *flags)

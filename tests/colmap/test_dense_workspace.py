@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 from dense_scenes import (
     DenseScene,
@@ -15,13 +16,12 @@ from dense_scenes import (
 )
 
 from polmvs.camera import PinholeCamera
-from polmvs.colmap.dense_workspace import open_dense_workspace, source_order, write_dense_workspace
-from polmvs.colmap.models import pycolmap, read_model
-from polmvs.colmap.sparse_model import write_model
-from polmvs.colmap.workspace_layout import map_files
+from polmvs.colmap.dense_workspace import map_files, open_dense_workspace, source_order
+from polmvs.colmap.models import read_model, write_model
 from polmvs.errors import DataError
 from polmvs.io.images import write_png
 from polmvs.scene import SparseModel
+from polmvs.surface.map_export import export_dense_workspace
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_names_that_lead_out_of_the_folder(scene, tmp_path, name):
     views = (replace(view, name=name),)
     model = scene_of(views, scene.surface, board_points()).model
     with pytest.raises(DataError, match="no name of an image"):
-        write_dense_workspace(
+        export_dense_workspace(
             tmp_path / "workspace", model, lambda _: scene.image("000.png"), lambda _: None
         )
     assert not list(tmp_path.iterdir())

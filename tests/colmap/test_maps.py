@@ -3,6 +3,7 @@
 import struct
 
 import numpy as np
+import pycolmap
 import pytest
 from dense_scenes import PINHOLE
 
@@ -15,7 +16,6 @@ from polmvs.colmap.maps import (
     write_depth_map,
     write_normal_map,
 )
-from polmvs.colmap.models import pycolmap
 from polmvs.errors import DataError
 
 SMALL = PinholeCamera(width=3, height=2, fx=4.0, fy=4.0, cx=1.5, cy=1.0)

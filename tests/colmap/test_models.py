@@ -8,19 +8,18 @@ import subprocess
 import sys
 
 import numpy as np
+import pycolmap
 import pytest
 
 from polmvs.camera import PinholeCamera, pixel_centers
+from polmvs.colmap.cameras import ColmapCamera, camera_from_colmap, camera_to_colmap
 from polmvs.colmap.models import (
-    ColmapCamera,
-    camera_from_colmap,
-    camera_to_colmap,
     find_model,
+    match_model_to_capture,
     model_from_reconstruction,
-    pycolmap,
     read_model,
+    write_model,
 )
-from polmvs.colmap.sparse_model import match_model_to_capture, write_model
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
 from polmvs.scene import SparseModel, Tracks, View
@@ -369,3 +368,20 @@ def test_rig_of_two_cameras_is_read(tmp_path):
     assert len(model.views) == 10
     write_model(model, tmp_path / "flat")
     assert_same_model(read_model(tmp_path / "flat"), model)
+
+
+def test_importing_leaves_colmaps_log_as_it_was():
+    code = (
+        "import pycolmap\n"
+        "before = pycolmap.logging.minloglevel\n"
+        "import polmvs.colmap.sfm\n"
+        "assert pycolmap.logging.minloglevel == before\n"
+        "from polmvs.colmap.cameras import quiet_colmap\n"
+        "with quiet_colmap():\n"
+        "    assert pycolmap.logging.minloglevel == 3\n"
+        "assert pycolmap.logging.minloglevel == before\n"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", "import zlib\n" + code], capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr

@@ -118,7 +118,7 @@ def test_faulty_images(images, tmp_path):
     work, sparse = tmp_path / "work", tmp_path / "sparse"
     with pytest.raises(DataError, match="has 1 images"):
         run_sfm(images, ["000.png"], work, sparse, options)
-    with pytest.raises(DataError, match=r"none\.png: is no image"):
+    with pytest.raises(DataError, match=r"none\.png: no such file"):
         run_sfm(images, ["000.png", "none.png"], work, sparse, options)
     small = tmp_path / "images"
     small.mkdir()

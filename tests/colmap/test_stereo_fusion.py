@@ -15,8 +15,7 @@ from dense_scenes import (
     scene_of,
 )
 
-from polmvs.colmap.dense_workspace import open_dense_workspace
-from polmvs.colmap.workspace_layout import write_maps
+from polmvs.colmap.dense_workspace import open_dense_workspace, write_maps
 from polmvs.synthetic.captures import Sphere, ring_of_views
 
 CAMERAS = pytest.mark.parametrize(

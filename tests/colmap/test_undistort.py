@@ -1,6 +1,7 @@
 """Undistorted cameras and warps: against COLMAP, exact planes, edges."""
 
 import numpy as np
+import pycolmap
 import pytest
 from dense_scenes import (
     BOARD,
@@ -18,15 +19,10 @@ from dense_scenes import (
 from scipy.ndimage import binary_erosion
 
 from polmvs.camera import pixel_centers
+from polmvs.colmap.cameras import camera_to_colmap
 from polmvs.colmap.maps import map_pixel_xy
-from polmvs.colmap.models import camera_to_colmap, pycolmap
-from polmvs.colmap.undistort import (
-    undistort_xy,
-    undistorted_camera,
-    undistorted_model,
-    warp_dense_view,
-    warp_image,
-)
+from polmvs.colmap.undistort import undistort_xy, undistorted_camera, undistorted_model, warp_image
+from polmvs.surface.map_export import warp_dense_view
 from polmvs.synthetic.captures import Group, Plane, Sphere
 
 CAMERAS = pytest.mark.parametrize(

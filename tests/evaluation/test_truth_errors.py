@@ -16,7 +16,7 @@ from polmvs.evaluation.truth_errors import evaluate, phase_errors_on_part, track
 from polmvs.geometry import RigidTransform
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.polarization.angle_models import phase_from_normal
-from polmvs.poses.alignment import align_to_truth
+from polmvs.poses.alignment import align_views
 from polmvs.scene import View
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ def test_one_wrong_camera_is_dropped(truth: GroundTruth, num: int, distance: flo
     rng = np.random.default_rng(0)
     views = [moved(v, SCALE * rng.normal(0, 0.0003, 3)) for v in scrambled_views(truth)[:num]]
     views[2] = moved(views[2], SCALE * distance * np.array([0.6, 0.0, 0.8]))
-    transform, report = align_to_truth(views, truth)
+    transform, report = align_views(views, truth.views)
     assert report.dropped == (views[2].name,)
     assert report.num_cameras == num - 1
     assert report.scale == pytest.approx(1 / SCALE, rel=5e-3)
@@ -93,7 +93,7 @@ def test_noise_alone_drops_nobody(truth: GroundTruth) -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
         views = [moved(v, SCALE * rng.normal(0, 0.002, 3)) for v in scrambled_views(truth)]
-        assert align_to_truth(views, truth)[1].dropped == ()
+        assert align_views(views, truth.views)[1].dropped == ()
 
 
 def test_rotation_error_is_reported(truth: GroundTruth) -> None:
@@ -103,7 +103,7 @@ def test_rotation_error_is_reported(truth: GroundTruth) -> None:
         rotation = turn @ view.cam_from_world.rotation
         pose = RigidTransform(rotation, -rotation @ view.center_in_world)
         views.append(replace(view, cam_from_world=pose))
-    _, report = align_to_truth(views, truth)
+    _, report = align_views(views, truth.views)
     assert report.rotation_error_median_deg == pytest.approx(2.0, rel=1e-6)
 
 
@@ -111,14 +111,14 @@ def test_three_names_must_match(truth: GroundTruth) -> None:
     views = scrambled_views(truth)[:4]
     views[:2] = [replace(view, name=f"other_{view.name}") for view in views[:2]]
     with pytest.raises(DataError, match="knows 2 of the 4"):
-        align_to_truth(views, truth)
+        align_views(views, truth.views)
 
 
 def test_cameras_on_a_line(truth: GroundTruth) -> None:
     views = scrambled_views(truth)[:3]
     on_line = [moved(v, -v.center_in_world + [k, 0.0, 0.0]) for k, v in enumerate(views)]
     with pytest.raises(DataError, match="cannot be aligned"):
-        align_to_truth(on_line, truth)
+        align_views(on_line, truth.views)
 
 
 def test_track_normals(truth: GroundTruth) -> None:

@@ -1,5 +1,7 @@
 """The quarter turn between specular and diffuse light, and maps corrected for tilted polarizers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import CAMERA, Scene, board_scene, phase_map_of, tracks_at
@@ -63,6 +65,19 @@ def test_the_light_of_a_curved_thing_is_told(light):
 def test_without_points_strong_polarisation_means_specular(board):
     none = tracks_at(board, np.zeros((0, 3)))
     assert not any(mask.any() for mask in find_diffuse(none, board.maps))
+
+
+@pytest.mark.parametrize("light", ["specular", "diffuse"])
+def test_a_part_without_points_is_told_by_its_own_phases(light):
+    """Weak polarisation, which alone would pass for diffuse, on a thing without sparse points."""
+    scene = dome_scene(light)
+    weak = [replace(m, samples=m.samples * np.float32([0.3, 0.3, 1])) for m in scene.maps]
+    assert max(np.linalg.norm(m.samples[..., :2], axis=-1).max() for m in weak) < 0.4
+    corners = np.array([[x, y, -0.2] for x in (-0.3, 0.3) for y in (-0.3, 0.3)])
+    about = tracks_at(scene, corners)  # on the ground beside it
+    masks = find_diffuse(about, weak)
+    share = sum(int(m.sum()) for m in masks) / sum(int(m.region.inside.sum()) for m in weak)
+    assert share == pytest.approx(1.0 if light == "diffuse" else 0.0, abs=0.05)
 
 
 def test_turning_twice_changes_nothing(board):

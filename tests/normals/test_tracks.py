@@ -6,15 +6,9 @@ from scenes import board_scene, tracks_at
 
 from polmvs.config import AngleModel, Estimator, NormalOptions
 from polmvs.normals.rows import gather_rows
-from polmvs.normals.tracks import (
-    dolp_shares,
-    point_sigmas,
-    seen_shares,
-    select_seeds,
-    track_normals,
-    window_map,
-)
+from polmvs.normals.tracks import dolp_shares, seen_shares, select_seeds, track_normals, window_map
 from polmvs.polarization.phase_map import open_phase_map, store_phase_map
+from polmvs.scene import point_sigmas
 
 
 @pytest.fixture(scope="module")

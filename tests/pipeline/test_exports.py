@@ -5,24 +5,28 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from dense_scenes import fuse
 from helpers import content_of, cut_after, record_of, refused, stages_of
+from polmvs.pipeline.own_files import DENSE_MARKER
 from scipy.spatial import cKDTree
 
 from polmvs.cli import main
-from polmvs.colmap.dense_workspace import DenseWorkspace, open_dense_workspace
-from polmvs.colmap.kept_depth import kept_cloud
+from polmvs.colmap.dense_workspace import (
+    DenseWorkspace,
+    map_files,
+    open_dense_workspace,
+    write_maps,
+)
 from polmvs.colmap.maps import DepthNormals, read_depth_map, write_depth_map
-from polmvs.colmap.models import pycolmap, read_model
-from polmvs.colmap.sparse_model import write_model
-from polmvs.colmap.workspace_layout import map_files, write_maps
+from polmvs.colmap.models import read_model, write_model
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.clouds import read_cloud, read_mesh
 from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
-from polmvs.pipeline.own_files import DENSE_MARKER
 from polmvs.poses.metric_frame import transform_model
 from polmvs.scene import PointKind
+from polmvs.surface.kept_depth import kept_cloud
 
 BOARD_HEIGHT_M = 0.012  # of the true plane z = const, in the capture's gt/scene.json
 # A pixel is 1.3 mm on the board; SfM's poses bend and shift it by some tenths of that.

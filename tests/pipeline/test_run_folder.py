@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from polmvs.pipeline.runtime import peak_rss_mb, versions
 
 from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError
 from polmvs.pipeline.checks import followers
 from polmvs.pipeline.record import Record, StageRecord, write_json
 from polmvs.pipeline.run_folder import RunFolder, has_content, prepare_output, require_apart
-from polmvs.pipeline.runtime import peak_rss_mb, versions
 
 
 def finished_run(root: Path) -> RunFolder:

@@ -10,8 +10,7 @@ import pytest
 from scenes import CAMERA, tracks_at
 from scipy.spatial.transform import Rotation
 
-from polmvs.colmap.models import read_model
-from polmvs.colmap.sparse_model import write_model
+from polmvs.colmap.models import read_model, write_model
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform
 from polmvs.poses.known_poses import retriangulate, with_known_poses, write_known_poses

@@ -11,15 +11,20 @@ import pytest
 from numpy.typing import NDArray
 
 from polmvs.camera import Camera, PinholeCamera
-from polmvs.colmap.models import ColmapCamera
+from polmvs.colmap.cameras import ColmapCamera
 from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError, OptionError
-from polmvs.geometry import RigidTransform
+from polmvs.geometry import RigidTransform, intersect_rays
 from polmvs.polarization.capture import DISPLAY_GAMMA
-from polmvs.poses.marker_size import measure_markers
-from polmvs.poses.markers import Detection, detect_markers, find_markers, parse_marker_option
-from polmvs.poses.metric_sources import metric_frame
-from polmvs.poses.triangulation import intersect_rays, triangulate_together
+from polmvs.poses.markers import (
+    Detection,
+    detect_markers,
+    find_markers,
+    measure_markers,
+    parse_marker_option,
+    triangulate_together,
+)
+from polmvs.poses.metric_frame import metric_frame
 from polmvs.scene import SparseModel, Tracks, View
 from polmvs.synthetic.captures import look_at, ring_of_views
 

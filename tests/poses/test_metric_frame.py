@@ -20,14 +20,14 @@ from polmvs.geometry import RigidTransform, SimilarityTransform
 from polmvs.option_values import from_plain, to_plain
 from polmvs.poses.metric_frame import (
     Frame,
-    find_name,
+    check_reference,
     frame_from_centers,
-    match_names,
+    metric_frame,
+    read_centers,
     require_agreement,
     transform_model,
 )
-from polmvs.poses.metric_sources import check_reference, metric_frame, read_centers
-from polmvs.scene import SparseModel, Tracks, View
+from polmvs.scene import SparseModel, Tracks, View, find_name, match_names
 from polmvs.synthetic.captures import ring_of_views
 
 Array = NDArray[np.float64]
@@ -321,7 +321,7 @@ def test_names() -> None:
     assert find_name("a/0.png", names) == "a/0.png"
     assert find_name("1.tif", names) == "1.png"
     assert find_name("0.png", names) is None
-    assert match_names(["0.png", "1.tif"], names) == {"1.png": "1.tif"}
+    assert match_names(names, ["0.png", "1.tif"]) == {"1.png": "1.tif"}
     assert match_names(names, names) == {name: name for name in names}
 
 

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera, pixel_centers, sample_image
-from polmvs.colmap.models import ColmapCamera
+from polmvs.colmap.cameras import ColmapCamera
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import Region, smooth
 from polmvs.scene import View
-from polmvs.surface.stereo import (
+from polmvs.surface.surroundings import (
     combine_ranges,
     fit_planes,
     match,

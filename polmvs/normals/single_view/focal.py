@@ -24,10 +24,16 @@ from scipy.optimize import minimize_scalar
 
 from polmvs.config import AngleModel, Light
 from polmvs.normals.estimator import CAUCHY_SCALE
-from polmvs.normals.single_view.phase_errors import error_gradients, phase_errors, stack_samples
-from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal, robust_deviation, tangents
-from polmvs.polarization.angle_models import phase_sign
-from polmvs.polarization.tilted import correct_parameters, sigma_scale
+from polmvs.normals.single_view.plane import (
+    PlaneEstimate,
+    error_gradients,
+    phase_errors,
+    plane_normal,
+    robust_deviation,
+    stack_samples,
+    tangents,
+)
+from polmvs.polarization.angle_models import correct_parameters, phase_sign, sigma_scale
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Array: TypeAlias = NDArray[np.float64]
@@ -86,8 +92,9 @@ class _View:
         rays /= np.sqrt((rays * rays).sum(axis=0))
         parameters, sigma = self.parameters, self.sigma
         if self.model is AngleModel.TILTED:
-            parameters = correct_parameters(parameters, rays.T, light=self.light)
-            sigma = sigma * sigma_scale(parameters[1], parameters[2], rays.T, light=self.light)
+            diffuse = self.light is Light.DIFFUSE
+            parameters = correct_parameters(parameters, rays.T, diffuse=diffuse)
+            sigma = sigma * sigma_scale(parameters[1], parameters[2], rays.T, diffuse=diffuse)
         return phase_sign(self.light) * parameters[1:], rays, sigma
 
     def plane(self, focal_px: float) -> PlaneEstimate:

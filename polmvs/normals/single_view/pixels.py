@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.config import AngleModel, CaptureOptions, Light
-from polmvs.io.images import probe_mosaic
 from polmvs.normals.single_view.focal import FocalEstimate, estimate_focal
 from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal
 from polmvs.normals.single_view.search import FoundPlane, find_planes
-from polmvs.polarization.angle_models import phase_sign
-from polmvs.polarization.capture import Capture, _full_scale_16
+from polmvs.polarization.angle_models import correct_stokes, phase_sign
+from polmvs.polarization.capture import open_image
 from polmvs.polarization.phase_map import MIXTURE_SIGMA, MODEL_SIGMA
 from polmvs.polarization.stokes import Stokes
-from polmvs.polarization.tilted import correct_stokes
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -54,7 +52,7 @@ class PlaneView:
         rays = camera.rays(pixel_centers(camera.width, camera.height)).astype(np.float32)
         stokes = self.stokes
         if model is AngleModel.TILTED:
-            stokes = correct_stokes(stokes, rays, light=self.light)
+            stokes = correct_stokes(stokes, rays, diffuse=self.light is Light.DIFFUSE)
         axial = phase_sign(self.light) * np.stack([stokes.s1, stokes.s2])
         return axial, np.ascontiguousarray(np.moveaxis(rays, -1, 0)), phase_sigma(stokes)
 
@@ -99,17 +97,7 @@ def load_stokes(path: Path, options: CaptureOptions) -> Stokes:
     DataError
         The file is missing, damaged or no monochrome mosaic.
     """
-    header = probe_mosaic(path)
-    capture = Capture(
-        folder=path.parent,
-        paths=(path,),
-        width=header.width // 2,
-        height=header.height // 2,
-        bit_depth=header.bit_depth,
-        full_scale=255 if header.bit_depth == 8 else _full_scale_16([path]),
-        options=options,
-    )
-    return capture.load(path.name)
+    return open_image(path, options).load(path.name)
 
 
 def phase_sigma(stokes: Stokes) -> Image:

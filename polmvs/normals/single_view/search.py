@@ -16,8 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import AngleModel
-from polmvs.normals.single_view.phase_errors import phase_errors, stack_samples
-from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
+from polmvs.normals.single_view.plane import (
+    PlaneEstimate,
+    phase_errors,
+    phase_residuals,
+    plane_normal,
+    stack_samples,
+)
 from polmvs.polarization.angle_models import rows_from_axial
 
 Floats: TypeAlias = NDArray[np.floating[Any]]

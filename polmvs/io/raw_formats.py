@@ -1,0 +1,392 @@
+"""Samples of one image file as the camera stored them, whatever the container.
+
+PNG, TIFF, PGM, BMP, JPEG and Radiance HDR are decoded by OpenCV, NPY here, OpenEXR by its own
+library (OpenCV reads it only after an environment variable was set before its import), and dumps
+without a header, packed or not, from their size in pixels. Nothing is scaled, turned or converted:
+what a sample's value means is decided in :mod:`polmvs.polarization.bit_depth`.
+
+A TIFF's orientation tag is reported and not applied: turning the samples would turn the cells of
+the mosaic, and views of one camera that differ in it would differ in their camera.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import tokenize
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.choices import Packing
+from polmvs.errors import DataError, OptionError
+from polmvs.io.images import BROKEN, PNG_SIGNATURE, PathArg, check_png, decode_image, read_bytes
+
+DUMP_SUFFIXES = frozenset({".raw", ".bin"})
+LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg"})
+FLOAT_SUFFIXES = frozenset({".exr", ".hdr"})
+SUFFIXES = frozenset(
+    {".png", ".tif", ".tiff", ".bmp", ".pgm", ".npy", *DUMP_SUFFIXES, *LOSSY_SUFFIXES}
+    | FLOAT_SUFFIXES
+)
+MAX_PIXELS = 1 << 28  # of one file; the largest polarization sensors have 2^25
+PNG_GRAY = 0  # colour type of a monochrome PNG without alpha
+UPRIGHT = 1  # orientation tag of an image that is stored as it is shown
+TIFF_BITS, TIFF_COMPRESSION, TIFF_ORIENTATION = 258, 259, 274
+TIFF_JPEG = (6, 7)
+# Order of an 8x8 block's coefficients in a JPEG file, as (row, column).
+_ZIGZAG = sorted(
+    ((v, u) for v in range(8) for u in range(8)),
+    key=lambda at: (sum(at), at[0] if sum(at) % 2 else at[1]),
+)
+_PACKED_BITS = {
+    Packing.MONO10P: 10,
+    Packing.MONO12P: 12,
+    Packing.MONO10PACKED: 12,
+    Packing.MONO12PACKED: 12,
+}
+
+
+class DumpSize(NamedTuple):
+    """What a dump without a header does not say; None is decided from the file's size.
+
+    Attributes
+    ----------
+    width, height : px.
+    packing : how samples lie in the bytes.
+    """
+
+    width: int | None = None
+    height: int | None = None
+    packing: Packing | None = None
+
+
+class RawImage(NamedTuple):
+    """One file's samples and what it says about them.
+
+    Attributes
+    ----------
+    samples : (H, W), or (H, W, 3) in the order red, green, blue; uint8, uint16 or float32.
+    declared_bits : bits that the file itself says its samples have, if fewer than their type.
+    orientation : 1 to 8 as in TIFF's tag 274; the samples are as stored, not turned.
+    quantization : (8, 8) float64, steps of a JPEG's luminance coefficients, rows for vertical
+        frequencies; None where the file is not known to be a JPEG.
+    lossy : the container compressed with loss; the steps may be unknown.
+    """
+
+    samples: NDArray[Any]
+    declared_bits: int | None = None
+    orientation: int = UPRIGHT
+    quantization: NDArray[np.float64] | None = None
+    lossy: bool = False
+
+    @property
+    def header(self) -> RawHeader:
+        """Its size and type."""
+        height, width = self.samples.shape[:2]
+        channels = 1 if self.samples.ndim == 2 else self.samples.shape[2]
+        return RawHeader(width, height, channels, str(self.samples.dtype))
+
+
+class RawHeader(NamedTuple):
+    """Size and type of an image's samples.
+
+    Attributes
+    ----------
+    width, height : px.
+    channels : 1, or 3 in colour.
+    dtype : "uint8", "uint16" or "float32".
+    """
+
+    width: int
+    height: int
+    channels: int
+    dtype: str
+
+
+def read_raw(path: PathArg, dump: DumpSize | None = None) -> RawImage:
+    """Read an image's samples unchanged.
+
+    Parameters
+    ----------
+    path : a file with one of ``SUFFIXES``; its content decides where it has a signature.
+    dump : size and packing of a ``.raw`` or ``.bin`` file.
+
+    Raises
+    ------
+    DataError
+        The file is missing, damaged, or of a type that holds no intensities.
+    OptionError
+        A dump's size or packing is not given and does not follow from its length.
+    """
+    suffix = Path(path).suffix.lower()
+    data = read_bytes(path)
+    if suffix in DUMP_SUFFIXES:
+        return RawImage(unpack(path, data, dump if dump is not None else DumpSize()))
+    if data.startswith(b"\x93NUMPY"):
+        return RawImage(_as_samples(path, _read_npy(path, data)))
+    if data.startswith(b"v/1\x01"):
+        return RawImage(_as_samples(path, _read_exr(path)))
+    if data[:2] == b"P5":
+        return _read_pgm(path, data)
+    if data[:4] in (b"II*\0", b"MM\0*"):
+        return _read_tiff(path, data)
+    samples = _colour_last(path, decode_image(path, data))
+    if data[:2] == b"\xff\xd8":
+        return RawImage(samples, quantization=_luminance_steps(path, data), lossy=True)
+    return RawImage(samples)
+
+
+def probe_raw(path: PathArg, dump: DumpSize | None = None) -> RawHeader | None:
+    """Size and type of a monochrome PNG without decoding it; None of all other files.
+
+    Its checksums are verified, so that it will decode later.
+
+    Raises
+    ------
+    DataError
+        The file is missing, or a damaged PNG.
+    """
+    if Path(path).suffix.lower() != ".png":
+        return None
+    data = read_bytes(path)
+    if not data.startswith(PNG_SIGNATURE):
+        return None
+    check_png(path, data)
+    width, height, bit_depth, colour_type = struct.unpack_from(">IIBB", data, 16)
+    if colour_type != PNG_GRAY or bit_depth not in (8, 16):
+        return None
+    return RawHeader(width, height, 1, f"uint{bit_depth}")
+
+
+def unpack(path: PathArg, data: bytes, dump: DumpSize) -> NDArray[Any]:
+    """Samples ``(H, W)`` of a dump without a header.
+
+    ``Mono10p`` and ``Mono12p`` are one stream of bits, least significant first; the older
+    ``Mono10Packed`` and ``Mono12Packed`` hold the high bytes of two samples about one byte of
+    their low bits (GenICam PFNC 2.4 and GigE Vision 2.0).
+
+    Raises
+    ------
+    DataError
+        The length does not fit the size.
+    OptionError
+        The size is not given, or the packing is not and two of them have this length.
+    """
+    if dump.width is None or dump.height is None:
+        raise OptionError(f"{path}: is a dump without a header. Give --width and --height.")
+    num = dump.width * dump.height
+    packing = dump.packing if dump.packing is not None else _packing_of(path, len(data), num)
+    expected = _dump_bytes(packing, num)
+    if len(data) != expected:
+        raise DataError(
+            path,
+            f"has {len(data):,} bytes; {dump.width}x{dump.height} px of {packing} are "
+            f"{expected:,}. Check --width, --height and --packing.",
+        )
+    shape = (dump.height, dump.width)
+    if packing is Packing.MONO8:
+        return np.frombuffer(data, np.uint8).reshape(shape)
+    if packing is Packing.MONO16:
+        return np.frombuffer(data, "<u2").astype(np.uint16).reshape(shape)
+    return _unpack_bits(np.frombuffer(data, np.uint8), packing)[:num].reshape(shape)
+
+
+def _unpack_bits(packed: NDArray[np.uint8], packing: Packing) -> NDArray[np.uint16]:
+    """Samples of whole groups of bytes, flat."""
+    group = 5 if packing is Packing.MONO10P else 3
+    b = packed[: len(packed) // group * group].reshape(-1, group).T.astype(np.uint16)
+    match packing:
+        case Packing.MONO10P:
+            parts = [
+                b[0] | (b[1] & 0x03) << 8,
+                b[1] >> 2 | (b[2] & 0x0F) << 6,
+                b[2] >> 4 | (b[3] & 0x3F) << 4,
+                b[3] >> 6 | b[4] << 2,
+            ]
+        case Packing.MONO12P:
+            parts = [b[0] | (b[1] & 0x0F) << 8, b[1] >> 4 | b[2] << 4]
+        case Packing.MONO10PACKED:
+            parts = [b[0] << 2 | (b[1] & 0x03), b[2] << 2 | (b[1] >> 4 & 0x03)]
+        case _:
+            parts = [b[0] << 4 | (b[1] & 0x0F), b[2] << 4 | b[1] >> 4]
+    return np.stack(parts, axis=-1).ravel()
+
+
+def _dump_bytes(packing: Packing, num: int) -> int:
+    """Bytes of that many samples; an even number of them, as a mosaic has."""
+    bits = {Packing.MONO8: 8, Packing.MONO16: 16} | _PACKED_BITS
+    return -(-num * bits[packing] // 8)
+
+
+def _packing_of(path: PathArg, length: int, num: int) -> Packing:
+    """The only packing of this length, or a complaint that names those that fit."""
+    fits = [packing for packing in Packing if _dump_bytes(packing, num) == length]
+    if len(fits) == 1:
+        return fits[0]
+    if fits:
+        raise OptionError(f"{path}: may be packed as {' or '.join(fits)}. Say which by --packing.")
+    raise DataError(
+        path,
+        f"has {length:,} bytes, which no packing of {num:,} samples has. "
+        "Check --width and --height.",
+    )
+
+
+def _as_samples(path: PathArg, values: NDArray[Any]) -> NDArray[Any]:
+    """Numbers as uint8, uint16 or float32, unchanged in value."""
+    if values.dtype.kind == "f":
+        return values.astype(np.float32)
+    if values.dtype.kind not in "ui":
+        raise DataError(path, f"holds {values.dtype}, no intensities. Store integers or floats.")
+    if values.dtype in (np.uint8, np.uint16):
+        return values.astype(values.dtype.newbyteorder("="))
+    if values.size and (values.min() < 0 or values.max() > 0xFFFF):
+        raise DataError(path, "holds integers outside 0 to 65535. Store 16-bit integers or floats.")
+    return values.astype(np.uint16)
+
+
+def _colour_last(path: PathArg, image: NDArray[Any]) -> NDArray[Any]:
+    """OpenCV's channels in the order red, green, blue, alpha left out; its types checked."""
+    if image.dtype.type not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise DataError(path, f"holds {image.dtype}. Export 8- or 16-bit integers, or floats.")
+    if image.dtype == np.float64:
+        image = image.astype(np.float32)
+    if image.ndim == 2:
+        return image
+    return np.ascontiguousarray(image[..., 2::-1]) if image.shape[2] >= 3 else image[..., 0]
+
+
+def _read_npy(path: PathArg, data: bytes) -> NDArray[Any]:
+    """An array of numbers; its header is checked against the length before memory is taken."""
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        reader = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
+        shape, fortran, dtype = reader(stream)
+        offset = stream.tell()
+    except (ValueError, KeyError, EOFError, SyntaxError, tokenize.TokenError, TypeError) as error:
+        raise DataError(path, f"is no readable NPY file. {BROKEN}") from error
+    num = math.prod(shape)
+    if dtype.hasobject or num > 16 * MAX_PIXELS or num * dtype.itemsize != len(data) - offset:
+        raise DataError(path, f"is truncated or no array of numbers. {BROKEN}")
+    flat = np.frombuffer(data, dtype, offset=offset)
+    return flat.reshape(shape, order="F" if fortran else "C")
+
+
+def _read_exr(path: PathArg) -> NDArray[Any]:
+    """The image of an OpenEXR file: its only channel, or red, green and blue."""
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise DataError(
+            path, "is an OpenEXR file. Install its library: pip install 'polmvs[exr]'."
+        ) from error
+    try:
+        with OpenEXR.File(str(path)) as file:
+            channels = {name: np.array(c.pixels) for name, c in file.channels().items()}
+    except Exception as error:  # the library raises RuntimeError, ValueError and its own
+        raise DataError(path, f"is no readable OpenEXR file. {BROKEN}") from error
+    for name in ("RGB", "RGBA"):
+        if name in channels:
+            return channels[name][..., :3]
+    if len(channels) == 1:
+        return next(iter(channels.values()))
+    if "Y" in channels:
+        return channels["Y"]
+    raise DataError(path, f"has the channels {', '.join(sorted(channels))}; one or RGB is read.")
+
+
+def _read_pgm(path: PathArg, data: bytes) -> RawImage:
+    """A binary PGM; OpenCV would forget its largest value, which tells the bit depth."""
+    words: list[bytes] = []
+    position = 2
+    while len(words) < 3 and position < len(data):
+        if data[position : position + 1].isspace():
+            position += 1
+        elif data[position : position + 1] == b"#":
+            position = (data.find(b"\n", position) + 1) or len(data)
+        else:
+            end = position
+            while end < len(data) and not data[end : end + 1].isspace() and end - position < 12:
+                end += 1
+            words.append(data[position:end])
+            position = end
+    if len(words) < 3 or not all(word.isdigit() for word in words):
+        raise DataError(path, f"is damaged: its PGM header is not whole. {BROKEN}")
+    width, height, largest = map(int, words)
+    if not 0 < width * height <= MAX_PIXELS or not 0 < largest < 1 << 16:
+        raise DataError(path, f"is damaged: its PGM header makes no image. {BROKEN}")
+    dtype = np.dtype(">u2" if largest > 0xFF else np.uint8)
+    pixels = data[position + 1 : position + 1 + width * height * dtype.itemsize]
+    if len(pixels) < width * height * dtype.itemsize:
+        raise DataError(path, f"is truncated: {width}x{height} px are promised. {BROKEN}")
+    samples = np.frombuffer(pixels, dtype).reshape(height, width).astype(dtype.newbyteorder("="))
+    bits = largest.bit_length()
+    whole = largest == (1 << bits) - 1 and bits < 8 * dtype.itemsize
+    return RawImage(samples, declared_bits=bits if whole else None)
+
+
+def _read_tiff(path: PathArg, data: bytes) -> RawImage:
+    """A TIFF as stored: its orientation is read, and hidden from OpenCV, which would apply it."""
+    tags = _tiff_tags(data)
+    orientation, at = tags.get(TIFF_ORIENTATION, (UPRIGHT, 0))
+    if at and orientation != UPRIGHT:
+        order = "<H" if data[:2] == b"II" else ">H"
+        patched = bytearray(data)
+        struct.pack_into(order, patched, at, UPRIGHT)
+        data = bytes(patched)
+    samples = _colour_last(path, decode_image(path, data))
+    bits = tags.get(TIFF_BITS, (0, 0))[0]
+    lossy = tags.get(TIFF_COMPRESSION, (1, 0))[0] in TIFF_JPEG
+    odd = samples.dtype.kind == "u" and 8 < bits < 8 * samples.itemsize
+    return RawImage(
+        samples,
+        declared_bits=bits if odd else None,
+        orientation=orientation if 1 <= orientation <= 8 else UPRIGHT,
+        lossy=lossy,
+    )
+
+
+def _tiff_tags(data: bytes) -> dict[int, tuple[int, int]]:
+    """Tags of the first image that hold one short number: value and place in the file."""
+    order = "<" if data[:2] == b"II" else ">"
+    tags: dict[int, tuple[int, int]] = {}
+    try:
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (num,) = struct.unpack_from(f"{order}H", data, start)
+        for index in range(num):
+            at = start + 2 + 12 * index
+            tag, kind, count = struct.unpack_from(f"{order}HHI", data, at)
+            if kind == 3 and count == 1:
+                tags[tag] = (struct.unpack_from(f"{order}H", data, at + 8)[0], at + 8)
+    except struct.error:
+        pass  # OpenCV names the damage
+    return tags
+
+
+def _luminance_steps(path: PathArg, data: bytes) -> NDArray[np.float64]:
+    """Quantisation steps (8, 8) of a JPEG's first table, rows for vertical frequencies."""
+    position = 2
+    while position + 4 <= len(data):
+        marker, length = struct.unpack_from(">HH", data, position)
+        if marker == 0xFFDB and position + 2 + length <= len(data):
+            wide = data[position + 4] >> 4
+            count = 64 * (1 + wide)
+            values = data[position + 5 : position + 5 + count]
+            if len(values) == count:
+                steps = np.zeros((8, 8))
+                flat = np.frombuffer(values, ">u2" if wide else np.uint8)
+                for place, step in zip(_ZIGZAG, flat, strict=True):
+                    steps[place] = step
+                return steps
+        if marker == 0xFFDA or marker >> 8 != 0xFF:
+            break
+        position += 2 + length
+    raise DataError(path, f"is a damaged JPEG without quantisation tables. {BROKEN}")

@@ -1,0 +1,102 @@
+"""JSON files of typed results: dataclasses written whole, and read back as what they were."""
+
+from __future__ import annotations
+
+import json
+import math
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any, TypeVar
+
+from polmvs.io.images import write_bytes
+from polmvs.option_values import to_plain
+
+T = TypeVar("T")
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write dataclasses, mappings and sequences, whole or not at all; NaN becomes null."""
+    text = json.dumps(to_plain(content), indent=1, allow_nan=False)
+    write_bytes(path, (text + "\n").encode())
+
+
+def from_json(kind: type[T], value: Any, where: str = "") -> T:
+    """A value of a type from what JSON holds of it.
+
+    Parameters
+    ----------
+    kind : a dataclass, or what its fields may be: ``bool``, ``int``, ``float``, ``str``, ``Path``,
+        enums, tuples, mappings, other dataclasses, ``Any``, and each of these or None.
+    value : as ``json.loads`` gives it. A null is None, or NaN where a float must be.
+    where : place of the value in the file, for messages.
+
+    Raises
+    ------
+    ValueError
+        A key is missing or unknown, or a value is of another type; the message names it.
+    """
+    return typing.cast(T, _decode(kind, value, where))
+
+
+def _decode(kind: Any, value: Any, where: str) -> Any:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if kind is Any:
+        return value
+    if origin in (types.UnionType, typing.Union):
+        if value is None and type(None) in arguments:
+            return None
+        return _decode(next(a for a in arguments if a is not type(None)), value, where)
+    if is_dataclass(kind) and isinstance(kind, type):
+        return _decode_dataclass(kind, value, where)
+    if origin is tuple:
+        return _decode_tuple(arguments, value, where)
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        items = _expect(value, dict, where).items()
+        return {
+            _decode(arguments[0], key, where): _decode(arguments[1], item, f"{where}.{key}")
+            for key, item in items
+        }
+    if kind is float:
+        number = math.nan if value is None else _expect(value, (int, float), where)
+        return float(number)
+    if isinstance(kind, type) and issubclass(kind, Enum | Path):
+        return kind(_expect(value, (str, int), where))
+    return _expect(value, kind, where)
+
+
+def _decode_dataclass(kind: Any, value: Any, where: str) -> Any:
+    content = _expect(value, dict, where)
+    hints = typing.get_type_hints(kind)
+    names = {field.name for field in fields(kind)}
+    if unknown := sorted(content.keys() - names):
+        raise ValueError(f"{_place(where)} has an unknown key {unknown[0]!r}")
+    if missing := sorted(names - content.keys()):
+        raise ValueError(f"{_place(where)} lacks {missing[0]!r}")
+    return kind(
+        **{name: _decode(hints[name], item, f"{where}.{name}") for name, item in content.items()}
+    )
+
+
+def _decode_tuple(elements: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    items = _expect(value, list, where)
+    if Ellipsis in elements:
+        elements = (elements[0],) * len(items)
+    if len(items) != len(elements):
+        raise ValueError(f"{_place(where)} has {len(items)} elements, not {len(elements)}")
+    pairs = zip(elements, items, strict=True)
+    return tuple(_decode(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(pairs))
+
+
+def _expect(value: Any, kind: Any, where: str) -> Any:
+    """The value, if it is of that type; true and false are no numbers."""
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(f"{_place(where)} cannot be {str(value)[:40]!r}")
+    return value
+
+
+def _place(where: str) -> str:
+    return where.lstrip(".") or "the file"

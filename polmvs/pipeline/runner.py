@@ -1,0 +1,397 @@
+"""A run in a run folder: checked before it begins, recorded stage by stage, able to go on.
+
+A stage is recorded in ``run.json`` when its files are whole. A run that goes on skips recorded
+stages; the options that decided these must be the same. Every stage reads its input from the run
+folder, so that a run that was stopped gives the same result as one that was not. What is decided
+about a stage is decided when it begins, when all that it reads is known.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from polmvs.colmap.cameras import quiet_colmap
+from polmvs.config import Options, RunOptions
+from polmvs.errors import DataError, OptionError, PolmvsError
+from polmvs.evaluation.tables import format_table, number
+from polmvs.option_values import to_plain
+from polmvs.parallel import Workers
+from polmvs.pipeline.checks import (
+    check_input,
+    identity_of,
+    inputs_of,
+    require_apart,
+    require_same_capture,
+)
+from polmvs.pipeline.monitor import Monitor, NoMonitor, OnProgress, no_progress
+from polmvs.pipeline.record import (
+    Record,
+    StageRecord,
+    peak_rss_mb,
+    read_image_names,
+    read_record,
+    versions,
+    write_record,
+)
+from polmvs.pipeline.run_folder import (
+    RUN_FILE,
+    RunFolder,
+    discard,
+    has_content,
+    remove_temporary,
+    require_own,
+)
+from polmvs.pipeline.stage_table import (
+    StageInput,
+    StageSpec,
+    needed_by,
+    result_types,
+    with_dependent,
+    written_names,
+)
+from polmvs.pipeline.stages.images import image_names
+from polmvs.polarization.capture import Capture, open_capture
+from polmvs.scene import SparseModel
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(kw_only=True)
+class Run:
+    """A run in progress.
+
+    Attributes
+    ----------
+    run_folder, capture, options, workers, monitor : what it works with.
+    table : all stages, in order.
+    given_model : the sparse model of the options, fitted to the capture.
+    record : what is finished, as in ``run.json``.
+    """
+
+    run_folder: RunFolder
+    capture: Capture
+    options: Options
+    workers: Workers
+    monitor: Monitor
+    table: Sequence[StageSpec]
+    given_model: SparseModel | None
+    record: Record
+    _started: float = field(default_factory=time.perf_counter)
+
+    def is_finished(self, spec: StageSpec) -> bool:
+        """Whether a stage is recorded."""
+        return self.record.stage(spec.name) is not None
+
+    def do(self, spec: StageSpec) -> None:
+        """Do a stage, unless it is finished, and record it.
+
+        Raises
+        ------
+        DataError
+            A stage that it reads from is not finished.
+        """
+        finished = self.record.stage(spec.name)
+        if finished is not None and not (spec.is_redone and self._has_changed(spec, finished)):
+            logger.info("%s: finished earlier", spec.name)
+            self.monitor.skipped(spec.name)
+            return
+        for other in needed_by(spec, self.table):
+            if not self.is_finished(other):
+                raise DataError(
+                    self.run_folder.root,
+                    f"its stage {other.name!r} is not finished, which {spec.name!r} reads. "
+                    f"Run 'polmvs {other.command}' first.",
+                )
+        if finished is not None:
+            self.forget([spec.name])
+        self._carry_out(spec)
+
+    def _carry_out(self, spec: StageSpec) -> None:
+        """Do a stage whose input is there, and record it."""
+        logger.info("%s: begins", spec.name)
+        start = time.perf_counter()
+        with self.monitor.stage(spec.name, spec.num_steps(self._input())) as on_progress:
+            result = spec.work(self._input(on_progress))
+        seconds = round(time.perf_counter() - start, 3)
+        logger.info("%s: %.1f s, %s", spec.name, seconds, result)
+        finished = StageRecord(
+            name=spec.name,
+            angle_model=spec.angle_model,
+            reads=_names(spec.reads),
+            options=plain_options(self.options, spec.decides),
+            seconds=seconds,
+            peak_rss_mb=round(peak_rss_mb(), 1),
+            result=result,
+        )
+        self.record.stages = (*self.record.stages, finished)
+        self.save()
+        self.monitor.finished(spec.name, seconds, str(result))
+
+    def _input(self, on_progress: OnProgress = no_progress) -> StageInput:
+        return StageInput(
+            run_folder=self.run_folder,
+            capture=self.capture,
+            options=self.options,
+            workers=self.workers,
+            given_model=self.given_model,
+            record=self.record,
+            on_progress=on_progress,
+        )
+
+    def _has_changed(self, spec: StageSpec, finished: StageRecord) -> bool:
+        """Whether a finished stage was made from other files or options."""
+        now = to_plain(plain_options(self.options, spec.decides))
+        return finished.options != now or finished.reads != _names(spec.reads)
+
+    def forget(self, names: Collection[str]) -> None:
+        """Have stages done again, and all that are made from their files; their files go.
+
+        Raises
+        ------
+        DataError
+            A folder of theirs holds files that no run wrote; nothing is deleted.
+        """
+        stale = with_dependent(names, self.table)
+        paths = [self.run_folder.root / path for spec in stale for path in spec.writes]
+        images = frozenset(self.record.images)
+        for path in paths:
+            if path.is_dir():
+                require_own(path, images)
+        self.record.forget(spec.name for spec in stale)
+        self.save()  # before the files go: a stage that is recorded has its files
+        discard(paths, images)
+
+    def require_same_options(self, names: Collection[str]) -> None:
+        """Refuse finished stages that are to be taken over and are of other options.
+
+        Raises
+        ------
+        OptionError
+            One is; the option is named with both values.
+        """
+        for spec in self.table:
+            finished = self.record.stage(spec.name)
+            if finished is None or spec.name not in names or spec.is_redone:
+                continue
+            for path, now in plain_options(self.options, spec.decides).items():
+                earlier = finished.options.get(path)
+                if earlier != now:
+                    flag = "--" + path.partition(".")[2].replace("_", "-")
+                    raise OptionError(
+                        f"{flag} is {_text(now)} but the finished stage {spec.name!r} in "
+                        f"{self.run_folder.root} used {_text(earlier)}. Give the same value, or "
+                        "--overwrite."
+                    )
+
+    def save(self, *, finished: bool = False) -> None:
+        """Write ``run.json``."""
+        now = time.perf_counter()
+        self.record.wall_s = round(self.record.wall_s + now - self._started, 3)
+        self._started = now
+        self.record.finished = finished
+        write_record(self.run_folder, self.record)
+
+
+@contextmanager
+def open_run(
+    capture_folder: Path,
+    out: Path,
+    options: Options,
+    run_options: RunOptions,
+    *,
+    table: Sequence[StageSpec],
+    min_images: int,
+    taken_over: Collection[str],
+    continues: bool = False,
+    monitor: Monitor | None = None,
+    command_line: Sequence[str] = (),
+) -> Iterator[Run]:
+    """Check the input, make the run folder ready, and give the run.
+
+    Nothing is written or deleted before all input is found sound.
+
+    Parameters
+    ----------
+    capture_folder, out : as the user gave them.
+    options : of all stages.
+    run_options : workers, overwrite and resume.
+    table : all stages, in order.
+    min_images : the fewest that will do.
+    taken_over : names of the stages that are not done again if they are finished.
+    continues : the folder must hold a run, and its finished stages stay, whatever ``run_options``
+        say.
+    monitor : who watches.
+    command_line : for the record.
+
+    Raises
+    ------
+    DataError, OptionError
+        The input is unusable, or the run folder is.
+    """
+    monitor = monitor if monitor is not None else NoMonitor()
+    run_folder = RunFolder(out)
+    require_apart(
+        run_folder, capture=capture_folder, others=inputs_of(options), written=written_names()
+    )
+    with quiet_colmap(), Workers(run_options.workers) as workers:
+        capture = open_capture(capture_folder, options.capture)
+        given_model = check_input(capture, options, min_images)
+        if continues:
+            load_record(run_folder)
+        record = prepare_output(
+            run_folder,
+            overwrite=run_options.overwrite and not continues,
+            resume=run_options.resume or continues,
+        )
+        identity = identity_of(capture)
+        require_same_capture(record, identity, run_folder)
+        run = Run(
+            run_folder=run_folder,
+            capture=capture,
+            options=options,
+            workers=workers,
+            monitor=monitor,
+            table=table,
+            given_model=given_model,
+            record=record,
+        )
+        run.require_same_options(taken_over)
+        record.capture, record.images = identity, tuple(image_names(capture))
+        record.command_line, record.versions = tuple(command_line), versions()
+        record.options = to_plain(options)
+        run.save()
+        monitor.opened(run_folder)
+        try:
+            yield run
+        except BaseException:
+            with suppress(PolmvsError):  # the first error is the one to report
+                run.save()
+            raise
+
+
+def load_record(run_folder: RunFolder) -> Record:
+    """Read ``run.json``.
+
+    Raises
+    ------
+    DataError
+        It is missing, no record of a run, or one of another version.
+    """
+    return read_record(run_folder, result_types())
+
+
+def prepare_output(run_folder: RunFolder, *, overwrite: bool, resume: bool) -> Record:
+    """Make the run folder ready and give the record that the run starts from.
+
+    Parameters
+    ----------
+    overwrite : delete the results of an earlier run. Only what polmvs wrote is deleted.
+    resume : keep them and go on.
+
+    Raises
+    ------
+    OptionError
+        The folder holds something and neither was asked for.
+    DataError
+        It cannot be made, or holds files with our names that no run of polmvs wrote.
+    """
+    root = run_folder.root
+    occupied = has_content(root)
+    if occupied and resume:
+        record = load_record(run_folder)
+        remove_temporary(root)
+        return record
+    if occupied and not overwrite:
+        raise OptionError(
+            f"{root}: exists and is not empty. Give --overwrite to delete an earlier run in it, "
+            "--resume to go on with it, or another OUT."
+        )
+    if occupied:
+        _remove_results(run_folder)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(root, f"cannot be made: {error.strerror or error}.") from error
+    return Record()
+
+
+def _remove_results(run_folder: RunFolder) -> None:
+    """Delete what an earlier run wrote, of any version; other files stay."""
+    root = run_folder.root
+    present = [root / name for name in written_names() if os.path.lexists(root / name)]
+    if not present:
+        return
+    if run_folder.run_file not in present:
+        raise DataError(
+            present[0],
+            f"was not written by polmvs ({RUN_FILE} is missing) and is not overwritten. "
+            "Give another OUT.",
+        )
+    images = read_image_names(run_folder)
+    folders = [path for path in present if path.is_dir()]
+    for folder in folders:
+        require_own(folder, images if folder == run_folder.images else frozenset())
+    try:
+        remove_temporary(root)
+        for path in present:
+            if path in folders:
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+    except OSError as error:
+        raise DataError(root, f"cannot be emptied: {error.strerror or error}.") from error
+
+
+def plain_options(options: Options, paths: Sequence[str]) -> dict[str, Any]:
+    """Values of options by path, in terms of JSON; a group's name stands for all its options."""
+    plain = to_plain(options)
+    found: dict[str, Any] = {}
+    for path in paths:
+        group, _, name = path.partition(".")
+        values = plain[group]
+        found |= {f"{group}.{key}": values[key] for key in ([name] if name else values)}
+    return found
+
+
+def _names(paths: Sequence[Path]) -> tuple[str, ...]:
+    return tuple(path.as_posix() for path in paths)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return ",".join(str(item) for item in value)
+    return "not set" if value is None else str(value)
+
+
+def timing_table(records: Mapping[str, Record]) -> str:
+    """Seconds and memory of the stages of one or more runs, one column pair each."""
+    names = list(dict.fromkeys(stage.name for run in records.values() for stage in run.stages))
+    header = ["stage"]
+    for run in records:
+        header += [f"{run}, s", "peak MB"]
+    rows = [[name, *_stage_cells(name, records)] for name in names]
+    total, rest, wall = ["all stages"], ["all but poses"], ["wall clock"]
+    for record in records.values():
+        seconds = {stage.name: stage.seconds for stage in record.stages}
+        peak = max((stage.peak_rss_mb for stage in record.stages), default=None)
+        total += [number(sum(seconds.values())), number(peak, 1, 0)]
+        rest += [number(sum(t for name, t in seconds.items() if name != "poses")), ""]
+        wall += [number(record.wall_s), ""]
+    return format_table(header, [*rows, total, rest, wall])
+
+
+def _stage_cells(name: str, records: Mapping[str, Record]) -> list[str]:
+    cells = []
+    for record in records.values():
+        stage = record.stage(name)
+        found = (stage.seconds, stage.peak_rss_mb) if stage is not None else (None, None)
+        cells += [number(found[0]), number(found[1], 1, 0)]
+    return cells

@@ -1,0 +1,440 @@
+"""The stage table: every stage of a run, what it reads and writes, and what decides its result.
+
+All that a run knows of its stages follows from :func:`stage_table`: their order, which of them a
+command runs, which are stale when another is done again, the files that go with them, and when a
+finished one may be taken over. A new stage is one entry here and one file in ``stages/``.
+
+A stage reads files that other stages write, and options; it writes files that no other stage
+writes. An entry's function hands a stage its paths and options, nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+from polmvs.config import AngleModel, Options
+from polmvs.evaluation.comparison import SparseFigures
+from polmvs.parallel import Workers
+from polmvs.pipeline.monitor import OnProgress
+from polmvs.pipeline.record import Record
+from polmvs.pipeline.run_folder import HERE, LOG_FILE, RUN_FILE, RunFolder
+from polmvs.pipeline.stages import (
+    dense_workspace,
+    densify,
+    evaluation,
+    images,
+    maps,
+    mesh,
+    normals,
+    poses,
+    seeds,
+    sparse_cloud,
+)
+from polmvs.polarization.capture import Capture
+from polmvs.scene import SparseModel
+
+# Commands that do stages alone, by the stage; ``compare`` has no command for its own alone.
+SFM, NORMALS, DENSIFY, EXPORT, COMPARE = "sfm", "normals", "densify", "export", "compare"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageInput:
+    """What a run gives to a stage when it begins.
+
+    Attributes
+    ----------
+    run_folder, capture, options, workers : what the run works with.
+    given_model : the sparse model of the options, fitted to the capture.
+    record : of the stages that are finished.
+    on_progress : is told of the stage's steps.
+    """
+
+    run_folder: RunFolder
+    capture: Capture
+    options: Options
+    workers: Workers
+    given_model: SparseModel | None
+    record: Record
+    on_progress: OnProgress
+
+    @property
+    def num_views(self) -> int:
+        """Images with a pose."""
+        return self.record.result(poses.PosesResult).num_views
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageSpec:
+    """One stage of a run.
+
+    Attributes
+    ----------
+    name : in ``run.json``.
+    command : the command that does it alone.
+    angle_model : that it is of; None for those of all.
+    reads, writes : files and folders, as paths in the run folder; what other stages write, and
+        what this one does.
+    decides : paths of the options that decide its result; a group's name stands for all its own.
+    work : does it and gives what it found.
+    result : type of what it gives; no other stage of the same angle model gives that type.
+    num_steps : how many steps it will report, known when it begins; None where that is not known.
+    is_wanted : whether the options ask for it, where a command may leave it out.
+    is_redone : whether it is done again when what decides it has changed, instead of refusing to
+        take it over: for what is quickly done and nothing is made from.
+    """
+
+    name: str
+    command: str
+    angle_model: AngleModel | None = None
+    reads: tuple[Path, ...] = ()
+    writes: tuple[Path, ...]
+    decides: tuple[str, ...] = ()
+    work: Callable[[StageInput], Any]
+    result: type
+    num_steps: Callable[[StageInput], int | None] = lambda run: None
+    is_wanted: Callable[[Options], bool] = lambda options: True
+    is_redone: bool = False
+
+
+# What each stage is given
+
+
+def _write_images(run: StageInput) -> images.ImagesResult:
+    return images.write_images(
+        run.capture, run.run_folder.images, workers=run.workers, on_progress=run.on_progress
+    )
+
+
+def _find_poses(run: StageInput) -> poses.PosesResult:
+    folder, options = run.run_folder, run.options
+    if run.given_model is not None and options.sfm.sparse is not None:
+        return poses.take_poses(
+            run.given_model, options.sfm.sparse, folder.images, folder.sparse, options.reference
+        )
+    return poses.find_poses(
+        folder.images,
+        list(images.image_names(run.capture)),
+        folder.sparse,
+        options.sfm,
+        options.reference,
+        on_progress=run.on_progress,
+    )
+
+
+def _build_maps(run: StageInput) -> maps.MapsResult:
+    return maps.build_maps(
+        run.capture,
+        run.run_folder.sparse,
+        run.run_folder.maps(AngleModel.PPA),
+        run.options.region,
+        workers=run.workers,
+        on_progress=run.on_progress,
+    )
+
+
+def _tilt_maps(run: StageInput) -> maps.TiltedMapsResult:
+    folder = run.run_folder
+    return maps.tilt_maps(
+        folder.sparse,
+        folder.maps(AngleModel.PPA),
+        folder.maps(AngleModel.TILTED),
+        workers=run.workers,
+        on_progress=run.on_progress,
+    )
+
+
+def _solve_normals(model: AngleModel, run: StageInput) -> normals.NormalsResult:
+    folder = run.run_folder
+    return normals.solve_track_normals(
+        model, folder.sparse, folder.maps(model), folder.track_normals(model), run.options.normals
+    )
+
+
+def _find_seeds(run: StageInput) -> seeds.SeedsResult:
+    folder = run.run_folder
+    return seeds.find_seeds(
+        folder.sparse,
+        folder.maps(AngleModel.PPA),
+        folder.track_normals(AngleModel.PPA),
+        folder.seeds,
+        unseeded=run.options.normals.unseeded,
+        max_neighbors=run.options.propagation.max_neighbors,
+        tilt_aware=run.options.normals.tilt_aware_weights,
+        workers=run.workers,
+        on_progress=run.on_progress,
+    )
+
+
+def _write_sparse_cloud(model: AngleModel, run: StageInput) -> sparse_cloud.SparseCloudResult:
+    folder = run.run_folder
+    return sparse_cloud.write_sparse_cloud(
+        folder.sparse, folder.track_normals(model), folder.seeds, folder.sparse_cloud(model)
+    )
+
+
+def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
+    folder = run.run_folder
+    return densify.densify(
+        model,
+        sparse=folder.sparse,
+        images=folder.images,
+        maps=folder.maps(model),
+        track_normals=folder.track_normals(model),
+        seeds=folder.seeds,
+        cloud=folder.cloud(model),
+        views=folder.views(model),
+        propagation=run.options.propagation,
+        fusion=run.options.fusion,
+        tilt_aware=run.options.normals.tilt_aware_weights,
+        workers=run.workers,
+        on_progress=run.on_progress,
+    )
+
+
+def _make_mesh(model: AngleModel, run: StageInput) -> mesh.MeshResult:
+    return mesh.make_mesh(run.run_folder.cloud(model), run.run_folder.mesh(model))
+
+
+def _write_workspace(model: AngleModel, run: StageInput) -> dense_workspace.DenseWorkspaceResult:
+    folder, given = run.run_folder, run.options.fusion.workspace
+    if run.record.result(densify.DensifyResult, model).num_points == 0:
+        return dense_workspace.DenseWorkspaceResult(folder=None)
+    paths = (folder.sparse, folder.images, folder.views(model), folder.dense(model))
+    if given is None:
+        return dense_workspace.write_workspace(*paths)
+    return dense_workspace.fill_given(*paths, given, in_place=run.options.export.in_place)
+
+
+def _evaluate(models: Sequence[AngleModel], run: StageInput) -> evaluation.EvaluationResult:
+    found, chosen = run.record.result(poses.PosesResult), run.record.result(seeds.SeedsResult)
+    comparison = evaluation.evaluate_models(
+        run.capture,
+        SparseFigures(
+            num_views=found.num_views,
+            unregistered=found.unregistered,
+            num_tracks=found.num_tracks,
+            num_seeds=chosen.num_track_seeds,
+        ),
+        run.run_folder,
+        models,
+        run.options.evaluation.gt,
+        workers=run.workers,
+    )
+    return evaluation.write_comparison(comparison, run.run_folder.metrics, run.run_folder.summary)
+
+
+# The table
+
+
+@lru_cache(maxsize=32)
+def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[StageSpec, ...]:
+    """All stages, each after those whose files it reads.
+
+    Parameters
+    ----------
+    compared : angle models that the evaluation is of.
+    """
+    ppa = AngleModel.PPA
+    table = [
+        StageSpec(
+            name="images",
+            command=SFM,
+            writes=(HERE.images,),
+            decides=("capture",),
+            work=_write_images,
+            result=images.ImagesResult,
+            num_steps=lambda run: len(run.capture.names),
+        ),
+        StageSpec(
+            name="poses",
+            command=SFM,
+            reads=(HERE.images,),
+            writes=(HERE.sparse,),
+            decides=("sfm", "reference"),
+            work=_find_poses,
+            result=poses.PosesResult,
+            num_steps=lambda run: None if run.given_model else poses.NUM_SFM_STEPS,
+        ),
+        StageSpec(
+            name="maps",
+            command=NORMALS,
+            reads=(HERE.sparse,),
+            writes=(HERE.maps(ppa),),
+            decides=("capture", "region"),
+            work=_build_maps,
+            result=maps.MapsResult,
+            num_steps=lambda run: run.num_views,
+        ),
+        StageSpec(
+            name="maps_tilted",
+            command=NORMALS,
+            angle_model=AngleModel.TILTED,
+            reads=(HERE.sparse, HERE.maps(ppa)),
+            writes=(HERE.maps(AngleModel.TILTED),),
+            work=_tilt_maps,
+            result=maps.TiltedMapsResult,
+            num_steps=lambda run: run.num_views,
+        ),
+        StageSpec(
+            name="seeds",
+            command=NORMALS,
+            reads=(HERE.sparse, HERE.maps(ppa), HERE.track_normals(ppa)),
+            writes=(HERE.seeds,),
+            decides=(
+                "normals.unseeded",
+                "normals.tilt_aware_weights",
+                "propagation.max_neighbors",
+            ),
+            work=_find_seeds,
+            result=seeds.SeedsResult,
+            num_steps=lambda run: run.num_views if run.options.normals.unseeded else None,
+        ),
+    ]
+    for model in AngleModel:
+        table += _model_stages(model)
+    table.append(
+        StageSpec(
+            name="evaluation",
+            command=COMPARE,
+            reads=(
+                HERE.sparse,
+                HERE.maps(ppa),
+                HERE.seeds,
+                *(HERE.maps(model) for model in compared),
+                *(HERE.sparse_cloud(model) for model in compared),
+                *(HERE.cloud(model) for model in compared),
+                *(HERE.views(model) for model in compared),
+            ),
+            writes=(HERE.metrics, HERE.summary),
+            decides=("evaluation",),
+            work=partial(_evaluate, compared),
+            result=evaluation.EvaluationResult,
+            is_redone=True,
+        )
+    )
+    return _in_order(table)
+
+
+def _model_stages(model: AngleModel) -> list[StageSpec]:
+    """The stages that there are for each angle model."""
+    track_normals, cloud, views = HERE.track_normals(model), HERE.cloud(model), HERE.views(model)
+    return [
+        StageSpec(
+            name=f"normals_{model}",
+            command=NORMALS,
+            angle_model=model,
+            reads=(HERE.sparse, HERE.maps(model)),
+            writes=(track_normals,),
+            decides=(
+                "normals.estimator",
+                "normals.window_px",
+                "normals.tilt_aware_weights",
+            ),
+            work=partial(_solve_normals, model),
+            result=normals.NormalsResult,
+        ),
+        StageSpec(
+            name=f"sparse_cloud_{model}",
+            command=NORMALS,
+            angle_model=model,
+            reads=(HERE.sparse, track_normals, HERE.seeds),
+            writes=(HERE.sparse_cloud(model),),
+            work=partial(_write_sparse_cloud, model),
+            result=sparse_cloud.SparseCloudResult,
+        ),
+        StageSpec(
+            name=f"densify_{model}",
+            command=DENSIFY,
+            angle_model=model,
+            reads=(HERE.sparse, HERE.images, HERE.maps(model), track_normals, HERE.seeds),
+            writes=(cloud, views),
+            decides=("normals.tilt_aware_weights", "propagation", "fusion"),
+            work=partial(_densify, model),
+            result=densify.DensifyResult,
+            num_steps=lambda run: densify.num_densify_steps(run.num_views, run.options.propagation),
+        ),
+        StageSpec(
+            name=f"mesh_{model}",
+            command=EXPORT,
+            angle_model=model,
+            reads=(cloud,),
+            writes=(HERE.mesh(model),),
+            work=partial(_make_mesh, model),
+            result=mesh.MeshResult,
+            is_wanted=lambda options: options.export.mesh,
+        ),
+        StageSpec(
+            name=f"dense_{model}",
+            command=EXPORT,
+            angle_model=model,
+            reads=(HERE.sparse, HERE.images, cloud, views),
+            writes=(HERE.dense(model),),
+            decides=("fusion.workspace", "export.in_place"),
+            work=partial(_write_workspace, model),
+            result=dense_workspace.DenseWorkspaceResult,
+            is_wanted=lambda options: options.export.colmap,
+        ),
+    ]
+
+
+# What follows from it
+
+
+def _in_order(table: Sequence[StageSpec]) -> tuple[StageSpec, ...]:
+    """Each stage after those that it reads from; where that leaves a choice, as they are listed."""
+    written = {path for spec in table for path in spec.writes}
+    waiting, done, ordered = list(table), set[Path](), list[StageSpec]()
+    while waiting:
+        ready = next((s for s in waiting if done.issuperset(written.intersection(s.reads))), None)
+        if ready is None:
+            raise ValueError(f"stages read in a circle: {[spec.name for spec in waiting]}")
+        waiting.remove(ready)
+        ordered.append(ready)
+        done.update(ready.writes)
+    return tuple(ordered)
+
+
+def needed_by(spec: StageSpec, table: Sequence[StageSpec]) -> list[StageSpec]:
+    """The stages whose files a stage reads, in order."""
+    return [other for other in table if set(other.writes) & set(spec.reads)]
+
+
+def with_needed(names: Iterable[str], table: Sequence[StageSpec]) -> list[StageSpec]:
+    """Stages and all that they need, directly or not, in order."""
+    wanted = set(names)
+    for spec in reversed(table):  # what is needed comes before
+        if spec.name in wanted:
+            wanted.update(other.name for other in needed_by(spec, table))
+    return [spec for spec in table if spec.name in wanted]
+
+
+def with_dependent(names: Iterable[str], table: Sequence[StageSpec]) -> list[StageSpec]:
+    """Stages and all that are made from their files, directly or not, in order."""
+    stale = set(names)
+    for spec in table:
+        if any(other.name in stale for other in needed_by(spec, table)):
+            stale.add(spec.name)
+    return [spec for spec in table if spec.name in stale]
+
+
+def result_types() -> dict[str, type]:
+    """Type of the result of each stage by its name."""
+    return {spec.name: spec.result for spec in stage_table()}
+
+
+def written_names() -> tuple[str, ...]:
+    """Names of all files and folders that a run may write in its folder, the record last."""
+    names = [path.parts[0] for spec in stage_table() for path in spec.writes]
+    return (*dict.fromkeys(names), LOG_FILE, RUN_FILE)
+
+
+def option_groups(command: str) -> tuple[str, ...]:
+    """Groups of the options that the stages of a command read, those that they need included."""
+    table = stage_table()
+    own = [spec.name for spec in table if spec.command == command]
+    paths = [path for spec in with_needed(own, table) for path in spec.decides]
+    return tuple(dict.fromkeys(path.partition(".")[0] for path in paths))

@@ -1,0 +1,125 @@
+"""Stage ``dense_MODEL``: a COLMAP workspace of the depth and normal maps of a dense cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from polmvs.colmap.dense_workspace import common_views
+from polmvs.colmap.filling import fill_workspace
+from polmvs.colmap.maps import DepthNormals
+from polmvs.colmap.models import read_model
+from polmvs.errors import DataError
+from polmvs.io.images import read_gray
+from polmvs.pipeline.run_folder import mark_own_workspace, replace_folder, scratch
+from polmvs.pipeline.stages.densify import open_checked, open_dense_views
+from polmvs.scene import SparseModel
+from polmvs.surface.dense_view import DenseView
+from polmvs.surface.map_export import export_dense_workspace, warp_dense_view
+
+
+@dataclass(frozen=True, kw_only=True)
+class DenseWorkspaceResult:
+    """What the stage made.
+
+    Attributes
+    ----------
+    folder : of the workspace; None where there are no points to write one of.
+    backup : folder of the maps that were there before, where a given workspace was filled itself.
+    """
+
+    folder: Path | None
+    backup: Path | None = None
+
+    def __str__(self) -> str:
+        return "no workspace, for want of points" if self.folder is None else str(self.folder)
+
+
+def write_workspace(sparse: Path, images: Path, views: Path, target: Path) -> DenseWorkspaceResult:
+    """A COLMAP workspace of the run's own undistorted images and maps.
+
+    Parameters
+    ----------
+    sparse, images : folders of the COLMAP model and of its images.
+    views : folder of the dense views, see :func:`polmvs.pipeline.stages.densify.densify`.
+    target : folder of the workspace, whole or not at all.
+
+    Raises
+    ------
+    DataError
+        There are no dense views, or ``target`` holds files that no run wrote.
+    """
+    model = read_model(sparse)
+    dense = _by_name(model, sparse, views)
+    with _new_workspace(target) as folder:
+        export_dense_workspace(
+            folder, model, lambda name: read_gray(images / name), dense.__getitem__
+        )
+    return DenseWorkspaceResult(folder=target.absolute())
+
+
+def fill_given(
+    sparse: Path, images: Path, views: Path, target: Path, given: Path, *, in_place: bool
+) -> DenseWorkspaceResult:
+    """A copy of the user's workspace, or that one itself, with the holes of its maps filled.
+
+    Parameters
+    ----------
+    sparse, images, views, target : as in :func:`write_workspace`.
+    given : the user's workspace.
+    in_place : fill that one, after a backup of its maps, and write no ``target``.
+
+    Raises
+    ------
+    DataError
+        The workspace is unusable, or not of these images and this model.
+    """
+    model = read_model(sparse)
+    dense = _by_name(model, sparse, views)
+    source = open_checked(given, sparse, images)
+    pairs = {pair.item.view.name: pair for pair in common_views(source, model)}
+
+    def load_fill(name: str) -> DepthNormals | None:
+        pair = pairs.get(name)
+        view = dense.get(pair.view.name) if pair is not None else None
+        if pair is None or view is None:
+            return None
+        return warp_dense_view(view, pair.view, pair.item.camera)
+
+    if in_place:
+        backup = fill_workspace(source, None, load_fill, in_place=True)
+        return DenseWorkspaceResult(folder=given.absolute(), backup=backup)
+    with _new_workspace(target) as folder:
+        fill_workspace(source, folder, load_fill)
+    return DenseWorkspaceResult(folder=target.absolute())
+
+
+@contextmanager
+def _new_workspace(target: Path) -> Iterator[Path]:
+    """Where to write a COLMAP workspace, which then takes the place of the last one."""
+    with scratch(target) as folder:
+        workspace = folder / "dense"
+        yield workspace
+        mark_own_workspace(workspace)
+        replace_folder(workspace, target)
+
+
+def _by_name(model: SparseModel, sparse: Path, views: Path) -> dict[str, DenseView | None]:
+    """Dense views by image name.
+
+    Raises
+    ------
+    DataError
+        There are none.
+    """
+    names = [view.name for view in model.views]
+    dense = dict(zip(names, open_dense_views(sparse, views), strict=True))
+    if not any(dense.values()):
+        raise DataError(
+            views,
+            "holds no depth maps, so that there is no COLMAP workspace to write. "
+            "Look at the warnings in polmvs.log.",
+        )
+    return dense

@@ -1,0 +1,307 @@
+"""Stage ``densify_MODEL``: the dense cloud of a scene, and the dense depth of its views.
+
+The cloud holds the polarised surfaces and their surroundings, told apart by the kind of a point.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.colmap.dense_workspace import (
+    DenseWorkspace,
+    open_dense_workspace,
+    require_matching_images,
+    require_same_frame,
+)
+from polmvs.colmap.filling import previous_backups
+from polmvs.colmap.models import read_model
+from polmvs.config import AngleModel, FusionOptions, Method, PropagationOptions, Surroundings
+from polmvs.io.clouds import Cloud, write_cloud
+from polmvs.io.images import read_gray
+from polmvs.parallel import Workers
+from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.pipeline.run_folder import replace_folder, scratch
+from polmvs.pipeline.stages.maps import open_maps, posed_views
+from polmvs.pipeline.stages.seeds import load_seeds
+from polmvs.polarization.capture import DISPLAY_GAMMA
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import PointKind, Seeds
+from polmvs.surface.consensus import hidden_by
+from polmvs.surface.contour import propagate
+from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
+from polmvs.surface.fusion import FusedCloud, fuse, no_points
+from polmvs.surface.integration import integrate, plan_rounds
+from polmvs.surface.kept_depth import kept_cloud
+from polmvs.surface.surroundings import SparseSurroundings, sparse_surroundings, stereo_surroundings
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T", bound=np.generic)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensifyResult:
+    """What the stage found.
+
+    Attributes
+    ----------
+    num_points : of the cloud, on polarised surfaces.
+    num_surroundings : of the cloud, beside them.
+    """
+
+    num_points: int
+    num_surroundings: int
+
+    def __str__(self) -> str:
+        return f"{self.num_points:,} points, and {self.num_surroundings:,} of the surroundings"
+
+
+def densify(
+    model: AngleModel,
+    *,
+    sparse: Path,
+    images: Path,
+    maps: Path,
+    track_normals: Path,
+    seeds: Path,
+    cloud: Path,
+    views: Path,
+    propagation: PropagationOptions | None = None,
+    fusion: FusionOptions | None = None,
+    tilt_aware: bool = True,
+    workers: Workers | None = None,
+    on_progress: OnProgress = no_progress,
+) -> DensifyResult:
+    """Spread the seeds over the region of every view and fuse the views into one cloud.
+
+    Without a region or seeds the surface has no points.
+
+    Parameters
+    ----------
+    model : angle model.
+    sparse, images : folders of the COLMAP model and of its images.
+    maps : folder of the phase maps for ``model``.
+    track_normals, seeds : files of the model's normals of the sparse points, and of the seeds.
+    cloud : PLY to write.
+    views : folder to write, with the dense depth and normals of each view.
+    propagation, fusion : defaults where None.
+    tilt_aware : as in ``NormalOptions``.
+
+    Raises
+    ------
+    DataError
+        An input is unusable, or the COLMAP workspace of ``fusion`` is not of these images.
+    """
+    propagation, fusion = propagation or PropagationOptions(), fusion or FusionOptions()
+    workers = workers or Workers()
+    phase_maps = open_maps(sparse, maps, model)
+    known = load_seeds(model, seeds, track_normals)
+    given = _open_given(fusion, sparse, images)
+    with scratch(views) as folder, workers.stopped_on_error():
+        new_views = folder / "views"
+        new_views.mkdir()
+        fused = _dense_surface(
+            model,
+            phase_maps,
+            known,
+            propagation,
+            fusion,
+            folder,
+            new_views,
+            tilt_aware,
+            workers,
+            on_progress,
+        )
+        surface = surface_cloud(fused)
+        around = _surroundings_cloud(
+            sparse, fused, phase_maps, fusion, given, folder / "around", workers=workers
+        )
+        replace_folder(new_views, views)
+    write_cloud(cloud, _join_clouds(surface, around))
+    return DensifyResult(num_points=len(surface.points), num_surroundings=len(around.points))
+
+
+def _dense_surface(
+    model: AngleModel,
+    maps: Sequence[PhaseMap],
+    seeds: Seeds,
+    propagation: PropagationOptions,
+    fusion: FusionOptions,
+    folder: Path,
+    views: Path,
+    tilt_aware: bool,
+    workers: Workers,
+    on_progress: OnProgress,
+) -> FusedCloud:
+    """The fused polarised surfaces; what each view confirms of them goes to ``views``."""
+    num_inside = sum(int(phase_map.region.inside.sum()) for phase_map in maps)
+    if num_inside == 0 or len(seeds.sigma) == 0:
+        return no_points()
+    spread = integrate if propagation.method is Method.INTEGRATE else propagate
+    dense = spread(
+        model,
+        maps,
+        seeds,
+        propagation,
+        folder,
+        tilt_aware=tilt_aware,
+        workers=workers,
+        on_progress=on_progress,
+    )
+    confirmed: dict[int, NDArray[np.bool_]] = {}
+    cloud = fuse(
+        maps,
+        dense,
+        fusion,
+        max_neighbors=propagation.max_neighbors,
+        workers=workers,
+        on_progress=on_progress,
+        on_confirmed=confirmed.__setitem__,
+    )
+    for index, points in confirmed.items():
+        dense_view, view = dense[index], maps[index].view
+        assert dense_view is not None  # has points
+        seen = points & ~hidden_by(dense_view, view, cloud.points, cloud.normals)
+        store_dense_view(dense_view.only(seen), views / view.name)
+    return cloud
+
+
+def num_densify_steps(num_views: int, options: PropagationOptions) -> int:
+    """How many steps :func:`densify` reports."""
+    if options.method is Method.INTEGRATE:
+        return (len(plan_rounds(options)) + 1) * num_views
+    return (options.num_rounds + 2) * num_views
+
+
+def open_dense_views(sparse: Path, views: Path) -> list[DenseView | None]:
+    """Dense results of all posed views, None where a view has none.
+
+    Parameters
+    ----------
+    sparse : folder of the COLMAP model.
+    views : folder that :func:`densify` wrote.
+    """
+    return [find_dense_view(views / view.name) for view in posed_views(sparse)]
+
+
+def open_checked(folder: Path, sparse: Path, images: Path) -> DenseWorkspace:
+    """A user's COLMAP workspace, found to be of the run's images and model.
+
+    Raises
+    ------
+    DataError
+        It is unusable, or not of these.
+    """
+    given, model = open_dense_workspace(folder), read_model(sparse)
+    require_same_frame(given, model)
+    require_matching_images(given, model, lambda name: read_gray(images / name))
+    return given
+
+
+def _open_given(options: FusionOptions, sparse: Path, images: Path) -> DenseWorkspace | None:
+    """The COLMAP workspace of the options, if they name one."""
+    if options.workspace is None:
+        return None
+    given = open_checked(options.workspace, sparse, images)
+    if backups := previous_backups(given):
+        logger.warning(
+            "%s: was filled before, and what filled it counts as COLMAP's; the maps from before "
+            "are in %s.",
+            given.folder,
+            backups[0].name,
+        )
+    return given
+
+
+def surface_cloud(cloud: FusedCloud, kind: PointKind = PointKind.SURFACE) -> Cloud:
+    """A fused cloud as it is written, with grey colours as in COLMAP's images.
+
+    The brightest 1 % are white.
+    """
+    white = float(np.percentile(cloud.intensity, 99)) if len(cloud.intensity) else 1.0
+    share = np.clip(cloud.intensity / max(white, 1e-9), 0, 1) ** (1 / DISPLAY_GAMMA)
+    grey = np.rint(255 * share).astype(np.uint8)
+    return Cloud(
+        points=cloud.points,
+        normals=cloud.normals,
+        colors=np.repeat(grey[:, None], 3, axis=1),
+        scalars={
+            "num_views": cloud.num_views,
+            "sigma": cloud.sigma,
+            "sigma_deg": cloud.sigma_deg,
+            "kind": np.full(len(cloud.points), kind, np.float32),
+        },
+    )
+
+
+def _surroundings_cloud(
+    sparse: Path,
+    surface: FusedCloud,
+    maps: Sequence[PhaseMap],
+    options: FusionOptions,
+    given: DenseWorkspace | None,
+    folder: Path,
+    *,
+    workers: Workers,
+) -> Cloud:
+    """Points of the scene beside its polarised parts, of the kind that the options ask for.
+
+    Parameters
+    ----------
+    sparse : folder of the COLMAP model.
+    surface : of the polarised parts; what COLMAP saw there is left out.
+    maps : of all views.
+    given : the user's COLMAP workspace, if there is one; its points are the surroundings.
+    folder : for what is kept on disk meanwhile.
+    """
+    if given is not None:
+        return surface_cloud(kept_cloud(given, surface.points), PointKind.COLMAP)
+    tracks = read_model(sparse).tracks
+    if options.surroundings is Surroundings.STEREO:
+        return surface_cloud(
+            stereo_surroundings(tracks, maps, folder, workers=workers), PointKind.STEREO
+        )
+    if options.surroundings is Surroundings.SPARSE:
+        return _sparse_cloud(sparse_surroundings(tracks, maps))
+    return surface_cloud(surface[np.zeros(len(surface.points), np.bool_)])
+
+
+def _sparse_cloud(sparse: SparseSurroundings) -> Cloud:
+    """Sparse points as they are written; they have no normals, which is zero in a PLY file."""
+    num = len(sparse.points)
+    unknown = np.full(num, np.nan)
+    return Cloud(
+        points=sparse.points,
+        normals=np.zeros((num, 3)),
+        colors=sparse.colors,
+        scalars={
+            "num_views": sparse.num_views,
+            "sigma": unknown,
+            "sigma_deg": unknown,
+            "kind": np.full(num, PointKind.SPARSE, np.float32),
+        },
+    )
+
+
+def _join_clouds(first: Cloud, second: Cloud) -> Cloud:
+    """The points of two clouds with the same columns."""
+    return Cloud(
+        points=np.concatenate([first.points, second.points]),
+        normals=_joined(first.normals, second.normals),
+        colors=_joined(first.colors, second.colors),
+        scalars={
+            name: np.concatenate([values, second.scalars[name]])
+            for name, values in first.scalars.items()
+        },
+    )
+
+
+def _joined(first: NDArray[T] | None, second: NDArray[T] | None) -> NDArray[T] | None:
+    return None if first is None or second is None else np.concatenate([first, second])

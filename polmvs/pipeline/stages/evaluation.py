@@ -1,0 +1,88 @@
+"""Stage ``evaluation``: figures of several models on the same poses and seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from polmvs.config import AngleModel
+from polmvs.evaluation.comparison import Comparison, ModelEstimate, SparseFigures, compare_models
+from polmvs.io.clouds import read_cloud
+from polmvs.io.ground_truth import open_ground_truth
+from polmvs.io.images import write_bytes
+from polmvs.io.typed_json import write_json
+from polmvs.parallel import Workers
+from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.stages.densify import open_dense_views
+from polmvs.pipeline.stages.maps import open_maps
+from polmvs.polarization.capture import Capture
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationResult:
+    """What the stage found; the figures themselves are in ``metrics.json``.
+
+    Attributes
+    ----------
+    models : that were compared.
+    best_fit : the model that the phases fit best; None where nothing tells.
+    """
+
+    models: tuple[AngleModel, ...]
+    best_fit: AngleModel | None
+
+    def __str__(self) -> str:
+        names = ", ".join(model.upper() for model in self.models)
+        best = self.best_fit
+        return f"figures of {names}" + (f"; {best.upper()} fits best" if best is not None else "")
+
+
+def load_estimate(run_folder: RunFolder, model: AngleModel) -> ModelEstimate:
+    """What a model came to, from the files of a run.
+
+    Raises
+    ------
+    DataError
+        A file is missing or damaged.
+    """
+    return ModelEstimate(
+        cloud=read_cloud(run_folder.cloud(model)),
+        tracks=read_cloud(run_folder.sparse_cloud(model)),
+        maps=open_maps(run_folder.sparse, run_folder.maps(model), model),
+        dense=open_dense_views(run_folder.sparse, run_folder.views(model)),
+    )
+
+
+def evaluate_models(
+    capture: Capture,
+    sparse: SparseFigures,
+    run_folder: RunFolder,
+    models: Sequence[AngleModel],
+    gt: Path | None = None,
+    *,
+    workers: Workers | None = None,
+) -> Comparison:
+    """Measure the clouds of a run.
+
+    Parameters
+    ----------
+    capture : raw mosaics.
+    sparse : what all models started from.
+    run_folder : with the results of the models.
+    models : to compare.
+    gt : folder of the ground truth, if there is one.
+    """
+    estimates: Mapping[AngleModel, ModelEstimate] = {
+        model: load_estimate(run_folder, model) for model in models
+    }
+    maps = open_maps(run_folder.sparse, run_folder.maps(AngleModel.PPA))
+    truth = open_ground_truth(gt) if gt is not None else None
+    return compare_models(capture, sparse, maps, estimates, truth, workers=workers)
+
+
+def write_comparison(comparison: Comparison, metrics: Path, summary: Path) -> EvaluationResult:
+    """Write the figures, as JSON and as a page."""
+    write_json(metrics, comparison)
+    write_bytes(summary, comparison.summary().encode())
+    return EvaluationResult(models=tuple(comparison.models), best_fit=comparison.best_fit)

@@ -1,0 +1,79 @@
+"""Stage ``images``: the 8-bit intensity images that COLMAP sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from polmvs.errors import DataError
+from polmvs.io.images import write_png
+from polmvs.parallel import Workers
+from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.pipeline.run_folder import replacing
+from polmvs.polarization.capture import Capture, intensity_image_8bit
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagesResult:
+    """What the stage found.
+
+    Attributes
+    ----------
+    num_images : written.
+    """
+
+    num_images: int
+
+    def __str__(self) -> str:
+        return f"{self.num_images} images"
+
+
+def write_images(
+    capture: Capture,
+    target: Path,
+    *,
+    workers: Workers | None = None,
+    on_progress: OnProgress = no_progress,
+) -> ImagesResult:
+    """Write the intensity images of a capture, all with one exposure, named after the mosaics.
+
+    Parameters
+    ----------
+    target : folder, whole or not at all.
+
+    Raises
+    ------
+    DataError
+        A mosaic is unusable, or two are of one name.
+    """
+    names = image_names(capture)
+    white = capture.exposure()
+    with replacing(target) as folder:
+        write = partial(_write_image, capture, white, folder)
+        for _ in (workers or Workers()).map(write, names.values(), names):
+            on_progress(1)
+    return ImagesResult(num_images=len(names))
+
+
+def image_names(capture: Capture) -> dict[str, str]:
+    """File name of each mosaic by the name of its image: the stem with ``.png``.
+
+    Raises
+    ------
+    DataError
+        Two mosaics differ in their suffix only.
+    """
+    names: dict[str, str] = {}
+    for name in capture.names:
+        image = f"{Path(name).stem}.png"
+        if image in names:
+            raise DataError(
+                capture.folder, f"{names[image]} and {name} are of one name; rename one of them."
+            )
+        names[image] = name
+    return names
+
+
+def _write_image(capture: Capture, white: float, folder: Path, name: str, image: str) -> None:
+    write_png(folder / image, intensity_image_8bit(capture.load(name), white))

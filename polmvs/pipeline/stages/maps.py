@@ -1,0 +1,211 @@
+"""Stages ``maps`` and ``maps_tilted``: where each view shows a polarised surface, and its phase.
+
+The maps of OPA and PPA are the same; those of the tilted model are corrected for the tilt of the
+sensor's polarizers and lie in a folder of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from polmvs.colmap.models import read_model
+from polmvs.config import AngleModel, Light, RegionOptions
+from polmvs.errors import DataError
+from polmvs.io.images import read_mask
+from polmvs.normals.light import find_diffuse
+from polmvs.parallel import Workers
+from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.pipeline.run_folder import replacing
+from polmvs.pipeline.stages.images import image_names
+from polmvs.polarization.capture import Capture
+from polmvs.polarization.phase_map import (
+    PhaseMap,
+    as_tilted,
+    build_phase_map,
+    open_phase_map,
+    store_phase_map,
+    turned,
+)
+from polmvs.polarization.region import find_region
+from polmvs.scene import Tracks, View
+
+MIN_VIEWS = 3  # of normals: with two there is nothing left to check them by
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapsResult:
+    """What the stage ``maps`` found.
+
+    Attributes
+    ----------
+    num_region_px : pixels of all views that show a polarised surface.
+    num_diffuse_px : those of them whose light is diffuse.
+    """
+
+    num_region_px: int
+    num_diffuse_px: int
+
+    def __str__(self) -> str:
+        return f"{self.num_region_px:,} polarised pixels, {self.num_diffuse_px:,} of them diffuse"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TiltedMapsResult:
+    """What the stage ``maps_tilted`` did.
+
+    Attributes
+    ----------
+    num_maps : corrected for the tilt.
+    """
+
+    num_maps: int
+
+    def __str__(self) -> str:
+        return f"{self.num_maps} maps"
+
+
+def build_maps(
+    capture: Capture,
+    sparse: Path,
+    target: Path,
+    options: RegionOptions | None = None,
+    *,
+    workers: Workers | None = None,
+    on_progress: OnProgress = no_progress,
+) -> MapsResult:
+    """Find the region of every posed view and store its phase map.
+
+    Parameters
+    ----------
+    capture : raw mosaics.
+    sparse : folder of the COLMAP model.
+    target : folder of the maps, whole or not at all.
+    options : defaults where None.
+
+    Raises
+    ------
+    DataError
+        Fewer than three views have a pose, or a mosaic or mask is unusable.
+    """
+    options = options or RegionOptions()
+    views = posed_views(sparse)
+    names = image_names(capture)
+    tracks = read_model(sparse).tracks
+    with replacing(target) as folder:
+        build = partial(_build_map, capture, options, folder)
+        num_inside = 0
+        raw_names = [names[view.name] for view in views]
+        for count in (workers or Workers()).map(build, views, raw_names):
+            num_inside += count
+            on_progress(1)
+        maps = [open_phase_map(view, folder) for view in views]
+        num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
+        if options.light is None and len(tracks.point3D_ids):
+            num_diffuse = _turn_diffuse(tracks, maps, folder)
+    return MapsResult(num_region_px=num_inside, num_diffuse_px=num_diffuse)
+
+
+def tilt_maps(
+    sparse: Path,
+    maps: Path,
+    target: Path,
+    *,
+    workers: Workers | None = None,
+    on_progress: OnProgress = no_progress,
+) -> TiltedMapsResult:
+    """Correct phase maps for tilted polarizers.
+
+    Parameters
+    ----------
+    sparse, maps : folders of the COLMAP model and of the maps as :func:`build_maps` wrote them.
+    target : folder of the corrected maps, whole or not at all.
+    """
+    stored = open_maps(sparse, maps)
+    with replacing(target) as folder:
+        for _ in (workers or Workers()).map(partial(_tilt_map, folder), stored):
+            on_progress(1)
+    return TiltedMapsResult(num_maps=len(stored))
+
+
+def open_maps(sparse: Path, maps: Path, model: AngleModel = AngleModel.PPA) -> list[PhaseMap]:
+    """Phase maps of all posed views; their pixels stay on disk.
+
+    Parameters
+    ----------
+    sparse : folder of the COLMAP model.
+    maps : folder of the maps for ``model``.
+
+    Raises
+    ------
+    DataError
+        Fewer than three views have a pose, or a map is missing or damaged.
+    """
+    tilted = model is AngleModel.TILTED
+    return [open_phase_map(view, maps, tilted=tilted) for view in posed_views(sparse)]
+
+
+def posed_views(sparse: Path) -> tuple[View, ...]:
+    """Views of a COLMAP model.
+
+    Raises
+    ------
+    DataError
+        There are too few for normals.
+    """
+    views = read_model(sparse).views
+    if len(views) < MIN_VIEWS:
+        raise DataError(
+            sparse,
+            f"{len(views)} views with a pose; normals need {MIN_VIEWS} or more. "
+            "Record more views, or give a better model with --sparse.",
+        )
+    return views
+
+
+def find_mask(folder: Path, image: str) -> Path:
+    """The mask of an image: ``STEM.png`` or ``STEM_mask.png``.
+
+    Raises
+    ------
+    DataError
+        There is none.
+    """
+    if not folder.is_dir():
+        raise DataError(folder, "no such folder of masks.")
+    stem = Path(image).stem
+    for name in (f"{stem}.png", f"{stem}_mask.png"):
+        if (folder / name).is_file():
+            return folder / name
+    raise DataError(folder, f"has no mask {stem}.png or {stem}_mask.png.")
+
+
+def _build_map(
+    capture: Capture, options: RegionOptions, folder: Path, view: View, name: str
+) -> int:
+    """Phase map of one view; returns the number of its region's pixels."""
+    stokes = capture.load(name)
+    mask = None
+    if options.mask is not None:
+        mask = read_mask(find_mask(options.mask, view.name), stokes.shape)
+    s0, s1, s2 = stokes.s0, stokes.s1, stokes.s2
+    region = find_region(s0, s1, s2, stokes.valid, min_dolp=options.min_dolp, mask=mask)
+    light = options.light or Light.SPECULAR
+    store_phase_map(build_phase_map(view, s0, s1, s2, stokes.sigma, region, light), folder)
+    return int(region.inside.sum())
+
+
+def _turn_diffuse(tracks: Tracks, maps: Sequence[PhaseMap], folder: Path) -> int:
+    """Turn the phase where the light is diffuse; returns the number of these pixels."""
+    num_diffuse = 0
+    for phase_map, where in zip(maps, find_diffuse(tracks, maps), strict=True):
+        if where.any():
+            store_phase_map(turned(phase_map, where), folder)
+            num_diffuse += int(where.sum())
+    return num_diffuse
+
+
+def _tilt_map(folder: Path, phase_map: PhaseMap) -> None:
+    store_phase_map(as_tilted(phase_map), folder)

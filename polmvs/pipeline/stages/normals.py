@@ -1,0 +1,94 @@
+"""Stage ``normals_MODEL``: normals of the sparse points under an angle model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.colmap.models import read_model
+from polmvs.config import AngleModel, NormalOptions
+from polmvs.io.arrays import map_array, save_array
+from polmvs.normals.estimator import NormalEstimate
+from polmvs.normals.tracks import track_normals
+from polmvs.pipeline.stages.maps import open_maps
+
+# Columns of the stored normals, a row for each track; see NormalEstimate.
+NORMALS_TYPE = np.dtype(
+    [
+        ("normal", np.float64, 3),
+        ("valid", np.bool_),
+        ("conditioning", np.float64),
+        ("sigma_deg", np.float64),
+        ("residual", np.float64),
+        ("num_rows", np.int64),
+    ]
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormalsResult:
+    """What the stage found.
+
+    Attributes
+    ----------
+    num_tracks : sparse points.
+    num_normals : those with a normal.
+    """
+
+    num_tracks: int
+    num_normals: int
+
+    def __str__(self) -> str:
+        return f"{self.num_normals:,} of {self.num_tracks:,} sparse points have a normal"
+
+
+def solve_track_normals(
+    model: AngleModel,
+    sparse: Path,
+    maps: Path,
+    target: Path,
+    options: NormalOptions | None = None,
+) -> NormalsResult:
+    """Normals of the sparse points from the phases of all views that see them.
+
+    Parameters
+    ----------
+    model : angle model.
+    sparse, maps : folders of the COLMAP model and of the phase maps for ``model``.
+    target : file of the normals, ``.npy`` with rows of ``NORMALS_TYPE``, one for each track.
+    options : defaults where None.
+    """
+    tracks = read_model(sparse).tracks
+    phase_maps = open_maps(sparse, maps, model)
+    stored = np.zeros(len(tracks.point3D_ids), NORMALS_TYPE)
+    if len(stored):
+        estimate = track_normals(model, tracks, phase_maps, options or NormalOptions())
+        stored["normal"], stored["valid"] = estimate.normals, estimate.valid
+        stored["conditioning"], stored["sigma_deg"] = estimate.conditioning, estimate.sigma_deg
+        stored["residual"], stored["num_rows"] = estimate.residual, estimate.num_rows
+    target.parent.mkdir(exist_ok=True)
+    save_array(target, stored)
+    return NormalsResult(num_tracks=len(stored), num_normals=int(stored["valid"].sum()))
+
+
+def load_track_normals(source: Path) -> NormalEstimate:
+    """The normals that :func:`solve_track_normals` stored; the weights of their rows are not kept.
+
+    Raises
+    ------
+    DataError
+        The file is missing or damaged.
+    """
+    stored: NDArray[np.void] = np.array(map_array(source))
+    return NormalEstimate(
+        normals=np.ascontiguousarray(stored["normal"]),
+        valid=stored["valid"].copy(),
+        conditioning=stored["conditioning"].copy(),
+        sigma_deg=stored["sigma_deg"].copy(),
+        residual=stored["residual"].copy(),
+        num_rows=stored["num_rows"].copy(),
+        row_weights=np.zeros((0, len(stored))),
+    )

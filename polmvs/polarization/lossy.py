@@ -1,0 +1,130 @@
+"""Traces of lossy compression in a mosaic, and what it does to the Stokes images.
+
+A JPEG rounds the coefficients of each 8x8 block of samples to multiples of a step. A mosaic's
+polarisation lies at the highest frequencies (the difference of neighbouring samples), where the
+steps are largest, and the redundancy of the four samples shrinks with it: the noise that it shows
+is too small. So the steps are found, and the variance that rounding to them puts into s1 and s2 is
+computed: each coefficient errs uniformly within its step.
+
+The steps of a JPEG are in its file. In samples that were stored without loss *after* a JPEG, they
+are the spacing of the coefficients' values: for a step q, ``mean cos(2 pi c / q)`` over the
+coefficients that are not zero is near one only where they are multiples of q (J. Fan and
+R. de Queiroz, Identification of bitmap compression history, IEEE TIP 12(2), 2003).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.polarization.mosaic import split_mosaic
+
+BLOCK = 8
+MAX_BLOCKS = 1500  # that are looked at, evenly spread
+MIN_BLOCKS = 64
+MAX_STEP = 64
+MIN_STEP = 3  # rounding to whole samples blurs smaller ones (derived: deviation 0.29 of a step)
+MIN_MAGNITUDE = 1.0  # beyond which a coefficient is not the rounding of samples alone
+MIN_NONZERO = 24  # coefficients of one frequency, before their spacing means anything
+MIN_COMB = 0.6  # comb strength of a step; unrounded coefficients reach 0.3 with so few (simulated)
+MIN_RHYTHMIC = 6  # frequencies with a comb, before samples count as lossy
+COLUMN_SUM_PATTERN = (90, 45, 135, 0)  # any order has the same variances, averaged over s1 and s2
+
+
+def find_quantization(raw: NDArray[Any]) -> NDArray[np.float64] | None:
+    """Steps of the JPEG that 8-bit samples once were, or None.
+
+    Parameters
+    ----------
+    raw : (H, W) uint8, blocks counted from its corner.
+
+    Returns
+    -------
+    (8, 8) float64, rows for vertical frequencies: the step; where all coefficients are zero, twice
+    the largest that samples between may have had, a step that would have hidden them.
+    """
+    blocks = _blocks(raw)
+    if len(blocks) < MIN_BLOCKS:
+        return None
+    coefficients = _dct(blocks)
+    steps = np.ones((BLOCK, BLOCK))
+    rhythmic = 0
+    silent = np.zeros((BLOCK, BLOCK), np.bool_)
+    for v in range(BLOCK):
+        for u in range(BLOCK):
+            values = np.abs(coefficients[:, v, u])
+            step = _comb_step(values)
+            if step is not None:
+                rhythmic += v + u > 0
+                steps[v, u] = step
+            silent[v, u] = np.mean(values > 1.0) < 0.02
+    if rhythmic < MIN_RHYTHMIC:
+        return None
+    # Whatever a step removed was below half of it; steps grow with the frequency.
+    known = steps[steps > 1.0].max()
+    steps[silent & (steps == 1.0)] = known
+    return steps
+
+
+def lossy_variance(steps: NDArray[np.float64], *, scale: float) -> float:
+    """Variance of s1 and s2 (mean of the two) by rounding coefficients to steps.
+
+    Parameters
+    ----------
+    steps : (8, 8), of samples 0 to 255.
+    scale : intensity of one sample step, share of full scale.
+    """
+    return float((np.square(steps) / 12.0 * _stokes_gains()).sum() * scale**2)
+
+
+@cache
+def _stokes_gains() -> NDArray[np.float64]:
+    """Mean square of s1 and s2 for a unit coefficient of each frequency (8, 8)."""
+    gains = np.zeros((BLOCK, BLOCK))
+    for v in range(BLOCK):
+        for u in range(BLOCK):
+            unit = np.zeros((BLOCK, BLOCK), np.float32)
+            unit[v, u] = 1.0
+            # A single block amid silent ones; the filters reach into the next.
+            raw = np.zeros((3 * BLOCK, 3 * BLOCK), np.float32)
+            raw[BLOCK : 2 * BLOCK, BLOCK : 2 * BLOCK] = cv2.idct(unit)
+            i0, i45, i90, i135 = split_mosaic(raw, COLUMN_SUM_PATTERN)
+            total = np.square(i0 - i90).sum() + np.square(i45 - i135).sum()
+            gains[v, u] = 0.5 * float(total) / (BLOCK // 2) ** 2
+    return gains
+
+
+def _blocks(raw: NDArray[Any]) -> NDArray[np.float32]:
+    """Whole blocks (N, 8, 8), evenly spread, that neither clip nor are flat."""
+    rows, cols = raw.shape[0] // BLOCK, raw.shape[1] // BLOCK
+    tiles = raw[: rows * BLOCK, : cols * BLOCK].reshape(rows, BLOCK, cols, BLOCK)
+    step = max(1, int(np.sqrt(rows * cols / MAX_BLOCKS)))
+    blocks = tiles[::step, :, ::step].transpose(0, 2, 1, 3).reshape(-1, BLOCK, BLOCK)
+    low, high = blocks.min(axis=(1, 2)), blocks.max(axis=(1, 2))
+    return np.asarray(blocks[(low > 0) & (high < 255) & (low < high)], np.float32)
+
+
+def _dct(blocks: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Orthonormal cosine transform of blocks (N, 8, 8) about grey 128."""
+    n = np.arange(BLOCK)
+    basis = np.cos(np.pi * (2 * n[None] + 1) * n[:, None] / (2 * BLOCK)) * np.sqrt(2 / BLOCK)
+    basis[0] /= np.sqrt(2)
+    return np.asarray(basis @ (blocks - 128.0) @ basis.T, np.float64)
+
+
+def _comb_step(values: NDArray[np.float64]) -> int | None:
+    """The largest step that magnitudes are multiples of; None if of none."""
+    best = None
+    for step in range(MIN_STEP, MAX_STEP + 1):
+        # Half a step too: a multiple of the true step leaves the odd ones between.
+        nonzero = values[values > max(MIN_MAGNITUDE, 0.3 * step)]
+        if len(nonzero) < MIN_NONZERO:
+            break
+        comb = np.cos(2 * np.pi * nonzero / step).mean()
+        if comb > MIN_COMB:
+            best = step
+    return best

@@ -1,0 +1,124 @@
+"""The points of the depth maps that COLMAP itself made, where no polarised surface was found."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from polmvs.colmap.dense_workspace import DenseWorkspace, WorkspaceView
+from polmvs.colmap.maps import map_pixel_xy
+from polmvs.neighbors import voxel_of_each
+from polmvs.surface.fusion import FusedCloud, concatenate, merge, no_points
+
+Array = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeptDepthTolerances:
+    """Which points of COLMAP's depth maps are kept; lengths in footprints of a pixel.
+
+    Attributes
+    ----------
+    stride_px : every how many-th pixel is used; a guess, as dense as the polarised surface.
+    min_views : that must have a point in the same voxel; derived: one has nobody to confirm it.
+    agreement_px : side of that voxel; a guess, several times COLMAP's deviation.
+    min_agreement : share of the points that have a second view, below which the maps are doubted;
+        a guess: COLMAP keeps what other views confirm, so that most have one, and hardly one by
+        chance where the maps are of another unit or frame than the poses.
+    voxel_px : side of the merging voxel; derived: a pixel's.
+    depth_sigma_px : of COLMAP's depth; it matches to about half a pixel.
+    normal_sigma_deg : that COLMAP's fusion allows between views.
+    clearance_px : from the polarised surface; a guess.
+    """
+
+    stride_px: int = 2
+    min_views: int = 2
+    agreement_px: float = 2.0
+    min_agreement: float = 0.1
+    voxel_px: float = 1.0
+    depth_sigma_px: float = 0.5
+    normal_sigma_deg: float = 10.0
+    clearance_px: float = 6.0
+
+
+def kept_cloud(
+    workspace: DenseWorkspace,
+    surface_points: Array,
+    *,
+    tolerances: KeptDepthTolerances = KeptDepthTolerances(),
+) -> FusedCloud:
+    """Fuse the maps of a workspace, leaving out what lies on a polarised surface.
+
+    Parameters
+    ----------
+    workspace : with maps of some views; one view is in memory at a time.
+    surface_points : (N, 3), world, of the polarised surfaces, which have their own points.
+
+    Returns
+    -------
+    Points that two views or more put into one voxel.
+    """
+    clouds, footprints = [], []
+    for item in workspace.views:
+        cloud, footprint = _view_cloud(item, tolerances)
+        if len(cloud.points):
+            clouds.append(cloud)
+            footprints.append(footprint)
+    if not clouds:
+        return no_points()
+    cloud, footprint = concatenate(clouds), float(np.median(footprints))
+    owner = np.repeat(np.arange(len(clouds)), [len(part.points) for part in clouds])
+    num_views = _views_in_voxel(cloud.points, owner, tolerances.agreement_px * footprint)
+    cloud = replace(cloud, num_views=num_views)
+    keep = num_views >= tolerances.min_views
+    if keep.mean() < tolerances.min_agreement:
+        logger.warning(
+            "%s: two views agree on %.2g %% of the points of its depth maps. Are they of its own "
+            "model?",
+            workspace.folder,
+            100 * keep.mean(),
+        )
+    if len(surface_points):
+        reach = tolerances.clearance_px * footprint
+        distance = cKDTree(surface_points).query(cloud.points, distance_upper_bound=reach)[0]
+        keep &= ~np.isfinite(distance)
+    return merge(cloud[keep], tolerances.voxel_px * footprint)
+
+
+def _views_in_voxel(points: Array, owner: NDArray[np.int64], voxel: float) -> NDArray[np.int32]:
+    """How many owners have a point in each point's voxel."""
+    cell = voxel_of_each(points, voxel)
+    pairs = np.unique(np.stack([cell, owner], axis=1), axis=0)
+    return np.bincount(pairs[:, 0])[cell].astype(np.int32)
+
+
+def _view_cloud(item: WorkspaceView, tolerances: KeptDepthTolerances) -> tuple[FusedCloud, float]:
+    """Points of one view's maps, and the footprint of a pixel there."""
+    maps = item.load_maps()
+    if maps is None or not (maps.depth > 0).any():
+        return no_points(), 0.0
+    view, camera = item.view, item.camera
+    lattice = (slice(None, None, tolerances.stride_px),) * 2
+    depth, normals_in_cam = maps.depth[lattice], maps.normals[lattice]
+    xy = map_pixel_xy(camera.width, camera.height)[lattice]
+    known = (depth > 0) & (normals_in_cam != 0).any(axis=-1)
+    ranges = depth[known].astype(np.float64) / camera.rays(xy[known])[:, 2]
+    points = view.points_at(xy[known], ranges)
+    normals = normals_in_cam[known].astype(np.float64) @ view.cam_from_world.rotation
+    facing = view.faces(points, normals)
+    num, ranges = int(facing.sum()), ranges[facing]
+    cloud = FusedCloud(
+        points=points[facing],
+        normals=normals[facing],
+        intensity=(item.load_image()[lattice][known][facing] / 255).astype(np.float32),
+        num_views=np.ones(num, np.int32),
+        sigma_deg=np.full(num, tolerances.normal_sigma_deg, np.float32),
+        sigma=(tolerances.depth_sigma_px * ranges / camera.mean_focal_px).astype(np.float32),
+    )
+    return cloud, float(np.median(ranges)) / camera.mean_focal_px if num else 0.0

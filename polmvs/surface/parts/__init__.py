@@ -1,1 +1,0 @@
-"""Parts without seeds, placed by their outlines."""
