@@ -10,21 +10,25 @@ estimators beside a plain NumPy baseline.
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.cli import main as run_polmvs
-from polmvs.config import AngleModel
-from polmvs.errors import PolmvsError
+from polmvs.cli.call import Call
+from polmvs.cli.commands import HOW, TO_CLOUD
+from polmvs.cli.flags import Command
+from polmvs.cli.running import run
+from polmvs.cli.terminal import Terminal
+from polmvs.config import AngleModel, EvaluationOptions, OptionGroup, RunOptions, option
+from polmvs.errors import OptionError
 from polmvs.evaluation.tables import format_table
 from polmvs.normals.estimator import NUM_ROUNDS, solve_normals
 from polmvs.normals.single_view.plane import plane_normal
+from polmvs.pipeline.jobs import Job, compare
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
 from polmvs.pipeline.runner import load_record, timing_table
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
@@ -37,34 +41,52 @@ PHASE_SIGMA = 0.02  # rad
 REPEATS = 7
 
 
+@dataclass(frozen=True, kw_only=True)
+class Arguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    runs: tuple[Path, ...] = option((), "folders of finished runs", positional=True, metavar="OUT")
+    capture: Path | None = option(None, "compare the models on this capture first, into OUT")
+    estimators: bool = option(False, "time the normal estimators")
+
+    def check(self) -> None:
+        """There is something to do."""
+        if not self.runs and not self.estimators:
+            raise OptionError("give the folder of a run, or --estimators.")
+        if self.capture is not None and len(self.runs) != 1:
+            raise OptionError("--capture goes with one OUT.")
+
+
+def _benchmark(call: Call, terminal: Terminal) -> int:
+    given = call.get(Arguments)
+    if given.estimators:
+        print(estimator_table())
+    if given.capture is not None:
+        job = Job(
+            capture=given.capture,
+            out=given.runs[0],
+            options=call.options(),
+            run_options=call.get(RunOptions),
+            monitor=terminal,
+            command_line=call.command_line,
+        )
+        compare(job)
+    records = {str(out): load_record(RunFolder(_folder(out))) for out in given.runs}
+    if records:
+        print(timing_table(records))
+    return 0
+
+
+COMMAND = Command(
+    help_text="seconds and memory of the stages of one or more runs, side by side",
+    run=_benchmark,
+    groups=(Arguments, *TO_CLOUD, EvaluationOptions, *HOW),
+)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the script; the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "runs", type=Path, nargs="*", metavar="OUT", help="folders of finished runs"
-    )
-    parser.add_argument("--capture", type=Path, help="compare the models on this capture first")
-    parser.add_argument("--estimators", action="store_true", help="time the normal estimators")
-    args, flags = parser.parse_known_args(argv)
-    if args.estimators:
-        print(estimator_table())
-    if not args.runs:
-        return 0 if args.estimators else parser.error("give the folder of a run, or --estimators")
-    if args.capture is not None:
-        if len(args.runs) != 1:
-            parser.error("--capture goes with one OUT")
-        status = run_polmvs(["compare", str(args.capture), str(args.runs[0]), *flags])
-        if status != 0:
-            return status
-    elif flags:
-        parser.error(f"unknown arguments: {' '.join(flags)}")
-    try:
-        records = {str(out): load_record(RunFolder(_folder(out))) for out in args.runs}
-    except PolmvsError as error:
-        print(f"{parser.prog}: error: {error}", file=sys.stderr)
-        return error.exit_status
-    print(timing_table(records))
-    return 0
+    return run((COMMAND,), "benchmark.py", argv)
 
 
 def _folder(path: Path) -> Path:

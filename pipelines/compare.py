@@ -7,45 +7,59 @@ A capture that holds a ``gt`` folder is measured against it.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 
-from polmvs.cli.flags import GROUPS, add_flags, add_run_flags, options_from, run_options
-from polmvs.cli.terminal import Terminal, guarded
-from polmvs.config import EvaluationOptions
+from polmvs.cli.call import Call
+from polmvs.cli.commands import HOW, TO_CLOUD
+from polmvs.cli.flags import Command
+from polmvs.cli.running import run
+from polmvs.cli.terminal import Terminal
+from polmvs.config import OptionGroup, RunOptions, option, replace_option
 from polmvs.pipeline.jobs import Job, compare
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    out: Path = option(MISSING, "folder of the results, one folder in it for each", positional=True)
+    captures: tuple[Path, ...] = option(
+        MISSING, "folders of raw polarizer mosaics", positional=True, metavar="CAPTURE"
+    )
+
+
+def _compare(call: Call, terminal: Terminal) -> int:
+    arguments, status = call.get(Arguments), 0
+    job = Job(
+        capture=arguments.out,
+        out=arguments.out,
+        options=call.options(),
+        run_options=call.get(RunOptions),
+        monitor=terminal,
+    )
+    for capture in arguments.captures:
+        gt = capture / "gt" if (capture / "gt").is_dir() else None
+        options = replace_option(job.options, "evaluation.gt", gt)
+        out = arguments.out / capture.resolve().name
+        outcome = compare(replace(job, capture=capture, out=out, options=options))
+        assert outcome.comparison is not None
+        print(f"{capture}\n{outcome.comparison.table()}\n")
+        status = status if outcome.empty is None else 3
+    return status
+
+
+COMMAND = Command(
+    help_text="compare the models on several captures",
+    run=_compare,
+    groups=(Arguments, *TO_CLOUD, *HOW),
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the script; the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path, help="folder of the results, one folder in it for each")
-    parser.add_argument("captures", type=Path, nargs="+", help="folders of raw polarizer mosaics")
-    add_run_flags(parser)
-    add_flags(parser, [name for name in GROUPS if name != "evaluation"])
-    args = parser.parse_args(argv)
-
-    def run() -> int:
-        options, status = options_from(args), 0
-        for capture in args.captures:
-            gt = capture / "gt" if (capture / "gt").is_dir() else None
-            job = Job(
-                capture=capture,
-                out=args.out / capture.resolve().name,
-                options=replace(options, evaluation=EvaluationOptions(gt=gt)),
-                run_options=run_options(args),
-                monitor=terminal,
-            )
-            outcome = compare(job)
-            assert outcome.comparison is not None
-            print(f"{capture}\n{outcome.comparison.table()}\n")
-            status = status if outcome.empty is None else 3
-        return status
-
-    with Terminal(verbose=False) as terminal:
-        return guarded(run, terminal, parser.prog)
+    return run((COMMAND,), "compare.py", argv)
 
 
 if __name__ == "__main__":

@@ -7,35 +7,52 @@ For calibrated rigs and robot arms: give the result to ``polmvs`` as ``--sparse 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 
-from polmvs.cli.terminal import Terminal, guarded
+from polmvs.cli.call import Call, TerminalOptions
+from polmvs.cli.flags import Command
+from polmvs.cli.running import run
+from polmvs.cli.terminal import Terminal
+from polmvs.config import OptionGroup, option
 from polmvs.poses.known_poses import write_known_poses
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    sparse: Path = option(MISSING, "COLMAP model of the same images", positional=True)
+    cameras: Path = option(
+        MISSING, "K and cam_from_world of the images", positional=True, metavar="CAMERAS_JSON"
+    )
+    new: Path = option(MISSING, "folder to write, a new one", positional=True, metavar="NEW_MODEL")
+
+
+def _known_poses(call: Call, terminal: Terminal) -> int:
+    given = call.get(Arguments)
+    model = write_known_poses(given.sparse, given.cameras, given.new)
+    num_views, num_points = len(model.views), len(model.tracks.point3D_ids)
+    error_px = float(model.tracks.errors.mean())
+    terminal.show(
+        f"{given.new}: {num_views} views, {num_points} points, mean reprojection error "
+        f"{error_px:.2f} px",
+        {"num_views": num_views, "num_points": num_points, "mean_error_px": error_px},
+    )
+    return 0
+
+
+COMMAND = Command(
+    help_text="write a COLMAP model with known poses, its points triangulated anew",
+    run=_known_poses,
+    groups=(Arguments, TerminalOptions),
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the script; the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sparse", type=Path, help="COLMAP model of the same images")
-    parser.add_argument(
-        "cameras", type=Path, metavar="CAMERAS_JSON", help="K and cam_from_world of the images"
-    )
-    parser.add_argument("new", type=Path, metavar="NEW_MODEL", help="folder to write, a new one")
-    args = parser.parse_args(argv)
-
-    def run() -> int:
-        model = write_known_poses(args.sparse, args.cameras, args.new)
-        tracks = model.tracks
-        print(
-            f"{args.new}: {len(model.views)} views, {len(tracks.point3D_ids)} points, "
-            f"mean reprojection error {tracks.errors.mean():.2f} px"
-        )
-        return 0
-
-    with Terminal(verbose=False) as terminal:
-        return guarded(run, terminal, parser.prog)
+    return run((COMMAND,), "known_poses.py", argv)
 
 
 if __name__ == "__main__":

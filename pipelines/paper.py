@@ -8,78 +8,103 @@ page is ``OUT/paper.md``, its figures lie in ``OUT/CAPTURE/``, all numbers in ``
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from collections.abc import Sequence
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Any
 
-from polmvs.cli.flags import add_flags
-from polmvs.cli.terminal import Terminal, guarded
-from polmvs.errors import OptionError
-from polmvs.experiments.command import (
-    add_experiment_flags,
-    experiment_options,
-    require_apart,
-    scene_from,
+from polmvs.cli.call import Call, FileOptions, TerminalOptions
+from polmvs.cli.commands import ExperimentRun
+from polmvs.cli.flags import Command
+from polmvs.cli.running import run
+from polmvs.cli.terminal import Terminal
+from polmvs.config import (
+    CaptureOptions,
+    ExperimentOptions,
+    OptionGroup,
+    RegionOptions,
+    option,
+    to_plain,
 )
+from polmvs.errors import OptionError
+from polmvs.experiments.data import open_experiment, require_apart
 from polmvs.experiments.output import NAMES, Report, write_files, write_report
-from polmvs.experiments.reports import num_steps, run_experiment
-from polmvs.option_values import to_plain
+from polmvs.experiments.report import check_options, num_steps, run_experiment
 from polmvs.parallel import Workers
 from polmvs.pipeline.record import peak_rss_mb, versions
 from polmvs.pipeline.run_folder import has_content
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the experiments; the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the page")
-    parser.add_argument("captures", type=Path, nargs="+", metavar="CAPTURE", help="with truth")
-    add_experiment_flags(parser)
-    add_flags(parser, ["capture", "region"])
-    args = parser.parse_args(argv)
-    with Terminal(verbose=False) as terminal:
-        return guarded(lambda: _run(args, terminal), terminal, parser.prog)
+@dataclass(frozen=True, kw_only=True)
+class Arguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    out: Path = option(MISSING, "folder of the page", positional=True)
+    captures: tuple[Path, ...] = option(
+        MISSING, "captures with truth", positional=True, metavar="CAPTURE"
+    )
 
 
-def _run(args: argparse.Namespace, terminal: Terminal) -> int:
+def _paper(call: Call, terminal: Terminal) -> int:
     """Run all, then write all."""
-    names = [folder.resolve().name for folder in args.captures]
+    given, how, options = call.get(Arguments), call.get(ExperimentRun), call.get(ExperimentOptions)
+    names = [folder.resolve().name for folder in given.captures]
     if len(set(names)) < len(names):
         raise OptionError("two captures have the same folder name; their results would mix.")
-    if len(names) > 1 and (args.gt is not None or args.sparse is not None):
-        raise OptionError("--gt and --sparse belong to one capture; give that one alone.")
-    if has_content(args.out) and not args.overwrite:
-        raise OptionError(f"{args.out}: exists and is not empty. Give --overwrite or another OUT.")
+    if len(names) > 1 and (options.gt is not None or options.sparse is not None):
+        raise OptionError(
+            "`experiment.gt` and `experiment.sparse` belong to one capture; give that one alone."
+        )
+    if has_content(given.out) and not how.overwrite:
+        raise OptionError(
+            f"{given.out}: exists and is not empty. Give `run.overwrite` or another OUT."
+        )
     scenes = []
-    for folder in args.captures:
-        args.capture = folder
-        require_apart(args)
-        scenes.append(scene_from(args))
-    options = [experiment_options(args, scene, NAMES) for scene in scenes]
+    for folder in given.captures:
+        require_apart(given.out, folder)
+        scene = open_experiment(folder, options, call.get(CaptureOptions), call.get(RegionOptions))
+        check_options(scene, options, NAMES)
+        scenes.append(scene)
     reports: dict[str, list[Report]] = {}
     seconds: dict[str, dict[str, float]] = {}
-    with Workers(args.workers) as workers:
-        for capture, scene, chosen in zip(names, scenes, options, strict=True):
+    with Workers(how.workers) as workers:
+        for capture, scene in zip(names, scenes, strict=True):
             reports[capture], seconds[capture] = [], {}
             for name in NAMES:
                 start = time.perf_counter()
-                steps = num_steps(name, scene, chosen)
-                with terminal.stage(f"{capture} {name}", steps) as progress:
-                    report = run_experiment(name, scene, chosen, workers, progress)
+                with terminal.stage(f"{capture} {name}", num_steps(name, scene, options)) as report:
+                    reports[capture].append(run_experiment(name, scene, options, workers, report))
                 seconds[capture][name] = round(time.perf_counter() - start, 2)
-                reports[capture].append(report)
-                print(f"{capture}: {name} {seconds[capture][name]:.1f} s", file=sys.stderr)
+                terminal.finished(f"{capture} {name}", seconds[capture][name], "")
         memory = round(peak_rss_mb())
     for capture in names:
-        for report in reports[capture]:
-            write_report(args.out / capture, report)
-    write_files(args.out, _page(reports, seconds, memory, args.workers))
-    print(args.out / "paper.md")
+        for made in reports[capture]:
+            write_report(given.out / capture, made)
+    write_files(given.out, _page(reports, seconds, memory, how.workers))
+    terminal.show(str(given.out / "paper.md"), {"page": given.out / "paper.md"})
     return 0
+
+
+COMMAND = Command(
+    help_text="all experiments of the paper over a list of captures: one page with figures",
+    run=_paper,
+    groups=(
+        Arguments,
+        ExperimentOptions,
+        CaptureOptions,
+        RegionOptions,
+        ExperimentRun,
+        FileOptions,
+        TerminalOptions,
+    ),
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the experiments; the exit status."""
+    return run((COMMAND,), "paper.py", argv)
 
 
 def _page(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 
 import cv2
@@ -12,7 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera
-from polmvs.errors import PolmvsError
+from polmvs.cli.call import Call, TerminalOptions
+from polmvs.cli.flags import Command
+from polmvs.cli.running import run
+from polmvs.cli.terminal import Terminal
+from polmvs.config import OptionGroup, option
 from polmvs.geometry import RigidTransform
 from polmvs.io.clouds import Cloud, read_cloud
 from polmvs.io.images import write_png
@@ -67,31 +70,46 @@ def oblique_pose(cloud: Cloud, elevation_deg: float, azimuth_deg: float) -> Rigi
     return RigidTransform(rotation, -rotation @ eye)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+@dataclass(frozen=True, kw_only=True)
+class Arguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    clouds: tuple[Path, ...] = option(
+        MISSING, "PLY files of one frame", positional=True, metavar="CLOUD.ply"
+    )
+    out: Path = option(MISSING, "PNG to write")
+    labels: tuple[str, ...] = option((), "one for each cloud", metavar="NAME,...")
+    elevations: tuple[float, ...] = option((35.0, 4.0), "degrees")
+    azimuth: float = option(40.0, "degrees")
+
+
+def _render(call: Call, terminal: Terminal) -> int:
     """Render clouds from the last one's oblique views, one column each."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("clouds", type=Path, nargs="+", help="PLY files of one frame")
-    parser.add_argument("--out", type=Path, required=True, help="PNG to write")
-    parser.add_argument("--labels", nargs="*", default=[], help="one for each cloud")
-    parser.add_argument("--elevations", type=float, nargs="+", default=[35.0, 4.0], help="degrees")
-    parser.add_argument("--azimuth", type=float, default=40.0, help="degrees")
-    args = parser.parse_args(argv)
-    try:
-        clouds = [read_cloud(path) for path in args.clouds]
-        camera = PinholeCamera(width=640, height=400, fx=620, fy=620, cx=320, cy=200)
-        rows = []
-        for elevation in args.elevations:
-            pose = oblique_pose(clouds[-1], elevation, args.azimuth)
-            rows.append(np.hstack([render(c, camera, pose, 2) for c in clouds]))
-        picture = np.vstack(rows)
-        for i, label in enumerate(args.labels):
-            place = (camera.width * i + 16, 34)
-            cv2.putText(picture, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.9, 0, 2, cv2.LINE_AA)
-        write_png(args.out, picture)
-    except PolmvsError as error:
-        print(f"render: {error}", file=sys.stderr)
-        return error.exit_status
+    given = call.get(Arguments)
+    clouds = [read_cloud(path) for path in given.clouds]
+    camera = PinholeCamera(width=640, height=400, fx=620, fy=620, cx=320, cy=200)
+    rows = []
+    for elevation in given.elevations:
+        pose = oblique_pose(clouds[-1], elevation, given.azimuth)
+        rows.append(np.hstack([render(c, camera, pose, 2) for c in clouds]))
+    picture = np.vstack(rows)
+    for i, label in enumerate(given.labels):
+        place = (camera.width * i + 16, 34)
+        cv2.putText(picture, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.9, 0, 2, cv2.LINE_AA)
+    write_png(given.out, picture)
     return 0
+
+
+COMMAND = Command(
+    help_text="render point clouds side by side to a PNG, from the same virtual camera",
+    run=_render,
+    groups=(Arguments, TerminalOptions),
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; the exit status."""
+    return run((COMMAND,), "render.py", argv)
 
 
 if __name__ == "__main__":

@@ -1,36 +1,291 @@
-"""Options of every stage: typed, checked, in one place.
+"""Options of every stage and command: typed, checked, in one place.
 
-Each stage takes its own frozen dataclass. The command line makes its flags from the fields
-(``option`` carries the help text), and the run writes the resolved values into ``run.json``.
+Each stage takes its own frozen dataclass, a *group*. Flags, TOML keys, help, the record in
+``run.json`` and the messages all come from the groups' fields (:func:`option` carries the help and
+the range). An option is named by its path ``group.field`` such as ``propagation.step_px``, in
+messages between backquotes; only the command line knows flags.
+
+This module is light, so that ``--help`` is: it imports neither NumPy nor anything of this package
+but the errors, and msgspec, which converts TOML and JSON, when it is needed.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import math
 import os
-from dataclasses import dataclass, field
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
-from polmvs.choices import AngleModel as AngleModel
-from polmvs.choices import BayerOrder as BayerOrder
-from polmvs.choices import CaptureKind as CaptureKind
-from polmvs.choices import Channel as Channel
-from polmvs.choices import Contour as Contour
-from polmvs.choices import Estimator as Estimator
-from polmvs.choices import Light as Light
-from polmvs.choices import Method as Method
-from polmvs.choices import Packing as Packing
-from polmvs.choices import Resolution as Resolution
-from polmvs.choices import Surroundings as Surroundings
 from polmvs.errors import OptionError
 
 MAX_DEFAULT_WORKERS = 8  # each holds a few hundred MB
 
+T = TypeVar("T")
 
-def option(default: Any, help_text: str) -> Any:
-    """A dataclass field with its help text, which names the unit."""
-    return field(default=default, metadata={"help": help_text})
+
+class AngleModel(StrEnum):
+    """Relation between the measured angle and the surface normal."""
+
+    OPA = "opa"
+    PPA = "ppa"
+    TILTED = "tilted"
+
+
+class Light(StrEnum):
+    """Which reflection dominates the polarisation of the part."""
+
+    SPECULAR = "specular"
+    DIFFUSE = "diffuse"
+
+
+class Method(StrEnum):
+    """How ranges spread over a view's region."""
+
+    INTEGRATE = "integrate"
+    CONTOUR = "contour"
+
+
+class Contour(StrEnum):
+    """How a PPA contour is traced."""
+
+    TANGENT = "tangent"
+    NORMALS = "normals"
+
+
+class Surroundings(StrEnum):
+    """What a cloud holds beside the polarised parts."""
+
+    NONE = "none"
+    SPARSE = "sparse"
+    STEREO = "stereo"
+
+
+class Estimator(StrEnum):
+    """How a normal is solved from its rows."""
+
+    ROBUST = "robust"
+    ALGEBRAIC = "algebraic"
+
+
+class Experiment(StrEnum):
+    """The paper's experiments."""
+
+    PHASE = "phase"
+    PLANE = "plane"
+    TRACKS = "tracks"
+    CONTOURS = "contours"
+
+
+class Poses(StrEnum):
+    """Whose poses an experiment uses."""
+
+    TRUE = "true"
+    SFM = "sfm"
+
+
+class Selection(StrEnum):
+    """How the experiment on tracks chooses K views of a point."""
+
+    RANDOM = "random"
+    ANGLE = "angle"
+
+
+class Packing(StrEnum):
+    """How a dump without a header holds its samples."""
+
+    MONO8 = "mono8"
+    MONO16 = "mono16"
+    MONO10P = "mono10p"
+    MONO12P = "mono12p"
+    MONO10PACKED = "mono10packed"
+    MONO12PACKED = "mono12packed"
+
+
+class CaptureKind(StrEnum):
+    """What the files of a capture hold."""
+
+    MOSAIC = "mosaic"
+    ANGLES = "angles"
+    STOKES = "stokes"
+    AOLP = "aolp"
+
+
+class BayerOrder(StrEnum):
+    """Colours of the 2x2 blocks of polarizers of a colour sensor, row by row."""
+
+    RGGB = "rggb"
+    GRBG = "grbg"
+    GBRG = "gbrg"
+    BGGR = "bggr"
+
+
+class Channel(StrEnum):
+    """Which colour the Stokes images are made of."""
+
+    COMBINED = "combined"
+    RED = "red"
+    GREEN = "green"
+    BLUE = "blue"
+
+
+class Resolution(StrEnum):
+    """Size of the polarization images of a mosaic."""
+
+    HALF = "half"
+    FULL = "full"
+
+
+COMPARED_MODELS = (AngleModel.OPA, AngleModel.PPA, AngleModel.TILTED)
+
+
+def option(
+    default: Any,
+    help_text: str,
+    *,
+    positional: bool = False,
+    least: float | None = None,
+    most: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+    metavar: str | tuple[str, ...] | None = None,
+    flag: str | None = None,
+) -> Any:
+    """A field of a group of options.
+
+    Parameters
+    ----------
+    default : its value where none is given; ``dataclasses.MISSING`` where one must be.
+    help_text : what it means, with the unit. Other options are named as in messages.
+    positional : on the command line it is an argument and has no flag.
+    least, most, above, below : the range of a number, its ends included or not.
+    metavar : name of the value in the help; several for a mixed tuple.
+    flag : on the command line, where it is not that of the field's name.
+    """
+    return field(
+        default=default,
+        metadata={
+            "help": help_text,
+            "range": Range(least=least, most=most, above=above, below=below),
+            "metavar": metavar,
+            "flag": flag,
+            "positional": positional,
+        },
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Range:
+    """Which numbers an option takes; no end: any finite one.
+
+    Attributes
+    ----------
+    least, most : ends that belong to it.
+    above, below : ends that do not.
+    """
+
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    below: float | None = None
+
+    def __contains__(self, value: float) -> bool:
+        """Whether a number is one of these."""
+        return (
+            math.isfinite(value)
+            and (self.least is None or value >= self.least)
+            and (self.most is None or value <= self.most)
+            and (self.above is None or value > self.above)
+            and (self.below is None or value < self.below)
+        )
+
+    def __str__(self) -> str:
+        """What must hold, after "must"."""
+        low = self.least if self.above is None else self.above
+        high = self.most if self.below is None else self.below
+        if low is not None and high is not None:
+            names = ", ends excluded" if self.above is not None and self.below is not None else ""
+            return f"lie in {low:g} to {high:g}{names}"
+        if self.least is not None:
+            return f"be {self.least:g} or more"
+        if self.above is not None:
+            return "be positive" if self.above == 0 else f"be over {self.above:g}"
+        if high is not None:
+            return f"be {high:g} or less" if self.below is None else f"be under {high:g}"
+        return "be a finite number"
+
+
+class OptionGroup:
+    """Base of the groups: checks every field when an object is made.
+
+    A subclass names its group as a class keyword, ``class SfmOptions(OptionGroup, group="sfm")``,
+    and adds its own conditions in ``check``.
+
+    Attributes
+    ----------
+    group : name of the group, in paths, TOML files and ``run.json``.
+    in_files : whether a TOML file of options may have a table of it.
+    """
+
+    group: ClassVar[str] = ""
+    in_files: ClassVar[bool] = True
+
+    def __init_subclass__(cls, *, group: str, in_files: bool = True, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.group = group
+        cls.in_files = in_files
+
+    def __post_init__(self) -> None:
+        """Check the values; text that names an enum's member or a path is taken as such.
+
+        Raises
+        ------
+        OptionError
+            A value is out of its range, or contradicts another one.
+        """
+        for info in describe_fields(type(self)):
+            value = getattr(self, info.name)
+            if value is None:
+                continue
+            if isinstance(info.kind, type) and not isinstance(value, info.kind):
+                object.__setattr__(self, info.name, self._coerced(info, value))
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, int | float) and not isinstance(number, bool):
+                    self.require(number in info.range, info.name, f"must {info.range}", value)
+        self.check()
+
+    def check(self) -> None:
+        """Raise OptionError where values contradict each other; nothing by default."""
+
+    def require(self, holds: bool, name: str, reason: str, *value: Any) -> None:
+        """Raise OptionError for a field unless something holds.
+
+        Parameters
+        ----------
+        holds : what must be true.
+        name : of the field.
+        reason : what must hold, as a sentence without the option's name and without its end.
+        value : what was given instead, if it helps.
+        """
+        if not holds:
+            given = f", not {show_value(value[0])}" if value else ""
+            raise OptionError(f"{reason}{given}.", field=f"{self.group}.{name}")
+
+    def _coerced(self, info: FieldInfo, value: Any) -> Any:
+        """Text as the enum or path that a field is of; other values as they are."""
+        if issubclass(info.kind, Path) and isinstance(value, str):
+            return Path(value)
+        if issubclass(info.kind, StrEnum) and isinstance(value, str):
+            choices = [member.value for member in info.kind]
+            self.require(value in choices, info.name, f"must be one of {', '.join(choices)}", value)
+            return info.kind(value)
+        return value
 
 
 def default_num_workers() -> int:
@@ -39,23 +294,26 @@ def default_num_workers() -> int:
     return max(1, min(cores or 1, MAX_DEFAULT_WORKERS))
 
 
-def _require(holds: bool, message: str) -> None:
-    if not holds:
-        raise OptionError(message)
-
-
 @dataclass(frozen=True, kw_only=True)
-class CaptureOptions:
+class CaptureOptions(OptionGroup, group="capture"):
     """What a capture's files hold, and how they become polarization images."""
 
     pattern: tuple[int, int, int, int] = option(
         (90, 45, 135, 0), "polarizer angles of a 2x2 cell in degrees, row by row"
     )
-    gamma: float = option(1.0, "encoding gamma: linear = (raw / full scale) ** (1 / gamma)")
-    saturation: float = option(0.98, "share of full scale from which a sample counts as clipped")
-    darkness: float = option(0.004, "share of full scale under which a pixel counts as dark")
+    gamma: float = option(
+        1.0, "encoding gamma: linear = (raw / full scale) ** (1 / gamma)", least=0.1, most=10
+    )
+    saturation: float = option(
+        0.98, "share of full scale from which a sample counts as clipped", above=0, most=1
+    )
+    darkness: float = option(
+        0.004, "share of full scale under which a pixel counts as dark", least=0, below=0.5
+    )
     full_scale: float | None = option(
-        None, "value of a saturated sample; by default decided from the samples of all files"
+        None,
+        "value of a saturated sample; by default decided from the samples of all files",
+        above=0,
     )
     kind: CaptureKind | None = option(
         None,
@@ -89,44 +347,30 @@ class CaptureOptions:
     calibration: Path | None = option(
         None, "TOML file of 'polmvs calibrate polarizers': gains, angles, dark frame, flat field"
     )
-    width: int | None = option(None, "width of .raw and .bin dumps, px")
-    height: int | None = option(None, "height of .raw and .bin dumps, px")
+    width: int | None = option(None, "width of .raw and .bin dumps, px", least=1, below=1 << 16)
+    height: int | None = option(None, "height of .raw and .bin dumps, px", least=1, below=1 << 16)
     packing: Packing | None = option(
         None, "how dumps hold their samples; by default told by their length where only one fits"
     )
 
-    def __post_init__(self) -> None:
-        _require(
-            sorted(self.pattern) == [0, 45, 90, 135],
-            f"--pattern needs each of 0, 45, 90, 135 once, not {self.pattern}.",
-        )
-        _require(0.1 <= self.gamma <= 10, f"--gamma must lie in 0.1 to 10, not {self.gamma}.")
-        _require(
-            0 < self.saturation <= 1, f"--saturation must lie in 0 to 1, not {self.saturation}"
-        )
-        _require(0 <= self.darkness < 0.5, f"--darkness must lie in 0 to 0.5, not {self.darkness}.")
-        _require(
-            self.full_scale is None or 0 < self.full_scale < math.inf,
-            f"--full-scale must be positive, not {self.full_scale}.",
-        )
-        _require(
-            self.naming is None or "{view}" in self.naming,
-            f"--naming needs {{view}}, not {self.naming!r}.",
-        )
-        _require(
-            self.angles is None or len({angle % 180 for angle in self.angles}) >= 3,
-            f"--angles needs three or more different angles, not {self.angles}.",
-        )
-        for name, side in (("--width", self.width), ("--height", self.height)):
-            _require(side is None or 0 < side < 1 << 16, f"{name} must be positive, not {side}.")
+    def check(self) -> None:
+        """Each angle of a pattern once; names that tell views apart; angles that suffice."""
+        needed = sorted(self.pattern) == [0, 45, 90, 135]
+        self.require(needed, "pattern", "needs each of 0, 45, 90, 135 once", self.pattern)
+        named = self.naming is None or "{view}" in self.naming
+        self.require(named, "naming", "needs {view}", self.naming)
+        enough = self.angles is None or len({angle % 180 for angle in self.angles}) >= 3
+        self.require(enough, "angles", "needs three or more different angles", self.angles)
 
 
 @dataclass(frozen=True, kw_only=True)
-class SfmOptions:
+class SfmOptions(OptionGroup, group="sfm"):
     """Where poses come from."""
 
     intrinsics: tuple[float, ...] | None = option(
-        None, "fx,fy,cx,cy of the half-size polarization images, px, COLMAP's convention"
+        None,
+        "fx,fy,cx,cy of the half-size polarization images, px, COLMAP's convention",
+        metavar="FX,FY,CX,CY",
     )
     camera_model: str = option(
         "SIMPLE_RADIAL", "COLMAP camera model to estimate where no intrinsics are given"
@@ -135,38 +379,40 @@ class SfmOptions:
     single_camera: bool = option(True, "all images share one camera")
     seed: int = option(0, "random seed of SfM")
 
-    def __post_init__(self) -> None:
-        if self.intrinsics is not None:
-            _require(
-                len(self.intrinsics) == 4 and min(self.intrinsics) > 0,
-                f"--intrinsics needs four positive numbers fx,fy,cx,cy, not {self.intrinsics}.",
-            )
+    def check(self) -> None:
+        """Four positive numbers."""
+        _require_intrinsics(self, self.intrinsics)
+
+
+def _require_intrinsics(options: OptionGroup, given: tuple[float, ...] | None) -> None:
+    if given is not None:
+        positive = len(given) == 4 and min(given) > 0
+        options.require(positive, "intrinsics", "needs four positive numbers fx,fy,cx,cy", given)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionOptions:
+class RegionOptions(OptionGroup, group="region"):
     """Where the part is and which phase its light shows."""
 
     light: Light | None = option(
         None, "reflection that dominates the polarisation; by default decided for each part"
     )
-    min_dolp: float = option(0.1, "DoLP from which a pixel's phase is used on its own")
+    min_dolp: float = option(
+        0.1, "DoLP from which a pixel's phase is used on its own", above=0, below=1
+    )
     mask: Path | None = option(
         None,
         "folder of masks, STEM.png or STEM_mask.png for each image, of the size of the "
         "polarization images, not 0 on the part; without it the part is found",
     )
 
-    def __post_init__(self) -> None:
-        _require(0 < self.min_dolp < 1, f"--min-dolp must lie in 0 to 1, not {self.min_dolp}.")
-
 
 @dataclass(frozen=True, kw_only=True)
-class NormalOptions:
+class NormalOptions(OptionGroup, group="normals"):
     """How normals are solved from phase angles."""
 
     estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
-    window_px: int = option(17, "side of the window of rows about a track's point, px")
+    window_px: int = option(17, "side of the window of rows about a track's point, px", least=1)
     unseeded: bool = option(True, "place parts without a sparse point by their outlines")
     tilt_aware_weights: bool = option(
         True,
@@ -174,15 +420,13 @@ class NormalOptions:
         "would give their phase; without it the models are pure",
     )
 
-    def __post_init__(self) -> None:
-        _require(
-            self.window_px >= 1 and self.window_px % 2 == 1,
-            f"--window-px must be odd and positive, not {self.window_px}.",
-        )
+    def check(self) -> None:
+        """A window has a middle."""
+        self.require(self.window_px % 2 == 1, "window_px", "must be odd", self.window_px)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PropagationOptions:
+class PropagationOptions(OptionGroup, group="propagation"):
     """How ranges spread from the seeds over the polarised region."""
 
     method: Method = option(
@@ -195,49 +439,53 @@ class PropagationOptions:
         "contours: 'tangent' (iso-range under PPA, one view) or 'normals' (multi-view normals "
         "along the iso-depth paths, as in the paper)",
     )
-    step_px: float = option(0.5, "step of the contours, px")
-    spacing_px: float = option(6.0, "distance between contours and between their nodes, px")
-    stride_px: int = option(2, "distance between the dense points of one view, px")
+    step_px: float = option(0.5, "step of the contours, px", least=0.05, most=4)
+    spacing_px: float = option(
+        6.0, "distance between contours and between their nodes, px", least=0.05, most=64
+    )
+    stride_px: int = option(
+        2, "distance between the dense points of one view, px", least=1, most=16
+    )
     num_rounds: int = option(
-        6, "rounds of normals and ranges; of integrate on its coarsest lattice, two finer follow"
+        6,
+        "rounds of normals and ranges; of integrate on its coarsest lattice, two finer follow",
+        least=1,
+        most=20,
     )
     bending: float = option(
         0.002,
         "standard deviation, as a share of the distance, of the smooth bending of a surface by "
         "errors of the camera model, which the seeds correct; 0: none",
+        least=0,
+        most=0.1,
     )
-    max_neighbors: int = option(15, "other views that give rows to one view")
+    max_neighbors: int = option(15, "other views that give rows to one view", least=1)
 
-    def __post_init__(self) -> None:
-        _require(0.05 <= self.step_px <= 4, f"--step-px must lie in 0.05 to 4, not {self.step_px}.")
-        _require(
-            self.step_px <= self.spacing_px <= 64,
-            f"--spacing-px must lie in {self.step_px} to 64, not {self.spacing_px}.",
-        )
-        _require(1 <= self.stride_px <= 16, f"--stride-px must lie in 1 to 16: {self.stride_px}.")
-        _require(
-            1 <= self.num_rounds <= 20, f"--num-rounds must lie in 1 to 20: {self.num_rounds}."
-        )
-        _require(0 <= self.bending <= 0.1, f"--bending must lie in 0 to 0.1, not {self.bending}.")
-        _require(
-            self.max_neighbors >= 1, f"--max-neighbors must be 1 or more: {self.max_neighbors}."
-        )
+    def check(self) -> None:
+        """Contours lie no closer than they step."""
+        wide = self.spacing_px >= self.step_px
+        reason = "must be as long as `propagation.step_px` or longer"
+        self.require(wide, "spacing_px", reason, self.spacing_px)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FusionOptions:
+class FusionOptions(OptionGroup, group="fusion"):
     """How the views' points become one cloud."""
 
-    min_views: int = option(2, "views that must agree on a point, its own included")
+    min_views: int = option(2, "views that must agree on a point, its own included", least=1)
     max_range_difference_px: float = option(
-        2.0, "disagreement of two views' distances, in footprints of a pixel"
+        2.0, "disagreement of two views' distances, in footprints of a pixel", above=0
     )
-    max_normal_difference_deg: float = option(15.0, "disagreement of two views' normals, degrees")
+    max_normal_difference_deg: float = option(
+        15.0, "disagreement of two views' normals, degrees", above=0, most=90
+    )
     voxel_px: float = option(
-        0.5, "edge of the merging voxel, in footprints of a pixel; 0: no merging"
+        0.5, "edge of the merging voxel, in footprints of a pixel; 0: no merging", least=0
     )
     voxel: float | None = option(
-        None, "edge of the merging voxel in units of the model, instead of --voxel-px; 0: none"
+        None,
+        "edge of the merging voxel in units of the model, instead of `fusion.voxel_px`; 0: none",
+        least=0,
     )
     surroundings: Surroundings = option(
         Surroundings.SPARSE,
@@ -250,34 +498,25 @@ class FusionOptions:
         "and its points are the surroundings",
     )
 
-    def __post_init__(self) -> None:
-        _require(self.min_views >= 1, f"--min-views must be 1 or more, not {self.min_views}.")
-        _require(self.max_range_difference_px > 0, "--max-range-difference-px must be positive.")
-        _require(
-            0 < self.max_normal_difference_deg <= 90,
-            "--max-normal-difference-deg must lie in 0 to 90.",
-        )
-        _require(self.voxel_px >= 0, "--voxel-px must not be negative.")
-        _require(self.voxel is None or self.voxel >= 0, "--voxel must not be negative.")
-
 
 @dataclass(frozen=True, kw_only=True)
-class ExportOptions:
+class ExportOptions(OptionGroup, group="export"):
     """What is made of a dense cloud."""
 
     mesh: bool = option(True, "a Poisson mesh, where the cloud supports it")
     colmap: bool = option(True, "a COLMAP dense workspace with depth and normal maps")
     in_place: bool = option(
-        False, "fill --workspace itself, after a backup, and not a copy of it in OUT"
+        False, "fill `fusion.workspace` itself, after a backup, and not a copy of it in OUT"
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluationOptions:
+class EvaluationOptions(OptionGroup, group="evaluation"):
     """What the results are measured against."""
 
     gt: Path | None = option(
-        None, "folder of the ground truth (cameras.json and maps), or the capture's that has gt/"
+        None,
+        "folder of the ground truth (cameras.json and maps), or the capture's that has gt/",
     )
 
 
@@ -290,8 +529,8 @@ def _is_positive(value: str | float) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReferenceOptions:
-    """What gives the reconstruction its metric scale and frame; nothing does by default."""
+class ReferenceOptions(OptionGroup, group="reference"):
+    """What gives metric scale and frame; by default nothing does."""
 
     reference: Path | None = option(
         None,
@@ -302,27 +541,24 @@ class ReferenceOptions:
         None,
         "DICT:SIZE of printed markers in the scene, such as DICT_4X4_50:0.05, SIZE the side of "
         "the black square in metres; fixes the scale",
+        metavar="DICT:SIZE",
     )
-    scale: tuple[str, str, float] | None = field(
-        default=None,
-        metadata={
-            "help": "distance in metres between two images' cameras or sparse points (ids)",
-            "metavar": ("A", "B", "DISTANCE"),
-        },
+    scale: tuple[str, str, float] | None = option(
+        None,
+        "distance in metres between two images' cameras or sparse points (ids)",
+        metavar=("A", "B", "DISTANCE"),
     )
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """A marker has a size, a distance two ends."""
         if self.aruco is not None:
             name, _, size = self.aruco.rpartition(":")
-            _require(
-                bool(name) and _is_positive(size),
-                "--aruco needs DICT:SIZE with a positive size in metres, such as "
-                f"DICT_4X4_50:0.05, not {self.aruco}.",
-            )
+            reason = "needs DICT:SIZE with a positive size in metres, such as DICT_4X4_50:0.05"
+            self.require(bool(name) and _is_positive(size), "aruco", reason, self.aruco)
         if self.scale is not None:
             first, second, distance = self.scale
-            _require(first != second, f"--scale needs two different ends, not {first} twice.")
-            _require(_is_positive(distance), f"--scale needs a positive distance, not {distance}.")
+            self.require(first != second, "scale", f"needs two different ends, not {first} twice")
+            self.require(_is_positive(distance), "scale", "needs a positive distance", distance)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -341,15 +577,353 @@ class Options:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions:
+class RunOptions(OptionGroup, group="run", in_files=False):
     """How a run is carried out; nothing here changes its result."""
 
     overwrite: bool = option(False, "delete an earlier run's results in OUT first")
     resume: bool = option(False, "go on with the run in OUT at its first unfinished stage")
-    workers: int = option(default_num_workers(), "processes to share the views among")
+    workers: int = option(default_num_workers(), "processes to share the views among", least=1)
 
-    def __post_init__(self) -> None:
-        _require(
-            not (self.overwrite and self.resume), "--overwrite and --resume exclude each other."
+    def check(self) -> None:
+        """Not both."""
+        both = self.overwrite and self.resume
+        self.require(not both, "overwrite", "and `run.resume` exclude each other")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneOptions(OptionGroup, group="plane"):
+    """Which pixels count as a plane, and how its normal is solved."""
+
+    angle_model: AngleModel = option(
+        AngleModel.PPA,
+        "angle and normal; 'tilted' presumes a lens not telecentric on the image side",
+        flag="--model",
+    )
+    light: Light = option(Light.SPECULAR, "reflection that dominates the polarisation")
+    estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
+    intrinsics: tuple[float, ...] | None = option(
+        None,
+        "of the half-size polarization image, px, COLMAP's convention; without them centred, with "
+        "a focal length of the image's width, which the output says",
+        metavar="FX,FY,CX,CY",
+    )
+    mask: Path | None = option(None, "half-size image, not 0 on the plane")
+    polygon: tuple[tuple[float, float], ...] | None = option(
+        None, "corners about the plane, half-size px; without it all valid pixels", metavar="X,Y"
+    )
+    min_dolp: float = option(
+        0.1, "degree of polarisation from which a pixel counts", above=0, below=1
+    )
+    min_intensity: float = option(
+        0.5,
+        "share of the pixels' median intensity from which one counts: where something dark is "
+        "reflected, other light shows; 0: all",
+        least=0,
+        below=1,
+    )
+    drop_clipped: bool = option(
+        False, "leave saturated pixels out; a plane at one exposure loses its brightest part"
+    )
+    estimate_focal: bool = option(
+        False,
+        "estimate the focal length from the plane (tilted model); used where `plane.intrinsics` "
+        "are not given",
+    )
+    find_planes: bool = option(False, "find all planes in view")
+
+    def check(self) -> None:
+        """A place is given once, and planes are found under models that tell them apart."""
+        _require_intrinsics(self, self.intrinsics)
+        one = self.mask is None or self.polygon is None
+        self.require(one, "polygon", "and `plane.mask` exclude each other")
+        if self.polygon is not None:
+            self.require(
+                len(self.polygon) >= 3, "polygon", "needs three corners or more", self.polygon
+            )
+        apart = not self.find_planes or self.angle_model is not AngleModel.OPA
+        reason = "needs `plane.angle_model` ppa or tilted: under OPA planes are lines"
+        self.require(apart, "find_planes", reason)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExperimentOptions(OptionGroup, group="experiment"):
+    """What the paper's experiments measure."""
+
+    gt: Path | None = option(None, "ground truth; without it that of CAPTURE")
+    poses: Poses = option(Poses.TRUE, "whose poses are used")
+    sparse: Path | None = option(None, "COLMAP model of the poses of `experiment.poses` sfm")
+    blur_px: float = option(
+        # The paper blurs its images and does not say how much; ours are half as wide.
+        1.5,
+        "deviation of the Gaussian blur before phase and DoLP, px; 0: none",
+        least=0,
+        most=20,
+    )
+    views: tuple[str, ...] | None = option(
+        None,
+        "images that contours are traced in and that figures show; without it all, and a few",
+        metavar="NAME,...",
+    )
+    planar_deg: float = option(
+        5.0,
+        "plane: spread of the true normals of a planar region, degrees",
+        least=0.01,
+        most=90,
+    )
+    num_points: int = option(10_000, "tracks: surface points", least=10, below=1e7)
+    k: tuple[int, ...] | None = option(
+        None, "tracks: numbers of views; without it 2 to 20, as far as the capture goes"
+    )
+    select: Selection = option(Selection.RANDOM, "tracks: how the K views of a point are chosen")
+    seed: int = option(0, "tracks: random seed", least=0)
+    num_seeds: int = option(20, "contours: seeds along the edge in each view", least=1, below=1e7)
+    step_px: float = option(0.5, "contours: step of the tracing, px", least=0.05, most=4)
+
+    def check(self) -> None:
+        """Estimated poses come from a model."""
+        agree = (self.poses is Poses.SFM) == (self.sparse is not None)
+        self.require(agree, "poses", "sfm and `experiment.sparse` go together")
+
+
+# The fields of groups, and values as JSON and TOML have them
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldInfo:
+    """One field of a group of options.
+
+    Attributes
+    ----------
+    group, name : its path is ``group.name``.
+    kind : its type without ``None``: a class, or ``tuple[...]``.
+    default : its default value.
+    help_text : what it means, with the unit.
+    range : which numbers it takes.
+    metavar : name of its value, or of a mixed tuple's elements, if it has any.
+    flag : on the command line.
+    positional : it has none, it is an argument.
+    """
+
+    group: str
+    name: str
+    kind: Any
+    default: Any
+    help_text: str
+    range: Range
+    metavar: str | tuple[str, ...] | None
+    flag: str
+    positional: bool
+
+    @property
+    def path(self) -> str:
+        """How messages name it."""
+        return f"{self.group}.{self.name}"
+
+
+def describe_fields(cls: type) -> tuple[FieldInfo, ...]:
+    """Fields of a group of options in order; one without a default is required."""
+    key: Any = cls
+    return _described(key)
+
+
+@functools.cache
+def _described(cls: Any) -> tuple[FieldInfo, ...]:
+    hints = typing.get_type_hints(cls)
+    return tuple(
+        FieldInfo(
+            group=getattr(cls, "group", ""),
+            name=f.name,
+            kind=_without_none(hints[f.name]),
+            default=f.default,
+            help_text=f.metadata.get("help", ""),
+            range=f.metadata.get("range", Range()),
+            metavar=f.metadata.get("metavar"),
+            flag=f.metadata.get("flag") or "--" + f.name.replace("_", "-"),
+            positional=f.metadata.get("positional", False),
         )
-        _require(self.workers >= 1, f"--workers must be 1 or more, not {self.workers}.")
+        for f in fields(cls)
+    )
+
+
+def groups_of(cls: type) -> Mapping[str, type[OptionGroup]]:
+    """Groups of options by name, of a class that holds some, such as :class:`Options`."""
+    return typing.get_type_hints(cls)
+
+
+def option_paths(cls: type = Options) -> tuple[str, ...]:
+    """Paths of all options of :class:`Options` or of one group, in order."""
+    groups = (cls,) if issubclass(cls, OptionGroup) else groups_of(cls).values()
+    return tuple(info.path for group in groups for info in describe_fields(group))
+
+
+def get_option(options: Options, path: str) -> Any:
+    """Value of the option of a path such as ``"sfm.seed"``; KeyError if there is none."""
+    group, name = _split(path)
+    return getattr(getattr(options, group), name)
+
+
+def replace_option(options: Options, path: str, value: Any) -> Options:
+    """The options with one of another value, checked; KeyError if there is no such path."""
+    group, name = _split(path)
+    changed = dataclasses.replace(getattr(options, group), **{name: value})
+    return dataclasses.replace(options, **{group: changed})
+
+
+def plain_options(options: Options, paths: Iterable[str]) -> dict[str, Any]:
+    """Some options by path, in terms of JSON; the name of a group stands for all that it has."""
+    groups = groups_of(Options)
+    whole = {name: option_paths(cls) for name, cls in groups.items()}
+    every = [path for given in paths for path in whole.get(given, (given,))]
+    return {path: to_plain(get_option(options, path)) for path in every}
+
+
+def _split(path: str) -> tuple[str, str]:
+    if path not in option_paths(Options):
+        raise KeyError(path)
+    group, _, name = path.partition(".")
+    return group, name
+
+
+def to_plain(value: Any) -> Any:
+    """A value, or a whole dataclass, in terms of JSON; NaN and infinity become None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [to_plain(item) for item in value]
+    if isinstance(value, StrEnum):
+        return value.value
+    if isinstance(value, Path):
+        return str(value.absolute())  # a run may go on from another folder
+    if hasattr(value, "item"):  # a NumPy scalar
+        return to_plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def show_value(value: Any) -> str:
+    """A value as messages and the help show it, as a flag takes it."""
+    if isinstance(value, tuple | list):
+        parts = [show_value(item) for item in value]
+        nested = any(isinstance(item, tuple | list) for item in value)
+        return (" " if nested else ",").join(parts)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:g}"
+    return "none" if value is None else str(value)
+
+
+def from_plain(cls: type[T], values: Mapping[str, Any], source: str = "") -> T:
+    """A group of options from JSON or TOML values; fields that are not named keep their default.
+
+    Parameters
+    ----------
+    cls : the group's class.
+    values : by field name.
+    source : what the values come from, for messages: a file.
+
+    Raises
+    ------
+    OptionError
+        A name is unknown, or a value is of the wrong type or out of range; the message names
+        source, table and key. It carries no ``field``: what is at fault is no flag.
+    """
+    converted = values_from_plain(cls, values, source)
+    try:
+        return cls(**converted)
+    except OptionError as error:
+        raise in_table(error, source) from error
+
+
+def values_from_plain(cls: type, values: Mapping[str, Any], source: str = "") -> dict[str, Any]:
+    """Values of some fields from JSON or TOML, in the fields' types; ranges are not checked.
+
+    Raises
+    ------
+    OptionError
+        A name is unknown, or a value is of the wrong type.
+    """
+    import msgspec
+
+    infos = {info.name: info for info in describe_fields(cls)}
+    begin = _table(getattr(cls, "group", ""), source)
+    converted = {}
+    for name, value in values.items():
+        if name not in infos:
+            raise OptionError(f"{begin} has an unknown key {name!r}{_near(name, infos)}")
+        info = infos[name]
+        # JSON has null for None, TOML leaves the key out.
+        if value is None and info.default is None:
+            continue
+        try:
+            converted[name] = msgspec.convert(value, info.kind, dec_hook=_decode)
+        except msgspec.ValidationError as error:
+            expected = str(error).partition(" - at ")[0].replace("`", "")
+            raise OptionError(f"{begin} {name} cannot be {value!r}: {expected}.") from error
+    return converted
+
+
+def in_table(error: OptionError, source: str) -> OptionError:
+    """What is wrong with an option, as of a key in a table of a file, and not of a flag."""
+    if error.field is None:
+        return error
+    group, _, name = error.field.partition(".")
+    return OptionError(f"{_table(group, source)} {name} {error.reason}")
+
+
+def _table(group: str, source: str) -> str:
+    return f"{source}: [{group}]" if source else f"[{group}]"
+
+
+def options_from_plain(plain: Mapping[str, Any], source: str = "") -> Options:
+    """All options from JSON or TOML tables by group; what is not named keeps its default.
+
+    Raises
+    ------
+    OptionError
+        As :func:`from_plain`; also for an unknown table.
+    """
+    groups = groups_of(Options)
+    for name in plain:
+        require_table(name, plain[name], groups, source)
+    made: dict[str, Any] = {
+        name: from_plain(cls, plain.get(name, {}), source) for name, cls in groups.items()
+    }
+    return Options(**made)
+
+
+def require_table(name: str, table: Any, known: Iterable[str], source: str) -> None:
+    """Refuse, by OptionError, what is no table of options with a known name."""
+    begin = f"{source}: " if source else ""
+    names = tuple(known)
+    if name not in names:
+        what = "unknown table" if isinstance(table, Mapping) else "a key outside the tables,"
+        raise OptionError(f"{begin}{what} {name!r}{_near(name, names)}")
+    if not isinstance(table, Mapping):
+        raise OptionError(f"{begin}{name!r} must be a table, [{name}].")
+
+
+def _decode(kind: Any, value: Any) -> Any:
+    """What msgspec does not know of itself."""
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    raise NotImplementedError(f"no option is of type {kind}")
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    """The name that was probably meant, or all names."""
+    import difflib
+
+    names = tuple(known)
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(names)}."
+
+
+def _without_none(hint: Any) -> Any:
+    """``X`` of ``X | None``."""
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        return next(arg for arg in typing.get_args(hint) if arg is not type(None))
+    return hint

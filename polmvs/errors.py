@@ -1,7 +1,12 @@
-"""Errors that a user can act on; the command turns each into one line and an exit status."""
+"""Errors that a user can act on; the command turns each into one line and an exit status.
+
+A message names an option by its path between backquotes, as in "Give `run.overwrite`.": the
+command line puts the flag in its place, a notebook sees the field.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from os import PathLike
 from typing import ClassVar
 
@@ -34,6 +39,29 @@ class DataError(PolmvsError):
 
 
 class OptionError(PolmvsError):
-    """An option is malformed or contradicts another one or the data."""
+    """An option is malformed or contradicts another one or the data.
+
+    Parameters
+    ----------
+    reason : str
+        What is wrong, without the option's name if ``field`` is given. Other options are named by
+        their paths between backquotes.
+    field : str or None
+        Path of the option at fault, such as ``propagation.step_px``; the command line names its
+        flag instead.
+    """
 
     exit_status: ClassVar[int] = 2
+
+    def __init__(self, reason: str, *, field: str | None = None) -> None:
+        super().__init__(f"`{field}` {reason}" if field is not None else reason)
+        self.reason = reason
+        self.field = field
+
+    def __reduce__(self) -> tuple[Callable[[str, str | None], OptionError], tuple[str, str | None]]:
+        """Pickle the parts, so that the error of a worker process arrives whole."""
+        return _option_error, (self.reason, self.field)
+
+
+def _option_error(reason: str, field: str | None) -> OptionError:
+    return OptionError(reason, field=field)

@@ -8,6 +8,11 @@ def record_of(out: Path) -> dict:
     return json.loads((out / "run.json").read_text())
 
 
+def result_of(out: Path, stage: str) -> dict:
+    """What a finished stage found."""
+    return next(s["result"] for s in record_of(out)["stages"] if s["name"] == stage)
+
+
 def stages_of(out: Path) -> list[str]:
     return [stage["name"] for stage in record_of(out)["stages"]]
 

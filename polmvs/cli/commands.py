@@ -1,167 +1,223 @@
-"""The commands: each calls one library function and prints what came of it."""
+"""The commands: what each is called with, and where its function is.
+
+Nothing here imports what the commands do, so that ``--help`` is quick.
+"""
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 
-import polmvs
-from polmvs.camera import PinholeCamera
-from polmvs.cli.flags import options_from, recorded_options, run_options
-from polmvs.cli.terminal import Terminal
-from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
-from polmvs.errors import OptionError
-from polmvs.evaluation.comparison import evaluate_file
-from polmvs.evaluation.tables import best_fit_lines, evaluation_text
-from polmvs.io.clouds import read_cloud, write_mesh
-from polmvs.io.ground_truth import open_ground_truth
-from polmvs.option_values import to_plain
-from polmvs.pipeline import jobs as pipeline
-from polmvs.pipeline.stages.dense_workspace import DenseWorkspaceResult
-from polmvs.pipeline.stages.densify import DensifyResult
-from polmvs.pipeline.stages.mesh import MeshResult
-from polmvs.pipeline.stages.normals import NormalsResult
-from polmvs.pipeline.stages.poses import PosesResult
-from polmvs.pipeline.stages.seeds import SeedsResult
-from polmvs.surface.poisson import poisson_mesh
+from polmvs.cli.call import FileOptions, TerminalOptions
+from polmvs.cli.flags import Command
+from polmvs.config import (
+    COMPARED_MODELS,
+    AngleModel,
+    CaptureOptions,
+    EvaluationOptions,
+    Experiment,
+    ExperimentOptions,
+    ExportOptions,
+    FusionOptions,
+    NormalOptions,
+    OptionGroup,
+    PlaneOptions,
+    PropagationOptions,
+    ReferenceOptions,
+    RegionOptions,
+    RunOptions,
+    SfmOptions,
+    default_num_workers,
+    option,
+)
 
-EMPTY_STATUS = 3
-DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"
+ABOUT = "Dense clouds of glossy, textureless surfaces from polarization cameras."
 DEMO_OUT = Path("polmvs-demo")
 
-
-def demo(args: argparse.Namespace, terminal: Terminal) -> int:
-    """Run ``polmvs demo``."""
-    truth = open_ground_truth(DEMO_CAPTURE)
-    camera = truth.views[truth.names[0]].camera
-    assert isinstance(camera, PinholeCamera)
-    options = Options(
-        sfm=SfmOptions(intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy)),
-        evaluation=EvaluationOptions(gt=DEMO_CAPTURE / "gt"),
-    )
-    job = _job(args, terminal, DEMO_CAPTURE, options, run_options(args))
-    return _report_comparison(pipeline.compare(job))
+CAPTURE_HELP = "folder of raw polarizer mosaics, in it or in its raw/"
+OUT_HELP = "folder of the results"
 
 
-def reconstruct(args: argparse.Namespace, terminal: Terminal) -> int:
-    """Run ``polmvs reconstruct``."""
-    outcome = pipeline.reconstruct(_job_from(args, terminal), args.model)
-    return _report_cloud(outcome, args.model)
+@dataclass(frozen=True, kw_only=True)
+class JobArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    capture: Path = option(MISSING, CAPTURE_HELP, positional=True)
+    out: Path = option(MISSING, OUT_HELP, positional=True)
 
 
-def compare(args: argparse.Namespace, terminal: Terminal) -> int:
-    """Run ``polmvs compare``."""
-    return _report_comparison(pipeline.compare(_job_from(args, terminal), args.models))
+@dataclass(frozen=True, kw_only=True)
+class DemoArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    out: Path = option(DEMO_OUT, OUT_HELP, positional=True)
 
 
-def evaluate(args: argparse.Namespace, terminal: Terminal) -> int:
-    """Run ``polmvs evaluate``."""
-    figures = evaluate_file(args.cloud, args.gt, args.sparse)
-    print(json.dumps(to_plain(figures), indent=1) if args.json else evaluation_text(figures))
-    return 0
+@dataclass(frozen=True, kw_only=True)
+class ModelChoice(OptionGroup, group="model", in_files=False):
+    """Which model."""
 
-
-def sfm(args: argparse.Namespace, terminal: Terminal) -> int:
-    """Run ``polmvs sfm``."""
-    outcome = pipeline.find_poses(_job_from(args, terminal))
-    poses = outcome.result(PosesResult)
-    print(
-        f"{outcome.run_folder.sparse}: {_views(outcome)} have a pose, "
-        f"{poses.num_tracks:,} sparse points"
-    )
-    return 0
-
-
-def normals(args: argparse.Namespace, terminal: Terminal) -> int:
-    """Run ``polmvs normals``."""
-    outcome = pipeline.solve_normals(_job_from(args, terminal, continues=True), (args.model,))
-    found, seeds = outcome.result(NormalsResult, args.model), outcome.result(SeedsResult)
-    print(
-        f"{outcome.run_folder.sparse_cloud(args.model)}: {found.num_normals:,} of "
-        f"{found.num_tracks:,} sparse points have a normal, {seeds.num_track_seeds:,} are seeds"
-    )
-    return 0
-
-
-def densify(args: argparse.Namespace, terminal: Terminal) -> int:
-    """Run ``polmvs densify``."""
-    outcome = pipeline.densify(_job_from(args, terminal, continues=True), (args.model,))
-    return _report_cloud(outcome, args.model)
-
-
-def export(args: argparse.Namespace, terminal: Terminal) -> int:
-    """Run ``polmvs export``."""
-    outcome = pipeline.export(_job_from(args, terminal, continues=True), args.model)
-    return _report_cloud(outcome, args.model)
-
-
-def mesh(args: argparse.Namespace, terminal: Terminal) -> int:
-    """Run ``polmvs mesh``."""
-    if args.mesh.exists() and not args.overwrite:
-        raise OptionError(f"{args.mesh}: exists. Give --overwrite to replace it.")
-    made = poisson_mesh(read_cloud(args.cloud), source=args.cloud)
-    write_mesh(args.mesh, made)
-    print(f"{args.mesh}: {len(made.triangles):,} triangles")
-    return 0
-
-
-def _job_from(
-    args: argparse.Namespace, terminal: Terminal, *, continues: bool = False
-) -> pipeline.Job:
-    """The job; one that goes on takes the options of the run in OUT where none are given."""
-    how = run_options(args)
-    recorded = recorded_options(args.out) if how.resume or continues else None
-    return _job(args, terminal, args.capture, options_from(args, recorded), how)
-
-
-def _job(
-    args: argparse.Namespace, terminal: Terminal, capture: Path, options: Options, how: RunOptions
-) -> pipeline.Job:
-    return pipeline.Job(
-        capture=capture,
-        out=args.out,
-        options=options,
-        run_options=how,
-        monitor=terminal,
-        command_line=args.command_line,
+    angle_model: AngleModel = option(
+        AngleModel.PPA, "relation of measured angle and normal", flag="--model"
     )
 
 
-def _report_cloud(outcome: pipeline.JobOutcome, model: AngleModel) -> int:
-    folder, cloud = outcome.run_folder, outcome.result(DensifyResult, model)
-    metric = outcome.result(PosesResult).is_metric
-    unit = "metres" if metric else "the model's unit, not metric"
-    print(
-        f"{folder.cloud(model)}: {cloud.num_points:,} points from {_views(outcome)}, and "
-        f"{cloud.num_surroundings:,} of the surroundings; in {unit}"
+@dataclass(frozen=True, kw_only=True)
+class ComparedModels(OptionGroup, group="models", in_files=False):
+    """Which models."""
+
+    angle_models: tuple[AngleModel, ...] = option(
+        COMPARED_MODELS,
+        f"what to compare, of {', '.join(AngleModel)}",
+        flag="--models",
+        metavar="MODEL,...",
     )
-    mesh = outcome.find(MeshResult, model)
-    if mesh is not None and mesh.num_triangles:
-        print(f"{folder.mesh(model)}: {mesh.num_triangles:,} triangles")
-    dense = outcome.find(DenseWorkspaceResult, model)
-    if dense is not None and dense.folder is not None:
-        print(f"{dense.folder}: COLMAP dense workspace")
-    return _status(outcome)
 
 
-def _report_comparison(outcome: pipeline.JobOutcome) -> int:
-    comparison = outcome.comparison
-    assert comparison is not None
-    print("\n".join([comparison.table(), *best_fit_lines(comparison)]))
-    clouds = ", ".join(f"{model}.ply" for model in comparison.models)
-    print(f"{outcome.run_folder.root}: {clouds}, metrics.json, summary.md; {_views(outcome)}")
-    return _status(outcome)
+@dataclass(frozen=True, kw_only=True)
+class EvaluateArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    cloud: Path = option(MISSING, "PLY file of points, if possible with normals", positional=True)
+    gt: Path = option(MISSING, "ground truth", metavar="DIR")
+    sparse: Path = option(
+        MISSING,
+        "COLMAP model in whose frame the cloud is; its cameras align it with the truth",
+        metavar="DIR",
+    )
 
 
-def _views(outcome: pipeline.JobOutcome) -> str:
-    poses = outcome.result(PosesResult)
-    return f"{poses.num_views} of {poses.num_views + len(poses.unregistered)} views"
+@dataclass(frozen=True, kw_only=True)
+class MeshArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    cloud: Path = option(MISSING, "PLY file of points with normals", positional=True)
+    mesh: Path = option(MISSING, "PLY file of the mesh", positional=True)
+    overwrite: bool = option(False, "replace an existing MESH")
 
 
-def _status(outcome: pipeline.JobOutcome) -> int:
-    if outcome.empty is None:
-        return 0
-    print(f"polmvs: {outcome.empty}", file=sys.stderr)
-    return EMPTY_STATUS
+@dataclass(frozen=True, kw_only=True)
+class PlaneArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    image: Path = option(MISSING, "raw polarizer mosaic", positional=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExperimentArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    name: Experiment = option(MISSING, ", ".join(Experiment), positional=True)
+    capture: Path = option(
+        MISSING,
+        f"{CAPTURE_HELP}, or in the layout of the authors' demo (images/, cams/)",
+        positional=True,
+    )
+    out: Path = option(MISSING, OUT_HELP, positional=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExperimentRun(OptionGroup, group="run", in_files=False):
+    """How the experiment is carried out; nothing here changes its result."""
+
+    overwrite: bool = option(False, "replace earlier results of NAME in OUT")
+    workers: int = option(default_num_workers(), "processes to share the views among", least=1)
+
+
+# Options in the order in which data meets them.
+TO_POSES = (CaptureOptions, SfmOptions, ReferenceOptions)
+TO_NORMALS = (*TO_POSES, RegionOptions, NormalOptions)
+TO_CLOUD = (*TO_NORMALS, PropagationOptions, FusionOptions)
+HOW = (RunOptions, FileOptions, TerminalOptions)
+
+COMMANDS = (
+    Command(
+        name="demo",
+        help_text="compare OPA and PPA on the bundled capture of a glossy board",
+        run="polmvs.cli.jobs:demo",
+        groups=(DemoArguments, RunOptions, TerminalOptions),
+    ),
+    Command(
+        name="reconstruct",
+        help_text="capture in, dense cloud of one model out",
+        run="polmvs.cli.jobs:reconstruct",
+        groups=(JobArguments, ModelChoice, *TO_CLOUD, ExportOptions, *HOW),
+    ),
+    Command(
+        name="compare",
+        help_text="dense clouds of several models on the same poses, seeds and region, and figures "
+        "that tell them apart",
+        run="polmvs.cli.jobs:compare",
+        groups=(JobArguments, ComparedModels, *TO_CLOUD, EvaluationOptions, *HOW),
+    ),
+    Command(
+        name="evaluate",
+        help_text="measure a cloud against ground truth",
+        run="polmvs.cli.clouds:evaluate",
+        groups=(EvaluateArguments, TerminalOptions),
+    ),
+    Command(
+        name="sfm",
+        help_text="the first stages alone: images and poses",
+        run="polmvs.cli.jobs:sfm",
+        groups=(JobArguments, *TO_POSES, *HOW),
+    ),
+    Command(
+        name="normals",
+        help_text="normals of the sparse points, after 'sfm'",
+        run="polmvs.cli.jobs:normals",
+        groups=(JobArguments, ModelChoice, RegionOptions, NormalOptions, *HOW),
+        earlier=TO_POSES,
+    ),
+    Command(
+        name="densify",
+        help_text="the dense cloud, after 'normals'",
+        run="polmvs.cli.jobs:densify",
+        groups=(JobArguments, ModelChoice, PropagationOptions, FusionOptions, *HOW),
+        earlier=TO_NORMALS,
+    ),
+    Command(
+        name="export",
+        help_text="mesh and COLMAP dense workspace, after 'densify'",
+        run="polmvs.cli.jobs:export",
+        groups=(JobArguments, ModelChoice, ExportOptions, *HOW),
+        earlier=TO_CLOUD,
+    ),
+    Command(
+        name="mesh",
+        help_text="Poisson mesh of a cloud with normals",
+        run="polmvs.cli.clouds:mesh",
+        groups=(MeshArguments, TerminalOptions),
+    ),
+    Command(
+        name="plane",
+        help_text="normals of planes in one raw image, and which model fits it",
+        run="polmvs.cli.plane:plane",
+        groups=(PlaneArguments, PlaneOptions, CaptureOptions, FileOptions, TerminalOptions),
+    ),
+    Command(
+        name="experiment",
+        help_text="the paper's experiments: OPA, PPA and tilted side by side on a capture with "
+        "truth",
+        run="polmvs.cli.experiment:experiment",
+        groups=(
+            ExperimentArguments,
+            ExperimentOptions,
+            CaptureOptions,
+            RegionOptions,
+            ExperimentRun,
+            FileOptions,
+            TerminalOptions,
+        ),
+        more="phase: error of the phases that the models predict from true normals; plane: normal "
+        "of a planar region from one view; tracks: normals of surface points from K views; "
+        "contours: contours traced from seeds on the part's edge. The model 'tilted' presumes a "
+        "lens that is not telecentric on the image side.",
+    ),
+    Command(
+        name="doctor",
+        help_text="versions, cores and memory of this machine, and a self-test of a few seconds",
+        run="polmvs.cli.doctor:doctor",
+        groups=(TerminalOptions,),
+    ),
+)

@@ -1,197 +1,347 @@
-"""Flags made from the options' dataclass fields, and options from flags, a file and a record."""
+"""The command line's grammar: flags, help and usage errors, made by cyclopts from the options.
+
+cyclopts gets one signature for each command, made of the fields of the command's groups. It parses
+and names what is wrong; values reach the dataclasses, which check them.
+"""
 
 from __future__ import annotations
 
-import argparse
-import tomllib
+import dataclasses
+import inspect
+import re
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Annotated, Any
 
-from polmvs.config import Options, RunOptions
-from polmvs.errors import DataError, OptionError
-from polmvs.option_values import (
+from cyclopts import App, Group, Parameter
+from cyclopts.exceptions import CycloptsError, MissingArgumentError, UnusedCliTokensError
+from cyclopts.token import Token
+
+import polmvs
+from polmvs.cli.call import Call, FileOptions, TerminalOptions
+from polmvs.config import (
+    ExperimentOptions,
     FieldInfo,
+    OptionGroup,
+    Options,
+    PlaneOptions,
+    RunOptions,
     describe_fields,
-    from_plain,
-    mixed_kinds,
-    parse_text,
-    to_plain,
+    groups_of,
+    show_value,
 )
-from polmvs.pipeline.record import read_options
-from polmvs.pipeline.run_folder import RunFolder
 
-T = TypeVar("T")
+_NAMED_IN_MESSAGES: tuple[type[OptionGroup], ...] = (
+    *groups_of(Options).values(),
+    RunOptions,
+    PlaneOptions,
+    ExperimentOptions,
+    FileOptions,
+    TerminalOptions,
+)
 
-# Groups of options, as they are called in ``Options``, in TOML files and in ``run.json``.
-GROUPS: dict[str, type] = {info.name: info.kind for info in describe_fields(Options)}
-RUN_GROUP = "run"
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser that says what is wrong in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """End the program with status 2."""
-        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+HELP_ALL = "--help-all"
+USAGE_ERROR = 2
 
 
-def add_flags(parser: argparse.ArgumentParser, groups: Iterable[str]) -> None:
-    """Add the flags of some groups of options, and ``--config``."""
-    names = tuple(groups)
-    for name in names:
-        cls = GROUPS[name]
-        section = parser.add_argument_group(name, _first_line(cls))
-        for info in describe_fields(cls):
-            _add_flag(section, name, info)
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help=f"TOML file with options in tables named {', '.join(names)}; flags go before it",
-    )
-    parser.set_defaults(groups=names)
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """A command.
+
+    Attributes
+    ----------
+    help_text : what it does, one line.
+    run : a function of the call and the terminal that gives the exit status, or
+        ``"module:function"``, which is imported when the command is run.
+    groups : its options, in the order of its help; the first may hold its arguments.
+    earlier : options of the stages before, which its help shows on request.
+    more : what its help says beside.
+    name : as it is typed; none where the program has this command alone.
+    """
+
+    help_text: str
+    run: str | Callable[[Call, Any], int]
+    groups: tuple[type[OptionGroup], ...]
+    earlier: tuple[type[OptionGroup], ...] = ()
+    more: str = ""
+    name: str = ""
+
+    @property
+    def tables(self) -> tuple[type[OptionGroup], ...]:
+        """Groups that a file of options may have tables of."""
+        return tuple(cls for cls in (*self.groups, *self.earlier) if cls.in_files)
 
 
-def add_run_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags that say how a run is carried out."""
-    section = parser.add_argument_group("run", _first_line(RunOptions))
-    for info in describe_fields(RunOptions):
-        _add_flag(section, RUN_GROUP, info)
+class UsageError(Exception):
+    """The command line is not understood.
+
+    Attributes
+    ----------
+    prog : program and command that it was for.
+    message : one line that says why.
+    """
+
+    def __init__(self, prog: str, message: str) -> None:
+        super().__init__(message)
+        self.prog = prog
+        self.message = message
 
 
-def run_options(args: argparse.Namespace) -> RunOptions:
-    """How the run is carried out."""
-    return RunOptions(**_given(args, RUN_GROUP, RunOptions))
+@dataclass(frozen=True, kw_only=True)
+class Parsed:
+    """What a command line asks for.
+
+    Attributes
+    ----------
+    prog : program and command, for messages.
+    command : to be run with ``call``; None where the help or the version is asked for.
+    call : what was given to it.
+    show : shows the help or the version.
+    """
+
+    prog: str
+    command: Command | None = None
+    call: Call | None = None
+    show: Callable[[], Any] | None = None
 
 
-def options_from(args: argparse.Namespace, recorded: Mapping[str, Any] | None = None) -> Options:
-    """Options from, each before the next: flags, ``--config``, an earlier run, the defaults.
+def parse(commands: Sequence[Command], tokens: Sequence[str], prog: str, about: str = "") -> Parsed:
+    """Read a command line.
+
+    Parameters
+    ----------
+    commands : all there are; a single one without a name is the program itself.
+    tokens : the command line after the program's name.
+    prog : name of the program.
+    about : what it does, for its help.
 
     Raises
     ------
-    OptionError, DataError
-        A value is unusable, or the file has an unknown key.
+    UsageError
+        A command, flag, argument or value is unknown, missing, malformed or repeated.
     """
-    file = read_config(args.config, args.groups) if args.config is not None else {}
-    layers = [recorded or {}, file]
-    groups: dict[str, Any] = {}
-    for name, cls in GROUPS.items():
-        values: dict[str, Any] = {}
-        for layer in layers:
-            values |= layer.get(name, {})
-        values |= to_plain(_given(args, name, cls))
-        groups[name] = from_plain(cls, values, f"[{name}]")
-    return Options(**groups)
-
-
-def recorded_options(out: Path) -> Mapping[str, Any]:
-    """Options of the run in a folder; empty where there is none."""
-    return read_options(RunFolder(out))
-
-
-def read_config(path: Path, groups: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Read a TOML file of options.
-
-    Raises
-    ------
-    DataError
-        It is missing, no TOML, or has an unknown table or key, which is named.
-    """
+    words = ["--help" if token == HELP_ALL else token for token in tokens]
+    show_all = HELP_ALL in tokens
+    named = {command.name: command for command in commands}
+    chosen = named.get("") or named.get(words[0] if words else "")
+    name = prog if chosen is None or not chosen.name else f"{prog} {chosen.name}"
+    app = _app(prog, about)
+    for rank, command in enumerate(commands):
+        place = app if not command.name else _app(command.name, rank=rank)
+        if command is chosen:  # the others' flags are not needed
+            _complete(place, command, name, show_all=show_all)
+        else:
+            place.help = command.help_text
+        if place is not app:
+            app.command(place)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
-    except ValueError as error:
-        raise DataError(path, f"is no TOML file ({error}).") from error
-    known = tuple(groups)
-    for name, table in content.items():
-        if name not in known or not isinstance(table, dict):
-            raise DataError(path, f"unknown table {name!r}; known are {', '.join(known)}.")
-        try:
-            from_plain(GROUPS[name], table, f"[{name}]")
-        except OptionError as error:
-            raise DataError(path, str(error)) from error
-    return content
+        if not words and not named.get(""):
+            raise UsageError(name, f"a command is needed: {', '.join(named)}")
+        function, bound, _ = app.parse_args(words, print_error=False, exit_on_error=False)
+    except CycloptsError as error:
+        raise UsageError(name, _message(error)) from error
+    if chosen is None or not isinstance(function, _Signature):
+        return Parsed(prog=name, show=lambda: function(*bound.args, **bound.kwargs))
+    infos = [info for cls in (*chosen.groups, *chosen.earlier) for info in describe_fields(cls)]
+    values = bound.arguments
+    given = {info.path: values[_key(info)] for info in infos if _key(info) in values}
+    for info in infos:  # cyclopts lets several arguments be none
+        if info.default is dataclasses.MISSING and info.path not in given:
+            raise UsageError(name, f"{_metavar(info)} is missing")
+    call = Call(given=given, tables=chosen.tables, command_line=[prog, *tokens])
+    return Parsed(prog=name, command=chosen, call=call)
 
 
-def _add_flag(section: Any, group: str, info: FieldInfo) -> None:
-    """One flag; without a default, so that only what was given counts."""
+def in_flags(text: str) -> str:
+    """A message with each option's path, between backquotes, replaced by its flag."""
+    flags = {info.path: info.flag for cls in _NAMED_IN_MESSAGES for info in describe_fields(cls)}
+    return re.sub(r"`(\w+\.\w+)`", lambda found: flags.get(found[1], found[1]), text)
+
+
+class _Signature:
+    """Stands for a command's function: cyclopts reads its signature, and nobody calls it."""
+
+    def __init__(self, parameters: Iterable[inspect.Parameter]) -> None:
+        self.__signature__ = inspect.Signature(list(parameters))
+        self.__annotations__ = {
+            p.name: p.annotation for p in self.__signature__.parameters.values()
+        }
+        self.__name__ = "command"
+        self.__doc__ = None
+
+    def __call__(self, *args: Any, **kwargs: Any) -> None:
+        """Do nothing."""
+
+
+def _app(name: str, about: str = "", *, rank: int = 0) -> App:
+    app = App(
+        name=name,
+        help=about,
+        help_format="plaintext",
+        version=f"polmvs {polmvs.__version__}",
+        version_format="plaintext",
+        sort_key=rank,
+    )
+    app["--help"].group = app["--version"].group = Group("Help", sort_key=1000)
+    return app
+
+
+def _complete(app: App, command: Command, prog: str, *, show_all: bool) -> None:
+    """Give an app the flags and the help of a command."""
+    hidden = () if show_all else command.earlier
+    lines = [command.help_text[0].upper() + command.help_text[1:] + "."]
+    if hidden:
+        names = ", ".join(cls.group for cls in hidden)
+        lines.append(f"Options of earlier stages ({names}): {HELP_ALL}.")
+    app.help = "\n\n".join([*lines, command.more] if command.more else lines)
+    app.usage = f"Usage: {prog} {_arguments(command)}[OPTIONS]"
+    parameters = []
+    for rank, cls in enumerate((*command.groups, *command.earlier)):
+        panel = Group(_title(cls), sort_key=rank, show=cls not in hidden)
+        infos = describe_fields(cls)
+        if any(info.positional for info in infos):
+            app.group_arguments = panel  # in place of cyclopts' own of this name
+        parameters += [_parameter(info, panel, is_setting=cls.in_files) for info in infos]
+    app.default(_Signature(sorted(parameters, key=lambda p: p.kind)))
+
+
+def _arguments(command: Command) -> str:
+    """The command's arguments as its usage line has them."""
+    infos = [info for cls in command.groups for info in describe_fields(cls) if info.positional]
+    texts = [_metavar(info) + " ..." * _is_list(info.kind) for info in infos]
+    required = [info.default is dataclasses.MISSING for info in infos]
+    return "".join(
+        f"{text} " if needed else f"[{text}] " for text, needed in zip(texts, required, strict=True)
+    )
+
+
+def _title(cls: type[OptionGroup]) -> str:
+    text = (cls.__doc__ or "").splitlines()[0].rstrip(".")
+    return f"{cls.group}: {text}" if cls.in_files else text
+
+
+def _key(info: FieldInfo) -> str:
+    """Name of its parameter: the help shows that of an argument in capitals."""
+    return info.name if info.positional else info.path.replace(".", "__")
+
+
+def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Parameter:
+    """A field as a parameter; without a default of its own, so that only what is given counts.
+
+    Parameters
+    ----------
+    info : the field.
+    group : panel of the help.
+    is_setting : a file or an earlier run may have set it, so that a switch must turn off as well.
+    """
+    is_required = info.default is dataclasses.MISSING
+    text = in_flags(info.help_text)
+    if info.default not in (None, dataclasses.MISSING):
+        text += f" [default: {show_value(info.default)}]"
+    negative = info.kind is bool and (is_setting or info.default is True)
     common: dict[str, Any] = {
-        "dest": f"{group}.{info.name}",
-        "default": argparse.SUPPRESS,
-        "help": f"{info.help_text} (default: {_show(info.default)})".replace("%", "%%"),
+        "group": group,
+        "help": text,
+        "show_default": False,
+        "show_choices": False,
+        "negative": f"--no-{info.flag[2:]}" if negative else (),
+        "allow_repeating": False,
     }
-    if info.kind is bool:
-        section.add_argument(info.flag, action=argparse.BooleanOptionalAction, **common)
-    elif isinstance(info.kind, type) and issubclass(info.kind, StrEnum):
-        section.add_argument(info.flag, type=info.kind, choices=list(info.kind), **common)
-    elif kinds := mixed_kinds(info.kind):
-        common["metavar"] = info.metavar or tuple(map(_metavar, kinds))
-        section.add_argument(info.flag, nargs=len(kinds), action=_StoreMixed, kinds=kinds, **common)
-    else:
-        metavar = _metavar(info.kind)
-        section.add_argument(info.flag, type=_parser_of(info.kind), metavar=metavar, **common)
+    if not info.positional:
+        common["name"] = (info.flag, "-v") if info.flag == "--verbose" else info.flag
+    if info.kind is not bool:
+        common["metavar"] = _metavar(info)
+    kind: Any = info.kind
+    place: Any = inspect.Parameter.KEYWORD_ONLY
+    elements = typing.get_args(kind) if typing.get_origin(kind) is tuple else ()
+    if info.positional:
+        place = inspect.Parameter.POSITIONAL_ONLY
+        if elements:
+            kind, place = elements[0], inspect.Parameter.VAR_POSITIONAL
+    elif _is_list(kind):
+        common |= {"converter": _several(elements[0]), "n_tokens": 1, "consume_multiple": True}
+    elif elements and not _is_mixed(kind):
+        common |= {"converter": _one_list(elements[0]), "n_tokens": 1}
+    has_default = not is_required and place is not inspect.Parameter.VAR_POSITIONAL
+    return inspect.Parameter(
+        _key(info),
+        place,
+        default=None if has_default else inspect.Parameter.empty,
+        annotation=Annotated[kind, Parameter(**common)],
+    )
 
 
-class _StoreMixed(argparse.Action):
-    """Stores a mixed tuple; each element is read as its own type, which ``type=`` cannot."""
-
-    def __init__(self, *args: Any, kinds: tuple[Any, ...], **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.kinds = kinds
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: str | Sequence[Any] | None,
-        option_string: str | None = None,
-    ) -> None:
-        """Convert the texts and store them."""
-        try:
-            parts = [
-                _parser_of(kind)(text) for kind, text in zip(self.kinds, values or (), strict=True)
-            ]
-        except argparse.ArgumentTypeError as error:
-            raise argparse.ArgumentError(self, str(error)) from error
-        setattr(namespace, self.dest, tuple(parts))
+def _is_mixed(kind: Any) -> bool:
+    """Whether a tuple's elements differ in type: each is a text of its own."""
+    elements = typing.get_args(kind)
+    return len(set(elements)) > 1 and Ellipsis not in elements
 
 
-def _parser_of(kind: Any) -> Callable[[str], Any]:
-    def parse(text: str) -> Any:
-        try:
-            return parse_text(kind, text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(
-                f"{text!r} cannot be read as {_metavar(kind)}"
-            ) from error
-
-    return parse
+def _is_list(kind: Any) -> bool:
+    """Whether a kind is a tuple of tuples or of paths: any number of texts."""
+    elements = typing.get_args(kind) if typing.get_origin(kind) is tuple else ()
+    return bool(elements) and (elements[0] is Path or typing.get_origin(elements[0]) is tuple)
 
 
-def _metavar(kind: Any) -> str:
+def _one_list(element: Any) -> Callable[[Any, Sequence[Token]], tuple[Any, ...]]:
+    """Reads a list with commas."""
+
+    def read(kind: Any, tokens: Sequence[Token]) -> tuple[Any, ...]:
+        return _read_list(element, tokens[0].value)
+
+    return read
+
+
+def _several(kind: Any) -> Callable[[Any, Sequence[Token]], tuple[Any, ...]]:
+    """Reads several lists with commas, each of the length of a tuple."""
+    elements = typing.get_args(kind)
+
+    def read(_: Any, tokens: Sequence[Token]) -> tuple[Any, ...]:
+        values = [_read_list(elements[0], token.value) for token in tokens]
+        for token, value in zip(tokens, values, strict=True):
+            if len(value) != len(elements):
+                raise ValueError(f"{token.value!r} is no {_name(kind)}")
+        return tuple(values)
+
+    return read
+
+
+def _read_list(element: Any, text: str) -> tuple[Any, ...]:
+    """Elements of a list with commas; ValueError says what it should have been."""
+    try:
+        return tuple(element(part.strip()) for part in text.split(","))
+    except ValueError as error:
+        raise ValueError(f"{text!r} cannot be read as {_name(tuple[element, ...])}") from error
+
+
+def _metavar(info: FieldInfo) -> str:
+    if isinstance(info.metavar, tuple):
+        return " ".join(info.metavar)
+    return info.metavar or (info.name.upper() if info.positional else _name(info.kind))
+
+
+def _name(kind: Any) -> str:
+    """What a value is, in the help and in messages."""
     if typing.get_origin(kind) is tuple:
-        return f"{_metavar(typing.get_args(kind)[0])},..."
+        elements = typing.get_args(kind)
+        dots = ",..." if Ellipsis in elements else ""
+        return ",".join(_name(item) for item in elements if item is not Ellipsis) + dots
+    if isinstance(kind, type) and issubclass(kind, StrEnum):
+        return "|".join(kind)
     return {int: "INT", float: "NUMBER", Path: "PATH"}.get(kind, "NAME")
 
 
-def _show(value: Any) -> str:
-    if isinstance(value, tuple):
-        return ",".join(map(str, value))
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return "none" if value is None else str(value)
-
-
-def _given(args: argparse.Namespace, group: str, cls: type) -> dict[str, Any]:
-    """What was given on the command line, by field."""
-    values = vars(args)
-    keys = {info.name: f"{group}.{info.name}" for info in describe_fields(cls)}
-    return {name: values[key] for name, key in keys.items() if key in values}
-
-
-def _first_line(cls: type) -> str:
-    return (cls.__doc__ or "").splitlines()[0]
+def _message(error: CycloptsError) -> str:
+    """What cyclopts has to say, in one line."""
+    if isinstance(error, UnusedCliTokensError):
+        return f"unexpected argument: {' '.join(error.unused_tokens or [])}"
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
+        name = error.argument.name
+        if not name.startswith("-"):
+            return f"{name} is missing"
+    error.verbose = False
+    text = " ".join(str(error).split())
+    return text[0].lower() + text[1:].rstrip(".")

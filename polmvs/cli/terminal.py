@@ -1,37 +1,63 @@
-"""What the user sees of a run: progress, warnings, the log file, and one line for every error."""
+"""What the user sees of a run: progress, a line for each stage, warnings, and the log file."""
 
 from __future__ import annotations
 
+import json
 import logging
-import os
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING, Any
 
-from tqdm import tqdm
+from polmvs.cli.call import TerminalOptions
+from polmvs.cli.flags import in_flags
+from polmvs.cli.running import keep_sigterm
+from polmvs.config import to_plain
+from polmvs.errors import DataError
 
-from polmvs.colmap.cameras import quiet_colmap
-from polmvs.errors import DataError, PolmvsError
-from polmvs.pipeline.monitor import OnProgress
-from polmvs.pipeline.run_folder import RunFolder
+if TYPE_CHECKING:  # heavy
+    from rich.console import Console
 
-INTERRUPTED = 130  # as shells report a program ended by Ctrl-C
-FILE_ONLY = {"file_only": True}  # of records that the terminal gets in another form
+    from polmvs.pipeline.run_folder import RunFolder
+
 LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
-logger = logging.getLogger(__name__)
 package_logger = logging.getLogger("polmvs")
 
 
+@dataclass(frozen=True, kw_only=True)
+class StageLine:
+    """A finished stage as it is shown.
+
+    Attributes
+    ----------
+    stage : its name.
+    seconds : wall time.
+    summary : the figure that matters.
+    """
+
+    stage: str
+    seconds: float
+    summary: str
+
+
 class _TerminalHandler(logging.Handler):
-    """Lines on stderr that do not break the progress bar; tracebacks are for the log file."""
+    """Shows log records; tracebacks are for the log file."""
+
+    def __init__(self, terminal: Terminal, level: int) -> None:
+        super().__init__(level)
+        self.terminal = terminal
 
     def emit(self, record: logging.LogRecord) -> None:
         if not hasattr(record, "file_only"):
-            level = "" if record.levelno < logging.WARNING else f"{record.levelname.lower()}: "
-            tqdm.write(f"{level}{record.getMessage()}", file=sys.stderr)
+            text = in_flags(record.getMessage())
+            if record.levelno >= logging.WARNING:
+                self.terminal.warn(text)
+            else:
+                self.terminal.say(text)
 
 
 class _LogFileHandler(logging.FileHandler):
@@ -42,24 +68,27 @@ class _LogFileHandler(logging.FileHandler):
 
 
 class Terminal:
-    """One call of the command: a :class:`polmvs.pipeline.monitor.Monitor` that shows and logs.
+    """One call of a command: the monitor of its run, which shows and logs.
 
     Parameters
     ----------
-    verbose : show every step, and log details.
+    options : what is shown.
     """
 
-    def __init__(self, *, verbose: bool) -> None:
-        self.verbose = verbose
-        self.run_folder: RunFolder | None = None
+    def __init__(self, options: TerminalOptions) -> None:
+        self.options = options
+        self.log: Path | None = None
+        self.warnings: list[str] = []
+        self.stages: list[StageLine] = []
+        self._silent = options.quiet or options.json
+        self._unrepeated: list[str] = []  # shown, and since then something else
         self._handlers: list[logging.Handler] = []
-        self._scope = ExitStack()
+        self._console: Console | None = None  # that of the bar in progress
 
     def __enter__(self) -> Terminal:
-        self._scope.enter_context(quiet_colmap())
-        handler = _TerminalHandler(logging.INFO if self.verbose else logging.WARNING)
-        self._add(handler)
-        package_logger.setLevel(logging.DEBUG if self.verbose else logging.INFO)
+        level = logging.INFO if self.options.verbose else logging.WARNING
+        self._add(_TerminalHandler(self, level))
+        package_logger.setLevel(logging.DEBUG if self.options.verbose else logging.INFO)
         return self
 
     def __exit__(
@@ -68,15 +97,45 @@ class Terminal:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._scope.close()
+        if self._unrepeated:
+            sys.stdout.flush()
+            self.say(f"{len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}:")
+            for text in self.warnings:
+                self.say(f"  {text}")
         for handler in self._handlers:
             package_logger.removeHandler(handler)
             handler.close()
         self._handlers.clear()
 
+    def say(self, text: str) -> None:
+        """A line on stderr, which does not break the progress bar."""
+        if self._silent:
+            return
+        if self._console is not None:
+            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        else:
+            print(text, file=sys.stderr)
+
+    def warn(self, text: str) -> None:
+        """A warning: shown now, and once more at the end if other lines follow."""
+        if text not in self.warnings:
+            self.warnings.append(text)
+            self.say(f"warning: {text}")
+
+    def show(self, text: str, content: Mapping[str, Any]) -> None:
+        """The result of the command, on stdout.
+
+        Parameters
+        ----------
+        text : for people.
+        content : the same for machines, which JSON can hold.
+        """
+        print(json.dumps(to_plain(content), indent=1) if self.options.json else text)
+
     def opened(self, run_folder: RunFolder) -> None:
         """Log into the output folder from now on."""
-        self.run_folder = run_folder
+        keep_sigterm()
+        self.log = run_folder.log
         try:
             handler = _LogFileHandler(run_folder.log, encoding="utf-8")
         except OSError as error:
@@ -86,68 +145,48 @@ class Terminal:
         self._add(handler)
 
     @contextmanager
-    def stage(self, name: str, total: int | None) -> Iterator[OnProgress]:
-        """Show a bar, if this is a terminal."""
-        with tqdm(
-            total=total, desc=name, disable=None, leave=False, file=sys.stderr, mininterval=0.2
-        ) as bar:
+    def stage(self, name: str, total: int | None) -> Iterator[Callable[[int], None]]:
+        """Show a bar with the count and the time that is left, if this is a terminal."""
+        if self._silent or not sys.stderr.isatty():
+            yield lambda count: None
+            return
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
 
-            def on_progress(count: int) -> None:
-                bar.update(count)
-
-            yield on_progress
+        columns = (
+            TextColumn("{task.description:<18}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left", style="dim"),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+            task = progress.add_task(name, total=total)
+            self._console = progress.console
+            try:
+                yield lambda count: progress.advance(task, count)
+            finally:
+                self._console = None
 
     def finished(self, name: str, seconds: float, summary: str) -> None:
-        """The log says it."""
+        """One line for a stage."""
+        self.stages.append(StageLine(stage=name, seconds=seconds, summary=summary))
+        self.say(f"{name:<18} {seconds:7.1f} s  {summary}".rstrip())
+        self._unrepeated = list(self.warnings)
 
     def skipped(self, name: str) -> None:
-        """The log says it."""
+        """A stage of an earlier call."""
+        if self.options.verbose:
+            self.say(f"{name:<18} finished earlier")
 
     def _add(self, handler: logging.Handler) -> None:
         self._handlers.append(handler)
         package_logger.addHandler(handler)
-
-
-def guarded(command: Callable[[], int], terminal: Terminal, name: str) -> int:
-    """Run a command; whatever goes wrong becomes one line on stderr and an exit status.
-
-    Parameters
-    ----------
-    command : gives the exit status.
-    terminal : of this call.
-    name : of the command, for the message.
-    """
-    try:
-        return command()
-    except KeyboardInterrupt:
-        kept = "; finished stages are kept, go on with --resume"
-        _complain(name, "interrupted" + (kept if terminal.run_folder is not None else ""))
-        return INTERRUPTED
-    except PolmvsError as error:
-        logger.debug("where it happened:", exc_info=True, extra=FILE_ONLY)
-        _complain(name, f"error: {error}")
-        return error.exit_status
-    except BrokenPipeError:  # the reader of stdout has gone
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except (BrokenProcessPool, MemoryError):
-        logger.debug("where it happened:", exc_info=True, extra=FILE_ONLY)
-        _complain(name, "error: out of memory, or a worker was killed. Give --workers 1.")
-        return 1
-    except OSError as error:
-        logger.debug("where it happened:", exc_info=True, extra=FILE_ONLY)
-        place = f"{error.filename}: " if error.filename else ""
-        _complain(name, f"error: {place}{error.strerror or error}.")
-        return 1
-    except Exception as error:
-        logger.critical("internal error", exc_info=True, extra=FILE_ONLY)
-        where = f"; see {terminal.run_folder.log}" if terminal.run_folder is not None else ""
-        text = " ".join(f"{type(error).__name__}: {error}".split())
-        _complain(name, f"internal error: {text}{where}")
-        return 1
-
-
-def _complain(name: str, message: str) -> None:
-    line = " ".join(message.split())
-    logger.error("%s", line, extra=FILE_ONLY)
-    print(f"{name}: {line}", file=sys.stderr)

@@ -15,9 +15,13 @@ from polmvs.errors import DataError
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
 from polmvs.evaluation.map_errors import MapErrors, map_errors
 from polmvs.evaluation.metrics import AngleStats, CloudMetrics
-from polmvs.evaluation.phase_errors import phase_errors
 from polmvs.evaluation.tables import best_fit_lines, comparison_table
-from polmvs.evaluation.truth_errors import TrackNormalErrors, evaluate, track_normal_errors
+from polmvs.evaluation.truth_errors import (
+    TrackNormalErrors,
+    evaluate,
+    phase_errors,
+    track_normal_errors,
+)
 from polmvs.io.clouds import Cloud, read_cloud
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.typed_json import from_json
@@ -25,7 +29,7 @@ from polmvs.parallel import Workers
 from polmvs.polarization.capture import Capture
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.poses.alignment import Alignment
-from polmvs.scene import View, stem_of
+from polmvs.scene import View, match_names
 from polmvs.surface.dense_view import DenseView
 
 DenseViews = Sequence[DenseView | None]
@@ -233,8 +237,8 @@ def measure_against_truth(
 
 def named_as_truth(views: Sequence[View], truth: GroundTruth) -> list[View]:
     """Views under the truth's names, which may have another suffix."""
-    by_stem = {stem_of(name): name for name in truth.names}
-    return [replace(view, name=by_stem.get(stem_of(view.name), view.name)) for view in views]
+    matched = match_names([view.name for view in views], truth.names)
+    return [replace(view, name=matched.get(view.name, view.name)) for view in views]
 
 
 def evaluate_file(cloud: Path, gt: Path, sparse: Path) -> TruthFigures:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import sample_image
+from polmvs.camera import depth_buffer, sample_image
 from polmvs.config import AngleModel
-from polmvs.evaluation.metrics import AngleStats, axial_errors_deg
+from polmvs.evaluation.metrics import MIN_DOLP, AngleStats, axial_errors_deg
+from polmvs.geometry import unit
 from polmvs.io.clouds import Cloud
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.phase_map import PhaseMap
@@ -19,11 +20,10 @@ from polmvs.scene import PointKind
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-MIN_DOLP = 0.1  # of pixels whose phase is compared
+# These define the figures; they are no tolerances of an algorithm.
 MAX_RESIDUAL_POINTS = 100_000  # of a cloud, evenly spread, that phase residuals are taken from
 CELL_PX = 4  # of coverage and occlusion: wider than the distance of the cloud's points
 MAX_RELATIVE_EXCESS = 0.01  # of a visible point's distance over the nearest one's in its cell
-MIN_VISIBLE_COSINE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,13 +49,13 @@ class Consistency:
 
 
 def measure_consistency(
-    model: AngleModel, cloud: Cloud, tracks: Cloud, maps: Sequence[PhaseMap]
+    angle_model: AngleModel, cloud: Cloud, tracks: Cloud, maps: Sequence[PhaseMap]
 ) -> Consistency:
     """Compare the polarised surface of a cloud with the phase maps of all views.
 
     Parameters
     ----------
-    model : of the cloud.
+    angle_model : of the cloud.
     cloud : dense, with normals and, if it has points, ``num_views``. Points whose ``kind`` is
         that of the surroundings are left out; without a ``kind`` all are of the surface.
     tracks : sparse points with ``residual`` and ``seed``.
@@ -77,7 +77,7 @@ def measure_consistency(
         seeing += visible
         chosen = np.flatnonzero(visible[::step]) * step
         errors.append(
-            phase_residuals_deg(model, cloud.points[chosen], cloud.normals[chosen], phase_map)
+            phase_residuals_deg(angle_model, cloud.points[chosen], cloud.normals[chosen], phase_map)
         )
     confirmed = np.minimum(cloud.scalars.get("num_views", np.zeros(num)), np.maximum(seeing, 1))
     return Consistency(
@@ -127,20 +127,14 @@ def visible_points(points: Floats, normals: Floats, phase_map: PhaseMap) -> tupl
     hit : (H / CELL_PX, W / CELL_PX) bool, rounded up
     """
     view, inside = phase_map.view, phase_map.region.inside
-    in_cam = view.cam_from_world * points
-    distance = np.linalg.norm(in_cam, axis=1)
-    xy = view.camera.project(in_cam)
-    to_camera = view.center_in_world - points
-    facing = (to_camera * normals).sum(axis=1) > MIN_VISIBLE_COSINE * distance
+    xy, distance = view.project(points), view.ranges(points)
+    facing = view.faces(points, normals)
     seen = facing & (sample_image(inside.astype(np.float32), xy, nearest=True) > 0)
-    shape = tuple(-(-side // CELL_PX) for side in inside.shape)
-    cols, rows = np.floor(xy[seen] / CELL_PX).astype(np.intp).T
-    cell = rows * shape[1] + cols
-    nearest = np.full(shape[0] * shape[1], np.inf)
-    np.minimum.at(nearest, cell, distance[seen])
+    height, width = inside.shape
+    cells, nearest = depth_buffer(xy[seen], distance[seen], width, height, cell_px=CELL_PX)
     visible = np.zeros(len(points), np.bool_)
-    visible[seen] = distance[seen] <= (1 + MAX_RELATIVE_EXCESS) * nearest[cell]
-    return visible, np.isfinite(nearest).reshape(shape)
+    visible[seen] = distance[seen] <= (1 + MAX_RELATIVE_EXCESS) * nearest
+    return visible, np.isfinite(cells)
 
 
 def _region_cells(inside: Mask) -> Mask:
@@ -152,7 +146,7 @@ def _region_cells(inside: Mask) -> Mask:
 
 
 def phase_residuals_deg(
-    model: AngleModel, points: Floats, normals: Floats, phase_map: PhaseMap
+    angle_model: AngleModel, points: Floats, normals: Floats, phase_map: PhaseMap
 ) -> NDArray[np.float64]:
     """Axial difference between predicted and measured phase at points, degrees.
 
@@ -165,10 +159,9 @@ def phase_residuals_deg(
     (N,), NaN where the view shows no polarised light.
     """
     view = phase_map.view
-    in_cam = view.cam_from_world * points
-    rays = in_cam / np.linalg.norm(in_cam, axis=1, keepdims=True)
-    predicted = phase_from_normal(model, normals @ view.cam_from_world.rotation.T, rays)
-    samples = sample_image(phase_map.samples, view.camera.project(in_cam))
+    rays = unit(view.cam_from_world * points)
+    predicted = phase_from_normal(angle_model, normals @ view.cam_from_world.rotation.T, rays)
+    samples = sample_image(phase_map.samples, view.project(points))
     measured = 0.5 * np.arctan2(samples[:, 1], samples[:, 0])
     counted = (samples[:, 2] > 0) & (np.hypot(samples[:, 0], samples[:, 1]) > MIN_DOLP)
     return np.where(counted, axial_errors_deg(measured, predicted), np.nan)

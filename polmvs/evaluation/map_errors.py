@@ -7,7 +7,7 @@ point are on the part and continue one surface is there a truth to compare with.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+# These define the figures; they are no tolerances of an algorithm.
 WITHIN_M = 0.001
 WITHIN_SIGMAS = 2.0
 WHOLE_SHARE = 0.999  # of the pixels about a lattice point; interpolation rounds
@@ -67,6 +68,29 @@ class MapErrors:
     within_two_sigma: float
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LatticeErrors:
+    """Errors of one view at the points (h, w) of its lattice.
+
+    Attributes
+    ----------
+    on_part : bool, points that lie wholly on one surface of the part.
+    off_part : bool, points that show nothing of the part.
+    known : bool, points with a range.
+    depth_m : error of the depth, positive behind the surface, m; NaN where not ``on_part`` or not
+        ``known``.
+    sigma_m : standard deviation that the view states for it, m; NaN likewise.
+    normal_deg : angle between the normal and the true one, degrees; NaN likewise.
+    """
+
+    on_part: Mask
+    off_part: Mask
+    known: Mask
+    depth_m: Array
+    sigma_m: Array
+    normal_deg: Array
+
+
 class _Truth(NamedTuple):
     """Truth of one view at the points (h, w) of a lattice, camera frame, m."""
 
@@ -74,17 +98,6 @@ class _Truth(NamedTuple):
     off_part: Mask  # wholly
     depth: Array
     normals: Image  # of any length
-
-
-class _ViewErrors(NamedTuple):
-    """Errors of one view at its P points with a value and a truth, and what they are a share of."""
-
-    depth_m: Array
-    normal_deg: Array
-    sigma_ratio: Array
-    num_on_part: int
-    num_known: int
-    num_outside: int
 
 
 def map_errors(
@@ -108,45 +121,61 @@ def map_errors(
     """
     truth_from_world, _ = align_views(views, truth.views, source=truth.cameras)
     strides = [one.stride_px for one in dense if one is not None]
-    stride_px = strides[0] if strides else 1
     found = [
-        _view_errors(view, one, stride_px, truth, truth_from_world)
+        lattice_errors(view, one, truth, truth_from_world, stride_px=strides[0] if strides else 1)
         for view, one in zip(views, dense, strict=True)
         if truth.find(view.name) is not None
     ]
     return _summary(found)
 
 
-def _view_errors(
+def lattice_errors(
     view: View,
     dense: DenseView | None,
-    stride_px: int,
     truth: GroundTruth,
     truth_from_world: SimilarityTransform,
-) -> _ViewErrors:
-    """Errors of one view; where it has no map, only what it should have shown."""
+    *,
+    stride_px: int = 1,
+) -> LatticeErrors:
+    """Compare one dense view with the true maps of its image.
+
+    Parameters
+    ----------
+    view : estimated, of an image that the truth knows.
+    dense : its maps; None where it has none, which leaves all unknown.
+    truth_from_world : of which the scale counts.
+    stride_px : of the lattice where there are no maps.
+
+    Raises
+    ------
+    DataError
+        When the truth's maps have another size.
+    """
     camera = view.camera
     if dense is None:
         xy = lattice_xy(camera.height // stride_px, camera.width // stride_px, stride_px)
-        num_on_part = int(_truth_at(xy, view, truth).on_part.sum())
-        return _ViewErrors(np.zeros(0), np.zeros(0), np.zeros(0), num_on_part, 0, 0)
+        known, nothing = np.zeros(xy.shape[:2], np.bool_), np.full(xy.shape[:2], np.nan)
+        true = _truth_at(xy, view, truth)
+        return LatticeErrors(
+            on_part=true.on_part,
+            off_part=true.off_part,
+            known=known,
+            depth_m=nothing,
+            sigma_m=nothing,
+            normal_deg=nothing,
+        )
     xy = dense.lattice_xy()
-    true = _truth_at(xy, view, truth)
-    has_range = dense.range_map > 0
-    compared = has_range & true.on_part
-    z_of_ray = camera.rays(xy[compared])[:, 2]
-    scale = truth_from_world.scale
-    depth = scale * dense.range_map[compared].astype(np.float64) * z_of_ray
-    error = depth - true.depth[compared]
-    sigma = scale * dense.sigma[compared].astype(np.float64) * z_of_ray  # range's, along z
-    in_cam = dense.normals_in_world[compared] @ view.cam_from_world.rotation.T
-    return _ViewErrors(
-        depth_m=error,
-        normal_deg=angular_errors_deg(in_cam, true.normals[compared]),
-        sigma_ratio=np.abs(error[sigma > 0]) / sigma[sigma > 0],
-        num_on_part=int(true.on_part.sum()),
-        num_known=int(has_range.sum()),
-        num_outside=int((has_range & true.off_part).sum()),
+    true, known = _truth_at(xy, view, truth), dense.range_map > 0
+    compared = known & true.on_part
+    z_per_range = truth_from_world.scale * camera.rays(xy)[..., 2]
+    in_cam = dense.normals_in_world @ view.cam_from_world.rotation.T
+    return LatticeErrors(
+        on_part=true.on_part,
+        off_part=true.off_part,
+        known=known,
+        depth_m=np.where(compared, z_per_range * dense.range_map - true.depth, np.nan),
+        sigma_m=np.where(compared, z_per_range * dense.sigma, np.nan),
+        normal_deg=np.where(compared, angular_errors_deg(in_cam, true.normals), np.nan),
     )
 
 
@@ -177,24 +206,29 @@ def _truth_at(xy: Array, view: View, truth: GroundTruth) -> _Truth:
     )
 
 
-def _summary(views: Sequence[_ViewErrors]) -> MapErrors:
+def _summary(views: Sequence[LatticeErrors]) -> MapErrors:
     """The figures of all views together."""
-    depth = np.concatenate([np.zeros(0), *(one.depth_m for one in views)])
-    ratio = np.concatenate([np.zeros(0), *(one.sigma_ratio for one in views)])
-    angles = np.concatenate([np.zeros(0), *(one.normal_deg for one in views)])
+
+    def pooled(values: Callable[[LatticeErrors], Array]) -> Array:
+        return np.concatenate(
+            [np.zeros(0), *(values(one)[one.known & one.on_part] for one in views)]
+        )
+
+    depth, sigma = pooled(lambda one: one.depth_m), pooled(lambda one: one.sigma_m)
     size = np.abs(depth)
-    num_known = sum(one.num_known for one in views)
+    ratio = size[sigma > 0] / sigma[sigma > 0]
+    num_known = sum(int(one.known.sum()) for one in views)
     median, p95 = np.percentile(size, (50, 95)) if len(size) else (np.nan, np.nan)
     return MapErrors(
         num_pixels=len(depth),
-        coverage=_ratio(len(depth), sum(one.num_on_part for one in views)),
-        outside=_ratio(sum(one.num_outside for one in views), num_known),
+        coverage=_ratio(len(depth), sum(int(one.on_part.sum()) for one in views)),
+        outside=_ratio(sum(int((one.known & one.off_part).sum()) for one in views), num_known),
         depth_rmse_m=float(np.sqrt(_mean(depth**2))),
         depth_median_m=float(median),
         depth_p95_m=float(p95),
         depth_bias_m=_mean(depth),
         depth_within_1mm=_mean(size < WITHIN_M),
-        normals=AngleStats.from_degrees(angles),
+        normals=AngleStats.from_degrees(pooled(lambda one: one.normal_deg)),
         sigma_ratio_median=float(np.median(ratio)) if len(ratio) else float("nan"),
         within_two_sigma=_mean(ratio < WITHIN_SIGMAS),
     )

@@ -35,16 +35,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.io.ground_truth import PART_SPACING_M
 from polmvs.neighbors import nearest_points
+from polmvs.polarization.stokes import axial_difference
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
+# These define the figures; they are no tolerances of an algorithm.
 THRESHOLDS_M = (0.001, 0.002, 0.005)
-TRUTH_SPACING_M = 0.0005
 OFF_SURFACE_M = 0.005
 FAR_M = 0.02
 TANGENT_REACH = 1.5  # in spacings of the truth
+MIN_DOLP = 0.1  # of pixels whose phase is compared
 MAX_QUERIES = 2_000_000  # a larger cloud's accuracy is taken from a random subset of this size
 
 
@@ -143,14 +146,10 @@ def axial_errors_deg(phases: Floats, truth: Floats) -> Array:
     ----------
     phases, truth : (...), radians; NaN gives NaN.
     """
-    difference = np.asarray(phases, np.float64) - np.asarray(truth, np.float64)
-    finite = np.where(np.isfinite(difference), difference, np.nan)
-    return np.asarray(np.degrees(np.abs(np.mod(finite + np.pi / 2, np.pi) - np.pi / 2)))
-
-
-def phase_errors(phases: Floats, truth: Floats) -> AngleStats:
-    """Statistics of the axial differences of phase angles ``(...)``, radians modulo pi."""
-    return AngleStats.from_degrees(axial_errors_deg(phases, truth))
+    phases, truth = np.asarray(phases, np.float64), np.asarray(truth, np.float64)
+    finite = np.isfinite(phases) & np.isfinite(truth)
+    difference = axial_difference(np.where(finite, phases, np.nan), np.where(finite, truth, np.nan))
+    return np.degrees(np.abs(difference))
 
 
 def evaluate_cloud(
@@ -161,7 +160,7 @@ def evaluate_cloud(
     truth_is_part: NDArray[np.bool_],
     thresholds_m: tuple[float, ...] = THRESHOLDS_M,
     *,
-    spacing_m: float = TRUTH_SPACING_M,
+    spacing_m: float = PART_SPACING_M,
 ) -> CloudMetrics:
     """Compare a cloud with sampled true surfaces; definitions in the module's docstring.
 

@@ -1,17 +1,19 @@
-"""Evaluation stage: brings estimates into the true frame and measures them there."""
+"""Clouds, normals of sparse points, and measured phases against the ground truth."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import pixel_centers
+from polmvs.camera import in_image, pixel_centers
 from polmvs.config import AngleModel
 from polmvs.evaluation.metrics import (
+    MIN_DOLP,
     THRESHOLDS_M,
     AngleStats,
     CloudMetrics,
@@ -21,27 +23,23 @@ from polmvs.evaluation.metrics import (
 )
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.neighbors import nearest_points
-from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.angle_models import correct_stokes, phase_from_normal
+from polmvs.polarization.capture import Capture
+from polmvs.polarization.phase_map import PhaseMap, as_tilted, view_rays
+from polmvs.polarization.stokes import Stokes
 from polmvs.poses.alignment import Alignment, align_views
-from polmvs.scene import View
-
-__all__ = [
-    "Alignment",
-    "TrackNormalErrors",
-    "align_views",
-    "evaluate",
-    "phase_errors_on_part",
-    "points_on_part",
-    "track_normal_errors",
-]
+from polmvs.scene import View, match_names
 
 Array = NDArray[np.float64]
+Image = NDArray[np.float32]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
+# Of a sparse point that counts as one of the part; definitions, see `track_normal_errors`.
 ON_PART_M = 0.003
 IN_FRONT_M = 0.010
-MIN_DOLP = 0.1
+
+Measured = Iterable[tuple[str, Image, Image]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +146,9 @@ def points_on_part(points_in_truth: Floats, truth: GroundTruth) -> Mask:
     kernel = np.ones((3, 3), np.uint8)
     for name, view in truth.views.items():
         points_in_cam = view.cam_from_world * points_in_truth
-        inside, rows, cols = _pixels(view, points_in_cam)
+        xy = view.camera.project(points_in_cam)
+        inside = in_image(view.camera, xy)
+        cols, rows = np.floor(xy[inside]).astype(np.intp).T
         z = points_in_cam[inside, 2]
         depth = truth.depth(name)
         mask = cv2.erode(truth.mask(name).astype(np.uint8), kernel).astype(np.bool_)
@@ -159,19 +159,50 @@ def points_on_part(points_in_truth: Floats, truth: GroundTruth) -> Mask:
     return near & ~floats
 
 
+def phase_errors(
+    capture: Capture, maps: Sequence[PhaseMap], truth: GroundTruth
+) -> dict[str, dict[AngleModel, AngleStats]]:
+    """Errors of the measured phase on the part, under each model with the true normals.
+
+    Parameters
+    ----------
+    capture : whose single pixels are measured too.
+    maps : phase maps, as OPA and PPA use them.
+    truth : with the true normals.
+
+    Returns
+    -------
+    ``maps``: of the phase maps, which the geometry uses. ``pixels``: of the single pixels of the
+    capture, those neither clipped nor dark.
+    """
+    raw = match_names([phase_map.view.name for phase_map in maps], capture.names)
+    errors: dict[str, dict[AngleModel, AngleStats]] = {}
+    for source, tilted in product(("maps", "pixels"), (False, True)):
+        measured: Measured
+        if source == "maps":
+            measured = (_of_map(as_tilted(one) if tilted else one) for one in maps)
+        else:
+            # A folder holds the mosaics of all maps: they were made of it.
+            measured = (
+                _of_pixels(one, capture.load(raw[one.view.name]), tilted=tilted) for one in maps
+            )
+        found = phase_errors_on_part(measured, truth)
+        if tilted:  # the corrected phase is one that PPA predicts
+            errors[source][AngleModel.TILTED] = found[AngleModel.PPA]
+        else:
+            errors[source] = found
+    return errors
+
+
 def phase_errors_on_part(
-    phases: Mapping[str, Floats],
-    dolps: Mapping[str, Floats],
-    truth: GroundTruth,
-    *,
-    min_dolp: float = MIN_DOLP,
+    measured: Measured, truth: GroundTruth, *, min_dolp: float = MIN_DOLP
 ) -> dict[AngleModel, AngleStats]:
     """Axial errors of the phases that each model predicts from the true normals.
 
     Parameters
     ----------
-    phases : (H, W) of each image, phase (not AoLP), radians modulo pi; NaN is left out
-    dolps : (H, W) of the same images
+    measured : name, phase (not AoLP), rad modulo pi, and DoLP (H, W) of each image, one at a
+        time; pixels whose phase is NaN and images without a truth are left out.
     min_dolp : pixels count above this DoLP.
 
     Returns
@@ -179,12 +210,11 @@ def phase_errors_on_part(
     For OPA and PPA, the statistics over all pixels of the part in all images that have a truth.
     """
     errors: dict[AngleModel, list[Array]] = {AngleModel.OPA: [], AngleModel.PPA: []}
-    for name, phase in phases.items():
+    for name, phase, dolp in measured:
         view = truth.find(name)
         if view is None:
             continue
         camera = view.camera
-        dolp = dolps[name]
         if phase.shape != (camera.height, camera.width) or dolp.shape != phase.shape:
             raise ValueError(
                 f"{phase.shape=}, {dolp.shape=} but expected {(camera.height, camera.width)}."
@@ -192,17 +222,26 @@ def phase_errors_on_part(
         counted = truth.mask(view.name) & (dolp > min_dolp) & np.isfinite(phase)
         normals = truth.normals(view.name)[counted]
         rays = camera.rays(pixel_centers(camera.width, camera.height)[counted])
-        for model, values in errors.items():
-            values.append(axial_errors_deg(phase[counted], phase_from_normal(model, normals, rays)))
+        for angle_model, values in errors.items():
+            predicted = phase_from_normal(angle_model, normals, rays)
+            values.append(axial_errors_deg(phase[counted], predicted))
     return {
-        model: AngleStats.from_degrees(np.concatenate([np.zeros(0), *values]))
-        for model, values in errors.items()
+        angle_model: AngleStats.from_degrees(np.concatenate([np.zeros(0), *values]))
+        for angle_model, values in errors.items()
     }
 
 
-def _pixels(view: View, points_in_cam: Floats) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp]]:
-    """Which points fall into the image, and the row and column of each of those."""
-    xy = view.camera.project(points_in_cam)
-    inside = (xy >= 0).all(axis=1) & (xy < [view.camera.width, view.camera.height]).all(axis=1)
-    cols, rows = np.floor(xy[inside]).astype(np.intp).T
-    return np.asarray(inside, np.bool_), rows, cols
+def _of_map(phase_map: PhaseMap) -> tuple[str, Image, Image]:
+    """Name, phase, NaN where there is none, and DoLP of a phase map."""
+    cos, sin, precision = np.moveaxis(phase_map.samples, -1, 0)
+    phase = np.where(precision > 0, 0.5 * np.arctan2(sin, cos), np.nan)
+    return phase_map.view.name, phase.astype(np.float32), np.hypot(cos, sin)
+
+
+def _of_pixels(phase_map: PhaseMap, stokes: Stokes, *, tilted: bool) -> tuple[str, Image, Image]:
+    """Name, phase, NaN where clipped or dark, and DoLP of the single pixels of a view."""
+    if tilted:
+        stokes = correct_stokes(stokes, view_rays(phase_map.view), diffuse=phase_map.diffuse)
+    turn = np.where(phase_map.diffuse, np.float32(0), np.float32(np.pi / 2))
+    phase = np.where(stokes.valid, stokes.aolp + turn, np.float32(np.nan))
+    return phase_map.view.name, phase, stokes.dolp

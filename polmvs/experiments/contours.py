@@ -9,35 +9,49 @@ over the reliable pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel
-from polmvs.experiments.data import Scene, load_view, require_counted
-from polmvs.experiments.surfaces import TrueSurface
-from polmvs.experiments.two_views import second_view, step_with_normals
+from polmvs.config import AngleModel, ExperimentOptions
+from polmvs.errors import DataError
+from polmvs.experiments.data import OnProgress, Scene, Truth, load_view, require_counted
+from polmvs.io.ground_truth import GroundTruth
+from polmvs.io.layouts import BoardTruth
+from polmvs.neighbors import nearest_points
+from polmvs.normals.estimator import solve_normals
+from polmvs.normals.rows import gather_rows
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map, store_phase_map, view_rays
 from polmvs.surface.contour import Contours, direction_field, trace_contours
+from polmvs.surface.log_range import log_range_increment
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
+Image = NDArray[np.float32]
+Indices = NDArray[np.int64]
 
-DEFAULT_NUM_SEEDS = 20
-DEFAULT_STEP_PX = 0.5
 INSET_PX = 4  # of the seeds: nearer to the edge the blurred light of the background is mixed in
 MEASURED_PX = 1.0  # distance between the points of a contour that are measured
 
 METHODS = ("opa", "ppa_normals", "ppa_tangent", "tilted_tangent")
+
+CONTOUR_LABELS = {
+    "opa": "OPA, iso-depth",
+    "ppa_normals": "PPA, two-view normals, same 2D paths",
+    "ppa_tangent": "PPA, iso-range, one view",
+    "tilted_tangent": "tilted, iso-range, one view",
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,10 +113,10 @@ def measure_contours(
     surface: TrueSurface,
     indices: Sequence[int],
     workers: Workers,
-    report: Callable[[int], None] = lambda count: None,
+    on_progress: OnProgress = lambda count: None,
     *,
-    num_seeds: int = DEFAULT_NUM_SEEDS,
-    step_px: float = DEFAULT_STEP_PX,
+    num_seeds: int = ExperimentOptions.num_seeds,
+    step_px: float = ExperimentOptions.step_px,
 ) -> list[ViewContours]:
     """Contours of some views; all views may give the second rows.
 
@@ -124,7 +138,7 @@ def measure_contours(
         counts = []
         for counted in workers.map(partial(_store_maps, scene, folder), range(len(scene.views))):
             counts.append(counted)
-            report(1)
+            on_progress(1)
         require_counted(scene, counts)
         trace = partial(trace_view, scene, folder, num_seeds=num_seeds, step_px=step_px)
         results: list[ViewContours] = []
@@ -135,7 +149,7 @@ def measure_contours(
                 lines={m: _measured(*line, surface) for m, line in traced.items()},
             )
             results.append(result)
-            report(1)
+            on_progress(1)
         return results
 
 
@@ -261,3 +275,222 @@ def _to_world(phase_map: PhaseMap, xy: Floats, ranges: Floats) -> Array:
 
 def _measured(points: Array, curve: NDArray[np.int64], surface: TrueSurface) -> Lines:
     return Lines(points=points, curve=curve, heights=surface.heights(points))
+
+
+MIN_SEEN_SHARE = 0.9  # of the seeds, that a second view must see
+
+
+def second_view(maps: Sequence[PhaseMap], index: int, seeds: Array) -> int | None:
+    """The view whose rows cross those of another at the largest angle, seen from its seeds.
+
+    Parameters
+    ----------
+    maps : phase maps of all views.
+    index : of the first view.
+    seeds : (S, 3), world.
+
+    Returns
+    -------
+    Among the views that have rows for at least 90 % of the seeds (or, failing that, the most)
+    the one with the largest median angle; None without seeds or a second view.
+    """
+    if len(seeds) == 0 or len(maps) < 2:
+        return None
+    rows = gather_rows(AngleModel.PPA, seeds, maps)
+    sine = np.linalg.norm(np.cross(rows.rows, rows.rows[:, index : index + 1], axis=0), axis=0)
+    sine = np.where(np.isfinite(rows.sigma) & np.isfinite(sine), sine, np.nan)
+    sine[index] = np.nan
+    seen = np.isfinite(sine).sum(axis=1)
+    if seen.max() == 0:
+        return None
+    eligible = seen >= min(MIN_SEEN_SHARE * len(seeds), seen.max())
+    medians = [np.nanmedian(s) if ok else -1.0 for s, ok in zip(sine, eligible, strict=True)]
+    return int(np.argmax(medians))
+
+
+def step_with_normals(
+    maps: Sequence[PhaseMap],
+    range_maps: Sequence[Image | None],
+    paths: Contours,
+    seed_range: Floats,
+) -> Array:
+    """Distances along 2D paths, with the normal of two views at every place reached.
+
+    Parameters
+    ----------
+    maps : of the view of the paths, and of the second view.
+    range_maps : of the same views, by which occluded rows are told; see
+        :func:`polmvs.polarization.phase_map.gather_rows`.
+    paths : nodes of each curve ordered by their arc, seeds at arc 0; ``curve`` counts in seeds.
+    seed_range : (S,), distance of each seed from the camera centre.
+
+    Returns
+    -------
+    (N,), NaN from where on the second view has no row, or the two rows give no normal.
+    """
+    nodes = _halves(paths)
+    view = maps[0].view
+    rays = view.camera.rays(paths.xy)
+    result = np.full(len(paths.xy), np.nan)
+    if nodes.shape[1] == 0:
+        return result
+    seeds = nodes[:, 0]
+    ranges = np.asarray(seed_range, np.float64)[paths.curve[seeds]]
+    result[seeds] = ranges
+    active = np.arange(len(nodes))
+    for here, there in zip(nodes.T[:-1], nodes.T[1:], strict=True):
+        active = active[there[active] >= 0]
+        tail, head = rays[here[active]], rays[there[active]]
+        normals = _normals(maps, range_maps, tail * ranges[active, None])
+        known = np.isfinite(normals).all(axis=1)
+        active = active[known]
+        if len(active) == 0:
+            break
+        ranges[active] *= np.exp(log_range_increment(normals[known], tail[known], head[known]))
+        result[there[active]] = ranges[active]
+    return result
+
+
+def _halves(paths: Contours) -> Indices:
+    """Nodes (2 S, L) of both halves of every curve from its seed outwards, -1 after its end."""
+    halves = []
+    for curve in np.unique(paths.curve):
+        nodes = np.flatnonzero(paths.curve == curve)
+        arc = paths.arc_px[nodes]
+        halves.append(nodes[arc >= 0])
+        halves.append(nodes[arc <= 0][::-1])
+    length = max((len(half) for half in halves), default=0)
+    result = np.full((len(halves), length), -1, np.int64)
+    for row, half in zip(result, halves, strict=True):
+        row[: len(half)] = half
+    return result
+
+
+def _normals(
+    maps: Sequence[PhaseMap], range_maps: Sequence[Image | None], points_in_cam: Array
+) -> Array:
+    """Normals (N, 3) in the frame of the first view, NaN where the views do not give one."""
+    first = maps[0].view.cam_from_world
+    rows = gather_rows(AngleModel.PPA, first.inverse() * points_in_cam, maps, range_maps)
+    estimate = solve_normals(rows.rows, rows.rays, rows.sigma, robust=False)
+    return np.asarray(estimate.normals @ first.rotation.T, np.float64)
+
+
+FAR_M = 0.02
+
+
+class TrueSurface(Protocol):
+    """Distance of points to a surface."""
+
+    @property
+    def description(self) -> str:
+        """What it is, for the record."""
+
+    def heights(self, points: Floats) -> Array:
+        """Signed distance (N,) of points (N, 3), true world; positive outside, in its units."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneSurface:
+    """The plane ``normal . x = offset`` with a unit normal (3,)."""
+
+    normal: Array
+    offset: float
+    description: str = "plane, exact"
+
+    def heights(self, points: Floats) -> Array:
+        """Signed distance (N,) of points (N, 3)."""
+        return np.asarray(points @ self.normal - self.offset, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class SampledSurface:
+    """Points (N, 3) of a surface with unit normals (N, 3): distances are to tangent planes."""
+
+    points: Array
+    normals: Array
+    spacing: float
+    description: str = "tangent plane of the nearest true point"
+
+    def heights(self, points: Floats) -> Array:
+        """Signed distance (N,); to the nearest point itself where the surface has ended."""
+        distances, nearest = nearest_points(self.points, np.asarray(points, np.float64), far=FAR_M)
+        offsets = points - self.points[nearest]
+        heights = np.einsum("ij,ij->i", offsets, self.normals[nearest])
+        beside = np.sqrt(np.maximum(distances**2 - heights**2, 0)) > 3 * self.spacing
+        sign = np.where(heights < 0, -1.0, 1.0)
+        return np.asarray(np.where(beside, sign * distances, heights), np.float64)
+
+
+def open_surface(truth: Truth) -> TrueSurface:
+    """The part's surface: exact where the truth tells that it is a plane, else sampled.
+
+    Raises
+    ------
+    DataError
+        The truth has neither.
+    """
+    if isinstance(truth, BoardTruth):
+        return PlaneSurface(truth.normal, truth.offset)
+    scene_path = truth.folder / "scene.json"
+    if scene_path.is_file():
+        try:
+            surface = json.loads(scene_path.read_text(encoding="utf-8"))["surface"]
+            if surface["type"] == "plane":
+                normal = np.array(surface["normal"], np.float64)
+                length = float(np.linalg.norm(normal))
+                return PlaneSurface(normal / length, float(surface["offset"]) / length)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(scene_path, f"does not describe the surface ({error}).") from error
+    if not isinstance(truth, GroundTruth):
+        raise DataError(truth.folder, "has no surface that contours can be measured against.")
+    sampling = truth.surface_points()
+    part = sampling.is_part & np.isfinite(sampling.normals).all(axis=1)
+    return SampledSurface(
+        sampling.points[part], sampling.normals[part].astype(np.float64), sampling.spacing_m
+    )
+
+
+MAX_STRIDE = 4  # points of a contour between two vertices of the file
+
+
+def line_set_bytes(lines: Sequence[Lines], *, stride: int = MAX_STRIDE) -> bytes:
+    """A binary PLY of contours; neighbours on a curve are joined.
+
+    Parameters
+    ----------
+    lines : of any number of views, true world, metres.
+    stride : every how many-th point of a curve is kept.
+
+    Returns
+    -------
+    Vertices with ``height_mm``, the signed distance to the true surface; edges between them.
+    """
+    vertex = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("height_mm", "<f4")])
+    points, curves, heights, offset = [], [], [], 0
+    for line in lines:
+        points.append(line.points[::stride])
+        heights.append(line.heights[::stride])
+        curves.append(line.curve[::stride] + offset)
+        offset += int(line.curve.max(initial=-1)) + 1
+    vertices = np.zeros(sum(map(len, points)), vertex)
+    if len(vertices):
+        place = np.concatenate(points)
+        vertices["x"], vertices["y"], vertices["z"] = place.T
+        vertices["height_mm"] = 1e3 * np.concatenate(heights)
+    curve = np.concatenate(curves) if curves else np.zeros(0, np.int64)
+    tails = np.flatnonzero(curve[1:] == curve[:-1])
+    edges = np.stack([tails, tails + 1], axis=-1).astype("<i4")
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment contours in the world of the ground truth, metres",
+        f"element vertex {len(vertices)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        "property float height_mm",
+        f"element edge {len(edges)}",
+        "property int vertex1",
+        "property int vertex2",
+        "end_header",
+    ]
+    return ("\n".join(header) + "\n").encode() + vertices.tobytes() + edges.tobytes()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import match_model_to_capture, read_model
-from polmvs.config import AngleModel, Light, RegionOptions
-from polmvs.errors import DataError
+from polmvs.config import AngleModel, CaptureOptions, ExperimentOptions, Light, RegionOptions
+from polmvs.errors import DataError, OptionError
+from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.images import read_mask
+from polmvs.io.layouts import AUTHOR_OPTIONS, BoardTruth, is_author_layout, read_author_truth
 from polmvs.pipeline.stages.maps import find_mask
 from polmvs.polarization.angle_models import correct_stokes, phase_sign
-from polmvs.polarization.capture import Capture
+from polmvs.polarization.capture import Capture, open_capture
 from polmvs.polarization.phase_map import PhaseMap, as_tilted, build_phase_map, view_rays
 from polmvs.polarization.region import Region, find_region, smooth
 from polmvs.polarization.stokes import Stokes
@@ -29,7 +31,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-DEFAULT_BLUR_PX = 1.5  # the paper blurs its images and does not say how much; ours are half as wide
+OnProgress = Callable[[int], None]  # called with the number of steps done
+
 BLUR_REACH = 2.0  # deviations of the blur within which a mark spoils a pixel
 
 
@@ -54,6 +57,9 @@ class Truth(Protocol):
         """True normals (H, W, 3), unit, camera frame; NaN off the part."""
 
 
+MODEL_LABELS = {AngleModel.OPA: "OPA", AngleModel.PPA: "PPA", AngleModel.TILTED: "tilted"}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Scene:
     """A capture with poses in the world of its truth.
@@ -73,7 +79,7 @@ class Scene:
     views: tuple[View, ...]
     raw_names: tuple[str, ...]
     region: RegionOptions
-    blur_px: float = DEFAULT_BLUR_PX
+    blur_px: float = ExperimentOptions.blur_px
     alignment: Alignment | None = None
 
     def settings(self) -> dict[str, Any]:
@@ -162,7 +168,7 @@ def open_scene(
     truth: Truth,
     region: RegionOptions,
     *,
-    blur_px: float = DEFAULT_BLUR_PX,
+    blur_px: float = ExperimentOptions.blur_px,
     sparse: Path | None = None,
 ) -> Scene:
     """Match a capture with its truth, and with estimated poses where they are given.
@@ -290,5 +296,97 @@ def require_counted(scene: Scene, num_counted: Sequence[int] | int) -> None:
         raise DataError(
             scene.capture.folder,
             f"no pixel of the part has a DoLP above {scene.region.min_dolp}; "
-            "give a lower --min-dolp, or the mask of a polarised surface.",
+            "give a lower `region.min_dolp`, or the mask of a polarised surface.",
         )
+
+
+def open_experiment(
+    folder: Path,
+    options: ExperimentOptions,
+    capture: CaptureOptions,
+    region: RegionOptions,
+) -> Scene:
+    """The scene of a capture with truth, of either layout.
+
+    Parameters
+    ----------
+    folder : of the capture.
+    options : truth, poses and blur.
+    capture : how the mosaics are read; for the layout of the authors' demo only what differs from
+        the defaults, which are not its own.
+    region : light, DoLP threshold and masks.
+
+    Raises
+    ------
+    PolmvsError
+        Something is missing, damaged or contradictory.
+    """
+    opened, truth = _open_data(folder, options.gt, capture)
+    return open_scene(opened, truth, region, blur_px=options.blur_px, sparse=options.sparse)
+
+
+def _open_data(folder: Path, gt: Path | None, options: CaptureOptions) -> tuple[Capture, Truth]:
+    if is_author_layout(folder):
+        if gt is not None and gt.resolve() != folder.resolve():
+            raise OptionError(
+                f"is {gt}, but {folder} brings its own truth. Leave it out.", field="experiment.gt"
+            )
+        given = None if options == CaptureOptions() else options
+        return open_author_capture(folder, given)
+    return open_capture(folder, options), open_ground_truth(folder if gt is None else gt)
+
+
+def open_author_capture(
+    folder: Path, options: CaptureOptions | None = None
+) -> tuple[Capture, BoardTruth]:
+    """Open a capture in the layout of the authors' demo, with its truth.
+
+    Parameters
+    ----------
+    options : how mosaics become polarization images; None: the authors' own.
+
+    Raises
+    ------
+    DataError
+        A file is missing, damaged, or of another size or count.
+    """
+    capture = open_capture(folder / "images", AUTHOR_OPTIONS if options is None else options)
+    return capture, read_author_truth(folder, capture.names, capture.width, capture.height)
+
+
+def view_indices(names: Sequence[str] | None, scene: Scene) -> tuple[int, ...] | None:
+    """Indices of views by their images' names, with or without suffix; None for None.
+
+    Raises
+    ------
+    OptionError
+        There is no such view.
+    """
+    if names is None:
+        return None
+    by_name = {view.name: i for i, view in enumerate(scene.views)}
+    by_name |= {Path(view.name).stem: i for i, view in enumerate(scene.views)}
+    for name in names:
+        if name not in by_name:
+            raise OptionError(
+                f"names {name!r}, and there is no such image with truth and pose.",
+                field="experiment.views",
+            )
+    return tuple(dict.fromkeys(by_name[name] for name in names))
+
+
+def require_apart(out: Path, capture: Path) -> None:
+    """Refuse an output folder in which results would mix with the input.
+
+    Raises
+    ------
+    OptionError
+        It is a folder of the capture.
+    DataError
+        It is a file.
+    """
+    places = [capture, *(capture / name for name in ("raw", "images", "cams", "gt"))]
+    if out.resolve() in [place.resolve() for place in places if place.exists()]:
+        raise OptionError(f"{out}: OUT is a folder of the capture. Give another OUT.")
+    if out.exists() and not out.is_dir():
+        raise DataError(out, "is a file; OUT must be a folder.")

@@ -1,4 +1,4 @@
-"""Figures of the experiments as PNG: the only importer of matplotlib."""
+"""Figures of the experiments as PNG, with matplotlib."""
 
 from __future__ import annotations
 
@@ -13,13 +13,46 @@ from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
 from polmvs.config import AngleModel
-from polmvs.experiments import style
-from polmvs.experiments.contours import METHODS, ViewContours
+from polmvs.experiments.contours import CONTOUR_LABELS, METHODS, ViewContours
+from polmvs.experiments.data import MODEL_LABELS
 from polmvs.experiments.phase import ANGLE_LIMITS_DEG, ANGLES, PhaseImages, PhaseResult
-from polmvs.experiments.plane import ESTIMATES, PlaneResult
-from polmvs.experiments.tracks import ESTIMATORS, TrackResult
+from polmvs.experiments.plane import ESTIMATES, PLANE_LABELS, PlaneResult
+from polmvs.experiments.tracks import ESTIMATORS, TRACK_LABELS, TrackResult
 
 Array = NDArray[np.float64]
+
+# Okabe and Ito's palette, which people with any kind of colour blindness tell apart.
+VERMILLION, ORANGE, SKY, BLUE, GREEN, GREY = (
+    "#D55E00", "#E69F00", "#56B4E9", "#0072B2", "#009E73", "#666666",
+)  # fmt: skip
+PLANE_COLORS = {
+    "algebraic": SKY,
+    "weighted_noise": GREY,
+    "weighted": BLUE,
+    "tilted_algebraic": ORANGE,
+    "tilted": GREEN,
+}
+PLANE_MARKERS = {
+    "algebraic": "o", "weighted_noise": "x", "weighted": "s", "tilted_algebraic": "v",
+    "tilted": "D",
+}  # fmt: skip
+TRACK_COLORS = {
+    "opa": VERMILLION,
+    "opa_weighted": ORANGE,
+    "ppa_algebraic": SKY,
+    "ppa_weighted": BLUE,
+    "tilted_weighted": GREEN,
+}
+TRACK_STYLES = {
+    "opa": "-", "opa_weighted": "--", "ppa_algebraic": "--", "ppa_weighted": "-",
+    "tilted_weighted": "-",
+}  # fmt: skip
+CONTOUR_COLORS = {
+    "opa": VERMILLION,
+    "ppa_normals": SKY,
+    "ppa_tangent": BLUE,
+    "tilted_tangent": GREEN,
+}
 
 DPI = 150
 CYCLIC = "twilight"  # perceptually uniform, cyclic, safe for colour blindness
@@ -54,7 +87,7 @@ def draw_phase_density(result: PhaseResult) -> bytes:
             if row == 2:
                 ax.set_xlabel(f"{ANGLE_NAMES[angle]} (°)")
         rmse = result.all_pixels[model].rmse_deg
-        axes[row, 0].set_ylabel(f"{style.MODEL_LABELS[model]}, RMSE {rmse:.1f}°\nphase error (°)")
+        axes[row, 0].set_ylabel(f"{MODEL_LABELS[model]}, RMSE {rmse:.1f}°\nphase error (°)")
     if image is not None:
         bar = figure.colorbar(image, ax=axes, shrink=0.7, extend="max", pad=0.02)
         bar.set_label("density of each column (1/°); grey: too few pixels")
@@ -66,7 +99,7 @@ def draw_phase_maps(views: Sequence[PhaseImages]) -> bytes:
     titles = [
         "intensity",
         "measured phase",
-        *(f"{style.MODEL_LABELS[m]} phase" for m in AngleModel),
+        *(f"{MODEL_LABELS[m]} phase" for m in AngleModel),
     ]
     height, width = views[0].intensity.shape
     panel = 2.3
@@ -114,9 +147,9 @@ def draw_plane(result: PlaneResult) -> bytes:
         left.plot(
             np.arange(len(errors)),
             errors,
-            style.PLANE_MARKERS[name],
-            color=style.PLANE_COLORS[name],
-            label=f"{style.PLANE_LABELS[name]}: mean {result.stats[name].mean_deg:.2f}°",
+            PLANE_MARKERS[name],
+            color=PLANE_COLORS[name],
+            label=f"{PLANE_LABELS[name]}: mean {result.stats[name].mean_deg:.2f}°",
             markersize=5,
         )
     left.set_yscale("log")
@@ -128,12 +161,12 @@ def draw_plane(result: PlaneResult) -> bytes:
     left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
     places = np.arange(len(AngleModel))
     for offset, values, label, color in (
-        (-0.2, [a.rmse_deg for a in result.ambiguity.values()], "true normal", style.BLUE),
-        (0.2, [a.rmse_turned_deg for a in result.ambiguity.values()], "turned by π", style.ORANGE),
+        (-0.2, [a.rmse_deg for a in result.ambiguity.values()], "true normal", BLUE),
+        (0.2, [a.rmse_turned_deg for a in result.ambiguity.values()], "turned by π", ORANGE),
     ):
         bars = right.bar(places + offset, values, 0.4, label=label, color=color)
         right.bar_label(bars, fmt="%.1f", fontsize=8)
-    right.set_xticks(places, [style.MODEL_LABELS[m] for m in result.ambiguity])
+    right.set_xticks(places, [MODEL_LABELS[m] for m in result.ambiguity])
     right.set_ylabel("phase residual, RMS (°)")
     right.margins(y=0.15)
     right.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
@@ -148,13 +181,13 @@ def draw_track_distribution(result: TrackResult, k: int = 3) -> bytes:
     bins = np.linspace(0, 40, 81)
     for name in ESTIMATORS:
         errors = result.estimators[name].errors_deg[index]
-        kwargs = {"color": style.TRACK_COLORS[name], "linestyle": style.TRACK_STYLES[name]}
+        kwargs = {"color": TRACK_COLORS[name], "linestyle": TRACK_STYLES[name]}
         counts = np.histogram(errors[np.isfinite(errors)], bins)[0]
         share = 100 * counts / max(len(errors), 1)
-        left.stairs(share, bins, label=style.TRACK_LABELS[name], linewidth=1.5, **kwargs)
+        left.stairs(share, bins, label=TRACK_LABELS[name], linewidth=1.5, **kwargs)
         ordered = np.sort(errors[np.isfinite(errors)])
         rank = 100 * np.arange(1, len(ordered) + 1) / max(len(errors), 1)
-        right.plot(ordered, rank, linewidth=1.8, label=style.TRACK_LABELS[name], **kwargs)
+        right.plot(ordered, rank, linewidth=1.8, label=TRACK_LABELS[name], **kwargs)
     left.set_yscale("log")
     left.yaxis.set_major_formatter("{x:g}")
     right.set_xscale("log")
@@ -162,8 +195,8 @@ def draw_track_distribution(result: TrackResult, k: int = 3) -> bytes:
     left.set_ylabel("share of points per 0.5° (%)")
     right.set_xlim(0.05, 90)
     right.set_ylim(0, 100)
-    right.axvline(25, color=style.GREY, linewidth=0.8)
-    right.text(26, 4, "25°", color=style.GREY, fontsize=8)
+    right.axvline(25, color=GREY, linewidth=0.8)
+    right.text(26, 4, "25°", color=GREY, fontsize=8)
     right.set_ylabel("share of points with a smaller error (%)")
     for ax in (left, right):
         ax.set_xlabel(f"angular error with {result.k[index]} views (°)")
@@ -185,9 +218,9 @@ def draw_track_means(result: TrackResult) -> bytes:
                 result.k,
                 result.estimators[name].over(statistic),
                 marker=".",
-                color=style.TRACK_COLORS[name],
-                linestyle=style.TRACK_STYLES[name],
-                label=style.TRACK_LABELS[name],
+                color=TRACK_COLORS[name],
+                linestyle=TRACK_STYLES[name],
+                label=TRACK_LABELS[name],
             )
         ax.set_yscale("log")
         ax.set_xlabel("number of views K")
@@ -219,8 +252,8 @@ def draw_track_boxes(result: TrackResult) -> bytes:
             manage_ticks=False,
         )
         for box in boxes["boxes"]:
-            box.set_facecolor(style.TRACK_COLORS[name])
-        boxes["boxes"][0].set_label(style.TRACK_LABELS[name])
+            box.set_facecolor(TRACK_COLORS[name])
+        boxes["boxes"][0].set_label(TRACK_LABELS[name])
     ax.set_yscale("log")
     ax.yaxis.set_major_formatter("{x:g}")
     ax.set_xticks(np.arange(len(chosen)), [str(result.k[i]) for i in chosen])
@@ -259,11 +292,11 @@ def draw_contours(view: ViewContours) -> bytes:
                 ax.plot(
                     1e3 * (line.points[own] @ axis - middle),
                     1e3 * line.heights[own],
-                    color=style.CONTOUR_COLORS[method],
+                    color=CONTOUR_COLORS[method],
                     linewidth=0.9,
                 )
         axes[0, column].set_title(
-            f"{style.CONTOUR_LABELS[method]}\nRMSE {line.rmse_mm:.2f} mm", fontsize=9
+            f"{CONTOUR_LABELS[method]}\nRMSE {line.rmse_mm:.2f} mm", fontsize=9
         )
         axes[1, column].set_xlabel("place along the surface (mm)")
         axes[1, column].set_ylim(-limit, limit)

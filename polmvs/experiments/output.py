@@ -12,11 +12,11 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
+from polmvs.config import Experiment, to_plain
 from polmvs.errors import DataError, OptionError
-from polmvs.option_values import to_plain
 from polmvs.pipeline.run_folder import has_content
 
-NAMES = ("phase", "plane", "tracks", "contours")
+NAMES = tuple(Experiment)
 _OWN = re.compile(rf"({'|'.join(NAMES)})(_\w+)?\.(json|md|png|ply)")
 
 
@@ -63,7 +63,7 @@ def check_output(out: Path, name: str, *, overwrite: bool) -> None:
     Raises
     ------
     OptionError
-        It has results of this experiment, or files of another kind, and no ``--overwrite``.
+        It has results of this experiment, or files of another kind, and ``overwrite`` is off.
     DataError
         It cannot be used.
     """
@@ -73,8 +73,8 @@ def check_output(out: Path, name: str, *, overwrite: bool) -> None:
     foreign = [other for other in names if not _OWN.fullmatch(other)]
     if f"{name}.json" in names or foreign:
         raise OptionError(
-            f"{out}: exists and is not empty. Give --overwrite to replace results of '{name}' in "
-            "it, or another OUT."
+            f"{out}: exists and is not empty. Give `run.overwrite` to replace results of '{name}' "
+            "in it, or another OUT."
         )
 
 

@@ -9,7 +9,7 @@ within a few degrees of one of them and that has the most pixels; its truth is t
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, ExperimentOptions
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
-from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
+from polmvs.experiments.data import OnProgress, Scene, ViewData, load_view, require_counted
 from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
 from polmvs.parallel import Workers
 from polmvs.polarization.stokes import Stokes
@@ -29,7 +29,6 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 
-DEFAULT_PLANAR_DEG = 5.0
 NUM_CANDIDATES = 64  # normals tried as the middle of a patch
 MIN_PIXELS = 100
 MAX_SPREAD_DEG = 0.2  # of the true normals of a plane; 16-bit maps have less
@@ -56,6 +55,14 @@ ESTIMATES: dict[str, tuple[AngleModel, Weights]] = {
     "weighted": (AngleModel.PPA, Weights.TILT_AWARE),
     "tilted_algebraic": (AngleModel.TILTED, Weights.ALIKE),
     "tilted": (AngleModel.TILTED, Weights.NOISE),
+}
+
+PLANE_LABELS = {
+    "algebraic": "PPA, eigenvector (paper)",
+    "weighted_noise": "PPA, robust, noise weights",
+    "weighted": "PPA, robust, tilt-aware weights",
+    "tilted_algebraic": "tilted, eigenvector",
+    "tilted": "tilted, robust",
 }
 
 
@@ -132,9 +139,9 @@ class PlaneResult:
 def measure_plane(
     scene: Scene,
     workers: Workers,
-    report: Callable[[int], None] = lambda count: None,
+    on_progress: OnProgress = lambda count: None,
     *,
-    planar_deg: float = DEFAULT_PLANAR_DEG,
+    planar_deg: float = ExperimentOptions.planar_deg,
 ) -> PlaneResult:
     """Single-view normals of all views.
 
@@ -152,7 +159,7 @@ def measure_plane(
     for image, residual in workers.map(work, range(len(scene.views))):
         images.append(image)
         residuals.append(residual)
-        report(1)
+        on_progress(1)
     used = [i for i, image in enumerate(images) if image.num_pixels >= MIN_PIXELS]
     require_counted(scene, len(used))
     kept = [images[i] for i in used]

@@ -19,10 +19,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, ExperimentOptions, Selection
+from polmvs.errors import OptionError
 from polmvs.evaluation.metrics import angular_errors_deg
-from polmvs.experiments.data import Scene, load_view, require_counted
-from polmvs.experiments.view_choice import Selection, check_k, order_at_random, order_by_angle
+from polmvs.experiments.data import OnProgress, Scene, load_view, require_counted
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.parallel import Workers
@@ -32,7 +32,6 @@ Floats = NDArray[np.floating]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-DEFAULT_NUM_POINTS = 10_000
 UNDER_DEG = 25.0  # the paper's limit
 MIN_POINTS = 10  # of a K: fewer make no statistics
 CHUNK_ROWS = 200_000  # solved at a time: bounds the memory of many views
@@ -54,23 +53,13 @@ ESTIMATORS: dict[str, tuple[AngleModel, Source]] = {
     "tilted_weighted": (AngleModel.TILTED, Source.MAP),
 }
 
-
-@dataclass(frozen=True, kw_only=True)
-class TrackOptions:
-    """What is sampled.
-
-    Attributes
-    ----------
-    num_points : surface points.
-    k : numbers of views; None: 2 to 20, as far as the capture goes.
-    selection : how views are chosen.
-    seed : of the random numbers.
-    """
-
-    num_points: int = DEFAULT_NUM_POINTS
-    k: tuple[int, ...] | None = None
-    selection: Selection = Selection.RANDOM
-    seed: int = 0
+TRACK_LABELS = {
+    "opa": "OPA, eigenvector",
+    "opa_weighted": "OPA, weighted robust",
+    "ppa_algebraic": "PPA, eigenvector (paper)",
+    "ppa_weighted": "PPA, weighted robust",
+    "tilted_weighted": "tilted, weighted robust",
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,9 +118,9 @@ class SurfacePoints:
 
 def measure_tracks(
     scene: Scene,
-    options: TrackOptions,
+    options: ExperimentOptions,
     workers: Workers,
-    report: Callable[[int], None] = lambda count: None,
+    on_progress: OnProgress = lambda count: None,
 ) -> TrackResult:
     """Errors of normals from K views for every estimator and K.
 
@@ -148,11 +137,11 @@ def measure_tracks(
     parts = []
     for part in workers.map(partial(view_rows, scene, sample.points), range(len(scene.views))):
         parts.append(part)
-        report(1)
+        on_progress(1)
     rows = {name: _stack([part[name] for part in parts]) for name in ESTIMATORS}
     usable = np.isfinite(rows["ppa_algebraic"].sigma)
     require_counted(scene, int(usable.sum()))
-    if options.selection is Selection.ANGLE:
+    if options.select is Selection.ANGLE:
         order = order_by_angle(rows["opa"].rays, usable, max(ks), rng)
     else:
         order = order_at_random(usable, rng)
@@ -251,3 +240,56 @@ def _errors_deg(name: str, rows: Rows, true_normals: Array) -> Array:
         for start in range(0, num_points, size)
     ]
     return angular_errors_deg(np.concatenate(normals), true_normals)
+
+
+DEFAULT_K = tuple(range(2, 21))
+
+
+def check_k(k: Sequence[int] | None, num_views: int) -> tuple[int, ...]:
+    """Numbers of views in ascending order; those of the default that the capture has.
+
+    Raises
+    ------
+    OptionError
+        One is under 2 or over ``num_views``, or the capture has fewer than two views.
+    """
+    if num_views < 2:
+        raise OptionError(f"normals from tracks need 2 views or more, this capture has {num_views}")
+    if k is None:
+        return tuple(value for value in DEFAULT_K if value <= num_views)
+    if not k or min(k) < 2 or max(k) > num_views:
+        raise OptionError(
+            f"must lie in 2 to {num_views}, the views of this capture with truth and pose, "
+            f"not {','.join(map(str, k))}.",
+            field="experiment.k",
+        )
+    return tuple(sorted(set(k)))
+
+
+def order_at_random(usable: Mask, rng: np.random.Generator) -> Indices:
+    """Views of each point (V, N) in random order, those that do not count last."""
+    keys = np.where(usable, rng.random(usable.shape), 2.0)
+    return np.argsort(keys, axis=0, kind="stable")
+
+
+def order_by_angle(rays: Floats, usable: Mask, num: int, rng: np.random.Generator) -> Indices:
+    """Views of each point (num, N): a random one, then each the farthest in angle from the others.
+
+    Parameters
+    ----------
+    rays : (3, V, N), unit, world, from the views to the points.
+    usable : (V, N) bool; views that do not count come last.
+    num : views to choose.
+    """
+    points = np.arange(usable.shape[1])
+    order = order_at_random(usable, rng)[:num]
+    # Largest cosine to a chosen view; 3: not usable, 2: chosen already.
+    closest = np.where(usable, -1.0, 3.0)
+    for step in range(1, num):
+        chosen = order[step - 1]
+        cosine = np.einsum("ivn,in->vn", rays, rays[:, chosen, points])
+        closest = np.where(usable, np.maximum(closest, cosine), 3.0)
+        for earlier in order[:step]:
+            closest[earlier, points] = np.maximum(closest[earlier, points], 2.0)
+        order[step] = closest.argmin(axis=0)
+    return order

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from polmvs.choices import CaptureKind
+from polmvs.config import CaptureKind
 from polmvs.errors import DataError, OptionError
 from polmvs.io.raw_formats import DUMP_SUFFIXES, FLOAT_SUFFIXES, LOSSY_SUFFIXES, SUFFIXES
 
@@ -248,13 +248,17 @@ def _match(
         if match is None or path.suffix.lower() not in SUFFIXES:
             continue
         said = match.groupdict()
-        role = said.get("angle") or (said.get("stokes") or "").lower() or said.get("map") or ""
+        role = ""
         if said.get("angle"):
-            role = f"{float(role):g}"
-        if said.get("index"):
+            role = f"{float(said['angle']):g}"
+        elif said.get("stokes"):
+            role = said["stokes"].lower()
+        elif said.get("map"):
+            role = _MAP_NAMES.get(said["map"], said["map"])
+        elif said.get("index"):
             role = said["index"]
         exposure = float(said.get("exposure") or 1) * UNITS_S[said.get("unit") or ""]
-        found.append(_Named(path, said["view"], _MAP_NAMES.get(role, role), exposure))
+        found.append(_Named(path, said["view"], role, exposure))
     if angles is not None:
         return _with_angles(found, angles)
     return found

@@ -17,7 +17,7 @@ nothing stood before it.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,18 +27,17 @@ from numpy.typing import NDArray
 from polmvs.camera import PinholeCamera, pixel_centers, xy_from_opencv
 from polmvs.config import CaptureOptions
 from polmvs.errors import DataError
-from polmvs.geometry import RigidTransform
+from polmvs.geometry import RigidTransform, nearest_rotation
 from polmvs.io.images import write_bytes
-from polmvs.polarization.capture import Capture, open_capture
-from polmvs.scene import View
+from polmvs.scene import View, stem_of
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 AUTHOR_OPTIONS = CaptureOptions(pattern=(90, 45, 135, 0), gamma=0.5)
-MAX_OFF_PLANE = 0.02  # of the corners from the plane, in sizes of the board
-MAX_SIDE = 1 << 16  # of a depth map, px
+MAX_OFF_PLANE = 0.02  # of the corners from the plane, in sizes of the board; a guess
+MAX_SIDE = 1 << 16  # of a depth map, px; a guess, a longer one is a damaged header
 DMB_FLOAT = 1
 _DMB_HEADER = struct.Struct("<4i")
 
@@ -72,8 +71,8 @@ class BoardTruth:
     def depth(self, name: str) -> Image:
         """Depth z of the board, (H, W) float32; NaN beside it."""
         view = self.views[name]
-        rays = view.camera.rays(pixel_centers(view.camera.width, view.camera.height))
-        world_rays = rays @ view.cam_from_world.rotation
+        xy = pixel_centers(view.camera.width, view.camera.height)
+        rays, world_rays = view.camera.rays(xy), view.rays_in_world(xy)
         center = view.center_in_world
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (self.offset - center @ self.normal) / (world_rays @ self.normal)
@@ -106,33 +105,31 @@ def is_author_layout(folder: Path) -> bool:
     return (folder / "images").is_dir() and (folder / "cams").is_dir()
 
 
-def open_author_capture(
-    folder: Path, options: CaptureOptions | None = None
-) -> tuple[Capture, BoardTruth]:
-    """Open a capture in the layout of the authors' demo, with its truth.
+def read_author_truth(folder: Path, names: Sequence[str], width: int, height: int) -> BoardTruth:
+    """Read the truth of a capture in the layout of the authors' demo.
 
     Parameters
     ----------
-    options : how mosaics become polarization images; None: the authors' own.
+    names : of the capture's images, in order.
+    width, height : of its polarization images, px.
 
     Raises
     ------
     DataError
-        A file is missing, damaged, or of another size or count.
+        A file is missing, damaged, or of another count.
     """
-    capture = open_capture(folder / "images", AUTHOR_OPTIONS if options is None else options)
     views = {}
-    for index, name in enumerate(capture.names):
-        path = folder / "cams" / f"{Path(name).stem}_cam.txt"
+    for index, name in enumerate(names):
+        path = folder / "cams" / f"{stem_of(name)}_cam.txt"
         if not path.is_file():
             path = folder / "cams" / f"{index:08d}_cam.txt"
-        views[name] = read_camera_text(path, name, capture.width, capture.height)
+        views[name] = read_camera_text(path, name, width, height)
     normal = _read_npy(folder / "normal_w.npy", 3).reshape(3)
     corners = _read_npy(folder / "pts_3d_corners_w.npy", 12).reshape(4, 3)
     length = float(np.linalg.norm(normal))
     if not length > 0:
         raise DataError(folder / "normal_w.npy", "is no direction; copy the data again.")
-    return capture, _board(folder, views, normal / length, corners)
+    return _board(folder, views, normal / length, corners)
 
 
 def _board(folder: Path, views: dict[str, View], normal: Array, corners: Array) -> BoardTruth:
@@ -179,9 +176,8 @@ def read_camera_text(path: Path, name: str, width: int, height: int) -> View:
         raise DataError(
             path, "needs 'extrinsic' with 16 numbers and 'intrinsic' with 9; copy it again."
         ) from error
-    rotation = pose[:3, :3].copy()
-    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
-    if not rigid or not np.isfinite(pose).all():
+    rotation = nearest_rotation(pose[:3, :3])
+    if rotation is None or not np.isfinite(pose).all():
         raise DataError(path, "its extrinsic matrix is no rigid motion; copy it again.")
     if not (np.isfinite(K).all() and min(K[0, 0], K[1, 1]) > 0):
         raise DataError(path, "its focal lengths must be positive; copy it again.")

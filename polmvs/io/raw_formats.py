@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.choices import Packing
+from polmvs.config import Packing
 from polmvs.errors import DataError, OptionError
 from polmvs.io.images import BROKEN, PNG_SIGNATURE, PathArg, check_png, decode_image, read_bytes
 

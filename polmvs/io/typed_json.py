@@ -12,8 +12,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
+from polmvs.config import to_plain
 from polmvs.io.images import write_bytes
-from polmvs.option_values import to_plain
 
 T = TypeVar("T")
 

@@ -7,17 +7,19 @@ points, so that thousands of 3x3 problems are solved by a few vector operations.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from polmvs.fitting import CAUCHY_SCALE, MEDIAN_OF_NORMAL, annealed_scales, cauchy_weights
+from polmvs.scene import MIN_FACING_COSINE
+
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
 
-MIN_VISIBLE_COSINE = 0.03  # between normal and viewing direction; flatter sight is no sight
 MIN_SIN_ZENITH = 0.1  # a row of a nearly frontal surface says little: its weight is capped here
-CAUCHY_SCALE = 2.385  # 95 % efficiency on Gaussian residuals
 COUNTED_WEIGHT = 0.25  # robust weight over which a row counts: four deviations off
 NUM_ROUNDS = 5  # of reweighting; the change of later ones is below 0.01 deg
 DOUBTFUL_LOSS = 0.25  # from which a point is tried again; about 0.12 without outliers
@@ -27,7 +29,6 @@ NUM_NOISE_ROUNDS = 3  # in which a model's own error is found
 NOISE_CHANGE = 0.1  # of that error, under which no further round follows
 MIN_NOISE_ROWS = 300  # whose median says what a model's error is: to 8 %
 MAX_NOISE_ROWS = 50_000
-MEDIAN_OF_SQUARE = 0.455  # of a normal deviate
 MIN_PAIR_SINE = 0.05  # of the angle between the two rows
 # Spread of the rows over the variance of their noise. Where all planes of incidence are one (camera
 # centres and normal in one plane, as on a linear rail) the noise alone spreads them, and their mean
@@ -207,7 +208,7 @@ def model_error(rows: Floats, rays: Floats, sigma: Floats, estimate: NormalEstim
     """
     normals = np.nan_to_num(estimate.normals.T)
     cosine = _dot(rays, normals)
-    used = np.isfinite(sigma) & np.isfinite(rows).all(axis=0) & (cosine < -MIN_VISIBLE_COSINE)
+    used = np.isfinite(sigma) & np.isfinite(rows).all(axis=0) & (cosine < -MIN_FACING_COSINE)
     count = used.sum(axis=0)
     used &= estimate.valid & (count >= MIN_ROWS_TO_DOUBT)
     if used.sum() < MIN_NOISE_ROWS:
@@ -221,11 +222,11 @@ def model_error(rows: Floats, rays: Floats, sigma: Floats, estimate: NormalEstim
     variance = np.square(sigma[k, n])
 
     def excess(added: float) -> float:
-        return float(np.median(turn2 / (variance + added))) - MEDIAN_OF_SQUARE
+        return float(np.median(turn2 / (variance + added))) - MEDIAN_OF_NORMAL**2
 
     if excess(0.0) <= 0:
         return 0.0
-    return float(np.sqrt(brentq(excess, 0.0, float(turn2.max()) / MEDIAN_OF_SQUARE, rtol=1e-3)))
+    return float(np.sqrt(brentq(excess, 0.0, float(turn2.max()) / MEDIAN_OF_NORMAL**2, rtol=1e-3)))
 
 
 @dataclass(frozen=True)
@@ -242,16 +243,14 @@ class _Problem:
 
     def iterate(self, normals: Array, first_round: int = 0) -> Array:
         """Reweight and solve again, in ``NUM_ROUNDS`` rounds."""
-        for round_index in range(first_round, NUM_ROUNDS):
-            # Anneal: a wide loss first, so that a poor start does not reject the good rows.
-            scale = CAUCHY_SCALE * 2.0 ** max(2 - round_index, 0)
+        for scale in islice(annealed_scales(NUM_ROUNDS), first_round, None):
             normals = _smallest(self.rows, self.weights(normals, scale)[0])[1]
         return normals
 
     def weights(self, normals: Array, scale: float) -> tuple[Floats, Floats]:
         """Weights (K, N) of the squared ``m . n``, and their robust part in [0, 1]."""
         z2, sin2, visible = self._errors(normals)
-        robust = np.where(visible, 1 / (1 + z2 / scale**2), 0)
+        robust = np.where(visible, cauchy_weights(z2, scale), 0)
         return self.precision / sin2 * robust, robust
 
     def losses(self, normals: Array) -> Floats:
@@ -304,7 +303,7 @@ class _Problem:
         """Squared error over sigma, squared sine of the zenith angle, and who sees the point."""
         cosine = _dot(self.rays, normals)
         facing = np.sign((cosine * self.votes).sum(axis=0))
-        visible = (self.precision > 0) & (cosine * facing > MIN_VISIBLE_COSINE)
+        visible = (self.precision > 0) & (cosine * facing > MIN_FACING_COSINE)
         sin2 = np.maximum(1 - cosine**2, MIN_SIN_ZENITH**2)
         return _dot(self.rows, normals) ** 2 * self.precision / sin2, sin2, visible
 

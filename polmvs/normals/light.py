@@ -120,7 +120,7 @@ def _find_parts(phase_map: PhaseMap, points: Array, votes: Array, min_points: in
     """Parts with the votes (N,) of the points (N, 3) that project into them; NaN for too few."""
     inside = phase_map.region.inside
     num, labels = cv2.connectedComponents(inside.astype(np.uint8), connectivity=4)
-    xy = phase_map.view.camera.project(phase_map.view.cam_from_world * points)
+    xy = phase_map.view.project(points)
     owner = sample_image(labels.astype(np.float32), xy, nearest=True).astype(np.int64)
     total = np.bincount(owner, votes, minlength=num)
     count = np.bincount(owner, minlength=num)
@@ -157,7 +157,7 @@ def _pixel_votes(
         pixels.append(np.stack([cols[::step], rows[::step]], axis=-1) + 0.5)
         owners.append(np.full(len(pixels[-1]), index))
     owner, num = np.concatenate(owners), len(votes)
-    rays = view.camera.rays(np.concatenate(pixels)) @ view.cam_from_world.rotation
+    rays = view.rays_in_world(np.concatenate(pixels))
     distances = np.linalg.norm(ahead, axis=-1)
     nearest, farthest = np.percentile(distances, [2, 98]) * [1 / t.widening, t.widening]
     # Of each part, per kind of light, the least cost of a row at any of the distances.

@@ -14,18 +14,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import sample_image
+from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, Estimator, NormalOptions
 from polmvs.normals.estimator import NormalEstimate, solve_at_own_noise, solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Seeds, Tracks, point_sigmas
+from polmvs.scene import MIN_FACING_COSINE, Seeds, Tracks, point_sigmas
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 BORDER_MARGIN_PX = 7  # points nearer to the region's border may lie on the background
-MIN_FACING_COSINE = 0.2  # between normal and viewing direction, for a view to have a say
 MIN_INSIDE_SHARE = 0.8  # of a track's views that must see it in their region
 MIN_SEEN_SHARE = 0.7  # of the views that a point faces, to show the surface at its place
 MAX_DOLP_SHARE = 0.85  # of a mark's DoLP in that of the surface about it
@@ -48,25 +47,25 @@ def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
 
 
 def track_normals(
-    model: AngleModel, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
+    angle_model: AngleModel, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
 ) -> NormalEstimate:
     """Normals of all tracks in one batch (paper, eq. coeff_2).
 
     Parameters
     ----------
-    model : OPA, PPA or tilted.
+    angle_model : OPA, PPA or tilted.
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps of the views.
     options : window, estimator and weights.
     """
     windows = [window_map(phase_map, options.window_px) for phase_map in maps]
     return normals_from_windows(
-        model, tracks, windows, options.estimator, tilt_aware=options.tilt_aware_weights
+        angle_model, tracks, windows, options.estimator, tilt_aware=options.tilt_aware_weights
     )
 
 
 def normals_from_windows(
-    model: AngleModel,
+    angle_model: AngleModel,
     tracks: Tracks,
     windows: Sequence[PhaseMap],
     estimator: Estimator,
@@ -78,13 +77,14 @@ def normals_from_windows(
     First from the views that matched the point, which surely see it, then from every view that
     faces it.
     """
-    rows = gather_rows(model, tracks.points_in_world, windows, tilt_aware=tilt_aware)
+    rows = gather_rows(angle_model, tracks.points_in_world, windows, tilt_aware=tilt_aware)
     matched = np.zeros(rows.sigma.shape, bool)
     matched[tracks.obs_view, tracks.obs_track] = True
     robust = estimator is Estimator.ROBUST
     own_sigma = np.where(matched, rows.sigma, np.inf)
     own = solve_normals(rows.rows, rows.rays, own_sigma, robust=robust)
-    facing = np.einsum("ikn,ni->kn", rows.rays, np.nan_to_num(own.normals)) < -0.05
+    cosine = np.einsum("ikn,ni->kn", rows.rays, np.nan_to_num(own.normals))
+    facing = cosine < -MIN_FACING_COSINE
     sigma = np.where(matched | facing, rows.sigma, np.inf)
     start = own.normals.T
     if not robust:
@@ -115,12 +115,9 @@ def seen_shares(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> Arra
     """
     facing, seen = np.zeros(len(points)), np.zeros(len(points))
     for phase_map in maps:
-        camera = phase_map.view.camera
-        to_camera = phase_map.view.center_in_world - points
-        cosine = (to_camera * normals).sum(axis=-1) / np.linalg.norm(to_camera, axis=-1)
-        xy = camera.project(phase_map.view.cam_from_world * points)
-        shown = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
-        shown &= cosine > MIN_FACING_COSINE
+        view = phase_map.view
+        xy = view.project(points)
+        shown = in_image(view.camera, xy) & view.faces(points, normals)
         facing += shown
         seen += shown & phase_map.shows_surface(xy)
     return np.asarray(seen / np.maximum(facing, 1))

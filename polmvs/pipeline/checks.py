@@ -83,7 +83,7 @@ def require_same_capture(record: Record, identity: CaptureIdentity, run_folder: 
         raise DataError(
             run_folder.root,
             f"holds a run of another capture ({folder}), or its images have changed. Give another "
-            "OUT, or --overwrite.",
+            "OUT, or `run.overwrite`.",
         )
 
 
@@ -113,7 +113,7 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
         open_ground_truth(options.evaluation.gt)
     check_reference(options.reference)
     if options.export.in_place and options.fusion.workspace is None:
-        raise OptionError("--in-place needs a --workspace to fill.")
+        raise OptionError("needs a `fusion.workspace` to fill.", field="export.in_place")
     dense = open_dense_workspace(options.fusion.workspace) if options.fusion.workspace else None
     if options.sfm.sparse is not None:
         model = fit_model(capture, options.sfm.sparse)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from polmvs.config import AngleModel, Options, RunOptions
+from polmvs.config import COMPARED_MODELS, AngleModel, Options, RunOptions
 from polmvs.errors import OptionError
 from polmvs.evaluation.comparison import Comparison, read_comparison
 from polmvs.pipeline.monitor import Monitor
@@ -31,21 +31,20 @@ from polmvs.pipeline.stages.seeds import SeedsResult
 
 R = TypeVar("R")
 
-COMPARED = (AngleModel.OPA, AngleModel.PPA, AngleModel.TILTED)
 MIN_SFM_IMAGES = 2
 
 NO_REGION = (
-    "no polarised region: no view shows a surface with polarised light. Lower --min-dolp, check "
-    "--pattern and --gamma, or give the part with --mask."
+    "no polarised region: no view shows a surface with polarised light. Lower `region.min_dolp`, "
+    "check `capture.pattern` and `capture.gamma`, or give the part with `region.mask`."
 )
 NO_SEEDS = (
     "no seeds: no sparse point lies on the polarised surface with a normal that fits its light, "
     "and no part could be placed by its outline. Put a few printed marks or labels on the part, "
-    "check --light, or give the part with --mask."
+    "check `region.light`, or give the part with `region.mask`."
 )
 NO_POINTS = (
-    "no points: the views agree on none. Check --intrinsics or --sparse and --light, or record "
-    "more views."
+    "no points: the views agree on none. Check `sfm.intrinsics` or `sfm.sparse` and "
+    "`region.light`, or record more views."
 )
 
 
@@ -112,7 +111,7 @@ def reconstruct(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
         return _close(run, (model,))
 
 
-def compare(job: Job, models: Sequence[AngleModel] = COMPARED) -> JobOutcome:
+def compare(job: Job, models: Sequence[AngleModel] = COMPARED_MODELS) -> JobOutcome:
     """Several models on the same poses, tracks, seeds and region, with ``OUT/metrics.json``.
 
     Raises
@@ -177,7 +176,7 @@ def _do_alone(
         elif wanted and not job.run_options.resume and all(map(run.is_finished, wanted)):
             raise OptionError(
                 f"{run.run_folder.root}: the stage {wanted[-1].name!r} is finished. Give "
-                "--overwrite to do it again."
+                "`run.overwrite` to do it again."
             )
         for spec in wanted:
             run.do(spec)

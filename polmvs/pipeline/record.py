@@ -178,10 +178,10 @@ def read_options(run_folder: RunFolder) -> Mapping[str, Any]:
     if not run_folder.run_file.is_file():
         return {}
     content = _read_current(run_folder)
-    options, stages = content.get("options"), content.get("stages")
-    if not isinstance(options, dict) or not isinstance(stages, list):
-        raise _no_record(run_folder, "it has no options or stages")
-    return options if stages else {}
+    options = content.get("options")
+    if not isinstance(options, dict):
+        raise _no_record(run_folder, "it has no options")
+    return options if content["stages"] else {}
 
 
 def read_image_names(run_folder: RunFolder) -> frozenset[str]:
@@ -201,7 +201,7 @@ def read_image_names(run_folder: RunFolder) -> frozenset[str]:
 def _read_current(run_folder: RunFolder) -> dict[str, Any]:
     """Content of a ``run.json`` of this version."""
     content = _read_content(run_folder)
-    if "stages" not in content:
+    if not isinstance(content.get("stages"), list):
         raise _no_record(run_folder, "it lists no stages")
     found = content.get("schema_version", 1)
     if found != SCHEMA_VERSION:
@@ -211,7 +211,7 @@ def _read_current(run_folder: RunFolder) -> dict[str, Any]:
             run_folder.root,
             f"holds a run of polmvs {program}, whose {RUN_FILE} has schema version {found}; this "
             f"is polmvs {__version__}, which reads version {SCHEMA_VERSION} and cannot go on with "
-            "it. Give another OUT, or --overwrite to delete that run.",
+            "it. Give another OUT, or `run.overwrite` to delete that run.",
         )
     return content
 

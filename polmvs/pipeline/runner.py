@@ -16,13 +16,11 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from polmvs.colmap.cameras import quiet_colmap
-from polmvs.config import Options, RunOptions
+from polmvs.config import Options, RunOptions, plain_options, show_value, to_plain
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.evaluation.tables import format_table, number
-from polmvs.option_values import to_plain
 from polmvs.parallel import Workers
 from polmvs.pipeline.checks import (
     check_input,
@@ -148,7 +146,7 @@ class Run:
 
     def _has_changed(self, spec: StageSpec, finished: StageRecord) -> bool:
         """Whether a finished stage was made from other files or options."""
-        now = to_plain(plain_options(self.options, spec.decides))
+        now = plain_options(self.options, spec.decides)
         return finished.options != now or finished.reads != _names(spec.reads)
 
     def forget(self, names: Collection[str]) -> None:
@@ -184,11 +182,11 @@ class Run:
             for path, now in plain_options(self.options, spec.decides).items():
                 earlier = finished.options.get(path)
                 if earlier != now:
-                    flag = "--" + path.partition(".")[2].replace("_", "-")
                     raise OptionError(
-                        f"{flag} is {_text(now)} but the finished stage {spec.name!r} in "
-                        f"{self.run_folder.root} used {_text(earlier)}. Give the same value, or "
-                        "--overwrite."
+                        f"is {show_value(now)} but the finished stage {spec.name!r} in "
+                        f"{self.run_folder.root} used {show_value(earlier)}. Give the same value, "
+                        "or `run.overwrite`.",
+                        field=path,
                     )
 
     def save(self, *, finished: bool = False) -> None:
@@ -311,8 +309,8 @@ def prepare_output(run_folder: RunFolder, *, overwrite: bool, resume: bool) -> R
         return record
     if occupied and not overwrite:
         raise OptionError(
-            f"{root}: exists and is not empty. Give --overwrite to delete an earlier run in it, "
-            "--resume to go on with it, or another OUT."
+            f"{root}: exists and is not empty. Give `run.overwrite` to delete an earlier run in "
+            "it, `run.resume` to go on with it, or another OUT."
         )
     if occupied:
         _remove_results(run_folder)
@@ -350,25 +348,8 @@ def _remove_results(run_folder: RunFolder) -> None:
         raise DataError(root, f"cannot be emptied: {error.strerror or error}.") from error
 
 
-def plain_options(options: Options, paths: Sequence[str]) -> dict[str, Any]:
-    """Values of options by path, in terms of JSON; a group's name stands for all its options."""
-    plain = to_plain(options)
-    found: dict[str, Any] = {}
-    for path in paths:
-        group, _, name = path.partition(".")
-        values = plain[group]
-        found |= {f"{group}.{key}": values[key] for key in ([name] if name else values)}
-    return found
-
-
 def _names(paths: Sequence[Path]) -> tuple[str, ...]:
     return tuple(path.as_posix() for path in paths)
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, list):
-        return ",".join(str(item) for item in value)
-    return "not set" if value is None else str(value)
 
 
 def timing_table(records: Mapping[str, Record]) -> str:

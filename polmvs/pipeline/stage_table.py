@@ -39,6 +39,7 @@ from polmvs.scene import SparseModel
 
 # Commands that do stages alone, by the stage; ``compare`` has no command for its own alone.
 SFM, NORMALS, DENSIFY, EXPORT, COMPARE = "sfm", "normals", "densify", "export", "compare"
+TILT_AWARE = "normals.tilt_aware_weights"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,9 +162,8 @@ def _find_seeds(run: StageInput) -> seeds.SeedsResult:
         folder.maps(AngleModel.PPA),
         folder.track_normals(AngleModel.PPA),
         folder.seeds,
-        unseeded=run.options.normals.unseeded,
+        options=run.options.normals,
         max_neighbors=run.options.propagation.max_neighbors,
-        tilt_aware=run.options.normals.tilt_aware_weights,
         workers=run.workers,
         on_progress=run.on_progress,
     )
@@ -279,24 +279,20 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             result=maps.TiltedMapsResult,
             num_steps=lambda run: run.num_views,
         ),
+    ]
+    for same_kind in zip(*map(_model_stages, AngleModel), strict=True):
+        table += same_kind
+    table += [
         StageSpec(
             name="seeds",
             command=NORMALS,
             reads=(HERE.sparse, HERE.maps(ppa), HERE.track_normals(ppa)),
             writes=(HERE.seeds,),
-            decides=(
-                "normals.unseeded",
-                "normals.tilt_aware_weights",
-                "propagation.max_neighbors",
-            ),
+            decides=("normals.unseeded", TILT_AWARE, "propagation.max_neighbors"),
             work=_find_seeds,
             result=seeds.SeedsResult,
             num_steps=lambda run: run.num_views if run.options.normals.unseeded else None,
         ),
-    ]
-    for model in AngleModel:
-        table += _model_stages(model)
-    table.append(
         StageSpec(
             name="evaluation",
             command=COMPARE,
@@ -314,8 +310,8 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             work=partial(_evaluate, compared),
             result=evaluation.EvaluationResult,
             is_redone=True,
-        )
-    )
+        ),
+    ]
     return _in_order(table)
 
 
@@ -329,11 +325,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             angle_model=model,
             reads=(HERE.sparse, HERE.maps(model)),
             writes=(track_normals,),
-            decides=(
-                "normals.estimator",
-                "normals.window_px",
-                "normals.tilt_aware_weights",
-            ),
+            decides=("normals.estimator", "normals.window_px", TILT_AWARE),
             work=partial(_solve_normals, model),
             result=normals.NormalsResult,
         ),
@@ -352,7 +344,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             angle_model=model,
             reads=(HERE.sparse, HERE.images, HERE.maps(model), track_normals, HERE.seeds),
             writes=(cloud, views),
-            decides=("normals.tilt_aware_weights", "propagation", "fusion"),
+            decides=(TILT_AWARE, "propagation", "fusion"),
             work=partial(_densify, model),
             result=densify.DensifyResult,
             num_steps=lambda run: densify.num_densify_steps(run.num_views, run.options.propagation),

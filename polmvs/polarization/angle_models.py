@@ -54,9 +54,9 @@ Mask = NDArray[np.bool_]
 OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
 
 
-def model_rays(model: AngleModel, rays_in_cam: Floats) -> Floats:
+def model_rays(angle_model: AngleModel, rays_in_cam: Floats) -> Floats:
     """Rays as the model sees them: the optical axis under OPA, themselves under the others."""
-    if model is AngleModel.OPA:
+    if angle_model is AngleModel.OPA:
         return np.broadcast_to(OPTICAL_AXIS.astype(rays_in_cam.dtype), rays_in_cam.shape)
     return rays_in_cam
 
@@ -74,12 +74,14 @@ def phase_direction(phase: Floats) -> Array:
     return np.stack([np.cos(phase), -np.sin(phase), np.zeros_like(phase)], axis=-1)
 
 
-def phase_from_normal(model: AngleModel, normals_in_cam: Floats, rays_in_cam: Floats) -> Array:
+def phase_from_normal(
+    angle_model: AngleModel, normals_in_cam: Floats, rays_in_cam: Floats
+) -> Array:
     """Predict the phase angle of a surface (paper, eqs. phi_ortho and phi_persp).
 
     Parameters
     ----------
-    model : OPA, PPA or tilted.
+    angle_model : OPA, PPA or tilted.
     normals_in_cam : (..., 3), camera frame; the sign does not matter.
     rays_in_cam : (..., 3), unit rays, camera frame.
 
@@ -88,7 +90,7 @@ def phase_from_normal(model: AngleModel, normals_in_cam: Floats, rays_in_cam: Fl
     (...) float64 radians in [0, pi). Where the normal lies along the model's ray the plane of
     incidence is undefined and the value is NaN.
     """
-    v = model_rays(model, np.asarray(rays_in_cam, np.float64))
+    v = model_rays(angle_model, np.asarray(rays_in_cam, np.float64))
     n = np.asarray(normals_in_cam, np.float64)
     x = v[..., 0] * n[..., 2] - v[..., 2] * n[..., 0]
     y = v[..., 1] * n[..., 2] - v[..., 2] * n[..., 1]
@@ -97,12 +99,12 @@ def phase_from_normal(model: AngleModel, normals_in_cam: Floats, rays_in_cam: Fl
     return np.where(np.hypot(x, y) > 1e-12, phase, np.nan)
 
 
-def rows_from_phase(model: AngleModel, phase: Floats, rays_in_cam: Floats) -> Array:
+def rows_from_phase(angle_model: AngleModel, phase: Floats, rays_in_cam: Floats) -> Array:
     """Unit constraint rows ``m`` with ``m . n = 0`` (paper, eqs. con_ortho and con_persp).
 
     Parameters
     ----------
-    model : OPA, PPA or tilted.
+    angle_model : OPA, PPA or tilted.
     phase : (...) radians, modulo pi.
     rays_in_cam : (..., 3), unit rays, camera frame.
 
@@ -112,10 +114,12 @@ def rows_from_phase(model: AngleModel, phase: Floats, rays_in_cam: Floats) -> Ar
     also a tangent of the surface, and perpendicular to the model's ray.
     """
     cos2, sin2 = np.cos(2 * phase), np.sin(2 * phase)
-    return np.asarray(rows_from_axial(model, cos2, sin2, rays_in_cam), np.float64)
+    return np.asarray(rows_from_axial(angle_model, cos2, sin2, rays_in_cam), np.float64)
 
 
-def rows_from_axial(model: AngleModel, cos2: Floats, sin2: Floats, rays_in_cam: Floats) -> Floats:
+def rows_from_axial(
+    angle_model: AngleModel, cos2: Floats, sin2: Floats, rays_in_cam: Floats
+) -> Floats:
     """Rows from ``(cos 2 phase, sin 2 phase)`` of any common length; float32 stays float32.
 
     A pair of zero length (no polarisation) gives a NaN row.
@@ -130,7 +134,7 @@ def rows_from_axial(model: AngleModel, cos2: Floats, sin2: Floats, rays_in_cam: 
     steep = cos2 < 0
     cos = np.where(steep, smaller, larger)
     sin = np.copysign(np.where(steep, larger, smaller), sin2)
-    v = model_rays(model, rays_in_cam)
+    v = model_rays(angle_model, rays_in_cam)
     x, y = v[..., 2] * sin, v[..., 2] * cos
     z = -v[..., 0] * sin - v[..., 1] * cos
     scale = 1 / np.sqrt(x * x + y * y + z * z)
@@ -138,13 +142,13 @@ def rows_from_axial(model: AngleModel, cos2: Floats, sin2: Floats, rays_in_cam: 
 
 
 def normal_from_angles(
-    model: AngleModel, phase: Floats, zenith: Floats, rays_in_cam: Floats
+    angle_model: AngleModel, phase: Floats, zenith: Floats, rays_in_cam: Floats
 ) -> Array:
     """Normal ``n = -exp(zenith a^) v`` of a phase and a zenith angle (paper, same table).
 
     Parameters
     ----------
-    model : OPA, PPA or tilted.
+    angle_model : OPA, PPA or tilted.
     phase, zenith : (...) radians; the zenith angle lies between the normal and ``-v`` (PPA) or
         the optical axis (OPA).
     rays_in_cam : (..., 3), unit rays, camera frame.
@@ -153,7 +157,7 @@ def normal_from_angles(
     -------
     (..., 3) float64, unit, camera frame.
     """
-    v = model_rays(model, np.asarray(rays_in_cam, np.float64))
+    v = model_rays(angle_model, np.asarray(rays_in_cam, np.float64))
     axis = np.cross(phase_direction(phase), v)
     axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
     zenith = np.asarray(zenith)[..., None]

@@ -91,18 +91,25 @@ class LevelCounts:
             self.counts = np.zeros(1 << (8 * samples.dtype.itemsize), np.int64)
         self.counts += np.bincount(samples.ravel(), minlength=len(self.counts))
 
-    @property
-    def pile(self) -> int | None:
-        """The highest level where many samples end, if they do."""
+    def pile(self, step: float) -> int | None:
+        """The highest level, if samples pile up there; ``step`` is that between levels.
+
+        At a largest value of some depth one sample alone is a pile: a tail does not end just
+        there, with nothing close below it.
+        """
         occupied = np.flatnonzero(self.counts)
-        if len(occupied) == 0:
+        if len(occupied) == 0 or occupied[-1] == 0:
             return None
         top = int(occupied[-1])
-        below = self.counts[occupied[max(0, len(occupied) - 1 - PILE_NEIGHBORS) : -1]]
-        crowd = int(below.max()) if len(below) else 0
-        piled = top > 0 and self.counts[top] >= max(MIN_PILE, PILE_FACTOR * crowd)
-        natural = top & (top + 1) == 0 or (top | (top & -top) - 1) + 1 in _POWERS
-        return top if piled and (natural or len(occupied) >= MIN_PILE_LEVELS) else None
+        near = self.counts[max(0, top - round(PILE_NEIGHBORS * step)) : top]
+        if self.counts[top] < PILE_FACTOR * near.max(initial=0):
+            return None
+        filled = top | (round(step) - 1 if step.is_integer() else 0)
+        if filled + 1 in _POWERS:
+            return top
+        crowd = int(self.counts[occupied[-1 - PILE_NEIGHBORS : -1]].max(initial=0))
+        enough = self.counts[top] >= max(MIN_PILE, PILE_FACTOR * crowd)
+        return top if enough and len(occupied) >= MIN_PILE_LEVELS else None
 
 
 def decide_levels(counts: LevelCounts, full_scale: float | None = None) -> Levels:
@@ -121,7 +128,7 @@ def decide_levels(counts: LevelCounts, full_scale: float | None = None) -> Level
         return Levels(bit_depth=8, full_scale=scale, clip_level=scale, step=1.0, reason=why)
     occupied = np.flatnonzero(counts.counts)
     step, shift = _step(occupied)
-    pile = counts.pile
+    pile = counts.pile(step)
     highest = int(occupied[-1]) if len(occupied) else 0
     if full_scale is not None:
         clip = min(full_scale, pile) if pile is not None else full_scale

@@ -139,6 +139,15 @@ class Capture:
         if len(files.exposures_s) > 1:
             times = ", ".join(f"{1e3 * time:g}" for time in files.exposures_s)
             lines.append(f"{len(files.exposures_s)} exposures a view, {times} ms, are merged")
+        lines.extend(self.warnings)
+        if self.pattern_check is not None:
+            lines.append(self.pattern_check.message)
+        return tuple(lines)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Of the notes those that a user should act on."""
+        lines = []
         if self.orientations != (UPRIGHT,):
             tags = ", ".join(map(str, self.orientations))
             lines.append(
@@ -150,8 +159,6 @@ class Capture:
                 "compressed with loss (JPEG), which blurs the polarizers into each other; the "
                 "stated noise is widened by it. Record PNG or TIFF"
             )
-        if self.pattern_check is not None:
-            lines.append(self.pattern_check.message)
         return tuple(lines)
 
     def load(self, name: str) -> Stokes:
@@ -437,11 +444,9 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
         orientations=orientations,
         pattern_check=_check_pattern(files, options, levels, sampled),
     )
-    if steps is not None or orientations != (UPRIGHT,):
-        for note in capture.notes[2:]:
-            logger.warning("%s: %s.", files.folder, note)
-    else:
-        logger.info("%s: %s", files.folder, "; ".join(capture.notes))
+    for warning in capture.warnings:
+        logger.warning("%s: %s.", files.folder, warning)
+    logger.info("%s: %s", files.folder, "; ".join(capture.notes))
     return capture
 
 

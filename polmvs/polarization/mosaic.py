@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.choices import BayerOrder
+from polmvs.config import BayerOrder
 
 Image: TypeAlias = NDArray[np.float32]
 
@@ -26,21 +26,24 @@ NEAR, FAR = 0.75, 0.25
 INTERPOLATION_NOISE_GAIN: Final = (NEAR**2 + FAR**2) ** 2
 
 
-def linearize(
-    raw: NDArray[np.unsignedinteger[Any]], *, gamma: float = 1.0, full_scale: float | None = None
-) -> Image:
+def linearize(raw: NDArray[Any], *, gamma: float = 1.0, full_scale: float | None = None) -> Image:
     """Raw samples in units of full scale, proportional to the light: ``(raw / full) ** (1 / g)``.
 
     Parameters
     ----------
-    raw : (H, W) uint8 or uint16
+    raw : (H, W) uint8, uint16 or floats
     gamma : encoding gamma of the camera, 1 for a linear one.
-    full_scale : value of a saturated sample; the largest of the type where it is None.
+    full_scale : value of a saturated sample; the largest of the type where it is None, 1 of floats.
 
     Returns
     -------
     (H, W) float32, 0 to 1 (above 1 only where ``raw`` exceeds ``full_scale``).
     """
+    if raw.dtype.kind == "f":
+        share = np.asarray(raw, np.float32) / np.float32(1.0 if full_scale is None else full_scale)
+        if gamma == 1.0:
+            return np.asarray(share, np.float32)
+        return np.asarray(np.maximum(share, 0) ** np.float32(1.0 / gamma), np.float32)
     largest = np.iinfo(raw.dtype).max
     scale = largest if full_scale is None else full_scale
     if gamma == 1.0:

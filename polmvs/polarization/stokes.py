@@ -229,7 +229,7 @@ def stokes_by_least_squares(
         s0, s1, s2 = np.ascontiguousarray(solved[..., 0].T).reshape(3, *shape)
     valid = ~clipped & (s0 >= 2.0 * darkness) & np.isfinite(s0)
     # Scaled so that its variance is twice that of s1 and s2, as that of four images is.
-    null = np.sqrt(2.0 * gain) * u[:, 3:].T.astype(np.float32)
+    null = (np.sqrt(2.0 * gain) * u[:, 3:].T).astype(np.float32)
     redundancy = (null @ residual).reshape(num - 3, *shape)
     noise_gain = gain * (INTERPOLATION_NOISE_GAIN if interpolated else 1.0)
     variance = _variance(

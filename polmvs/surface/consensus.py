@@ -1,4 +1,4 @@
-"""What one view's dense result says about points of another."""
+"""What one view's dense result shows of points of another: places, normals, who hides whom."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import sample_image
+from polmvs.camera import depth_buffer, in_image, sample_image
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView, SurfaceSamples, extend_planes, view_samples
@@ -17,13 +17,12 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-MIN_HIDING_COSINE = 0.1  # between a normal and the direction to the camera
 HIDING_DISTANCE = 0.02  # relative, as in gathering rows
 
 
 @dataclass(frozen=True)
-class Opinion:
-    """What another view says of N points of a view.
+class Sighting:
+    """What another view sees where N points of a view lie.
 
     Attributes
     ----------
@@ -47,14 +46,14 @@ class Opinion:
     outside: Mask
 
 
-def ask_view(
+def sight(
     phase_map: PhaseMap,
     dense: DenseView,
     center: Floats,
     rays: Floats,
     distance: Floats,
     normals: Floats,
-) -> Opinion:
+) -> Sighting:
     """Look a view's points up in another dense view.
 
     Parameters
@@ -72,13 +71,12 @@ def ask_view(
     seen = sample_image(dense.range_map, lattice_xy, nearest=True).astype(np.float64)
     seen_normals = sample_image(dense.normals_in_world, lattice_xy, nearest=True)
     seen_normals = np.where(seen[:, None] > 0, seen_normals.astype(np.float64), np.nan)
-    other_center = view.center_in_world
     # The other's surface element at the nearest lattice point, and the chord from there to the
     # point: perpendicular to the mean of both normals, exactly so on planes and spheres. The
     # element's own plane would lie outside of every convex surface.
     nearest_xy = (np.floor(np.nan_to_num(lattice_xy)) + 0.5) * dense.stride_px
-    other_rays = view.camera.rays(nearest_xy) @ view.cam_from_world.rotation
-    elements = other_center + seen[:, None] * other_rays
+    other_rays = view.rays_in_world(nearest_xy)
+    elements = view.center_in_world + seen[:, None] * other_rays
     slant = (rays * seen_normals).sum(-1)
     mean = seen_normals + normals
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -88,12 +86,11 @@ def ask_view(
         # more.
         seen_sigma = sample_image(dense.sigma, lattice_xy, nearest=True)
         sigma = seen_sigma / np.abs(slant)
-        to_camera = other_center - points
-        facing = (to_camera * normals).sum(-1) / own_range
+        facing = view.facing_cosines(points, normals)
     excess = np.where(seen > 0, seen - own_range, np.nan)
     cosine = (seen_normals * normals).sum(axis=-1)
     outside = _shows_background(phase_map, xy)
-    return Opinion(place, sigma, np.nan_to_num(seen_normals), cosine, excess, facing, outside)
+    return Sighting(place, sigma, np.nan_to_num(seen_normals), cosine, excess, facing, outside)
 
 
 def surface_of_others(
@@ -130,7 +127,7 @@ def surface_of_others(
     distance = np.linalg.norm(points - center, axis=-1)
     unknown = np.full(len(points), np.nan)
     shown = SurfaceSamples(
-        xy=np.asarray(view.camera.project(view.cam_from_world * points), np.float64),
+        xy=np.asarray(view.project(points), np.float64),
         rays_in_world=(points - center) / distance[:, None],
         log_range=np.log(distance),
         normals=np.concatenate(normals),
@@ -143,7 +140,7 @@ def surface_of_others(
     if not len(shown.xy):
         return None
     stride_px = max(result.stride_px for _, result in known)
-    rays = view.camera.rays(xy) @ view.cam_from_world.rotation
+    rays = view.rays_in_world(xy)
     return extend_planes(shown, xy, rays, max_gap_strides * stride_px)
 
 
@@ -157,21 +154,14 @@ def hidden_by(dense: DenseView, view: View, points: Floats, normals: Floats) -> 
     dense, view : of the view.
     points, normals : (N, 3), world, of the surfaces of all views.
     """
-    to_point = points - view.center_in_world
-    distance = np.linalg.norm(to_point, axis=-1)
-    facing = (to_point * normals).sum(axis=-1) < -MIN_HIDING_COSINE * distance
-    xy = view.camera.project(view.cam_from_world * points) / dense.stride_px
+    xy = view.project(points) / dense.stride_px
     height, width = dense.range_map.shape
     with np.errstate(invalid="ignore"):
-        shown = facing & ((xy >= 0) & (xy < [width, height])).all(axis=-1)
-    cols, rows = np.floor(xy[shown]).astype(np.intp).T
-    nearest = np.full((height, width), np.inf)
-    np.minimum.at(nearest, (rows, cols), distance[shown])
+        shown = view.faces(points, normals) & ((xy >= 0) & (xy < [width, height])).all(axis=-1)
+    nearest, _ = depth_buffer(xy[shown], view.ranges(points[shown]), width, height)
     return np.asarray(dense.range_map > (1 + HIDING_DISTANCE) * nearest)
 
 
 def _shows_background(phase_map: PhaseMap, xy: Floats) -> Mask:
     """Which places lie in the image but outside its region."""
-    camera = phase_map.view.camera
-    in_image = ((xy >= 0) & (xy < [camera.width, camera.height])).all(axis=-1)
-    return np.asarray(in_image & ~phase_map.shows_surface(xy))
+    return np.asarray(in_image(phase_map.view.camera, xy) & ~phase_map.shows_surface(xy))

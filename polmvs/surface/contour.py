@@ -50,7 +50,7 @@ MEETING_PX = 2.0  # the two halves of a closed curve end this close to each othe
 
 
 def propagate(
-    model: AngleModel,
+    angle_model: AngleModel,
     maps: Sequence[PhaseMap],
     seeds: Seeds,
     options: PropagationOptions,
@@ -64,7 +64,7 @@ def propagate(
 
     Parameters
     ----------
-    model : OPA or PPA; it decides the rows of the normals and what is constant on a contour.
+    angle_model : OPA or PPA; it decides the rows of the normals and what is constant on a contour.
     maps : phase maps of the posed views.
     seeds : points on the surface.
     folder : for the dense views, which stay on disk; existing files are replaced.
@@ -80,7 +80,7 @@ def propagate(
     report = on_progress or (lambda count: None)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
     nodes: list[Nodes | None] = []
-    for started in workers.map(partial(_start, model, seeds, options), _chunks(maps)):
+    for started in workers.map(partial(_start, angle_model, seeds, options), _chunks(maps)):
         nodes += started
         report(len(started))
     folder.mkdir(parents=True, exist_ok=True)
@@ -97,7 +97,7 @@ def propagate(
             )
             for k, near in enumerate(neighbors)
         ]
-        solve = partial(_round, model, seeds, options, tilt_aware)
+        solve = partial(_round, angle_model, seeds, options, tilt_aware)
         for k, result in enumerate(workers.map(solve, tasks)):
             nodes[k], dense[k] = result
             report(1)
@@ -111,10 +111,10 @@ def _chunks(maps: Sequence[PhaseMap]) -> list[Sequence[PhaseMap]]:
 
 
 def _start(
-    model: AngleModel, seeds: Seeds, options: PropagationOptions, maps: Sequence[PhaseMap]
+    angle_model: AngleModel, seeds: Seeds, options: PropagationOptions, maps: Sequence[PhaseMap]
 ) -> list[Nodes | None]:
     """Trace the contours of some views and give each node a first range from the seeds."""
-    path_model = AngleModel.OPA if options.contour is Contour.NORMALS else model
+    path_model = AngleModel.OPA if options.contour is Contour.NORMALS else angle_model
     fields, insides, seeds_xy = [], [], []
     top = 0.0
     for phase_map in maps:
@@ -198,13 +198,17 @@ class _Task:
 
 
 def _round(
-    model: AngleModel, seeds: Seeds, options: PropagationOptions, tilt_aware: bool, task: _Task
+    angle_model: AngleModel,
+    seeds: Seeds,
+    options: PropagationOptions,
+    tilt_aware: bool,
+    task: _Task,
 ) -> tuple[Nodes | None, DenseView | None]:
     """Normals and ranges of one view's nodes, and the dense view that they make."""
     if task.nodes is None:
         return None, None
     nodes = relax(
-        model,
+        angle_model,
         task.maps,
         task.dense,
         task.nodes,
@@ -233,12 +237,12 @@ class Contours:
     arc_px: NDArray[np.float32]
 
 
-def direction_field(model: AngleModel, samples: Image, rays: Image, passable: Mask) -> Image:
+def direction_field(angle_model: AngleModel, samples: Image, rays: Image, passable: Mask) -> Image:
     """Direction of the contour at every pixel, as an axial image that can be interpolated.
 
     Parameters
     ----------
-    model : OPA or PPA.
+    angle_model : OPA or PPA.
     samples : (H, W, 3), phase map samples.
     rays : (H, W, 3), unit rays of the pixels; their derivatives carry any camera model.
     passable : (H, W) bool, pixels that a contour may cross.
@@ -248,7 +252,7 @@ def direction_field(model: AngleModel, samples: Image, rays: Image, passable: Ma
     (H, W, 2) float32: cos and sin of twice the direction's angle in the image (x right, y
     down); 0 where not passable.
     """
-    row = rows_from_axial(model, samples[..., 0], samples[..., 1], rays)
+    row = rows_from_axial(angle_model, samples[..., 0], samples[..., 1], rays)
     along = row - (row * rays).sum(axis=-1, keepdims=True) * rays  # the ray's own motion
     ray_dy, ray_dx = np.gradient(rays, axis=(0, 1))
     # Solve [ray_dx ray_dy] e = along in the plane perpendicular to the ray.

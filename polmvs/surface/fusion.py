@@ -12,9 +12,11 @@ from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
 from polmvs.config import FusionOptions
+from polmvs.neighbors import voxel_of_each
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.surface.consensus import ask_view
+from polmvs.scene import MIN_FACING_COSINE
+from polmvs.surface.consensus import sight
 from polmvs.surface.dense_view import DenseView
 
 Array = NDArray[np.float64]
@@ -25,7 +27,6 @@ MAX_CONFLICT_SHARE = 0.5  # of the views that could see a point and see somethin
 SIGMAS = 3.0  # by how many deviations of both two views may differ
 MIN_TOLERANCE = 0.5  # share of the tolerance that is left to views however certain they are
 MIN_SIGMA_PX = 0.02  # of a range, in footprints: no view is trusted more than that
-MIN_VISIBLE_COSINE = 0.1  # between normal and viewing direction, for a view to have a say
 OUTLIER_NEIGHBORS = 8
 OUTLIER_SPACINGS = 4.0  # a point this many spacings from its neighbours is alone
 
@@ -130,11 +131,11 @@ def _confirm(options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]
     xy = dense.lattice_xy()[known]
     distance = dense.range_map[known].astype(np.float64)
     normals = dense.normals_in_world[known].astype(np.float64)
-    rays = view.camera.rays(xy) @ view.cam_from_world.rotation
+    rays = view.rays_in_world(xy)
     center = view.center_in_world
     footprint = distance / view.camera.mean_focal_px
     # As the others' deviations: grazing sight counts less.
-    cosine = np.maximum(np.abs((rays * normals).sum(axis=-1)), MIN_VISIBLE_COSINE)
+    cosine = np.maximum(np.abs((rays * normals).sum(axis=-1)), MIN_FACING_COSINE)
     sigma = _finite_sigma(dense.sigma[known] / cosine, footprint)
     tolerance = options.max_range_difference_px * footprint
     total = 1 / sigma**2
@@ -142,18 +143,18 @@ def _confirm(options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]
     votes, conflicts = np.ones(len(distance), np.int32), np.zeros(len(distance), np.int32)
     min_cosine = np.cos(np.radians(options.max_normal_difference_deg))
     for other_map, other in views[1:]:
-        opinion = ask_view(other_map, other, center, rays, distance, normals)
-        other_sigma = _finite_sigma(opinion.sigma, footprint)
+        seen = sight(other_map, other, center, rays, distance, normals)
+        other_sigma = _finite_sigma(seen.sigma, footprint)
         explained = SIGMAS * np.hypot(sigma, other_sigma)
         allowed = np.clip(explained, MIN_TOLERANCE * tolerance, tolerance)
-        agrees = (np.abs(opinion.place - distance) < allowed) & (opinion.cosine > min_cosine)
+        agrees = (np.abs(seen.place - distance) < allowed) & (seen.cosine > min_cosine)
         votes += agrees
-        behind = opinion.excess > 2 * allowed
-        conflicts += (behind | opinion.outside) & (opinion.facing > MIN_VISIBLE_COSINE)
+        behind = seen.excess > 2 * allowed
+        conflicts += (behind | seen.outside) & (seen.facing > MIN_FACING_COSINE)
         weight = np.where(agrees, 1 / other_sigma**2, 0)
         total += weight
-        place += weight * np.where(agrees, opinion.place, 0)
-        normal += weight[:, None] * opinion.normals
+        place += weight * np.where(agrees, seen.place, 0)
+        normal += weight[:, None] * seen.normals
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     keep = (votes >= options.min_views) & (conflicts <= MAX_CONFLICT_SHARE * (votes + conflicts))
     cloud = FusedCloud(
@@ -191,11 +192,8 @@ def merge(cloud: FusedCloud, voxel: float) -> FusedCloud:
     """One point per voxel (world units; 0: no merging): means weighted by views and certainty."""
     if voxel <= 0 or not len(cloud.points):
         return cloud
-    cells = np.floor((cloud.points - cloud.points.min(axis=0)) / voxel).astype(np.int64)
-    extent = cells.max(axis=0) + 1
-    key = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-    unique, inverse = np.unique(key, return_inverse=True)
-    num = len(unique)
+    inverse = voxel_of_each(cloud.points, voxel)
+    num = int(inverse.max()) + 1
     weight = cloud.num_views / np.maximum(cloud.sigma.astype(np.float64), 1e-3 * voxel) ** 2
     total = np.bincount(inverse, weight, num)
 

@@ -29,7 +29,7 @@ from polmvs.normals.rows import gather_rows
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
-from polmvs.surface.consensus import ask_view, surface_of_others
+from polmvs.surface.consensus import sight, surface_of_others
 from polmvs.surface.dense_view import (
     DenseView,
     SurfaceSamples,
@@ -45,6 +45,7 @@ from polmvs.surface.pixel_graph import (
     Nodes,
     bending_modes,
     fill_normals,
+    lattice_edges,
     node_edges,
     tie_seeds,
     uncrossed,
@@ -75,7 +76,7 @@ MIN_OWN_WEIGHT = 0.25  # robust weight of a row 4 deviations off
 
 
 def integrate(
-    model: AngleModel,
+    angle_model: AngleModel,
     maps: Sequence[PhaseMap],
     seeds: Seeds,
     options: PropagationOptions,
@@ -89,7 +90,7 @@ def integrate(
 
     Parameters
     ----------
-    model : decides the rows of the normals.
+    angle_model : decides the rows of the normals.
     maps : phase maps of the posed views.
     seeds : points on the surface.
     folder : for the dense views, which stay on disk; existing files are replaced.
@@ -116,7 +117,7 @@ def integrate(
             for k, near in enumerate(neighbors)
         ]
         dense = []
-        solve = partial(_round, model, seeds, options.bending, tilt_aware)
+        solve = partial(_round, angle_model, seeds, options.bending, tilt_aware)
         for result in workers.map(solve, tasks):
             dense.append(result)
             if on_progress is not None:
@@ -129,7 +130,7 @@ class RoundPlan:
     """One round: its lattice, and whether the other views' surfaces tie the view's own."""
 
     stride_px: int
-    use_opinions: bool
+    use_consensus: bool
 
 
 def plan_rounds(options: PropagationOptions) -> list[RoundPlan]:
@@ -154,7 +155,7 @@ class _Task:
 
 
 def _round(
-    model: AngleModel, seeds: Seeds, bending: float, tilt_aware: bool, task: _Task
+    angle_model: AngleModel, seeds: Seeds, bending: float, tilt_aware: bool, task: _Task
 ) -> DenseView | None:
     """One view's result on its lattice."""
     stride_px = task.plan.stride_px
@@ -163,14 +164,14 @@ def _round(
     if surface is None:
         return None
     nodes = relax(
-        model,
+        angle_model,
         task.maps,
         task.dense,
         _lattice_nodes(task.maps[0], surface, wanted, stride_px),
         seeds,
         bending=bending,
         tilt_aware=tilt_aware,
-        use_opinions=task.plan.use_opinions,
+        use_consensus=task.plan.use_consensus,
     )
     dense = dense_view(nodes.surface, wanted, stride_px)
     return store_dense_view(dense, task.path) if dense.known.any() else None
@@ -192,11 +193,7 @@ def _lattice_nodes(
     phase_map: PhaseMap, surface: SurfaceSamples, wanted: Mask, stride_px: int
 ) -> Nodes:
     """The lattice's points, joined to their neighbours in rows and columns."""
-    index = np.full(wanted.shape, -1)
-    index[wanted] = np.arange(len(surface.xy))
-    pairs = [(index[:, :-1], index[:, 1:]), (index[:-1], index[1:])]
-    tail = np.concatenate([a[(a >= 0) & (b >= 0)] for a, b in pairs])
-    head = np.concatenate([b[(a >= 0) & (b >= 0)] for a, b in pairs])
+    tail, head = lattice_edges(wanted)
     clear = uncrossed(phase_map, surface.xy[tail], surface.xy[head])
     return Nodes(
         surface=surface,
@@ -223,7 +220,7 @@ def surface_at_seeds(phase_map: PhaseMap, seeds: Seeds, xy: Floats) -> SurfaceSa
     unknown = np.full(len(xy), np.nan)
     return SurfaceSamples(
         xy=xy,
-        rays_in_world=view.camera.rays(xy) @ view.cam_from_world.rotation,
+        rays_in_world=view.rays_in_world(xy),
         # The median of some: one wrong seed does not spoil it.
         log_range=np.median(np.log(distance)[nearest], axis=1),
         normals=seeds.normals_in_world[visible][nearest[:, 0]],
@@ -234,7 +231,7 @@ def surface_at_seeds(phase_map: PhaseMap, seeds: Seeds, xy: Floats) -> SurfaceSa
 
 
 def relax(
-    model: AngleModel,
+    angle_model: AngleModel,
     maps: Sequence[PhaseMap],
     dense: Sequence[DenseView | None],
     nodes: Nodes,
@@ -243,13 +240,13 @@ def relax(
     bending: float,
     tilt_aware: bool = True,
     along_contours: bool = False,
-    use_opinions: bool = False,
+    use_consensus: bool = False,
 ) -> Nodes:
     """Solve the normals at a view's nodes from all views, then the ranges of the nodes.
 
     Parameters
     ----------
-    model : of the rows.
+    angle_model : of the rows.
     maps, dense : phase maps, and dense views of the round before where there are any, the view's
         own first.
     nodes : of the first view, with the ranges and normals of the round before.
@@ -257,7 +254,7 @@ def relax(
     bending : deviation of the smooth modes, as a share of the distance; 0: none.
     tilt_aware : of the rows' weights.
     along_contours : ranges (OPA: depths) are constant along the nodes' contours.
-    use_opinions : the surfaces that the other views see tie the nodes, too.
+    use_consensus : the surfaces that the other views see tie the nodes, too.
     """
     center = maps[0].view.center_in_world
     surface = nodes.surface
@@ -265,7 +262,7 @@ def relax(
     unknown = ~np.isfinite(surface.log_range)
     points[unknown] = center  # anywhere
     range_maps = [d.range_map if d is not None else None for d in dense]
-    rows = gather_rows(model, points, maps, range_maps, tilt_aware=tilt_aware)
+    rows = gather_rows(angle_model, points, maps, range_maps, tilt_aware=tilt_aware)
     rows.sigma[:, unknown] = np.inf  # other views may see this one's camera: no rows
     start = surface.normals.T
     estimate, row_sigma = solve_at_own_noise(
@@ -280,12 +277,12 @@ def relax(
     )
     nodes = replace(nodes, surface=surface)
     ties, num_known = tie_seeds(maps[0], nodes, seeds), len(seeds.sigma)
-    if use_opinions:
-        ties = _joined(ties, tie_opinions(maps, dense, nodes), num_known)
+    if use_consensus:
+        ties = _joined(ties, tie_to_consensus(maps, dense, nodes), num_known)
         num_known += len(normals)
     solution = solve_log_ranges(
         len(normals),
-        node_edges(model, nodes, row_sigma[0], along_contours=along_contours),
+        node_edges(angle_model, nodes, row_sigma[0], along_contours=along_contours),
         ties,
         num_known,
         modes=bending_modes(surface.xy) if bending > 0 else None,
@@ -308,7 +305,7 @@ def _agreement(sigma: Floats, rays: Floats, estimate: NormalEstimate) -> Array:
     return np.where(denied, 0, agree.sum(axis=0) / np.maximum(facing.sum(axis=0), 1))
 
 
-def tie_opinions(
+def tie_to_consensus(
     maps: Sequence[PhaseMap], dense: Sequence[DenseView | None], nodes: Nodes
 ) -> SeedTies:
     """Tie the nodes of the first view to the surface on which the other views agree.
@@ -321,13 +318,11 @@ def tie_opinions(
     for phase_map, other in zip(maps[1:], dense[1:], strict=True):
         if other is None:
             continue
-        opinion = ask_view(
-            phase_map, other, center, surface.rays_in_world, distance, surface.normals
-        )
+        seen = sight(phase_map, other, center, surface.rays_in_world, distance, surface.normals)
         with np.errstate(invalid="ignore"):
-            counts = (opinion.cosine > MIN_OPINION_COSINE) & (opinion.place > 0)
-        said.append(np.where(counts, opinion.place, np.nan))
-        deviations.append(np.where(counts, opinion.sigma, np.nan))
+            counts = (seen.cosine > MIN_OPINION_COSINE) & (seen.place > 0)
+        said.append(np.where(counts, seen.place, np.nan))
+        deviations.append(np.where(counts, seen.sigma, np.nan))
     if not said:
         none = np.zeros(0, np.int64)
         return SeedTies(
@@ -394,5 +389,5 @@ def spread_nodes(
         return None
     wanted = open_lattice(phase_map, stride_px)
     xy = lattice_points(wanted, stride_px)
-    rays = phase_map.view.camera.rays(xy) @ phase_map.view.cam_from_world.rotation
+    rays = phase_map.view.rays_in_world(xy)
     return dense_view(extend_planes(surface[good], xy, rays, max_gap_px), wanted, stride_px)

@@ -16,12 +16,13 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
+from polmvs.fitting import annealed_scales, cauchy_weights
+
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 MAX_GRAZING = 0.05  # |n . v| under which the increment of a node is not to be trusted
-CAUCHY_SCALE = 2.385
 NUM_DRAWS = 16  # of the noise, for the deviation of the solution: 18 % uncertain where alone
 
 
@@ -127,16 +128,16 @@ def solve_log_ranges(
     sigma = np.concatenate([edges.sigma[keep], ties.sigma, np.full(num_modes, mode_sigma)])
     precision = 1 / sigma**2
     robust = np.ones(len(target))
-    for round_index in range(num_rounds):
+    for scale in annealed_scales(num_rounds):
         used = robust.copy()
         factors = system.factorise(used * precision)
         solution = factors.solve(target[:, None])
-        scale = CAUCHY_SCALE * 2.0 ** max(num_rounds - 3 - round_index, 0)
         z2 = (system.predict(solution)[:, 0] - target) ** 2 * precision
         tie_z2 = z2[num_edges : len(z2) - num_modes]
         count = np.maximum(np.bincount(ties.seed, minlength=num_seeds), 1)
-        seed_weight = 1 / (1 + np.bincount(ties.seed, tie_z2, num_seeds) / count / scale**2)
-        robust[:num_edges] = 1 / (1 + z2[:num_edges] / scale**2)
+        seed_z2 = np.bincount(ties.seed, tie_z2, num_seeds) / count
+        seed_weight = np.asarray(cauchy_weights(seed_z2, scale), np.float64)
+        robust[:num_edges] = cauchy_weights(z2[:num_edges], scale)
         robust[num_edges : len(z2) - num_modes] = seed_weight[ties.seed]
     log_range[reached] = system.log_ranges(solution)[:, 0]
     common = np.concatenate([np.zeros(num_edges), ties.common, np.zeros(num_modes)])

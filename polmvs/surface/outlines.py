@@ -21,7 +21,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import LOW_TEXTURE, Region, smooth
 from polmvs.scene import View
 from polmvs.surface.dense_view import SurfaceSamples, extend_planes
-from polmvs.surface.pixel_graph import Nodes, uncrossed
+from polmvs.surface.pixel_graph import Nodes, lattice_edges, uncrossed
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
@@ -256,10 +256,7 @@ def piece_nodes(phase_map: PhaseMap, piece: Piece) -> Nodes:
     y = np.arange(spacing / 2, camera.height, spacing)
     grid = np.stack(np.meshgrid(x, y), axis=-1)
     wanted = piece.signed_distance(grid) < -INNER_PX
-    index = np.where(wanted, np.cumsum(wanted).reshape(wanted.shape) - 1, -1)
-    pairs = [(index[:, :-1], index[:, 1:]), (index[:-1], index[1:])]
-    tail = np.concatenate([a[(a >= 0) & (b >= 0)] for a, b in pairs])
-    head = np.concatenate([b[(a >= 0) & (b >= 0)] for a, b in pairs])
+    tail, head = lattice_edges(wanted)
     xy = grid[wanted]
     clear = uncrossed(phase_map, xy[tail], xy[head])
     rays_in_cam = camera.rays(xy)
@@ -292,7 +289,7 @@ def known(surface: SurfaceSamples) -> Mask:
 def rim_of(reference: Reference, nodes: Nodes) -> SurfaceSamples:
     """The surface at the points of the piece's outline where it ends, none where it bends away."""
     view, outline = reference.maps[0].view, reference.piece.outline
-    rays = view.camera.rays(outline) @ view.cam_from_world.rotation
+    rays = view.rays_in_world(outline)
     surface = nodes.surface
     rim = extend_planes(surface[known(surface)], outline, rays, GAP_SPACINGS * nodes.spacing_px)
     with np.errstate(invalid="ignore"):
@@ -306,7 +303,7 @@ def points_of(surface: SurfaceSamples, center: Array, shift: float = 0.0) -> Arr
     return np.asarray(center + distance * surface.rays_in_world, np.float64)
 
 
-def find_misfit(
+def find_outline_errors(
     reference: Reference,
     nodes: Nodes,
     rim: SurfaceSamples,
@@ -314,7 +311,7 @@ def find_misfit(
     *,
     thin: int = 1,
     with_slopes: bool = False,
-) -> Misfit:
+) -> OutlineErrors:
     """Compare a surface's outlines with the other views' pieces.
 
     Parameters
@@ -346,20 +343,20 @@ def find_misfit(
         view, pieces = reference.maps[k].view, reference.pieces[k]
         matched[k] = _best_piece(view, pieces, outlines.points[outlines.known])
         points, weight, stretch = outlines.seen_by(view)
-        xy = view.camera.project(view.cam_from_world * points)
+        xy = view.project(points)
         shown = np.flatnonzero(_in_image(view, xy))
         piece = pieces[matched[k]] if matched[k] >= 0 else None
         error = _errors(piece, xy[shown])
         slope = np.full(len(error), np.nan)
         if step is not None:
             farther = center + step * (points[shown] - center)
-            moved = view.camera.project(view.cam_from_world * farther)
+            moved = view.project(farther)
             slope = (_errors(piece, moved) - error) / SLOPE_STEP
         owner = np.full(len(error), k)
         turning = np.where(stretch[shown] < 0, -1 - k, stretch[shown])
         parts.append((error, slope, weight[shown], owner, turning))
     error, slope, weight, owner, stretch = (np.concatenate(c) for c in zip(*parts, strict=True))
-    return Misfit(error, slope, weight, owner, stretch, matched)
+    return OutlineErrors(error, slope, weight, owner, stretch, matched)
 
 
 @dataclass(frozen=True)
@@ -378,7 +375,7 @@ class _Outlines:
 
         Where the surface ends facing the view, and where it turns away from it (stretch -1).
         """
-        ends = np.flatnonzero(cosines(view, self.rim_points, self.rim_normals) > MIN_COSINE)
+        ends = np.flatnonzero(view.facing_cosines(self.rim_points, self.rim_normals) > MIN_COSINE)
         turns = self._turning_points(view)
         stretch = np.full(len(ends) + len(turns), -1)
         stretch[: len(ends)] = ends * self.thin // STRETCH_POINTS
@@ -392,7 +389,7 @@ class _Outlines:
         A hollow turns the other way about, and shows no outline there.
         """
         surface, tail, head = self.nodes.surface, self.nodes.tail, self.nodes.head
-        cosine = cosines(view, self.points, surface.normals)
+        cosine = view.facing_cosines(self.points, surface.normals)
         distance = np.linalg.norm(self.points - view.center_in_world, axis=-1)
         own = -(surface.normals * surface.rays_in_world).sum(axis=-1)
         with np.errstate(invalid="ignore"):
@@ -416,15 +413,9 @@ def _in_image(view: View, xy: Floats) -> Mask:
     return np.asarray(((xy > BORDER_PX) & (xy < size - BORDER_PX)).all(axis=-1))
 
 
-def cosines(view: View, points: Array, normals: Array) -> Array:
-    """Cosine (N,) between the normals and the directions to the camera."""
-    to_camera = view.center_in_world - points
-    return np.asarray((to_camera * normals).sum(axis=-1) / np.linalg.norm(to_camera, axis=-1))
-
-
 def _best_piece(view: View, pieces: Sequence[Piece], points: Array) -> int:
     """The piece that most of the points in the image lie on; -1: none holds a good share."""
-    xy = view.camera.project(view.cam_from_world * points)
+    xy = view.project(points)
     xy = xy[_in_image(view, xy)]
     if not len(xy) or not len(pieces):
         return -1
@@ -434,7 +425,7 @@ def _best_piece(view: View, pieces: Sequence[Piece], points: Array) -> int:
 
 
 @dataclass(frozen=True)
-class Misfit:
+class OutlineErrors:
     """Distances of the points of a surface's outlines from those of the pieces that show it.
 
     Attributes

@@ -19,6 +19,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from polmvs.camera import in_image
 from polmvs.config import AngleModel
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import gather_rows
@@ -30,11 +31,10 @@ from polmvs.surface.integration import relax
 from polmvs.surface.outlines import (
     FINE_SCALE_PX,
     MIN_COSINE,
-    Misfit,
+    OutlineErrors,
     Piece,
     Reference,
-    cosines,
-    find_misfit,
+    find_outline_errors,
     find_pieces,
     known,
     piece_nodes,
@@ -48,8 +48,8 @@ Array = NDArray[np.float64]
 MIN_SCENE_POINTS = 10  # in sight of a view, for it to know how far the scene is
 SCENE_PERCENTILES = (2.0, 98.0)
 SCENE_WIDENING = 1.6  # a part may stand nearer or farther than all that has texture
-FOLLOWER_BOUNDS = 0.12  # of log range about where the first view puts the part
-MAX_FOLLOWERS = 6  # views that place a part again
+OTHER_VIEW_BOUNDS = 0.12  # of log range about where the first view puts the part
+MAX_OTHER_VIEWS = 6  # views that place a part again
 MAX_TRIES = 3  # first views for what may be one part
 NUM_PART_SEEDS = 48
 PLACEMENTS_PER_VIEW = 6  # bounds the search's time; five parts of a whole capture take two
@@ -109,7 +109,7 @@ class _Member:
 
 
 def find_part_seeds(
-    model: AngleModel,
+    angle_model: AngleModel,
     maps: Sequence[PhaseMap],
     seeds: Seeds,
     points_in_world: Array,
@@ -124,7 +124,7 @@ def find_part_seeds(
 
     Parameters
     ----------
-    model : of the rows.
+    angle_model : of the rows.
     maps : phase maps of the posed views.
     seeds : those there are. A piece of a view is left alone if three lie on it, or if most of the
         other views show it so.
@@ -146,7 +146,7 @@ def find_part_seeds(
     workers = workers or Workers(1)
     pieces = list(workers.map(_pieces_of, maps))
     seeded = _seeded_pieces(maps, pieces, seeds)
-    search = _Search(model, maps, pieces, seeded, points_in_world, max_neighbors, workers)
+    search = _Search(angle_model, maps, pieces, seeded, points_in_world, max_neighbors, workers)
     search.tilt_aware = tilt_aware
     search.placements_left = placements_per_view * len(maps)
     return search.run(_Progress(len(search.left), len(maps), on_progress))
@@ -191,7 +191,7 @@ class _Search:
 
     def __init__(
         self,
-        model: AngleModel,
+        angle_model: AngleModel,
         maps: Sequence[PhaseMap],
         pieces: Sequence[Sequence[Piece]],
         seeded: set[PieceId],
@@ -199,7 +199,7 @@ class _Search:
         max_neighbors: int,
         workers: Workers,
     ) -> None:
-        self.model, self.maps, self.pieces, self.done = model, maps, pieces, set(seeded)
+        self.angle_model, self.maps, self.pieces, self.done = angle_model, maps, pieces, set(seeded)
         self.points, self.max_neighbors, self.workers = points_in_world, max_neighbors, workers
         self.tilt_aware = True
         self.placements_left = PLACEMENTS_PER_VIEW * len(maps)
@@ -218,8 +218,8 @@ class _Search:
         parts, reports = [], []
         while self.left and self.placements_left > 0:
             progress.left(len(self.left))
-            lead = self.left.pop(0)
-            first = self._place([lead], [None])[0]
+            piece_id = self.left.pop(0)
+            first = self._place([piece_id], [None])[0]
             members, doubt = self._agreement(first)
             if doubt == KNOWN_PART:
                 self._drop(first.pieces)
@@ -230,35 +230,37 @@ class _Search:
             part, report = self._finish(members)
             parts.append(part)
             reports.append(report)
-            self._drop(set().union(*(member.pieces for member in members)) | {lead})
+            self._drop(set().union(*(member.pieces for member in members)) | {piece_id})
         reports += [report for _, report in self.failures]
         if self.left:
             reports.append(self._not_tried())
         progress.left(0)
         return join_seeds(parts), reports
 
-    def _place(self, leads: list[PieceId], middles: Sequence[float | None]) -> list[_Member]:
+    def _place(
+        self, chosen_pieces: list[PieceId], middles: Sequence[float | None]
+    ) -> list[_Member]:
         """Place pieces, where known within bounds about a log-range."""
-        views = [self._neighbors(lead) for lead in leads]
+        views = [self._neighbors(piece_id) for piece_id in chosen_pieces]
         references, bounds = [], []
-        for lead, near, middle in zip(leads, views, middles, strict=True):
+        for piece_id, near, middle in zip(chosen_pieces, views, middles, strict=True):
             chosen = [self.pieces[k] for k in near]
             maps = [self.maps[k] for k in near]
-            references.append(Reference(maps, chosen, lead[1], self.tilt_aware))
-            low, high = self._bounds(lead[0])
+            references.append(Reference(maps, chosen, piece_id[1], self.tilt_aware))
+            low, high = self._bounds(piece_id[0])
             if middle is not None:
-                low, high = middle - FOLLOWER_BOUNDS, middle + FOLLOWER_BOUNDS
+                low, high = middle - OTHER_VIEW_BOUNDS, middle + OTHER_VIEW_BOUNDS
             bounds.append((low, high))
-        self.placements_left -= len(leads)
-        placements = self.workers.map(partial(place_piece, self.model), references, bounds)
-        return [_Member(*each) for each in zip(leads, views, placements, strict=True)]
+        self.placements_left -= len(chosen_pieces)
+        placements = self.workers.map(partial(place_piece, self.angle_model), references, bounds)
+        return [_Member(*each) for each in zip(chosen_pieces, views, placements, strict=True)]
 
     def _bounds(self, k: int) -> tuple[float, float]:
         """Of the log-range in a view, from the scene's points that it sees."""
         view = self.maps[k].view
         in_cam = view.cam_from_world * self.points
         xy = view.camera.project(in_cam)
-        shown = ((xy > 0) & (xy < [view.camera.width, view.camera.height])).all(axis=-1)
+        shown = in_image(view.camera, xy)
         if shown.sum() < MIN_SCENE_POINTS:
             shown = in_cam[:, 2] > 0
         if not shown.any():
@@ -267,20 +269,19 @@ class _Search:
         low, high = np.log(np.percentile(distance, SCENE_PERCENTILES))
         return float(low - np.log(SCENE_WIDENING)), float(high + np.log(SCENE_WIDENING))
 
-    def _neighbors(self, lead: PieceId) -> list[int]:
-        """The lead's view, then others that can see what lies on its piece, from all sides."""
-        k = lead[0]
+    def _neighbors(self, piece_id: PieceId) -> list[int]:
+        """The piece_id's view, then others that can see what lies on its piece, from all sides."""
+        k = piece_id[0]
         view = self.maps[k].view
-        outline = self.pieces[k][lead[1]].outline
+        outline = self.pieces[k][piece_id[1]].outline
         low, high = self._bounds(k)
         middle = outline.mean(axis=0) if len(outline) else np.zeros(2)
         ray = view.camera.rays(middle[None])[0] @ view.cam_from_world.rotation
         along = view.center_in_world + np.exp(np.linspace(low, high, 9))[:, None] * ray
         others = []
         for j, phase_map in enumerate(self.maps):
-            camera = phase_map.view.camera
-            xy = camera.project(phase_map.view.cam_from_world * along)
-            if j != k and ((xy > 0) & (xy < [camera.width, camera.height])).all(axis=-1).any():
+            other = phase_map.view
+            if j != k and in_image(other.camera, other.project(along)).any():
                 others.append(j)
         gap = [np.linalg.norm(self.maps[j].view.center_in_world - along[4]) for j in others]
         order = [others[i] for i in np.argsort(gap, kind="stable")]
@@ -294,9 +295,9 @@ class _Search:
             return [first], placement.doubt
         if 2 * len(others & self.done) > len(others):
             return [first], KNOWN_PART
-        followers = sorted(others - self.done, key=self._rank)[:MAX_FOLLOWERS]
-        middles = [self._middle(follower, placement) for follower in followers]
-        members = [first, *self._place(followers, middles)]
+        others_left = sorted(others - self.done, key=self._rank)[:MAX_OTHER_VIEWS]
+        middles = [self._middle(other, placement) for other in others_left]
+        members = [first, *self._place(others_left, middles)]
         members = [member for member in members if not member.placement.doubt]
         agreeing = most_agreeing([member.placement for member in members], self._views(members))
         if len(agreeing) < max(MIN_VIEWS, len(members) // 2 + 1):
@@ -310,9 +311,9 @@ class _Search:
         """Log-range at which another view sees the middle of a placed surface's piece."""
         view = self.maps[piece[0]].view
         points = points_of(placement.surface, placement.center)
-        cosine = cosines(view, points, placement.surface.normals)
+        cosine = view.facing_cosines(points, placement.surface.normals)
         points = points[cosine > np.minimum(MIN_COSINE, np.median(cosine))]
-        xy = view.camera.project(view.cam_from_world * points)
+        xy = view.project(points)
         outline = self.pieces[piece[0]][piece[1]].outline
         gap = np.linalg.norm(xy - np.median(outline, axis=0), axis=-1)
         near = points[np.argsort(np.nan_to_num(gap, nan=np.inf))[:MIN_OVERLAP]]
@@ -414,12 +415,14 @@ class _State:
     log_range: float
 
 
-def place_piece(model: AngleModel, reference: Reference, bounds: tuple[float, float]) -> Placement:
+def place_piece(
+    angle_model: AngleModel, reference: Reference, bounds: tuple[float, float]
+) -> Placement:
     """Find the range of a piece within bounds.
 
     Parameters
     ----------
-    model : of the rows.
+    angle_model : of the rows.
     reference : the piece and the views.
     bounds : of the log-range of the piece's middle.
 
@@ -430,17 +433,17 @@ def place_piece(model: AngleModel, reference: Reference, bounds: tuple[float, fl
     nodes = piece_nodes(reference.maps[0], reference.piece)
     if not len(nodes.surface.xy):
         return _nowhere(reference, nodes)
-    states, costs = _sweep(model, reference, nodes, bounds)
+    states, costs = _sweep(angle_model, reference, nodes, bounds)
     refined = []
     for index in _minima(costs):
-        state = _refine(model, reference, states[index])
+        state = _refine(angle_model, reference, states[index])
         if state is not None:
-            refined.append((_misfit(reference, state).support(FINE_SCALE_PX), state))
+            refined.append((_outline_errors(reference, state).support(FINE_SCALE_PX), state))
     if not refined:
         return _nowhere(reference, nodes)
     refined.sort(key=lambda candidate: -candidate[0])
     best = refined[0][1]
-    placement = _describe(model, reference, best)
+    placement = _describe(angle_model, reference, best)
     rival = _has_rival(refined, max(5 * placement.sigma, 2 * SWEEP_STEP))
     flat = costs.min() > MAX_SWEEP_COST
     at_end = not bounds[0] < best.log_range < bounds[1]
@@ -466,7 +469,7 @@ def _nowhere(reference: Reference, nodes: Nodes) -> Placement:
 
 
 def _sweep(
-    model: AngleModel, reference: Reference, nodes: Nodes, bounds: tuple[float, float]
+    angle_model: AngleModel, reference: Reference, nodes: Nodes, bounds: tuple[float, float]
 ) -> tuple[list[_State], Array]:
     """States over all ranges and what they cost."""
     num_shapes = max(int(np.ceil((bounds[1] - bounds[0]) / SHAPE_STEP)), 1)
@@ -478,7 +481,7 @@ def _sweep(
     # Shapes begin with one range for all nodes; on the way from nearer ranges they settle.
     for index in range(-WARM_UP, num_shapes):
         log_range = float(bounds[0] + (index + 0.5) * width)
-        state = _solve_shape(model, reference, nodes, log_range)
+        state = _solve_shape(angle_model, reference, nodes, log_range)
         if state is not None:
             nodes = state.nodes
         if index < 0:
@@ -486,12 +489,12 @@ def _sweep(
         if state is None:
             continue
         for shift in shifts:
-            misfit = find_misfit(
+            met = find_outline_errors(
                 reference, state.nodes, state.rim, float(shift), thin=SWEEP_THINNING
             )
             states.append(_shifted(state, float(shift)))
-            enough = misfit.weight.sum() >= MIN_POINTS
-            costs.append(misfit.cost(SWEEP_SCALE_PX) if enough else 1.0)
+            enough = met.weight.sum() >= MIN_POINTS
+            costs.append(met.cost(SWEEP_SCALE_PX) if enough else 1.0)
     return states, np.array(costs)
 
 
@@ -506,7 +509,7 @@ def _minima(costs: Array) -> list[int]:
 
 
 def _solve_shape(
-    model: AngleModel, reference: Reference, nodes: Nodes, log_range: float
+    angle_model: AngleModel, reference: Reference, nodes: Nodes, log_range: float
 ) -> _State | None:
     """The piece's shape with its middle at a range; None where no normals are found."""
     surface = nodes.surface
@@ -518,7 +521,7 @@ def _solve_shape(
     held = Seeds(place, np.full((1, 3), np.nan), np.full(1, 1e-4 * np.exp(log_range)))
     blind = [None] * len(reference.maps)
     nodes = relax(
-        model,
+        angle_model,
         reference.maps,
         blind,
         replace(nodes, surface=surface),
@@ -549,22 +552,24 @@ def _shifted(state: _State, shift: float) -> _State:
     return _State(replace(state.nodes, surface=surface), rim, state.log_range + shift)
 
 
-def _misfit(reference: Reference, state: _State) -> Misfit:
-    return find_misfit(reference, state.nodes, state.rim, with_slopes=True)
+def _outline_errors(reference: Reference, state: _State) -> OutlineErrors:
+    return find_outline_errors(reference, state.nodes, state.rim, with_slopes=True)
 
 
-def _refine(model: AngleModel, reference: Reference, state: _State) -> _State | None:
+def _refine(angle_model: AngleModel, reference: Reference, state: _State) -> _State | None:
     """Follow a minimum down: the shape anew and a closer look, again and again."""
     for reach, step, scale in REFINEMENTS:
-        solved = _solve_shape(model, reference, state.nodes, state.log_range)
+        solved = _solve_shape(angle_model, reference, state.nodes, state.log_range)
         if solved is None:
             return None
         shifts = np.arange(-reach, reach + step / 2, step)
-        misfits = [find_misfit(reference, solved.nodes, solved.rim, float(s)) for s in shifts]
-        best = int(np.argmin([misfit.cost(scale) for misfit in misfits]))
+        candidates = [
+            find_outline_errors(reference, solved.nodes, solved.rim, float(s)) for s in shifts
+        ]
+        best = int(np.argmin([met.cost(scale) for met in candidates]))
         state = _shifted(solved, float(shifts[best]))
     for _ in range(3):
-        step = _misfit(reference, state).balancing_step()
+        step = _outline_errors(reference, state).balancing_step()
         state = _shifted(state, float(np.clip(step, -MAX_STEP, MAX_STEP)))
     return state
 
@@ -578,21 +583,21 @@ def _has_rival(refined: Sequence[tuple[float, _State]], apart: float) -> bool:
     )
 
 
-def _describe(model: AngleModel, reference: Reference, state: _State) -> Placement:
+def _describe(angle_model: AngleModel, reference: Reference, state: _State) -> Placement:
     """The state with its uncertainty, and the doubts that it gives rise to itself."""
-    misfit = _misfit(reference, state)
+    met = _outline_errors(reference, state)
     surface = state.nodes.surface[np.flatnonzero(known(state.nodes.surface))]
     center = reference.maps[0].view.center_in_world
     points = points_of(surface, center)
-    rows = gather_rows(model, points, reference.maps, tilt_aware=reference.tilt_aware)
+    rows = gather_rows(angle_model, points, reference.maps, tilt_aware=reference.tilt_aware)
     estimate = solve_normals(rows.rows, rows.rays, rows.sigma, initial_normals=surface.normals.T)
     used = np.isfinite(rows.sigma)
     outliers = float((1 - estimate.row_weights)[used].mean()) if used.any() else 1.0
-    near = np.abs(misfit.error) < NEAR_PX
-    total = misfit.weight.sum()
-    met = float((misfit.weight * near).sum() / total) if total > 0 else 0.0
-    sigma = float(np.hypot(misfit.sigma(), _shape_sigma(surface, points, center)))
-    num_views = len(np.unique(misfit.view[near])) + 1
+    near = np.abs(met.error) < NEAR_PX
+    total = met.weight.sum()
+    met_share = float((met.weight * near).sum() / total) if total > 0 else 0.0
+    sigma = float(np.hypot(met.sigma(), _shape_sigma(surface, points, center)))
+    num_views = len(np.unique(met.view[near])) + 1
     doubt = ""
     if outliers > MAX_PHASE_OUTLIERS:
         doubt = "phases of the views contradict each other"
@@ -600,7 +605,7 @@ def _describe(model: AngleModel, reference: Reference, state: _State) -> Placeme
         doubt = "too few views to fix its shape"
     if not sigma < MAX_SIGMA:
         doubt = "outlines do not fix the range"
-    if met < MIN_MET_SHARE:
+    if met_share < MIN_MET_SHARE:
         doubt = "outlines of the views do not meet"
     if num_views < MIN_VIEWS or total < MIN_POINTS:
         doubt = f"its outline is seen in fewer than {MIN_VIEWS} views"
@@ -609,8 +614,8 @@ def _describe(model: AngleModel, reference: Reference, state: _State) -> Placeme
         center=center,
         log_range=state.log_range,
         sigma=sigma,
-        matched=misfit.matched,
-        outline_px=float(np.median(np.abs(misfit.error[near]))) if near.any() else np.nan,
+        matched=met.matched,
+        outline_px=float(np.median(np.abs(met.error[near]))) if near.any() else np.nan,
         phase_deg=float(np.degrees(np.median(estimate.residual[estimate.valid])))
         if estimate.valid.any()
         else np.nan,
@@ -670,9 +675,9 @@ def heights_over(placement: Placement, view: View, points: Array, normals: Array
     """
     to_point = points - placement.center
     distance = np.linalg.norm(to_point, axis=-1)
-    xy = view.camera.project(view.cam_from_world * points)
+    xy = view.project(points)
     heights = np.full(len(points), np.nan)
-    facing = cosines(view, points, normals) > MIN_COSINE
+    facing = view.facing_cosines(points, normals) > MIN_COSINE
     seen = np.flatnonzero(np.isfinite(xy).all(axis=-1) & facing)
     if not len(seen) or not len(placement.surface.xy):
         return heights

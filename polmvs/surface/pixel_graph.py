@@ -58,12 +58,24 @@ class Nodes:
 
 def visible_seeds(phase_map: PhaseMap, seeds: Seeds) -> tuple[NDArray[np.bool_], Array]:
     """Which seeds project into the view's region facing it, and where."""
-    in_cam = phase_map.view.cam_from_world * seeds.points_in_world
-    xy = phase_map.view.camera.project(in_cam)
-    to_point = seeds.points_in_world - phase_map.view.center_in_world
-    facing = (to_point * seeds.normals_in_world).sum(-1) < -0.1 * np.linalg.norm(to_point, axis=-1)
-    known = np.isfinite(seeds.normals_in_world).all(axis=-1)
-    return phase_map.shows_surface(xy) & (facing | ~known), np.asarray(xy, np.float64)
+    view, points, normals = phase_map.view, seeds.points_in_world, seeds.normals_in_world
+    xy = view.project(points)
+    facing = view.faces(points, normals) | ~np.isfinite(normals).all(axis=-1)
+    return phase_map.shows_surface(xy) & facing, np.asarray(xy, np.float64)
+
+
+def lattice_edges(wanted: NDArray[np.bool_]) -> tuple[Indices, Indices]:
+    """Pairs of neighbours in rows and columns of the ``wanted`` (h, w) points of a lattice.
+
+    Returns
+    -------
+    tail, head : (E,) indices in the list of the wanted points, row by row.
+    """
+    index = np.where(wanted, np.cumsum(wanted).reshape(wanted.shape) - 1, -1)
+    pairs = [(index[:, :-1], index[:, 1:]), (index[:-1], index[1:])]
+    tail = np.concatenate([a[(a >= 0) & (b >= 0)] for a, b in pairs])
+    head = np.concatenate([b[(a >= 0) & (b >= 0)] for a, b in pairs])
+    return tail, head
 
 
 def uncrossed(phase_map: PhaseMap, start_xy: Floats, end_xy: Floats) -> NDArray[np.bool_]:
@@ -105,13 +117,13 @@ def fill_normals(nodes: Nodes, estimate: NormalEstimate) -> tuple[Array, Array]:
 
 
 def node_edges(
-    model: AngleModel, nodes: Nodes, own_sigma: Floats, *, along_contours: bool
+    angle_model: AngleModel, nodes: Nodes, own_sigma: Floats, *, along_contours: bool
 ) -> Edges:
     """Increments from the nodes' normals on all edges, and the constancy along the contours.
 
     Parameters
     ----------
-    model : decides what is constant on a contour.
+    angle_model : decides what is constant on a contour.
     nodes : with normals.
     own_sigma : (N,), deviation of the turn of the view's own row about its ray, rad.
     along_contours : use that constancy.
@@ -136,7 +148,9 @@ def node_edges(
         return edges
     # Constant range (PPA) or depth (OPA); its slope errs by the turn of the row about the ray.
     constant = (
-        np.log(nodes.ray_z[tail] / nodes.ray_z[head]) if model is AngleModel.OPA else 0.0 * angle
+        np.log(nodes.ray_z[tail] / nodes.ray_z[head])
+        if angle_model is AngleModel.OPA
+        else 0.0 * angle
     )
     turn = 0.5 * (own_sigma[tail] + own_sigma[head])
     cosine = np.abs((mean * rays[tail]).sum(axis=-1))

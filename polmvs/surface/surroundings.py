@@ -513,7 +513,7 @@ def stereo_view(
     view = phase_map.view
     shape = view.camera.height // stride_px, view.camera.width // stride_px
     xy = lattice_xy(*shape, stride_px)
-    rays = view.camera.rays(xy) @ view.cam_from_world.rotation
+    rays = view.rays_in_world(xy)
     found = []
     for partner in partners:
         pair = rectify_pair(view, partner.view, points)

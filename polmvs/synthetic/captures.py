@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from polmvs.camera import Camera, pixel_centers
-from polmvs.geometry import RigidTransform
+from polmvs.geometry import RigidTransform, unit
 from polmvs.scene import View
-from polmvs.synthetic.surfaces import Cylinder, Group, Plane, Sphere, Surface, unit
+from polmvs.synthetic.surfaces import Cylinder, Group, Plane, Sphere, Surface
 
 __all__ = [
     "Cylinder",

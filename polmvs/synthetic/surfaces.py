@@ -9,6 +9,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from polmvs.geometry import unit
+
 Array: TypeAlias = NDArray[np.float64]
 
 MIN_DISTANCE = 1e-9
@@ -119,13 +121,6 @@ class Group:
             np.take_along_axis(distances, nearest, axis=0)[0],
             np.take_along_axis(normals, nearest[..., None], axis=0)[0],
         )
-
-
-def unit(vectors: ArrayLike) -> Array:
-    """Vectors ``(..., 3)`` scaled to unit length; NaN where they have none."""
-    array = np.asarray(vectors, np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(array / np.linalg.norm(array, axis=-1, keepdims=True))
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -11,11 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import result_of
 
 from polmvs.colmap.models import read_model, write_model
 from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud
-from polmvs.pipeline.stages import capture as stages
+from polmvs.pipeline.stages.images import write_images
 from polmvs.polarization.capture import open_capture
 from polmvs.scene import PointKind, Tracks
 
@@ -229,7 +230,7 @@ def assert_finished_but_empty(out: Path) -> None:
     assert not (cloud.scalars.get("kind", np.ones(0)) == PointKind.SURFACE).any()
     record = json.loads((out / "run.json").read_text())
     assert record["finished"] is True
-    assert record["results"]["num_points_ppa"] == 0
+    assert result_of(out, "densify_ppa")["num_points"] == 0
 
 
 def test_no_polarised_region(cli, demo_run: Path, demo_capture: Path, tmp_path: Path) -> None:
@@ -294,8 +295,7 @@ def test_masks_are_honoured(cli, demo_run: Path, demo_capture: Path, tmp_path: P
     flags = ("--sparse", demo_run / "sparse", "--mask", masks)
     status, _, _ = cli("reconstruct", demo_capture, out, *flags, "--stride-px", 8)
     assert status == 0
-    results = json.loads((out / "run.json").read_text())["results"]
-    assert results["num_region_px"] == expected
+    assert result_of(out, "maps")["num_region_px"] == expected
 
 
 def test_ground_truth_that_is_none(fails, demo_capture: Path, tmp_path: Path) -> None:
@@ -359,7 +359,7 @@ def test_overwrite_loses_nothing_to_bad_input(cli, demo_run: Path, demo_capture:
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--gamma", "2"), "--gamma is 2.0 but the finished stage 'capture'"),
+        (("--gamma", "2"), "--gamma is 2.0 but the finished stage 'images'"),
         (("--intrinsics", "400,400,230,190"), "--intrinsics is 400.0,400.0,230.0,190.0 but"),
         (("--min-dolp", "0.2"), "--min-dolp is 0.2 but the finished stage 'maps'"),
         (("--stride-px", "4"), "--stride-px is 4 but the finished stage 'densify_opa'"),
@@ -406,8 +406,8 @@ def test_stages_alone_out_of_order(cli, demo_run: Path, demo_capture: Path, tmp_
     (out / "run.json").write_text(json.dumps(record))
     status, _, err = cli("densify", demo_capture, out)
     assert status == 1
-    assert "its stage 'normals' is not finished" in err
-    assert "Run 'polmvs normals' first" in err
+    assert "its stage 'poses' is not finished, which 'densify_ppa' reads" in err
+    assert "Run 'polmvs sfm' first" in err
     status, _, err = cli("normals", demo_capture, out)
     assert status == 1
     assert "Run 'polmvs sfm' first" in err
@@ -503,7 +503,7 @@ def test_errors_of_workers_arrive_whole(capture: Path, tmp_path: Path) -> None:
 
     found = open_capture(capture)
     (capture / "2.png").write_text("no image")
-    workspace = stages.Workspace(tmp_path / "out")
+    (tmp_path / "out").mkdir()
     with Workers(2) as workers, pytest.raises(DataError, match=r"2\.png: is not a readable image"):
-        stages.write_images(found, workspace, workers=workers, report=lambda count: None)
+        write_images(found, tmp_path / "out" / "images", workers=workers)
     assert not (tmp_path / "out" / "images").exists()

@@ -4,12 +4,19 @@ import sys
 from pathlib import Path
 
 import pytest
+from polmvs.cli.parsers import build_parser
 
 import polmvs
 from polmvs.cli.flags import GROUPS, options_from, run_options
-from polmvs.cli.parsers import build_parser
-from polmvs.config import AngleModel, Contour, Options, RunOptions
-from polmvs.option_values import describe_fields, from_plain, to_plain
+from polmvs.config import (
+    AngleModel,
+    Contour,
+    Options,
+    RunOptions,
+    describe_fields,
+    from_plain,
+    to_plain,
+)
 from polmvs.pipeline.jobs import COMPARED
 
 COMMANDS = ("demo", "reconstruct", "compare", "evaluate", "sfm", "normals", "densify", "plane")

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from polmvs.camera import PinholeCamera
 from polmvs.errors import DataError
-from polmvs.evaluation.map_errors import map_errors
+from polmvs.evaluation.map_errors import lattice_errors, map_errors
 from polmvs.evaluation.tables import summary_text
-from polmvs.geometry import RigidTransform
+from polmvs.geometry import RigidTransform, SimilarityTransform
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView, lattice_xy
@@ -119,6 +119,31 @@ def test_an_offset_of_the_range_in_units_of_its_sigma(plane: ExactTruth, offset_
     assert errors.depth_within_1mm == (abs(offset_m) < 1e-3)
     assert errors.normals.mean_deg < 1e-4
     assert errors.coverage == 1
+
+
+def test_errors_of_one_view_lie_where_they_arise(plane: ExactTruth) -> None:
+    view, same = VIEWS[0], SimilarityTransform(1.0, np.eye(3), np.zeros(3))
+    dense = dense_of(PLANE, view)
+    dense = replace(dense, normals_in_world=(dense.normals_in_world @ ROTATION).astype(np.float32))
+    moved = dense.range_map.copy()
+    moved[20:24, 30:40] += np.float32(0.003)
+    moved[26:30, 30:40] = 0
+    errors = lattice_errors(view, replace(dense, range_map=moved), plane, same)
+    z = CAMERA.rays(dense.lattice_xy())[..., 2]
+    np.testing.assert_allclose(errors.depth_m[20:24, 30:40], 0.003 * z[20:24, 30:40], atol=1e-6)
+    assert np.isnan(errors.depth_m[26:30, 30:40]).all()
+    assert not errors.known[26:30, 30:40].any()
+    elsewhere = errors.on_part & errors.known
+    elsewhere[20:24, 30:40] = False
+    assert np.abs(errors.depth_m[elsewhere]).max() < 1e-6
+    assert errors.normal_deg[elsewhere].max() < 0.01
+    np.testing.assert_allclose(errors.sigma_m[elsewhere], 1e-3 * z[elsewhere], rtol=1e-5)
+    assert np.isnan(errors.depth_m[~errors.on_part]).all()
+    assert not (errors.on_part & errors.off_part).any()
+    nothing = lattice_errors(view, None, plane, same, stride_px=2)
+    np.testing.assert_array_equal(nothing.on_part, errors.on_part)
+    assert not nothing.known.any()
+    assert np.isnan(nothing.depth_m).all()
 
 
 def test_turned_normals(plane: ExactTruth) -> None:

@@ -10,7 +10,6 @@ from polmvs.evaluation.metrics import (
     angular_errors_deg,
     axial_errors_deg,
     evaluate_cloud,
-    phase_errors,
 )
 
 Array = NDArray[np.float64]
@@ -148,7 +147,8 @@ def test_axial_errors_ignore_multiples_of_pi() -> None:
     phases = np.radians([0.0, 179.0, 1.0, 90.0, 400.0])
     truth = np.radians([180.0, 1.0, 179.0, 0.0, 30.0])
     np.testing.assert_allclose(axial_errors_deg(phases, truth), [0, 2, 2, 90, 10], atol=1e-9)
-    stats = phase_errors(np.append(phases, np.nan), np.append(truth, 0.0))
+    errors = axial_errors_deg(np.append(phases, np.nan), np.append(truth, 0.0))
+    stats = AngleStats.from_degrees(errors)
     assert stats.count == 5
     assert stats.median_deg == pytest.approx(2.0)
 

@@ -156,11 +156,11 @@ def test_phase_made_by_a_model_fits_that_model_only(truth: GroundTruth) -> None:
     rays = camera.rays(pixel_centers(camera.width, camera.height))
     phase = phase_from_normal(AngleModel.PPA, truth.normals(name), rays) + np.radians(1.0)
     dolp = np.where(np.arange(camera.width) < camera.width // 2, 0.5, 0.05) * np.ones(phase.shape)
-    errors = phase_errors_on_part({name: phase, "strange.png": phase}, {name: dolp}, truth)
+    errors = phase_errors_on_part([(name, phase, dolp), ("strange.png", phase, dolp)], truth)
     assert errors[AngleModel.PPA].median_deg == pytest.approx(1.0, abs=0.01)
     assert errors[AngleModel.PPA].count == (truth.mask(name) & (dolp > 0.1)).sum()
     assert errors[AngleModel.OPA].mean_deg > 3.0
-    empty = phase_errors_on_part({name: phase}, {name: 0 * dolp}, truth)
+    empty = phase_errors_on_part([(name, phase, 0 * dolp)], truth)
     assert empty[AngleModel.OPA].count == 0
     with pytest.raises(ValueError, match=r"phase\.shape"):
-        phase_errors_on_part({name: phase[1:]}, {name: dolp}, truth)
+        phase_errors_on_part([(name, phase[1:], dolp)], truth)

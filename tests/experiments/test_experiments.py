@@ -16,15 +16,25 @@ from polmvs.cli.flags import Parser
 from polmvs.config import AngleModel, Light, RegionOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.experiments import command, output
-from polmvs.experiments.contours import Lines, edge_seeds, measure_contours, pool_lines
+from polmvs.experiments.contours import (
+    Lines,
+    PlaneSurface,
+    SampledSurface,
+    edge_seeds,
+    line_set_bytes,
+    measure_contours,
+    pool_lines,
+)
 from polmvs.experiments.data import Scene, load_view, open_scene
-from polmvs.experiments.lines_io import line_set_bytes
-from polmvs.experiments.phase import measure_phase, phase_images
+from polmvs.experiments.phase import ErrorTally, measure_phase, phase_images
 from polmvs.experiments.plane import measure_plane
-from polmvs.experiments.statistics import ErrorTally
-from polmvs.experiments.surfaces import PlaneSurface, SampledSurface
-from polmvs.experiments.tracks import TrackOptions, measure_tracks
-from polmvs.experiments.view_choice import check_k, order_at_random, order_by_angle
+from polmvs.experiments.tracks import (
+    TrackOptions,
+    check_k,
+    measure_tracks,
+    order_at_random,
+    order_by_angle,
+)
 from polmvs.io.clouds import _open3d
 from polmvs.io.images import write_png
 from polmvs.parallel import Workers

@@ -10,16 +10,10 @@ import pytest
 from polmvs.camera import PinholeCamera
 from polmvs.config import RegionOptions
 from polmvs.errors import DataError
-from polmvs.experiments.data import open_scene
+from polmvs.experiments.contours import PlaneSurface, open_surface
+from polmvs.experiments.data import open_author_capture, open_scene
 from polmvs.experiments.phase import measure_phase
-from polmvs.experiments.surfaces import PlaneSurface, open_surface
-from polmvs.io.layouts import (
-    is_author_layout,
-    open_author_capture,
-    read_camera_text,
-    read_dmb,
-    write_dmb,
-)
+from polmvs.io.layouts import is_author_layout, read_camera_text, read_dmb, write_dmb
 from polmvs.parallel import Workers
 from polmvs.synthetic.captures import Plane, render_mosaic, render_view, ring_of_views
 

@@ -12,18 +12,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import cut_after, record_of, result_of, stages_of
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Options, PropagationOptions, RunOptions, SfmOptions
+from polmvs.config import Options, PropagationOptions, RunOptions, SfmOptions
 from polmvs.io.clouds import read_cloud
 from polmvs.pipeline.jobs import COMPARED, Job, reconstruct
-from polmvs.pipeline.run_folder import RunFolder
 from polmvs.scene import PointKind
 
-OTHERS = [model for model in COMPARED if model is not AngleModel.PPA]
-NORMAL_STAGES = ["normals", "parts", *[f"normals_{model}" for model in OTHERS]]
-BEFORE_CLOUDS = ["capture", "sfm", "maps", *NORMAL_STAGES]
-STAGES = [*BEFORE_CLOUDS, *[f"densify_{model}" for model in COMPARED], "evaluate"]
+BEFORE_CLOUDS = [
+    *("images", "poses", "maps", "maps_tilted"),
+    *(f"normals_{model}" for model in COMPARED),
+    "seeds",
+    *(f"sparse_cloud_{model}" for model in COMPARED),
+]
+STAGES = [*BEFORE_CLOUDS, *[f"densify_{model}" for model in COMPARED], "evaluation"]
 RESULTS = ("normals.ply", "normals_opa.ply", "opa.ply", "ppa.ply", "metrics.json")
 
 
@@ -60,8 +63,9 @@ def test_run_record(demo_run: Path) -> None:
     assert record["options"]["sfm"]["intrinsics"][0] == pytest.approx(333.75)
     assert record["options"]["fusion"]["min_views"] == 2
     assert {"python", "numpy", "pycolmap", "open3d", "polmvs"} <= set(record["versions"])
-    assert record["results"]["num_views"] == 10
-    assert record["results"]["unregistered"] == []
+    assert record["schema_version"] == 2
+    poses = result_of(demo_run, "poses")
+    assert (poses["num_views"], poses["unregistered"]) == (10, [])
     assert record["command_line"][:2] == ["polmvs", "demo"]
     assert record["finished"] is True
 
@@ -127,18 +131,20 @@ def test_sparse_normals_carry_their_quality(demo_run: Path) -> None:
 def test_library_and_one_worker_give_the_same_cloud(
     demo_run: Path, demo_capture: Path, tmp_path: Path
 ) -> None:
-    before = RunFolder(demo_run).load()
-    intrinsics = tuple(before.options["sfm"]["intrinsics"])
+    intrinsics = tuple(record_of(demo_run)["options"]["sfm"]["intrinsics"])
     options = Options(sfm=SfmOptions(intrinsics=intrinsics, sparse=demo_run / "sparse"))
     job = Job(
-        capture=demo_capture, out=tmp_path / "out", options=options, how=RunOptions(workers=1)
+        capture=demo_capture,
+        out=tmp_path / "out",
+        options=options,
+        run_options=RunOptions(workers=1),
     )
     outcome = reconstruct(job)
     assert outcome.empty is None
     first, again = read_cloud(demo_run / "ppa.ply"), read_cloud(tmp_path / "out" / "ppa.ply")
     # The model is written anew from its views and tracks: the last digits differ.
     assert len(again.points) == pytest.approx(len(first.points), rel=0.01)
-    before_cloud = ["capture", "sparse", "maps", "normals", "parts"]
+    before_cloud = ["images", "poses", "maps", "normals_ppa", "seeds", "sparse_cloud_ppa"]
     assert stages_of(tmp_path / "out") == [*before_cloud, "densify_ppa", "mesh_ppa", "dense_ppa"]
 
 
@@ -185,31 +191,24 @@ def wait_until(holds, process: subprocess.Popen[str], timeout_s: float = 60) -> 
         time.sleep(0.02)
 
 
-def stages_of(out: Path) -> list[str]:
-    return [stage.name for stage in RunFolder(out).load().stages]
-
-
 def copy_until(demo_run: Path, out: Path, last: str) -> None:
     """A run that was stopped after this stage."""
     shutil.copytree(demo_run, out)
-    record = json.loads((out / "run.json").read_text())
-    record["stages"] = record["stages"][: STAGES.index(last) + 1]
-    record["finished"] = False
-    (out / "run.json").write_text(json.dumps(record))
+    cut_after(out, last)
 
 
 def test_killed_run_goes_on_to_the_same_result(demo_run: Path, tmp_path: Path, cli) -> None:
     """Killed twice, in SfM and while it densifies; each time the finished stages stay."""
     out = tmp_path / "out"
     process = start(out)
-    wait_until((out / ".sfm.tmp").exists, process)
+    wait_until((out / ".sparse.tmp").exists, process)
     time.sleep(0.5)
     kill(process)
     assert not (out / "sparse").exists()
-    assert stages_of(out) == ["capture"]
+    assert stages_of(out) == ["images"]
 
     process = start(out, "--resume")
-    wait_until((out / ".densify_opa.tmp").exists, process)
+    wait_until((out / ".views_opa.tmp").exists, process)
     kill(process)
     assert not (out / "opa.ply").exists()
     assert stages_of(out) == BEFORE_CLOUDS
@@ -226,7 +225,7 @@ def test_interrupt_keeps_finished_stages_only(demo_run: Path, tmp_path: Path, nu
     out = tmp_path / "out"
     copy_until(demo_run, out, BEFORE_CLOUDS[-1])
     process = start(out, "--resume")
-    wait_until((out / ".densify_opa.tmp").exists, process)
+    wait_until((out / ".views_opa.tmp").exists, process)
     process.send_signal(number)
     stdout, stderr = process.communicate(timeout=60)
     assert process.returncode == 130
@@ -240,10 +239,11 @@ def test_stages_alone_give_the_same_result(
     demo_run: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:
     out = tmp_path / "out"
-    copy_until(demo_run, out, "sfm")
+    copy_until(demo_run, out, "poses")
     for name in RESULTS:
         (out / name).unlink()
     shutil.rmtree(out / "maps")
+    shutil.rmtree(out / "tracks")
     status, text, err = cli("normals", demo_capture, out)
     assert (status, err) == (0, "")
     assert "are seeds" in text
@@ -293,7 +293,7 @@ def test_new_truth_is_measured_on_a_finished_run(
 
 def test_paper_contours_work_too(demo_run: Path, demo_capture: Path, tmp_path: Path, cli) -> None:
     out = tmp_path / "out"
-    copy_until(demo_run, out, "parts")
+    copy_until(demo_run, out, "sparse_cloud_ppa")
     args = ("--method", "contour", "--contour", "normals")
     status, _, err = cli("densify", demo_capture, out, *args)
     assert (status, err) == (0, "")

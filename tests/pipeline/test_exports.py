@@ -8,8 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 from dense_scenes import fuse
-from helpers import content_of, cut_after, record_of, refused, stages_of
-from polmvs.pipeline.own_files import DENSE_MARKER
+from helpers import content_of, cut_after, record_of, refused, result_of, stages_of
 from scipy.spatial import cKDTree
 
 from polmvs.cli import main
@@ -24,6 +23,7 @@ from polmvs.colmap.models import read_model, write_model
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.clouds import read_cloud, read_mesh
 from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
+from polmvs.pipeline.run_folder import DENSE_MARKER
 from polmvs.poses.metric_frame import transform_model
 from polmvs.scene import PointKind
 from polmvs.surface.kept_depth import kept_cloud
@@ -98,17 +98,18 @@ def heights(points: np.ndarray) -> np.ndarray:
 def test_files_and_their_record(run: Path) -> None:
     names = {path.name for path in run.iterdir()}
     assert {"ppa.ply", "ppa_mesh.ply", "dense", "normals.ply", "run.json"} <= names
-    record = record_of(run)
     assert stages_of(run)[-3:] == ["densify_ppa", "mesh_ppa", "dense_ppa"]
-    assert Path(record["results"]["dense_ppa"]) == run / "dense"
-    assert record["results"]["num_triangles_ppa"] == len(read_mesh(run / "ppa_mesh.ply").triangles)
+    assert Path(result_of(run, "dense_ppa")["folder"]) == run / "dense"
+    assert result_of(run, "mesh_ppa")["num_triangles"] == len(
+        read_mesh(run / "ppa_mesh.ply").triangles
+    )
 
 
 def test_kinds_of_the_cloud(run: Path, truth: GroundTruth) -> None:
     cloud = read_cloud(run / "ppa.ply")
-    kinds, results = cloud.scalars["kind"], record_of(run)["results"]
-    assert (kinds == PointKind.SURFACE).sum() == results["num_points_ppa"] > 10_000
-    assert (kinds == PointKind.SPARSE).sum() == results["num_surroundings_ppa"] > 500
+    kinds, found = cloud.scalars["kind"], result_of(run, "densify_ppa")
+    assert (kinds == PointKind.SURFACE).sum() == found["num_points"] > 10_000
+    assert (kinds == PointKind.SPARSE).sum() == found["num_surroundings"] > 500
     assert np.quantile(heights(surface_of(cloud)), 0.99) < TOLERANCE_M
     true = truth.surface_points()
     distance = cKDTree(true.points).query(cloud.points[kinds == PointKind.SPARSE])[0]
@@ -180,7 +181,7 @@ def test_export_alone(go_on: Continue, run: Path, demo_capture: Path, cli) -> No
 
 
 def test_export_before_the_cloud(run: Path, demo_capture: Path, tmp_path: Path, cli) -> None:
-    out = stopped(run, tmp_path / "out", "parts")
+    out = stopped(run, tmp_path / "out", "sparse_cloud_ppa")
     err = refused(cli("export", demo_capture, out))
     assert "Run 'polmvs densify' first" in err
 
@@ -225,7 +226,9 @@ def test_mesh_of_what_is_no_cloud(tmp_path: Path, cli) -> None:
 
 def test_voxel_in_metres_thins(go_on: Continue, run: Path) -> None:
     voxel = 0.01
-    points = surface_of(read_cloud(go_on("parts", "densify", "--voxel", voxel) / "ppa.ply"))
+    points = surface_of(
+        read_cloud(go_on("sparse_cloud_ppa", "densify", "--voxel", voxel) / "ppa.ply")
+    )
     before = surface_of(read_cloud(run / "ppa.ply"))
     cells = len(np.unique(np.floor(before / voxel), axis=0))
     assert 0.5 * cells < len(points) < 1.5 * cells
@@ -233,7 +236,7 @@ def test_voxel_in_metres_thins(go_on: Continue, run: Path) -> None:
 
 
 def test_more_views_must_agree(go_on: Continue, run: Path) -> None:
-    cloud = read_cloud(go_on("parts", "densify", "--min-views", 6) / "ppa.ply")
+    cloud = read_cloud(go_on("sparse_cloud_ppa", "densify", "--min-views", 6) / "ppa.ply")
     on_surface = cloud.scalars["kind"] == PointKind.SURFACE
     assert cloud.scalars["num_views"][on_surface].min() >= 6
     before = read_cloud(run / "ppa.ply")
@@ -243,17 +246,17 @@ def test_more_views_must_agree(go_on: Continue, run: Path) -> None:
 
 
 def test_no_surroundings(go_on: Continue, run: Path) -> None:
-    cloud = read_cloud(go_on("parts", "densify", "--surroundings", "none") / "ppa.ply")
+    cloud = read_cloud(go_on("sparse_cloud_ppa", "densify", "--surroundings", "none") / "ppa.ply")
     assert set(cloud.scalars["kind"]) == {PointKind.SURFACE}
-    assert len(cloud.points) == record_of(run)["results"]["num_points_ppa"]
+    assert len(cloud.points) == result_of(run, "densify_ppa")["num_points"]
 
 
 def test_surroundings_by_stereo(go_on: Continue, run: Path, truth: GroundTruth) -> None:
-    cloud = read_cloud(go_on("parts", "densify", "--surroundings", "stereo") / "ppa.ply")
+    cloud = read_cloud(go_on("sparse_cloud_ppa", "densify", "--surroundings", "stereo") / "ppa.ply")
     kinds = cloud.scalars["kind"]
     assert set(kinds) == {PointKind.SURFACE, PointKind.STEREO}
     around = cloud.points[kinds == PointKind.STEREO]
-    assert len(around) > 3 * record_of(run)["results"]["num_surroundings_ppa"]
+    assert len(around) > 3 * result_of(run, "densify_ppa")["num_surroundings"]
     true = truth.surface_points()
     distance = cKDTree(true.points).query(around)[0]
     assert np.median(distance) < OTHER_SPACING_M
@@ -380,7 +383,7 @@ def test_in_place_changes_the_workspace_and_keeps_a_backup(
     assert not (out / "dense").exists()
     assert_filled(open_dense_workspace(own), open_dense_workspace(given))
     backup = own / "stereo.polmvs-backup-1"
-    assert record_of(out)["results"]["backup_ppa"] == str(backup)
+    assert result_of(out, "dense_ppa")["backup"] == str(backup)
     saved = {f"stereo/{name}": content for name, content in content_of(backup).items()}
     after = content_of(own)
     changed = {name for name in before if after.get(name) != before[name]}
@@ -494,4 +497,4 @@ def test_images_of_another_capture(
     assert f"{own / 'images' / '000.png'}: undistorted images do not match" in err
     assert content_of(own) == before
     assert not (out / "ppa.ply").exists()
-    assert stages_of(out)[-1] == "parts"
+    assert stages_of(out)[-1] == "sparse_cloud_ppa"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import cut_after, record_of, refused, stages_of
+from helpers import cut_after, record_of, refused, result_of, stages_of
 
 from polmvs.colmap.models import read_model
 from polmvs.io.ground_truth import open_ground_truth
@@ -22,7 +22,7 @@ def out(demo_run: Path, tmp_path: Path) -> Path:
     folder.mkdir()
     shutil.copytree(demo_run / "images", folder / "images")
     shutil.copy(demo_run / "run.json", folder)
-    cut_after(folder, "capture")
+    cut_after(folder, "images")
     return folder
 
 
@@ -90,9 +90,7 @@ def test_reference_brings_the_model_into_the_true_frame(
     assert (status, err) == (0, "")
     assert "10 of 10 views" in text
     assert center_errors_m(out, true_centers).max() < CENTER_TOLERANCE_M
-    results = record_of(out)["results"]
-    assert results["unit"] == "m"
-    frame = results["frame"]
+    frame = result_of(out, "poses")["frame"]
     assert (frame["source"], frame["num_used"], frame["dropped"]) == ("reference", 10, [])
     ends = ("000.png", "004.png")
     ratio = distance_in(out / "sparse", *ends) / distance_in(demo_run / "sparse", *ends)
@@ -117,7 +115,7 @@ def test_reference_as_text_by_stem_and_with_one_that_is_wrong(
     status, _, err = take_poses("--reference", write_lines(tmp_path / "cameras.txt", centers))
     assert (status, err) == (0, "")
     assert center_errors_m(out, true_centers).max() < CENTER_TOLERANCE_M
-    frame = record_of(out)["results"]["frame"]
+    frame = result_of(out, "poses")["frame"]
     assert (frame["source"], frame["dropped"]) == ("reference", ["003.png"])
 
 
@@ -136,7 +134,7 @@ def test_reference_of_too_few_cameras(take_poses, out: Path, tmp_path: Path, tru
     err = refused(take_poses("--reference", write_lines(tmp_path / "two.txt", two)))
     assert "two.txt: knows 2 of the 10 reconstructed images by name, 3 are needed" in err
     assert not (out / "sparse").exists()
-    assert stages_of(out) == ["capture"]
+    assert stages_of(out) == ["images"]
 
 
 def test_reference_of_other_names(take_poses, tmp_path: Path, true_centers) -> None:
@@ -187,8 +185,7 @@ def test_scale_from_the_distance_of_two_cameras(take_poses, out: Path, demo_run:
     status, _, err = take_poses("--scale", "000", "004.png", 0.25)
     assert (status, err) == (0, "")
     assert distance_in(out / "sparse", "000.png", "004.png") == pytest.approx(0.25, rel=1e-9)
-    results = record_of(out)["results"]
-    assert (results["unit"], results["frame"]["source"]) == ("m", "scale")
+    assert result_of(out, "poses")["frame"]["source"] == "scale"
     # The axes stay: only the unit changes.
     before = {view.name: view for view in read_model(demo_run / "sparse").views}
     for view in read_model(out / "sparse").views:
@@ -198,8 +195,7 @@ def test_scale_from_the_distance_of_two_cameras(take_poses, out: Path, demo_run:
 
 def test_without_a_source_the_model_stays(take_poses, out: Path, demo_run: Path) -> None:
     assert take_poses()[0] == 0
-    results = record_of(out)["results"]
-    assert (results["unit"], results["frame"]) == ("model unit", None)
+    assert result_of(out, "poses")["frame"] is None
     ends = ("000.png", "004.png")
     expected = distance_in(demo_run / "sparse", *ends)
     assert distance_in(out / "sparse", *ends) == pytest.approx(expected, rel=1e-9)
@@ -211,7 +207,7 @@ def test_agreeing_scale_is_recorded(
     distance = np.linalg.norm(true_centers["000.png"] - true_centers["004.png"])
     flags = ("--reference", cameras_file(demo_capture), "--scale", "000.png", "004.png", distance)
     assert take_poses(*flags)[0] == 0
-    frame = record_of(out)["results"]["frame"]
+    frame = result_of(out, "poses")["frame"]
     assert frame["checked_by"]["scale"] == pytest.approx(frame["scale"], rel=0.005)
 
 

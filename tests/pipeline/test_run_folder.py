@@ -1,49 +1,129 @@
 import json
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
-from polmvs.pipeline.runtime import peak_rss_mb, versions
 
 from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError
-from polmvs.pipeline.checks import followers
-from polmvs.pipeline.record import Record, StageRecord, write_json
-from polmvs.pipeline.run_folder import RunFolder, has_content, prepare_output, require_apart
+from polmvs.io.typed_json import write_json
+from polmvs.pipeline import checks
+from polmvs.pipeline.record import (
+    Record,
+    StageRecord,
+    peak_rss_mb,
+    read_options,
+    versions,
+    write_record,
+)
+from polmvs.pipeline.run_folder import RunFolder, discard, has_content, replacing
+from polmvs.pipeline.runner import load_record, prepare_output
+from polmvs.pipeline.stage_table import written_names
+from polmvs.pipeline.stages.images import ImagesResult
 
 
 def finished_run(root: Path) -> RunFolder:
     """An output folder with one file of each kind."""
-    workspace = RunFolder(root)
+    run_folder = RunFolder(root)
     for folder, name in (("images", "a.png"), ("sparse", "cameras.bin"), ("maps", "a.npy")):
         (root / folder).mkdir(parents=True)
         (root / folder / name).write_bytes(b"x")
     for model in AngleModel:
-        workspace.cloud(model).write_bytes(b"x")
-        workspace.normals(model).write_bytes(b"x")
-    workspace.metrics.write_text("{}")
-    workspace.save(
-        Record(images=["a.png"], stages=[StageRecord(name="sfm", seconds=1.0, peak_rss_mb=2.0)])
+        run_folder.cloud(model).write_bytes(b"x")
+        run_folder.sparse_cloud(model).write_bytes(b"x")
+    run_folder.metrics.write_text("{}")
+    stage = StageRecord(
+        name="images",
+        options={"capture.gamma": 1.0},
+        seconds=1.0,
+        peak_rss_mb=2.0,
+        result=ImagesResult(num_images=1),
     )
-    return workspace
+    write_record(run_folder, Record(images=("a.png",), stages=(stage,), options={"sfm": {}}))
+    return run_folder
+
+
+def require_apart(run_folder: RunFolder, *, capture: Path, others: Sequence[Path]) -> None:
+    checks.require_apart(run_folder, capture=capture, others=others, written=written_names())
 
 
 def test_record_survives_writing_and_reading(tmp_path: Path) -> None:
-    workspace = finished_run(tmp_path)
-    record = workspace.load()
-    assert record.images == ["a.png"]
-    assert record.is_done("sparse", "sfm")
-    assert not record.is_done("maps")
-    record.forget(["sfm"])
-    assert record.stages == []
+    run_folder = finished_run(tmp_path)
+    record = load_record(run_folder)
+    assert record.images == ("a.png",)
+    assert record.stage("maps") is None
+    assert record.result(ImagesResult) == ImagesResult(num_images=1)
+    write_record(run_folder, record)
+    assert load_record(run_folder) == record
+    assert read_options(run_folder) == {"sfm": {}}
+    record.forget(["images"])
+    assert record.stages == ()
+    assert record.find(ImagesResult) is None
+    with pytest.raises(KeyError, match="no stage with a ImagesResult"):
+        record.result(ImagesResult)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"stages": 3}', '{"stages": [], "x": 1}', "\0"])
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"stages": 3}', '{"schema_version": 2, "stages": []}', "\0"]
+)
 def test_damaged_record_is_one_clear_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(DataError, match=r"run\.json: is no record of a run"):
-        RunFolder(tmp_path).load()
+        load_record(RunFolder(tmp_path))
+
+
+def test_run_of_the_version_before_is_refused_by_name_and_version(tmp_path: Path) -> None:
+    """Not misread: its stages have other names, and its seeds lie elsewhere."""
+    run_folder = finished_run(tmp_path)
+    stage = {"name": "sfm", "seconds": 1.0, "peak_rss_mb": 2.0}
+    content = {
+        "capture": {"folder": "c", "width": 4, "height": 4, "bytes": {}},
+        "images": ["a.png"],
+        "stages": [stage],
+        "stage_options": {"sfm": {}},
+        "results": {"num_views": 3},
+        "versions": {"polmvs": "0.1.0"},
+    }
+    run_folder.run_file.write_text(json.dumps(content))
+    message = (
+        rf"{tmp_path}: holds a run of polmvs 0\.1\.0, whose run\.json has schema version 1; this "
+        r"is polmvs .*, which reads version 2 .*Give another OUT, or --overwrite to delete that run"
+    )
+    with pytest.raises(DataError, match=message):
+        prepare_output(run_folder, overwrite=False, resume=True)
+    with pytest.raises(DataError, match=message):
+        read_options(run_folder)
+    content["schema_version"] = 3
+    run_folder.run_file.write_text(json.dumps(content))
+    with pytest.raises(DataError, match="has schema version 3"):
+        load_record(run_folder)
+    assert prepare_output(run_folder, overwrite=True, resume=False) == Record()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: r["stages"][0].update(name="soup"), "stage 'soup' is unknown"),
+        (lambda r: r["stages"][0].update(seconds="1"), r"stages\[0\]\.seconds cannot be '1'"),
+        (lambda r: r["stages"][0].pop("reads"), r"stages\[0\] lacks 'reads'"),
+        (lambda r: r["stages"][0].update(angle_model="best"), "'best' is not a valid AngleModel"),
+        (
+            lambda r: r["stages"][0]["result"].update(num_images=1.5),
+            r"images\.result\.num_images cannot be '1\.5'",
+        ),
+        (lambda r: r.update(colour="red"), "unknown key 'colour'"),
+    ],
+)
+def test_record_is_read_strictly(tmp_path: Path, change, message: str) -> None:
+    run_folder = finished_run(tmp_path)
+    content = json.loads(run_folder.run_file.read_text())
+    change(content)
+    run_folder.run_file.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=rf"run\.json: is no record of a run \(.*{message}"):
+        load_record(run_folder)
 
 
 def test_json_has_null_for_what_is_no_number(tmp_path: Path) -> None:
@@ -57,37 +137,37 @@ def test_json_has_null_for_what_is_no_number(tmp_path: Path) -> None:
 
 def test_new_and_empty_folders_are_taken(tmp_path: Path) -> None:
     for root in (tmp_path / "new" / "deep", tmp_path / "empty"):
-        workspace = RunFolder(root)
+        run_folder = RunFolder(root)
         assert not has_content(root)
-        assert prepare_output(workspace, overwrite=False, resume=False) == Record()
+        assert prepare_output(run_folder, overwrite=False, resume=False) == Record()
         assert root.is_dir()
 
 
 def test_occupied_folder_is_refused(tmp_path: Path) -> None:
-    workspace = finished_run(tmp_path)
+    run_folder = finished_run(tmp_path)
     with pytest.raises(OptionError, match=r"--overwrite .*--resume"):
-        prepare_output(workspace, overwrite=False, resume=False)
-    assert workspace.cloud(AngleModel.PPA).exists()
+        prepare_output(run_folder, overwrite=False, resume=False)
+    assert run_folder.cloud(AngleModel.PPA).exists()
 
 
 def test_overwrite_deletes_results_only(tmp_path: Path) -> None:
-    workspace = finished_run(tmp_path)
+    run_folder = finished_run(tmp_path)
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "photos").mkdir()
     (tmp_path / ".sfm.tmp").mkdir()
-    assert prepare_output(workspace, overwrite=True, resume=False) == Record()
+    assert prepare_output(run_folder, overwrite=True, resume=False) == Record()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.txt", "photos"]
 
 
 @pytest.mark.parametrize("foreign", ["images/mine.png", "sparse/notes.txt", "maps/sub/a.npy"])
 def test_overwrite_deletes_nothing_where_foreign_files_lie(tmp_path: Path, foreign: str) -> None:
-    workspace = finished_run(tmp_path)
+    run_folder = finished_run(tmp_path)
     path = tmp_path / foreign
     path.parent.mkdir(exist_ok=True)
     path.write_text("mine")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(DataError, match="was not written by polmvs"):
-        prepare_output(workspace, overwrite=True, resume=False)
+        prepare_output(run_folder, overwrite=True, resume=False)
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -101,25 +181,25 @@ def test_overwrite_needs_the_record_of_a_run(tmp_path: Path) -> None:
 
 
 def test_linked_folder_is_not_emptied(tmp_path: Path) -> None:
-    workspace = finished_run(tmp_path / "out")
+    run_folder = finished_run(tmp_path / "out")
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "points3D.bin").write_bytes(b"x")
-    (workspace.sparse / "cameras.bin").unlink()
-    workspace.sparse.rmdir()
-    workspace.sparse.symlink_to(tmp_path / "elsewhere")
+    (run_folder.sparse / "cameras.bin").unlink()
+    run_folder.sparse.rmdir()
+    run_folder.sparse.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(DataError, match="was not written by polmvs"):
-        prepare_output(workspace, overwrite=True, resume=False)
+        prepare_output(run_folder, overwrite=True, resume=False)
     assert (tmp_path / "elsewhere" / "points3D.bin").exists()
 
 
 def test_resume_keeps_results_and_clears_what_is_half_done(tmp_path: Path) -> None:
-    workspace = finished_run(tmp_path)
+    run_folder = finished_run(tmp_path)
     (tmp_path / ".maps.tmp").mkdir()
     (tmp_path / ".ppa.12.tmp.ply").write_bytes(b"x")
-    record = prepare_output(workspace, overwrite=False, resume=True)
-    assert record.is_done("sfm")
+    record = prepare_output(run_folder, overwrite=False, resume=True)
+    assert record.stage("images") is not None
     assert not list(tmp_path.glob(".*"))
-    assert workspace.cloud(AngleModel.PPA).exists()
+    assert run_folder.cloud(AngleModel.PPA).exists()
 
 
 def test_resume_without_a_run_is_an_error(tmp_path: Path) -> None:
@@ -152,45 +232,32 @@ def test_input_may_not_lie_where_results_go(tmp_path: Path) -> None:
 
 
 def test_replacing_a_folder_is_whole_or_not_at_all(tmp_path: Path) -> None:
-    workspace = RunFolder(tmp_path)
-    with workspace.replacing(workspace.maps) as folder:
+    maps = tmp_path / "maps"
+    with replacing(maps) as folder:
         (folder / "a.npy").write_bytes(b"1")
-        assert not workspace.maps.exists()
-    with suppress(KeyboardInterrupt), workspace.replacing(workspace.maps) as folder:
+        assert not maps.exists()
+    with suppress(KeyboardInterrupt), replacing(maps) as folder:
         (folder / "a.npy").write_bytes(b"2")
         raise KeyboardInterrupt
-    assert (workspace.maps / "a.npy").read_bytes() == b"1"
-    with workspace.replacing(workspace.maps) as folder:
+    assert (maps / "a.npy").read_bytes() == b"1"
+    with replacing(maps) as folder:
         (folder / "b.npy").write_bytes(b"3")
     assert [path.name for path in tmp_path.rglob("*")] == ["maps", "b.npy"]
 
 
-def test_names_of_the_files_of_a_stage(tmp_path: Path) -> None:
-    workspace = RunFolder(tmp_path)
-    names = {
-        "capture": [],
-        "normals": ["normals.ply"],
-        "normals_opa": ["normals_opa.ply"],
-        "densify_opa": ["opa.ply"],
-        "evaluate": ["metrics.json", "summary.md"],
-    }
-    for stage, expected in names.items():
-        assert [path.name for path in workspace.files_of(stage)] == expected
+def test_nothing_is_discarded_where_a_foreign_file_lies(tmp_path: Path) -> None:
+    run_folder = finished_run(tmp_path)
+    paths = [run_folder.metrics, run_folder.maps(AngleModel.PPA), tmp_path / "nothing"]
+    (tmp_path / "maps" / "mine.txt").write_text("mine")
+    with pytest.raises(DataError, match=r"mine\.txt: was not written by polmvs"):
+        discard(paths)
+    assert run_folder.metrics.exists()
+    (tmp_path / "maps" / "mine.txt").unlink()
+    discard(paths)
+    assert not any(path.exists() for path in paths)
 
 
 def test_machine_facts() -> None:
     assert set(versions()) >= {"polmvs", "python", "numpy", "open3d"}
     assert "unknown" not in versions().values()
     assert 20 < peak_rss_mb() < 100_000
-
-
-def test_what_follows_a_stage_leaves_other_models_alone():
-    assert followers("mesh_ppa") == ["mesh_ppa"]
-    assert set(followers("densify_tilted")) == {
-        "densify_tilted",
-        "mesh_tilted",
-        "dense_tilted",
-        "evaluate",
-    }
-    assert {"densify_opa", "dense_ppa", "parts", "evaluate"} <= set(followers("normals"))
-    assert {"sparse", "maps"} <= set(followers("sfm"))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polmvs.io.images import read_mosaic
+from polmvs.io.raw_formats import read_raw
 from polmvs.polarization.mosaic import (
     ANGLES_DEG,
     INTERPOLATION_NOISE_GAIN,
@@ -100,7 +100,7 @@ def test_linearize():
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason=f"{SHARED} is absent")
 def test_interpolation_meets_the_redundancy_better_than_slicing():
-    raw = linearize(read_mosaic(SHARED / "board" / "raw" / "003.png"))
+    raw = linearize(read_raw(SHARED / "board" / "raw" / "003.png").samples)
     cells = raw.reshape(512, 2, 612, 2).transpose(1, 3, 0, 2).reshape(4, 512, 612)
     sliced = cells[[3, 1, 0, 2]]
     even = {}

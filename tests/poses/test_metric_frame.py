@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 import polmvs
 from polmvs.camera import PinholeCamera
 from polmvs.cli import flags
-from polmvs.config import ReferenceOptions
+from polmvs.config import ReferenceOptions, from_plain, to_plain
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform, SimilarityTransform
-from polmvs.option_values import from_plain, to_plain
 from polmvs.poses.metric_frame import (
     Frame,
     check_reference,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import CAMERA, Scene, phase_map_of
 
-from polmvs.surface.consensus import ask_view, hidden_by, surface_of_others
+from polmvs.surface.consensus import hidden_by, sight, surface_of_others
 from polmvs.surface.dense_view import SurfaceSamples, dense_view, lattice_points
 from polmvs.synthetic.captures import Plane, Sphere, render_view, ring_of_views
 
@@ -44,11 +44,11 @@ def true_view(scene, k, stride=2):
 
 
 def ask(scene, dense, away=0.0, turn=None):
-    """Opinion of the second view on the first one's true points, moved away from it."""
+    """Sighting of the second view on the first one's true points, moved away from it."""
     samples, _ = true_samples(scene, 0)
     normals = samples.normals if turn is None else samples.normals @ turn.T
     distance = np.exp(samples.log_range)
-    opinion = ask_view(
+    opinion = sight(
         scene.maps[1],
         dense,
         scene.views[0].center_in_world,
@@ -136,7 +136,7 @@ def test_outside_is_what_the_image_shows_beside_the_region():
     to_point = points - view.center_in_world
     distance = np.linalg.norm(to_point, axis=-1)
     normals = np.broadcast_to([0.0, 0.0, 1.0], (4, 3))
-    opinion = ask_view(
+    opinion = sight(
         other,
         true_view(scene, 1),
         view.center_in_world,

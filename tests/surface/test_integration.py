@@ -208,7 +208,7 @@ def test_the_same_twice(scene, dense, tmp_path):
 def test_the_plan_of_rounds():
     plan = plan_rounds(PropagationOptions(num_rounds=3, stride_px=2))
     assert [p.stride_px for p in plan] == [8, 8, 8, 4, 2]
-    assert [p.use_opinions for p in plan] == [False, False, True, True, True]
+    assert [p.use_consensus for p in plan] == [False, False, True, True, True]
     single = plan_rounds(PropagationOptions(num_rounds=1, stride_px=1))
     assert [p.stride_px for p in single] == list(REFINEMENTS)
 

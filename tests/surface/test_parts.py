@@ -12,7 +12,7 @@ from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import store_phase_map
 from polmvs.polarization.region import Region
 from polmvs.scene import Seeds
-from polmvs.surface.outlines import FAR_PX, Misfit, find_pieces, piece_nodes
+from polmvs.surface.outlines import FAR_PX, OutlineErrors, find_pieces, piece_nodes
 from polmvs.surface.parts import (
     Placement,
     contradicted,
@@ -114,7 +114,7 @@ def test_nothing_and_specks_are_no_pieces():
 def misfit_of(error, slope, view, stretch):
     none = np.zeros(0, np.int64)
     ones = np.ones(len(error))
-    return Misfit(np.array(error), np.array(slope), ones, view, stretch, none)
+    return OutlineErrors(np.array(error), np.array(slope), ones, view, stretch, none)
 
 
 def test_the_deviation_of_a_balance_does_not_shrink_with_copies_of_its_points():

@@ -18,7 +18,7 @@ from polmvs.surface.integration import (
     relax,
     spread_nodes,
     surface_at_seeds,
-    tie_opinions,
+    tie_to_consensus,
 )
 from polmvs.surface.pixel_graph import Nodes, tie_seeds
 from polmvs.synthetic.captures import render_view, ring_of_views
@@ -66,7 +66,7 @@ def moved(dense, away):
 def test_others_tie_the_nodes_to_their_common_surface(exact):
     scene, dense = exact
     nodes = nodes_of(scene)
-    ties = tie_opinions(scene.maps, dense, nodes)
+    ties = tie_to_consensus(scene.maps, dense, nodes)
     assert len(ties.node) > 0.7 * len(nodes.surface.xy)
     np.testing.assert_allclose(ties.value, nodes.surface.log_range[ties.node], atol=1e-5)
     assert len(np.unique(ties.seed)) == len(ties.seed)
@@ -77,8 +77,10 @@ def test_one_opinion_is_none(exact):
     scene, dense = exact
     nodes = nodes_of(scene)
     for others in ([None] * 4, [dense[1], None, None, None]):
-        assert len(tie_opinions(scene.maps, [dense[0], *others], nodes).node) == 0
-    assert len(tie_opinions(scene.maps, [None, dense[1], None, None, dense[4]], nodes).node) > 100
+        assert len(tie_to_consensus(scene.maps, [dense[0], *others], nodes).node) == 0
+    assert (
+        len(tie_to_consensus(scene.maps, [None, dense[1], None, None, dense[4]], nodes).node) > 100
+    )
 
 
 def test_two_that_contradict_each_other_are_none(exact):
@@ -87,9 +89,9 @@ def test_two_that_contradict_each_other_are_none(exact):
     nodes = nodes_of(scene)
     # One alone can tell neither which of both is right nor whether it is.
     two = [None, moved(dense[1], -0.01), None, None, dense[4]]
-    assert len(tie_opinions(scene.maps, two, nodes).node) == 0
+    assert len(tie_to_consensus(scene.maps, two, nodes).node) == 0
     within = [None, moved(dense[1], -0.0005), None, None, dense[4]]
-    assert len(tie_opinions(scene.maps, within, nodes).node) > 100
+    assert len(tie_to_consensus(scene.maps, within, nodes).node) > 100
 
 
 @pytest.mark.parametrize("away", [-0.03, 0.03])
@@ -97,7 +99,7 @@ def test_one_of_many_is_outvoted(exact, away):
     scene, dense = exact
     nodes = nodes_of(scene)
     wrong = [dense[0], moved(dense[1], away), *dense[2:]]
-    ties = tie_opinions(scene.maps, wrong, nodes)
+    ties = tie_to_consensus(scene.maps, wrong, nodes)
     assert len(ties.node) > 0.5 * len(nodes.surface.xy)
     error = np.abs(ties.value - nodes.surface.log_range[ties.node])
     assert np.median(error) < 1e-5
@@ -111,7 +113,7 @@ def test_an_opinion_on_another_surface_is_none(exact):
     cos, sin = np.cos(np.radians(30)), np.sin(np.radians(30))
     turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
     turned = replace(nodes, surface=replace(nodes.surface, normals=nodes.surface.normals @ turn.T))
-    assert len(tie_opinions(scene.maps, dense, turned).node) == 0
+    assert len(tie_to_consensus(scene.maps, dense, turned).node) == 0
 
 
 def test_opinions_within_reach_count_once(exact):
@@ -119,11 +121,11 @@ def test_opinions_within_reach_count_once(exact):
     scene, dense = exact
     sums = []
     for stride in (2, 4):
-        ties = tie_opinions(scene.maps, dense, nodes_of(scene, stride=stride))
+        ties = tie_to_consensus(scene.maps, dense, nodes_of(scene, stride=stride))
         sums.append((1 / ties.sigma**2).sum())
     assert sums[0] == pytest.approx(sums[1], rel=0.05)
     nodes = nodes_of(scene, stride=4)
-    ties = tie_opinions(scene.maps, dense, nodes)
+    ties = tie_to_consensus(scene.maps, dense, nodes)
     # Views that agree exactly: the deviation of one of them, along an oblique ray.
     assert np.median(ties.sigma) == pytest.approx(1.2e-3 * OPINION_REACH_PX / 4, rel=0.25)
 
@@ -131,9 +133,9 @@ def test_opinions_within_reach_count_once(exact):
 def test_views_that_scatter_are_less_certain(exact):
     scene, dense = exact
     nodes = nodes_of(scene)
-    sharp = tie_opinions(scene.maps, dense, nodes)
+    sharp = tie_to_consensus(scene.maps, dense, nodes)
     spread = [moved(d, a) for d, a in zip(dense, (0, 0.004, -0.004, 0.002, -0.002), strict=True)]
-    blurred = tie_opinions(scene.maps, spread, nodes)
+    blurred = tie_to_consensus(scene.maps, spread, nodes)
     assert np.median(blurred.sigma) > 1.5 * np.median(sharp.sigma)
 
 

@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from polmvs.config import AngleModel, Light
-from polmvs.normals.estimator import CAUCHY_SCALE
+from polmvs.fitting import CAUCHY_SCALE, cauchy_weights
 from polmvs.normals.single_view.plane import (
     PlaneEstimate,
     error_gradients,
     phase_errors,
     plane_normal,
-    robust_deviation,
+    residual_scale,
     stack_samples,
     tangents,
 )
@@ -78,7 +78,7 @@ class _View:
     parameters: Floats
     offsets: Floats
     sigma: Floats
-    model: AngleModel
+    angle_model: AngleModel
     light: Light
 
     def phases(self, focal_px: float) -> tuple[Floats, Floats, Floats]:
@@ -91,7 +91,7 @@ class _View:
         rays = np.concatenate([self.offsets / self.offsets.dtype.type(focal_px), one])
         rays /= np.sqrt((rays * rays).sum(axis=0))
         parameters, sigma = self.parameters, self.sigma
-        if self.model is AngleModel.TILTED:
+        if self.angle_model is AngleModel.TILTED:
             diffuse = self.light is Light.DIFFUSE
             parameters = correct_parameters(parameters, rays.T, diffuse=diffuse)
             sigma = sigma * sigma_scale(parameters[1], parameters[2], rays.T, diffuse=diffuse)
@@ -99,16 +99,16 @@ class _View:
 
     def plane(self, focal_px: float) -> PlaneEstimate:
         """Robust normal at a focal length."""
-        return plane_normal(self.model, *self.phases(focal_px))
+        return plane_normal(self.angle_model, *self.phases(focal_px))
 
     def errors(self, focal_px: float, normal: Floats) -> Floats:
         """Phase errors (N,) over their sigma."""
-        samples = stack_samples(self.model, *self.phases(focal_px))
+        samples = stack_samples(self.angle_model, *self.phases(focal_px))
         return np.asarray(phase_errors(normal, samples) * np.sqrt(samples[4]))
 
 
 def estimate_focal(
-    model: AngleModel,
+    angle_model: AngleModel,
     parameters: Floats,
     offsets_px: Floats,
     sigma: Floats,
@@ -121,7 +121,8 @@ def estimate_focal(
 
     Parameters
     ----------
-    model : tilted; under the others the focal length is not observable, and the result says so.
+    angle_model : tilted; under the others the focal length is not observable, which the result
+        says.
     parameters : (3, N), Stokes parameters s0, s1, s2 as measured, not corrected.
     offsets_px : (2, N), image coordinates relative to the principal point, px; square pixels.
     sigma : (N,), standard deviation of the phase, rad.
@@ -132,7 +133,7 @@ def estimate_focal(
     shortest, longest = focal_range_px
     if not 0 < shortest < longest:
         raise ValueError(f"{focal_range_px=} but expected 0 < shortest < longest.")
-    view = _pick(model, parameters, offsets_px, sigma, light)
+    view = _pick(angle_model, parameters, offsets_px, sigma, light)
     focals = np.geomspace(shortest, longest, NUM_FOCALS)
     planes = []
     for index, focal in enumerate(focals):
@@ -140,7 +141,7 @@ def estimate_focal(
         if progress is not None:
             progress(index + 1, len(focals))
     errors = [view.errors(f, p.normal) for f, p in zip(focals, planes, strict=True)]
-    scale = min(robust_deviation(error) for error in errors)
+    scale = CAUCHY_SCALE * min(residual_scale(error) for error in errors)
     best = int(np.argmin([_loss(error, scale) for error in errors]))
     inner = min(max(best, 1), len(focals) - 2)
     focal = _refine(view, focals[inner - 1], focals[inner + 1], scale)
@@ -159,7 +160,7 @@ def estimate_focal(
 
 
 def _pick(
-    model: AngleModel, parameters: Floats, offsets_px: Floats, sigma: Floats, light: Light
+    angle_model: AngleModel, parameters: Floats, offsets_px: Floats, sigma: Floats, light: Light
 ) -> _View:
     """Evenly spaced ones of the polarised pixels that are known."""
     if parameters.shape != (3, len(sigma)) or offsets_px.shape != (2, len(sigma)):
@@ -170,12 +171,12 @@ def _pick(
     polarized = np.abs(parameters[1]) + np.abs(parameters[2])
     usable = np.flatnonzero((polarized > 0) & (sigma > 0) & (polarized + sigma < np.inf))
     usable = usable[:: max(1, len(usable) // NUM_PIXELS)]
-    return _View(parameters[:, usable], offsets_px[:, usable], sigma[usable], model, light)
+    return _View(parameters[:, usable], offsets_px[:, usable], sigma[usable], angle_model, light)
 
 
 def _loss(errors: Floats, scale: float) -> float:
     """Mean Cauchy loss of errors over their sigma."""
-    return float(np.log1p(np.square(errors / (CAUCHY_SCALE * scale))).mean())
+    return float(np.log1p(np.square(errors / scale)).mean())
 
 
 def _refine(view: _View, shortest: float, longest: float, scale: float) -> float:
@@ -195,10 +196,10 @@ def _log_sigma(view: _View, focal: float, normal: Array, scale: float) -> float:
     step = float(np.exp(LOG_STEP))
     error = view.errors(focal, normal)
     slope = (view.errors(focal * step, normal) - view.errors(focal / step, normal)) / (2 * LOG_STEP)
-    samples = stack_samples(view.model, *view.phases(focal))
+    samples = stack_samples(view.angle_model, *view.phases(focal))
     on_normal = tangents(normal) @ error_gradients(normal, samples) * np.sqrt(samples[4])
     gradients = np.stack([*on_normal, slope]).astype(np.float64)
-    weighted = gradients / (1 + np.square(error / (CAUCHY_SCALE * scale)))
+    weighted = gradients * cauchy_weights(np.square(error), scale)
     matrix = weighted @ gradients.T
     # Dividing by the diagonal first makes the test for a flat direction independent of units.
     size = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))

@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import AngleModel
-from polmvs.normals.estimator import CAUCHY_SCALE, smallest_eigenvectors
+from polmvs.fitting import CAUCHY_SCALE, annealed_scales, robust_deviation
+from polmvs.normals.estimator import smallest_eigenvectors
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Array: TypeAlias = NDArray[np.float64]
@@ -38,7 +39,6 @@ FINE_ROUNDS = 2  # over all pixels
 NUM_RUNS = 32  # of pixels from whose scatter the covariance is taken, at least
 MIN_CONDITIONING = 0.01
 MAX_STEP = 0.3  # rad
-MEDIAN_OF_NORMAL = 0.6745  # median of |x|, x of unit deviation
 MEDIAN_PIXELS = 32768  # of which a median is taken, at least
 MIN_DEVIATION = 0.01  # in units of sigma: keeps exact data from a division by zero
 OUTLIER = 4.0  # robust deviations
@@ -80,7 +80,7 @@ class PlaneEstimate:
 
 
 def plane_normal(
-    model: AngleModel,
+    angle_model: AngleModel,
     axial: Floats,
     rays: Floats,
     sigma: Floats,
@@ -92,7 +92,7 @@ def plane_normal(
 
     Parameters
     ----------
-    model : OPA, PPA, or tilted (then ``axial`` is of corrected images,
+    angle_model : OPA, PPA, or tilted (then ``axial`` is of corrected images,
     :mod:`polmvs.polarization.angle_models`).
     axial : (2, N), ``(cos 2 phase, sin 2 phase)`` times any positive number.
     rays : (3, N), camera frame, of any length.
@@ -106,33 +106,31 @@ def plane_normal(
     Not valid for fewer than two pixels, or where their rows have rank 1. Pixels that are not
     finite or have no polarisation are left out.
     """
-    samples = stack_samples(model, axial, rays, sigma)
+    samples = stack_samples(angle_model, axial, rays, sigma)
     num = samples.shape[1]
     if num < 2:
         return _no_estimate(num)
     if not robust:
-        return _describe(_facing(_eigenvector(model, samples), samples), samples, None)
+        return _describe(_facing(_eigenvector(angle_model, samples), samples), samples, None)
     coarse = np.ascontiguousarray(samples[:, :: max(1, num // COARSE_PIXELS)])
-    normal = _eigenvector(model, coarse)
+    normal = _eigenvector(angle_model, coarse)
     if initial_normal is not None:
         normal = np.array(initial_normal, np.float64)
-    scale = 1.0
-    for round_index in range(COARSE_ROUNDS):
-        # Anneal: a wide loss first, so that a poor start does not reject the good pixels.
-        deviation = robust_deviation(phase_errors(normal, coarse) * np.sqrt(coarse[4]))
-        scale = deviation * 2.0 ** max(2 - round_index, 0)
+    scale = CAUCHY_SCALE
+    for loss_scale in annealed_scales(COARSE_ROUNDS, num_final=COARSE_ROUNDS - 2):
+        scale = residual_scale(phase_errors(normal, coarse) * np.sqrt(coarse[4])) * loss_scale
         normal = _improve(normal, normal_equations(normal, coarse, scale))
     for _ in range(FINE_ROUNDS):
         normal = _improve(normal, normal_equations(normal, samples, scale))
     return _describe(_facing(normal, samples), samples, scale)
 
 
-def phase_residuals(model: AngleModel, normal: Floats, axial: Floats, rays: Floats) -> Floats:
+def phase_residuals(angle_model: AngleModel, normal: Floats, axial: Floats, rays: Floats) -> Floats:
     """Measured phase minus that of a normal, rad in [-pi/2, pi/2].
 
     Parameters
     ----------
-    model : OPA, PPA or tilted.
+    angle_model : OPA, PPA or tilted.
     normal : (3,), camera frame.
     axial : (2, N), ``(cos 2 phase, sin 2 phase)`` times any positive number.
     rays : (3, N), camera frame, of any length.
@@ -144,23 +142,25 @@ def phase_residuals(model: AngleModel, normal: Floats, axial: Floats, rays: Floa
     measured = (np.abs(axial[0]) + np.abs(axial[1]) > 0) & np.isfinite(rays).all(axis=0)
     residuals = np.full(measured.shape, np.nan, np.result_type(axial, rays))
     some = stack_samples(
-        model, axial[:, measured], rays[:, measured], np.ones_like(axial[0, measured])
+        angle_model, axial[:, measured], rays[:, measured], np.ones_like(axial[0, measured])
     )
     residuals[measured] = phase_errors(normal, some)
     return residuals
 
 
-def _eigenvector(model: AngleModel, samples: Floats) -> Array:
+def _eigenvector(angle_model: AngleModel, samples: Floats) -> Array:
     """Eigenvector of the smallest eigenvalue of ``M^T M`` (paper, eq. coeff), ``(3,)``."""
     entries = row_products(samples)
-    if model is AngleModel.OPA:  # no row has a z component: only the direction in the image counts
+    if (
+        angle_model is AngleModel.OPA
+    ):  # no row has a z component: only the direction in the image counts
         entries[2] = entries[:2].sum()
     return smallest_eigenvectors(entries[:, None])[1][:, 0]
 
 
-def robust_deviation(normalized_errors: Floats) -> float:
+def residual_scale(normalized_errors: Floats) -> float:
     """Deviation of errors, from the median of their size; at least ``MIN_DEVIATION``."""
-    return max(float(np.median(np.abs(normalized_errors))) / MEDIAN_OF_NORMAL, MIN_DEVIATION)
+    return max(robust_deviation(normalized_errors), MIN_DEVIATION)
 
 
 def _improve(normal: Array, equations: NormalEquations) -> Array:
@@ -200,7 +200,7 @@ def _describe(normal: Array, samples: Floats, scale: float | None) -> PlaneEstim
     step = max(1, num // MEDIAN_PIXELS)
     some = np.abs(equations.errors[::step])
     normalized = some * np.sqrt(samples[4, ::step])
-    limit = OUTLIER * robust_deviation(normalized)
+    limit = OUTLIER * residual_scale(normalized)
     return PlaneEstimate(
         normal=normal,
         valid=valid,
@@ -252,12 +252,12 @@ class NormalEquations(NamedTuple):
     errors: Floats
 
 
-def stack_samples(model: AngleModel, axial: Floats, rays: Floats, sigma: Floats) -> Floats:
+def stack_samples(angle_model: AngleModel, axial: Floats, rays: Floats, sigma: Floats) -> Floats:
     """Samples (5, N) of the pixels that count: polarised, finite, with a sigma.
 
     Parameters
     ----------
-    model : OPA, PPA or tilted.
+    angle_model : OPA, PPA or tilted.
     axial : (2, N), ``(cos 2 phase, sin 2 phase)`` times any positive number.
     rays : (3, N), camera frame, of any length.
     sigma : (N,), standard deviation of the phase, rad.
@@ -271,7 +271,7 @@ def stack_samples(model: AngleModel, axial: Floats, rays: Floats, sigma: Floats)
     if not usable.all():
         axial, rays = axial[:, usable], rays[:, usable]
         sigma, length = sigma[usable], length[usable]
-    xy = np.zeros_like(rays[:2]) if model is AngleModel.OPA else rays[:2] / rays[2]
+    xy = np.zeros_like(rays[:2]) if angle_model is AngleModel.OPA else rays[:2] / rays[2]
     return np.stack([*(axial / length), *xy, 1 / (sigma * sigma)])
 
 
@@ -358,7 +358,7 @@ def _weights(rows: list[Floats], cos: Floats, precision: Floats, scale: float | 
     if scale is None:  # rows of unit length weigh alike
         return 1 / (rows[0] * rows[0] + rows[1] * rows[1] + rows[2] * rows[2])
     # 1 - cos is 2 sin^2 of the error.
-    return precision / (1 + (1 - cos) * precision * (0.5 / (CAUCHY_SCALE * scale) ** 2))
+    return precision / (1 + (1 - cos) * precision * (0.5 / scale**2))
 
 
 def _products(left: Sequence[Floats], right: Sequence[Floats]) -> Array:

@@ -58,7 +58,7 @@ class FoundPlane:
 class _Blocks:
     """Averages over blocks; (H', W') maps of what counts, arrays of the blocks that do."""
 
-    model: AngleModel
+    angle_model: AngleModel
     known: Mask
     axial: Floats
     rays: Floats
@@ -67,14 +67,16 @@ class _Blocks:
     def residuals(self, normal: Floats) -> Floats:
         """Size of the phase residual (H', W'), infinite where nothing is known."""
         residuals = np.full(self.known.shape, np.inf)
-        residuals[self.known] = np.abs(phase_residuals(self.model, normal, self.axial, self.rays))
+        residuals[self.known] = np.abs(
+            phase_residuals(self.angle_model, normal, self.axial, self.rays)
+        )
         return residuals
 
     def refine(self, inside: Mask, normal: Floats | None = None) -> PlaneEstimate:
         """Robust normal of the blocks of a map."""
         some = inside[self.known]
         return plane_normal(
-            self.model,
+            self.angle_model,
             self.axial[:, some],
             self.rays[:, some],
             self.sigma[some],
@@ -83,7 +85,7 @@ class _Blocks:
 
 
 def find_planes(
-    model: AngleModel,
+    angle_model: AngleModel,
     axial: Floats,
     rays: Floats,
     sigma: Floats,
@@ -99,7 +101,7 @@ def find_planes(
 
     Parameters
     ----------
-    model : PPA or tilted; under OPA a plane is known by its azimuth only.
+    angle_model : PPA or tilted; under OPA a plane is known by its azimuth only.
     axial : (2, H, W), ``(cos 2 phase, sin 2 phase)`` times any positive number.
     rays : (3, H, W), unit, camera frame.
     sigma : (H, W), standard deviation of the phase, rad.
@@ -117,7 +119,7 @@ def find_planes(
     """
     if axial.shape != (2, *mask.shape) or rays.shape != (3, *mask.shape):
         raise ValueError(f"{axial.shape=}, {rays.shape=}, {mask.shape=}.")
-    blocks = _average(model, axial, rays, sigma, mask)
+    blocks = _average(angle_model, axial, rays, sigma, mask)
     limit = np.full(blocks.known.shape, 0.0)
     limit[blocks.known] = np.hypot(np.radians(max_residual_deg), 3 * blocks.sigma)
     min_blocks = max(int(min_share * np.count_nonzero(blocks.known)), COHERENCE_BLOCKS**2)
@@ -132,10 +134,12 @@ def find_planes(
         if all(abs(float(normal @ other)) < np.cos(np.radians(min_angle_deg)) for other in normals):
             normals.append(normal)
     labels = _assign(blocks, normals, limit, min_blocks)
-    return _finish(model, axial, rays, sigma, mask, labels)
+    return _finish(angle_model, axial, rays, sigma, mask, labels)
 
 
-def _average(model: AngleModel, axial: Floats, rays: Floats, sigma: Floats, mask: Mask) -> _Blocks:
+def _average(
+    angle_model: AngleModel, axial: Floats, rays: Floats, sigma: Floats, mask: Mask
+) -> _Blocks:
     """Average a phase map over blocks, weighted by precision; half a block has to be known."""
     length = np.hypot(axial[0], axial[1])
     usable = mask & (length > 0) & (sigma > 0) & np.isfinite(length + sigma)
@@ -148,7 +152,7 @@ def _average(model: AngleModel, axial: Floats, rays: Floats, sigma: Floats, mask
     means = np.stack([_block_sums(weight * u)[known] for u in unit]) / total
     mean_rays = np.stack([_block_sums(np.where(usable, r, 0))[known] for r in rays])
     mean_rays /= np.sqrt((mean_rays * mean_rays).sum(axis=0))
-    return _Blocks(model, known, means, mean_rays, np.sqrt(1 / total + MODEL_SIGMA**2))
+    return _Blocks(angle_model, known, means, mean_rays, np.sqrt(1 / total + MODEL_SIGMA**2))
 
 
 def _block_sums(image: NDArray[Any]) -> Array:
@@ -182,7 +186,7 @@ def _hypotheses(
     """Normals of pairs of rows near each other, those first that most blocks agree with."""
     rows = np.full((*left.shape, 3), np.nan)
     rows[blocks.known] = rows_from_axial(
-        blocks.model, blocks.axial[0], blocks.axial[1], blocks.rays.T
+        blocks.angle_model, blocks.axial[0], blocks.axial[1], blocks.rays.T
     )
     height, width = left.shape
     where = np.argwhere(left)
@@ -196,7 +200,7 @@ def _hypotheses(
     normals = normals[usable] / length[usable, None]
     some = left[blocks.known]
     samples = stack_samples(
-        blocks.model, blocks.axial[:, some], blocks.rays[:, some], blocks.sigma[some]
+        blocks.angle_model, blocks.axial[:, some], blocks.rays[:, some], blocks.sigma[some]
     )
     step = max(1, samples.shape[1] // NUM_SCORED)
     limits = limit[left][::step]
@@ -253,7 +257,7 @@ def _mean_where(image: Floats, known: Mask) -> Floats:
 
 
 def _finish(
-    model: AngleModel,
+    angle_model: AngleModel,
     axial: Floats,
     rays: Floats,
     sigma: Floats,
@@ -268,6 +272,6 @@ def _finish(
     for index in range(labels.max() + 1):
         inside = mask & (full == index)
         if inside.any():
-            estimate = plane_normal(model, axial[:, inside], rays[:, inside], sigma[inside])
+            estimate = plane_normal(angle_model, axial[:, inside], rays[:, inside], sigma[inside])
             found.append(FoundPlane(estimate=estimate, mask=inside))
     return sorted(found, key=lambda plane: -plane.estimate.num_pixels)

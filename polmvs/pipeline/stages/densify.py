@@ -92,7 +92,7 @@ def densify(
     cloud : PLY to write.
     views : folder to write, with the dense depth and normals of each view.
     propagation, fusion : defaults where None.
-    tilt_aware : as in ``NormalOptions``.
+    tilt_aware : as ``NormalOptions.tilt_aware_weights``.
 
     Raises
     ------
@@ -115,9 +115,9 @@ def densify(
             fusion,
             folder,
             new_views,
-            tilt_aware,
-            workers,
-            on_progress,
+            tilt_aware=tilt_aware,
+            workers=workers,
+            on_progress=on_progress,
         )
         surface = surface_cloud(fused)
         around = _surroundings_cloud(
@@ -136,6 +136,7 @@ def _dense_surface(
     fusion: FusionOptions,
     folder: Path,
     views: Path,
+    *,
     tilt_aware: bool,
     workers: Workers,
     on_progress: OnProgress,

@@ -160,7 +160,7 @@ def posed_views(sparse: Path) -> tuple[View, ...]:
         raise DataError(
             sparse,
             f"{len(views)} views with a pose; normals need {MIN_VIEWS} or more. "
-            "Record more views, or give a better model with --sparse.",
+            "Record more views, or give a better model with `sfm.sparse`.",
         )
     return views
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, NormalOptions
 from polmvs.io.arrays import map_array, save_array
 from polmvs.normals.tracks import select_seeds
 from polmvs.parallel import Workers
@@ -64,9 +64,8 @@ def find_seeds(
     track_normals: Path,
     target: Path,
     *,
-    unseeded: bool,
+    options: NormalOptions | None = None,
     max_neighbors: int,
-    tilt_aware: bool = True,
     workers: Workers | None = None,
     on_progress: OnProgress = no_progress,
 ) -> SeedsResult:
@@ -77,11 +76,10 @@ def find_seeds(
     sparse, maps : folders of the COLMAP model and of PPA's phase maps.
     track_normals : file of PPA's normals of the sparse points.
     target : file of the seeds, ``.npy`` with rows of ``SEEDS_TYPE``.
-    unseeded : place parts without sparse points by their outlines.
+    options : whether and how parts without sparse points are placed; defaults where None.
     max_neighbors : other views that give rows to the view of a part.
-    tilt_aware : as in ``NormalOptions``.
     """
-    workers = workers or Workers()
+    options, workers = options or NormalOptions(), workers or Workers()
     tracks = read_model(sparse).tracks
     phase_maps = open_maps(sparse, maps)
     if not len(tracks.point3D_ids):
@@ -91,14 +89,14 @@ def find_seeds(
     on_tracks = _rows(seeds, np.flatnonzero(is_seed))
     on_parts = np.zeros(0, SEEDS_TYPE)
     reports: tuple[PartReport, ...] = ()
-    if unseeded:
+    if options.unseeded:
         new, found = find_part_seeds(
             AngleModel.PPA,
             phase_maps,
             seeds,
             tracks.points_in_world,
             max_neighbors=max_neighbors,
-            tilt_aware=tilt_aware,
+            tilt_aware=options.tilt_aware_weights,
             workers=workers,
             on_progress=on_progress,
         )

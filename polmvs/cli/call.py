@@ -1,0 +1,154 @@
+"""One call of a command: what was given, and the options that it comes to."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+from polmvs.config import (
+    OptionGroup,
+    Options,
+    describe_fields,
+    groups_of,
+    in_table,
+    option,
+    require_table,
+    values_from_plain,
+)
+from polmvs.errors import DataError, OptionError
+
+Group = TypeVar("Group", bound=OptionGroup)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileOptions(OptionGroup, group="file", in_files=False):
+    """Options from a file."""
+
+    config: Path | None = option(
+        None, "TOML file with options in tables named as the groups here; flags go before it"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerminalOptions(OptionGroup, group="terminal", in_files=False):
+    """What is shown."""
+
+    verbose: bool = option(False, "show every step", flag="--verbose")
+    quiet: bool = option(False, "show errors and the result only: no progress, no warnings")
+    json: bool = option(False, "print the result as JSON; nothing else but errors is shown")
+
+    def check(self) -> None:
+        """One or the other."""
+        self.require(
+            not (self.verbose and self.quiet), "verbose", "and `terminal.quiet` exclude each other"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Call:
+    """A parsed command line.
+
+    Attributes
+    ----------
+    given : values of the arguments and flags that were given, by path.
+    tables : groups that the file of ``--config`` may have tables of.
+    command_line : as it was typed, for the record.
+    """
+
+    given: Mapping[str, Any]
+    tables: tuple[type[OptionGroup], ...] = ()
+    command_line: list[str] = field(default_factory=list)
+
+    def get(self, cls: type[Group], recorded: Mapping[str, Any] | None = None) -> Group:
+        """A group of options from, each before the next: flags, the file, an earlier run, defaults.
+
+        Parameters
+        ----------
+        cls : the group.
+        recorded : of an earlier run, in terms of JSON, by field.
+
+        Raises
+        ------
+        OptionError, DataError
+            A value is unusable, or the file is.
+        """
+        flags = {
+            info.name: self.given[info.path]
+            for info in describe_fields(cls)
+            if info.path in self.given
+        }
+        file = self.file.get(cls.group, {})
+        before = values_from_plain(cls, recorded or {})
+        try:
+            return cls(**{**before, **file, **flags})
+        except OptionError as error:
+            name = (error.field or "").partition(".")[2]
+            if name in file and name not in flags:
+                raise in_table(error, str(self.given["file.config"])) from error
+            raise
+
+    def options(self, recorded: Mapping[str, Any] | None = None) -> Options:
+        """Options of all stages, in the same order of precedence.
+
+        Parameters
+        ----------
+        recorded : those of an earlier run, in terms of JSON, by group and field.
+        """
+        before = recorded or {}
+        groups = groups_of(Options)
+        made: dict[str, Any] = {name: self.get(c, before.get(name)) for name, c in groups.items()}
+        return Options(**made)
+
+    @cached_property
+    def file(self) -> dict[str, dict[str, Any]]:
+        """Values in the tables of the file of ``--config``; empty where none is given."""
+        path = self.given.get("file.config")
+        return {} if path is None else read_config(path, self.tables)
+
+
+def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, dict[str, Any]]:
+    """Values of a TOML file of options by table and key, in the fields' types.
+
+    Parameters
+    ----------
+    path : the file.
+    groups : those that it may have tables of.
+
+    Raises
+    ------
+    DataError
+        It cannot be read.
+    OptionError
+        It is no TOML, or has an unknown or repeated table or key or a value of a wrong type, which
+        is named.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+    except UnicodeDecodeError as error:
+        raise OptionError(f"{path}: is no TOML file (not UTF-8).") from error
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise OptionError(f"{path}: is no TOML file ({error}{_line_of(text, error)}).") from error
+    known = {cls.group: cls for cls in groups}
+    values = {}
+    for name, table in content.items():
+        require_table(name, table, known, str(path))
+        values[name] = values_from_plain(known[name], table, str(path))
+    return values
+
+
+def _line_of(text: str, error: tomllib.TOMLDecodeError) -> str:
+    """The line at fault: Python's message does not name the key that is there twice."""
+    found = re.search(r"at line (\d+)", str(error))
+    lines = text.splitlines()
+    if found is None or int(found[1]) > len(lines):
+        return ""
+    return f": {lines[int(found[1]) - 1].strip()}"

@@ -1,0 +1,36 @@
+"""The commands on a cloud: measure it, and make a mesh of it."""
+
+from __future__ import annotations
+
+from polmvs.cli.call import Call
+from polmvs.cli.commands import EvaluateArguments, MeshArguments
+from polmvs.cli.terminal import Terminal
+from polmvs.config import to_plain
+from polmvs.errors import OptionError
+from polmvs.evaluation.comparison import evaluate_file
+from polmvs.evaluation.tables import evaluation_text
+from polmvs.io.clouds import read_cloud, write_mesh
+from polmvs.surface.poisson import poisson_mesh
+
+
+def evaluate(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs evaluate``."""
+    arguments = call.get(EvaluateArguments)
+    figures = evaluate_file(arguments.cloud, arguments.gt, arguments.sparse)
+    terminal.show(evaluation_text(figures), to_plain(figures))
+    return 0
+
+
+def mesh(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs mesh``."""
+    arguments = call.get(MeshArguments)
+    if arguments.mesh.exists() and not arguments.overwrite:
+        raise OptionError(f"{arguments.mesh}: exists. Give `run.overwrite` to replace it.")
+    made = poisson_mesh(read_cloud(arguments.cloud), source=arguments.cloud)
+    write_mesh(arguments.mesh, made)
+    num_triangles = len(made.triangles)
+    terminal.show(
+        f"{arguments.mesh}: {num_triangles:,} triangles",
+        {"mesh": arguments.mesh, "num_triangles": num_triangles},
+    )
+    return 0

@@ -1,0 +1,166 @@
+"""The commands that run a job in an output folder: each calls one function of the pipeline."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import polmvs
+from polmvs.camera import PinholeCamera
+from polmvs.cli.call import Call
+from polmvs.cli.commands import ComparedModels, DemoArguments, JobArguments, ModelChoice
+from polmvs.cli.flags import in_flags
+from polmvs.cli.terminal import Terminal
+from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
+from polmvs.evaluation.tables import best_fit_lines
+from polmvs.io.ground_truth import open_ground_truth
+from polmvs.pipeline import jobs as pipeline
+from polmvs.pipeline.record import read_options
+from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.stages.dense_workspace import DenseWorkspaceResult
+from polmvs.pipeline.stages.densify import DensifyResult
+from polmvs.pipeline.stages.mesh import MeshResult
+from polmvs.pipeline.stages.normals import NormalsResult
+from polmvs.pipeline.stages.poses import PosesResult
+from polmvs.pipeline.stages.seeds import SeedsResult
+
+EMPTY_STATUS = 3
+DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"
+
+
+def demo(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs demo``."""
+    truth = open_ground_truth(DEMO_CAPTURE)
+    camera = truth.views[truth.names[0]].camera
+    assert isinstance(camera, PinholeCamera)
+    options = Options(
+        sfm=SfmOptions(intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy)),
+        evaluation=EvaluationOptions(gt=DEMO_CAPTURE / "gt"),
+    )
+    job = pipeline.Job(
+        capture=DEMO_CAPTURE,
+        out=call.get(DemoArguments).out,
+        options=options,
+        run_options=call.get(RunOptions),
+        monitor=terminal,
+        command_line=call.command_line,
+    )
+    return _show_comparison(pipeline.compare(job), terminal)
+
+
+def reconstruct(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs reconstruct``."""
+    model = call.get(ModelChoice).angle_model
+    return _show_cloud(pipeline.reconstruct(job_of(call, terminal), model), model, terminal)
+
+
+def compare(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs compare``."""
+    models = call.get(ComparedModels).angle_models
+    return _show_comparison(pipeline.compare(job_of(call, terminal), models), terminal)
+
+
+def sfm(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs sfm``."""
+    outcome = pipeline.find_poses(job_of(call, terminal))
+    num_tracks = outcome.result(PosesResult).num_tracks
+    text = (
+        f"{outcome.run_folder.sparse}: {_views(outcome)} have a pose, {num_tracks:,} sparse points"
+    )
+    terminal.show(text, _content(outcome, terminal))
+    return 0
+
+
+def normals(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs normals``."""
+    model = call.get(ModelChoice).angle_model
+    outcome = pipeline.solve_normals(job_of(call, terminal, continues=True), (model,))
+    found, seeds = outcome.result(NormalsResult, model), outcome.result(SeedsResult)
+    text = (
+        f"{outcome.run_folder.sparse_cloud(model)}: {found.num_normals:,} of "
+        f"{found.num_tracks:,} sparse points have a normal, {seeds.num_track_seeds:,} are seeds"
+    )
+    terminal.show(text, _content(outcome, terminal))
+    return 0
+
+
+def densify(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs densify``."""
+    model = call.get(ModelChoice).angle_model
+    outcome = pipeline.densify(job_of(call, terminal, continues=True), (model,))
+    return _show_cloud(outcome, model, terminal)
+
+
+def export(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs export``."""
+    model = call.get(ModelChoice).angle_model
+    outcome = pipeline.export(job_of(call, terminal, continues=True), model)
+    return _show_cloud(outcome, model, terminal)
+
+
+def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeline.Job:
+    """The job; one that goes on takes the options of the run in OUT where none are given."""
+    arguments, run_options = call.get(JobArguments), call.get(RunOptions)
+    recorded = None
+    if run_options.resume or continues:
+        recorded = read_options(RunFolder(arguments.out))
+    return pipeline.Job(
+        capture=arguments.capture,
+        out=arguments.out,
+        options=call.options(recorded),
+        run_options=run_options,
+        monitor=terminal,
+        command_line=call.command_line,
+    )
+
+
+def _show_cloud(outcome: pipeline.JobOutcome, model: AngleModel, terminal: Terminal) -> int:
+    folder, cloud = outcome.run_folder, outcome.result(DensifyResult, model)
+    metric = outcome.result(PosesResult).is_metric
+    unit = "metres" if metric else "the model's unit, not metric"
+    lines = [
+        f"{folder.cloud(model)}: {cloud.num_points:,} points from {_views(outcome)}, and "
+        f"{cloud.num_surroundings:,} of the surroundings; in {unit}"
+    ]
+    mesh = outcome.find(MeshResult, model)
+    if mesh is not None and mesh.num_triangles:
+        lines.append(f"{folder.mesh(model)}: {mesh.num_triangles:,} triangles")
+    dense = outcome.find(DenseWorkspaceResult, model)
+    if dense is not None and dense.folder is not None:
+        lines.append(f"{dense.folder}: COLMAP dense workspace")
+    terminal.show("\n".join(lines), _content(outcome, terminal))
+    return _status(outcome)
+
+
+def _show_comparison(outcome: pipeline.JobOutcome, terminal: Terminal) -> int:
+    comparison = outcome.comparison
+    assert comparison is not None
+    clouds = ", ".join(f"{model}.ply" for model in comparison.models)
+    last = f"{outcome.run_folder.root}: {clouds}, metrics.json, summary.md; {_views(outcome)}"
+    lines = [comparison.table(), *best_fit_lines(comparison), last]
+    terminal.show("\n".join(lines), {**_content(outcome, terminal), "metrics": comparison})
+    return _status(outcome)
+
+
+def _content(outcome: pipeline.JobOutcome, terminal: Terminal) -> dict[str, Any]:
+    """The outcome for machines."""
+    return {
+        "out": outcome.run_folder.root,
+        "results": {stage.name: stage.result for stage in outcome.record.stages},
+        "empty": outcome.empty,
+        "stages": terminal.stages,
+        "warnings": terminal.warnings,
+    }
+
+
+def _views(outcome: pipeline.JobOutcome) -> str:
+    poses = outcome.result(PosesResult)
+    return f"{poses.num_views} of {poses.num_views + len(poses.unregistered)} views"
+
+
+def _status(outcome: pipeline.JobOutcome) -> int:
+    if outcome.empty is None:
+        return 0
+    print(f"polmvs: {in_flags(outcome.empty)}", file=sys.stderr)
+    return EMPTY_STATUS

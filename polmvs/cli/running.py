@@ -1,0 +1,126 @@
+"""From a command line to an exit status; whatever goes wrong becomes one line on stderr."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any
+
+from polmvs.cli.call import Call, TerminalOptions
+from polmvs.cli.flags import USAGE_ERROR, Command, UsageError, in_flags, parse
+from polmvs.errors import OptionError, PolmvsError
+
+INTERRUPTED = 130  # as shells report a program ended by Ctrl-C
+
+logger = logging.getLogger(__name__)
+
+
+def run(
+    commands: Sequence[Command], prog: str, argv: Sequence[str] | None = None, about: str = ""
+) -> int:
+    """Run the command that a command line names.
+
+    Parameters
+    ----------
+    commands : all there are; a single one without a name is the program itself.
+    prog : name of the program.
+    argv : the command line after the program's name; by default that of the process.
+    about : what the program does, for its help.
+
+    Returns
+    -------
+    The exit status: 0; 1 the input is unusable; 2 the command line is; others of the command.
+    """
+    try:
+        parsed = parse(commands, sys.argv[1:] if argv is None else argv, prog, about)
+    except UsageError as error:
+        _print(error.prog, f"error: {error.message} (see {error.prog} --help)")
+        return USAGE_ERROR
+    if parsed.show is not None:
+        parsed.show()
+        return 0
+    assert parsed.command is not None
+    assert parsed.call is not None
+    return _execute(parsed.command, parsed.call, parsed.prog)
+
+
+def _execute(command: Command, call: Call, prog: str) -> int:
+    try:
+        options = call.get(TerminalOptions)
+    except OptionError as error:
+        _print(prog, f"error: {in_flags(str(error))}")
+        return error.exit_status
+    # Progress bars are not for --help.
+    from polmvs.cli.terminal import Terminal
+
+    with Terminal(options) as terminal:
+        return _guarded(lambda: _function(command)(call, terminal), terminal, prog)
+
+
+def _function(command: Command) -> Callable[[Call, Any], int]:
+    """What does a command; its module is imported only now."""
+    if not isinstance(command.run, str):
+        return command.run
+    module, _, name = command.run.partition(":")
+    function: Callable[[Call, Any], int] = getattr(import_module(module), name)
+    keep_sigterm()
+    return function
+
+
+def keep_sigterm() -> None:
+    """Take SIGTERM back from COLMAP's log, which takes it when it is imported."""
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+
+
+def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
+    """Run a command; its exit status, or that of what went wrong."""
+    try:
+        return command()
+    except KeyboardInterrupt:
+        kept = "; finished stages are kept, go on with --resume" if terminal.log else ""
+        _complain(prog, f"interrupted{kept}")
+        return INTERRUPTED
+    except PolmvsError as error:
+        _trace(logging.DEBUG)
+        _complain(prog, f"error: {error}")
+        return error.exit_status
+    except BrokenPipeError:  # the reader of stdout has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        _trace(logging.DEBUG)
+        place = f"{error.filename}: " if error.filename else ""
+        _complain(prog, f"error: {place}{error.strerror or error}.")
+        return 1
+    except Exception as error:
+        from concurrent.futures.process import BrokenProcessPool
+
+        if isinstance(error, BrokenProcessPool | MemoryError):
+            _trace(logging.DEBUG)
+            _complain(prog, "error: out of memory, or a worker was killed. Give `run.workers` 1.")
+            return 1
+        _trace(logging.CRITICAL)
+        where = f"; see {terminal.log}" if terminal.log else ""
+        _complain(prog, f"internal error: {type(error).__name__}: {error}{where}")
+        return 1
+
+
+def _trace(level: int) -> None:
+    logger.log(level, "where it happened:", exc_info=True, extra={"file_only": True})
+
+
+def _complain(prog: str, message: str) -> None:
+    line = in_flags(" ".join(message.split()))
+    logger.error("%s", line, extra={"file_only": True})
+    _print(prog, line)
+
+
+def _print(prog: str, line: str) -> None:
+    print(f"{prog}: {line}", file=sys.stderr)

@@ -1,0 +1,249 @@
+"""All that one raw image tells about planes: their normals, the focal length, the model that fits.
+
+The library's side of ``polmvs plane``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import PinholeCamera
+from polmvs.config import AngleModel, CaptureOptions, Estimator, Light, PlaneOptions, to_plain
+from polmvs.errors import DataError, OptionError
+from polmvs.io.images import read_mask
+from polmvs.normals.single_view.focal import FocalEstimate
+from polmvs.normals.single_view.pixels import PlaneView, load_stokes, polygon_mask
+from polmvs.normals.single_view.plane import PlaneEstimate
+from polmvs.polarization.stokes import Stokes
+
+Mask = NDArray[np.bool_]
+
+MIN_PIXELS = 50
+
+
+class IntrinsicsSource(StrEnum):
+    """Where the intrinsics come from."""
+
+    OPTIONS = "options"
+    ASSUMED = "assumed"
+    ESTIMATED = "estimated"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneFigures:
+    """A plane's normal, as in :class:`.plane.PlaneEstimate`, in numbers that JSON holds.
+
+    Attributes
+    ----------
+    normal : unit, camera frame, facing the camera.
+    center_xy : mean of its pixels' centres, px; None for the plane of all pixels.
+    """
+
+    normal: tuple[float, float, float]
+    valid: bool
+    conditioning: float
+    sigma_deg: float
+    rmse_deg: float
+    median_deg: float
+    num_pixels: int
+    outlier_share: float
+    center_xy: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Residual:
+    """Phase residual of the best single normal, degrees."""
+
+    rmse_deg: float
+    median_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class FocalFigures:
+    """A focal length, as in :class:`.focal.FocalEstimate`; ``focal_px`` is None if unobservable."""
+
+    focal_px: float | None
+    sigma_px: float
+    observable: bool
+    scan_focal_px: tuple[float, ...]
+    scan_rmse_deg: tuple[float, ...]
+    scan_median_deg: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneMeasurement:
+    """What one image tells about planes.
+
+    Attributes
+    ----------
+    image : the raw mosaic.
+    width, height : of the polarization image, px.
+    intrinsics : fx, fy, cx, cy that were used, px, COLMAP's convention.
+    intrinsics_from : where they come from.
+    angle_model, light, estimator, min_dolp : options that ``plane`` depends on.
+    plane : the best single normal of all pixels that count, under ``angle_model``.
+    residuals : of the best single normal under each model.
+    focal : the focal length, if it was asked for.
+    planes : all planes in view, if they were asked for.
+    """
+
+    image: Path
+    width: int
+    height: int
+    intrinsics: tuple[float, float, float, float]
+    intrinsics_from: IntrinsicsSource
+    angle_model: AngleModel
+    light: Light
+    estimator: Estimator
+    min_dolp: float
+    plane: PlaneFigures
+    residuals: dict[AngleModel, Residual]
+    focal: FocalFigures | None = None
+    planes: tuple[PlaneFigures, ...] | None = None
+
+    def content(self) -> dict[str, Any]:
+        """In terms of JSON, without what was not asked for."""
+        plain: dict[str, Any] = to_plain(self)
+        return {key: value for key, value in plain.items() if value is not None}
+
+
+def measure_planes(
+    image: Path, options: PlaneOptions | None = None, capture: CaptureOptions | None = None
+) -> PlaneMeasurement:
+    """Normals of planes in one raw mosaic, under every angle model.
+
+    Parameters
+    ----------
+    image : the file.
+    options : which pixels count, and how their normal is solved.
+    capture : how the mosaic is read.
+
+    Raises
+    ------
+    OptionError
+        The intrinsics do not fit the image.
+    DataError
+        A file is unusable, or no pixel counts.
+    """
+    options = options or PlaneOptions()
+    stokes = load_stokes(image, capture or CaptureOptions())
+    mask = select_pixels(stokes, options, image)
+    view = PlaneView(stokes=stokes, mask=mask, light=options.light)
+    camera = _camera(options, stokes)
+    source = IntrinsicsSource.OPTIONS if options.intrinsics else IntrinsicsSource.ASSUMED
+    focal = view.focal(camera) if options.estimate_focal else None
+    if focal is not None and focal.observable and options.intrinsics is None:
+        scale = focal.focal_px / camera.fx
+        camera = replace(camera, fx=camera.fx * scale, fy=camera.fy * scale)
+        source = IntrinsicsSource.ESTIMATED
+    robust = options.estimator is Estimator.ROBUST
+    planes = {model: view.plane(model, camera, robust=robust) for model in AngleModel}
+    found = None
+    if options.find_planes:
+        found = tuple(
+            _figures(plane.estimate, plane.mask)
+            for plane in view.planes(options.angle_model, camera)
+        )
+    return PlaneMeasurement(
+        image=image,
+        width=camera.width,
+        height=camera.height,
+        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+        intrinsics_from=source,
+        angle_model=options.angle_model,
+        light=options.light,
+        estimator=options.estimator,
+        min_dolp=options.min_dolp,
+        plane=_figures(planes[options.angle_model]),
+        residuals={
+            model: Residual(rmse_deg=plane.rmse_deg, median_deg=plane.median_deg)
+            for model, plane in planes.items()
+        },
+        focal=None if focal is None else _focal_figures(focal),
+        planes=found,
+    )
+
+
+def select_pixels(stokes: Stokes, options: PlaneOptions, source: Path) -> Mask:
+    """Pixels (H, W) that count.
+
+    Parameters
+    ----------
+    stokes : images of the mosaic.
+    options : say which.
+    source : the image, for messages.
+
+    Raises
+    ------
+    DataError
+        Fewer than ``MIN_PIXELS`` do, or the mask is unusable.
+    """
+    inside = np.ones(stokes.shape, np.bool_)
+    if options.mask is not None:
+        inside = read_mask(options.mask, stokes.shape)
+    elif options.polygon is not None:
+        inside = polygon_mask(options.polygon, stokes.shape)
+    valid = stokes.valid if options.drop_clipped else stokes.s0 > 0
+    mask = inside & valid & (stokes.dolp > options.min_dolp)
+    if mask.any():
+        mask &= stokes.s0 >= options.min_intensity * np.median(stokes.s0[mask])
+    if np.count_nonzero(mask) < MIN_PIXELS:
+        raise DataError(
+            source,
+            f"only {np.count_nonzero(mask)} pixels have a DoLP above {options.min_dolp} there; "
+            "lower `plane.min_dolp` or choose a polarised area.",
+        )
+    return np.asarray(mask)
+
+
+def _camera(options: PlaneOptions, stokes: Stokes) -> PinholeCamera:
+    """The given camera, or a centred one with a focal length of the image's width."""
+    height, width = stokes.shape
+    if options.intrinsics is None:
+        return PinholeCamera(
+            width=width, height=height, fx=width, fy=width, cx=width / 2, cy=height / 2
+        )
+    fx, fy, cx, cy = options.intrinsics
+    if not (0 < cx < width and 0 < cy < height):
+        raise OptionError(
+            f"have the principal point {cx:g},{cy:g} outside the polarization image of "
+            f"{width}x{height} px; give those of the half-size image.",
+            field="plane.intrinsics",
+        )
+    return PinholeCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def _figures(plane: PlaneEstimate, mask: Mask | None = None) -> PlaneFigures:
+    center = None
+    if mask is not None:
+        row, col = np.argwhere(mask).mean(axis=0)
+        center = (float(col + 0.5), float(row + 0.5))
+    x, y, z = plane.normal.tolist()
+    return PlaneFigures(
+        normal=(x, y, z),
+        valid=plane.valid,
+        conditioning=plane.conditioning,
+        sigma_deg=plane.sigma_deg,
+        rmse_deg=plane.rmse_deg,
+        median_deg=plane.median_deg,
+        num_pixels=plane.num_pixels,
+        outlier_share=plane.outlier_share,
+        center_xy=center,
+    )
+
+
+def _focal_figures(focal: FocalEstimate) -> FocalFigures:
+    return FocalFigures(
+        focal_px=focal.focal_px if focal.observable else None,
+        sigma_px=focal.sigma_px,
+        observable=focal.observable,
+        scan_focal_px=tuple(focal.scan_focal_px.tolist()),
+        scan_rmse_deg=tuple(focal.scan_rmse_deg.tolist()),
+        scan_median_deg=tuple(focal.scan_median_deg.tolist()),
+    )

@@ -1,0 +1,356 @@
+"""What a capture's files are and how well they were exposed; nothing is reconstructed.
+
+:func:`inspect_capture` gives numbers, :func:`contact_sheet` a picture of some views: intensity,
+AoLP as hue with its wheel, DoLP.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.config import CaptureKind, CaptureOptions, Resolution
+from polmvs.io.images import write_png
+from polmvs.polarization.capture import Capture, intensity_image_8bit, open_capture
+from polmvs.polarization.stokes import Stokes
+
+Image = NDArray[np.float32]
+Picture = NDArray[np.uint8]
+
+POLARIZED_DOLP = 0.1  # from which a pixel counts as polarised, as --min-dolp
+SHOWN_DOLP = 0.5  # DoLP that is shown white, and AoLP in full colour
+SHEET_VIEWS = 8
+TILE_PX = 320  # width of one picture
+MARGIN_PX = 6
+HEADER_PX = 96
+CAPTION_PX = 22
+WHITE, GRAY, BLACK = (255, 255, 255), (160, 160, 160), (0, 0, 0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectionLimits:
+    """Figures beyond which a capture is warned of; all are guesses of what still works.
+
+    Attributes
+    ----------
+    saturated : share of a view's pixels that are clipped.
+    dark_white : brightest 0.5 % of the capture, share of full scale.
+    polarized : share of the capture's pixels that are polarised.
+    edge_px : width of the sharpest edges of a view.
+    uneven : ratio of the brightest to the darkest view's median intensity.
+    colour : difference of the four 2x2 blocks' brightness, share, of a colour sensor.
+    """
+
+    saturated: float = 0.1
+    dark_white: float = 0.2
+    polarized: float = 0.01
+    edge_px: float = 6.0
+    uneven: float = 4.0
+    colour: float = 0.06
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewFigures:
+    """One view in numbers.
+
+    Attributes
+    ----------
+    name : of the view.
+    median_intensity : of s0 / 2, share of full scale.
+    saturated : share of pixels that a clipped sample contributes to, or that are not finite.
+    dark : share of pixels under the darkness threshold.
+    polarized : share of all pixels that are valid and have a DoLP of 0.1 and more.
+    median_dolp : of the valid pixels.
+    sigma_aolp_deg : median over the polarised pixels; NaN without any.
+    gain_sigma : see :class:`polmvs.polarization.stokes.Stokes`.
+    edge_px : width of the sharpest edges, px: contrast over slope. 2 is perfect, 5 blurred.
+    """
+
+    name: str
+    median_intensity: float
+    saturated: float
+    dark: float
+    polarized: float
+    median_dolp: float
+    sigma_aolp_deg: float
+    gain_sigma: float
+    edge_px: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inspection:
+    """A capture in numbers.
+
+    Attributes
+    ----------
+    capture : as it was opened, with what was recognised and decided.
+    white : s0 / 2 of the brightest 0.5 % of pixels, share of full scale.
+    views : figures of each view.
+    warnings : what a user should look at, one line each.
+    """
+
+    capture: Capture
+    white: float
+    views: tuple[ViewFigures, ...]
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The whole in lines of text: what it is, a table of the views, warnings."""
+        header = (
+            f"{'view':<24} {'intensity':>9} {'clipped':>8} {'dark':>7} {'polarised':>9} "
+            f"{'DoLP':>6} {'sigma AoLP':>10} {'edge':>7}"
+        )
+        rows = [
+            f"{v.name[-24:]:<24} {100 * v.median_intensity:>7.1f} % {100 * v.saturated:>6.1f} % "
+            f"{100 * v.dark:>5.1f} % {100 * v.polarized:>7.1f} % {v.median_dolp:>6.3f} "
+            f"{v.sigma_aolp_deg:>6.2f} deg {v.edge_px:>4.1f} px"
+            for v in self.views
+        ]
+        size = f"polarization images of {self.capture.width}x{self.capture.height} px"
+        warned = [f"warning: {text}" for text in self.warnings]
+        return (*self.capture.notes, size, header, *rows, *warned)
+
+
+def inspect_capture(
+    capture: Capture | Path,
+    options: CaptureOptions | None = None,
+    *,
+    limits: InspectionLimits | None = None,
+    on_progress: Callable[[int], None] | None = None,
+) -> Inspection:
+    """Look at every view of a capture.
+
+    Parameters
+    ----------
+    capture : an open one, or its folder.
+    options : how it is to be opened.
+    on_progress : called with 1 after each view.
+
+    Raises
+    ------
+    PolmvsError
+        The capture cannot be read, or its pattern does not fit.
+    """
+    opened = capture if isinstance(capture, Capture) else open_capture(capture, options)
+    bounds = InspectionLimits() if limits is None else limits
+    white = 0.5 * opened.exposure()
+    figures: list[ViewFigures] = []
+    colour = 0.0
+    for name in opened.names:
+        stokes = opened.load(name)
+        if not figures:
+            colour = _block_differences(opened, stokes)
+        figures.append(_figures_of(name, stokes, opened.options.darkness))
+        if on_progress is not None:
+            on_progress(1)
+    warnings = _warnings(opened, white, figures, colour, bounds)
+    return Inspection(capture=opened, white=white, views=tuple(figures), warnings=tuple(warnings))
+
+
+def contact_sheet(capture: Capture, names: Sequence[str] | None = None) -> Picture:
+    """Pictures of some views: intensity, AoLP, DoLP, one view a row, in two columns of rows.
+
+    Parameters
+    ----------
+    names : of the views; None for eight, evenly spread.
+
+    Returns
+    -------
+    (H, W, 3) uint8, BGR. Clipped pixels are red in the intensity; hue is the AoLP, paler and
+    darker where the DoLP is under 0.5.
+    """
+    if names is None:
+        count = min(SHEET_VIEWS, len(capture.names))
+        chosen = np.linspace(0, len(capture.names) - 1, count).round().astype(int)
+        names = [capture.names[k] for k in chosen]
+    white = capture.exposure()
+    tiles = []
+    for name in names:
+        stokes = capture.load(name)
+        shown = (intensity_picture(stokes, white), aolp_picture(stokes), dolp_picture(stokes))
+        captions = (f"{name}  intensity", "AoLP", f"DoLP, white: {SHOWN_DOLP:g}")
+        tiles.append(np.hstack([_tile(*pair) for pair in zip(shown, captions, strict=True)]))
+    columns = 2 if len(tiles) > 2 else 1
+    if len(tiles) % columns:
+        tiles.append(np.zeros_like(tiles[0]))
+    rows = [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
+    body = np.vstack(rows)
+    return np.vstack([_header(capture, body.shape[1]), body])
+
+
+def write_contact_sheet(path: Path, capture: Capture) -> None:
+    """Write the contact sheet as PNG, whole or not at all.
+
+    Raises
+    ------
+    DataError
+        The system refuses, or a view cannot be read.
+    """
+    write_png(path, contact_sheet(capture))
+
+
+def intensity_picture(stokes: Stokes, white: float) -> Picture:
+    """Intensity as a picture (H, W, 3), BGR; pixels that are not valid but bright are red."""
+    gray = intensity_image_8bit(stokes, white)
+    picture = np.dstack([gray, gray, gray])
+    picture[~stokes.valid & (stokes.s0 > 0.1 * white)] = (40, 40, 255)
+    return picture
+
+
+def aolp_picture(stokes: Stokes) -> Picture:
+    """AoLP as hue (H, W, 3), BGR: red 0, and once around the circle in 180 degrees."""
+    return _hue_picture(stokes.aolp, np.clip(stokes.dolp / SHOWN_DOLP, 0, 1))
+
+
+def dolp_picture(stokes: Stokes) -> Picture:
+    """DoLP as grey (H, W, 3), white from 0.5."""
+    gray = np.rint(255 * np.clip(stokes.dolp / SHOWN_DOLP, 0, 1)).astype(np.uint8)
+    return np.dstack([gray, gray, gray])
+
+
+def _hue_picture(aolp: Image, strength: Image) -> Picture:
+    """Axial angles in rad as colours; OpenCV's hue has 180 steps."""
+    hue = np.mod(np.rint(aolp * (180 / np.pi)), 180).astype(np.uint8)
+    # A root keeps weakly polarised surfaces visible.
+    value = np.rint(255 * np.sqrt(np.clip(strength, 0, 1))).astype(np.uint8)
+    hsv = np.dstack([hue, value, value])
+    return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR), np.uint8)
+
+
+def _wheel(size: int) -> Picture:
+    """Colours of the AoLP's directions: each colour lies along its angle."""
+    y, x = np.mgrid[0:size, 0:size] - (size - 1) / 2
+    radius = np.hypot(x, y)
+    angle = np.mod(np.arctan2(-y, x), np.pi).astype(np.float32)
+    inside = (radius < size / 2 - 1) & (radius > size / 6)
+    return _hue_picture(angle, inside.astype(np.float32))
+
+
+def _tile(picture: Picture, caption: str) -> Picture:
+    """A picture of the tiles' width with its caption and a margin."""
+    height = round(picture.shape[0] * TILE_PX / picture.shape[1])
+    small = cv2.resize(picture, (TILE_PX, height), interpolation=cv2.INTER_AREA)
+    tile = np.zeros((height + CAPTION_PX + MARGIN_PX, TILE_PX + MARGIN_PX, 3), np.uint8)
+    tile[CAPTION_PX : CAPTION_PX + height, :TILE_PX] = small
+    _write(tile, caption, (2, CAPTION_PX - 7), WHITE)
+    return tile
+
+
+def _header(capture: Capture, width: int) -> Picture:
+    """The wheel and what the capture is."""
+    header = np.zeros((HEADER_PX, width, 3), np.uint8)
+    wheel = _wheel(HEADER_PX - 12)
+    header[6:-6, 6 : 6 + wheel.shape[1]] = wheel
+    left = wheel.shape[1] + 14
+    lines = [str(capture.folder), *capture.notes]
+    for k, line in enumerate(lines[:4]):
+        room = (width - left) // 8
+        _write(header, line[:room], (left, 18 + 22 * k), WHITE if k == 0 else GRAY)
+    return header
+
+
+def _write(picture: Picture, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    plain = text.encode("ascii", "replace").decode()
+    cv2.putText(picture, plain, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
+
+
+def _figures_of(name: str, stokes: Stokes, darkness: float) -> ViewFigures:
+    valid, s0 = stokes.valid, stokes.s0
+    dolp = stokes.dolp
+    dark = ~valid & (s0 < 2.0 * darkness)
+    polarized = valid & (dolp >= POLARIZED_DOLP)
+    sigma = np.degrees(np.median(stokes.sigma_aolp[polarized])) if polarized.any() else np.nan
+    return ViewFigures(
+        name=name,
+        median_intensity=0.5 * float(np.median(s0)),
+        saturated=float(np.mean(~valid & ~dark)),
+        dark=float(np.mean(dark)),
+        polarized=float(np.mean(polarized)),
+        median_dolp=float(np.median(dolp[valid])) if valid.any() else 0.0,
+        sigma_aolp_deg=float(sigma),
+        gain_sigma=stokes.gain_sigma,
+        edge_px=_edge_width(s0),
+    )
+
+
+def _edge_width(s0: Image) -> float:
+    """Contrast over slope at the steepest 0.5 % of pixels, px; NaN in an even image."""
+    gx = cv2.Sobel(s0, cv2.CV_32F, 1, 0, scale=0.125)
+    gy = cv2.Sobel(s0, cv2.CV_32F, 0, 1, scale=0.125)
+    slope = np.hypot(gx, gy)
+    kernel = np.ones((9, 9), np.uint8)
+    contrast = cv2.dilate(s0, kernel) - cv2.erode(s0, kernel)
+    steep = slope >= np.quantile(slope, 0.995)
+    if not slope[steep].max(initial=0) > 0:
+        return float("nan")
+    return float(np.median(contrast[steep] / np.maximum(slope[steep], 1e-12)))
+
+
+def _block_differences(capture: Capture, stokes: Stokes) -> float:
+    """How the brightness of neighbouring cells differs in a 2x2 rhythm, share: a Bayer pattern."""
+    options = capture.options
+    half = options.resolution is Resolution.HALF
+    if capture.files.kind is not CaptureKind.MOSAIC or options.bayer is not None or not half:
+        return 0.0
+    rows, cols = (side // 2 * 2 for side in stokes.shape)
+    blocks: NDArray[Any] = stokes.s0[:rows, :cols].reshape(rows // 2, 2, cols // 2, 2)
+    mean = blocks.mean(axis=(1, 3))
+    lit = mean > 2 * options.darkness
+    if not lit.any():
+        return 0.0
+    shares = [float(np.median(blocks[:, i, :, j][lit] / mean[lit])) for i in (0, 1) for j in (0, 1)]
+    return max(shares) - min(shares)
+
+
+def _warnings(
+    capture: Capture,
+    white: float,
+    views: Sequence[ViewFigures],
+    colour: float,
+    limits: InspectionLimits,
+) -> list[str]:
+    """What a user should look at."""
+    lines = list(capture.warnings)
+    if colour > limits.colour:
+        lines.append(
+            f"neighbouring cells differ by {100 * colour:.0f} % in a 2x2 rhythm, as those of a "
+            "colour sensor do; give --bayer"
+        )
+    spoiled = [v.name for v in views if v.saturated > limits.saturated]
+    if spoiled:
+        lines.append(
+            f"more than {100 * limits.saturated:.0f} % is clipped in {_some(spoiled)}; expose less"
+        )
+    if white < limits.dark_white:
+        lines.append(f"the brightest 0.5 % are at {100 * white:.0f} % of full scale; expose more")
+    polarized = float(np.mean([v.polarized for v in views]))
+    if polarized < limits.polarized:
+        lines.append(
+            f"{100 * polarized:.1f} % of the pixels are polarised (DoLP {POLARIZED_DOLP:g}); "
+            "is it a polarization camera's raw format, and is the part glossy?"
+        )
+    blurred = [v.name for v in views if v.edge_px > limits.edge_px]
+    if blurred:
+        lines.append(f"no sharp edge in {_some(blurred)}: out of focus or moved")
+    levels = [v.median_intensity for v in views if v.median_intensity > 0]
+    if levels and max(levels) > limits.uneven * min(levels):
+        lines.append(
+            f"the views' intensities differ by a factor of {max(levels) / min(levels):.1f}; was "
+            "automatic exposure on?"
+        )
+    if capture.pattern_check is not None and capture.pattern_check.fits is False:
+        lines.append(capture.pattern_check.message)
+    return lines
+
+
+def _some(names: Sequence[str]) -> str:
+    """A few of many names."""
+    shown = ", ".join(names[:3])
+    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
