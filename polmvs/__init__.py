@@ -22,12 +22,81 @@ Rows
     the residual is the sine of the angle between the normal and the plane of incidence.
 World
     COLMAP's. Its scale is arbitrary unless the poses were given in metres.
+
+Use
+---
+Importing this is light and changes nothing; what a function needs is imported when it is used::
+
+    stokes = polmvs.read_stokes("frame.png")              # .aolp, .dolp, .phase(), .sigma_aolp
+    normal = polmvs.plane_normal(stokes, (fx, fy, cx, cy))
+    result = polmvs.reconstruct("capture", "out", model="ppa")
+    result.point_cloud(), result.mesh(), result.depth_map("003.png"), result.metrics
+    print(polmvs.compare("capture", "out2", gt="capture/gt").table())
 """
 
 # pycolmap >= 4.1 exports its own deflate symbols: imported before zlib it makes PNG and npz
 # writing abort. Loading zlib first, before anything else of this package, cures it.
 import zlib  # noqa: F401
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from polmvs._version import __version__
 
-__all__ = ["__version__"]
+if TYPE_CHECKING:
+    from polmvs.api import (
+        Reconstruction,
+        RunResult,
+        TrackNormals,
+        compare,
+        open_run,
+        plane_normal,
+        read_stokes,
+        reconstruct,
+        track_normals,
+    )
+    from polmvs.camera import PinholeCamera
+    from polmvs.config import AngleModel, Options
+    from polmvs.errors import DataError, OptionError, PolmvsError
+
+__all__ = [
+    "AngleModel",
+    "DataError",
+    "OptionError",
+    "Options",
+    "PinholeCamera",
+    "PolmvsError",
+    "Reconstruction",
+    "RunResult",
+    "TrackNormals",
+    "__version__",
+    "compare",
+    "open_run",
+    "plane_normal",
+    "read_stokes",
+    "reconstruct",
+    "track_normals",
+]
+
+# Where the names are that are not in polmvs.api; each is imported when it is first used.
+_ELSEWHERE = {
+    "AngleModel": "polmvs.config",
+    "DataError": "polmvs.errors",
+    "OptionError": "polmvs.errors",
+    "Options": "polmvs.config",
+    "PinholeCamera": "polmvs.camera",
+    "PolmvsError": "polmvs.errors",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A name of the public API."""
+    if name not in __all__:
+        raise AttributeError(f"module 'polmvs' has no attribute {name!r}")
+    value = getattr(import_module(_ELSEWHERE.get(name, "polmvs.api")), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """The public API."""
+    return sorted(__all__)

@@ -8,10 +8,7 @@ user gives must belong to the capture: the same frame, the same images.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path, PurePosixPath
@@ -37,6 +34,7 @@ from polmvs.colmap.models import read_model, require_matches, write_model
 from polmvs.colmap.undistort import undistorted_model, warp_image
 from polmvs.errors import DataError
 from polmvs.geometry import SimilarityTransform, align_points, rotation_angle
+from polmvs.io.folders import new_folder
 from polmvs.io.images import read_gray, write_bytes, write_png
 from polmvs.scene import SparseModel, Tracks, View, short_list
 
@@ -318,36 +316,6 @@ def write_lines(path: Path, lines: Sequence[str]) -> None:
     write_bytes(path, "".join(f"{line}\n" for line in lines).encode())
 
 
-@contextmanager
-def new_folder(folder: PathArg) -> Iterator[Path]:
-    """A temporary folder beside a new one, which takes its name when all went well, else goes.
-
-    Raises
-    ------
-    DataError
-        The folder exists and is not empty, or the system refuses.
-    """
-    target = Path(folder)
-    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
-        raise DataError(target, "exists already. Remove it or choose another folder.")
-    temporary: Path | None = None
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-        # mkdtemp's folder is the owner's alone; one that mkdir makes has the usual rights.
-        content = temporary / "content"
-        content.mkdir()
-        yield content
-        if target.exists():
-            target.rmdir()
-        content.rename(target)
-    except OSError as error:
-        raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
-    finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
-
-
 class CommonView(NamedTuple):
     """A view of the workspace and the same of the capture's model."""
 
@@ -402,8 +370,8 @@ def require_same_frame(
         f"its poses are in another frame than those of the capture's model: the scene lies "
         f"{errors[worst]:.3g} px apart in {pairs[worst].item.view.name}, the worst of "
         f"{len(pairs)} views{hint}. "
-        "Give the model that the workspace was made from as --sparse, without --reference, --aruco "
-        "and --scale.",
+        "Give the model that the workspace was made from as `sfm.sparse`, without "
+        "`reference.reference`, `reference.aruco` and `reference.scale`.",
     )
 
 

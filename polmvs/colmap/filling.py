@@ -26,12 +26,12 @@ from polmvs.colmap.dense_workspace import (
     DenseWorkspace,
     WorkspaceView,
     map_files,
-    new_folder,
     write_lines,
     write_maps,
 )
 from polmvs.colmap.maps import DepthNormals
 from polmvs.errors import DataError, OptionError
+from polmvs.io.folders import new_folder
 
 # Depth and normals of an image in the workspace's pixels by name, None for none.
 FillLoader = Callable[[str], DepthNormals | None]

@@ -13,12 +13,10 @@ from __future__ import annotations
 
 import logging
 import mmap
-import os
 import re
-import shutil
 import struct
-import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -36,6 +34,7 @@ from polmvs.colmap.cameras import (
 )
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
+from polmvs.io.folders import new_folder
 from polmvs.scene import SparseModel, Tracks, View, match_names, short_list
 
 PathArg = str | PathLike[str]
@@ -58,23 +57,49 @@ def read_model(path: PathArg) -> SparseModel:
         The model is missing, damaged or without a registered image.
     """
     folder = find_model(path)
+    with _as_data_error(folder):
+        model = model_from_reconstruction(_open(folder))
+    if not model.views:
+        raise DataError(
+            folder, "has no registered image. Run COLMAP again or leave out `sfm.sparse`."
+        )
+    numbers = [view.cam_from_world.translation for view in model.views]
+    if not all(np.isfinite(array).all() for array in (*numbers, model.tracks.points_in_world)):
+        raise DataError(folder, "is no sound COLMAP model (not all numbers in it are finite).")
+    return model
+
+
+def read_reconstruction(path: PathArg) -> pycolmap.Reconstruction:
+    """Read a COLMAP model as pycolmap's own type, for users of pycolmap.
+
+    Raises
+    ------
+    DataError
+        The model is missing or damaged.
+    """
+    folder = find_model(path)
+    with _as_data_error(folder):
+        return _open(folder)
+
+
+def _open(folder: Path) -> pycolmap.Reconstruction:
     if _model_suffix(folder) == ".bin":
         check_binary_model(folder)
+    with quiet_colmap():
+        return pycolmap.Reconstruction(str(folder))
+
+
+@contextmanager
+def _as_data_error(folder: Path) -> Iterator[None]:
+    """What pycolmap says of a damaged model as one line."""
     try:
-        with quiet_colmap():
-            model = model_from_reconstruction(pycolmap.Reconstruction(str(folder)))
+        yield
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OverflowError) as error:
         # COLMAP's own words, shortened and without the place in its source.
         reason = re.sub(r"\[[\w.]+:\d+\]", "", " ".join(str(error).split()))[:120].strip()
         raise DataError(
             folder, f"is no sound COLMAP model ({reason or 'no reason given'}). Export it again."
         ) from error
-    if not model.views:
-        raise DataError(folder, "has no registered image. Run COLMAP again or leave out --sparse.")
-    numbers = [view.cam_from_world.translation for view in model.views]
-    if not all(np.isfinite(array).all() for array in (*numbers, model.tracks.points_in_world)):
-        raise DataError(folder, "is no sound COLMAP model (not all numbers in it are finite).")
-    return model
 
 
 def find_model(path: PathArg) -> Path:
@@ -286,28 +311,10 @@ def write_model(model: SparseModel, folder: str | PathLike[str]) -> None:
     write_reconstruction(_reconstruction(model), folder)
 
 
-def write_reconstruction(
-    reconstruction: pycolmap.Reconstruction, folder: str | PathLike[str]
-) -> None:
+def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: PathArg) -> None:
     """Write a reconstruction as COLMAP binary, whole or not at all."""
-    target = Path(folder)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    try:
-        temporary.chmod(0o777 & ~_umask())
-        reconstruction.write_binary(str(temporary))
-        if target.exists():
-            shutil.rmtree(target)
-        temporary.rename(target)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    with new_folder(folder, overwrite=True) as root:
+        reconstruction.write_binary(str(root))
 
 
 def _reconstruction(model: SparseModel) -> pycolmap.Reconstruction:

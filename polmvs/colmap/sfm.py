@@ -31,7 +31,7 @@ logger = logging.getLogger(__name__)
 
 NO_MODEL_REMEDY = (
     "The surroundings of the part need texture and neighbouring views more overlap; give "
-    "--intrinsics where they are known, or a COLMAP model with --sparse."
+    "`sfm.intrinsics` where they are known, or a COLMAP model as `sfm.sparse`."
 )
 
 OnProgress = Callable[[str], None]
@@ -153,20 +153,23 @@ def check_intrinsics(
     if max(abs(cx / width - 1), abs(cy / height - 1)) < tolerances.corner_tolerance:
         half = ",".join(f"{value / 2:.10g}" for value in intrinsics)
         raise OptionError(
-            f"--intrinsics: the principal point {cx:g},{cy:g} lies in the corner of the "
-            f"{width}x{height} px polarization images. For the intrinsics of the full mosaic "
-            f"give half of each: --intrinsics {half}."
+            f"has the principal point {cx:g},{cy:g} in the corner of the {width}x{height} px "
+            "polarization images. For the intrinsics of the full mosaic give half of each: "
+            f"{half}.",
+            field="sfm.intrinsics",
         )
     if not (0 < cx < width and 0 < cy < height):
         raise OptionError(
-            f"--intrinsics: the principal point {cx:g},{cy:g} lies outside the {width}x{height} "
-            "px polarization images. Give fx,fy,cx,cy in pixels of that size."
+            f"has the principal point {cx:g},{cy:g} outside the {width}x{height} px "
+            "polarization images. Give fx,fy,cx,cy in pixels of that size.",
+            field="sfm.intrinsics",
         )
     least, most = tolerances.focal_range
     if not all(least * width <= focal <= most * width for focal in (fx, fy)):
         raise OptionError(
-            f"--intrinsics: focal lengths {fx:g},{fy:g} are not within {least:g} to {most:g} "
-            f"times the image's width of {width} px. Give them in pixels of the half-size images."
+            f"has focal lengths {fx:g},{fy:g}, not within {least:g} to {most:g} "
+            f"times the image's width of {width} px. Give them in pixels of the half-size images.",
+            field="sfm.intrinsics",
         )
     return PinholeCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
@@ -197,8 +200,9 @@ def _reader_options(
     known = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
     if options.camera_model not in known:
         raise OptionError(
-            f"--camera-model {options.camera_model} is unknown to COLMAP. Choose one of "
-            f"{', '.join(sorted(known))}."
+            f"{options.camera_model} is unknown to COLMAP. Choose one of "
+            f"{', '.join(sorted(known))}.",
+            field="sfm.camera_model",
         )
     reader.camera_model = options.camera_model
     return reader

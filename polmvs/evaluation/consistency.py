@@ -94,13 +94,7 @@ def _polarised_surface(cloud: Cloud) -> Cloud:
     kind = cloud.scalars.get("kind")
     if kind is None:
         return cloud
-    kept = kind == PointKind.SURFACE
-    return Cloud(
-        points=cloud.points[kept],
-        normals=None if cloud.normals is None else cloud.normals[kept],
-        colors=None if cloud.colors is None else cloud.colors[kept],
-        scalars={name: values[kept] for name, values in cloud.scalars.items()},
-    )
+    return cloud.only(kind == PointKind.SURFACE)
 
 
 def _track_residual(tracks: Cloud) -> float:

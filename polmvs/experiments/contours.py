@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, ExperimentOptions
 from polmvs.errors import DataError
+from polmvs.evaluation.metrics import FAR_M
 from polmvs.experiments.data import OnProgress, Scene, Truth, load_view, require_counted
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.io.layouts import BoardTruth
@@ -41,8 +42,10 @@ Mask = NDArray[np.bool_]
 Image = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
+# What the experiment measures; these define the figures.
 INSET_PX = 4  # of the seeds: nearer to the edge the blurred light of the background is mixed in
 MEASURED_PX = 1.0  # distance between the points of a contour that are measured
+MIN_SEEN_SHARE = 0.9  # of the seeds, that a second view must see
 
 METHODS = ("opa", "ppa_normals", "ppa_tangent", "tilted_tangent")
 
@@ -189,7 +192,7 @@ def trace_view(
     ranges = np.nan_to_num(_true_ranges(scene, index))
     seeds_xy = edge_seeds(own.region.inside & (ranges > 0), num_seeds)
     seed_range = sample_image(ranges.astype(np.float32), seeds_xy, nearest=True)
-    seeds = _to_world(own, seeds_xy, seed_range)
+    seeds = own.view.points_at(seeds_xy, seed_range)
     lines = {}
     along: Floats
     sources = (
@@ -247,7 +250,7 @@ def _thinned(
     # The node nearest to each whole pixel; steps need not divide a pixel.
     nearest = np.abs(np.abs(paths.arc_px) - step) <= 0.25 * MEASURED_PX
     kept = nearest & np.isfinite(ranges)
-    return _to_world(phase_map, paths.xy[kept], ranges[kept]), paths.curve[kept]
+    return phase_map.view.points_at(paths.xy[kept], ranges[kept]), paths.curve[kept]
 
 
 def _trace(
@@ -267,17 +270,8 @@ def _true_ranges(scene: Scene, index: int) -> Array:
     return depth / view_rays(scene.truth.views[name])[..., 2]
 
 
-def _to_world(phase_map: PhaseMap, xy: Floats, ranges: Floats) -> Array:
-    """World points (N, 3) of image coordinates (N, 2) at distances (N,)."""
-    in_cam = phase_map.view.camera.rays(xy) * np.asarray(ranges, np.float64)[:, None]
-    return np.asarray(phase_map.view.cam_from_world.inverse() * in_cam, np.float64)
-
-
 def _measured(points: Array, curve: NDArray[np.int64], surface: TrueSurface) -> Lines:
     return Lines(points=points, curve=curve, heights=surface.heights(points))
-
-
-MIN_SEEN_SHARE = 0.9  # of the seeds, that a second view must see
 
 
 def second_view(maps: Sequence[PhaseMap], index: int, seeds: Array) -> int | None:
@@ -376,9 +370,6 @@ def _normals(
     return np.asarray(estimate.normals @ first.rotation.T, np.float64)
 
 
-FAR_M = 0.02
-
-
 class TrueSurface(Protocol):
     """Distance of points to a surface."""
 
@@ -451,10 +442,7 @@ def open_surface(truth: Truth) -> TrueSurface:
     )
 
 
-MAX_STRIDE = 4  # points of a contour between two vertices of the file
-
-
-def line_set_bytes(lines: Sequence[Lines], *, stride: int = MAX_STRIDE) -> bytes:
+def line_set_bytes(lines: Sequence[Lines], *, stride: int = 4) -> bytes:
     """A binary PLY of contours; neighbours on a curve are joined.
 
     Parameters

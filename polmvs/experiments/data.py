@@ -25,7 +25,7 @@ from polmvs.polarization.phase_map import PhaseMap, as_tilted, build_phase_map, 
 from polmvs.polarization.region import Region, find_region, smooth
 from polmvs.polarization.stokes import Stokes
 from polmvs.poses.alignment import Alignment, align_views
-from polmvs.scene import View, match_names, short_list
+from polmvs.scene import View, find_name, match_names, short_list
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -364,15 +364,17 @@ def view_indices(names: Sequence[str] | None, scene: Scene) -> tuple[int, ...] |
     """
     if names is None:
         return None
-    by_name = {view.name: i for i, view in enumerate(scene.views)}
-    by_name |= {Path(view.name).stem: i for i, view in enumerate(scene.views)}
+    known = [view.name for view in scene.views]
+    indices = []
     for name in names:
-        if name not in by_name:
+        found = find_name(name, known)
+        if found is None:
             raise OptionError(
                 f"names {name!r}, and there is no such image with truth and pose.",
                 field="experiment.views",
             )
-    return tuple(dict.fromkeys(by_name[name] for name in names))
+        indices.append(known.index(found))
+    return tuple(dict.fromkeys(indices))
 
 
 def require_apart(out: Path, capture: Path) -> None:

@@ -182,12 +182,10 @@ def _sample_view(scene: Scene, index: int, num: int, seed: int) -> SurfacePoints
     if len(pixels) == 0:
         return SurfacePoints(points=np.zeros((0, 3)), normals=np.zeros((0, 3)))
     rows, cols = pixels[np.random.default_rng(seed).integers(0, len(pixels), num)].T
-    rays = view.camera.rays(np.stack([cols + 0.5, rows + 0.5], axis=-1))
-    in_cam = rays * (depth[rows, cols] / rays[:, 2])[:, None]
-    world_from_cam = view.cam_from_world.inverse()
+    xy = np.stack([cols + 0.5, rows + 0.5], axis=-1)
     return SurfacePoints(
-        points=np.asarray(world_from_cam * in_cam, np.float64),
-        normals=normals[rows, cols] @ world_from_cam.rotation.T,
+        points=view.points_at(xy, depth[rows, cols] / view.camera.rays(xy)[:, 2]),
+        normals=normals[rows, cols] @ view.cam_from_world.rotation,
     )
 
 

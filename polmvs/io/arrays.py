@@ -40,7 +40,9 @@ def map_array(path: Path) -> NDArray[Any]:
         stamp = path.stat().st_mtime_ns
         return _map_array(path, stamp)
     except (OSError, ValueError, EOFError) as error:
-        raise DataError(path, f"cannot be read ({error}); run again with --overwrite.") from error
+        raise DataError(
+            path, f"cannot be read ({error}); run again with `run.overwrite`."
+        ) from error
 
 
 @lru_cache(maxsize=256)

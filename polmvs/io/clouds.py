@@ -43,6 +43,15 @@ class Cloud:
     colors: NDArray[np.uint8] | None = None
     scalars: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
+    def only(self, kept: NDArray[np.bool_]) -> Cloud:
+        """The ``kept`` (N,) points as a cloud of their own."""
+        return Cloud(
+            points=self.points[kept],
+            normals=None if self.normals is None else self.normals[kept],
+            colors=None if self.colors is None else self.colors[kept],
+            scalars={name: values[kept] for name, values in self.scalars.items()},
+        )
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -96,6 +105,18 @@ def to_open3d(cloud: Cloud) -> Any:
     for name, values in cloud.scalars.items():
         column = np.ascontiguousarray(values, np.float32).reshape(-1, 1)
         result.point[name] = o3d.core.Tensor(column)
+    return result
+
+
+def mesh_to_open3d(mesh: Mesh) -> Any:
+    """Make an ``open3d.geometry.TriangleMesh`` with vertex normals."""
+    o3d = _open3d()
+    result = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.triangles)
+    )
+    result.vertex_normals = o3d.utility.Vector3dVector(mesh.normals)
+    if mesh.colors is not None:
+        result.vertex_colors = o3d.utility.Vector3dVector(mesh.colors / 255)
     return result
 
 

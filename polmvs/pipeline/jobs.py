@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from polmvs.config import COMPARED_MODELS, AngleModel, Options, RunOptions
+from polmvs.config import COMPARED_MODELS, AngleModel, Options, RunOptions, options_from_plain
 from polmvs.errors import OptionError
 from polmvs.evaluation.comparison import Comparison, read_comparison
 from polmvs.pipeline.monitor import Monitor
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.runner import Run, open_run
+from polmvs.pipeline.runner import Run, load_record, open_run
 from polmvs.pipeline.stage_table import (
     COMPARE,
     DENSIFY,
@@ -22,12 +22,15 @@ from polmvs.pipeline.stage_table import (
     NORMALS,
     SFM,
     StageSpec,
+    sparse_figures,
     stage_table,
     with_needed,
 )
 from polmvs.pipeline.stages.densify import DensifyResult
+from polmvs.pipeline.stages.evaluation import evaluate_models
 from polmvs.pipeline.stages.maps import MIN_VIEWS, MapsResult
 from polmvs.pipeline.stages.seeds import SeedsResult
+from polmvs.polarization.capture import open_capture
 
 R = TypeVar("R")
 
@@ -149,6 +152,28 @@ def densify(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> JobOu
 def export(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
     """Mesh and COLMAP workspace of a folder that has a dense cloud."""
     return _do_alone(job, EXPORT, (model,), (model,))
+
+
+def measure(run_folder: RunFolder, models: Sequence[AngleModel]) -> Comparison:
+    """Figures of the clouds of a finished run, against the ground truth that its options name.
+
+    Nothing is written.
+
+    Raises
+    ------
+    DataError
+        The folder holds no such run, or its capture is gone.
+    """
+    record = load_record(run_folder)
+    assert record.capture is not None
+    options = options_from_plain(record.options, str(run_folder.run_file))
+    return evaluate_models(
+        open_capture(record.capture.folder, options.capture),
+        sparse_figures(record),
+        run_folder,
+        models,
+        options.evaluation.gt,
+    )
 
 
 def _do_alone(

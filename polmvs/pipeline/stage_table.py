@@ -210,21 +210,26 @@ def _write_workspace(model: AngleModel, run: StageInput) -> dense_workspace.Dens
 
 
 def _evaluate(models: Sequence[AngleModel], run: StageInput) -> evaluation.EvaluationResult:
-    found, chosen = run.record.result(poses.PosesResult), run.record.result(seeds.SeedsResult)
     comparison = evaluation.evaluate_models(
         run.capture,
-        SparseFigures(
-            num_views=found.num_views,
-            unregistered=found.unregistered,
-            num_tracks=found.num_tracks,
-            num_seeds=chosen.num_track_seeds,
-        ),
+        sparse_figures(run.record),
         run.run_folder,
         models,
         run.options.evaluation.gt,
         workers=run.workers,
     )
     return evaluation.write_comparison(comparison, run.run_folder.metrics, run.run_folder.summary)
+
+
+def sparse_figures(record: Record) -> SparseFigures:
+    """What all models of a run start from."""
+    found, chosen = record.result(poses.PosesResult), record.result(seeds.SeedsResult)
+    return SparseFigures(
+        num_views=found.num_views,
+        unregistered=found.unregistered,
+        num_tracks=found.num_tracks,
+        num_seeds=chosen.num_track_seeds,
+    )
 
 
 # The table

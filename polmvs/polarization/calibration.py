@@ -34,10 +34,12 @@ Image = NDArray[np.float32]
 Pattern = tuple[int, int, int, int]
 
 VERSION = 1
+STANDARD: Pattern = (90, 45, 135, 0)  # where the file names none
 MAX_ANGLE_ERROR_DEG = 20.0  # of a channel; more is another pattern, or angles of another direction
 MIN_DIATTENUATION = 0.3  # of a channel; sensors have 0.9 and more
 MIN_LIGHT = 0.01  # mean of a frame, share of full scale
-LEVEL_ROUNDS = 20  # of brightness against response; the error falls tenfold in each
+LEVEL_ROUNDS = 300  # at most, of brightness against response
+LEVEL_CHANGE = 1e-10  # of the brightness in one round, at which they agree
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -260,7 +262,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
             path,
             f"unknown key {min(unknown)!r}." if unknown else f"is not of version {VERSION}.",
         )
-    pattern = _four(path, content, "pattern", ANGLES_DEG)
+    pattern = _four(path, content, "pattern", STANDARD)
     if sorted(pattern) != list(ANGLES_DEG):
         raise DataError(path, "pattern must hold 0, 45, 90 and 135 once each.")
     values = {
@@ -362,8 +364,11 @@ def _fit_polarizer(tilt: Array, values: Array) -> tuple[Array, Array, float]:
     for _ in range(LEVEL_ROUNDS):
         fitted, *_ = np.linalg.lstsq(design * brightness[:, None], values, rcond=None)
         response = design @ fitted
+        before = brightness
         brightness = (values * response).sum(axis=1) / np.square(response).sum(axis=1)
         brightness /= brightness.mean()
+        if np.abs(brightness - before).max() < LEVEL_CHANGE:
+            break
     residual = values - brightness[:, None] * response
     return brightness, fitted, float(np.sqrt(np.mean(residual**2)) / values.mean())
 

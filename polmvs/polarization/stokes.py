@@ -46,6 +46,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 
+from polmvs.config import Light
 from polmvs.polarization.mosaic import INTERPOLATION_NOISE_GAIN
 
 Image: TypeAlias = NDArray[np.float32]
@@ -102,6 +103,16 @@ class Stokes:
     def aolp(self) -> Image:
         """Angle of linear polarization (H, W), rad in [0, pi), anticlockwise from +x as shown."""
         return np.asarray(_wrap(0.5 * np.arctan2(self.s2, self.s1)), np.float32)
+
+    def phase(self, light: Light | str = Light.SPECULAR) -> Image:
+        """Direction in which the plane of incidence cuts the image (H, W), rad in [0, pi).
+
+        Parameters
+        ----------
+        light : reflection that dominates; specular light turns the phase by pi/2 from the AoLP.
+        """
+        turn = np.float32(0.5 * np.pi if Light(light) is Light.SPECULAR else 0.0)
+        return np.asarray(_wrap(self.aolp + turn), np.float32)
 
     @property
     def dolp(self) -> Image:

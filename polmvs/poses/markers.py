@@ -128,10 +128,16 @@ def parse_marker_option(option: str) -> tuple[int, float]:
     except ValueError:
         size_m = np.nan
     if not 0 < size_m < np.inf:
-        raise OptionError(f"--aruco needs DICT:SIZE with a positive size in metres, not {option}.")
+        raise OptionError(
+            f"needs DICT:SIZE with a positive size in metres, not {option}.",
+            field="reference.aruco",
+        )
     known = {key: value for key, value in vars(cv2.aruco).items() if key.startswith("DICT_")}
     if name not in known:
-        raise OptionError(f"--aruco: unknown dictionary {name!r}; known are {', '.join(known)}.")
+        raise OptionError(
+            f"names an unknown dictionary {name!r}; known are {', '.join(known)}.",
+            field="reference.aruco",
+        )
     return int(known[name]), size_m
 
 

@@ -156,7 +156,7 @@ def frame_from_markers(sparse_model: SparseModel, option: str, load_image: Image
     """
     dictionary, size_m = parse_marker_option(option)
     detections = detect_markers(sparse_model.views, dictionary, load_image)
-    result = measure_markers(sparse_model.views, detections, source=f"--aruco {option}")
+    result = measure_markers(sparse_model.views, detections, source=f"`reference.aruco` {option}")
     return Frame(
         metric_from_world=scaling(size_m / result.side),
         source="aruco",
@@ -231,7 +231,8 @@ def _require_breadth(
             raise DataError(
                 source,
                 f"the {name} centres of the {len(points)} cameras lie on one line (or in one "
-                "place), which leaves the rotation open; give cameras beside it, or use --scale.",
+                "place), which leaves the rotation open; give cameras beside it, or use "
+                "`reference.scale`.",
             )
 
 
@@ -264,14 +265,17 @@ def frame_from_distance(
         An end is unknown, or the two are one, or their distance in the model is none.
     """
     if not 0 < distance_m < np.inf:
-        raise OptionError(f"--scale needs a positive distance, not {distance_m}.")
+        raise OptionError(f"needs a positive distance, not {distance_m}.", field="reference.scale")
     ends = [_end_of_distance(sparse_model, text) for text in (first, second)]
     offset = ends[1][0] - ends[0][0]
     distance = float(np.linalg.norm(offset))
     # Coordinates are of the size of the scene: below this their difference is rounding.
     rounding = 1e-9 * max(float(np.abs(end).max()) for end, _ in ends)
     if not distance > rounding:
-        raise OptionError(f"--scale: {first} and {second} are at one place in the sparse_model.")
+        raise OptionError(
+            f"names {first} and {second}, which are at one place in the model.",
+            field="reference.scale",
+        )
     sigmas = [sigma for _, sigma in ends]
     known = [sigma**2 for sigma in sigmas if sigma is not None]
     return Frame(
@@ -297,10 +301,14 @@ def _end_of_distance(sparse_model: SparseModel, text: str) -> tuple[Array, float
                 point_sigmas(some_tracks(sparse_model.tracks, chosen), sparse_model.views)[0]
             )
     if find_name(text, sparse_model.unregistered) is not None:
-        raise OptionError(f"--scale: the image {text} has no pose; name another one.")
+        raise OptionError(
+            f"names the image {text}, which has no pose; name another one.",
+            field="reference.scale",
+        )
     raise OptionError(
-        f"--scale: {text} is neither a reconstructed image (such as "
-        f"{short_list(list(views)[:2])}) nor the id of a sparse point."
+        f"names {text}, which is neither a reconstructed image (such as "
+        f"{short_list(list(views)[:2])}) nor the id of a sparse point.",
+        field="reference.scale",
     )
 
 
@@ -324,8 +332,10 @@ def require_agreement(
     # The logarithm makes it the same whichever comes first.
     if not abs(np.log(other.scale / first.scale)) <= allowed:
         raise OptionError(
-            f"--{first.source} gives a scale of {first.scale:.6g} m per unit but --{other.source} "
-            f"{other.scale:.6g}; they may differ by {100 * allowed:.2g} %. Leave out the wrong one."
+            f"gives a scale of {first.scale:.6g} m per unit but `reference.{other.source}` "
+            f"{other.scale:.6g}; they may differ by {100 * allowed:.2g} %. Leave out the wrong "
+            "one.",
+            field=f"reference.{first.source}",
         )
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import PinholeCamera
+from polmvs.camera import Camera, PinholeCamera, pixel_centers
 from polmvs.colmap.dense_workspace import ImageLoader, write_dense_workspace
 from polmvs.colmap.maps import DepthNormals, map_pixel_xy
 from polmvs.scene import SparseModel, View
@@ -98,11 +98,30 @@ def warp_dense_view(
     view : camera and pose; the target has the same pose.
     target : camera of the maps.
     """
-    depth = np.zeros((target.height, target.width), np.float32)
-    normals = np.zeros((target.height, target.width, 3), np.float32)
-    xy = map_pixel_xy(target.width, target.height)
-    for rows in _bands(target.height):
-        rays = target.rays(xy[rows])
+    return _maps_at(map_pixel_xy(target.width, target.height), target, dense, view, tolerances)
+
+
+def sensor_maps(
+    dense: DenseView, view: View, *, tolerances: WarpTolerances = WarpTolerances()
+) -> DepthNormals:
+    """Depth and normals of a dense view at the centres of the sensor's own pixels.
+
+    Parameters
+    ----------
+    dense, view, tolerances : see :func:`warp_dense_view`; the camera may have any distortion.
+    """
+    camera = view.camera
+    return _maps_at(pixel_centers(camera.width, camera.height), camera, dense, view, tolerances)
+
+
+def _maps_at(
+    xy: Array, camera: Camera, dense: DenseView, view: View, tolerances: WarpTolerances
+) -> DepthNormals:
+    """Depth and normals at image coordinates ``(H, W, 2)`` of a camera at the view's pose."""
+    depth = np.zeros(xy.shape[:2], np.float32)
+    normals = np.zeros((*xy.shape[:2], 3), np.float32)
+    for rows in _bands(len(xy)):
+        rays = camera.rays(xy[rows])
         position = np.asarray(view.camera.project(rays), np.float64) / dense.stride_px - 0.5
         ranges, normals[rows] = _extend(dense, view, rays, position, tolerances)
         depth[rows] = ranges * rays[..., 2]

@@ -108,7 +108,7 @@ def test_no_model_of_textureless_images(tmp_path):
     folder.mkdir()
     for index in range(3):
         cv2.imwrite(str(folder / f"{index}.png"), np.full((80, 100), 90, np.uint8))
-    with pytest.raises(DataError, match=r"no model of these images.*texture.*--sparse"):
+    with pytest.raises(DataError, match=r"no model of these images.*texture.*`sfm.sparse`"):
         reconstruct(folder, tmp_path)
     assert not (tmp_path / "sparse").exists()
 
@@ -129,7 +129,7 @@ def test_faulty_images(images, tmp_path):
 
 
 def test_unknown_camera_model(images, tmp_path):
-    with pytest.raises(OptionError, match=r"--camera-model LENS is unknown.*SIMPLE_RADIAL"):
+    with pytest.raises(OptionError, match=r"`sfm.camera_model` LENS is unknown.*SIMPLE_RADIAL"):
         reconstruct(images, tmp_path, camera_model="LENS")
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from polmvs.normals.single_view.command import add_parser
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.config import AngleModel, Light
 from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import open_ground_truth
-from polmvs.normals.single_view.command import add_parser
 from polmvs.normals.single_view.focal import estimate_focal
 from polmvs.normals.single_view.pixels import PlaneView, polygon_mask
 from polmvs.normals.single_view.plane import phase_residuals, plane_normal

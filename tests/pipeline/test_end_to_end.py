@@ -15,18 +15,18 @@ import pytest
 from helpers import cut_after, record_of, result_of, stages_of
 
 from polmvs.colmap.models import read_model
-from polmvs.config import Options, PropagationOptions, RunOptions, SfmOptions
+from polmvs.config import COMPARED_MODELS, Options, PropagationOptions, RunOptions, SfmOptions
 from polmvs.io.clouds import read_cloud
-from polmvs.pipeline.jobs import COMPARED, Job, reconstruct
+from polmvs.pipeline.jobs import Job, reconstruct
 from polmvs.scene import PointKind
 
 BEFORE_CLOUDS = [
     *("images", "poses", "maps", "maps_tilted"),
-    *(f"normals_{model}" for model in COMPARED),
+    *(f"normals_{model}" for model in COMPARED_MODELS),
     "seeds",
-    *(f"sparse_cloud_{model}" for model in COMPARED),
+    *(f"sparse_cloud_{model}" for model in COMPARED_MODELS),
 ]
-STAGES = [*BEFORE_CLOUDS, *[f"densify_{model}" for model in COMPARED], "evaluation"]
+STAGES = [*BEFORE_CLOUDS, *[f"densify_{model}" for model in COMPARED_MODELS], "evaluation"]
 RESULTS = ("normals.ply", "normals_opa.ply", "opa.ply", "ppa.ply", "metrics.json")
 
 

@@ -10,22 +10,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import cut_after, record_of, refused, result_of, stages_of
-from polmvs.colmap.sparse_model import write_model
 
-from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Options, PropagationOptions, RunOptions, SfmOptions, to_plain
+from polmvs.colmap.models import read_model, write_model
+from polmvs.config import (
+    COMPARED_MODELS,
+    AngleModel,
+    Options,
+    PropagationOptions,
+    RunOptions,
+    SfmOptions,
+    to_plain,
+)
 from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud
-from polmvs.normals.tracks import some_tracks
 from polmvs.parallel import Workers
-from polmvs.pipeline.jobs import COMPARED, Job, compare, reconstruct
+from polmvs.pipeline.jobs import Job, compare, reconstruct
 from polmvs.pipeline.monitor import NoMonitor
 from polmvs.pipeline.record import Record, read_record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import Run
 from polmvs.pipeline.stage_table import StageSpec, stage_table
 from polmvs.polarization.capture import open_capture
-from polmvs.scene import SparseModel
+from polmvs.scene import SparseModel, some_tracks
 
 INTRINSICS = (333.75, 333.75, 230.6475, 196.608)  # of the bundled capture
 COARSE = PropagationOptions(stride_px=8, num_rounds=2)
@@ -302,7 +308,7 @@ def test_stages_keep_to_their_entries(
         run_options=RunOptions(workers=1),
         monitor=monitor,
     )
-    outcome = compare(job, COMPARED)
+    outcome = compare(job, COMPARED_MODELS)
     assert outcome.comparison is not None
     assert (outcome.comparison.sparse.num_views, len(outcome.comparison.models)) == (6, 3)
     specs = {spec.name: spec for spec in stage_table()}

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from polmvs.config import AngleModel, Options
+from polmvs.config import AngleModel, Options, plain_options
 from polmvs.pipeline.run_folder import HERE
-from polmvs.pipeline.runner import plain_options
 from polmvs.pipeline.stage_table import (
     StageSpec,
     _in_order,

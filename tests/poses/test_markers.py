@@ -218,7 +218,9 @@ def test_marker_in_a_single_view() -> None:
 def test_no_marker() -> None:
     views = views_of(PINHOLE, 2)
     blank = np.full((PINHOLE.height, PINHOLE.width), 140, np.uint8)
-    with pytest.raises(DataError, match=r"--aruco DICT_4X4_50:0\.05: no such marker is found"):
+    with pytest.raises(
+        DataError, match=r"`reference.aruco` DICT_4X4_50:0\.05: no such marker is found"
+    ):
         metric_frame(model_of(views), ReferenceOptions(aruco=OPTION), lambda _: blank)
 
 

@@ -330,7 +330,7 @@ def test_sources_that_agree_and_that_do_not(tmp_path: Path) -> None:
     frame = frame_of(reference=path, scale=("000", "003", 1.005 * distance))
     assert frame.source == "reference"
     assert frame.checked_by == (("scale", pytest.approx(1.005 / 7)),)
-    message = "--reference gives a scale of 0.142857 m per unit but --scale 0.145714"
+    message = "gives a scale of 0.142857 m per unit but `reference.scale` 0.145714"
     with pytest.raises(OptionError, match=message):
         frame_of(reference=path, scale=("000", "003", 1.02 * distance))
 
@@ -340,7 +340,7 @@ def test_uncertain_sources_may_differ_more() -> None:
     wide = SimilarityTransform(1.02 / 7, np.eye(3), np.zeros(3))
     other = replace(first, metric_from_world=wide, source="aruco", relative_sigma=0.006)
     require_agreement(first, other)
-    with pytest.raises(OptionError, match="--aruco"):
+    with pytest.raises(OptionError, match=r"reference\.aruco"):
         require_agreement(first, replace(other, relative_sigma=0.004))
 
 

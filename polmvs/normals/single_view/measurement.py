@@ -170,7 +170,9 @@ def measure_planes(
     )
 
 
-def select_pixels(stokes: Stokes, options: PlaneOptions, source: Path) -> Mask:
+def select_pixels(
+    stokes: Stokes, options: PlaneOptions, source: str | Path, inside: Mask | None = None
+) -> Mask:
     """Pixels (H, W) that count.
 
     Parameters
@@ -178,17 +180,22 @@ def select_pixels(stokes: Stokes, options: PlaneOptions, source: Path) -> Mask:
     stokes : images of the mosaic.
     options : say which.
     source : the image, for messages.
+    inside : (H, W) bool, the only pixels that may count, instead of the options' mask or polygon.
 
     Raises
     ------
     DataError
         Fewer than ``MIN_PIXELS`` do, or the mask is unusable.
     """
-    inside = np.ones(stokes.shape, np.bool_)
-    if options.mask is not None:
+    if inside is not None:
+        if inside.shape != stokes.shape:
+            raise ValueError(f"{inside.shape=} but expected {stokes.shape}.")
+    elif options.mask is not None:
         inside = read_mask(options.mask, stokes.shape)
     elif options.polygon is not None:
         inside = polygon_mask(options.polygon, stokes.shape)
+    else:
+        inside = np.ones(stokes.shape, np.bool_)
     valid = stokes.valid if options.drop_clipped else stokes.s0 > 0
     mask = inside & valid & (stokes.dolp > options.min_dolp)
     if mask.any():

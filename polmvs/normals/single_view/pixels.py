@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import PinholeCamera, pixel_centers
+from polmvs.camera import Camera, PinholeCamera, pixel_centers
 from polmvs.config import AngleModel, CaptureOptions, Light
 from polmvs.normals.single_view.focal import FocalEstimate, estimate_focal
 from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal
@@ -40,7 +40,7 @@ class PlaneView:
     mask: Mask
     light: Light
 
-    def phase_map(self, model: AngleModel, camera: PinholeCamera) -> tuple[Image, Image, Image]:
+    def phase_map(self, model: AngleModel, camera: Camera) -> tuple[Image, Image, Image]:
         """Phase as the estimators take it.
 
         Returns
@@ -56,15 +56,13 @@ class PlaneView:
         axial = phase_sign(self.light) * np.stack([stokes.s1, stokes.s2])
         return axial, np.ascontiguousarray(np.moveaxis(rays, -1, 0)), phase_sigma(stokes)
 
-    def plane(
-        self, model: AngleModel, camera: PinholeCamera, *, robust: bool = True
-    ) -> PlaneEstimate:
+    def plane(self, model: AngleModel, camera: Camera, *, robust: bool = True) -> PlaneEstimate:
         """Best single normal of the pixels, by :func:`.plane.plane_normal`."""
         axial, rays, sigma = self.phase_map(model, camera)
         m = self.mask
         return plane_normal(model, axial[:, m], rays[:, m], sigma[m], robust=robust)
 
-    def planes(self, model: AngleModel, camera: PinholeCamera) -> list[FoundPlane]:
+    def planes(self, model: AngleModel, camera: Camera) -> list[FoundPlane]:
         """All planes among the pixels, by :func:`.search.find_planes`."""
         axial, rays, sigma = self.phase_map(model, camera)
         return find_planes(model, axial, rays, sigma, self.mask)

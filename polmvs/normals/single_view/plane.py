@@ -60,9 +60,11 @@ class PlaneEstimate:
     valid : the rows determine a single normal.
     conditioning : ratio of the middle to the largest singular value of the weighted predicted
         rows; 0 for rows of rank 1, at most 1.
-    sigma_deg : standard deviation along the larger axis of the covariance, degrees: what the
-        pixels' sigma explains or, where it is larger, the scatter of runs of pixels. Infinite
+    covariance : (3, 3) float64, of the normal, rad^2, camera frame; across the normal, of rank 2.
+        What the pixels' sigma explains or, where it is larger, the scatter of runs of pixels. NaN
         where not valid. An error that is common to the whole view is not in it.
+    sigma_deg : standard deviation along the larger axis of the covariance, degrees; infinite
+        where not valid.
     rmse_deg, median_deg : root mean square, and median of the absolute, phase residual (measured
         minus predicted by ``normal``), degrees.
     num_pixels : pixels used, outliers included.
@@ -72,6 +74,7 @@ class PlaneEstimate:
     normal: Array
     valid: bool
     conditioning: float
+    covariance: Array
     sigma_deg: float
     rmse_deg: float
     median_deg: float
@@ -196,7 +199,12 @@ def _describe(normal: Array, samples: Floats, scale: float | None) -> PlaneEstim
     eigenvalues, axes = np.linalg.eigh(basis @ equations.matrix @ basis.T)
     conditioning = float(np.sqrt(max(eigenvalues[0], 0) / max(eigenvalues[1], TINY)))
     valid = conditioning >= MIN_CONDITIONING
-    sigma = _sigma(equations, axes.T @ basis / eigenvalues[:, None]) if valid else np.inf
+    covariance, sigma = np.full((3, 3), np.nan), np.inf
+    if valid:
+        across = axes.T @ basis
+        in_plane = _covariance(equations, across / eigenvalues[:, None])
+        covariance = across.T @ in_plane @ across
+        sigma = float(np.sqrt(np.linalg.eigvalsh(in_plane)[-1]))
     step = max(1, num // MEDIAN_PIXELS)
     some = np.abs(equations.errors[::step])
     normalized = some * np.sqrt(samples[4, ::step])
@@ -205,6 +213,7 @@ def _describe(normal: Array, samples: Floats, scale: float | None) -> PlaneEstim
         normal=normal,
         valid=valid,
         conditioning=conditioning,
+        covariance=covariance,
         sigma_deg=float(np.degrees(sigma)),
         rmse_deg=float(np.degrees(np.sqrt(equations.errors @ equations.errors / num))),
         median_deg=float(np.degrees(np.median(some))),
@@ -213,13 +222,14 @@ def _describe(normal: Array, samples: Floats, scale: float | None) -> PlaneEstim
     )
 
 
-def _sigma(equations: NormalEquations, solver: Array) -> float:
-    """Deviation along the larger axis, rad; ``solver`` (2, 3) takes scores to steps."""
+def _covariance(equations: NormalEquations, solver: Array) -> Array:
+    """Covariance (2, 2) of a step, rad^2; ``solver`` (2, 3) takes scores to steps."""
     influence = equations.scores @ solver.T
     num = len(influence)
     scatter = influence.T @ influence * (num / max(num - 2, 1))
-    known = solver @ equations.noise @ solver.T
-    return float(np.sqrt(max(np.linalg.eigvalsh(scatter)[-1], np.linalg.eigvalsh(known)[-1])))
+    known = np.asarray(solver @ equations.noise @ solver.T)
+    larger: Array = max(scatter, known, key=lambda matrix: float(np.linalg.eigvalsh(matrix)[-1]))
+    return larger
 
 
 def _no_estimate(num: int) -> PlaneEstimate:
@@ -227,6 +237,7 @@ def _no_estimate(num: int) -> PlaneEstimate:
         normal=np.full(3, np.nan),
         valid=False,
         conditioning=0.0,
+        covariance=np.full((3, 3), np.nan),
         sigma_deg=np.inf,
         rmse_deg=np.nan,
         median_deg=np.nan,

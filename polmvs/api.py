@@ -1,0 +1,653 @@
+"""The public API: what a notebook needs, as ``polmvs.NAME``.
+
+Functions take paths and options by name, and give results that read their files when they are
+asked. What they do is imported when they are called.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import Camera, PinholeCamera
+from polmvs.config import (
+    COMPARED_MODELS,
+    AngleModel,
+    CaptureOptions,
+    Estimator,
+    Light,
+    OptionGroup,
+    Options,
+    PlaneOptions,
+    RunOptions,
+    describe_fields,
+    groups_of,
+    options_from_plain,
+    to_plain,
+    values_from_plain,
+)
+from polmvs.errors import DataError, OptionError
+from polmvs.io.clouds import Cloud, mesh_to_open3d, read_cloud, read_mesh, to_open3d
+
+if TYPE_CHECKING:  # heavy
+    import open3d
+    import pycolmap
+
+    from polmvs.evaluation.comparison import Comparison, ModelFigures
+    from polmvs.normals.single_view.plane import PlaneEstimate
+    from polmvs.pipeline.monitor import Monitor
+    from polmvs.pipeline.record import Record
+    from polmvs.pipeline.run_folder import RunFolder
+    from polmvs.polarization.stokes import Stokes
+    from polmvs.scene import SparseModel, View
+    from polmvs.surface.dense_view import DenseView
+
+PathArg = str | PathLike[str]
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Group = TypeVar("Group", bound=OptionGroup)
+
+logger = logging.getLogger(__name__)
+
+
+# One image
+
+
+def read_stokes(path: PathArg, *, options: CaptureOptions | None = None, **changes: Any) -> Stokes:
+    """Stokes images of one raw image, with their noise.
+
+    Parameters
+    ----------
+    path : raw mosaic of a polarization camera.
+    options : how it is read; defaults where None.
+    **changes : single options by name instead, such as ``pattern=(90, 45, 135, 0)``.
+
+    Returns
+    -------
+    ``s0``, ``s1``, ``s2`` (H, W) with ``sigma`` and ``valid``, and what follows from them:
+    ``aolp``, ``dolp``, ``sigma_aolp`` and ``phase(light)``.
+
+    Raises
+    ------
+    DataError
+        The file is missing or unusable.
+    OptionError
+        An option is unusable or unknown.
+    """
+    from polmvs.normals.single_view.pixels import load_stokes
+
+    return load_stokes(Path(path), _changed(options or CaptureOptions(), changes))
+
+
+def plane_normal(
+    stokes: Stokes,
+    camera: Camera | Sequence[float],
+    *,
+    model: AngleModel | str = AngleModel.PPA,
+    light: Light | str = Light.SPECULAR,
+    mask: Mask | None = None,
+    estimator: Estimator | str = Estimator.ROBUST,
+    **changes: Any,
+) -> PlaneEstimate:
+    """Normal of a plane that one view shows.
+
+    Parameters
+    ----------
+    stokes : of the view, from :func:`read_stokes`.
+    camera : of the polarization images, or ``fx, fy, cx, cy`` of a pinhole camera, px, COLMAP's
+        convention.
+    model : angle model.
+    light : reflection that dominates on the plane.
+    mask : (H, W) bool, True on the plane; None where all that is polarised is of it.
+    estimator : weighted robust, or the paper's eigenvector.
+    **changes : further options of ``polmvs plane`` by name: ``min_dolp``, ``min_intensity``,
+        ``drop_clipped``, ``polygon``.
+
+    Returns
+    -------
+    ``normal`` (3,), camera frame, facing the camera, with its ``covariance`` (3, 3), whether it is
+    determined (``valid``), and its phase residual.
+
+    Raises
+    ------
+    DataError
+        Too few pixels count.
+    OptionError
+        An option is unusable or unknown.
+    """
+    from polmvs.normals.single_view.measurement import select_pixels
+    from polmvs.normals.single_view.pixels import PlaneView
+
+    given = {"angle_model": model, "light": light, "estimator": estimator}
+    options = _changed(PlaneOptions(), given | changes)
+    inside = None if mask is None else np.asarray(mask, np.bool_)
+    used = select_pixels(stokes, options, "these Stokes images", inside)
+    view = PlaneView(stokes=stokes, mask=used, light=options.light)
+    robust = options.estimator is Estimator.ROBUST
+    return view.plane(options.angle_model, _camera(stokes, camera), robust=robust)
+
+
+def _camera(stokes: Stokes, given: Camera | Sequence[float]) -> Camera:
+    """A camera of the size of the images."""
+    height, width = stokes.shape
+    if not isinstance(given, Sequence):
+        if (given.width, given.height) != (width, height):
+            raise OptionError(
+                f"is of {given.width}x{given.height} px, the polarization images of "
+                f"{width}x{height} px.",
+                field="camera",
+            )
+        return given
+    values = [float(value) for value in given]
+    if len(values) != 4 or not min(values) > 0:
+        raise OptionError(
+            f"needs four positive numbers fx, fy, cx, cy, not {values}.", field="camera"
+        )
+    fx, fy, cx, cy = values
+    return PinholeCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+# Sparse points
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrackNormals:
+    """Normals of the sparse points of a COLMAP model.
+
+    Attributes
+    ----------
+    point3D_ids : (T,) int64, of the COLMAP model.
+    points : (T, 3) float64, world.
+    normals : (T, 3) float64, unit, world, facing the cameras; NaN where not valid.
+    valid : (T,) bool, where the views determine a normal.
+    sigma_deg : (T,) larger standard deviation of the normal, degrees.
+    residual : (T,) sine of the angle between normal and planes of incidence.
+    num_views : (T,) int64, views that see the point.
+    angle_model : of the normals.
+    """
+
+    point3D_ids: NDArray[np.int64]
+    points: Array
+    normals: Array
+    valid: Mask
+    sigma_deg: Array
+    residual: Array
+    num_views: NDArray[np.int64]
+    angle_model: AngleModel
+
+    def point_cloud(self) -> open3d.geometry.PointCloud:
+        """The points with a normal."""
+        cloud = Cloud(points=self.points[self.valid], normals=self.normals[self.valid])
+        return to_open3d(cloud).to_legacy()
+
+
+def track_normals(
+    capture: PathArg,
+    sparse: PathArg | pycolmap.Reconstruction,
+    *,
+    model: AngleModel | str = AngleModel.PPA,
+    options: Options | None = None,
+    workers: int = 1,
+    **changes: Any,
+) -> TrackNormals:
+    """Normals of the sparse points of a COLMAP model, from the phases of all views.
+
+    Parameters
+    ----------
+    capture : folder of the raw images.
+    sparse : folder of a COLMAP model of the same images, or the model itself.
+    model : angle model.
+    options : of all stages; ``capture``, ``region`` and ``normals`` count. Defaults where None.
+    workers : processes.
+    **changes : single options by name, such as ``min_dolp=0.2``.
+
+    Raises
+    ------
+    DataError, OptionError
+        The input or an option is unusable.
+    """
+    from polmvs.colmap.models import write_model
+    from polmvs.parallel import Workers
+    from polmvs.pipeline.stages.maps import build_maps, tilt_maps
+    from polmvs.pipeline.stages.normals import load_track_normals, solve_track_normals
+    from polmvs.polarization.capture import open_capture
+
+    angle_model = _choice(AngleModel, model, "model")
+    options = change_options(options, changes)
+    opened = open_capture(capture, options.capture)
+    fitted = _fitted(opened, sparse)
+    with tempfile.TemporaryDirectory(prefix="polmvs-") as scratch, Workers(workers) as pool:
+        folder = Path(scratch)
+        write_model(fitted, folder / "sparse")
+        maps = folder / "maps"
+        build_maps(opened, folder / "sparse", maps, options.region, workers=pool)
+        if angle_model is AngleModel.TILTED:
+            maps = folder / "maps_tilted"
+            tilt_maps(folder / "sparse", folder / "maps", maps, workers=pool)
+        target = folder / "normals.npy"
+        solve_track_normals(angle_model, folder / "sparse", maps, target, options.normals)
+        estimate = load_track_normals(target)
+    tracks = fitted.tracks
+    return TrackNormals(
+        point3D_ids=tracks.point3D_ids,
+        points=tracks.points_in_world,
+        normals=estimate.normals,
+        valid=estimate.valid,
+        sigma_deg=estimate.sigma_deg,
+        residual=estimate.residual,
+        num_views=estimate.num_rows,
+        angle_model=angle_model,
+    )
+
+
+def _fitted(capture: Any, sparse: Any) -> SparseModel:
+    """A sparse model with the names and the image size of a capture."""
+    from polmvs.colmap.models import match_model_to_capture, model_from_reconstruction, read_model
+    from polmvs.pipeline.stages.images import image_names
+
+    if isinstance(sparse, str | PathLike):
+        model, source = read_model(sparse), str(sparse)
+    else:
+        model, source = model_from_reconstruction(sparse), "the sparse model"
+    names = list(image_names(capture))
+    return match_model_to_capture(model, names, capture.width, capture.height, source=source)
+
+
+# Whole captures
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reconstruction:
+    """What one angle model came to in a run; its files are read when they are asked for.
+
+    Attributes
+    ----------
+    folder : of the run.
+    angle_model : of this result.
+    """
+
+    folder: Path
+    angle_model: AngleModel
+
+    def __repr__(self) -> str:
+        """What was found."""
+        return f"Reconstruction({str(self.folder)!r}, {self.angle_model}: {self._dense})"
+
+    @property
+    def view_names(self) -> tuple[str, ...]:
+        """Names of the views, as in the sparse model."""
+        return tuple(self._views)
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether a reference that was given makes metres of the unit."""
+        from polmvs.pipeline.stages.poses import PosesResult
+
+        return self.record.result(PosesResult).is_metric
+
+    @cached_property
+    def record(self) -> Record:
+        """The record of the run: its options, and its stages with what they found."""
+        from polmvs.pipeline.runner import load_record
+
+        return load_record(self._run_folder)
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        """The dense cloud as arrays, with ``kind``, ``sigma``, ``sigma_deg`` and ``num_views``."""
+        return read_cloud(self._run_folder.cloud(self.angle_model))
+
+    def point_cloud(self, *, surroundings: bool = False) -> open3d.geometry.PointCloud:
+        """The dense cloud.
+
+        Parameters
+        ----------
+        surroundings : with the points beside the polarised surfaces, whose normals are zero.
+        """
+        from polmvs.scene import PointKind
+
+        cloud = self.cloud
+        if not surroundings:
+            cloud = cloud.only(cloud.scalars.get("kind", np.zeros(0)) == PointKind.SURFACE)
+        return to_open3d(cloud).to_legacy()
+
+    def mesh(self) -> open3d.geometry.TriangleMesh:
+        """The Poisson mesh of the polarised surfaces.
+
+        Raises
+        ------
+        DataError
+            The run made none: options said so, or the cloud has too few points.
+        """
+        path = self._run_folder.mesh(self.angle_model)
+        if not path.is_file():
+            raise DataError(path, "no mesh was made; reconstruct with `export.mesh` does it.")
+        return mesh_to_open3d(read_mesh(path))
+
+    def depth_map(self, name: str) -> Image:
+        """Depth (H, W) float32 of a view's pixels along the optical axis, in the model's unit.
+
+        NaN where unknown. Pixels are those of the polarization images, not undistorted.
+
+        Parameters
+        ----------
+        name : of the view; without its suffix is enough.
+
+        Raises
+        ------
+        KeyError
+            There is no such view.
+        """
+        depth, _ = self._maps(name)
+        return np.where(depth > 0, depth, np.float32(np.nan))
+
+    def normal_map(self, name: str) -> Image:
+        """Unit normals (H, W, 3) float32 of a view's pixels, camera frame; NaN where unknown.
+
+        Parameters
+        ----------
+        name : of the view; without its suffix is enough.
+
+        Raises
+        ------
+        KeyError
+            There is no such view.
+        """
+        depth, normals = self._maps(name)
+        return np.where((depth > 0)[..., None], normals, np.float32(np.nan))
+
+    @cached_property
+    def metrics(self) -> ModelFigures:
+        """How well the result fits its own images and, where there is one, the ground truth."""
+        from polmvs.pipeline.jobs import measure
+
+        return measure(self._run_folder, (self.angle_model,)).models[self.angle_model]
+
+    @cached_property
+    def sparse_model(self) -> pycolmap.Reconstruction:
+        """The poses and sparse points."""
+        from polmvs.colmap.models import read_reconstruction
+
+        return read_reconstruction(self._run_folder.sparse)
+
+    @property
+    def _run_folder(self) -> RunFolder:
+        from polmvs.pipeline.run_folder import RunFolder
+
+        return RunFolder(self.folder)
+
+    @property
+    def _dense(self) -> Any:
+        from polmvs.pipeline.stages.densify import DensifyResult
+
+        return self.record.result(DensifyResult, self.angle_model)
+
+    @cached_property
+    def _views(self) -> Mapping[str, View]:
+        from polmvs.pipeline.stages.maps import posed_views
+
+        return {view.name: view for view in posed_views(self._run_folder.sparse)}
+
+    def _maps(self, name: str) -> tuple[Image, Image]:
+        """Depth, 0 where unknown, and normals of a view."""
+        from polmvs.surface.dense_view import find_dense_view
+        from polmvs.surface.map_export import sensor_maps
+
+        view = self._view(name)
+        dense: DenseView | None = find_dense_view(
+            self._run_folder.views(self.angle_model) / view.name
+        )
+        if dense is None:
+            shape = (view.camera.height, view.camera.width)
+            return np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32)
+        maps = sensor_maps(dense, view)
+        return maps.depth, maps.normals
+
+    def _view(self, name: str) -> View:
+        stems = {Path(known).stem: known for known in self._views}
+        found = name if name in self._views else stems.get(Path(name).stem)
+        if found is None:
+            raise KeyError(f"{name!r} is no view of {self.folder}; there are {list(self._views)}")
+        return self._views[found]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunResult:
+    """A run of one or more angle models on the same poses, seeds and region.
+
+    Attributes
+    ----------
+    folder : of the run.
+    models : the results by angle model.
+    """
+
+    folder: Path
+    models: Mapping[AngleModel, Reconstruction] = field(repr=False)
+
+    def __getitem__(self, model: AngleModel | str) -> Reconstruction:
+        """The result of an angle model; KeyError if the run has none of it."""
+        found = self.models.get(_choice(AngleModel, model, "model"))
+        if found is None:
+            raise KeyError(f"{self.folder} has no cloud of {model!r}, but of {list(self.models)}")
+        return found
+
+    @cached_property
+    def metrics(self) -> Comparison:
+        """Figures of all models, as in ``metrics.json``."""
+        from polmvs.evaluation.comparison import read_comparison
+        from polmvs.pipeline.jobs import measure
+        from polmvs.pipeline.run_folder import RunFolder
+
+        run_folder = RunFolder(self.folder)
+        if run_folder.metrics.is_file():
+            comparison = read_comparison(run_folder.metrics)
+            if set(comparison.models) == set(self.models):
+                return comparison
+        return measure(run_folder, tuple(self.models))
+
+    def table(self) -> str:
+        """The figures, a column for each model, in Markdown."""
+        return self.metrics.table()
+
+
+def reconstruct(
+    capture: PathArg,
+    out: PathArg,
+    model: AngleModel | str = AngleModel.PPA,
+    *,
+    options: Options | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    workers: int | None = None,
+    monitor: Monitor | None = None,
+    **changes: Any,
+) -> Reconstruction:
+    """Reconstruct a capture with one angle model.
+
+    Parameters
+    ----------
+    capture : folder of the raw images.
+    out : run folder, a new one.
+    model : angle model.
+    options : of all stages; defaults where None.
+    overwrite, resume : delete an earlier run in ``out`` first, or go on with it.
+    workers : processes; one for each core where None. With more than one a script needs
+        ``if __name__ == "__main__":``.
+    monitor : who follows the run, if anybody.
+    **changes : single options by name, such as ``intrinsics=(fx, fy, cx, cy)``.
+
+    Raises
+    ------
+    DataError, OptionError
+        The input or an option is unusable; errors name options as ``group.name``.
+    """
+    from polmvs.pipeline import jobs
+
+    angle_model = _choice(AngleModel, model, "model")
+    job = _job(capture, out, options, changes, overwrite, resume, workers, monitor)
+    outcome = jobs.reconstruct(job, angle_model)
+    _warn_if_empty(outcome.empty)
+    return Reconstruction(folder=outcome.run_folder.root, angle_model=angle_model)
+
+
+def compare(
+    capture: PathArg,
+    out: PathArg,
+    models: Sequence[AngleModel | str] = COMPARED_MODELS,
+    *,
+    options: Options | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    workers: int | None = None,
+    monitor: Monitor | None = None,
+    **changes: Any,
+) -> RunResult:
+    """Reconstruct a capture with several angle models on the same poses and seeds, and measure.
+
+    Parameters
+    ----------
+    models : angle models.
+    capture, out, options, overwrite, resume, workers, monitor, **changes : see
+        :func:`reconstruct`; ``gt`` is the folder of the ground truth.
+
+    Raises
+    ------
+    DataError, OptionError
+        As :func:`reconstruct`.
+    """
+    from polmvs.pipeline import jobs
+
+    chosen = tuple(dict.fromkeys(_choice(AngleModel, model, "models") for model in models))
+    job = _job(capture, out, options, changes, overwrite, resume, workers, monitor)
+    outcome = jobs.compare(job, chosen)
+    _warn_if_empty(outcome.empty)
+    return _run_result(outcome.run_folder.root, chosen)
+
+
+def open_run(folder: PathArg) -> RunResult:
+    """The results of an earlier run.
+
+    Raises
+    ------
+    DataError
+        The folder holds no run, one of another version, or no dense cloud.
+    """
+    from polmvs.pipeline.run_folder import RunFolder
+    from polmvs.pipeline.runner import load_record
+    from polmvs.pipeline.stages.densify import DensifyResult
+
+    root = Path(folder)
+    record = load_record(RunFolder(root))
+    models = [model for model in AngleModel if record.find(DensifyResult, model) is not None]
+    if not models:
+        raise DataError(root, "holds a run without a dense cloud. Go on with it: `run.resume`.")
+    return _run_result(root, models)
+
+
+def _run_result(root: Path, models: Sequence[AngleModel]) -> RunResult:
+    return RunResult(
+        folder=root,
+        models={model: Reconstruction(folder=root, angle_model=model) for model in models},
+    )
+
+
+def _warn_if_empty(why: str | None) -> None:
+    if why is not None:
+        logger.warning("%s", why)
+
+
+def _job(
+    capture: PathArg,
+    out: PathArg,
+    options: Options | None,
+    changes: Mapping[str, Any],
+    overwrite: bool,
+    resume: bool,
+    workers: int | None,
+    monitor: Monitor | None,
+) -> Any:
+    from polmvs.pipeline.jobs import Job
+    from polmvs.pipeline.record import read_options
+    from polmvs.pipeline.run_folder import RunFolder
+
+    if resume and options is None:  # those of the run, as the command line does
+        options = options_from_plain(read_options(RunFolder(Path(out))), str(out))
+    run_options = RunOptions(overwrite=overwrite, resume=resume)
+    if workers is not None:
+        run_options = replace(run_options, workers=workers)
+    return Job(
+        capture=Path(capture),
+        out=Path(out),
+        options=change_options(options, changes),
+        run_options=run_options,
+        monitor=monitor,
+    )
+
+
+# Options by name
+
+
+def change_options(options: Options | None, changes: Mapping[str, Any]) -> Options:
+    """Options with some of them changed.
+
+    Parameters
+    ----------
+    options : to start from; defaults where None.
+    changes : values by the option's name, which no two groups share.
+
+    Raises
+    ------
+    OptionError
+        A name is unknown, or a value is unusable.
+    """
+    options = options or Options()
+    group_of = {
+        info.name: group
+        for group, cls in groups_of(Options).items()
+        for info in describe_fields(cls)
+    }
+    by_group: dict[str, dict[str, Any]] = {}
+    for name, value in changes.items():
+        if name not in group_of:
+            raise OptionError(f"there is no option {name!r}{_similar(name, group_of)}.")
+        by_group.setdefault(group_of[name], {})[name] = value
+    changed = {group: _changed(getattr(options, group), new) for group, new in by_group.items()}
+    return replace(options, **changed)
+
+
+def _changed(group: Group, changes: Mapping[str, Any]) -> Group:
+    """A group of options with some of them changed, in the fields' types."""
+    known = [info.name for info in describe_fields(type(group))]
+    for name in changes:
+        if name not in known:
+            raise OptionError(f"there is no option {name!r}{_similar(name, known)}.")
+    given = {name: value for name, value in changes.items() if value is not None}
+    none = {name: None for name in changes if name not in given}
+    converted = values_from_plain(type(group), to_plain(given))
+    values = {name: getattr(group, name) for name in known}
+    return type(group)(**{**values, **converted, **none})
+
+
+def _similar(name: str, known: Any) -> str:
+    from difflib import get_close_matches
+
+    close = get_close_matches(name, list(known), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _choice(kind: type[AngleModel], value: AngleModel | str, name: str) -> AngleModel:
+    try:
+        return kind(value)
+    except ValueError as error:
+        choices = ", ".join(kind)
+        raise OptionError(f"must be one of {choices}, not {value!r}.", field=name) from error

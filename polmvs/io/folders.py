@@ -1,0 +1,52 @@
+"""Folders that appear whole or not at all."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+
+from polmvs.errors import DataError
+
+
+@contextmanager
+def new_folder(folder: str | PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+    """A temporary folder beside a new one, which takes its name when all went well, else goes.
+
+    Parameters
+    ----------
+    overwrite : a folder of that name, with all that is in it, is replaced at the end.
+
+    Raises
+    ------
+    DataError
+        The folder exists and is not empty, without ``overwrite``, or the system refuses.
+    """
+    target = Path(folder)
+    if target.exists() and not overwrite and not (target.is_dir() and not any(target.iterdir())):
+        raise DataError(target, "exists already. Remove it or choose another folder.")
+    temporary: Path | None = None
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        # mkdtemp's folder is the owner's alone; one that mkdir makes has the usual rights.
+        content = temporary / "content"
+        content.mkdir()
+        yield content
+        replaced = temporary / "replaced"
+        if target.exists():
+            target.rename(replaced)
+        try:
+            content.rename(target)
+        except OSError:
+            if replaced.exists():
+                replaced.rename(target)
+            raise
+    except OSError as error:
+        raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
+    finally:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
