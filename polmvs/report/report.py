@@ -172,9 +172,7 @@ def _open_truth(
         return None
 
 
-def _view_pages(
-    given: _Given, samples: Mapping[AngleModel, ErrorSamples]
-) -> Iterator[ViewPage]:
+def _view_pages(given: _Given, samples: Mapping[AngleModel, ErrorSamples]) -> Iterator[ViewPage]:
     folder = given.folder
     maps = {m: open_maps(folder.sparse, folder.maps(m), m) for m in given.models}
     dense = {m: open_dense_views(folder.sparse, folder.views(m)) for m in given.models}
@@ -409,9 +407,7 @@ def _plots(given: _Given, samples: Mapping[AngleModel, ErrorSamples]) -> list[Pl
     if depth:
         result.append(
             Plot(
-                svg=plots.error_curves(
-                    {m: 1e3 * e for m, e in depth.items()}, "mm", "depth error"
-                ),
+                svg=plots.error_curves({m: 1e3 * e for m, e in depth.items()}, "mm", "depth error"),
                 caption="Absolute errors of the depth maps against the truth.",
                 wide=True,
             )
