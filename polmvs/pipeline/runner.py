@@ -163,6 +163,7 @@ class Run:
         """
         stale = with_dependent(names, self.table)
         paths = [self.run_folder.root / path for spec in stale for path in spec.writes]
+        paths.append(self.run_folder.report)  # which shows them
         images = frozenset(self.record.images)
         for path in paths:
             if path.is_dir():

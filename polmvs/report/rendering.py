@@ -90,13 +90,19 @@ class Subject:
 
 
 def render_cloud(
-    cloud: Cloud, camera: PinholeCamera, cam_from_world: RigidTransform, *, radius_px: int = 1
+    cloud: Cloud,
+    camera: PinholeCamera,
+    cam_from_world: RigidTransform,
+    *,
+    radius_px: int = 1,
+    plain: bool = False,
 ) -> Rgb:
     """Picture ``(H, W, 3)`` of a cloud.
 
     Parameters
     ----------
     radius_px : half the side of a point's square, less half a pixel.
+    plain : without the points' own colours.
 
     Notes
     -----
@@ -111,7 +117,8 @@ def render_cloud(
         bright = 1 - NORMAL_SHADING * (1 - np.clip(normals @ LIGHT_IN_CAM, 0, 1))
         shade = np.where(has_normal, bright, shade)
         drawn &= ~has_normal | ((normals * in_cam).sum(axis=-1) < 0)
-    base = np.array(SURFACE, np.float64) if cloud.colors is None else cloud.colors
+    uncoloured = plain or cloud.colors is None
+    base = np.array(SURFACE, np.float64) if uncoloured else np.asarray(cloud.colors)
     colors = (base * shade[:, None]).astype(np.uint8)
     order = np.flatnonzero(drawn)
     order = order[np.argsort(-in_cam[order, 2], kind="stable")]  # far first, near ones over them
@@ -153,6 +160,7 @@ def contact_sheet(
     *,
     labels: Sequence[str] = (),
     size_px: tuple[int, int] = (640, 400),
+    plain: bool = False,
 ) -> Rgb:
     """One column for each cloud or mesh, one row for each viewpoint, all seen by one camera.
 
@@ -169,7 +177,7 @@ def contact_sheet(
     ]
     middle = Subject.of(clouds[-1].points, clouds[-1].normals)
     rows = [
-        np.hstack([render_cloud(cloud, camera, middle.pose(viewpoint)) for cloud in clouds])
+        np.hstack([render_cloud(c, camera, middle.pose(viewpoint), plain=plain) for c in clouds])
         for viewpoint in viewpoints
     ]
     sheet = np.ascontiguousarray(np.vstack(rows))

@@ -1,4 +1,4 @@
-"""``OUT/report.html``: what a finished run came to, in one file that needs nothing beside itself."""
+"""``OUT/report.html``: what a finished run came to, in one file that needs nothing beside it."""
 
 from __future__ import annotations
 
