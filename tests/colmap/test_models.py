@@ -3,9 +3,9 @@
 import logging
 import os
 import pickle
-import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -250,8 +250,8 @@ def test_failed_write_leaves_the_old_model(tmp_path, reconstruction, monkeypatch
     model = model_from_reconstruction(reconstruction)
     target = tmp_path / "sparse"
     write_model(model, target)
-    monkeypatch.setattr(shutil, "rmtree", _refuse_once(shutil.rmtree))
-    with pytest.raises(OSError, match="refused"):
+    monkeypatch.setattr(Path, "rename", _refuse_once(Path.rename))
+    with pytest.raises(DataError, match="cannot be written: refused"):
         write_model(model, target)
     assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
     assert_same_model(read_model(target), model)

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import polmvs
 from polmvs.camera import PinholeCamera
-from polmvs.cli import flags
-from polmvs.config import ReferenceOptions, from_plain, to_plain
+from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform, SimilarityTransform
 from polmvs.poses.metric_frame import (
@@ -202,10 +201,10 @@ def test_uncertainty_of_a_distance_has_no_unit() -> None:
 @pytest.mark.parametrize(
     ("scale", "message"),
     [
-        (("000.png", "nobody.png", 1.0), "nobody.png is neither a reconstructed image .*000.png"),
-        (("000.png", "999", 1.0), "999 is neither"),
-        (("000.png", "-1", 1.0), "-1 is neither"),
-        (("lost.png", "000.png", 1.0), "image lost.png has no pose"),
+        (("000.png", "nobody.png", 1.0), "nobody.png, which is neither a .* image .*000.png"),
+        (("000.png", "999", 1.0), "999, which is neither"),
+        (("000.png", "-1", 1.0), "-1, which is neither"),
+        (("lost.png", "000.png", 1.0), "image lost.png, which has no pose"),
         (("000.png", "000", 1.0), "at one place"),
     ],
 )
@@ -229,7 +228,7 @@ def test_bad_ends_of_a_distance(scale: tuple[str, str, float], message: str) -> 
     ],
 )
 def test_malformed_options(options: dict[str, object]) -> None:
-    with pytest.raises(OptionError, match="--"):
+    with pytest.raises(OptionError, match=r"reference\."):
         ReferenceOptions(**options)
 
 
@@ -346,28 +345,3 @@ def test_uncertain_sources_may_differ_more() -> None:
 
 def test_nothing_given() -> None:
     assert metric_frame(WORLD, ReferenceOptions(), lambda name: pytest.fail(name)) is None
-
-
-def test_flags_and_file(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.setitem(flags.GROUPS, "reference", ReferenceOptions)
-    parser = flags.Parser(prog="x")
-    flags.add_flags(parser, ["reference"])
-    args = parser.parse_args(["--scale", "000.png", "17", "0.5", "--aruco", "DICT_4X4_50:0.05"])
-    given = vars(args)
-    assert given["reference.scale"] == ("000.png", "17", 0.5)
-    expected = ReferenceOptions(scale=("000.png", "17", 0.5))
-    plain = to_plain(expected)
-    assert plain["scale"] == ["000.png", "17", 0.5]
-    assert from_plain(ReferenceOptions, plain, "[reference]") == expected
-    assert "--scale A B DISTANCE" in parser.format_help()
-    for words, message in (
-        (["a", "b"], "expected 3 arguments"),
-        (["a", "b", "far"], "'far' cannot be read as NUMBER"),
-        (["a", "b", "nan"], "'nan' cannot be read as NUMBER"),
-    ):
-        with pytest.raises(SystemExit, match="2"):
-            parser.parse_args(["--scale", *words])
-        assert f"argument --scale: {message}" in capsys.readouterr().err
-    for value in (["a", "b"], ["a", 3, 1.0], "abc", ["a", "b", True]):
-        with pytest.raises(OptionError, match="scale cannot be"):
-            from_plain(ReferenceOptions, {"scale": value}, "[reference]")
