@@ -45,14 +45,13 @@ BANDS = (0.05, 0.1, 0.2, 0.4, 1.0)  # of DoLP, whose errors are told apart
 
 
 @dataclass(frozen=True, kw_only=True)
-class FigureArguments(OptionGroup, group="figure", in_files=False):
-    """What is written."""
+class Arguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
 
     figure: Path = option(MISSING, "PNG to write", positional=True)
 
 
 def _calibration(call: Call, terminal: Terminal) -> int:
-    figure = call.get(FigureArguments).figure
     errors, dolp = measure()
     lines = []
     for name, error in errors.items():
@@ -61,15 +60,15 @@ def _calibration(call: Call, terminal: Terminal) -> int:
             for low, high in pairwise(BANDS)
         )
         lines.append(f"{name:<12} rms AoLP error, deg, by DoLP  {bands}  all: {_rms(error):.2f}")
-    draw(figure, errors)
-    print("\n".join([*lines, str(figure)]))
+    draw(call.get(Arguments).figure, errors)
+    terminal.show("\n".join(lines), {name: _rms(error) for name, error in errors.items()})
     return 0
 
 
 COMMAND = Command(
-    help_text="what the calibration of polarizers wins",
+    help_text="AoLP error of a faulty sensor before and after its calibration",
     run=_calibration,
-    groups=(FigureArguments, TerminalOptions),
+    groups=(Arguments, TerminalOptions),
 )
 
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -619,7 +620,7 @@ def change_options(options: Options | None, changes: Mapping[str, Any]) -> Optio
     by_group: dict[str, dict[str, Any]] = {}
     for name, value in changes.items():
         if name not in group_of:
-            raise OptionError(f"there is no option {name!r}{_similar(name, group_of)}.")
+            raise _unknown(name, group_of)
         by_group.setdefault(group_of[name], {})[name] = value
     changed = {group: _changed(getattr(options, group), new) for group, new in by_group.items()}
     return replace(options, **changed)
@@ -627,22 +628,24 @@ def change_options(options: Options | None, changes: Mapping[str, Any]) -> Optio
 
 def _changed(group: Group, changes: Mapping[str, Any]) -> Group:
     """A group of options with some of them changed, in the fields' types."""
-    known = [info.name for info in describe_fields(type(group))]
-    for name in changes:
-        if name not in known:
-            raise OptionError(f"there is no option {name!r}{_similar(name, known)}.")
+    infos = {info.name: info for info in describe_fields(type(group))}
+    for name, value in changes.items():
+        if name not in infos:
+            raise _unknown(name, infos)
+        if value is None and infos[name].default is not None:
+            raise OptionError("cannot be none.", field=infos[name].path)
     given = {name: value for name, value in changes.items() if value is not None}
     none = {name: None for name in changes if name not in given}
+    values = {name: getattr(group, name) for name in infos}
     converted = values_from_plain(type(group), to_plain(given))
-    values = {name: getattr(group, name) for name in known}
     return type(group)(**{**values, **converted, **none})
 
 
-def _similar(name: str, known: Any) -> str:
-    from difflib import get_close_matches
-
+def _unknown(name: str, known: Iterable[str]) -> OptionError:
     close = get_close_matches(name, list(known), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    return OptionError(
+        f"there is no option {name!r}" + (f"; is it {close[0]!r}?" if close else ".")
+    )
 
 
 def _choice(kind: type[AngleModel], value: AngleModel | str, name: str) -> AngleModel:

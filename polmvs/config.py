@@ -416,8 +416,8 @@ class NormalOptions(OptionGroup, group="normals"):
     unseeded: bool = option(True, "place parts without a sparse point by their outlines")
     tilt_aware_weights: bool = option(
         True,
-        "OPA and PPA: rows of oblique rays count less, by the turn that a tilt of the polarizers "
-        "would give their phase; without it the models are pure",
+        "rows of oblique rays count less, by what the model leaves out: OPA the perspective, OPA "
+        "and PPA a tilt of the polarizers; without it the models are pure",
     )
 
     def check(self) -> None:

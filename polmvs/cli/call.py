@@ -82,7 +82,7 @@ class Call:
             for info in describe_fields(cls)
             if info.path in self.given
         }
-        file = self.file.get(cls.group, {})
+        file = self.file.get(cls.group, {}) if cls.in_files else {}
         before = values_from_plain(cls, recorded or {})
         try:
             return cls(**{**before, **file, **flags})

@@ -5,7 +5,6 @@ from __future__ import annotations
 from polmvs.cli.call import Call
 from polmvs.cli.commands import EvaluateArguments, MeshArguments
 from polmvs.cli.terminal import Terminal
-from polmvs.config import to_plain
 from polmvs.errors import OptionError
 from polmvs.evaluation.comparison import evaluate_file
 from polmvs.evaluation.tables import evaluation_text
@@ -17,7 +16,7 @@ def evaluate(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs evaluate``."""
     arguments = call.get(EvaluateArguments)
     figures = evaluate_file(arguments.cloud, arguments.gt, arguments.sparse)
-    terminal.show(evaluation_text(figures), to_plain(figures))
+    terminal.show(evaluation_text(figures), figures)
     return 0
 
 

@@ -75,6 +75,53 @@ class ComparedModels(OptionGroup, group="models", in_files=False):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReportChoice(OptionGroup, group="report", in_files=False):
+    """What is written beside the results."""
+
+    report: bool = option(True, "OUT/report.html, a page that shows them all")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    out: Path = option(MISSING, "folder of a finished run", positional=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    picture: Path = option(MISSING, "PNG file of the picture", positional=True)
+    files: tuple[Path, ...] = option(
+        MISSING, "PLY files of clouds or meshes in one frame, a column each", metavar="FILE,..."
+    )
+    labels: tuple[str, ...] = option((), "a text for each column", metavar="TEXT,...")
+    elevations: tuple[float, ...] = option(
+        (35.0, 4.0),
+        "over the part's mean plane, degrees, a row each",
+        least=-90,
+        most=90,
+        metavar="DEG,...",
+    )
+    azimuths: tuple[float, ...] = option(
+        (40.0,),
+        "from the part's longest direction, degrees; each with every elevation",
+        metavar="DEG,...",
+    )
+    size: tuple[int, int] = option(
+        (640, 400), "of each panel, px", least=16, most=8192, metavar="WIDTH,HEIGHT"
+    )
+    plain: bool = option(False, "shade by the normals alone, without the surfaces' own grey")
+    overwrite: bool = option(False, "replace an existing PICTURE")
+
+    def check(self) -> None:
+        """A text for each column, or none."""
+        fits = len(self.labels) in (0, len(self.files))
+        self.require(fits, "labels", "needs one text for each of `arguments.files`", self.labels)
+
+
+@dataclass(frozen=True, kw_only=True)
 class EvaluateArguments(OptionGroup, group="arguments", in_files=False):
     """Arguments."""
 
@@ -135,20 +182,20 @@ COMMANDS = (
         name="demo",
         help_text="compare OPA and PPA on the bundled capture of a glossy board",
         run="polmvs.cli.jobs:demo",
-        groups=(DemoArguments, RunOptions, TerminalOptions),
+        groups=(DemoArguments, ReportChoice, RunOptions, TerminalOptions),
     ),
     Command(
         name="reconstruct",
         help_text="capture in, dense cloud of one model out",
         run="polmvs.cli.jobs:reconstruct",
-        groups=(JobArguments, ModelChoice, *TO_CLOUD, ExportOptions, *HOW),
+        groups=(JobArguments, ModelChoice, *TO_CLOUD, ExportOptions, ReportChoice, *HOW),
     ),
     Command(
         name="compare",
         help_text="dense clouds of several models on the same poses, seeds and region, and figures "
         "that tell them apart",
         run="polmvs.cli.jobs:compare",
-        groups=(JobArguments, ComparedModels, *TO_CLOUD, EvaluationOptions, *HOW),
+        groups=(JobArguments, ComparedModels, *TO_CLOUD, EvaluationOptions, ReportChoice, *HOW),
     ),
     Command(
         name="evaluate",
@@ -188,6 +235,24 @@ COMMANDS = (
         help_text="Poisson mesh of a cloud with normals",
         run="polmvs.cli.clouds:mesh",
         groups=(MeshArguments, TerminalOptions),
+    ),
+    Command(
+        name="report",
+        help_text="the page that shows a finished run, OUT/report.html, anew",
+        run="polmvs.cli.pages:report",
+        groups=(FolderArguments, TerminalOptions),
+    ),
+    Command(
+        name="view",
+        help_text="clouds and meshes of a finished run in Open3D's viewer",
+        run="polmvs.cli.pages:view",
+        groups=(FolderArguments, TerminalOptions),
+    ),
+    Command(
+        name="render",
+        help_text="still picture of clouds and meshes, without a display",
+        run="polmvs.cli.pages:render",
+        groups=(RenderArguments, TerminalOptions),
     ),
     Command(
         name="plane",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
+import types
 import typing
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -265,12 +266,15 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
         common |= {"converter": _several(elements[0]), "n_tokens": 1, "consume_multiple": True}
     elif elements and not _is_mixed(kind):
         common |= {"converter": _one_list(elements[0]), "n_tokens": 1}
+        # Of what length it is is the group's to say.
+        kind = types.GenericAlias(tuple, (elements[0], ...))
     has_default = not is_required and place is not inspect.Parameter.VAR_POSITIONAL
     return inspect.Parameter(
         _key(info),
         place,
         default=None if has_default else inspect.Parameter.empty,
-        annotation=Annotated[kind, Parameter(**common)],
+        # Where pydantic happens to be loaded, cyclopts has it check the default as well.
+        annotation=Annotated[kind | None if has_default else kind, Parameter(**common)],
     )
 
 
@@ -344,4 +348,9 @@ def _message(error: CycloptsError) -> str:
             return f"{name} is missing"
     error.verbose = False
     text = " ".join(str(error).split())
-    return text[0].lower() + text[1:].rstrip(".")
+    name = error.argument.name if error.argument is not None else ""
+    if name not in text:  # of several values cyclopts does not say whose they are
+        text = f"invalid value for {name}: {text}"
+    if not text.endswith("..."):
+        text = text.removesuffix(".")
+    return text[0].lower() + text[1:]

@@ -9,7 +9,13 @@ from typing import Any
 import polmvs
 from polmvs.camera import PinholeCamera
 from polmvs.cli.call import Call
-from polmvs.cli.commands import ComparedModels, DemoArguments, JobArguments, ModelChoice
+from polmvs.cli.commands import (
+    ComparedModels,
+    DemoArguments,
+    JobArguments,
+    ModelChoice,
+    ReportChoice,
+)
 from polmvs.cli.flags import in_flags
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
@@ -46,19 +52,21 @@ def demo(call: Call, terminal: Terminal) -> int:
         monitor=terminal,
         command_line=call.command_line,
     )
-    return _show_comparison(pipeline.compare(job), terminal)
+    return _show_comparison(_reported(pipeline.compare(job), call, terminal), terminal)
 
 
 def reconstruct(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs reconstruct``."""
     model = call.get(ModelChoice).angle_model
-    return _show_cloud(pipeline.reconstruct(job_of(call, terminal), model), model, terminal)
+    outcome = pipeline.reconstruct(job_of(call, terminal), model)
+    return _show_cloud(_reported(outcome, call, terminal), model, terminal)
 
 
 def compare(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs compare``."""
     models = call.get(ComparedModels).angle_models
-    return _show_comparison(pipeline.compare(job_of(call, terminal), models), terminal)
+    outcome = pipeline.compare(job_of(call, terminal), models)
+    return _show_comparison(_reported(outcome, call, terminal), terminal)
 
 
 def sfm(call: Call, terminal: Terminal) -> int:
@@ -97,6 +105,15 @@ def export(call: Call, terminal: Terminal) -> int:
     model = call.get(ModelChoice).angle_model
     outcome = pipeline.export(job_of(call, terminal, continues=True), model)
     return _show_cloud(outcome, model, terminal)
+
+
+def _reported(outcome: pipeline.JobOutcome, call: Call, terminal: Terminal) -> pipeline.JobOutcome:
+    """Write the page that shows the results, if it is wanted."""
+    if call.get(ReportChoice).report:
+        from polmvs.cli.pages import make_report
+
+        make_report(outcome.run_folder, terminal)
+    return outcome
 
 
 def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeline.Job:

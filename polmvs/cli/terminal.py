@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,13 +122,13 @@ class Terminal:
             self.warnings.append(text)
             self.say(f"warning: {text}")
 
-    def show(self, text: str, content: Mapping[str, Any]) -> None:
+    def show(self, text: str, content: Any) -> None:
         """The result of the command, on stdout.
 
         Parameters
         ----------
         text : for people.
-        content : the same for machines, which JSON can hold.
+        content : the same for machines: a dataclass, or what JSON can hold.
         """
         print(json.dumps(to_plain(content), indent=1) if self.options.json else text)
 
@@ -179,13 +179,13 @@ class Terminal:
     def finished(self, name: str, seconds: float, summary: str) -> None:
         """One line for a stage."""
         self.stages.append(StageLine(stage=name, seconds=seconds, summary=summary))
-        self.say(f"{name:<18} {seconds:7.1f} s  {summary}".rstrip())
+        self.say(f"{name:<20} {seconds:7.1f} s  {summary}".rstrip())
         self._unrepeated = list(self.warnings)
 
     def skipped(self, name: str) -> None:
         """A stage of an earlier call."""
         if self.options.verbose:
-            self.say(f"{name:<18} finished earlier")
+            self.say(f"{name:<20} finished earlier")
 
     def _add(self, handler: logging.Handler) -> None:
         self._handlers.append(handler)

@@ -53,7 +53,12 @@ def best_fit_lines(comparison: Comparison) -> list[str]:
 
 
 def comparison_table(comparison: Comparison) -> str:
-    """One column for each model."""
+    """The figures as a table in Markdown, a column for each model."""
+    return format_table(*comparison_rows(comparison))
+
+
+def comparison_rows(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the figures, a column for each model."""
     models = comparison.models
 
     def row(name: str, cell: Callable[[ModelFigures], str]) -> list[str]:
@@ -78,7 +83,7 @@ def comparison_table(comparison: Comparison) -> str:
     truth = {model: figures.truth for model, figures in models.items() if figures.truth is not None}
     if len(truth) == len(models):
         rows += _truth_rows(truth, comparison.phase)
-    return format_table(["", *[name.upper() for name in models]], rows)
+    return ["", *[name.upper() for name in models]], rows
 
 
 def rmse_and_median(stats: AngleStats | None) -> str:

@@ -10,10 +10,10 @@ unless *all* their names end in
 
 A folder without images may hold them in folders by angle (``pol000 pol045``, ``I0 I45``), by
 Stokes parameter (``s0 s1 s2``), by map (``aolp dolp image``), or by view (``left/I0.png``). Other
-names are given as a template (``--naming``).
+names are given as a template (```capture.naming```).
 
 Numbers of frames look like angles. So an ending counts as an angle only if the whole set is one
-that polarizers are used at (``ANGLE_SETS``); any other needs the template or ``--kind``.
+that polarizers are used at (``ANGLE_SETS``); any other needs the template or ```capture.kind```.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def find_capture(
     raise DataError(
         folder,
         f"no images in it or in its raw/. Raw mosaics ({kinds}) are expected, or a folder for "
-        "each polarizer angle, Stokes image or map; other names are given by --naming.",
+        "each polarizer angle, Stokes image or map; other names are given by `capture.naming`.",
     )
 
 
@@ -196,8 +196,8 @@ def _flat(
                 return _assemble(folder, its_kind, named)
     raise DataError(
         place,
-        f"its files' names are not those of a capture of kind {kind}. Say by --naming how its "
-        "files are named.",
+        f"its files' names are not those of a capture of kind {kind}. Say by `capture.naming` how "
+        "its files are named.",
     )
 
 
@@ -209,15 +209,15 @@ def _by_template(
     for token in re.findall(r"{(.*?)}", pattern):
         if token not in _TOKENS:
             known = ", ".join(f"{{{name}}}" for name in _TOKENS)
-            raise OptionError(f"--naming: {{{token}}} is unknown; known are {known}.")
+            raise OptionError(f"`capture.naming`: {{{token}}} is unknown; known are {known}.")
         pattern = pattern.replace(f"{{{token}}}", _TOKENS[token], 1)
     try:
         compiled = re.compile(pattern)
     except re.error as error:
-        raise OptionError(f"--naming: {naming!r} names something twice.") from error
+        raise OptionError(f"`capture.naming`: {naming!r} names something twice.") from error
     groups = compiled.groupindex
     if "index" in groups and angles is None:
-        raise OptionError("--naming has {index}; give the --angles of these files.")
+        raise OptionError("`capture.naming` has {index}; give the `capture.angles` of these files.")
     told = CaptureKind.MOSAIC
     for name, its_kind in (
         ("angle", CaptureKind.ANGLES),
@@ -229,11 +229,13 @@ def _by_template(
     if told is CaptureKind.MOSAIC and kind is CaptureKind.STOKES:
         told = kind  # one array a view with all three
     if kind not in (None, told):
-        raise OptionError(f"--naming {naming!r} is of {told} files, --kind says {kind}.")
+        raise OptionError(
+            f"`capture.naming` {naming!r} is of {told} files, `capture.kind` says {kind}."
+        )
     tree = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     named = _match(folder, tree, pattern, angles)
     if not named:
-        raise DataError(folder, f"no image's name fits --naming {naming!r}.")
+        raise DataError(folder, f"no image's name fits `capture.naming` {naming!r}.")
     return _assemble(folder, told, named)
 
 
@@ -275,7 +277,8 @@ def _with_angles(named: Sequence[_Named], angles: Sequence[float]) -> list[_Name
         order = sorted(places[item.view])
         if len(order) != len(angles):
             raise DataError(
-                item.path, f"its view {item.view!r} has {len(order)} images, --angles {len(angles)}"
+                item.path,
+                f"its view {item.view!r} has {len(order)} images, `capture.angles` {len(angles)}",
             )
         result.append(item._replace(role=f"{angles[order.index(int(item.role))]:g}"))
     return result

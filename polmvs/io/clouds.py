@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -164,8 +164,6 @@ def read_cloud(path: str | Path) -> Cloud:
         If the file is missing or no point cloud.
     """
     source = Path(path)
-    if not source.is_file():
-        raise DataError(source, "no such file; give a PLY point cloud.")
     num_points = _checked_header(source)
     if num_points == 0:
         return Cloud(np.zeros((0, 3)))
@@ -184,17 +182,62 @@ def read_cloud(path: str | Path) -> Cloud:
     )
 
 
-def _checked_header(source: Path) -> int:
-    """Number of points that a PLY promises, once the file is known to be long enough.
+def has_triangles(path: str | Path) -> bool:
+    """Whether a PLY is a mesh.
 
-    Open3D fills a truncated file up with zeros.
+    Raises
+    ------
+    DataError
+        The file is missing or no PLY.
     """
+    lines, _ = _header(Path(path))
+    return any(line[:2] == ["element", "face"] and line[-1] != "0" for line in lines)
+
+
+def show_in_viewer(paths: Sequence[str | Path]) -> None:
+    """Open Open3D's viewer on clouds and meshes; returns when its window is closed.
+
+    Raises
+    ------
+    DataError
+        A file is unusable.
+    PolmvsError
+        There is no window to be had.
+    """
+    o3d = _open3d()
+    shown = [
+        {
+            "name": Path(path).stem,
+            "geometry": mesh_to_open3d(read_mesh(path))
+            if has_triangles(path)
+            else to_open3d(read_cloud(path)),
+        }
+        for path in paths
+    ]
+    try:
+        o3d.visualization.draw(shown, show_ui=True)
+    except RuntimeError as error:
+        raise PolmvsError(f"Open3D opens no window here ({error}).") from error
+
+
+def _header(source: Path) -> tuple[list[list[str]], int]:
+    """Words of the lines of a PLY's header, and where that ends."""
+    if not source.is_file():
+        raise DataError(source, "no such file; give a PLY point cloud.")
     with source.open("rb") as file:
         head = file.read(65536)
     end = head.find(b"end_header")
     if not head.startswith(b"ply") or end < 0:
         raise DataError(source, "is no PLY file; give a PLY point cloud.")
-    lines = [line.split() for line in head[:end].decode("ascii", "replace").splitlines()]
+    return [line.split() for line in head[:end].decode("ascii", "replace").splitlines()], end
+
+
+def _checked_header(source: Path) -> int:
+    """Number of points that a PLY promises, once the file is known to be long enough.
+
+    Open3D fills a truncated file up with zeros.
+    """
+    lines, end = _header(source)
     elements = [line for line in lines if line[:1] == ["element"]]
     if not elements or elements[0][1:2] != ["vertex"] or not elements[0][-1].isdigit():
         raise DataError(source, "holds no vertices; give a PLY point cloud.")

@@ -177,7 +177,9 @@ def unpack(path: PathArg, data: bytes, dump: DumpSize) -> NDArray[Any]:
         The size is not given, or the packing is not and two of them have this length.
     """
     if dump.width is None or dump.height is None:
-        raise OptionError(f"{path}: is a dump without a header. Give --width and --height.")
+        raise OptionError(
+            f"{path}: is a dump without a header. Give `capture.width` and `capture.height`."
+        )
     num = dump.width * dump.height
     packing = dump.packing if dump.packing is not None else _packing_of(path, len(data), num)
     expected = _dump_bytes(packing, num)
@@ -185,7 +187,7 @@ def unpack(path: PathArg, data: bytes, dump: DumpSize) -> NDArray[Any]:
         raise DataError(
             path,
             f"has {len(data):,} bytes; {dump.width}x{dump.height} px of {packing} are "
-            f"{expected:,}. Check --width, --height and --packing.",
+            f"{expected:,}. Check `capture.width`, `capture.height` and `capture.packing`.",
         )
     shape = (dump.height, dump.width)
     if packing is Packing.MONO8:
@@ -228,11 +230,13 @@ def _packing_of(path: PathArg, length: int, num: int) -> Packing:
     if len(fits) == 1:
         return fits[0]
     if fits:
-        raise OptionError(f"{path}: may be packed as {' or '.join(fits)}. Say which by --packing.")
+        raise OptionError(
+            f"{path}: may be packed as {' or '.join(fits)}. Say which by `capture.packing`."
+        )
     raise DataError(
         path,
         f"has {length:,} bytes, which no packing of {num:,} samples has. "
-        "Check --width and --height.",
+        "Check `capture.width` and `capture.height`.",
     )
 
 

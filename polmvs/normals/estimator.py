@@ -11,9 +11,8 @@ from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
-from polmvs.fitting import CAUCHY_SCALE, MEDIAN_OF_NORMAL, annealed_scales, cauchy_weights
+from polmvs.fitting import CAUCHY_SCALE, annealed_scales, cauchy_weights
 from polmvs.scene import MIN_FACING_COSINE
 
 Floats = NDArray[np.floating]
@@ -25,10 +24,6 @@ NUM_ROUNDS = 5  # of reweighting; the change of later ones is below 0.01 deg
 DOUBTFUL_LOSS = 0.25  # from which a point is tried again; about 0.12 without outliers
 NUM_PAIRS = 24  # of rows that a doubtful point is started from again
 MIN_ROWS_TO_DOUBT = 7  # that count; of fewer, some agree by chance
-NUM_NOISE_ROUNDS = 3  # in which a model's own error is found
-NOISE_CHANGE = 0.1  # of that error, under which no further round follows
-MIN_NOISE_ROWS = 300  # whose median says what a model's error is: to 8 %
-MAX_NOISE_ROWS = 50_000
 MIN_PAIR_SINE = 0.05  # of the angle between the two rows
 # Spread of the rows over the variance of their noise. Where all planes of incidence are one (camera
 # centres and normal in one plane, as on a linear rail) the noise alone spreads them, and their mean
@@ -168,65 +163,6 @@ def solve_normals(
         return estimate
     sigma = _algebraic_sigma(rows, rays, precision, estimate.normals.T)
     return replace(estimate, sigma_deg=np.degrees(sigma, dtype=np.float64))
-
-
-def solve_at_own_noise(
-    rows: Floats, rays: Floats, sigma: Floats, *, initial_normals: Floats | None = None
-) -> tuple[NormalEstimate, Floats]:
-    """As :func:`solve_normals`, robust, with deviations that the rows' own residuals bear out.
-
-    An angle model that leaves something out (OPA the perspective, PPA the tilt of polarizers) errs
-    by more than the noise of its phases. Held against that noise all its rows were outliers, and
-    the loss would keep those few that happen to agree. One variance, that of the model's error, is
-    added for all points of a call, so large that the median residual is that of a normal
-    distribution; none if it is that already. Every model is treated alike.
-
-    Returns
-    -------
-    estimate : of the points.
-    sigma : (K, N), with the model's error.
-    """
-    estimate = solve_normals(rows, rays, sigma, initial_normals=initial_normals)
-    total, error = sigma, 0.0
-    for _ in range(NUM_NOISE_ROUNDS):
-        before = error
-        error = model_error(rows, rays, sigma, estimate)
-        if error <= (1 + NOISE_CHANGE) * before:
-            break
-        total = np.hypot(sigma, np.asarray(error, sigma.dtype))
-        estimate = solve_normals(rows, rays, total, initial_normals=initial_normals)
-    return estimate, total
-
-
-def model_error(rows: Floats, rays: Floats, sigma: Floats, estimate: NormalEstimate) -> float:
-    """Deviation of the rows' turns that their sigma leaves unexplained, rad; 0 for few rows.
-
-    Parameters
-    ----------
-    rows, rays, sigma : as in :func:`solve_normals`.
-    estimate : of their normals. Points of fewer than ``MIN_ROWS_TO_DOUBT`` rows do not count.
-    """
-    normals = np.nan_to_num(estimate.normals.T)
-    cosine = _dot(rays, normals)
-    used = np.isfinite(sigma) & np.isfinite(rows).all(axis=0) & (cosine < -MIN_FACING_COSINE)
-    count = used.sum(axis=0)
-    used &= estimate.valid & (count >= MIN_ROWS_TO_DOUBT)
-    if used.sum() < MIN_NOISE_ROWS:
-        return 0.0
-    step = max(1, int(used.sum()) // MAX_NOISE_ROWS)
-    k, n = (index[::step] for index in np.nonzero(used))
-    sin2 = np.maximum(1 - cosine[k, n] ** 2, MIN_SIN_ZENITH**2)
-    product = (rows[:, k, n] * normals[:, n].astype(rows.dtype)).sum(axis=0)
-    # Two of a point's residuals go into its normal.
-    turn2 = product**2 / sin2 * (count[n] / (count[n] - 2))
-    variance = np.square(sigma[k, n])
-
-    def excess(added: float) -> float:
-        return float(np.median(turn2 / (variance + added))) - MEDIAN_OF_NORMAL**2
-
-    if excess(0.0) <= 0:
-        return 0.0
-    return float(np.sqrt(brentq(excess, 0.0, float(turn2.max()) / MEDIAN_OF_NORMAL**2, rtol=1e-3)))
 
 
 @dataclass(frozen=True)

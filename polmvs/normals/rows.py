@@ -51,9 +51,10 @@ def gather_rows(
     maps : K phase maps.
     range_maps : per view ``(h, w)`` distances from the camera centre, 0 where unknown: a point
         that lies behind its view's map by more than ``range_tolerance`` (relative) is occluded.
-    tilt_aware : add to the variance of OPA's and PPA's phases the square of the turn that a tilt
-        of the polarizers would give them (:func:`polmvs.polarization.angle_models.tilt_turn`):
-        oblique rays count less. Without it a row's weight comes from the phase map alone.
+    tilt_aware : add to a row's variance the square of what its model leaves out: to OPA's and
+        PPA's phases the turn that a tilt of the polarizers would give them
+        (:func:`polmvs.polarization.angle_models.tilt_turn`), to OPA's rows their angle to PPA's.
+        Oblique rays count less. Without it a row's weight comes from the phase map alone.
     """
     tilt_aware = tilt_aware and angle_model is not AngleModel.TILTED
     points = np.asarray(points_in_world, np.float64)  # the origin may be far
@@ -82,7 +83,12 @@ def gather_rows(
         variance = 1 / precision[seen]
         if tilt_aware:
             variance += np.square(_tilt_turns(phase_map, samples[seen], ray[seen], xy[seen]))
-        sigma[k, seen] = turn[seen] * np.sqrt(variance)
+        variance *= np.square(turn[seen])
+        if tilt_aware and angle_model is AngleModel.OPA:
+            # Both rows are perpendicular to d: v . (z x d) over v_z is the tangent of their angle.
+            aside2 = np.square((row[seen] * ray[seen]).sum(axis=-1))
+            variance += aside2 / (aside2 + ray[seen, 2] ** 2)
+        sigma[k, seen] = np.sqrt(variance)
     return Rows(rows, rays, sigma)
 
 

@@ -8,7 +8,7 @@ projected point, in every view that sees it, not only in the views that matched 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, Estimator, NormalOptions
-from polmvs.normals.estimator import NormalEstimate, solve_at_own_noise, solve_normals
+from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds, Tracks, point_sigmas
@@ -25,12 +25,28 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 BORDER_MARGIN_PX = 7  # points nearer to the region's border may lie on the background
-MIN_INSIDE_SHARE = 0.8  # of a track's views that must see it in their region
-MIN_SEEN_SHARE = 0.7  # of the views that a point faces, to show the surface at its place
-MAX_DOLP_SHARE = 0.85  # of a mark's DoLP in that of the surface about it
-CLEAR_DOLP = 0.15  # of the surface, for the comparison to tell
-MAX_SEED_SIGMA_DEG = 3.0
-MAX_SEED_RESIDUAL = 0.06  # sine; 3.4 deg between the normal and the planes of incidence
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeedTolerances:
+    """Which tracks are seeds: on the polarised surface, their phases explained by one normal.
+
+    Attributes
+    ----------
+    min_inside_share : of a track's views that must see it in their region. Guess.
+    min_seen_share : of the views that a point faces, to show the surface at its place. Guess.
+    max_dolp_share : of a mark's DoLP in that of the surface about it. Guess.
+    clear_dolp : of the surface, for the comparison to tell. Guess.
+    max_sigma_deg : of the normal. Guess.
+    max_residual : sine; 3.4 deg between the normal and the planes of incidence. Guess.
+    """
+
+    min_inside_share: float = 0.8
+    min_seen_share: float = 0.7
+    max_dolp_share: float = 0.85
+    clear_dolp: float = 0.15
+    max_sigma_deg: float = 3.0
+    max_residual: float = 0.06
 
 
 def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
@@ -86,10 +102,7 @@ def normals_from_windows(
     cosine = np.einsum("ikn,ni->kn", rows.rays, np.nan_to_num(own.normals))
     facing = cosine < -MIN_FACING_COSINE
     sigma = np.where(matched | facing, rows.sigma, np.inf)
-    start = own.normals.T
-    if not robust:
-        return solve_normals(rows.rows, rows.rays, sigma, robust=False, initial_normals=start)
-    return solve_at_own_noise(rows.rows, rows.rays, sigma, initial_normals=start)[0]
+    return solve_normals(rows.rows, rows.rays, sigma, robust=robust, initial_normals=own.normals.T)
 
 
 def inside_shares(
@@ -123,7 +136,9 @@ def seen_shares(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> Arra
     return np.asarray(seen / np.maximum(facing, 1))
 
 
-def dolp_shares(tracks: Tracks, maps: Sequence[PhaseMap]) -> Array:
+def dolp_shares(
+    tracks: Tracks, maps: Sequence[PhaseMap], *, tolerances: SeedTolerances = SeedTolerances()
+) -> Array:
     """DoLP at the keypoints over that of the surface about them, the median ``(T,)`` of a track.
 
     NaN where the surface is nowhere polarised enough to tell.
@@ -135,7 +150,9 @@ def dolp_shares(tracks: Tracks, maps: Sequence[PhaseMap]) -> Array:
         lowest = sample_image(phase_map.lowest_dolp.astype(np.float32), xy, nearest=True) / 255
         about = sample_image(phase_map.samples, xy, nearest=True)
         surface = np.hypot(about[:, 0], about[:, 1])
-        ratio[here] = np.where(surface > CLEAR_DOLP, lowest / np.maximum(surface, 1e-6), np.nan)
+        ratio[here] = np.where(
+            surface > tolerances.clear_dolp, lowest / np.maximum(surface, 1e-6), np.nan
+        )
     known = np.isfinite(ratio)
     # The median of each track: its ratios lie together once sorted by track and value.
     order = np.lexsort((ratio[known], tracks.obs_track[known]))
@@ -152,6 +169,8 @@ def select_seeds(
     tracks: Tracks,
     estimate: NormalEstimate,
     maps: Sequence[PhaseMap],
+    *,
+    tolerances: SeedTolerances = SeedTolerances(),
 ) -> tuple[Seeds, Mask]:
     """Tracks that lie on the polarised surface and whose normal explains their phases.
 
@@ -165,12 +184,12 @@ def select_seeds(
     """
     good = (
         estimate.valid
-        & (inside_shares(tracks, maps) >= MIN_INSIDE_SHARE)
-        & (seen_shares(tracks.points_in_world, estimate.normals, maps) >= MIN_SEEN_SHARE)
-        & ~(dolp_shares(tracks, maps) > MAX_DOLP_SHARE)
+        & (inside_shares(tracks, maps) >= tolerances.min_inside_share)
+        & (seen_shares(tracks.points_in_world, estimate.normals, maps) >= tolerances.min_seen_share)
+        & ~(dolp_shares(tracks, maps, tolerances=tolerances) > tolerances.max_dolp_share)
         & (estimate.num_rows >= 3)
-        & (estimate.sigma_deg < MAX_SEED_SIGMA_DEG)
-        & (estimate.residual < MAX_SEED_RESIDUAL)
+        & (estimate.sigma_deg < tolerances.max_sigma_deg)
+        & (estimate.residual < tolerances.max_residual)
     )
     sigma = point_sigmas(tracks, [m.view for m in maps])
     return Seeds(tracks.points_in_world[good], estimate.normals[good], sigma[good]), good

@@ -43,6 +43,7 @@ class StageRecord:
     options : values of the options that decided its result, by path, in terms of JSON.
     seconds : wall time.
     peak_rss_mb : largest memory so far of the run's processes together.
+    warnings : what it warned of.
     result : what it found, of the type that the stage table says.
     """
 
@@ -52,6 +53,7 @@ class StageRecord:
     options: Mapping[str, Any] = field(default_factory=dict)
     seconds: float
     peak_rss_mb: float
+    warnings: tuple[str, ...] = ()
     result: Any = None
 
 

@@ -57,6 +57,11 @@ class RunFolder:
         return self.root / "summary.md"
 
     @property
+    def report(self) -> Path:
+        """The page that shows all results."""
+        return self.root / "report.html"
+
+    @property
     def run_file(self) -> Path:
         """Record of the run."""
         return self.root / RUN_FILE

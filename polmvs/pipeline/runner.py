@@ -61,6 +61,8 @@ from polmvs.scene import SparseModel
 
 logger = logging.getLogger(__name__)
 
+FILE_ONLY = {"file_only": True}  # of records that a monitor is told of as well
+
 
 @dataclass(kw_only=True)
 class Run:
@@ -98,7 +100,7 @@ class Run:
         """
         finished = self.record.stage(spec.name)
         if finished is not None and not (spec.is_redone and self._has_changed(spec, finished)):
-            logger.info("%s: finished earlier", spec.name)
+            logger.info("%s: finished earlier", spec.name, extra=FILE_ONLY)
             self.monitor.skipped(spec.name)
             return
         for other in needed_by(spec, self.table):
@@ -116,10 +118,13 @@ class Run:
         """Do a stage whose input is there, and record it."""
         logger.info("%s: begins", spec.name)
         start = time.perf_counter()
-        with self.monitor.stage(spec.name, spec.num_steps(self._input())) as on_progress:
+        with (
+            self.monitor.stage(spec.name, spec.num_steps(self._input())) as on_progress,
+            _collected_warnings() as warned,
+        ):
             result = spec.work(self._input(on_progress))
         seconds = round(time.perf_counter() - start, 3)
-        logger.info("%s: %.1f s, %s", spec.name, seconds, result)
+        logger.info("%s: %.1f s, %s", spec.name, seconds, result, extra=FILE_ONLY)
         finished = StageRecord(
             name=spec.name,
             angle_model=spec.angle_model,
@@ -127,6 +132,7 @@ class Run:
             options=plain_options(self.options, spec.decides),
             seconds=seconds,
             peak_rss_mb=round(peak_rss_mb(), 1),
+            warnings=tuple(dict.fromkeys(warned)),
             result=result,
         )
         self.record.stages = (*self.record.stages, finished)
@@ -159,6 +165,7 @@ class Run:
         """
         stale = with_dependent(names, self.table)
         paths = [self.run_folder.root / path for spec in stale for path in spec.writes]
+        paths.append(self.run_folder.report)  # which shows them
         images = frozenset(self.record.images)
         for path in paths:
             if path.is_dir():
@@ -196,6 +203,31 @@ class Run:
         self._started = now
         self.record.finished = finished
         write_record(self.run_folder, self.record)
+
+
+class _Collector(logging.Handler):
+    """Keeps the texts of warnings."""
+
+    def __init__(self, texts: list[str]) -> None:
+        super().__init__(logging.WARNING)
+        self.texts = texts
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a text."""
+        if record.levelno == logging.WARNING:
+            self.texts.append(record.getMessage())
+
+
+@contextmanager
+def _collected_warnings() -> Iterator[list[str]]:
+    """What this package warns of meanwhile."""
+    texts: list[str] = []
+    handler, package = _Collector(texts), logging.getLogger("polmvs")
+    package.addHandler(handler)
+    try:
+        yield texts
+    finally:
+        package.removeHandler(handler)
 
 
 @contextmanager

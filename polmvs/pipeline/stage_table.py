@@ -426,7 +426,7 @@ def result_types() -> dict[str, type]:
 def written_names() -> tuple[str, ...]:
     """Names of all files and folders that a run may write in its folder, the record last."""
     names = [path.parts[0] for spec in stage_table() for path in spec.writes]
-    return (*dict.fromkeys(names), LOG_FILE, RUN_FILE)
+    return (*dict.fromkeys(names), HERE.report.name, LOG_FILE, RUN_FILE)
 
 
 def option_groups(command: str) -> tuple[str, ...]:

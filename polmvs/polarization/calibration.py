@@ -404,8 +404,8 @@ def _near_nominal(angles_deg: Array) -> Array:
     if np.abs(near - nominal).max() > MAX_ANGLE_ERROR_DEG:
         found = ", ".join(f"{angle % 180:.1f}" for angle in angles_deg)
         raise ValueError(
-            f"the channels 0, 45, 90, 135 are found at {found} degrees; check --pattern, and that "
-            "the polarizer's angles count anticlockwise from +x as displayed."
+            f"the channels 0, 45, 90, 135 are found at {found} degrees; check `capture.pattern`, "
+            "and that the polarizer's angles count anticlockwise from +x as displayed."
         )
     return near
 

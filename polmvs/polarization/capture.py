@@ -428,8 +428,8 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
         calibration = read_calibration(options.calibration)
         if calibration.pattern != options.pattern:
             raise OptionError(
-                f"--calibration {options.calibration} is of the pattern {calibration.pattern}, "
-                f"--pattern says {options.pattern}."
+                f"is of the pattern {calibration.pattern}, `capture.pattern` is {options.pattern}.",
+                field="capture.calibration",
             )
     capture = Capture(
         folder=files.folder,
@@ -481,7 +481,7 @@ def _require_fitting_options(files: CaptureFiles, options: CaptureOptions) -> No
     for name in ("pattern", "bayer", "resolution", "calibration"):
         if getattr(options, name) != getattr(defaults, name):
             raise OptionError(
-                f"--{name} is of raw mosaics; {files.folder} holds {files.kind} images."
+                f"`capture.{name}` is of raw mosaics; {files.folder} holds {files.kind} images."
             )
 
 

@@ -321,7 +321,7 @@ def _warnings(
     if colour > limits.colour:
         lines.append(
             f"neighbouring cells differ by {100 * colour:.0f} % in a 2x2 rhythm, as those of a "
-            "colour sensor do; give --bayer"
+            "colour sensor do; give `capture.bayer`"
         )
     spoiled = [v.name for v in views if v.saturated > limits.saturated]
     if spoiled:

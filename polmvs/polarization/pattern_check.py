@@ -66,14 +66,14 @@ class PatternCheck:
         """One line for the user."""
         text = ",".join(map(str, self.pattern))
         if self.fits is None:
-            return f"too little polarised light to check --pattern {text}"
+            return f"too little polarised light to check `capture.pattern` {text}"
         if self.fits:
-            return f"--pattern {text} fits, or a turned or mirrored one"
+            return f"`capture.pattern` {text} fits, or a turned or mirrored one"
         likely = ",".join(map(str, self.fitting[0]))
+        pairs = PAIRING_NAMES[int(np.argmin(self.disagreement))]
         return (
-            f"--pattern {text} does not fit: its perpendicular samples do not sum alike. Those on "
-            f"the {PAIRING_NAMES[int(np.argmin(self.disagreement))]} of a cell do, as in "
-            f"--pattern {likely}"
+            f"`capture.pattern` {text} does not fit: its perpendicular samples do not sum alike. "
+            f"Those on the {pairs} of a cell do, as in `capture.pattern` {likely}"
         )
 
 

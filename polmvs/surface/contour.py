@@ -180,6 +180,7 @@ def _start_view(
         surface=surface,
         ray_z=phase_map.view.camera.rays(contours.xy)[:, 2],
         spacing_px=options.spacing_px,
+        focal_px=phase_map.view.camera.mean_focal_px,
         tail=tail,
         head=head,
         on_contour=on_contour,

@@ -23,12 +23,30 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-MAX_CONFLICT_SHARE = 0.5  # of the views that could see a point and see something else there
-SIGMAS = 3.0  # by how many deviations of both two views may differ
-MIN_TOLERANCE = 0.5  # share of the tolerance that is left to views however certain they are
-MIN_SIGMA_PX = 0.02  # of a range, in footprints: no view is trusted more than that
-OUTLIER_NEIGHBORS = 8
-OUTLIER_SPACINGS = 4.0  # a point this many spacings from its neighbours is alone
+
+@dataclass(frozen=True, kw_only=True)
+class FusionTolerances:
+    """When views agree on a point, beside what the options say.
+
+    Attributes
+    ----------
+    max_conflict_share : of the views that could see a point and see something else there.
+        Derived: the majority.
+    max_deviations : of both by which two views may differ. Derived: 0.3 % of right ones do by
+        more.
+    min_tolerance : share of the tolerance that is left to views however certain they are.
+        Guess.
+    min_sigma_px : of a range, in footprints: no view is trusted more than that. Guess.
+    outlier_neighbors : whose distance tells whether a point is alone. Guess.
+    outlier_spacings : usual distances to that neighbour from which a point is alone. Guess.
+    """
+
+    max_conflict_share: float = 0.5
+    max_deviations: float = 3.0
+    min_tolerance: float = 0.5
+    min_sigma_px: float = 0.02
+    outlier_neighbors: int = 8
+    outlier_spacings: float = 4.0
 
 
 @dataclass(frozen=True)
@@ -69,6 +87,7 @@ def fuse(
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
     on_confirmed: Callable[[int, Mask], None] | None = None,
+    tolerances: FusionTolerances = FusionTolerances(),
 ) -> FusedCloud:
     """Fuse the dense views into one cloud.
 
@@ -89,6 +108,7 @@ def fuse(
     on_progress : called with the number of views done.
     on_confirmed : called with the index of each view that has a result and with the points
         (h, w) of its lattice on which the others agree.
+    tolerances : of this step.
     """
     workers = workers or Workers(1)
     used = [k for k, d in enumerate(dense) if d is not None]
@@ -99,7 +119,7 @@ def fuse(
         near = [used[j] for j in order if j != i][:max_neighbors]
         tasks.append([(maps[j], dense[j]) for j in [k, *near]])
     clouds, footprints = [], []
-    for k, part in zip(used, workers.map(partial(_confirm, options), tasks), strict=True):
+    for k, part in zip(used, workers.map(partial(_confirm, options, tolerances=tolerances), tasks), strict=True):
         clouds.append(part.cloud)
         footprints.append(part.footprint)
         if on_confirmed is not None:
@@ -111,7 +131,7 @@ def fuse(
         return cloud
     footprint = float(np.median(np.concatenate(footprints)))
     voxel = options.voxel if options.voxel is not None else options.voxel_px * footprint
-    return _without_lone_points(merge(cloud, voxel))
+    return _without_lone_points(merge(cloud, voxel), tolerances=tolerances)
 
 
 @dataclass(frozen=True)
@@ -123,7 +143,12 @@ class _Confirmed:
     confirmed: Mask
 
 
-def _confirm(options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]) -> _Confirmed:
+def _confirm(
+    options: FusionOptions,
+    views: Sequence[tuple[PhaseMap, DenseView]],
+    *,
+    tolerances: FusionTolerances,
+) -> _Confirmed:
     """Points of the first view that enough of the others confirm."""
     phase_map, dense = views[0]
     view = phase_map.view
@@ -136,7 +161,7 @@ def _confirm(options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]
     footprint = distance / view.camera.mean_focal_px
     # As the others' deviations: grazing sight counts less.
     cosine = np.maximum(np.abs((rays * normals).sum(axis=-1)), MIN_FACING_COSINE)
-    sigma = _finite_sigma(dense.sigma[known] / cosine, footprint)
+    sigma = _finite_sigma(dense.sigma[known] / cosine, footprint, tolerances=tolerances)
     tolerance = options.max_range_difference_px * footprint
     total = 1 / sigma**2
     place, normal = total * distance, total[:, None] * normals
@@ -144,9 +169,9 @@ def _confirm(options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]
     min_cosine = np.cos(np.radians(options.max_normal_difference_deg))
     for other_map, other in views[1:]:
         seen = sight(other_map, other, center, rays, distance, normals)
-        other_sigma = _finite_sigma(seen.sigma, footprint)
-        explained = SIGMAS * np.hypot(sigma, other_sigma)
-        allowed = np.clip(explained, MIN_TOLERANCE * tolerance, tolerance)
+        other_sigma = _finite_sigma(seen.sigma, footprint, tolerances=tolerances)
+        explained = tolerances.max_deviations * np.hypot(sigma, other_sigma)
+        allowed = np.clip(explained, tolerances.min_tolerance * tolerance, tolerance)
         agrees = (np.abs(seen.place - distance) < allowed) & (seen.cosine > min_cosine)
         votes += agrees
         behind = seen.excess > 2 * allowed
@@ -156,7 +181,9 @@ def _confirm(options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]
         place += weight * np.where(agrees, seen.place, 0)
         normal += weight[:, None] * seen.normals
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    keep = (votes >= options.min_views) & (conflicts <= MAX_CONFLICT_SHARE * (votes + conflicts))
+    keep = (votes >= options.min_views) & (
+        conflicts <= tolerances.max_conflict_share * (votes + conflicts)
+    )
     cloud = FusedCloud(
         points=center + (place / total)[:, None] * rays,
         normals=normal,
@@ -170,10 +197,10 @@ def _confirm(options: FusionOptions, views: Sequence[tuple[PhaseMap, DenseView]]
     return _Confirmed(cloud[keep], footprint[keep].astype(np.float32), confirmed)
 
 
-def _finite_sigma(sigma: Floats, footprint: Array) -> Array:
+def _finite_sigma(sigma: Floats, footprint: Array, *, tolerances: FusionTolerances) -> Array:
     """Deviations of ranges, no smaller than a share of the footprint; large where unknown."""
     known = np.isfinite(sigma)
-    return np.where(known, np.maximum(sigma, MIN_SIGMA_PX * footprint), footprint)
+    return np.where(known, np.maximum(sigma, tolerances.min_sigma_px * footprint), footprint)
 
 
 def concatenate(clouds: Sequence[FusedCloud]) -> FusedCloud:
@@ -215,10 +242,10 @@ def merge(cloud: FusedCloud, voxel: float) -> FusedCloud:
     )
 
 
-def _without_lone_points(cloud: FusedCloud) -> FusedCloud:
+def _without_lone_points(cloud: FusedCloud, *, tolerances: FusionTolerances) -> FusedCloud:
     """Remove points far from their neighbours, by the spacing that is usual in the cloud."""
-    k = min(OUTLIER_NEIGHBORS + 1, len(cloud.points))
+    k = min(tolerances.outlier_neighbors + 1, len(cloud.points))
     if k < 2:
         return cloud
     gaps = cKDTree(cloud.points).query(cloud.points, k=k, workers=-1)[0][:, -1]
-    return cloud[gaps <= OUTLIER_SPACINGS * np.median(gaps)]
+    return cloud[gaps <= tolerances.outlier_spacings * np.median(gaps)]

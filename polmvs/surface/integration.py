@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, PropagationOptions
-from polmvs.normals.estimator import NormalEstimate, solve_at_own_noise
+from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
@@ -199,6 +199,7 @@ def _lattice_nodes(
         surface=surface,
         ray_z=phase_map.view.camera.rays(surface.xy)[:, 2],
         spacing_px=float(stride_px),
+        focal_px=phase_map.view.camera.mean_focal_px,
         tail=tail[clear],
         head=head[clear],
         on_contour=np.zeros(len(tail[clear]), np.bool_),
@@ -264,16 +265,13 @@ def relax(
     range_maps = [d.range_map if d is not None else None for d in dense]
     rows = gather_rows(angle_model, points, maps, range_maps, tilt_aware=tilt_aware)
     rows.sigma[:, unknown] = np.inf  # other views may see this one's camera: no rows
-    start = surface.normals.T
-    estimate, row_sigma = solve_at_own_noise(
-        rows.rows, rows.rays, rows.sigma, initial_normals=start
-    )
+    estimate = solve_normals(rows.rows, rows.rays, rows.sigma, initial_normals=surface.normals.T)
     normals, normal_sigma = fill_normals(nodes, estimate)
     surface = replace(
         surface,
         normals=normals,
         normal_sigma=normal_sigma,
-        confidence=_agreement(row_sigma, rows.rays, estimate),
+        confidence=_agreement(rows.sigma, rows.rays, estimate),
     )
     nodes = replace(nodes, surface=surface)
     ties, num_known = tie_seeds(maps[0], nodes, seeds), len(seeds.sigma)
@@ -282,7 +280,7 @@ def relax(
         num_known += len(normals)
     solution = solve_log_ranges(
         len(normals),
-        node_edges(angle_model, nodes, row_sigma[0], along_contours=along_contours),
+        node_edges(angle_model, nodes, rows.sigma[0], along_contours=along_contours),
         ties,
         num_known,
         modes=bending_modes(surface.xy) if bending > 0 else None,

@@ -274,6 +274,7 @@ def piece_nodes(phase_map: PhaseMap, piece: Piece) -> Nodes:
         surface=surface,
         ray_z=rays_in_cam[:, 2],
         spacing_px=spacing,
+        focal_px=camera.mean_focal_px,
         tail=tail[clear],
         head=head[clear],
         on_contour=np.zeros(int(clear.sum()), np.bool_),

@@ -21,18 +21,37 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 
-# Systematic error of multi-view normals, rad, between nodes REFERENCE_SPACING_PX apart. Errors of
-# edges count as independent: that of denser ones must be larger to add up to the same.
-NORMAL_SIGMA_FLOOR = 0.012
-REFERENCE_SPACING_PX = 6.0
-MAX_SEED_DISTANCE_PX = 12.0  # from a seed to the nodes it is tied to
-NUM_TIES = 4
-MIN_SEED_COSINE = 0.995  # 5.7 deg between the normals of a seed and of a node it is tied to
-MIN_CREASE_ANGLE = 0.03  # rad, between neighbouring normals
-# A crease turns the normal this much more than noise or local curvature does. On a cylinder half
-# of a lattice's edges turn: their local mean is a quarter of a turn, which must pass.
-CREASE_FACTOR = 5.0
-FILLED_SIGMA = 0.1  # rad, of a normal taken from the neighbours
+
+@dataclass(frozen=True, kw_only=True)
+class GraphTolerances:
+    """How nodes are joined, and tied to seeds.
+
+    Attributes
+    ----------
+    normal_sigma_floor : rad, systematic error of multi-view normals between nodes
+        ``reference_angle`` apart. Errors of edges count as independent: that of denser ones
+        must be larger to add up to the same. Measured on the shared captures.
+    reference_angle : rad; 6 px of the captures that the floor was measured on.
+    max_seed_distance_px : from a seed to the nodes it is tied to. Guess; more than the
+        diagonal of the coarsest lattice.
+    num_ties : nodes that a seed is tied to. Derived: the corners of its cell.
+    min_seed_cosine : between the normals of a seed and of a node it is tied to: 5.7 deg.
+        Guess.
+    min_crease_angle : rad, between neighbouring normals. Guess.
+    crease_factor : by which a crease turns the normal more than noise or local curvature does.
+        Derived: on a cylinder half of the edges of a lattice turn, their local mean is a
+        quarter of a turn, which must pass.
+    filled_sigma : rad, of a normal taken from the neighbours. Guess.
+    """
+
+    normal_sigma_floor: float = 0.012
+    reference_angle: float = 0.0135
+    max_seed_distance_px: float = 12.0
+    num_ties: int = 4
+    min_seed_cosine: float = 0.995
+    min_crease_angle: float = 0.03
+    crease_factor: float = 5.0
+    filled_sigma: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -44,6 +63,7 @@ class Nodes:
     surface : the nodes with what is known of the surface there; NaN where unknown.
     ray_z : (N,), z component of the nodes' rays in the camera frame.
     spacing_px : distance between neighbouring nodes.
+    focal_px : of the view.
     tail, head : (E,) indices of the nodes that an edge joins.
     on_contour : (E,) bool, edges between consecutive nodes of a contour.
     """
@@ -51,9 +71,15 @@ class Nodes:
     surface: SurfaceSamples
     ray_z: Floats
     spacing_px: float
+    focal_px: float
     tail: Indices
     head: Indices
     on_contour: NDArray[np.bool_]
+
+    @property
+    def spacing(self) -> float:
+        """Angle between neighbouring nodes, rad."""
+        return self.spacing_px / self.focal_px
 
 
 def visible_seeds(phase_map: PhaseMap, seeds: Seeds) -> tuple[NDArray[np.bool_], Array]:
@@ -101,7 +127,9 @@ def bending_modes(xy: Image) -> Array:
     return np.stack([legendre[0][i] * legendre[1][j] for i, j in degrees], axis=-1)
 
 
-def fill_normals(nodes: Nodes, estimate: NormalEstimate) -> tuple[Array, Array]:
+def fill_normals(
+    nodes: Nodes, estimate: NormalEstimate, *, tolerances: GraphTolerances = GraphTolerances()
+) -> tuple[Array, Array]:
     """Normals with the gaps filled from neighbours, which widens their deviation."""
     sigma = np.radians(estimate.sigma_deg)
     good = estimate.valid & (estimate.num_rows >= 3) & (estimate.sigma_deg < 5)
@@ -112,12 +140,17 @@ def fill_normals(nodes: Nodes, estimate: NormalEstimate) -> tuple[Array, Array]:
     index = cKDTree(xy[good]).query(xy[~good], k=k)[1].reshape(-1, k)
     mean = normals[good][index].mean(axis=1)
     normals[~good] = mean / np.linalg.norm(mean, axis=-1, keepdims=True)
-    sigma[~good] = FILLED_SIGMA
+    sigma[~good] = tolerances.filled_sigma
     return normals, sigma
 
 
 def node_edges(
-    angle_model: AngleModel, nodes: Nodes, own_sigma: Floats, *, along_contours: bool
+    angle_model: AngleModel,
+    nodes: Nodes,
+    own_sigma: Floats,
+    *,
+    along_contours: bool,
+    tolerances: GraphTolerances = GraphTolerances(),
 ) -> Edges:
     """Increments from the nodes' normals on all edges, and the constancy along the contours.
 
@@ -127,11 +160,12 @@ def node_edges(
     nodes : with normals.
     own_sigma : (N,), deviation of the turn of the view's own row about its ray, rad.
     along_contours : use that constancy.
+    tolerances : of this step.
     """
     surface = nodes.surface
-    floor = NORMAL_SIGMA_FLOOR * np.sqrt(REFERENCE_SPACING_PX / nodes.spacing_px)
+    floor = tolerances.normal_sigma_floor * np.sqrt(tolerances.reference_angle / nodes.spacing)
     sigma = np.hypot(surface.normal_sigma, floor)
-    joined = _smooth_edges(nodes, surface.normals, sigma)
+    joined = _smooth_edges(nodes, surface.normals, sigma, tolerances=tolerances)
     tail, head = nodes.tail[joined], nodes.head[joined]
     rays = surface.rays_in_world.astype(np.float64)
     mean = surface.normals[tail] + surface.normals[head]
@@ -166,7 +200,9 @@ def node_edges(
     )
 
 
-def _smooth_edges(nodes: Nodes, normals: Array, sigma: Array) -> NDArray[np.bool_]:
+def _smooth_edges(
+    nodes: Nodes, normals: Array, sigma: Array, *, tolerances: GraphTolerances
+) -> NDArray[np.bool_]:
     """Edges without a crease: normals differ no more than noise and the curvature about them."""
     tail, head = nodes.tail, nodes.head
     turn = np.arccos(np.clip((normals[tail] * normals[head]).sum(axis=-1), -1, 1))
@@ -177,17 +213,25 @@ def _smooth_edges(nodes: Nodes, normals: Array, sigma: Array) -> NDArray[np.bool
     local = ((np.bincount(tail, root, num) + np.bincount(head, root, num)) / degree) ** 2
     noise = np.hypot(sigma[tail], sigma[head])
     expected = np.minimum(local[tail], local[head])
-    limit = np.maximum(MIN_CREASE_ANGLE, CREASE_FACTOR * np.maximum(noise, expected))
+    limit = np.maximum(
+        tolerances.min_crease_angle, tolerances.crease_factor * np.maximum(noise, expected)
+    )
     return np.asarray(~(turn > limit))
 
 
-def tie_seeds(phase_map: PhaseMap, nodes: Nodes, seeds: Seeds) -> SeedTies:
+def tie_seeds(
+    phase_map: PhaseMap,
+    nodes: Nodes,
+    seeds: Seeds,
+    *,
+    tolerances: GraphTolerances = GraphTolerances(),
+) -> SeedTies:
     """Tie every visible seed to the nearest nodes along the chords to them."""
     surface = nodes.surface
     visible, seed_xy = visible_seeds(phase_map, seeds)
     to_seed = seeds.points_in_world - phase_map.view.center_in_world
     distance = np.linalg.norm(to_seed, axis=-1)
-    k = min(NUM_TIES, len(surface.xy))
+    k = min(tolerances.num_ties, len(surface.xy))
     gap, node = cKDTree(surface.xy).query(np.where(visible[:, None], seed_xy, -1e6), k=k)
     gap, node = gap.reshape(-1, k), node.reshape(-1, k)
     seed = np.repeat(np.arange(len(distance)), k)
@@ -200,8 +244,8 @@ def tie_seeds(phase_map: PhaseMap, nodes: Nodes, seeds: Seeds) -> SeedTies:
         chord = node_normals + np.where(known, seed_normals, node_normals)
         step = log_range_increment(chord, rays, node_rays)
         # A seed of another surface, hidden behind this one, has another normal.
-        alike = ~((seed_normals * node_normals).sum(axis=-1) < MIN_SEED_COSINE)
-    ok = visible[seed] & alike & (gap < MAX_SEED_DISTANCE_PX) & np.isfinite(step)
+        alike = ~((seed_normals * node_normals).sum(axis=-1) < tolerances.min_seed_cosine)
+    ok = visible[seed] & alike & (gap < tolerances.max_seed_distance_px) & np.isfinite(step)
     seed, node, gap, step = seed[ok], node[ok], gap[ok], step[ok]
     footprint = 1 / phase_map.view.camera.mean_focal_px
     sigma = np.sqrt(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
+from dataclasses import dataclass
 from os import PathLike
 
 import numpy as np
@@ -28,18 +29,38 @@ Triangles = NDArray[np.int32]
 logger = logging.getLogger(__name__)
 
 MIN_POINTS = 100
-NUM_NEIGHBORS = 8
-NUM_SMOOTHED = 4  # points whose normals a vertex takes
-LONE_SPACINGS = 4.0  # a point whose neighbours are this much farther than usual is an outlier
 # Points scattered at random leave a void of this radius with probability exp(-pi 2.5^2) = 3e-9.
 SUPPORT_SPACINGS = 2.5
-BORDER_SPACINGS = 0.5  # a point stands for its cell, which ends half-way to the next one
-MIN_FACING_COSINE = 0.0  # between a vertex's normal and its nearest point's
 MIN_ISLAND_SPACINGS = 20.0  # side of the square whose area an island must have
 MAX_DEPTH = 10  # of the octree: 1024 cells a side, about 2 GB for a surface that fills them
-MIN_DEPTH = 2  # that Open3D takes
-CUBE_SCALE = 1.1  # of Poisson's cube over the cloud's extent
 KIND = "kind"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshTolerances:
+    """Where the points of a cloud support a mesh; lengths in spacings of the points.
+
+    Attributes
+    ----------
+    num_neighbors : by which the density about a point is told. Guess.
+    num_smoothed : points whose normals a vertex takes. Guess.
+    lone_spacings : a point whose neighbours are this much farther than usual is an outlier.
+        Guess.
+    border_spacings : a point stands for its cell, which ends half-way to the next one.
+        Derived.
+    min_facing_cosine : between a vertex's normal and its nearest point's. Derived: the other
+        side of the sheet.
+    min_depth : of the octree, that Open3D takes.
+    cube_scale : of Poisson's cube over the cloud's extent; Open3D's own.
+    """
+
+    num_neighbors: int = 8
+    num_smoothed: int = 4
+    lone_spacings: float = 4.0
+    border_spacings: float = 0.5
+    min_facing_cosine: float = 0.0
+    min_depth: int = 2
+    cube_scale: float = 1.1
 
 
 def poisson_mesh(
@@ -50,6 +71,7 @@ def poisson_mesh(
     support_spacings: float = SUPPORT_SPACINGS,
     min_island_spacings: float = MIN_ISLAND_SPACINGS,
     source: str | PathLike[str] = "cloud",
+    tolerances: MeshTolerances = MeshTolerances(),
 ) -> Mesh:
     """Poisson mesh of a cloud's oriented points, where the points support it.
 
@@ -67,6 +89,7 @@ def poisson_mesh(
     support_spacings : vertices farther than this from any point go, in spacings of the points.
     min_island_spacings : side of a square, in spacings; separate pieces of a smaller area go.
     source : where the cloud came from, for messages.
+    tolerances : of this step.
 
     Returns
     -------
@@ -79,23 +102,25 @@ def poisson_mesh(
         If the cloud has no normals, fewer than 100 usable points, or most of them coincide.
     """
     points, normals, colors = _usable(cloud, kinds, source)
-    spacings = point_spacings(points)
-    usual = spacings <= LONE_SPACINGS * np.median(spacings)
+    spacings = point_spacings(points, tolerances=tolerances)
+    usual = spacings <= tolerances.lone_spacings * np.median(spacings)
     points, normals = points[usual], normals[usual]
     colors = None if colors is None else colors[usual]
     spacing = float(np.median(spacings[usual]))
     if not spacing > 0:
         raise DataError(source, "has most of its points in the same places; merge them first.")
-    depth = octree_depth(points, spacing, max_depth)
-    vertices, triangles = solve_poisson(points, normals, depth=depth, scale=CUBE_SCALE)
+    depth = octree_depth(points, spacing, max_depth, tolerances=tolerances)
+    vertices, triangles = solve_poisson(points, normals, depth=depth, scale=tolerances.cube_scale)
     logger.debug("Poisson: depth %d, spacing %.3g, %d vertices", depth, spacing, len(vertices))
     tree = cKDTree(points)
-    distance, nearest = tree.query(vertices, k=NUM_SMOOTHED, workers=-1)
+    distance, nearest = tree.query(vertices, k=tolerances.num_smoothed, workers=-1)
     near_normals = _mean_normals(normals[nearest])
     facing = (vertex_normals(vertices, triangles) * near_normals).sum(axis=-1)
-    supported = (distance[:, 0] <= support_spacings * spacing) & (facing > MIN_FACING_COSINE)
+    supported = (distance[:, 0] <= support_spacings * spacing) & (
+        facing > tolerances.min_facing_cosine
+    )
     supported = _without_rim(
-        vertices, triangles, supported, (support_spacings - BORDER_SPACINGS) * spacing
+        vertices, triangles, supported, (support_spacings - tolerances.border_spacings) * spacing
     )
     kept = np.flatnonzero(supported[triangles].all(axis=1))
     kept = kept[_large_islands(vertices, triangles[kept], (min_island_spacings * spacing) ** 2)]
@@ -131,24 +156,30 @@ def _usable(
     return cloud.points[used], normals, None if cloud.colors is None else cloud.colors[used]
 
 
-def point_spacings(points: Array) -> Array:
+def point_spacings(points: Array, *, tolerances: MeshTolerances = MeshTolerances()) -> Array:
     """Distance between points ``(N, 3)`` of a surface as their density about each tells.
 
     The side of the square that each point would have to itself; the nearest neighbour alone
     would be that of a pair that noise has brought together.
     """
-    k = min(NUM_NEIGHBORS, len(points) - 1)
+    k = min(tolerances.num_neighbors, len(points) - 1)
     radius = cKDTree(points).query(points, k=k + 1, workers=-1)[0][:, -1]
     # The disc to the k-th neighbour holds it by half, k - 1 others and the point itself.
     return np.asarray(radius * np.sqrt(np.pi / (k + 0.5)), np.float64)
 
 
-def octree_depth(points: Array, spacing: float, max_depth: int = MAX_DEPTH) -> int:
+def octree_depth(
+    points: Array,
+    spacing: float,
+    max_depth: int = MAX_DEPTH,
+    *,
+    tolerances: MeshTolerances = MeshTolerances(),
+) -> int:
     """The greatest depth at which Poisson's cells are no narrower than the spacing."""
-    side = CUBE_SCALE * float(np.ptp(points, axis=0).max())
+    side = tolerances.cube_scale * float(np.ptp(points, axis=0).max())
     if not (side > 0 and spacing > 0):
-        return MIN_DEPTH
-    return int(np.clip(np.floor(np.log2(side / spacing)), MIN_DEPTH, max_depth))
+        return tolerances.min_depth
+    return int(np.clip(np.floor(np.log2(side / spacing)), tolerances.min_depth, max_depth))
 
 
 def triangle_areas(vertices: Array, triangles: Triangles) -> Array:

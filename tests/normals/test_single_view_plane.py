@@ -1,17 +1,12 @@
-"""Planes in one view: normals, several planes, the focal length, and the command."""
+"""Planes in one view: normals, several planes, the focal length."""
 
-import argparse
-import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from polmvs.normals.single_view.command import add_parser
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.config import AngleModel, Light
-from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.normals.single_view.focal import estimate_focal
 from polmvs.normals.single_view.pixels import PlaneView, polygon_mask
@@ -26,15 +21,11 @@ from polmvs.synthetic.captures import (
     Sphere,
     add_noise,
     look_at,
-    quantize,
-    render_mosaic,
     render_view,
 )
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
-CARPS = SHARED / "real" / "carps_IMX250MZR.png"
 BOARD = SHARED / "board"
-needs_carps = pytest.mark.skipif(not CARPS.is_file(), reason=f"{CARPS} is not here")
 needs_board = pytest.mark.skipif(not BOARD.is_dir(), reason=f"{BOARD} is not here")
 
 CAMERA = PinholeCamera(width=160, height=120, fx=110.0, fy=110.0, cx=80.0, cy=60.0)
@@ -311,66 +302,7 @@ def test_a_ppa_sensor_has_no_focal_length_under_the_tilted_model():
         )
 
 
-# The command.
-
-
-def run(capsys, *arguments):
-    parser = argparse.ArgumentParser()
-    add_parser(parser.add_subparsers())
-    args = parser.parse_args(["plane", *map(str, arguments)])
-    assert args.run(args) == 0
-    return capsys.readouterr().out
-
-
-@pytest.fixture(scope="module")
-def mosaic(tmp_path_factory):
-    """A raw mosaic of a plane behind tilted polarizers, and its normal."""
-    view = View(name="a", camera=CAMERA, cam_from_world=look_at([0.1, 0.5, 0.5], [0.0, 0.1, 0.0]))
-    surface = Plane([0, 0, 0], [0.1, 0.0, 1])
-    raw = render_mosaic(view, surface, sensor="tilted")
-    path = tmp_path_factory.mktemp("plane") / "frame.png"
-    noisy = add_noise(raw, rng=np.random.default_rng(0))
-    assert cv2.imwrite(str(path), quantize(noisy))
-    return path, render_view(view, surface).normals_in_cam[60, 80]
-
-
-def test_the_command_prints_normal_and_residuals(mosaic, capsys):
-    path, normal = mosaic
-    intrinsics = "--intrinsics=110,110,80,60"
-    text = run(capsys, path, intrinsics, "--model", "tilted")
-    assert "tilted, robust" in text
-    assert "assumed" not in text
-    result = json.loads(run(capsys, path, intrinsics, "--model", "tilted", "--json"))
-    assert error_deg(np.array(result["plane"]["normal"]), normal) < 0.1
-    assert result["plane"]["valid"]
-    rmse = {model: figures["rmse_deg"] for model, figures in result["residuals"].items()}
-    assert rmse["opa"] > 2 * rmse["ppa"] > 2 * rmse["tilted"]
-    assert "assumed" in run(capsys, path)
-    assert "not determined" in run(capsys, path, intrinsics, "--model", "opa")
-    run(capsys, path, intrinsics, "--estimator", "algebraic", "--light", "specular")
-
-
-def test_the_command_estimates_the_focal_length_and_finds_planes(mosaic, capsys):
-    path, normal = mosaic
-    flags = ["--estimate-focal", "--find-planes", "--model", "tilted"]
-    result = json.loads(run(capsys, path, *flags, "--json"))
-    assert result["intrinsics_from"] == "estimated"
-    assert result["focal"]["focal_px"] == pytest.approx(110, abs=4 * result["focal"]["sigma_px"])
-    [plane] = result["planes"]
-    assert error_deg(np.array(plane["normal"]), normal) < 1
-    assert "+-" in run(capsys, path, *flags)
-
-
-def test_mask_and_polygon_say_where(mosaic, capsys, tmp_path):
-    path, _ = mosaic
-    corners = ["20,20", "60,20", "60,50", "20,50"]
-    polygon = json.loads(run(capsys, path, "--json", "--polygon", *corners))
-    mask = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
-    mask[20:50, 20:60] = 1
-    cv2.imwrite(str(tmp_path / "mask.png"), mask)
-    masked = json.loads(run(capsys, path, "--json", "--mask", tmp_path / "mask.png"))
-    assert polygon["plane"] == masked["plane"]
-    assert polygon["plane"]["num_pixels"] == 40 * 30
+# Pixels.
 
 
 def test_a_polygon_contains_the_pixels_whose_centres_it_does():
@@ -380,79 +312,7 @@ def test_a_polygon_contains_the_pixels_whose_centres_it_does():
     assert polygon_mask([(-5, -5), (9, -5), (9, 9), (-5, 9)], (5, 5)).all()
 
 
-@pytest.mark.parametrize(
-    ("flags", "error", "words"),
-    [
-        (["--intrinsics", "900,900"], OptionError, "--intrinsics"),
-        (["--intrinsics", "a,b,c,d"], OptionError, "--intrinsics"),
-        (["--intrinsics", "110,110,160,60"], OptionError, "half-size"),
-        (["--intrinsics=-1,1,1,1"], OptionError, "positive"),
-        (["--polygon", "1,1", "5,5"], OptionError, "three corners"),
-        (["--polygon", "1,1", "5", "3,3"], OptionError, "--polygon"),
-        (["--polygon", "1,1", "3,1", "3,3"], DataError, "pixels"),
-        (["--mask", "nowhere.png"], DataError, "no such file"),
-        (["--pattern", "0,45,90"], OptionError, "--pattern"),
-        (["--pattern", "0,45.5,90,135"], OptionError, "--pattern"),
-        (["--gamma", "0"], OptionError, "--gamma"),
-        (["--min-dolp", "1.5"], OptionError, "--min-dolp"),
-        (["--min-intensity", "2"], OptionError, "--min-intensity"),
-        (["--find-planes", "--model", "opa"], OptionError, "--find-planes"),
-    ],
-)
-def test_bad_input_is_one_clear_line(mosaic, capsys, flags, error, words):
-    with pytest.raises(error, match=words) as caught:
-        run(capsys, mosaic[0], *flags)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_missing_or_odd_image_is_a_data_error(tmp_path, capsys):
-    with pytest.raises(DataError, match="no such file"):
-        run(capsys, tmp_path / "none.png")
-    cv2.imwrite(str(tmp_path / "odd.png"), np.zeros((11, 10), np.uint8))
-    with pytest.raises(DataError, match="even"):
-        run(capsys, tmp_path / "odd.png")
-
-
-# What the shared captures gave when this was written; the design notes have 10.6, 3.0 and 1.8 for
-# a selection of pixels that is not recorded.
-
-
-@needs_carps
-def test_the_pond_fits_the_tilted_model_and_tells_its_focal_length(capsys):
-    common = [CARPS, "--min-dolp", "0.35", "--drop-clipped", "--json"]
-    result = json.loads(run(capsys, *common, "--estimate-focal"))
-    residuals = result["residuals"]
-    assert residuals["opa"]["rmse_deg"] == pytest.approx(11.9, abs=0.5)
-    assert residuals["ppa"]["rmse_deg"] == pytest.approx(2.9, abs=0.2)
-    assert residuals["ppa"]["median_deg"] == pytest.approx(1.5, abs=0.15)
-    assert residuals["tilted"]["rmse_deg"] == pytest.approx(1.5, abs=0.2)
-    assert residuals["tilted"]["median_deg"] == pytest.approx(0.68, abs=0.1)
-    assert result["focal"]["focal_px"] == pytest.approx(870, abs=50)  # nominal, a 6 mm lens
-    assert 5 < result["focal"]["sigma_px"] < 40
-    # PPA leaves the same at any focal length.
-    for focal in (600, 3000):
-        other = json.loads(run(capsys, *common, f"--intrinsics={focal},{focal},612,512"))
-        assert other["residuals"]["ppa"]["rmse_deg"] == pytest.approx(2.9, abs=0.2)
-
-
-@needs_carps
-def test_the_clearer_part_of_the_pond_has_the_nominal_focal_length(capsys):
-    flags = ["--min-dolp", "0.45", "--drop-clipped", "--estimate-focal", "--json"]
-    focal = json.loads(run(capsys, CARPS, *flags))["focal"]
-    assert 850 < focal["focal_px"] < 930
-    assert focal["focal_px"] == pytest.approx(870, abs=2 * focal["sigma_px"])
-
-
-@needs_carps
-def test_the_pond_with_its_clipped_pixels_has_the_residuals_of_the_design_notes(capsys):
-    flags = ["--min-dolp", "0.35", "--json", "--intrinsics=880,880,612,512"]
-    residuals = json.loads(run(capsys, CARPS, *flags))["residuals"]
-    assert residuals["opa"]["rmse_deg"] == pytest.approx(10.6, rel=0.05)
-    assert residuals["opa"]["median_deg"] == pytest.approx(7.1, rel=0.05)
-    assert residuals["ppa"]["rmse_deg"] == pytest.approx(3.0, rel=0.12)
-    assert residuals["ppa"]["median_deg"] == pytest.approx(1.6, rel=0.1)
-    assert residuals["tilted"]["rmse_deg"] == pytest.approx(1.78, rel=0.15)
-    assert residuals["tilted"]["median_deg"] == pytest.approx(0.77, rel=0.1)
+# What the shared captures gave when this was written.
 
 
 @needs_board

@@ -341,7 +341,9 @@ def watch(options, group: str, monitor: Snapshots, monkeypatch: pytest.MonkeyPat
 
 
 def test_library_leaves_colmaps_log_as_it_was(tmp_path: Path, capfd) -> None:
-    from polmvs.colmap.models import pycolmap, quiet_colmap
+    import pycolmap
+
+    from polmvs.colmap.cameras import quiet_colmap
 
     before = pycolmap.logging.minloglevel
     with suppress(KeyboardInterrupt), quiet_colmap():

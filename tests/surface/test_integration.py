@@ -293,7 +293,7 @@ def test_a_crease_joins_nothing_and_curvature_everything(scene, angle_deg, is_cr
     rays = CAMERA.rays(xy)
     sigma, unknown = np.full(120, 1e-3), np.full(120, np.nan)
     surface = SurfaceSamples(xy, rays, np.zeros(120), normals, sigma, unknown, sigma)
-    nodes = Nodes(surface, rays[:, 2], 2.0, tail, head, np.zeros(len(tail), bool))
+    nodes = Nodes(surface, rays[:, 2], 2.0, CAMERA.fx, tail, head, np.zeros(len(tail), bool))
     edges = node_edges(AngleModel.PPA, nodes, sigma, along_contours=False)
     across = (edges.tail % 20 == 9) & (edges.head % 20 == 10)
     assert across.sum() == (0 if is_crease else 6)

@@ -19,7 +19,6 @@ from polmvs.surface.parts import (
     find_part_seeds,
     join_seeds,
     most_agreeing,
-    pieces,
 )
 from polmvs.surface.pixel_graph import visible_seeds
 from polmvs.synthetic.captures import Plane, render_view, ring_of_views
@@ -294,7 +293,9 @@ def test_the_search_is_bounded_and_says_so(board, monkeypatch):
         return Placement(surface, np.zeros(3), np.nan, np.inf, matched, np.nan, np.nan, "lost")
 
     found = {id(m): find_pieces(m.region, m.intensity) for m in board.maps}
-    monkeypatch.setattr(pieces, "_pieces_of", lambda phase_map: 40 * found[id(phase_map)])
+    monkeypatch.setattr(
+        "polmvs.surface.parts._pieces_of", lambda phase_map: 40 * found[id(phase_map)]
+    )
     monkeypatch.setattr(pieces, "place_piece", nowhere)
     seeds, reports = find_part_seeds(
         AngleModel.PPA, board.maps, NO_SEEDS, ABOUT, placements_per_view=3, on_progress=told.append

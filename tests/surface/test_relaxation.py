@@ -20,7 +20,7 @@ from polmvs.surface.integration import (
     surface_at_seeds,
     tie_to_consensus,
 )
-from polmvs.surface.pixel_graph import Nodes, tie_seeds
+from polmvs.surface.pixel_graph import Nodes, lattice_edges, tie_seeds
 from polmvs.synthetic.captures import render_view, ring_of_views
 
 STRIDE = 4
@@ -42,17 +42,16 @@ def nodes_of(scene, k=0, stride=STRIDE):
     """True nodes of a view on the lattice of its region, joined to their neighbours."""
     samples, hit = true_samples(scene, k, stride)
     inside = scene.maps[k].shows_surface(samples.xy)
-    index = np.full(hit.shape, -1)
-    index[hit] = np.where(inside, np.cumsum(inside) - 1, -1)
-    pairs = [(index[:, :-1], index[:, 1:]), (index[:-1], index[1:])]
+    hit[hit] = inside
+    tail, head = lattice_edges(hit)
     surface = samples[inside]
-    tail = np.concatenate([a[(a >= 0) & (b >= 0)] for a, b in pairs])
     return Nodes(
         surface=surface,
         ray_z=scene.views[k].camera.rays(surface.xy)[:, 2],
         spacing_px=float(stride),
+        focal_px=scene.views[k].camera.mean_focal_px,
         tail=tail,
-        head=np.concatenate([b[(a >= 0) & (b >= 0)] for a, b in pairs]),
+        head=head,
         on_contour=np.zeros(len(tail), bool),
     )
 
@@ -326,6 +325,21 @@ def test_pure_rows_take_their_weight_from_the_map_alone(oblique):
     precision = oblique.samples[..., 2]
     some = precision > 0
     np.testing.assert_allclose(pure[some], precision[some] ** -0.5, rtol=2e-3)
+
+
+def test_opa_doubts_its_rows_by_their_angle_to_those_of_ppa(oblique):
+    view = oblique.view
+    xy = pixel_centers(view.camera.width, view.camera.height).reshape(-1, 2)
+    points = view.points_at(xy, np.ones(len(xy)))
+    models = (AngleModel.OPA, AngleModel.PPA)
+    opa, ppa = (gather_rows(m, points, [oblique]) for m in models)
+    pure_opa, pure_ppa = (gather_rows(m, points, [oblique], tilt_aware=False) for m in models)
+    some = np.isfinite(opa.sigma[0])
+    squares = [r.sigma[0, some].astype(float) ** 2 for r in (opa, pure_opa, ppa, pure_ppa)]
+    tilt = (squares[2] - squares[3]) * squares[1] / squares[3]  # of the phase
+    sine = np.linalg.norm(np.cross(opa.rows[:, 0, some].T, ppa.rows[:, 0, some].T), axis=-1)
+    assert sine.max() > np.sin(np.radians(20))
+    np.testing.assert_allclose(squares[0], squares[1] + tilt + sine**2, rtol=1e-3)
 
 
 def test_the_tilted_model_knows_no_such_doubt(oblique):

@@ -1,0 +1,91 @@
+"""The commands that show results: the report, the viewer, and still pictures."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from itertools import product
+
+import numpy as np
+
+from polmvs.cli.call import Call
+from polmvs.cli.commands import FolderArguments, RenderArguments
+from polmvs.cli.terminal import Terminal
+from polmvs.config import AngleModel
+from polmvs.errors import DataError, OptionError
+from polmvs.io.clouds import Cloud, Mesh, has_triangles, read_cloud, read_mesh, show_in_viewer
+from polmvs.io.images import write_png
+from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.runner import load_record
+from polmvs.pipeline.stages.poses import PosesResult
+from polmvs.report.rendering import Viewpoint, contact_sheet
+from polmvs.report.report import write_report
+
+
+def report(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs report``."""
+    path = make_report(RunFolder(call.get(FolderArguments).out), terminal)
+    terminal.show(str(path), {"report": path})
+    return 0
+
+
+def make_report(run_folder: RunFolder, terminal: Terminal) -> str:
+    """Write the report with a bar and a line, as for a stage; its path."""
+    found = load_record(run_folder).find(PosesResult)
+    start = time.perf_counter()
+    with terminal.stage("report", found.num_views if found is not None else None) as on_progress:
+        path = write_report(run_folder, on_progress=on_progress)
+    megabytes = path.stat().st_size / 1e6
+    terminal.finished("report", time.perf_counter() - start, f"{path}, {megabytes:.1f} MB")
+    return str(path)
+
+
+def view(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs view``."""
+    folder = RunFolder(call.get(FolderArguments).out)
+    load_record(folder)
+    files = [
+        path
+        for model in AngleModel
+        for path in (folder.cloud(model), folder.mesh(model))
+        if path.is_file()
+    ]
+    if not files:
+        raise DataError(folder.root, "has no cloud to show. Run 'polmvs densify' first.")
+    if sys.platform == "linux" and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        page = folder.report if folder.report.is_file() else make_report(folder, terminal)
+        terminal.show(
+            f"there is no display here to open a window on; {page} shows the same in a browser",
+            {"report": page},
+        )
+        return 0
+    show_in_viewer(files)
+    terminal.show("\n".join(map(str, files)), {"shown": files})
+    return 0
+
+
+def render(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs render``."""
+    arguments = call.get(RenderArguments)
+    if arguments.picture.exists() and not arguments.overwrite:
+        raise OptionError(f"{arguments.picture}: exists. Give `arguments.overwrite` to replace it.")
+    subjects: list[Cloud | Mesh] = [
+        read_mesh(path) if has_triangles(path) else read_cloud(path) for path in arguments.files
+    ]
+    viewpoints = [
+        Viewpoint(elevation_deg=elevation, azimuth_deg=azimuth)
+        for elevation, azimuth in product(arguments.elevations, arguments.azimuths)
+    ]
+    sheet = contact_sheet(
+        subjects,
+        viewpoints,
+        labels=arguments.labels,
+        size_px=arguments.size,
+        plain=arguments.plain,
+    )
+    write_png(arguments.picture, np.ascontiguousarray(sheet[..., ::-1]))  # OpenCV counts BGR
+    terminal.show(str(arguments.picture), {"picture": arguments.picture})
+    return 0

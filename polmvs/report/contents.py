@@ -1,0 +1,237 @@
+"""What a report shows, gathered from a finished run: figures, pictures of the views, the 3D scene.
+
+Views are taken one after another and leave nothing but their coded pictures behind, so that the
+memory does not grow with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import sample_image
+from polmvs.config import AngleModel
+from polmvs.evaluation.map_errors import LatticeErrors, lattice_errors
+from polmvs.evaluation.metrics import axial_errors_deg
+from polmvs.geometry import SimilarityTransform
+from polmvs.io.ground_truth import GroundTruth
+from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.polarization.stokes import Stokes
+from polmvs.report import pictures
+from polmvs.report.page import Picture, ViewPage
+from polmvs.scene import View
+from polmvs.surface.dense_view import DenseView
+
+Floats = NDArray[np.floating]
+
+FULL_DOLP = 0.6  # from which the AoLP picture has its full colour; specular light reaches more
+MAX_RESIDUAL_DEG = 20.0  # top of the colour scales: OPA's phase errors on oblique surfaces
+MAX_DEPTH_ERROR_M = 0.005
+MAX_NORMAL_ERROR_DEG = 15.0
+MAX_SAMPLES_A_VIEW = 4000  # of errors for the plots: quartiles of 16 views then err by under 1 %
+
+
+@dataclass(kw_only=True)
+class ErrorSamples:
+    """Errors of a model at some pixels of all views, and what may cause them.
+
+    Attributes
+    ----------
+    residual_deg : phase that the surface predicts against the measured one.
+    viewing_deg : angle between the normal and the ray, at the same pixels.
+    depth_m, normal_deg, true_viewing_deg : against the truth, where there is one.
+    """
+
+    residual_deg: list[Floats] = field(default_factory=list)
+    viewing_deg: list[Floats] = field(default_factory=list)
+    depth_m: list[Floats] = field(default_factory=list)
+    normal_deg: list[Floats] = field(default_factory=list)
+    true_viewing_deg: list[Floats] = field(default_factory=list)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewInput:
+    """What is known of one view.
+
+    Attributes
+    ----------
+    maps : phase map for each model.
+    stokes : raw Stokes images; None where the capture is gone.
+    dense : dense result under each model, None where there is none.
+    """
+
+    view: View
+    maps: Mapping[AngleModel, PhaseMap]
+    stokes: Stokes | None
+    dense: Mapping[AngleModel, DenseView | None]
+
+
+def view_page(
+    given: ViewInput,
+    truth: tuple[GroundTruth, SimilarityTransform] | None,
+    samples: Mapping[AngleModel, ErrorSamples],
+    *,
+    white: float,
+) -> ViewPage:
+    """Pictures of one view; its errors are added to the samples.
+
+    Parameters
+    ----------
+    given : of the view.
+    truth : the truth and ``truth_from_world``.
+    samples : for each model that ``given`` has; added to.
+    white : intensity that is shown white.
+    """
+    first = next(iter(given.maps.values()))
+    shown = [*_measured(given, first, white)]
+    of_model: dict[AngleModel, list[Picture]] = {}
+    for model, dense in given.dense.items():
+        if dense is not None:
+            errors = None
+            if truth is not None and truth[0].find(given.view.name) is not None:
+                errors = lattice_errors(given.view, dense, *truth)
+            of_model[model] = _of_model(model, given, dense, errors, samples[model])
+    for several in zip(*of_model.values(), strict=False):
+        shown += several
+    return ViewPage(name=given.view.name, pictures=tuple(shown), wipe=_wipe(of_model))
+
+
+def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[Picture]:
+    """What the camera saw, and where a polarised surface was found."""
+    inside = phase_map.region.inside
+    intensity = phase_map.intensity
+    aolp: Floats
+    dolp: Floats
+    if given.stokes is not None:
+        valid = given.stokes.valid
+        aolp = np.where(valid, given.stokes.aolp, np.nan)
+        dolp = np.where(valid, given.stokes.dolp, np.nan)
+    else:  # of the region alone, smoothed
+        samples = phase_map.samples
+        sign = np.where(phase_map.diffuse, 1, -1)
+        aolp = 0.5 * np.arctan2(sign * samples[..., 1], sign * samples[..., 0])
+        dolp = np.where(samples[..., 2] > 0, np.hypot(samples[..., 0], samples[..., 1]), np.nan)
+    return [
+        _picture("intensity", "what COLMAP was given", pictures.gray_picture(intensity, white)),
+        _picture(
+            "AoLP",
+            "angle of linear polarisation in cyclic colours, faint where the DoLP is low",
+            pictures.angle_picture(aolp, strength=dolp / FULL_DOLP),
+            wheel=True,
+        ),
+        _picture(
+            "DoLP",
+            "degree of linear polarisation",
+            pictures.scalar_picture(dolp, 0, 1),
+            scale=("0", "1", pictures.SEQUENTIAL),
+        ),
+        _picture(
+            "silhouette",
+            "the intensity, dim outside the polarised region, whose outline is drawn",
+            pictures.outline_picture(intensity, white, inside),
+        ),
+    ]
+
+
+def _of_model(
+    model: AngleModel,
+    given: ViewInput,
+    dense: DenseView,
+    errors: LatticeErrors | None,
+    samples: ErrorSamples,
+) -> list[Picture]:
+    """Normals, depth, residual phase, and the errors where there is a truth."""
+    view, name = given.view, model.value.upper()
+    xy = dense.lattice_xy()
+    rays = view.camera.rays(xy)
+    known = dense.known
+    in_cam = np.where(known[..., None], dense.normals_in_world, np.nan) @ (
+        view.cam_from_world.rotation.T
+    )
+    depth = np.where(known, dense.range_map, np.nan) * rays[..., 2]
+    residual = _residual_deg(model, in_cam, rays, sample_image(given.maps[model].samples, xy))
+    viewing = np.degrees(np.arccos(np.clip(-(in_cam * rays).sum(axis=-1), -1, 1)))
+    _add(samples.residual_deg, samples.viewing_deg, residual, viewing)
+    low, high = np.nanpercentile(depth, (1, 99)) if known.any() else (0.0, 1.0)
+    result = [
+        _picture(f"{name}: normals", "normals, camera frame", pictures.normal_picture(in_cam)),
+        _picture(
+            f"{name}: depth",
+            "depth z",
+            pictures.scalar_picture(depth, low, high),
+            scale=(f"{low:.3g}", f"{high:.3g}", pictures.SEQUENTIAL),
+        ),
+        _picture(
+            f"{name}: residual phase",
+            "angle between the measured phase and that of the surface found",
+            pictures.scalar_picture(residual, 0, MAX_RESIDUAL_DEG, colors=pictures.ERROR),
+            scale=("0", f"{MAX_RESIDUAL_DEG:g} deg", pictures.ERROR),
+        ),
+    ]
+    if errors is None:
+        return result
+    _add(samples.normal_deg, samples.true_viewing_deg, errors.normal_deg, viewing)
+    samples.depth_m.append(_some(np.abs(errors.depth_m[np.isfinite(errors.depth_m)])))
+    return [
+        *result,
+        _picture(
+            f"{name}: depth error",
+            "absolute error of the depth against the truth",
+            pictures.scalar_picture(
+                np.abs(errors.depth_m), 0, MAX_DEPTH_ERROR_M, colors=pictures.ERROR
+            ),
+            scale=("0", f"{1e3 * MAX_DEPTH_ERROR_M:g} mm", pictures.ERROR),
+        ),
+        _picture(
+            f"{name}: normal error",
+            "angle between the normal and the true one",
+            pictures.scalar_picture(
+                errors.normal_deg, 0, MAX_NORMAL_ERROR_DEG, colors=pictures.ERROR
+            ),
+            scale=("0", f"{MAX_NORMAL_ERROR_DEG:g} deg", pictures.ERROR),
+        ),
+    ]
+
+
+def _wipe(of_model: Mapping[AngleModel, Sequence[Picture]]) -> tuple[Picture, Picture] | None:
+    """The last picture of OPA and of the best of the others: errors if known, else residuals."""
+    if AngleModel.OPA not in of_model or len(of_model) < 2:
+        return None
+    other = AngleModel.PPA if AngleModel.PPA in of_model else AngleModel.TILTED
+    return of_model[AngleModel.OPA][-1], of_model[other][-1]
+
+
+def _residual_deg(model: AngleModel, in_cam: Floats, rays: Floats, samples: Floats) -> Floats:
+    """Axial difference (h, w) of predicted and measured phase, NaN where one is missing."""
+    measured = 0.5 * np.arctan2(samples[..., 1], samples[..., 0])
+    known = (samples[..., 2] > 0) & np.isfinite(in_cam).all(axis=-1)
+    safe = np.where(known[..., None], in_cam, -rays + 0.1)
+    predicted = phase_from_normal(model, safe, rays)
+    return np.where(known, axial_errors_deg(measured, predicted), np.nan)
+
+
+def _add(errors: list[Floats], causes: list[Floats], error: Floats, cause: Floats) -> None:
+    known = np.isfinite(error) & np.isfinite(cause)
+    errors.append(_some(error[known]))
+    causes.append(_some(cause[known]))
+
+
+def _some(values: Floats) -> Floats:
+    """An even choice, the same for arrays of one length."""
+    step = max(1, -(-len(values) // MAX_SAMPLES_A_VIEW))
+    return np.asarray(values[::step])
+
+
+def _picture(
+    title: str,
+    alt: str,
+    rgb: NDArray[np.uint8],
+    *,
+    scale: tuple[str, str, str] | None = None,
+    wheel: bool = False,
+) -> Picture:
+    return Picture(title=title, alt=alt, uri=pictures.data_uri(rgb), scale=scale, wheel=wheel)

@@ -1,0 +1,274 @@
+"""Clouds and meshes as the report's 3D view reads them: quantised, packed, a few bytes a point.
+
+A scene has one box for all its layers. Positions are 16-bit shares of its longest edge (0.004 mm
+for a part of a quarter of a metre), normals 8 bit an axis, and each further channel one byte a
+point with the range that it spans. ``viewer/viewer.js`` is the other side of this format.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from polmvs.report.pictures import hex_palette
+from polmvs.scene import PointKind, View
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+
+FULL = 65535
+FRUSTUM_SHARE = 0.08  # depth of a drawn camera, of the distance from the target
+EYE_DISTANCE = 3.2  # from the target, in radii of the part: all of it in a field of view of 40 deg
+EYE_ELEVATION_DEG = 35.0
+SPACING_SAMPLES = 2000  # points whose nearest neighbour is looked up; their median errs by 1 %
+NORMAL_NOTE = "red and green: sideways, blue: up; grey: no normal"
+KIND_COLORS = ("#0072b2", "#999999", "#e69f00", "#009e73")  # by PointKind
+
+
+@dataclass(frozen=True, kw_only=True)
+class Channel:
+    """Something that points can be coloured by.
+
+    Attributes
+    ----------
+    label : what it is called on the page.
+    unit : of its values; "" without one.
+    low, high : the range that colours span; all layers share it.
+    colors : name of the colour map; None for grey.
+    classes : names of the values 0, 1, ... where they are kinds and not amounts.
+    """
+
+    label: str
+    unit: str = ""
+    low: float = 0.0
+    high: float = 1.0
+    colors: str | None = None
+    classes: tuple[str, ...] = ()
+
+
+KIND = Channel(
+    label="kind of point",
+    low=0,
+    high=len(PointKind),
+    classes=("polarised surface", "sparse point", "stereo", "given workspace"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """A cloud, or with ``triangles`` a mesh.
+
+    Attributes
+    ----------
+    label : its name on the page.
+    points : (N, 3), world.
+    normals : (N, 3), unit; NaN or 0 where there is none.
+    values : (N,) by name of the channel.
+    triangles : (F, 3) or None.
+    """
+
+    label: str
+    points: Floats
+    normals: Floats
+    values: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    triangles: NDArray[np.integer] | None = None
+
+
+def thinned(layer: Layer, max_points: int) -> Layer:
+    """At most so many points, spread evenly over the order in which they come; meshes stay."""
+    num = len(layer.points)
+    if num <= max_points or layer.triangles is not None:
+        return layer
+    # A fixed permutation: points come in the order of views or voxels, which a stride would alias.
+    index = np.sort(np.random.default_rng(0).permutation(num)[:max_points])
+    return Layer(
+        label=layer.label,
+        points=layer.points[index],
+        normals=layer.normals[index],
+        values={name: values[index] for name, values in layer.values.items()},
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene3D:
+    """What the page's 3D view is given.
+
+    Attributes
+    ----------
+    description : JSON for the viewer.
+    blocks : base64 text of each layer's bytes, by the id that the description names.
+    """
+
+    description: dict[str, Any]
+    blocks: dict[str, str]
+
+
+def pack_scene(
+    layers: Sequence[Layer],
+    channels: Mapping[str, Channel],
+    views: Sequence[View],
+    start: tuple[int, int | None],
+) -> Scene3D:
+    """Pack layers that share one world.
+
+    Parameters
+    ----------
+    layers : at least one with a point.
+    channels : by the names that the layers' values use.
+    views : whose frusta can be shown.
+    start : layers shown first in the left and the right pane; None: one pane.
+    """
+    everything = np.concatenate([layer.points for layer in layers if len(layer.points)])
+    origin, top = everything.min(axis=0), everything.max(axis=0)
+    extent = float(max((top - origin).max(), 1e-12))
+    blocks, described = {}, []
+    for number, layer in enumerate(layers):
+        data, parts = _bytes_of(layer, channels, origin, extent)
+        name = f"layer-{number}"
+        # mtime 0: the same result is the same file.
+        blocks[name] = base64.b64encode(gzip.compress(data, 6, mtime=0)).decode("ascii")
+        described.append(
+            {
+                "label": layer.label,
+                "data": name,
+                "count": len(layer.points),
+                "spacing": _spacing(layer),
+                **parts,
+            }
+        )
+    main = layers[start[0]]
+    target, up, radius = _pose_of_part(main, views)
+    side = _any_across(up)
+    lift = np.radians(EYE_ELEVATION_DEG)
+    eye = target + EYE_DISTANCE * radius * (np.cos(lift) * side + np.sin(lift) * up)
+    description = {
+        "origin": origin.tolist(),
+        "extent": extent,
+        "layers": described,
+        "channels": {
+            "normal": {
+                "label": "normal",
+                "note": "red and green: sideways, blue: up; grey: no normal",
+            },
+            **{name: _channel_json(channel) for name, channel in channels.items()},
+        },
+        "target": target.tolist(),
+        "up": up.tolist(),
+        "basis": np.concatenate([side, np.cross(up, side), up]).tolist(),
+        "eye": eye.tolist(),
+        "radius": radius,
+        "frusta": _frusta(views, target),
+        "start": list(start),
+    }
+    return Scene3D(description=description, blocks=blocks)
+
+
+def _bytes_of(
+    layer: Layer, channels: Mapping[str, Channel], origin: Array, extent: float
+) -> tuple[bytes, dict[str, Any]]:
+    """One buffer, and where what lies in it; every part begins at a multiple of four bytes."""
+    pieces: list[bytes] = []
+    used = 0
+
+    def add(array: NDArray[Any]) -> dict[str, Any]:
+        nonlocal used
+        content = np.ascontiguousarray(array).tobytes()
+        place = {"offset": used, "type": str(array.dtype), "length": int(array.size)}
+        pieces.append(content + b"\0" * (-len(content) % 4))
+        used += len(pieces[-1])
+        return place
+
+    position = np.round((layer.points - origin) / extent * FULL).astype(np.uint16)
+    normals = np.round(127 * np.nan_to_num(layer.normals)).astype(np.int8)
+    parts: dict[str, Any] = {"position": add(position), "normal": add(normals)}
+    if layer.triangles is not None:
+        parts["triangles"] = add(layer.triangles.astype(np.uint32))
+    parts["channels"] = {
+        name: add(_quantised(values, channels[name])) for name, values in layer.values.items()
+    }
+    return b"".join(pieces), parts
+
+
+def _quantised(values: NDArray[Any], channel: Channel) -> NDArray[np.uint8]:
+    """One byte a value; what is not finite counts as the highest, which is the worst."""
+    if channel.classes:
+        share = (np.asarray(values, np.float64) + 0.5) / len(channel.classes)
+    else:
+        share = (np.asarray(values, np.float64) - channel.low) / max(
+            channel.high - channel.low, 1e-300
+        )
+    clean = np.clip(np.nan_to_num(share, nan=1.0, posinf=1.0, neginf=0.0), 0, 1)
+    return np.asarray(np.round(255 * clean), np.uint8)
+
+
+def _channel_json(channel: Channel) -> dict[str, Any]:
+    if channel.classes:
+        colors = [KIND_COLORS[i % len(KIND_COLORS)] for i in range(len(channel.classes))]
+        return {"label": channel.label, "classes": list(channel.classes), "colors": colors}
+    result: dict[str, Any] = {
+        "label": channel.label,
+        "unit": channel.unit,
+        "range": [channel.low, channel.high],
+    }
+    if channel.colors is not None:
+        result["colors"] = hex_palette(channel.colors)
+    return result
+
+
+def _spacing(layer: Layer) -> float:
+    """Typical distance of neighbouring points; of a mesh it is not used."""
+    points = layer.points
+    if layer.triangles is not None or len(points) < 2:
+        return 1.0
+    chosen = points[:: max(1, len(points) // SPACING_SAMPLES)]
+    distance, _ = cKDTree(points).query(chosen, k=2)
+    return float(np.median(distance[:, 1]))
+
+
+def _pose_of_part(layer: Layer, views: Sequence[View]) -> tuple[Array, Array, float]:
+    """Middle, upward direction and radius of the part.
+
+    Up is where the cameras are, seen from the middle: captures look down on a table.
+    """
+    surface = np.asarray(layer.points, np.float64)
+    kind = layer.values.get("kind")
+    if kind is not None and (kind == PointKind.SURFACE).any():
+        surface = surface[np.asarray(kind) == PointKind.SURFACE]
+    target = np.median(surface, axis=0)
+    radius = float(np.percentile(np.linalg.norm(surface - target, axis=1), 98)) or 1.0
+    up = np.array([0.0, 0.0, 1.0])
+    if views:
+        towards = np.mean([view.center_in_world for view in views], axis=0) - target
+        if np.linalg.norm(towards) > 0:
+            up = towards / np.linalg.norm(towards)
+    return target, up, radius
+
+
+def _any_across(up: Array) -> Array:
+    """A unit vector perpendicular to another."""
+    side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    return np.asarray(side / np.linalg.norm(side))
+
+
+def _frusta(views: Sequence[View], target: Array) -> list[float]:
+    """Line segments of all cameras, flat: their four edges and the image's border."""
+    segments: list[Array] = []
+    for view in views:
+        camera, center = view.camera, view.center_in_world
+        size = (camera.width, camera.height)
+        corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float64) * size
+        rays = camera.rays(corners) @ view.cam_from_world.rotation
+        if not np.isfinite(rays).all():  # a lens that does not reach its image's corners
+            continue
+        depth = FRUSTUM_SHARE * float(np.linalg.norm(center - target))
+        ends = center + depth * rays
+        for i in range(4):
+            segments += [center, ends[i], ends[i], ends[(i + 1) % 4]]
+    return [round(float(value), 6) for value in np.asarray(segments).ravel()]

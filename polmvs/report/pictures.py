@@ -1,0 +1,112 @@
+"""Maps as pictures: false colours that everybody can read, and their code for a page.
+
+Every function takes arrays and gives RGB ``(H, W, 3)`` uint8. Colours come from perceptually
+uniform maps that people with any kind of colour blindness can read; angles, which are cyclic, from
+a cyclic one.
+"""
+
+from __future__ import annotations
+
+import base64
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Rgb = NDArray[np.uint8]
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+CYCLIC, SEQUENTIAL, ERROR = "twilight", "viridis", "inferno"
+NOTHING = 236  # grey of pixels without a value; reads on light and dark pages
+WEBP_QUALITY = 82  # of 100; 100 px of a thumbnail hardly show a difference above
+
+
+@lru_cache(maxsize=8)
+def palette(name: str, num: int = 256) -> Rgb:
+    """``(num, 3)`` colours of one of matplotlib's maps."""
+    from matplotlib import colormaps
+
+    return np.asarray(255 * colormaps[name](np.linspace(0, 1, num))[:, :3] + 0.5, np.uint8)
+
+
+def hex_palette(name: str, num: int = 256) -> list[str]:
+    """The colours of :func:`palette` as ``#rrggbb``."""
+    return ["#" + bytes(color).hex() for color in palette(name, num).tolist()]
+
+
+def scalar_picture(values: Floats, low: float, high: float, *, colors: str = SEQUENTIAL) -> Rgb:
+    """Values ``(H, W)`` from ``low`` to ``high`` in sequential colours; grey where not finite."""
+    share = (np.asarray(values, np.float64) - low) / max(high - low, 1e-300)
+    return _colored(share, palette(colors))
+
+
+def angle_picture(angle: Floats, *, strength: Floats | None = None) -> Rgb:
+    """Axial angles ``(H, W)``, rad modulo pi, in cyclic colours; grey where not finite.
+
+    Parameters
+    ----------
+    strength : (H, W), 0 to 1, how far the colour shows before a grey ground.
+    """
+    share = np.mod(np.asarray(angle, np.float64), np.pi) / np.pi
+    picture = _colored(share, palette(CYCLIC))
+    if strength is None:
+        return picture
+    weight = np.clip(np.nan_to_num(strength), 0, 1)[..., None]
+    return np.asarray(weight * picture + (1 - weight) * NOTHING, np.uint8)
+
+
+def angle_wheel(size_px: int = 96) -> NDArray[np.uint8]:
+    """Key to :func:`angle_picture`: RGBA ``(size, size, 4)``, the colour of each direction.
+
+    Angles count anticlockwise from +x as displayed, so that opposite directions are alike.
+    """
+    axis = np.arange(size_px) + 0.5 - size_px / 2
+    x, y = np.meshgrid(axis, -axis)  # y up, as displayed
+    radius = np.hypot(x, y) / (size_px / 2)
+    ring = (radius < 1) & (radius > 0.45)
+    rgb = angle_picture(np.arctan2(y, x))
+    return np.dstack([rgb, np.where(ring, 255, 0).astype(np.uint8)])
+
+
+def normal_picture(normals_in_cam: Floats) -> Rgb:
+    """Normals ``(H, W, 3)``, camera frame, in the usual colours; grey where not finite.
+
+    Red is right, green is up, blue is towards the camera.
+    """
+    known = np.isfinite(normals_in_cam).all(axis=-1, keepdims=True)
+    flipped = np.where(known, normals_in_cam, 0) * np.array([1.0, -1.0, -1.0])
+    return np.where(known, 127.5 * (1 + flipped) + 0.5, NOTHING).astype(np.uint8)
+
+
+def gray_picture(intensity: Floats, white: float) -> Rgb:
+    """Linear intensities ``(H, W)`` as they look on a screen; ``white`` and above is white."""
+    share = np.clip(np.nan_to_num(np.asarray(intensity, np.float64)) / white, 0, 1)
+    gray = (255 * share ** (1 / 2.2) + 0.5).astype(np.uint8)
+    return np.repeat(gray[..., None], 3, axis=-1)
+
+
+def outline_picture(intensity: Floats, white: float, inside: Mask) -> Rgb:
+    """The intensity with what lies outside a mask dimmed and the mask's outline drawn."""
+    picture = gray_picture(intensity, white)
+    picture[~inside] = (0.35 * picture[~inside]).astype(np.uint8)
+    flags = inside.astype(np.uint8)
+    edge = cv2.dilate(flags, np.ones((3, 3), np.uint8)) > flags
+    picture[edge] = (230, 159, 0)
+    return picture
+
+
+def _colored(share: Floats, colors: Rgb) -> Rgb:
+    known = np.isfinite(share)
+    index = np.clip(np.where(known, share, 0) * len(colors), 0, len(colors) - 1).astype(np.intp)
+    return np.where(known[..., None], colors[index], np.uint8(NOTHING))
+
+
+def data_uri(picture: NDArray[np.uint8]) -> str:
+    """A picture, RGB or RGBA, as text that a page takes for an image (WebP)."""
+    order = cv2.COLOR_RGBA2BGRA if picture.shape[-1] == 4 else cv2.COLOR_RGB2BGR
+    _, code = cv2.imencode(
+        ".webp", cv2.cvtColor(picture, order), [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY]
+    )
+    return "data:image/webp;base64," + base64.b64encode(code.tobytes()).decode("ascii")

@@ -1,0 +1,276 @@
+"""The public API as a notebook uses it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import open3d
+import pycolmap
+import pytest
+
+import polmvs
+from polmvs.config import Options
+from polmvs.io.clouds import read_cloud
+from polmvs.io.images import read_mask
+from polmvs.pipeline.stages.densify import DensifyResult
+from polmvs.polarization.capture import open_capture
+
+INTRINSICS = (333.75, 333.75, 230.6475, 196.608)  # of the bundled capture
+FRAME = "003.png"
+
+
+def in_new_process(code: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-W", "error::RuntimeWarning", "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stderr == ""
+    return done.stdout
+
+
+# Importing
+
+
+def test_importing_is_light_and_sets_nothing() -> None:
+    code = """
+import logging, signal, sys
+before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)], list(logging.root.handlers)
+import polmvs
+after = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)], list(logging.root.handlers)
+assert before == after
+assert logging.getLogger("polmvs").level == logging.NOTSET
+heavy = {"numpy", "scipy", "cv2", "pycolmap", "open3d", "matplotlib", "msgspec", "rich"}
+print(sorted(heavy & set(sys.modules)))
+polmvs.Options, polmvs.PolmvsError, polmvs.AngleModel
+heavy -= {"numpy"}
+print(sorted(heavy & set(sys.modules)))
+"""
+    assert in_new_process(code) == "[]\n[]\n"
+
+
+def test_colmaps_log_stays_as_the_user_has_it() -> None:
+    code = """
+import pycolmap
+for level in (0, 2):
+    pycolmap.logging.minloglevel = level
+    import polmvs, polmvs.api, polmvs.colmap.models, polmvs.colmap.sfm, polmvs.pipeline.jobs
+    assert pycolmap.logging.minloglevel == level
+    for name in [name for name in __import__("sys").modules if name.startswith("polmvs")]:
+        del __import__("sys").modules[name]
+"""
+    assert in_new_process(code) == ""
+
+
+def test_names_of_the_api() -> None:
+    assert set(polmvs.__all__) <= set(dir(polmvs))
+    for name in polmvs.__all__:
+        assert getattr(polmvs, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'reconstruct_all'"):
+        _ = polmvs.reconstruct_all
+
+
+# One image
+
+
+def test_stokes_of_a_frame(demo_capture: Path) -> None:
+    stokes = polmvs.read_stokes(demo_capture / "raw" / FRAME)
+    same = open_capture(demo_capture).load(FRAME)
+    np.testing.assert_array_equal(stokes.s1, same.s1)
+    phase = stokes.phase()
+    assert ((phase >= 0) & (phase < np.float32(np.pi))).all()
+    turn = np.exp(2j * (phase - stokes.aolp))
+    np.testing.assert_allclose(turn, -1, atol=1e-5)
+    np.testing.assert_array_equal(stokes.phase("diffuse"), stokes.aolp)
+    turned = polmvs.read_stokes(demo_capture / "raw" / FRAME, pattern=(0, 135, 45, 90))
+    assert not np.allclose(turned.s1, stokes.s1)
+    with pytest.raises(ValueError, match="'mirror' is not a valid Light"):
+        stokes.phase("mirror")
+
+
+def test_errors_name_fields_and_not_flags(demo_capture: Path, tmp_path: Path) -> None:
+    frame = demo_capture / "raw" / FRAME
+    cases = {
+        "`capture.gamma` must": lambda: polmvs.read_stokes(frame, gamma=0.0),
+        "no option 'gama'; is it 'gamma'?": lambda: polmvs.read_stokes(frame, gama=2.0),
+        "`capture.gamma` cannot be none": lambda: polmvs.read_stokes(frame, gamma=None),
+        "gamma cannot be '2'": lambda: polmvs.read_stokes(frame, gamma="2"),
+        "`model` must be one of opa, ppa, tilted, not 'best'": lambda: polmvs.reconstruct(
+            demo_capture, tmp_path / "out", "best"
+        ),
+        "no option 'min_view'; is it 'min_views'?": lambda: polmvs.reconstruct(
+            demo_capture, tmp_path / "out", min_view=3
+        ),
+        "`export.in_place` needs a `fusion.workspace`": lambda: polmvs.reconstruct(
+            demo_capture, tmp_path / "out", in_place=True
+        ),
+    }
+    for message, call in cases.items():
+        with pytest.raises(polmvs.OptionError) as error:
+            call()
+        assert message in str(error.value)
+        assert "--" not in str(error.value)
+    with pytest.raises(polmvs.DataError, match="no such"):
+        polmvs.read_stokes(tmp_path / "none.png")
+    assert not (tmp_path / "out").exists()
+
+
+def test_plane_from_one_frame(demo_capture: Path) -> None:
+    """The board's true normal is +z of the world, in the camera's frame by its pose."""
+    from polmvs.io.ground_truth import open_ground_truth
+
+    stokes = polmvs.read_stokes(demo_capture / "raw" / FRAME)
+    mask = read_mask(demo_capture / "gt" / "003_mask.png", stokes.shape)
+    truth = open_ground_truth(demo_capture).views[FRAME].cam_from_world.rotation[:, 2]
+    errors = {}
+    for model in ("ppa", "tilted"):
+        plane = polmvs.plane_normal(stokes, INTRINSICS, model=model, mask=mask)
+        assert plane.valid
+        errors[model] = np.degrees(np.arccos(plane.normal @ truth))
+        spread = np.sqrt(np.linalg.eigvalsh(plane.covariance))
+        assert np.degrees(spread[2]) == pytest.approx(plane.sigma_deg, rel=1e-6)
+        assert spread[0] == pytest.approx(0, abs=1e-6 * spread[2])
+        np.testing.assert_allclose(plane.covariance @ plane.normal, 0, atol=1e-12)
+    # Measured 0.9 and 0.1 deg; the sensor's polarizers are tilted.
+    assert errors["ppa"] < 3
+    assert errors["tilted"] < 0.5
+    opa = polmvs.plane_normal(stokes, INTRINSICS, model="opa", mask=mask)
+    assert not opa.valid
+    assert np.isnan(opa.covariance).all()
+
+
+def test_camera_must_fit_the_images(demo_capture: Path) -> None:
+    stokes = polmvs.read_stokes(demo_capture / "raw" / FRAME)
+    camera = polmvs.PinholeCamera(width=100, height=100, fx=100, fy=100, cx=50, cy=50)
+    with pytest.raises(polmvs.OptionError, match="`camera` is of 100x100 px"):
+        polmvs.plane_normal(stokes, camera)
+    with pytest.raises(polmvs.OptionError, match="`camera` needs four positive numbers"):
+        polmvs.plane_normal(stokes, (1, 2, 3))
+    with pytest.raises(ValueError, match=r"inside.shape=\(2, 2\)"):
+        polmvs.plane_normal(stokes, INTRINSICS, mask=np.ones((2, 2)))
+    nothing = np.zeros(stokes.shape, bool)
+    with pytest.raises(polmvs.DataError, match="only 0 pixels"):
+        polmvs.plane_normal(stokes, INTRINSICS, mask=nothing)
+
+
+# Whole captures
+
+
+@pytest.fixture(scope="module")
+def result(
+    demo_run: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory
+) -> polmvs.Reconstruction:
+    return polmvs.reconstruct(
+        demo_capture,
+        tmp_path_factory.mktemp("api") / "out",
+        sparse=str(demo_run / "sparse"),
+        gt=demo_capture / "gt",
+        stride_px=4,
+        workers=1,
+    )
+
+
+def test_cloud_and_mesh_are_open3ds(result: polmvs.Reconstruction) -> None:
+    cloud, whole = result.point_cloud(), result.point_cloud(surroundings=True)
+    assert isinstance(cloud, open3d.geometry.PointCloud)
+    found = result.record.result(DensifyResult, result.angle_model)
+    assert len(cloud.points) == found.num_points > 10_000
+    assert len(whole.points) == found.num_points + found.num_surroundings
+    assert cloud.has_normals()
+    assert cloud.has_colors()
+    assert result.cloud.scalars["sigma"].max() > 0
+    mesh = result.mesh()
+    assert isinstance(mesh, open3d.geometry.TriangleMesh)
+    assert mesh.has_vertex_normals()
+    assert len(mesh.triangles) > 1000
+
+
+def test_maps_show_the_cloud(result: polmvs.Reconstruction) -> None:
+    """Where a point of the cloud projects, the map has its depth: less than a pixel's footprint."""
+    assert len(result.view_names) == 10
+    view = result._view("003")
+    depth, normals = result.depth_map("003.png"), result.normal_map("003")
+    assert depth.shape == (view.camera.height, view.camera.width)
+    assert normals.shape == (*depth.shape, 3)
+    known = np.isfinite(depth)
+    assert 0.2 < known.mean() < 0.9
+    np.testing.assert_array_equal(np.isfinite(normals).all(axis=-1), known)
+    np.testing.assert_allclose(np.linalg.norm(normals[known], axis=-1), 1, atol=1e-5)
+    points = view.cam_from_world * np.asarray(result.point_cloud().points)
+    xy = view.camera.project(points)
+    inside = ((xy > 0) & (xy < [view.camera.width, view.camera.height])).all(axis=-1)
+    cols, rows = np.floor(xy[inside]).astype(int).T
+    error = np.abs(depth[rows, cols] / points[inside, 2] - 1)
+    assert np.isfinite(error).mean() > 0.9
+    assert np.nanquantile(error, 0.95) < 1 / view.camera.mean_focal_px
+    with pytest.raises(KeyError, match=r"'900\.png' is no view"):
+        result.depth_map("900.png")
+
+
+def test_sparse_model_is_pycolmaps(result: polmvs.Reconstruction) -> None:
+    assert isinstance(result.sparse_model, pycolmap.Reconstruction)
+    assert result.sparse_model.num_reg_images() == 10
+
+
+def test_figures_of_a_reconstruction(result: polmvs.Reconstruction) -> None:
+    """They are measured when they are asked for; nothing is written."""
+    before = {path: path.stat().st_mtime_ns for path in result.folder.rglob("*")}
+    metrics = result.metrics
+    assert metrics.consistency.coverage > 0.9
+    assert metrics.truth is not None
+    assert metrics.truth.cloud.f_score[1] > 0.9
+    assert metrics.truth.maps is not None
+    assert metrics.truth.maps.depth_rmse_m < 0.001
+    assert {path: path.stat().st_mtime_ns for path in result.folder.rglob("*")} == before
+
+
+def test_going_on_takes_the_options_of_the_run(
+    result: polmvs.Reconstruction, demo_capture: Path
+) -> None:
+    again = polmvs.reconstruct(demo_capture, result.folder, resume=True, workers=1)
+    assert len(again.cloud.points) == len(result.cloud.points)
+    with pytest.raises(polmvs.OptionError, match=r"`propagation\.stride_px` is 2 but"):
+        polmvs.reconstruct(demo_capture, result.folder, resume=True, stride_px=2)
+    with pytest.raises(polmvs.OptionError, match=r"Give `run\.overwrite`"):
+        polmvs.reconstruct(demo_capture, result.folder, options=Options())
+
+
+def test_results_of_an_earlier_run(demo_run: Path, tmp_path: Path) -> None:
+    run = polmvs.open_run(demo_run)
+    assert [str(model) for model in run.models] == ["opa", "ppa", "tilted"]
+    assert run.table() in (demo_run / "summary.md").read_text()
+    assert run.metrics.best_fit == "tilted"
+    assert len(run["opa"].cloud.points) == len(read_cloud(demo_run / "opa.ply").points)
+    assert "ppa: " in repr(run["ppa"])
+    with pytest.raises(polmvs.OptionError, match="`model` must be one of"):
+        run["best"]
+    with pytest.raises(polmvs.DataError, match="no mesh was made"):
+        run["ppa"].mesh()
+    with pytest.raises(polmvs.DataError, match="holds no run of polmvs"):
+        polmvs.open_run(tmp_path)
+
+
+def test_comparison_goes_on_with_a_run(demo_run: Path, demo_capture: Path) -> None:
+    run = polmvs.compare(demo_capture, demo_run, resume=True, workers=1)
+    assert run.table() in (demo_run / "summary.md").read_text()
+    assert set(run.models) == {"opa", "ppa", "tilted"}
+
+
+@pytest.mark.parametrize("as_object", [False, True])
+def test_normals_of_sparse_points(demo_run: Path, demo_capture: Path, as_object: bool) -> None:
+    """The same as the stages find on the same model; writing it anew changes the last digits."""
+    folder = demo_run / "sparse"
+    sparse = pycolmap.Reconstruction(str(folder)) if as_object else folder
+    found = polmvs.track_normals(demo_capture, sparse, model="tilted", workers=1)
+    expected = read_cloud(demo_run / "normals_tilted.ply")
+    np.testing.assert_allclose(found.points, expected.points, rtol=1e-5, atol=1e-5)
+    assert (found.valid == (expected.scalars["valid"] > 0)).mean() > 0.998
+    both = found.valid & (expected.scalars["valid"] > 0)
+    assert both.sum() > 80
+    assert expected.normals is not None
+    cosine = (found.normals * expected.normals)[both].sum(axis=-1)
+    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.1
+    assert len(found.point_cloud().points) == found.valid.sum()
+    assert not found.normals[~found.valid].any() or np.isnan(found.normals[~found.valid]).all()
