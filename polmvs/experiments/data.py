@@ -33,6 +33,7 @@ Mask = NDArray[np.bool_]
 
 OnProgress = Callable[[int], None]  # called with the number of steps done
 
+EXACT_SIGMA = 1e-3  # rad; stands for no noise, far below that of any phase
 BLUR_REACH = 2.0  # deviations of the blur within which a mark spoils a pixel
 
 
@@ -150,14 +151,13 @@ class ViewData:
         return as_tilted(measured) if angle_model is AngleModel.TILTED else measured
 
     def plain_map(self, angle_model: AngleModel) -> PhaseMap:
-        """A phase map of the paper's kind: blurred pixels over the threshold, single.
+        """A phase map of the paper's kind: blurred pixels over the threshold, all alike.
 
-        Their precision is that of the pixel before the blur; the paper's estimator takes all rows
-        alike, and it tells whether they leave a direction of the normal open.
+        The paper knows of no noise: its rows count as exact, so that only their geometry decides
+        whether they give a normal.
         """
-        stokes = self.blurred_for(angle_model)
-        axial = self.axial(angle_model) / np.maximum(stokes.s0, 1e-6)[..., None]
-        precision = self.counted / np.square(np.maximum(stokes.sigma_aolp, 1e-6))
+        axial = self.axial(angle_model) / np.maximum(self.blurred.s0, 1e-6)[..., None]
+        precision = np.where(self.counted, EXACT_SIGMA**-2, 0)
         samples = np.dstack([axial, precision])
         region = Region(self.part, self.counted, np.zeros_like(self.part))
         base = self.phase_map(AngleModel.PPA, region)

@@ -199,7 +199,13 @@ def view_rows(scene: Scene, points: Array, index: int) -> dict[str, Rows]:
             phase_map = data.plain_map(angle_model)
         else:
             phase_map = data.phase_map(angle_model, region)
-        rows[name] = gather_rows(angle_model, points, [phase_map], [data.range_map])
+        rows[name] = gather_rows(
+            angle_model,
+            points,
+            [phase_map],
+            [data.range_map],
+            tilt_aware=source is Source.MAP,
+        )
     return rows
 
 
