@@ -94,7 +94,7 @@ class RenderArguments(OptionGroup, group="arguments", in_files=False):
 
     picture: Path = option(MISSING, "PNG file of the picture", positional=True)
     files: tuple[Path, ...] = option(
-        MISSING, "PLY files of clouds or meshes in one frame, a column each", metavar="FILE,..."
+        MISSING, "PLY files of clouds or meshes in one frame, a column each", positional=True
     )
     labels: tuple[str, ...] = option((), "a text for each column", metavar="TEXT,...")
     elevations: tuple[float, ...] = option(

@@ -1,0 +1,211 @@
+"""The report in a real browser: nothing is loaded, nothing complains, the 3D view turns.
+
+Needs Chromium (Debian's package ``chromium``); without it these tests are skipped and say so.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = (
+    "--no-sandbox",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-quic",
+    # WebGL in software, where there is no graphics card.
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+)
+MAX_REPORT_MB = 25
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator:
+    api = pytest.importorskip("playwright.sync_api")
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        yield browser
+        browser.close()
+
+
+class Opened:
+    """The report in a page of some width, with what it asked for and complained of."""
+
+    def __init__(self, browser, report: Path, width: int, scheme: str = "light") -> None:
+        self.page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("console", lambda m: self.complaints.append(f"{m.type}: {m.text}"))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(report.as_uri())
+        self.page.wait_for_selector("#view3d[data-ready=true]", timeout=120_000)
+
+    def shot(self, selector: str) -> bytes:
+        """What one element looks like, once the next frames are drawn."""
+        self.page.wait_for_timeout(300)
+        return self.page.locator(selector).screenshot()
+
+    def drawing(self, pane: str = "left") -> str:
+        """The picture on a pane's canvas, once the next frames are drawn."""
+        self.page.wait_for_timeout(300)
+        return self.page.evaluate(
+            "name => document.querySelector(`[data-pane=${name}] canvas`).toDataURL()", pane
+        )
+
+    def colors(self, pane: str) -> int:
+        """Number of different colours on a pane's canvas."""
+        return self.page.evaluate(
+            """(name) => {
+              const canvas = document.querySelector(`[data-pane=${name}] canvas`);
+              const copy = document.createElement("canvas");
+              copy.width = canvas.width; copy.height = canvas.height;
+              const context = copy.getContext("2d");
+              context.drawImage(canvas, 0, 0);
+              const data = context.getImageData(0, 0, copy.width, copy.height).data;
+              const found = new Set();
+              for (let i = 0; i < data.length; i += 4) {
+                found.add(data[i] << 16 | data[i + 1] << 8 | data[i + 2]);
+              }
+              return found.size;
+            }""",
+            pane,
+        )
+
+
+@pytest.fixture(scope="module", params=[390, 1440])
+def opened(request: pytest.FixtureRequest, browser, demo_run: Path) -> Iterator[Opened]:
+    page = Opened(browser, demo_run / "report.html", request.param)
+    yield page
+    page.page.close()
+
+
+def test_the_report_is_one_file_of_a_size_to_send(demo_run: Path) -> None:
+    report = demo_run / "report.html"
+    assert report.stat().st_size < 1e6 * MAX_REPORT_MB
+    text = report.read_text()
+    addresses = set(re.findall(r"https?://[^\s\"'<>)]+", text))
+    assert all(address.startswith("http://www.w3.org/") for address in addresses)  # XML names
+
+
+def test_nothing_is_loaded_and_nothing_complains(opened: Opened) -> None:
+    assert [url for url in opened.requests if not url.startswith(("data:", "blob:", "file:"))] == []
+    assert sum(url.startswith("file:") for url in opened.requests) == 1
+    assert opened.complaints == []
+
+
+def test_both_panes_show_something_and_opa_is_not_ppa(opened: Opened) -> None:
+    assert opened.colors("left") > 100
+    assert opened.colors("right") > 100
+    left, right = (opened.drawing(name) for name in ("left", "right"))
+    assert left != right
+
+
+def test_dragging_turns_both_panes(opened: Opened) -> None:
+    before = [opened.drawing(name) for name in ("left", "right")]
+    canvas = opened.page.locator("[data-pane=left] canvas")
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    mouse = opened.page.mouse
+    mouse.move(x, y)
+    mouse.down()
+    for step in range(1, 9):
+        mouse.move(x + 12 * step, y + 4 * step)
+    mouse.up()
+    after = [opened.drawing(name) for name in ("left", "right")]
+    assert all(one != other for one, other in zip(before, after, strict=True))
+    opened.page.click("[data-control=reset]")
+    assert opened.drawing() == before[0]
+
+
+@pytest.mark.parametrize("key", ["ArrowLeft", "ArrowUp", "+", "-"])
+def test_keys_turn_and_zoom(opened: Opened, key: str) -> None:
+    selector = "[data-pane=left] canvas"
+    before = opened.drawing()
+    opened.page.locator(selector).focus()
+    opened.page.keyboard.press(key)
+    assert opened.drawing() != before
+    opened.page.keyboard.press("r")
+    assert opened.drawing() == before
+
+
+def test_colours_frusta_and_layout_can_be_chosen(opened: Opened) -> None:
+    page = opened.page
+    start = opened.drawing()
+    seen = {start}
+    for name in ("intensity", "kind", "sigma", "error"):
+        page.select_option("[data-control=color]", name)
+        seen.add(opened.drawing())
+        assert page.locator(".legend").inner_text().strip() or name == "intensity"
+    assert len(seen) == 5
+    page.select_option("[data-control=color]", "normal")
+    page.check("[data-control=frusta]")
+    assert opened.drawing() != start
+    page.uncheck("[data-control=frusta]")
+    assert opened.drawing() == start
+    page.uncheck("[data-control=two]")
+    assert not page.locator("[data-pane=right]").is_visible()
+    page.check("[data-control=two]")
+    assert page.locator("[data-pane=right]").is_visible()
+
+
+def test_pictures_open_large_and_close(opened: Opened) -> None:
+    page = opened.page
+    first = page.locator(".thumb").first
+    first.click()
+    dialog = page.locator("dialog")
+    assert dialog.is_visible()
+    caption = dialog.locator("output").inner_text()
+    page.keyboard.press("ArrowRight")
+    assert dialog.locator("output").inner_text() != caption
+    page.keyboard.press("Escape")
+    assert not dialog.is_visible()
+
+
+def test_the_slider_wipes_between_opa_and_ppa(opened: Opened) -> None:
+    page = opened.page
+    slider = page.locator(".wipe input").first
+    before = opened.shot(".wipe >> nth=0")
+    slider.focus()
+    for _ in range(10):
+        page.keyboard.press("ArrowLeft")
+    assert opened.shot(".wipe >> nth=0") != before
+    labels = page.locator(".wipe >> nth=0").inner_text()
+    assert "OPA" in labels
+    assert "PPA" in labels
+
+
+def test_nothing_is_wider_than_the_screen(opened: Opened) -> None:
+    wide = opened.page.evaluate("document.documentElement.scrollWidth - innerWidth")
+    assert wide <= 0
+
+
+def test_every_picture_and_control_has_a_name(opened: Opened) -> None:
+    nameless = opened.page.evaluate(
+        """() => [...document.querySelectorAll("img, canvas, input, select, button, svg[role=img]")]
+          .filter((e) => !(e.alt || e.ariaLabel || e.getAttribute("aria-label")
+            || e.textContent.trim() || e.closest("label") || e.querySelector("img")
+            || e.closest("dialog")))
+          .map((e) => e.outerHTML.slice(0, 80))"""
+    )
+    assert nameless == []
+
+
+def test_dark_mode_is_dark(browser, demo_run: Path) -> None:
+    opened = Opened(browser, demo_run / "report.html", 800, "dark")
+    color = opened.page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert max(map(int, re.findall(r"\d+", color)[:3])) < 60
+    assert opened.colors("left") > 100
+    opened.page.close()
