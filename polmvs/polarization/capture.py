@@ -501,21 +501,23 @@ def _survey(
     for view in files.views:
         for role, paths in enumerate(view.files):
             for path in paths:
-                header = probe_raw(path, _dump_size(options))
+                header, raw = probe_raw(path, _dump_size(options)), None
                 if header is None or header.dtype != "uint8" or path in looked_at:
                     raw = read_raw(path, _dump_size(options))
                     header = raw.header
-                    orientations.add(raw.orientation)
-                    # Of Stokes images s0 has the scale; the maps have each their own.
-                    if (files.kind is not CaptureKind.AOLP and role == 0) or _has_levels(files):
-                        counts.add(raw.samples, raw.declared_bits)
-                    if path in looked_at:
-                        sampled.append(raw)
                 _require_usable(files.kind, path, header, options)
                 if first is None:
                     first = (path, header)
                 elif files.kind is not CaptureKind.AOLP or header[:2] != first[1][:2]:
                     _require_same(*first, path, header)
+                if raw is None:
+                    continue
+                orientations.add(raw.orientation)
+                # Of Stokes images s0 has the scale; the maps have each their own.
+                if (files.kind is not CaptureKind.AOLP and role == 0) or _has_levels(files):
+                    counts.add(raw.samples, raw.declared_bits)
+                if path in looked_at:
+                    sampled.append(raw)
     if first is None:
         raise DataError(files.folder, "holds no views.")
     levels = decide_levels(counts, options.full_scale)

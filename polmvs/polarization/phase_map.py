@@ -185,7 +185,8 @@ def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMa
     size = (view.camera.height, view.camera.width)
     shapes = (samples.shape[:2], intensity.shape, flags.shape, lowest_dolp.shape)
     if any(shape != size for shape in shapes):
-        raise DataError(folder / view.name, "has another size than its camera; use --overwrite.")
+        reason = "has another size than its camera; give `run.overwrite`."
+        raise DataError(folder / view.name, reason)
     region = Region((flags & 1) > 0, (flags & 2) > 0, (flags & 4) > 0)
     diffuse = (flags & 8) > 0
     return PhaseMap(view, region, samples, intensity, diffuse, lowest_dolp, folder, tilted)

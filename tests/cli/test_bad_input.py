@@ -109,7 +109,7 @@ def test_colour(fails, capture: Path) -> None:
 
 def test_names_that_differ_in_the_suffix_only(fails, capture: Path) -> None:
     cv2.imwrite(str(capture / "2.tif"), noise(2))
-    assert "2.png and 2.tif are of one name" in fails("reconstruct", capture, OUT)
+    assert "2.tif: is the same image of the same view as " in fails("reconstruct", capture, OUT)
 
 
 @pytest.mark.parametrize(("command", "num_images"), [("sfm", 1), ("reconstruct", 2)])
@@ -141,7 +141,7 @@ def test_sfm_that_finds_no_model(cli, capture: Path, tmp_path: Path) -> None:
     assert not (out / "sparse").exists()
     assert not list(out.glob(".*"))
     assert [stage["name"] for stage in json.loads((out / "run.json").read_text())["stages"]] == [
-        "capture"
+        "images"
     ]
 
 

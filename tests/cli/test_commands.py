@@ -20,6 +20,20 @@ def test_demo_prints_both_models_and_no_progress(demo_run: Path, cli) -> None:
     assert "\n".join(lines[:-1]) in summary
 
 
+def test_json_of_a_job_is_all_that_is_printed(demo_run: Path, cli) -> None:
+    status, out, err = cli("demo", demo_run, "--resume", "--json")
+    content = json.loads(out)
+    assert (status, err) == (0, "")
+    assert content["out"] == str(demo_run)
+    assert content["results"]["densify_ppa"]["num_points"] > 10_000
+    assert (content["empty"], content["warnings"]) == (None, [])
+
+
+def test_quiet_leaves_the_result(demo_run: Path, cli) -> None:
+    _, text, _ = cli("demo", demo_run, "--resume")
+    assert cli("demo", demo_run, "--resume", "--quiet") == (0, text, "")
+
+
 def test_verbose_shows_every_stage(demo_run: Path, cli) -> None:
     status, _, err = cli("demo", demo_run, "--resume", "-v")
     assert status == 0
