@@ -118,7 +118,7 @@ class RenderArguments(OptionGroup, group="arguments", in_files=False):
     def check(self) -> None:
         """A text for each column, or none."""
         fits = len(self.labels) in (0, len(self.files))
-        self.require(fits, "labels", "needs one text for each of `arguments.files`", self.labels)
+        self.require(fits, "labels", "needs one text for each FILE", self.labels)
 
 
 @dataclass(frozen=True, kw_only=True)

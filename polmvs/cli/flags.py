@@ -159,7 +159,14 @@ def parse(commands: Sequence[Command], tokens: Sequence[str], prog: str, about: 
 def in_flags(text: str) -> str:
     """A message with each option's path, between backquotes, replaced by its flag."""
     flags = {info.path: info.flag for cls in _NAMED_IN_MESSAGES for info in describe_fields(cls)}
-    return re.sub(r"`(\w+\.\w+)`", lambda found: flags.get(found[1], found[1]), text)
+
+    def flag(found: re.Match[str]) -> str:
+        group, _, name = found[1].partition(".")
+        if group == "arguments":  # of whichever command; each has its own
+            return "--" + name.replace("_", "-")
+        return flags.get(found[1], found[1])
+
+    return re.sub(r"`(\w+\.\w+)`", flag, text)
 
 
 class _Signature:
