@@ -26,7 +26,8 @@ except ImportError:  # Windows
 
 R = TypeVar("R")
 
-# Of ``run.json``. 1: the first releases, which did not name it. 2: stages with their results.
+# Of ``run.json``; to be raised with every change of the record or of what a stage gives.
+# 1: the first releases, which did not name it. 2: stages with their results.
 SCHEMA_VERSION = 2
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pycolmap", "open3d")
 
