@@ -119,7 +119,9 @@ def fuse(
         near = [used[j] for j in order if j != i][:max_neighbors]
         tasks.append([(maps[j], dense[j]) for j in [k, *near]])
     clouds, footprints = [], []
-    for k, part in zip(used, workers.map(partial(_confirm, options, tolerances=tolerances), tasks), strict=True):
+    for k, part in zip(
+        used, workers.map(partial(_confirm, options, tolerances=tolerances), tasks), strict=True
+    ):
         clouds.append(part.cloud)
         footprints.append(part.footprint)
         if on_confirmed is not None:
