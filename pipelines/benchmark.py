@@ -26,7 +26,7 @@ from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel, EvaluationOptions, OptionGroup, RunOptions, option
 from polmvs.errors import OptionError
 from polmvs.evaluation.tables import format_table
-from polmvs.normals.estimator import NUM_ROUNDS, solve_normals
+from polmvs.normals.estimator import EstimatorTolerances, solve_normals
 from polmvs.normals.single_view.plane import plane_normal
 from polmvs.pipeline.jobs import Job, compare
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
@@ -151,7 +151,7 @@ def _tracks(rng: np.random.Generator) -> list[tuple[str, float]]:
         """The weighted rounds with one LAPACK call for each matrix."""
         weights = np.ones(shape[1:])
         vectors = np.zeros((NUM_TRACKS, 3))
-        for _ in range(NUM_ROUNDS + 1):
+        for _ in range(EstimatorTolerances().num_rounds + 1):
             matrices = np.einsum("ikn,jkn,kn->nij", rows, rows, weights)
             vectors = np.linalg.eigh(matrices)[1][:, :, 0]
             residual = np.einsum("ikn,ni->kn", rows, vectors)

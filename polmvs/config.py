@@ -372,6 +372,11 @@ class SfmOptions(OptionGroup, group="sfm"):
         "fx,fy,cx,cy of the half-size polarization images, px, COLMAP's convention",
         metavar="FX,FY,CX,CY",
     )
+    camera: Path | None = option(
+        None,
+        "file of a calibrated camera of the mosaics or the polarization images: OpenCV, ROS or "
+        "Kalibr (YAML, JSON), or a camera line of COLMAP",
+    )
     camera_model: str = option(
         "SIMPLE_RADIAL", "COLMAP camera model to estimate where no intrinsics are given"
     )
@@ -380,8 +385,10 @@ class SfmOptions(OptionGroup, group="sfm"):
     seed: int = option(0, "random seed of SfM")
 
     def check(self) -> None:
-        """Four positive numbers."""
+        """Four positive numbers, or a file."""
         _require_intrinsics(self, self.intrinsics)
+        once = self.intrinsics is None or self.camera is None
+        self.require(once, "camera", "and `sfm.intrinsics` exclude each other")
 
 
 def _require_intrinsics(options: OptionGroup, given: tuple[float, ...] | None) -> None:
@@ -812,7 +819,7 @@ def show_value(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:g}"
+        return f"{value:.15g}"
     return "none" if value is None else str(value)
 
 

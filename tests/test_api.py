@@ -129,9 +129,10 @@ def test_plane_from_one_frame(demo_capture: Path) -> None:
         plane = polmvs.plane_normal(stokes, INTRINSICS, model=model, mask=mask)
         assert plane.valid
         errors[model] = np.degrees(np.arccos(plane.normal @ truth))
-        spread = np.sqrt(np.linalg.eigvalsh(plane.covariance))
-        assert np.degrees(spread[2]) == pytest.approx(plane.sigma_deg, rel=1e-6)
-        assert spread[0] == pytest.approx(0, abs=1e-6 * spread[2])
+        variance = np.linalg.eigvalsh(plane.covariance)
+        assert np.degrees(np.sqrt(variance[2])) == pytest.approx(plane.sigma_deg, rel=1e-6)
+        assert variance[0] == pytest.approx(0, abs=1e-9 * variance[2])
+        assert variance[1] > 0.01 * variance[2]
         np.testing.assert_allclose(plane.covariance @ plane.normal, 0, atol=1e-12)
     # Measured 0.9 and 0.1 deg; the sensor's polarizers are tilted.
     assert errors["ppa"] < 3
@@ -180,14 +181,14 @@ def test_cloud_and_mesh_are_open3ds(result: polmvs.Reconstruction) -> None:
     assert len(whole.points) == found.num_points + found.num_surroundings
     assert cloud.has_normals()
     assert cloud.has_colors()
-    assert result.cloud.scalars["sigma"].max() > 0
+    assert np.nanmax(result.cloud.scalars["sigma"]) > 0
     mesh = result.mesh()
     assert isinstance(mesh, open3d.geometry.TriangleMesh)
     assert mesh.has_vertex_normals()
     assert len(mesh.triangles) > 1000
 
 
-def test_maps_show_the_cloud(result: polmvs.Reconstruction) -> None:
+def test_maps_show_the_cloud(result: polmvs.Reconstruction, demo_capture: Path) -> None:
     """Where a point of the cloud projects, the map has its depth: less than a pixel's footprint."""
     assert len(result.view_names) == 10
     view = result._view("003")
@@ -195,7 +196,9 @@ def test_maps_show_the_cloud(result: polmvs.Reconstruction) -> None:
     assert depth.shape == (view.camera.height, view.camera.width)
     assert normals.shape == (*depth.shape, 3)
     known = np.isfinite(depth)
-    assert 0.2 < known.mean() < 0.9
+    board = read_mask(demo_capture / "gt" / "003_mask.png", depth.shape)
+    assert known[board].mean() > 0.9
+    assert board[known].mean() > 0.95
     np.testing.assert_array_equal(np.isfinite(normals).all(axis=-1), known)
     np.testing.assert_allclose(np.linalg.norm(normals[known], axis=-1), 1, atol=1e-5)
     points = view.cam_from_world * np.asarray(result.point_cloud().points)

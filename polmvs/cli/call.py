@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -127,6 +126,8 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
         It is no TOML, or has an unknown or repeated table or key or a value of a wrong type, which
         is named.
     """
+    import tomllib  # not for --help
+
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
@@ -145,7 +146,7 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
     return values
 
 
-def _line_of(text: str, error: tomllib.TOMLDecodeError) -> str:
+def _line_of(text: str, error: ValueError) -> str:
     """The line at fault: Python's message does not name the key that is there twice."""
     found = re.search(r"at line (\d+)", str(error))
     lines = text.splitlines()

@@ -147,7 +147,7 @@ def _show_cloud(outcome: pipeline.JobOutcome, model: AngleModel, terminal: Termi
     if dense is not None and dense.folder is not None:
         lines.append(f"{dense.folder}: COLMAP dense workspace")
     terminal.show("\n".join(lines), _content(outcome, terminal))
-    return _status(outcome)
+    return _status(outcome, terminal)
 
 
 def _show_comparison(outcome: pipeline.JobOutcome, terminal: Terminal) -> int:
@@ -157,7 +157,7 @@ def _show_comparison(outcome: pipeline.JobOutcome, terminal: Terminal) -> int:
     last = f"{outcome.run_folder.root}: {clouds}, metrics.json, summary.md; {_views(outcome)}"
     lines = [comparison.table(), *best_fit_lines(comparison), last]
     terminal.show("\n".join(lines), {**_content(outcome, terminal), "metrics": comparison})
-    return _status(outcome)
+    return _status(outcome, terminal)
 
 
 def _content(outcome: pipeline.JobOutcome, terminal: Terminal) -> dict[str, Any]:
@@ -176,8 +176,9 @@ def _views(outcome: pipeline.JobOutcome) -> str:
     return f"{poses.num_views} of {poses.num_views + len(poses.unregistered)} views"
 
 
-def _status(outcome: pipeline.JobOutcome) -> int:
+def _status(outcome: pipeline.JobOutcome, terminal: Terminal) -> int:
     if outcome.empty is None:
         return 0
+    terminal.repeat_warnings()
     print(f"polmvs: {in_flags(outcome.empty)}", file=sys.stderr)
     return EMPTY_STATUS

@@ -85,11 +85,11 @@ def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
         return command()
     except KeyboardInterrupt:
         kept = "; finished stages are kept, go on with --resume" if terminal.log else ""
-        _complain(prog, f"interrupted{kept}")
+        _complain(terminal, prog, f"interrupted{kept}")
         return INTERRUPTED
     except PolmvsError as error:
         _trace(logging.DEBUG)
-        _complain(prog, f"error: {error}")
+        _complain(terminal, prog, f"error: {error}")
         return error.exit_status
     except BrokenPipeError:  # the reader of stdout has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -97,18 +97,22 @@ def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
     except OSError as error:
         _trace(logging.DEBUG)
         place = f"{error.filename}: " if error.filename else ""
-        _complain(prog, f"error: {place}{error.strerror or error}.")
+        _complain(terminal, prog, f"error: {place}{error.strerror or error}.")
         return 1
     except Exception as error:
         from concurrent.futures.process import BrokenProcessPool
 
         if isinstance(error, BrokenProcessPool | MemoryError):
             _trace(logging.DEBUG)
-            _complain(prog, "error: out of memory, or a worker was killed. Give `run.workers` 1.")
+            _complain(
+                terminal,
+                prog,
+                "error: out of memory, or a worker was killed. Give `run.workers` 1.",
+            )
             return 1
         _trace(logging.CRITICAL)
         where = f"; see {terminal.log}" if terminal.log else ""
-        _complain(prog, f"internal error: {type(error).__name__}: {error}{where}")
+        _complain(terminal, prog, f"internal error: {type(error).__name__}: {error}{where}")
         return 1
 
 
@@ -116,9 +120,10 @@ def _trace(level: int) -> None:
     logger.log(level, "where it happened:", exc_info=True, extra={"file_only": True})
 
 
-def _complain(prog: str, message: str) -> None:
+def _complain(terminal: Any, prog: str, message: str) -> None:
     line = in_flags(" ".join(message.split()))
     logger.error("%s", line, extra={"file_only": True})
+    terminal.repeat_warnings()
     _print(prog, line)
 
 

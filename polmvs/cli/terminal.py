@@ -97,11 +97,7 @@ class Terminal:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._unrepeated:
-            sys.stdout.flush()
-            self.say(f"{len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}:")
-            for text in self.warnings:
-                self.say(f"  {text}")
+        self.repeat_warnings()
         for handler in self._handlers:
             package_logger.removeHandler(handler)
             handler.close()
@@ -121,6 +117,15 @@ class Terminal:
         if text not in self.warnings:
             self.warnings.append(text)
             self.say(f"warning: {text}")
+
+    def repeat_warnings(self) -> None:
+        """All warnings once more, if other lines came since; an error is said after them."""
+        if self._unrepeated:
+            sys.stdout.flush()
+            self.say(f"{len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}:")
+            for text in self.warnings:
+                self.say(f"  {text}")
+        self._unrepeated = []
 
     def show(self, text: str, content: Any) -> None:
         """The result of the command, on stdout.

@@ -319,6 +319,30 @@ def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: PathAr
         reconstruction.write_binary(str(root))
 
 
+def reconstruction_of_views(
+    views: Sequence[View], *, single_camera: bool = False
+) -> pycolmap.Reconstruction:
+    """Posed views without points; ids of images and cameras count from 1 in their order.
+
+    Parameters
+    ----------
+    single_camera : all share that of the first; else each has its own.
+    """
+    reconstruction = pycolmap.Reconstruction()
+    for index, view in enumerate(views):
+        if index == 0 or not single_camera:
+            camera = camera_to_colmap(view.camera)
+            camera.camera_id = index + 1
+            reconstruction.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(
+            name=view.name, camera_id=1 if single_camera else index + 1, image_id=index + 1
+        )
+        pose = view.cam_from_world
+        matrix = np.column_stack([pose.rotation, pose.translation])
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
+    return reconstruction
+
+
 def _reconstruction(sparse_model: SparseModel) -> pycolmap.Reconstruction:
     """The model in pycolmap's types; ids of points are kept."""
     reconstruction = pycolmap.Reconstruction()

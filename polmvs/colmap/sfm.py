@@ -20,12 +20,17 @@ from pathlib import Path
 import pycolmap
 
 from polmvs.camera import PinholeCamera
-from polmvs.colmap.cameras import quiet_colmap
-from polmvs.colmap.models import model_from_reconstruction, write_reconstruction
+from polmvs.colmap.cameras import camera_to_colmap, quiet_colmap
+from polmvs.colmap.models import (
+    model_from_reconstruction,
+    reconstruction_of_views,
+    write_reconstruction,
+)
 from polmvs.config import SfmOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.images import read_gray
-from polmvs.scene import SparseModel, short_list
+from polmvs.io.intrinsics import Intrinsics, read_intrinsics
+from polmvs.scene import SparseModel, View, short_list
 
 logger = logging.getLogger(__name__)
 
@@ -126,13 +131,68 @@ def run_sfm(
         reconstruction = _refine(
             reconstruction,
             tolerances,
-            free_intrinsics=options.intrinsics is None,
+            free_intrinsics=options.intrinsics is None and options.camera is None,
             single_camera=options.single_camera,
         )
     write_reconstruction(reconstruction, sparse_folder)
     sparse_model = model_from_reconstruction(reconstruction, names)
     _log_result(sparse_model, reconstruction.compute_mean_reprojection_error())
     return sparse_model
+
+
+def triangulate_views(
+    image_folder: Path,
+    views: Sequence[View],
+    work_folder: Path,
+    sparse_folder: Path,
+    *,
+    seed: int = 0,
+    tolerances: SfmTolerances = SfmTolerances(),
+) -> SparseModel:
+    """A model of known cameras: features are matched and triangulated, no pose is changed.
+
+    Parameters
+    ----------
+    image_folder : 8-bit intensity images, one size.
+    views : known cameras, named as the images.
+    work_folder, sparse_folder : see :func:`run_sfm`.
+
+    Raises
+    ------
+    DataError
+        An image is missing.
+    """
+    ordered = sorted(views, key=lambda view: view.name)
+    names = [view.name for view in ordered]
+    width, height = _image_size(image_folder, names)
+    for view in ordered:
+        if (view.camera.width, view.camera.height) != (width, height):
+            raise DataError(image_folder / view.name, "is of another size than its known camera.")
+    single = all(view.camera == ordered[0].camera for view in ordered)
+    options = SfmOptions(seed=seed, single_camera=single)
+    reader = pycolmap.ImageReaderOptions()
+    camera = camera_to_colmap(ordered[0].camera)
+    reader.camera_model = camera.model.name
+    reader.camera_params = camera.params_to_string()
+    work_folder.mkdir(parents=True, exist_ok=True)
+    database = work_folder / "database.db"
+    for left_over in work_folder.glob("database.db*"):
+        left_over.unlink()
+    pycolmap.set_random_seed(seed)
+    with quiet_colmap():
+        _extract_features(database, image_folder, names, reader, options)
+        _match(database, len(names), seed, tolerances)
+        # Images were imported in the order of names, so their ids are those of the views here.
+        known = reconstruction_of_views(ordered, single_camera=single)
+        mapper = _mapper_options(len(names), options, tolerances)
+        output = work_folder / "triangulated"
+        output.mkdir(exist_ok=True)
+        found = pycolmap.triangulate_points(known, database, image_folder, output, options=mapper)
+    shutil.rmtree(output)
+    write_reconstruction(found, sparse_folder)
+    model = model_from_reconstruction(found, names)
+    _log_result(model, found.compute_mean_reprojection_error())
+    return model
 
 
 def check_intrinsics(
@@ -174,6 +234,20 @@ def check_intrinsics(
     return PinholeCamera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
+def check_camera(path: Path, width: int, height: int) -> Intrinsics:
+    """The camera of a calibration file, scaled to images of this size.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read, or is of images of another shape.
+    """
+    try:
+        return read_intrinsics(path).scaled_to(width, height)
+    except ValueError as error:
+        raise DataError(path, f"{error}. Calibrate at the capture's region of interest.") from error
+
+
 def _image_size(folder: Path, names: Sequence[str]) -> tuple[int, int]:
     """Width and height of the images, px; all must exist and be alike."""
     if len(names) < 2:
@@ -196,6 +270,11 @@ def _reader_options(
         check_intrinsics(options.intrinsics, width, height, tolerances=tolerances)
         reader.camera_model = "PINHOLE"
         reader.camera_params = ",".join(repr(float(value)) for value in options.intrinsics)
+        return reader
+    if options.camera is not None:
+        camera = check_camera(options.camera, width, height)
+        reader.camera_model = camera.model
+        reader.camera_params = ",".join(repr(value) for value in camera.params)
         return reader
     known = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
     if options.camera_model not in known:
@@ -266,7 +345,7 @@ def _mapper_options(
     pipeline.mapper.num_threads = 1
     two_view_tracks = num_images <= tolerances.max_images_two_view_tracks
     pipeline.triangulation.ignore_two_view_tracks = not two_view_tracks
-    if options.intrinsics is not None:
+    if options.intrinsics is not None or options.camera is not None:
         pipeline.ba_refine_focal_length = False
         pipeline.ba_refine_extra_params = False
         pipeline.mapper.abs_pose_refine_focal_length = False

@@ -174,7 +174,8 @@ def find_capture(
     for its_kind, pattern in _FOLDERS:
         if kind in (None, its_kind):
             named = _match(folder, tree, pattern)
-            if named and _is_complete(its_kind, named):
+            # Of a kind that was asked for, what is missing is named.
+            if named and (kind is not None or _is_complete(its_kind, named)):
                 return _assemble(folder, its_kind, named)
     kinds = ", ".join(sorted(SUFFIXES))
     raise DataError(

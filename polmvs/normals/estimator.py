@@ -18,18 +18,40 @@ from polmvs.scene import MIN_FACING_COSINE
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
 
-MIN_SIN_ZENITH = 0.1  # a row of a nearly frontal surface says little: its weight is capped here
-COUNTED_WEIGHT = 0.25  # robust weight over which a row counts: four deviations off
-NUM_ROUNDS = 5  # of reweighting; the change of later ones is below 0.01 deg
-DOUBTFUL_LOSS = 0.25  # from which a point is tried again; about 0.12 without outliers
-NUM_PAIRS = 24  # of rows that a doubtful point is started from again
-MIN_ROWS_TO_DOUBT = 7  # that count; of fewer, some agree by chance
-MIN_PAIR_SINE = 0.05  # of the angle between the two rows
-# Spread of the rows over the variance of their noise. Where all planes of incidence are one (camera
-# centres and normal in one plane, as on a linear rail) the noise alone spreads them, and their mean
-# variance exceeds this many times the expected one at fewer than 1 in 1000 of three rows (derived:
-# chi-squared of 3, over 3, is 5.4 there).
-MIN_SPREAD = 6.0
+
+@dataclass(frozen=True, kw_only=True)
+class EstimatorTolerances:
+    """What the robust estimator takes for a good row, and when rows determine a normal.
+
+    Attributes
+    ----------
+    min_sin_zenith : a row of a nearly frontal surface says little: its weight is capped here.
+        Guess.
+    counted_weight : robust weight over which a row counts. Derived: four deviations off.
+    num_rounds : of reweighting. Measured (tests): the change of later ones is below 0.01 deg.
+    doubtful_loss : from which a point is tried again; about 0.12 without outliers. Guess.
+    num_pairs : of rows that a doubtful point is started from again. Derived: with three of ten
+        rows wrong one pair of 24 is right but once in 3,000,000.
+    min_rows_to_doubt : that count; of fewer, some agree by chance. Guess.
+    min_pair_sine : of the angle between the two rows. Guess.
+    min_spread : of the rows, over the variance of their noise. Where all planes of incidence are
+        one (camera centres and normal in one plane, as on a linear rail) the noise alone spreads
+        them. Derived: their mean variance is more than this many times the expected one for fewer
+        than 1 in 1000 of three rows (chi-squared of 3, over 3, is 5.4 there).
+    min_rows : of a normal. Derived.
+    min_conditioning : ratio of singular values under which rows count as one. Guess.
+    """
+
+    min_sin_zenith: float = 0.1
+    counted_weight: float = 0.25
+    num_rounds: int = 5
+    doubtful_loss: float = 0.25
+    num_pairs: int = 24
+    min_rows_to_doubt: int = 7
+    min_pair_sine: float = 0.05
+    min_spread: float = 6.0
+    min_rows: int = 2
+    min_conditioning: float = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,15 +134,14 @@ def solve_normals(
     *,
     robust: bool = True,
     initial_normals: Floats | None = None,
-    min_rows: int = 2,
-    min_conditioning: float = 0.02,
+    tolerances: EstimatorTolerances = EstimatorTolerances(),
 ) -> NormalEstimate:
     """Normals of N points from K rows each.
 
     The paper's estimator (``robust=False``): the eigenvector of the smallest eigenvalue of
     ``M^T M`` over the usable rows, all alike. The robust one: rows weighted by the inverse
     variance of their residual, ``(sin(theta) sigma)^2`` with theta the angle between normal and
-    ray, and by a Cauchy loss; both re-estimated in ``NUM_ROUNDS`` rounds. A view from behind the
+    ray, and by a Cauchy loss; both re-estimated in ``num_rounds`` rounds. A view from behind the
     surface cannot see it: its row is left out. A point whose rows disagree is started again from
     pairs of its rows: of ten rows, three may be wrong.
 
@@ -133,7 +154,7 @@ def solve_normals(
     robust : weighted robust estimator, or the paper's.
     initial_normals : (3, N), where known (else NaN): a start that tells which views face the
         point before its first solution.
-    min_rows, min_conditioning : under these a point has no normal (NaN, not valid).
+    tolerances : of this step.
     """
     if rows.ndim != 3 or rows.shape[0] != 3 or rows.shape != rays.shape:
         raise ValueError(f"{rows.shape=}, {rays.shape=} but expected two (3, K, N).")
@@ -149,19 +170,19 @@ def solve_normals(
         weights = weights * ~(cosine > 0)  # NaN: unknown, kept
     normals = _smallest(rows, weights)[1]
     if robust:
-        problem = _Problem(rows, rays, precision, weights)
+        problem = _Problem(rows, rays, precision, weights, tolerances)
         normals = problem.iterate(normals)
         normals = problem.try_again(normals)
         weights, outlier_weights = problem.weights(normals, CAUCHY_SCALE)
         facing = outlier_weights > 0
-    estimate = _describe(rows, rays, weights, outlier_weights, min_rows, min_conditioning)
-    kept = precision * (outlier_weights > COUNTED_WEIGHT)
-    determined = _spread(rows, kept, alike=not robust) > MIN_SPREAD
+    estimate = _describe(rows, rays, weights, outlier_weights, tolerances)
+    kept = precision * (outlier_weights > tolerances.counted_weight)
+    determined = _spread(rows, kept, alike=not robust) > tolerances.min_spread
     determined &= (estimate.num_rows > 2) | (facing.sum(axis=0) <= 2)
     estimate = _only(estimate, determined)
     if robust:
         return estimate
-    sigma = _algebraic_sigma(rows, rays, precision, estimate.normals.T)
+    sigma = _algebraic_sigma(rows, rays, precision, estimate.normals.T, tolerances.min_sin_zenith)
     return replace(estimate, sigma_deg=np.degrees(sigma, dtype=np.float64))
 
 
@@ -176,10 +197,11 @@ class _Problem:
     rays: Floats
     precision: Floats
     votes: Floats
+    tolerances: EstimatorTolerances
 
     def iterate(self, normals: Array, first_round: int = 0) -> Array:
-        """Reweight and solve again, in ``NUM_ROUNDS`` rounds."""
-        for scale in islice(annealed_scales(NUM_ROUNDS), first_round, None):
+        """Reweight and solve again, in ``num_rounds`` rounds."""
+        for scale in islice(annealed_scales(self.tolerances.num_rounds), first_round, None):
             normals = _smallest(self.rows, self.weights(normals, scale)[0])[1]
         return normals
 
@@ -202,12 +224,17 @@ class _Problem:
     def try_again(self, normals: Array) -> Array:
         """Start points that are badly explained again from pairs of rows; the better one stays."""
         losses = self.losses(normals)
-        enough = (self.precision > 0).sum(axis=0) >= MIN_ROWS_TO_DOUBT
-        where = np.flatnonzero((losses > DOUBTFUL_LOSS) & enough)
+        enough = (self.precision > 0).sum(axis=0) >= self.tolerances.min_rows_to_doubt
+        where = np.flatnonzero((losses > self.tolerances.doubtful_loss) & enough)
         if len(where) == 0:
             return normals
-        parts = (self.rows, self.rays, self.precision, self.votes)
-        some = _Problem(*(part[..., where] for part in parts))
+        some = _Problem(
+            self.rows[..., where],
+            self.rays[..., where],
+            self.precision[..., where],
+            self.votes[..., where],
+            self.tolerances,
+        )
         again = some.iterate(some._best_pair(normals[:, where]), first_round=2)
         better = some.losses(again) < losses[where]
         improved = normals.copy()
@@ -222,15 +249,17 @@ class _Problem:
         order = np.argsort(self.precision <= 0, axis=0, kind="stable")
         count = (self.precision > 0).sum(axis=0)
         points = np.arange(len(count))
-        for _ in range(NUM_PAIRS):
+        for _ in range(self.tolerances.num_pairs):
             first, step = rng.random((2, len(count)))
             i = np.floor(first * count).astype(np.int64)
             j = (i + 1 + np.floor(step * (count - 1)).astype(np.int64)) % count
             a, b = (self.rows[:, order[k, points], points] for k in (i, j))
             candidate = np.cross(a, b, axis=0).astype(np.float64)
             length = np.linalg.norm(candidate, axis=0)
-            candidate /= np.maximum(length, MIN_PAIR_SINE)
-            losses = np.where(length > MIN_PAIR_SINE, self.losses(candidate), np.inf)
+            candidate /= np.maximum(length, self.tolerances.min_pair_sine)
+            losses = np.where(
+                length > self.tolerances.min_pair_sine, self.losses(candidate), np.inf
+            )
             better = losses < least
             best[:, better], least[better] = candidate[:, better], losses[better]
         return best
@@ -240,7 +269,7 @@ class _Problem:
         cosine = _dot(self.rays, normals)
         facing = np.sign((cosine * self.votes).sum(axis=0))
         visible = (self.precision > 0) & (cosine * facing > MIN_FACING_COSINE)
-        sin2 = np.maximum(1 - cosine**2, MIN_SIN_ZENITH**2)
+        sin2 = np.maximum(1 - cosine**2, self.tolerances.min_sin_zenith**2)
         return _dot(self.rows, normals) ** 2 * self.precision / sin2, sin2, visible
 
 
@@ -263,12 +292,11 @@ def _describe(
     rays: Floats,
     weights: Floats,
     outlier_weights: Floats,
-    min_rows: int,
-    min_conditioning: float,
+    tolerances: EstimatorTolerances,
 ) -> NormalEstimate:
     """Final solution with its sign, conditioning, covariance and validity."""
     eigenvalues, normals = _smallest(rows, weights)
-    num_rows = (outlier_weights > COUNTED_WEIGHT).sum(axis=0)
+    num_rows = (outlier_weights > tolerances.counted_weight).sum(axis=0)
     total = weights.sum(axis=0, dtype=np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         conditioning = np.sqrt(np.maximum(eigenvalues[1], 0) / eigenvalues[2])
@@ -277,7 +305,11 @@ def _describe(
         sigma_deg = np.degrees(1 / np.sqrt(eigenvalues[1]))
     facing = (_dot(rays, normals) * weights).sum(axis=0)
     normals = np.where(facing > 0, -normals, normals)
-    valid = (num_rows >= min_rows) & (conditioning >= min_conditioning) & (total > 0)
+    valid = (
+        (num_rows >= tolerances.min_rows)
+        & (conditioning >= tolerances.min_conditioning)
+        & (total > 0)
+    )
     return NormalEstimate(
         normals=np.where(valid, normals, np.nan).T,
         valid=valid,
@@ -315,7 +347,9 @@ def _only(estimate: NormalEstimate, kept: NDArray[np.bool_]) -> NormalEstimate:
     )
 
 
-def _algebraic_sigma(rows: Floats, rays: Floats, precision: Floats, normals: Array) -> Array:
+def _algebraic_sigma(
+    rows: Floats, rays: Floats, precision: Floats, normals: Array, min_sin_zenith: float
+) -> Array:
     """Deviation (N,) of a solution with all weights alike along its larger axis, rad.
 
     The covariance on the tangent plane is ``A^-1 B A^-1`` with ``A = M^T M`` and B the same with
@@ -325,7 +359,7 @@ def _algebraic_sigma(rows: Floats, rays: Floats, precision: Floats, normals: Arr
     first = np.cross(normals, least, axis=0)
     first /= np.linalg.norm(first, axis=0)
     a, b = _dot(rows, first), _dot(rows, np.cross(normals, first, axis=0))
-    sin2 = np.maximum(1 - _dot(rays, normals) ** 2, MIN_SIN_ZENITH**2)
+    sin2 = np.maximum(1 - _dot(rays, normals) ** 2, min_sin_zenith**2)
     variance = np.divide(sin2, precision, out=np.zeros_like(sin2), where=precision > 0)
     products = (a * a, a * b, b * b)
     aa, ab, bb = (p.sum(axis=0, dtype=np.float64) for p in products)

@@ -208,7 +208,8 @@ def specular_votes(
     costs, compared = _row_costs(specular, diffuse, t.max_row_cost)
     votes = ((costs[1] - costs[0]) * compared).sum(axis=0)
     enough = np.maximum(specular.num_rows, diffuse.num_rows) >= t.min_rows
-    return np.asarray(votes, np.float64), specular.valid & diffuse.valid & enough
+    # Under the wrong kind of light the rows often leave no normal at all.
+    return np.asarray(votes, np.float64), (specular.valid | diffuse.valid) & enough
 
 
 def _dolp_votes(maps: Sequence[PhaseMap], t: LightTolerances) -> float:

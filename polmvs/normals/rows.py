@@ -17,6 +17,10 @@ from polmvs.scene import View
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 
+# Relative distance by which a point lies behind the surface that a view sees, to be hidden by it. A
+# guess: several times the error of a first range map, less than the depth of things that hide.
+OCCLUSION_TOLERANCE = 0.02
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -39,7 +43,7 @@ def gather_rows(
     maps: Sequence[PhaseMap],
     range_maps: Sequence[Image | None] | None = None,
     *,
-    range_tolerance: float = 0.02,
+    range_tolerance: float = OCCLUSION_TOLERANCE,
     tilt_aware: bool = True,
 ) -> Rows:
     """Rows of points from all views that see them (paper, eq. coeff_2, before stacking).

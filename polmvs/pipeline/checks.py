@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from polmvs.colmap.dense_workspace import open_dense_workspace, require_same_frame
-from polmvs.colmap.sfm import check_intrinsics
+from polmvs.colmap.sfm import check_camera, check_intrinsics
 from polmvs.config import Options, ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.ground_truth import open_ground_truth
@@ -25,6 +25,8 @@ def inputs_of(options: Options) -> list[Path]:
     """Files and folders that are read beside the capture."""
     paths = (
         options.sfm.sparse,
+        options.sfm.camera,
+        options.capture.calibration,
         options.reference.reference,
         options.region.mask,
         options.fusion.workspace,
@@ -122,4 +124,6 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
         return model
     if options.sfm.intrinsics is not None:
         check_intrinsics(options.sfm.intrinsics, capture.width, capture.height)
+    if options.sfm.camera is not None:
+        check_camera(options.sfm.camera, capture.width, capture.height)
     return None

@@ -62,6 +62,7 @@ WHITE_PERCENTILE = 99.5
 WHITE_IMAGES = 32  # images that the white level is taken from, evenly spread over the capture
 WHITE_SAMPLES = 20_000  # cells of each
 CHECKED_IMAGES = 3  # that are looked at for lossy compression and the pattern, evenly spread
+MOST_PIXELS, MAX_DOLP = 0.9, 1.5  # a map of which a tenth exceeds this holds something else
 CLEARLY_WRONG = 0.5  # disagreement of the best pairing over that of the pattern: refused below
 # A camera that records 16 bits hardly needs 1/65536 to tell its levels apart; floats say nothing.
 FLOAT_QUANTUM = 2.0**-16
@@ -640,6 +641,7 @@ def _share(view: ViewFiles, role: int, values: NDArray[Any]) -> Image:
     scale = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
     plane = values if values.ndim == 2 else values.mean(axis=-1)
     share = np.asarray(plane / scale, np.float32)
-    if role == 2 and np.nanmax(share, initial=0.0) > 1.5:
+    # Noise in dark pixels exceeds 1 without bound.
+    if role == 2 and np.nanquantile(share, MOST_PIXELS) > MAX_DOLP:
         raise DataError(view.files[role][0], "has a degree of polarization far above 1.")
     return share

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,17 +12,59 @@ Image = NDArray[np.float32]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-SMOOTHING_PX = (
-    2.0  # texture's false polarisation (the four samples see different points) averages out
-)
-LOW_TEXTURE = 0.03  # relative intensity gradient per px under which a surface shows no texture
-SIMILAR_INTENSITY = 1.6  # factor within which unpolarised pixels may belong to a polarised region
-MIN_AREA_PX = 200  # of a region
-MIN_CORE_SHARE = 0.03  # of a region: less means that it has run into the background
-GROWTH_PX = 15.0  # reach of a round of growth is about three times this
-MAX_GROWTH_ROUNDS = 6
-MARK_AREA_PX = 1500  # holes of up to this area are filled whatever they show (printed marks)
-MIN_PHASE_JUMP = 0.12  # change of (cos 2 phase, sin 2 phase) per px that counts as a crease
+
+@dataclass(frozen=True, kw_only=True)
+class RegionTolerances:
+    """What belongs to the polarised region of a view.
+
+    Lengths that are those of things in the scene hold for images of ``reference_area_px`` pixels;
+    :meth:`at` scales them.
+
+    Attributes
+    ----------
+    smoothing_px : over which texture's false polarisation (the four samples see different
+        points) averages out. Derived: twice a cell.
+    low_texture : relative intensity gradient per px under which a surface shows no texture.
+        Guess.
+    similar_intensity : factor within which unpolarised pixels may belong to a polarised
+        region. Guess.
+    min_area_px : of a region, single pixels whatever the resolution. Guess.
+    min_core_share : of a region: less means that it has run into the background. Guess.
+    growth_px : reach of a round of growth is about three times this. Guess.
+    max_growth_rounds : Guess.
+    mark_area_px : holes of up to this area are filled whatever they show (printed marks).
+        Guess.
+    mark_reach_px : marks are told from the mean intensity of the surface about them; deviation of
+        the window. Guess.
+    min_phase_jump : change of (cos 2 phase, sin 2 phase) per px that counts as a crease; the
+        smoothing makes it a matter of pixels. Guess.
+    reference_area_px : of the images that these were chosen on.
+    """
+
+    smoothing_px: float = 2.0
+    low_texture: float = 0.03
+    similar_intensity: float = 1.6
+    min_area_px: int = 200
+    min_core_share: float = 0.03
+    growth_px: float = 15.0
+    max_growth_rounds: int = 6
+    mark_area_px: float = 1500.0
+    mark_reach_px: float = 8.0
+    min_phase_jump: float = 0.12
+    reference_area_px: float = 612.0 * 512.0
+
+    def at(self, shape: tuple[int, ...]) -> RegionTolerances:
+        """The same for a larger image, ``shape`` (H, W), of the same scene.
+
+        For a smaller one they stay: fewer pixels would not tell a surface from what is beside it.
+        """
+        scale = max(np.sqrt(shape[0] * shape[1] / self.reference_area_px), 1.0)
+        return replace(
+            self,
+            growth_px=float(scale * self.growth_px),
+            mark_area_px=float(scale**2 * self.mark_area_px),
+            mark_reach_px=float(scale * self.mark_reach_px),
+        )
 
 
 @dataclass(frozen=True)
@@ -55,6 +97,7 @@ def find_region(
     *,
     min_dolp: float,
     mask: Mask | None = None,
+    tolerances: RegionTolerances = RegionTolerances(),
 ) -> Region:
     """Find the polarised, textureless region of a view.
 
@@ -68,17 +111,19 @@ def find_region(
     valid : (H, W) bool, neither clipped nor dark.
     min_dolp : smoothed DoLP from which a pixel belongs to the core.
     mask : (H, W) bool, the user's region; it replaces the search, edges are still found.
+    tolerances : of this step.
     """
-    intensity = np.maximum(smooth(s0, SMOOTHING_PX), 1e-6)
-    axial = smooth(np.dstack([s1, s2]), SMOOTHING_PX)
+    tolerances = tolerances.at(s0.shape)
+    intensity = np.maximum(smooth(s0, tolerances.smoothing_px), 1e-6)
+    axial = smooth(np.dstack([s1, s2]), tolerances.smoothing_px)
     dolp = np.hypot(axial[..., 0], axial[..., 1]) / intensity
     texture = _relative_gradient(s0)
     core = (dolp > min_dolp) & valid
     core = _open(core, 3)
-    inside = mask if mask is not None else _grow(core, intensity, texture)
-    marks = _marks(s0, inside & core)
+    inside = mask if mask is not None else _grow(core, intensity, texture, tolerances=tolerances)
+    marks = _marks(s0, inside & core, tolerances.mark_reach_px)
     reliable = inside & valid & ~marks & (dolp > 0.3 * min_dolp)
-    edges = inside & _phase_jumps(axial, dolp, min_dolp)
+    edges = inside & _phase_jumps(axial, dolp, min_dolp, tolerances=tolerances)
     return Region(inside, reliable, edges)
 
 
@@ -99,31 +144,40 @@ def _relative_gradient(s0: Image) -> Image:
     return np.asarray(np.hypot(dx, dy) / np.maximum(smooth(s0, 3.0), 1e-6), np.float32)
 
 
-def _grow(core: Mask, intensity: Image, texture: Image) -> Mask:
+def _grow(core: Mask, intensity: Image, texture: Image, *, tolerances: RegionTolerances) -> Mask:
     """Core plus textureless neighbours of like intensity, holes filled, small regions dropped.
 
     The intensity that a neighbour must resemble is that of the region next to it, and follows
     shading as the region grows. Where growth would swallow much more than the core (an open,
     textureless background) the core stays as it is.
     """
-    flat = texture < LOW_TEXTURE
+    flat = texture < tolerances.low_texture
     grown = core
-    for _ in range(MAX_GROWTH_ROUNDS):
-        weight = smooth(grown.astype(np.float32), GROWTH_PX)
-        reference = smooth(np.where(grown, intensity, 0), GROWTH_PX) / np.maximum(weight, 1e-6)
+    for _ in range(tolerances.max_growth_rounds):
+        weight = smooth(grown.astype(np.float32), tolerances.growth_px)
+        reference = smooth(np.where(grown, intensity, 0), tolerances.growth_px) / np.maximum(
+            weight, 1e-6
+        )
         similar = (
             flat
-            & (intensity < SIMILAR_INTENSITY * reference)
-            & (intensity * SIMILAR_INTENSITY > reference)
+            & (intensity < tolerances.similar_intensity * reference)
+            & (intensity * tolerances.similar_intensity > reference)
             & (weight > 1e-3)
         )
         before = int(grown.sum())
         grown = _touching(_open(grown | similar, 5), core)
         if grown.sum() < 1.02 * before:
             break
-    grown = _substantial(_fill_holes(grown, texture), core, MIN_CORE_SHARE)
-    alone = _substantial(_fill_holes(core, texture) & ~grown, core, 0.0)
-    return _fill_holes(grown | alone, texture)
+    grown = _substantial(
+        _fill_holes(grown, texture, tolerances=tolerances),
+        core,
+        tolerances.min_core_share,
+        tolerances=tolerances,
+    )
+    alone = _substantial(
+        _fill_holes(core, texture, tolerances=tolerances) & ~grown, core, 0.0, tolerances=tolerances
+    )
+    return _fill_holes(grown | alone, texture, tolerances=tolerances)
 
 
 def _touching(mask: Mask, core: Mask) -> Mask:
@@ -135,17 +189,19 @@ def _touching(mask: Mask, core: Mask) -> Mask:
     return np.asarray(held[labels])
 
 
-def _substantial(mask: Mask, core: Mask, min_core_share: float) -> Mask:
+def _substantial(
+    mask: Mask, core: Mask, min_core_share: float, *, tolerances: RegionTolerances
+) -> Mask:
     """Connected parts with enough of the core, in px and as a share of the part."""
     num, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     core_area = np.bincount(labels[core & mask], minlength=num)
     area = stats[:, cv2.CC_STAT_AREA]
-    keep = (core_area >= MIN_AREA_PX) & (core_area >= min_core_share * area)
+    keep = (core_area >= tolerances.min_area_px) & (core_area >= min_core_share * area)
     keep[0] = False
     return np.asarray(keep[labels])
 
 
-def _fill_holes(mask: Mask, texture: Image) -> Mask:
+def _fill_holes(mask: Mask, texture: Image, *, tolerances: RegionTolerances) -> Mask:
     """Fill holes that are small or show no texture."""
     num, labels, stats, _ = cv2.connectedComponentsWithStats(
         (~mask).astype(np.uint8), connectivity=4
@@ -159,27 +215,29 @@ def _fill_holes(mask: Mask, texture: Image) -> Mask:
         & (top + stats[:, cv2.CC_STAT_HEIGHT] < height)
     )
     area = np.maximum(stats[:, cv2.CC_STAT_AREA], 1)
-    flat = np.bincount(labels.ravel(), (texture < LOW_TEXTURE).ravel(), minlength=num)
-    fill = closed & ((area <= MARK_AREA_PX) | (flat > 0.7 * area))
+    flat = np.bincount(labels.ravel(), (texture < tolerances.low_texture).ravel(), minlength=num)
+    fill = closed & ((area <= tolerances.mark_area_px) | (flat > 0.7 * area))
     fill[0] = False
     return np.asarray(mask | fill[labels])
 
 
-def _marks(s0: Image, polarised: Mask) -> Mask:
+def _marks(s0: Image, polarised: Mask, reach_px: float) -> Mask:
     """Pixels much brighter or darker than the polarised surface about them, with a margin."""
-    weight = smooth(polarised.astype(np.float32), 8.0)
-    reference = smooth(np.where(polarised, s0, 0).astype(np.float32), 8.0) / np.maximum(
+    weight = smooth(polarised.astype(np.float32), reach_px)
+    reference = smooth(np.where(polarised, s0, 0).astype(np.float32), reach_px) / np.maximum(
         weight, 1e-6
     )
     deviation = smooth(s0, 0.8) / np.maximum(reference, 1e-6)
     return _dilate((weight > 0.02) & ((deviation > 1.5) | (deviation < 0.5)), 3)
 
 
-def _phase_jumps(axial: Floats, dolp: Floats, min_dolp: float) -> Mask:
+def _phase_jumps(
+    axial: Floats, dolp: Floats, min_dolp: float, *, tolerances: RegionTolerances
+) -> Mask:
     """Where the phase changes abruptly between two polarised sides."""
     unit = axial / np.maximum(np.linalg.norm(axial, axis=-1, keepdims=True), 1e-9)
     dx = cv2.Sobel(unit, cv2.CV_32F, 1, 0, scale=1 / 8)
     dy = cv2.Sobel(unit, cv2.CV_32F, 0, 1, scale=1 / 8)
     jump = np.sqrt((dx**2 + dy**2).sum(axis=-1))
     near_polarised = _dilate(dolp > min_dolp, 5)
-    return np.asarray((jump > MIN_PHASE_JUMP) & near_polarised & (dolp > 0.5 * min_dolp))
+    return np.asarray((jump > tolerances.min_phase_jump) & near_polarised & (dolp > 0.5 * min_dolp))

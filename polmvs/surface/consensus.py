@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import depth_buffer, in_image, sample_image
+from polmvs.normals.rows import OCCLUSION_TOLERANCE
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView, SurfaceSamples, extend_planes, view_samples
@@ -16,8 +17,6 @@ from polmvs.surface.dense_view import DenseView, SurfaceSamples, extend_planes, 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
-
-HIDING_DISTANCE = 0.02  # relative, as in gathering rows
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ def hidden_by(dense: DenseView, view: View, points: Floats, normals: Floats) -> 
     with np.errstate(invalid="ignore"):
         shown = view.faces(points, normals) & ((xy >= 0) & (xy < [width, height])).all(axis=-1)
     nearest, _ = depth_buffer(xy[shown], view.ranges(points[shown]), width, height)
-    return np.asarray(dense.range_map > (1 + HIDING_DISTANCE) * nearest)
+    return np.asarray(dense.range_map > (1 + OCCLUSION_TOLERANCE) * nearest)
 
 
 def _shows_background(phase_map: PhaseMap, xy: Floats) -> Mask:

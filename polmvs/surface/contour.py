@@ -39,14 +39,29 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 
-NUM_NEIGHBORS = 6  # that a node is joined to
-MIN_CONTOUR_DOLP = 0.05  # smoothed; contours stop under it
-MAX_STACKED_VIEWS = 8  # whose contours are traced together
 
 Mask = NDArray[np.bool_]
 
-MIN_COHERENCE = 0.7  # of neighbouring directions; a contour stops in an incoherent field
-MEETING_PX = 2.0  # the two halves of a closed curve end this close to each other
+
+@dataclass(frozen=True, kw_only=True)
+class ContourTolerances:
+    """Where contours may run, and what they are joined to.
+
+    Attributes
+    ----------
+    num_neighbors : that a node is joined to. Guess.
+    min_dolp : smoothed; contours stop under it. Guess.
+    max_stacked_views : whose contours are traced together; memory and time only.
+    min_coherence : of neighbouring directions: a contour stops in an incoherent field.
+        Derived: cosine of half a right angle.
+    meeting_px : the two halves of a closed curve end this close to each other. Guess.
+    """
+
+    num_neighbors: int = 6
+    min_dolp: float = 0.05
+    max_stacked_views: int = 8
+    min_coherence: float = 0.7
+    meeting_px: float = 2.0
 
 
 def propagate(
@@ -59,6 +74,7 @@ def propagate(
     tilt_aware: bool = True,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
+    tolerances: ContourTolerances = ContourTolerances(),
 ) -> list[DenseView | None]:
     """Range and normal over the polarised region of every view.
 
@@ -71,6 +87,7 @@ def propagate(
     tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done, ``(num_rounds + 1)`` times per view.
+    tolerances : of this step.
 
     Returns
     -------
@@ -80,7 +97,10 @@ def propagate(
     report = on_progress or (lambda count: None)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
     nodes: list[Nodes | None] = []
-    for started in workers.map(partial(_start, angle_model, seeds, options), _chunks(maps)):
+    for started in workers.map(
+        partial(_start, angle_model, seeds, options, tolerances=tolerances),
+        _chunks(maps, tolerances=tolerances),
+    ):
         nodes += started
         report(len(started))
     folder.mkdir(parents=True, exist_ok=True)
@@ -104,14 +124,19 @@ def propagate(
     return dense
 
 
-def _chunks(maps: Sequence[PhaseMap]) -> list[Sequence[PhaseMap]]:
+def _chunks(maps: Sequence[PhaseMap], *, tolerances: ContourTolerances) -> list[Sequence[PhaseMap]]:
     """Split the views; not by the number of workers, which must not change the result."""
-    size = max(min(MAX_STACKED_VIEWS, -(-len(maps) // 2)), 1)
+    size = max(min(tolerances.max_stacked_views, -(-len(maps) // 2)), 1)
     return [maps[i : i + size] for i in range(0, len(maps), size)]
 
 
 def _start(
-    angle_model: AngleModel, seeds: Seeds, options: PropagationOptions, maps: Sequence[PhaseMap]
+    angle_model: AngleModel,
+    seeds: Seeds,
+    options: PropagationOptions,
+    maps: Sequence[PhaseMap],
+    *,
+    tolerances: ContourTolerances,
 ) -> list[Nodes | None]:
     """Trace the contours of some views and give each node a first range from the seeds."""
     path_model = AngleModel.OPA if options.contour is Contour.NORMALS else angle_model
@@ -120,7 +145,7 @@ def _start(
     for phase_map in maps:
         open_pixels = phase_map.region.inside & ~phase_map.region.edges
         dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
-        passable = open_pixels & (dolp > MIN_CONTOUR_DOLP)
+        passable = open_pixels & (dolp > tolerances.min_dolp)
         passable[[0, -1]] = False  # the views lie below each other: keep them apart
         fields.append(
             direction_field(path_model, phase_map.samples, view_rays(phase_map.view), passable)
@@ -135,6 +160,7 @@ def _start(
         np.concatenate(insides),
         spacing_px=options.spacing_px,
         step_px=options.step_px,
+        tolerances=tolerances,
     )
     starts = np.cumsum([0] + [m.view.camera.height for m in maps])
     owner = np.searchsorted(starts, contours.xy[:, 1], side="right") - 1
@@ -143,19 +169,19 @@ def _start(
         mine = owner == k
         xy = (contours.xy[mine] - [0.0, starts[k]]).astype(np.float32)
         part = Contours(xy, contours.curve[mine], contours.arc_px[mine])
-        results.append(_start_view(phase_map, seeds, part, options))
+        results.append(_start_view(phase_map, seeds, part, options, tolerances=tolerances))
     return results
 
 
 def _connect(
-    contours: Contours, phase_map: PhaseMap, spacing_px: float
+    contours: Contours, phase_map: PhaseMap, spacing_px: float, *, tolerances: ContourTolerances
 ) -> tuple[Indices, Indices, NDArray[np.bool_]]:
     """Edges between consecutive nodes of a curve and between neighbouring nodes of all curves."""
     xy = contours.xy
     num = len(xy)
     follows = contours.curve[1:] == contours.curve[:-1]
     along = np.stack([np.flatnonzero(follows), np.flatnonzero(follows) + 1], axis=1)
-    k = min(NUM_NEIGHBORS + 1, num)
+    k = min(tolerances.num_neighbors + 1, num)
     distance, index = cKDTree(xy).query(xy, k=k, distance_upper_bound=2.2 * spacing_px)
     tails = np.repeat(np.arange(num), k)
     heads, near = index.reshape(-1), distance.reshape(-1)
@@ -169,13 +195,20 @@ def _connect(
 
 
 def _start_view(
-    phase_map: PhaseMap, seeds: Seeds, contours: Contours, options: PropagationOptions
+    phase_map: PhaseMap,
+    seeds: Seeds,
+    contours: Contours,
+    options: PropagationOptions,
+    *,
+    tolerances: ContourTolerances,
 ) -> Nodes | None:
     """Network of a view's contours with ranges and normals from the nearest seeds."""
     surface = surface_at_seeds(phase_map, seeds, contours.xy)
     if surface is None:
         return None
-    tail, head, on_contour = _connect(contours, phase_map, options.spacing_px)
+    tail, head, on_contour = _connect(
+        contours, phase_map, options.spacing_px, tolerances=tolerances
+    )
     return Nodes(
         surface=surface,
         ray_z=phase_map.view.camera.rays(contours.xy)[:, 2],
@@ -277,6 +310,7 @@ def trace_contours(
     keep_every: int = 1,
     claims: NDArray[np.int32] | None = None,
     first_curve: int = 0,
+    tolerances: ContourTolerances = ContourTolerances(),
 ) -> Contours:
     """Trace contours both ways from all seeds in lock step (midpoint rule).
 
@@ -293,12 +327,13 @@ def trace_contours(
     claims : cells of the image, each owned by the first curve that entered it (-1: free), over
         the same extent as the field; a curve ends in a cell of another. Updated in place.
     first_curve : index of the first seed's curve.
+    tolerances : of this step.
     """
     seeds = np.asarray(seeds_xy, np.float32).reshape(-1, 2)
     start = sample_image(field, seeds)
     angle = _angle(start)
     forward = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    curve = np.flatnonzero(np.linalg.norm(start, axis=-1) > MIN_COHERENCE)
+    curve = np.flatnonzero(np.linalg.norm(start, axis=-1) > tolerances.min_coherence)
     nodes, owners = [seeds[curve]], [curve]
     arcs = [np.zeros(len(curve), np.float32)]
     # Both halves of a curve side by side, (2, S, 2): a closed curve ends where they meet.
@@ -309,13 +344,15 @@ def trace_contours(
     for index in range(1, int(max_length_px / step_px) + 1):
         if not len(curve):
             break
-        middle_heading, ok = _heading(field, position + 0.5 * step_px * heading, heading)
+        middle_heading, ok = _heading(
+            field, position + 0.5 * step_px * heading, heading, tolerances=tolerances
+        )
         position = np.where(alive[..., None], position + step_px * middle_heading, position)
-        heading, still_ok = _heading(field, position, middle_heading)
+        heading, still_ok = _heading(field, position, middle_heading, tolerances=tolerances)
         alive &= ok & still_ok
-        if index * step_px > 2 * MEETING_PX:
+        if index * step_px > 2 * tolerances.meeting_px:
             gap = ((position[0] - position[1]) ** 2).sum(axis=-1)
-            alive &= (gap > MEETING_PX**2) | ~alive.all(axis=0)
+            alive &= (gap > tolerances.meeting_px**2) | ~alive.all(axis=0)
         if claims is not None and index % check_every == 0:
             alive &= _claim(claims, field.shape, position, curve + first_curve)
         if index % keep_every == 0:
@@ -336,15 +373,17 @@ def _angle(axial: Image) -> NDArray[np.float32]:
     return np.asarray(0.5 * np.arctan2(axial[..., 1], axial[..., 0]), np.float32)
 
 
-def _heading(field: Image, xy: Floats, previous: Floats) -> tuple[Image, Mask]:
+def _heading(
+    field: Image, xy: Floats, previous: Floats, *, tolerances: ContourTolerances
+) -> tuple[Image, Mask]:
     """Unit direction of the field nearest to the previous one, and where the field is coherent."""
     axial = sample_image(field, xy)
     angle = _angle(axial)
     heading = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     dot = (heading * previous).sum(axis=-1)
     heading *= np.where(dot < 0, -1, 1)[..., None].astype(np.float32)
-    coherent = (axial**2).sum(axis=-1) > MIN_COHERENCE**2
-    return heading, coherent & (np.abs(dot) > MIN_COHERENCE)
+    coherent = (axial**2).sum(axis=-1) > tolerances.min_coherence**2
+    return heading, coherent & (np.abs(dot) > tolerances.min_coherence)
 
 
 def _cells(claims: NDArray[np.int32], shape: tuple[int, ...], xy: Floats) -> tuple[Any, Any]:
@@ -373,6 +412,7 @@ def cover_with_contours(
     *,
     spacing_px: float,
     step_px: float = 0.5,
+    tolerances: ContourTolerances = ContourTolerances(),
 ) -> Contours:
     """Contours from the seeds, then sideways of them until the region is covered.
 
@@ -388,6 +428,7 @@ def cover_with_contours(
     inside : (H, W) bool, the region to cover.
     spacing_px : distance between contours, and between the nodes kept of each.
     step_px : step length, px.
+    tolerances : of this step.
     """
     height, width = field.shape[:2]
     keep_every = max(round(spacing_px / step_px), 1)
@@ -398,7 +439,10 @@ def cover_with_contours(
     parts, num_curves = [], 0
     for places in candidates:
         free = claims[_cells(claims, field.shape, places)] < 0
-        free &= np.linalg.norm(sample_image(field, places, nearest=True), axis=-1) > MIN_COHERENCE
+        free &= (
+            np.linalg.norm(sample_image(field, places, nearest=True), axis=-1)
+            > tolerances.min_coherence
+        )
         parts.append(
             trace_contours(
                 field,
@@ -407,6 +451,7 @@ def cover_with_contours(
                 keep_every=keep_every,
                 claims=claims,
                 first_curve=num_curves,
+                tolerances=tolerances,
             )
         )
         num_curves += int(free.sum())

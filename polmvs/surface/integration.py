@@ -57,22 +57,42 @@ Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 REFINEMENTS = (4, 2, 1)  # strides of the coarsest lattice and those that follow, of the last one's
-MAX_GAP_STRIDES = 2.0  # from a point of the coarser lattice to those made of it
 
 Array = NDArray[np.float64]
 
-NUM_STARTING_SEEDS = 5
-MIN_OPINIONS = 2  # one view's error must not return to it as another's agreement
-MIN_OPINION_COSINE = 0.9  # 26 deg between the normals of a node and of the surface another sees
-MAX_OPINION_OUTLIER = 3.0  # deviations from the views' median
-# Errors of another view's map are alike over about this distance: its points within it are worth
-# one.
-OPINION_REACH_PX = 24.0
-# Share of an opinion's deviation that all opinions of a view have in common, as the views share
-# seeds and rows. On a curved part the stated deviations came out half of the errors at 0 and
-# twice the errors at 1.
-COMMON_SHARE = 0.5
-MIN_OWN_WEIGHT = 0.25  # robust weight of a row 4 deviations off
+
+@dataclass(frozen=True, kw_only=True)
+class IntegrationTolerances:
+    """How views are started from seeds and tied to each other.
+
+    Attributes
+    ----------
+    max_gap_strides : from a point of the coarser lattice to those made of it. Derived: its
+        diagonal, with a margin.
+    num_starting_seeds : nearest ones whose median starts a node: a wrong one does not spoil
+        it. Guess.
+    min_agreeing : views that tie a node: the error of a single one must not return to it as
+        another's agreement. Derived.
+    min_agreeing_cosine : between the normals of a node and of the surface another view sees;
+        26 deg. Guess.
+    max_deviations : from the views' median. Derived: 0.3 % of right ones are farther.
+    correlation_px : Errors of another view's map are alike over about this distance: its
+        points within it are worth one. Measured on the shared captures.
+    common_share : of a tie's deviation that all ties of a view have in common, as the views
+        share seeds and rows. Measured on a curved part: the stated deviations came out half of
+        the errors at 0 and twice the errors at 1.
+    min_own_weight : of a view's own row, under which it denies the node; that of a row 4
+        deviations off. Derived.
+    """
+
+    max_gap_strides: float = 2.0
+    num_starting_seeds: int = 5
+    min_agreeing: int = 2
+    min_agreeing_cosine: float = 0.9
+    max_deviations: float = 3.0
+    correlation_px: float = 24.0
+    common_share: float = 0.5
+    min_own_weight: float = 0.25
 
 
 def integrate(
@@ -85,6 +105,7 @@ def integrate(
     tilt_aware: bool = True,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
+    tolerances: IntegrationTolerances = IntegrationTolerances(),
 ) -> list[DenseView | None]:
     """Range and normal over the polarised region of every view.
 
@@ -97,6 +118,7 @@ def integrate(
     tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done, once per view and round.
+    tolerances : of this step.
 
     Returns
     -------
@@ -117,7 +139,9 @@ def integrate(
             for k, near in enumerate(neighbors)
         ]
         dense = []
-        solve = partial(_round, angle_model, seeds, options.bending, tilt_aware)
+        solve = partial(
+            _round, angle_model, seeds, options.bending, tilt_aware, tolerances=tolerances
+        )
         for result in workers.map(solve, tasks):
             dense.append(result)
             if on_progress is not None:
@@ -155,12 +179,18 @@ class _Task:
 
 
 def _round(
-    angle_model: AngleModel, seeds: Seeds, bending: float, tilt_aware: bool, task: _Task
+    angle_model: AngleModel,
+    seeds: Seeds,
+    bending: float,
+    tilt_aware: bool,
+    task: _Task,
+    *,
+    tolerances: IntegrationTolerances,
 ) -> DenseView | None:
     """One view's result on its lattice."""
     stride_px = task.plan.stride_px
     wanted = open_lattice(task.maps[0], stride_px)
-    surface = _start(task, seeds, wanted)
+    surface = _start(task, seeds, wanted, tolerances=tolerances)
     if surface is None:
         return None
     nodes = relax(
@@ -172,21 +202,26 @@ def _round(
         bending=bending,
         tilt_aware=tilt_aware,
         use_consensus=task.plan.use_consensus,
+        tolerances=tolerances,
     )
     dense = dense_view(nodes.surface, wanted, stride_px)
     return store_dense_view(dense, task.path) if dense.known.any() else None
 
 
-def _start(task: _Task, seeds: Seeds, wanted: Mask) -> SurfaceSamples | None:
+def _start(
+    task: _Task, seeds: Seeds, wanted: Mask, *, tolerances: IntegrationTolerances
+) -> SurfaceSamples | None:
     """The lattice's surface: of the view's last result; else of the seeds, or of the others."""
     phase_map, before = task.maps[0], task.dense[0]
     xy = lattice_points(wanted, task.plan.stride_px)
     if before is None:
-        surface = surface_at_seeds(phase_map, seeds, xy)
-        return surface or surface_of_others(task.maps, task.dense, xy, MAX_GAP_STRIDES)
+        surface = surface_at_seeds(phase_map, seeds, xy, tolerances=tolerances)
+        return surface or surface_of_others(task.maps, task.dense, xy, tolerances.max_gap_strides)
     camera, rotation = phase_map.view.camera, phase_map.view.cam_from_world.rotation
     coarse = view_samples(before, camera.rays(before.lattice_xy()) @ rotation)
-    return extend_planes(coarse, xy, camera.rays(xy) @ rotation, MAX_GAP_STRIDES * before.stride_px)
+    return extend_planes(
+        coarse, xy, camera.rays(xy) @ rotation, tolerances.max_gap_strides * before.stride_px
+    )
 
 
 def _lattice_nodes(
@@ -206,7 +241,13 @@ def _lattice_nodes(
     )
 
 
-def surface_at_seeds(phase_map: PhaseMap, seeds: Seeds, xy: Floats) -> SurfaceSamples | None:
+def surface_at_seeds(
+    phase_map: PhaseMap,
+    seeds: Seeds,
+    xy: Floats,
+    *,
+    tolerances: IntegrationTolerances = IntegrationTolerances(),
+) -> SurfaceSamples | None:
     """A first guess of the surface at some pixels: range and normal of the nearest seeds.
 
     None where the view sees no seed.
@@ -216,7 +257,7 @@ def surface_at_seeds(phase_map: PhaseMap, seeds: Seeds, xy: Floats) -> SurfaceSa
         return None
     view = phase_map.view
     distance = np.linalg.norm(seeds.points_in_world[visible] - view.center_in_world, axis=-1)
-    k = min(NUM_STARTING_SEEDS, len(distance))
+    k = min(tolerances.num_starting_seeds, len(distance))
     nearest = cKDTree(seed_xy[visible]).query(xy, k=k)[1].reshape(len(xy), k)
     unknown = np.full(len(xy), np.nan)
     return SurfaceSamples(
@@ -242,6 +283,7 @@ def relax(
     tilt_aware: bool = True,
     along_contours: bool = False,
     use_consensus: bool = False,
+    tolerances: IntegrationTolerances = IntegrationTolerances(),
 ) -> Nodes:
     """Solve the normals at a view's nodes from all views, then the ranges of the nodes.
 
@@ -256,6 +298,7 @@ def relax(
     tilt_aware : of the rows' weights.
     along_contours : ranges (OPA: depths) are constant along the nodes' contours.
     use_consensus : the surfaces that the other views see tie the nodes, too.
+    tolerances : of this step.
     """
     center = maps[0].view.center_in_world
     surface = nodes.surface
@@ -271,12 +314,12 @@ def relax(
         surface,
         normals=normals,
         normal_sigma=normal_sigma,
-        confidence=_agreement(rows.sigma, rows.rays, estimate),
+        confidence=_agreement(rows.sigma, rows.rays, estimate, tolerances=tolerances),
     )
     nodes = replace(nodes, surface=surface)
     ties, num_known = tie_seeds(maps[0], nodes, seeds), len(seeds.sigma)
     if use_consensus:
-        ties = _joined(ties, tie_to_consensus(maps, dense, nodes), num_known)
+        ties = _joined(ties, tie_to_consensus(maps, dense, nodes, tolerances=tolerances), num_known)
         num_known += len(normals)
     solution = solve_log_ranges(
         len(normals),
@@ -290,7 +333,9 @@ def relax(
     return replace(nodes, surface=surface)
 
 
-def _agreement(sigma: Floats, rays: Floats, estimate: NormalEstimate) -> Array:
+def _agreement(
+    sigma: Floats, rays: Floats, estimate: NormalEstimate, *, tolerances: IntegrationTolerances
+) -> Array:
     """Share (N,) of the rows that face a node which its normal explains.
 
     0 where the view's own row, the first, is an outlier: it sees another surface there, such as
@@ -299,12 +344,16 @@ def _agreement(sigma: Floats, rays: Floats, estimate: NormalEstimate) -> Array:
     cosine = np.einsum("ikn,ni->kn", rays, np.nan_to_num(estimate.normals))
     facing = np.isfinite(sigma) & (cosine < 0)
     agree = facing & (estimate.row_weights > 0.5)
-    denied = facing[0] & (estimate.row_weights[0] < MIN_OWN_WEIGHT)
+    denied = facing[0] & (estimate.row_weights[0] < tolerances.min_own_weight)
     return np.where(denied, 0, agree.sum(axis=0) / np.maximum(facing.sum(axis=0), 1))
 
 
 def tie_to_consensus(
-    maps: Sequence[PhaseMap], dense: Sequence[DenseView | None], nodes: Nodes
+    maps: Sequence[PhaseMap],
+    dense: Sequence[DenseView | None],
+    nodes: Nodes,
+    *,
+    tolerances: IntegrationTolerances = IntegrationTolerances(),
 ) -> SeedTies:
     """Tie the nodes of the first view to the surface on which the other views agree.
 
@@ -318,7 +367,7 @@ def tie_to_consensus(
             continue
         seen = sight(phase_map, other, center, surface.rays_in_world, distance, surface.normals)
         with np.errstate(invalid="ignore"):
-            counts = (seen.cosine > MIN_OPINION_COSINE) & (seen.place > 0)
+            counts = (seen.cosine > tolerances.min_agreeing_cosine) & (seen.place > 0)
         said.append(np.where(counts, seen.place, np.nan))
         deviations.append(np.where(counts, seen.sigma, np.nan))
     if not said:
@@ -326,20 +375,24 @@ def tie_to_consensus(
         return SeedTies(
             node=none, seed=none, value=np.zeros(0), sigma=np.zeros(0), common=np.zeros(0)
         )
-    place, sigma, count = _consensus(np.array(said), np.array(deviations))
-    node = np.flatnonzero((count >= MIN_OPINIONS) & np.isfinite(place) & np.isfinite(sigma))
-    alike = max(OPINION_REACH_PX / nodes.spacing_px, 1.0)
+    place, sigma, count = _consensus(np.array(said), np.array(deviations), tolerances=tolerances)
+    node = np.flatnonzero(
+        (count >= tolerances.min_agreeing) & np.isfinite(place) & np.isfinite(sigma)
+    )
+    alike = max(tolerances.correlation_px / nodes.spacing_px, 1.0)
     relative = sigma[node] / place[node]
     return SeedTies(
         node=node,
         seed=node,
         value=np.log(place[node]),
         sigma=alike * relative,
-        common=COMMON_SHARE * relative,
+        common=tolerances.common_share * relative,
     )
 
 
-def _consensus(places: Array, sigmas: Array) -> tuple[Array, Array, Array]:
+def _consensus(
+    places: Array, sigmas: Array, *, tolerances: IntegrationTolerances
+) -> tuple[Array, Array, Array]:
     """Robust weighted mean (N,) of what K views say (K, N), NaN: nothing.
 
     With it its deviation, which the number of views does not narrow because their errors are not
@@ -352,7 +405,7 @@ def _consensus(places: Array, sigmas: Array) -> tuple[Array, Array, Array]:
     with np.errstate(invalid="ignore", divide="ignore"):
         gap = np.abs(places - median)
         spread = np.sort(gap, axis=0)[np.maximum(count - 1, 0) // 2, columns]
-        near = gap <= MAX_OPINION_OUTLIER * np.maximum(1.5 * spread, sigmas)
+        near = gap <= tolerances.max_deviations * np.maximum(1.5 * spread, sigmas)
         weight = np.where(near, 1 / sigmas**2, 0)
         total = weight.sum(axis=0)
         place = (weight * np.where(near, places, 0)).sum(axis=0) / total

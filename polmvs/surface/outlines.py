@@ -18,7 +18,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from polmvs.camera import sample_image, xy_from_opencv, xy_to_opencv
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.polarization.region import LOW_TEXTURE, Region, smooth
+from polmvs.polarization.region import Region, RegionTolerances, smooth
 from polmvs.scene import View
 from polmvs.surface.dense_view import SurfaceSamples, extend_planes
 from polmvs.surface.pixel_graph import Nodes, lattice_edges, uncrossed
@@ -177,7 +177,9 @@ def _snap(smoothed: Image, mask: Mask, contour: Array) -> Array:
     profile = sample_image(smoothed, contour[:, None] + offsets[:, None] * outward[:, None])
     middles = 0.5 * (offsets[1:] + offsets[:-1])
     step = np.abs(np.diff(profile, axis=1)) * np.exp(-0.5 * (middles / SNAP_PX) ** 2)
-    texture = 0.5 * LOW_TEXTURE * profile.mean(axis=1)  # change from sample to sample
+    texture = (
+        0.5 * RegionTolerances().low_texture * profile.mean(axis=1)
+    )  # change from sample to sample
     peak = middles[step.argmax(axis=1)]
     about = np.where(np.abs(middles - peak[:, None]) <= PEAK_PX, step, 0)
     place = (about * middles).sum(axis=1) / np.maximum(about.sum(axis=1), 1e-12)

@@ -35,33 +35,73 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 REGION_MARGIN_PX = 3  # a keypoint this near a part's outline may owe its place to the outline
-MIN_OBSERVATIONS = 3  # two rays that meet say nothing about whether they belong together
 MAX_PART_SHARE = 1 / 3  # of a point's observations on parts: of three, none; of four, one
 MAX_RELATIVE_SIGMA = 0.005  # of a point's place, as a share of its distance
-MIN_ANGLE_DEG = 5.0  # of triangulation: half a pixel of disparity is 1 % of the distance there
-MAX_ANGLE_DEG = 25.0  # of triangulation: patches of slanted surfaces look too different beyond
-MAX_AXIS_ANGLE_DEG = 45.0  # between the directions in which two views look
-MIN_BASELINE_ANGLE_DEG = 40.0  # between baseline and views: an epipole in the image is no use
-PART_MARGIN_PX = 8  # by which a match may leak over a part's outline: a patch and its neighbours
-MAX_NORMAL_DIFFERENCE_DEG = 30.0  # of two views; planes of ten pixels' disparities are uncertain
-MIN_SHARED_POINTS = 20  # of two views, for their angle to be known and their overlap to be worth it
 
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 
-BLOCK_PX = 5  # side of the patches that are compared
-BORDER_PX = 4  # a patch and the filter before it look this far
-TEXTURE_PX = 2 * BORDER_PX + 1  # side of the window in which texture must show
-MIN_TEXTURE = 2.0  # standard deviation, grey levels; noise of a full well of 10,000 e- makes 0.6
-DISPARITY_SIGMA_PX = 0.5  # of a match; half of it the bias towards whole pixels
-MIN_RAY_Z = 0.5  # rays more than 60 deg from the rectified axis would be stretched fourfold
-RANGE_PERCENTILES = (1.0, 99.0)  # of the sparse points' distances; few of them are wrong
-RANGE_MARGIN = 0.15  # of the disparities beyond those of the sparse points
-MAX_DISPARITIES = 512  # searched; more means that the sparse points are no guide
-MIN_POINTS = 10  # in a view, for the range to search
-WINDOW = 5  # lattice points along a side of the planes that are fitted
-MIN_WINDOW_SHARE = 0.6  # of a window's lattice points that are known
-MIN_COSINE = 0.1  # between a plane's normal and the ray; steeper ones are steps of the range
+
+@dataclass(frozen=True, kw_only=True)
+class SurroundingsTolerances:
+    """Which sparse points are kept, which views are paired, and which matches count.
+
+    Attributes
+    ----------
+    min_observations : two rays that meet say nothing about whether they belong together.
+        Derived.
+    min_angle_deg : of triangulation: half a pixel of disparity is 1 % of the distance there.
+        Derived.
+    max_angle_deg : of triangulation: patches of slanted surfaces look too different beyond.
+        Guess.
+    max_axis_angle_deg : between the directions in which two views look. Guess.
+    min_baseline_angle_deg : between baseline and views: an epipole in the image is no use.
+        Guess.
+    part_margin_px : by which a match may leak over a part's outline. Derived: a patch and its
+        neighbours.
+    max_normal_difference_deg : of two views; planes of ten pixels' disparities are uncertain.
+        Guess.
+    min_shared_points : of two views, for their angle to be known and their overlap to be worth
+        it. Guess.
+    block_px : side of the patches that are compared. Guess.
+    border_px : a patch and the filter before it look this far. Derived.
+    texture_px : side of the window in which texture must show. Derived.
+    min_texture : standard deviation, grey levels. Derived: noise of a full well of 10,000
+        electrons makes 0.6.
+    disparity_sigma_px : of a match; half of it the bias towards whole pixels. Guess.
+    min_ray_z : rays more than 60 deg from the rectified axis would be stretched fourfold.
+        Derived.
+    range_percentiles : of the sparse points' distances; few of them are wrong. Guess.
+    range_margin : of the disparities beyond those of the sparse points. Guess.
+    max_disparities : searched; more means that the sparse points are no guide. Guess.
+    min_points : in a view, for the range to search. Guess.
+    window : lattice points along a side of the planes that are fitted. Guess.
+    min_window_share : of a window's lattice points that are known. Guess.
+    min_cosine : between a plane's normal and the ray; steeper ones are steps of the range.
+        Guess.
+    """
+
+    min_observations: int = 3
+    min_angle_deg: float = 5.0
+    max_angle_deg: float = 25.0
+    max_axis_angle_deg: float = 45.0
+    min_baseline_angle_deg: float = 40.0
+    part_margin_px: int = 8
+    max_normal_difference_deg: float = 30.0
+    min_shared_points: int = 20
+    block_px: int = 5
+    border_px: int = 4
+    texture_px: int = 2 * border_px + 1
+    min_texture: float = 2.0
+    disparity_sigma_px: float = 0.5
+    min_ray_z: float = 0.5
+    range_percentiles: tuple[float, float] = (1.0, 99.0)
+    range_margin: float = 0.15
+    max_disparities: int = 512
+    min_points: int = 10
+    window: int = 5
+    min_window_share: float = 0.6
+    min_cosine: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -89,6 +129,7 @@ def sparse_surroundings(
     max_part_share: float = MAX_PART_SHARE,
     max_relative_sigma: float = MAX_RELATIVE_SIGMA,
     margin_px: int = REGION_MARGIN_PX,
+    tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> SparseSurroundings:
     """Sparse points that are certain in place and neither on a polarised part nor mirrored in one.
 
@@ -101,12 +142,13 @@ def sparse_surroundings(
     max_relative_sigma : points are left out whose place is less certain than this share of their
         mean distance from the cameras, along the worst axis.
     margin_px : the parts' regions are grown by this, px.
+    tolerances : of this step.
     """
     part_share = part_shares(tracks, maps, margin_px)
     num_views = np.bincount(tracks.obs_track, minlength=len(part_share))
     sigma = relative_sigmas(tracks, [phase_map.view for phase_map in maps])
     kept = (
-        (num_views >= MIN_OBSERVATIONS)
+        (num_views >= tolerances.min_observations)
         & (part_share <= max_part_share)
         & (sigma <= max_relative_sigma)
     )
@@ -163,7 +205,11 @@ def relative_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
 
 
 def choose_partners(
-    tracks: Tracks, views: Sequence[View], max_partners: int = 3
+    tracks: Tracks,
+    views: Sequence[View],
+    max_partners: int = 3,
+    *,
+    tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> list[list[int]]:
     """For each view the views to match it with, those with the most points in common first.
 
@@ -173,6 +219,7 @@ def choose_partners(
     Parameters
     ----------
     tracks : points to go by; ``obs_view`` counts in ``views``.
+    tolerances : of this step.
     """
     sees = np.zeros((len(views), len(tracks.points_in_world)), bool)
     sees[tracks.obs_view, tracks.obs_track] = True
@@ -183,24 +230,30 @@ def choose_partners(
             b
             for b in np.argsort(-shared[a], kind="stable")
             if b != a
-            and shared[a, b] >= MIN_SHARED_POINTS
-            and _fits(view, views[b], tracks.points_in_world[sees[a] & sees[b]])
+            and shared[a, b] >= tolerances.min_shared_points
+            and _fits(
+                view, views[b], tracks.points_in_world[sees[a] & sees[b]], tolerances=tolerances
+            )
         ]
         partners.append([int(b) for b in candidates[:max_partners]])
     return partners
 
 
-def _fits(view: View, other: View, points: Array) -> bool:
+def _fits(view: View, other: View, points: Array, *, tolerances: SurroundingsTolerances) -> bool:
     """Whether two views can be matched, by their poses and the points that both see."""
     axes = view.cam_from_world.rotation[2], other.cam_from_world.rotation[2]
     baseline = other.center_in_world - view.center_in_world
-    if not np.linalg.norm(baseline) > 0 or _angle_deg(*axes) > MAX_AXIS_ANGLE_DEG:
+    if not np.linalg.norm(baseline) > 0 or _angle_deg(*axes) > tolerances.max_axis_angle_deg:
         return False
     to_baseline = float(_angle_deg(baseline, axes[0] + axes[1]))
-    if not MIN_BASELINE_ANGLE_DEG <= to_baseline <= 180 - MIN_BASELINE_ANGLE_DEG:
+    if (
+        not tolerances.min_baseline_angle_deg
+        <= to_baseline
+        <= 180 - tolerances.min_baseline_angle_deg
+    ):
         return False
     angles = _angle_deg(points - view.center_in_world, points - other.center_in_world)
-    return bool(MIN_ANGLE_DEG <= np.median(angles) <= MAX_ANGLE_DEG)
+    return bool(tolerances.min_angle_deg <= np.median(angles) <= tolerances.max_angle_deg)
 
 
 def _angle_deg(a: Array, b: Array) -> Array:
@@ -243,6 +296,7 @@ def stereo_surroundings(
     voxel_px: float = 1.0,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
+    tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> FusedCloud:
     """Dense cloud of the textured surroundings of the polarised parts, from pairs of views.
 
@@ -258,14 +312,15 @@ def stereo_surroundings(
     voxel_px : edge of the merging voxel, in footprints of a pixel.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done, twice for each view with points.
+    tolerances : of this step.
     """
     workers = workers or Workers(1)
     folder.mkdir(parents=True, exist_ok=True)
-    kept = sparse_surroundings(tracks, maps).is_kept
+    kept = sparse_surroundings(tracks, maps, tolerances=tolerances).is_kept
     certain = some_tracks(tracks, kept)
-    chosen = choose_partners(certain, [m.view for m in maps], max_partners)
+    chosen = choose_partners(certain, [m.view for m in maps], max_partners, tolerances=tolerances)
     used = [k for k, partners in enumerate(chosen) if partners]
-    task = partial(_match_view, folder, stride_px)
+    task = partial(_match_view, folder, stride_px, tolerances=tolerances)
     groups = [[maps[k], *(maps[j] for j in chosen[k])] for k in used]
     dense: list[DenseView] = []
     points = [certain.points_in_world[certain.obs_track[certain.obs_view == k]] for k in used]
@@ -275,17 +330,24 @@ def stereo_surroundings(
             on_progress(1)
     options = FusionOptions(
         min_views=min_views,
-        max_normal_difference_deg=MAX_NORMAL_DIFFERENCE_DEG,
+        max_normal_difference_deg=tolerances.max_normal_difference_deg,
         voxel_px=voxel_px,
     )
     views = [_whole_view(maps[k]) for k in used]
     return fuse(views, dense, options, workers=workers, on_progress=on_progress)
 
 
-def _match_view(folder: Path, stride_px: int, maps: Sequence[PhaseMap], points: Array) -> DenseView:
+def _match_view(
+    folder: Path,
+    stride_px: int,
+    maps: Sequence[PhaseMap],
+    points: Array,
+    *,
+    tolerances: SurroundingsTolerances,
+) -> DenseView:
     """Match the first view with the others and store what comes of it."""
-    excluded = grow_mask(maps[0].region.inside, PART_MARGIN_PX)
-    dense = stereo_view(maps[0], maps[1:], points, excluded, stride_px)
+    excluded = grow_mask(maps[0].region.inside, tolerances.part_margin_px)
+    dense = stereo_view(maps[0], maps[1:], points, excluded, stride_px, tolerances=tolerances)
     return store_dense_view(dense, folder / f"{maps[0].view.name}.stereo")
 
 
@@ -313,13 +375,20 @@ class RectifiedPair:
         return self.right.cx - self.left.cx
 
 
-def rectify_pair(view: View, other: View, points: Floats) -> RectifiedPair | None:
+def rectify_pair(
+    view: View,
+    other: View,
+    points: Floats,
+    *,
+    tolerances: SurroundingsTolerances = SurroundingsTolerances(),
+) -> RectifiedPair | None:
     """Virtual cameras at the centres of two views that see what both see.
 
     Parameters
     ----------
     view, other : the left and the right one, whatever their roll.
     points : (N, 3), world, that the view sees; they bound the depths to search.
+    tolerances : of this step.
 
     Returns
     -------
@@ -336,16 +405,16 @@ def rectify_pair(view: View, other: View, points: Floats) -> RectifiedPair | Non
     rotation = np.stack([x, np.cross(z, x), z])
     depth = (np.asarray(points, np.float64) - view.center_in_world) @ z
     depth = depth[depth > 0]
-    boxes = [_plane_box(v, rotation) for v in (view, other)]
+    boxes = [_plane_box(v, rotation, tolerances=tolerances) for v in (view, other)]
     low, high = np.maximum(boxes[0][0], boxes[1][0]), np.minimum(boxes[0][1], boxes[1][1])
-    if len(depth) < MIN_POINTS or not high[1] > low[1]:
+    if len(depth) < tolerances.min_points or not high[1] > low[1]:
         return None
     focal = view.camera.mean_focal_px
-    far, near = focal * length / np.percentile(depth, RANGE_PERCENTILES[::-1])
-    margin = RANGE_MARGIN * (near - far) + 4 * DISPARITY_SIGMA_PX
+    far, near = focal * length / np.percentile(depth, tolerances.range_percentiles[::-1])
+    margin = tolerances.range_margin * (near - far) + 4 * tolerances.disparity_sigma_px
     lowest = max(far - margin, 0.0)
     num = 16 * int(np.ceil((near + margin - lowest) / 16))
-    if num > MAX_DISPARITIES:
+    if num > tolerances.max_disparities:
         return None
     left = PinholeCamera(
         width=num + int(np.ceil(focal * (boxes[0][1][0] - boxes[0][0][0]))),
@@ -358,39 +427,56 @@ def rectify_pair(view: View, other: View, points: Floats) -> RectifiedPair | Non
     return RectifiedPair(rotation, left, replace(left, cx=left.cx + lowest), length, num)
 
 
-def _plane_box(view: View, rect_from_world: Array) -> tuple[Array, Array]:
+def _plane_box(
+    view: View, rect_from_world: Array, *, tolerances: SurroundingsTolerances
+) -> tuple[Array, Array]:
     """Lowest and highest ``(x, y) / z`` of a view's rays in the rectified frame."""
     size = view.camera.width, view.camera.height
     grid = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 33)]), axis=-1).reshape(-1, 2)
     rays = view.camera.rays(grid * size) @ (rect_from_world @ view.cam_from_world.rotation.T).T
-    plane = rays[rays[:, 2] > MIN_RAY_Z]
+    plane = rays[rays[:, 2] > tolerances.min_ray_z]
     plane = plane[:, :2] / plane[:, 2:]
     return plane.min(axis=0, initial=np.inf), plane.max(axis=0, initial=-np.inf)
 
 
-def warp(image: Image, view: View, camera: PinholeCamera, rotation: Array) -> tuple[Image, Mask]:
+def warp(
+    image: Image,
+    view: View,
+    camera: PinholeCamera,
+    rotation: Array,
+    *,
+    tolerances: SurroundingsTolerances = SurroundingsTolerances(),
+) -> tuple[Image, Mask]:
     """Resample an image of a view for a virtual camera at its centre, and where it has pixels."""
     rays = camera.rays(pixel_centers(camera.width, camera.height))
     xy = view.camera.project(rays @ (view.cam_from_world.rotation @ rotation.T).T)
-    margin, size = BORDER_PX, np.array([view.camera.width, view.camera.height])
+    margin, size = tolerances.border_px, np.array([view.camera.width, view.camera.height])
     inside = ((xy >= margin) & (xy <= size - margin)).all(axis=-1)
     return sample_image(image, xy), np.asarray(inside)
 
 
-def match(pair: RectifiedPair, left: PhaseMap, right: PhaseMap) -> Image:
+def match(
+    pair: RectifiedPair,
+    left: PhaseMap,
+    right: PhaseMap,
+    *,
+    tolerances: SurroundingsTolerances = SurroundingsTolerances(),
+) -> Image:
     """Disparities ``(H, W)`` of the left virtual camera, px, less the pair's offset; NaN: none."""
     white = max(float(np.percentile(m.intensity, 99)) for m in (left, right))
     sides = []
     for phase_map, camera in ((left, pair.left), (right, pair.right)):
         shown = np.clip(phase_map.intensity / max(white, 1e-9), 0, 1) ** (1 / DISPLAY_GAMMA)
         grey_levels = 255 * shown.astype(np.float32)
-        grey, inside = warp(grey_levels, phase_map.view, camera, pair.rect_from_world)
+        grey, inside = warp(
+            grey_levels, phase_map.view, camera, pair.rect_from_world, tolerances=tolerances
+        )
         sides.append((np.rint(grey).astype(np.uint8), inside))
     matcher = cv2.StereoSGBM.create(
         numDisparities=pair.num_disparities,
-        blockSize=BLOCK_PX,
-        P1=8 * BLOCK_PX**2,  # OpenCV's recommendation
-        P2=32 * BLOCK_PX**2,
+        blockSize=tolerances.block_px,
+        P1=8 * tolerances.block_px**2,  # OpenCV's recommendation
+        P2=32 * tolerances.block_px**2,
         disp12MaxDiff=1,
         preFilterCap=31,
         uniquenessRatio=10,
@@ -401,19 +487,25 @@ def match(pair: RectifiedPair, left: PhaseMap, right: PhaseMap) -> Image:
     xy = pixel_centers(pair.left.width, pair.left.height)
     xy[..., 0] -= disparity
     matched = sample_image(sides[1][1].astype(np.float32), xy, nearest=True) > 0
-    good = (disparity >= 0) & sides[0][1] & matched & _is_textured(sides[0][0])
+    good = (
+        (disparity >= 0) & sides[0][1] & matched & _is_textured(sides[0][0], tolerances=tolerances)
+    )
     return np.where(good, disparity, np.nan).astype(np.float32)
 
 
-def _is_textured(grey: NDArray[np.uint8]) -> Mask:
+def _is_textured(grey: NDArray[np.uint8], *, tolerances: SurroundingsTolerances) -> Mask:
     """Where an image varies by more than noise; elsewhere a match only continues others."""
-    image, size = grey.astype(np.float32), (TEXTURE_PX, TEXTURE_PX)
+    image, size = grey.astype(np.float32), (tolerances.texture_px, tolerances.texture_px)
     variance = cv2.boxFilter(image * image, -1, size) - cv2.boxFilter(image, -1, size) ** 2
-    return np.asarray(variance > MIN_TEXTURE**2)
+    return np.asarray(variance > tolerances.min_texture**2)
 
 
 def ranges_from_disparity(
-    pair: RectifiedPair, disparity: Image, rays_in_world: Floats
+    pair: RectifiedPair,
+    disparity: Image,
+    rays_in_world: Floats,
+    *,
+    tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> tuple[Image, Image]:
     """Distances of the left view's rays, and their relative deviations.
 
@@ -421,6 +513,7 @@ def ranges_from_disparity(
     ----------
     disparity : as from :func:`match`.
     rays_in_world : (..., 3), unit, world axes.
+    tolerances : of this step.
 
     Returns
     -------
@@ -433,13 +526,13 @@ def ranges_from_disparity(
     filled = np.where(known, disparity, 0).astype(np.float32)
     moments = np.dstack([known.astype(np.float32), filled, filled * filled])
     share, mean, square = np.moveaxis(sample_image(moments, xy), -1, 0)
-    smooth = square - mean * mean < DISPARITY_SIGMA_PX**2
+    smooth = square - mean * mean < tolerances.disparity_sigma_px**2
     total = mean + np.float32(pair.offset_px)
     good = (share > 0.999) & smooth & (total > 0)
     total = np.where(good, total, 1)
     depth = pair.left.fx * pair.baseline / total
     distance = np.where(good, depth / np.where(good, rays[..., 2], 1), 0)
-    return distance.astype(np.float32), (DISPARITY_SIGMA_PX / total).astype(np.float32)
+    return distance.astype(np.float32), (tolerances.disparity_sigma_px / total).astype(np.float32)
 
 
 def combine_ranges(ranges: Image, sigmas: Image) -> tuple[Image, Image]:
@@ -465,13 +558,19 @@ def combine_ranges(ranges: Image, sigmas: Image) -> tuple[Image, Image]:
     return np.where(found, np.exp(place), 0).astype(np.float32), sigma.astype(np.float32)
 
 
-def fit_planes(inverse_ranges: Floats, rays: Floats) -> tuple[Array, Array]:
+def fit_planes(
+    inverse_ranges: Floats,
+    rays: Floats,
+    *,
+    tolerances: SurroundingsTolerances = SurroundingsTolerances(),
+) -> tuple[Array, Array]:
     """Planes about every lattice point: on one, the inverse range is linear in the ray.
 
     Parameters
     ----------
     inverse_ranges : (h, w), 0 where unknown.
     rays : (h, w, 3), unit.
+    tolerances : of this step.
 
     Returns
     -------
@@ -485,8 +584,10 @@ def fit_planes(inverse_ranges: Floats, rays: Floats) -> tuple[Array, Array]:
     outer = (v[..., :, None] * v[..., None, :]).reshape(*known.shape, 9)
     columns = [outer, v * u[..., None], (u * u)[..., None], known[..., None].astype(np.float64)]
     moments, border = np.concatenate(columns, axis=-1), cv2.BORDER_CONSTANT
-    sums = cv2.boxFilter(moments, -1, (WINDOW, WINDOW), normalize=False, borderType=border)
-    used = known & (sums[..., 13] >= MIN_WINDOW_SHARE * WINDOW**2 - 0.5)
+    sums = cv2.boxFilter(
+        moments, -1, (tolerances.window, tolerances.window), normalize=False, borderType=border
+    )
+    used = known & (sums[..., 13] >= tolerances.min_window_share * tolerances.window**2 - 0.5)
     matrix, right = sums[used, :9].reshape(-1, 3, 3), sums[used, 9:12]
     solved = np.linalg.solve(matrix, right[..., None])[..., 0]
     residual = sums[used, 12] - (solved * right).sum(axis=-1)
@@ -498,7 +599,13 @@ def fit_planes(inverse_ranges: Floats, rays: Floats) -> tuple[Array, Array]:
 
 
 def stereo_view(
-    phase_map: PhaseMap, partners: Sequence[PhaseMap], points: Floats, part: Mask, stride_px: int
+    phase_map: PhaseMap,
+    partners: Sequence[PhaseMap],
+    points: Floats,
+    part: Mask,
+    stride_px: int,
+    *,
+    tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> DenseView:
     """Ranges and normals of one view's pixels, matched with its partners.
 
@@ -509,6 +616,7 @@ def stereo_view(
     points : (N, 3), world, that the view sees; they bound the depths to search.
     part : (H, W) bool, pixels to leave out: polarised parts and what is beside them.
     stride_px : of the lattice.
+    tolerances : of this step.
     """
     view = phase_map.view
     shape = view.camera.height // stride_px, view.camera.width // stride_px
@@ -516,28 +624,43 @@ def stereo_view(
     rays = view.rays_in_world(xy)
     found = []
     for partner in partners:
-        pair = rectify_pair(view, partner.view, points)
+        pair = rectify_pair(view, partner.view, points, tolerances=tolerances)
         if pair is not None:
-            found.append(ranges_from_disparity(pair, match(pair, phase_map, partner), rays))
+            found.append(
+                ranges_from_disparity(
+                    pair,
+                    match(pair, phase_map, partner, tolerances=tolerances),
+                    rays,
+                    tolerances=tolerances,
+                )
+            )
     found.append((np.zeros(shape, np.float32), np.ones(shape, np.float32)))  # if there is no pair
     ranges, sigma = combine_ranges(*(np.stack(kind) for kind in zip(*found, strict=True)))
     ranges[sample_image(part.astype(np.float32), xy, nearest=True) > 0] = 0
-    return _on_planes(ranges, sigma, rays, view, stride_px)
+    return _on_planes(ranges, sigma, rays, view, stride_px, tolerances=tolerances)
 
 
-def _on_planes(ranges: Image, sigma: Image, rays: Array, view: View, stride_px: int) -> DenseView:
+def _on_planes(
+    ranges: Image,
+    sigma: Image,
+    rays: Array,
+    view: View,
+    stride_px: int,
+    *,
+    tolerances: SurroundingsTolerances,
+) -> DenseView:
     """Ranges moved onto the planes through their windows, where a plane explains the window."""
     inverse = 1 / np.where(ranges > 0, ranges, np.inf)
-    slope, deviation = fit_planes(inverse, rays)
+    slope, deviation = fit_planes(inverse, rays, tolerances=tolerances)
     length = np.linalg.norm(slope, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         fitted = 1 / (slope * rays).sum(axis=-1)
         cosine = 1 / (fitted * length)
         good = (np.abs(fitted / ranges - 1) < 2 * sigma) & (deviation < 2 * sigma)
-        good &= cosine > MIN_COSINE
+        good &= cosine > tolerances.min_cosine
         # The normal of a plane through errors of the window's points, seen under this angle.
-        spread = WINDOW * stride_px / np.sqrt(12) / view.camera.mean_focal_px
-        turn = deviation / (WINDOW * spread) * cosine**2
+        spread = tolerances.window * stride_px / np.sqrt(12) / view.camera.mean_focal_px
+        turn = deviation / (tolerances.window * spread) * cosine**2
     normals = np.where(good[..., None], -slope / length[..., None], np.nan)
     return DenseView(
         stride_px=stride_px,

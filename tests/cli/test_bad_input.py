@@ -135,8 +135,9 @@ def test_sfm_that_finds_no_model(cli, capture: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     status, text, err = cli("reconstruct", capture, out)
     assert (status, text) == (1, "")
-    assert "SfM finds no model" in err
-    assert err.count("\n") == 1
+    first, *_, last = err.splitlines()
+    assert first.startswith("images ")
+    assert "SfM finds no model" in last
     assert not (out / "sparse").exists()
     assert not list(out.glob(".*"))
     assert [stage["name"] for stage in json.loads((out / "run.json").read_text())["stages"]] == [
@@ -163,9 +164,9 @@ def test_sfm_that_registers_few_views_names_the_others(
 @pytest.mark.parametrize(
     ("intrinsics", "message"),
     [
-        ("667.5,667.5,461.295,393.216", "give half of each: --intrinsics 333.75,333.75,230.6"),
-        ("333,333,900,100", "lies outside the 459x384 px polarization images"),
-        ("33375,33375,230,196", "focal lengths 33375,33375 are not within"),
+        ("667.5,667.5,461.295,393.216", "give half of each: 333.75,333.75,230.6"),
+        ("333,333,900,100", "--intrinsics has the principal point 900,100 outside the 459x384 px"),
+        ("33375,33375,230,196", "--intrinsics has focal lengths 33375,33375, not within"),
     ],
 )
 def test_intrinsics_that_do_not_fit(
@@ -245,9 +246,9 @@ def test_no_polarised_region(cli, demo_run: Path, demo_capture: Path, tmp_path: 
     status, text, err = cli("reconstruct", capture, out, "--sparse", demo_run / "sparse")
     assert status == 3
     assert text.startswith(f"{out / 'ppa.ply'}: 0 points")
-    assert err.startswith("polmvs: no polarised region: ")
-    assert "--min-dolp" in err
-    assert err.count("\n") == 1
+    last = err.splitlines()[-1]
+    assert last.startswith("polmvs: no polarised region: ")
+    assert "--min-dolp" in last
     assert_finished_but_empty(out)
 
 
@@ -257,9 +258,9 @@ def test_no_seeds(cli, demo_run: Path, demo_capture: Path, tmp_path: Path) -> No
     status, text, err = cli("compare", demo_capture, out, *flags)
     assert status == 3
     assert "| F-score at 1 mm, %" in text
-    assert err.startswith("polmvs: no seeds: ")
-    assert "marks" in err
-    assert err.count("\n") == 1
+    last = err.splitlines()[-1]
+    assert last.startswith("polmvs: no seeds: ")
+    assert "marks" in last
     assert_finished_but_empty(out)
     json.loads((out / "metrics.json").read_text())
     # The same when it is asked for again.
@@ -359,8 +360,8 @@ def test_overwrite_loses_nothing_to_bad_input(cli, demo_run: Path, demo_capture:
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--gamma", "2"), "--gamma is 2.0 but the finished stage 'images'"),
-        (("--intrinsics", "400,400,230,190"), "--intrinsics is 400.0,400.0,230.0,190.0 but"),
+        (("--gamma", "2"), "--gamma is 2 but the finished stage 'images'"),
+        (("--intrinsics", "400,400,230,190"), "--intrinsics is 400,400,230,190 but"),
         (("--min-dolp", "0.2"), "--min-dolp is 0.2 but the finished stage 'maps'"),
         (("--stride-px", "4"), "--stride-px is 4 but the finished stage 'densify_opa'"),
     ],

@@ -5,7 +5,7 @@ import pytest
 
 from polmvs.normals.estimator import (
     CAUCHY_SCALE,
-    MIN_SIN_ZENITH,
+    EstimatorTolerances,
     smallest_eigenvectors,
     solve_normals,
 )
@@ -88,7 +88,7 @@ def test_sigma_is_honest(num_rows):
     estimate = solve_normals(rows, rays, sigma)
     assert estimate.valid.all()
     cosine = (rays * estimate.normals.T[:, None]).sum(axis=0)
-    sin2 = np.maximum(1 - cosine**2, MIN_SIN_ZENITH**2)
+    sin2 = np.maximum(1 - cosine**2, EstimatorTolerances().min_sin_zenith ** 2)
     weights = estimate.row_weights / (sigma**2 * sin2)
     precision = np.einsum("ikn,kn,jkn->nij", rows, weights, rows)
     values, axes = np.linalg.eigh(precision)

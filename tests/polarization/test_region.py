@@ -100,3 +100,20 @@ def test_growth_does_not_run_into_an_open_textureless_background(shade):
     region = find(s0, s1, s2)
     assert region.inside[55:65, 75:85].all()
     assert region.inside.sum() < 4 * 400
+
+
+def test_a_larger_image_of_a_scene_has_the_same_region():
+    """Marks and frontal spots grow with the resolution, and so does what is filled."""
+    rows, cols = np.mgrid[:512, :612] + 0.5
+    inside = np.hypot(rows - 256, cols - 306) < 180
+    mark = (np.abs(rows - 200) < 17) & (np.abs(cols - 300) < 20)  # 1,360 px of strong texture
+    dolp = np.where(inside & ~mark, 0.5, 0.0)
+    s0 = np.where(inside, 0.2, 0.6) + np.where(mark & (cols % 4 < 2), 0.6, 0.0)
+    shares = []
+    for times in (1, 2):
+        images = [np.kron(a, np.ones((times, times))).astype(np.float32) for a in (s0, s0 * dolp)]
+        valid = np.ones(images[0].shape, bool)
+        region = find_region(images[0], images[1], 0 * images[1], valid, min_dolp=0.1)
+        assert region.inside[200 * times, 300 * times]
+        shares.append(region.inside.mean())
+    assert abs(shares[0] - shares[1]) < 0.002

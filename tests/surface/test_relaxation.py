@@ -13,7 +13,7 @@ from polmvs.normals.rows import gather_rows
 from polmvs.polarization.phase_map import as_tilted, turned
 from polmvs.scene import Seeds
 from polmvs.surface.integration import (
-    OPINION_REACH_PX,
+    IntegrationTolerances,
     open_lattice,
     relax,
     spread_nodes,
@@ -126,7 +126,9 @@ def test_opinions_within_reach_count_once(exact):
     nodes = nodes_of(scene, stride=4)
     ties = tie_to_consensus(scene.maps, dense, nodes)
     # Views that agree exactly: the deviation of one of them, along an oblique ray.
-    assert np.median(ties.sigma) == pytest.approx(1.2e-3 * OPINION_REACH_PX / 4, rel=0.25)
+    assert np.median(ties.sigma) == pytest.approx(
+        1.2e-3 * IntegrationTolerances().correlation_px / 4, rel=0.25
+    )
 
 
 def test_views_that_scatter_are_less_certain(exact):

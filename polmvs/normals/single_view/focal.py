@@ -38,12 +38,28 @@ from polmvs.polarization.angle_models import correct_parameters, phase_sign, sig
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Array: TypeAlias = NDArray[np.float64]
 
-NUM_PIXELS = 20_000  # that are used of the given ones, at least if there are as many
-NUM_FOCALS = 20  # of the scan
-NUM_RUNS = 32  # of pixels from whose scatter the uncertainty is taken
-MIN_EIGENVALUE = 1e-6  # of the scaled normal equations: flatter is not observable
-LOG_STEP = 0.01  # of the numerical derivative on the logarithm of the focal length
-MAX_LOG_SIGMA = 0.2  # relative deviation from which a focal length counts as not observable
+
+@dataclass(frozen=True, kw_only=True)
+class FocalTolerances:
+    """How a focal length is searched for, and when it is observable.
+
+    Attributes
+    ----------
+    num_pixels : that are used of the given ones, at least if there are as many; time only.
+    num_focals : of the scan. Guess.
+    num_runs : of pixels from whose scatter the uncertainty is taken. Guess.
+    min_eigenvalue : of the scaled normal equations: flatter is not observable. Guess.
+    log_step : of the numerical derivative on the logarithm of the focal length.
+    max_log_sigma : relative deviation from which a focal length counts as not observable.
+        Guess.
+    """
+
+    num_pixels: int = 20_000
+    num_focals: int = 20
+    num_runs: int = 32
+    min_eigenvalue: float = 1e-6
+    log_step: float = 0.01
+    max_log_sigma: float = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +132,7 @@ def estimate_focal(
     light: Light,
     focal_range_px: tuple[float, float],
     progress: Callable[[int, int], None] | None = None,
+    tolerances: FocalTolerances = FocalTolerances(),
 ) -> FocalEstimate:
     """Focal length at which one normal explains the phase angles of a plane best.
 
@@ -129,12 +146,13 @@ def estimate_focal(
     light : which reflection dominates.
     focal_range_px : shortest and longest focal length to try, px.
     progress : called with the number of scanned and of all focal lengths.
+    tolerances : of this step.
     """
     shortest, longest = focal_range_px
     if not 0 < shortest < longest:
         raise ValueError(f"{focal_range_px=} but expected 0 < shortest < longest.")
-    view = _pick(angle_model, parameters, offsets_px, sigma, light)
-    focals = np.geomspace(shortest, longest, NUM_FOCALS)
+    view = _pick(angle_model, parameters, offsets_px, sigma, light, tolerances=tolerances)
+    focals = np.geomspace(shortest, longest, tolerances.num_focals)
     planes = []
     for index, focal in enumerate(focals):
         planes.append(view.plane(float(focal)))
@@ -146,12 +164,14 @@ def estimate_focal(
     inner = min(max(best, 1), len(focals) - 2)
     focal = _refine(view, focals[inner - 1], focals[inner + 1], scale)
     plane = view.plane(focal)
-    sigma_log = _log_sigma(view, focal, plane.normal, scale)
-    interior = focals[0] * (1 + LOG_STEP) < focal < focals[-1] / (1 + LOG_STEP)
+    sigma_log = _log_sigma(view, focal, plane.normal, scale, tolerances=tolerances)
+    interior = (
+        focals[0] * (1 + tolerances.log_step) < focal < focals[-1] / (1 + tolerances.log_step)
+    )
     return FocalEstimate(
         focal_px=focal,
         sigma_px=focal * sigma_log,
-        observable=bool(interior and plane.valid and sigma_log < MAX_LOG_SIGMA),
+        observable=bool(interior and plane.valid and sigma_log < tolerances.max_log_sigma),
         plane=plane,
         scan_focal_px=focals,
         scan_rmse_deg=np.array([p.rmse_deg for p in planes]),
@@ -160,7 +180,13 @@ def estimate_focal(
 
 
 def _pick(
-    angle_model: AngleModel, parameters: Floats, offsets_px: Floats, sigma: Floats, light: Light
+    angle_model: AngleModel,
+    parameters: Floats,
+    offsets_px: Floats,
+    sigma: Floats,
+    light: Light,
+    *,
+    tolerances: FocalTolerances,
 ) -> _View:
     """Evenly spaced ones of the polarised pixels that are known."""
     if parameters.shape != (3, len(sigma)) or offsets_px.shape != (2, len(sigma)):
@@ -170,7 +196,7 @@ def _pick(
         )
     polarized = np.abs(parameters[1]) + np.abs(parameters[2])
     usable = np.flatnonzero((polarized > 0) & (sigma > 0) & (polarized + sigma < np.inf))
-    usable = usable[:: max(1, len(usable) // NUM_PIXELS)]
+    usable = usable[:: max(1, len(usable) // tolerances.num_pixels)]
     return _View(parameters[:, usable], offsets_px[:, usable], sigma[usable], angle_model, light)
 
 
@@ -191,11 +217,15 @@ def _refine(view: _View, shortest: float, longest: float, scale: float) -> float
     return float(np.exp(found.x))
 
 
-def _log_sigma(view: _View, focal: float, normal: Array, scale: float) -> float:
+def _log_sigma(
+    view: _View, focal: float, normal: Array, scale: float, *, tolerances: FocalTolerances
+) -> float:
     """Deviation of the logarithm of the focal length, the normal being free as well."""
-    step = float(np.exp(LOG_STEP))
+    step = float(np.exp(tolerances.log_step))
     error = view.errors(focal, normal)
-    slope = (view.errors(focal * step, normal) - view.errors(focal / step, normal)) / (2 * LOG_STEP)
+    slope = (view.errors(focal * step, normal) - view.errors(focal / step, normal)) / (
+        2 * tolerances.log_step
+    )
     samples = stack_samples(view.angle_model, *view.phases(focal))
     on_normal = tangents(normal) @ error_gradients(normal, samples) * np.sqrt(samples[4])
     gradients = np.stack([*on_normal, slope]).astype(np.float64)
@@ -203,10 +233,10 @@ def _log_sigma(view: _View, focal: float, normal: Array, scale: float) -> float:
     matrix = weighted @ gradients.T
     # Dividing by the diagonal first makes the test for a flat direction independent of units.
     size = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
-    if np.linalg.eigvalsh(matrix / np.outer(size, size))[0] < MIN_EIGENVALUE:
+    if np.linalg.eigvalsh(matrix / np.outer(size, size))[0] < tolerances.min_eigenvalue:
         return np.inf
     inverse = np.linalg.inv(matrix)
-    runs = np.array_split(np.arange(len(error)), min(NUM_RUNS, len(error)))
+    runs = np.array_split(np.arange(len(error)), min(tolerances.num_runs, len(error)))
     influence = np.array([weighted[:, run] @ error[run] for run in runs]) @ inverse[2]
     scatter = influence @ influence * len(runs) / max(len(runs) - 3, 1)
     return float(np.sqrt(max(scatter, inverse[2, 2])))

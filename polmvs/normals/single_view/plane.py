@@ -33,19 +33,38 @@ from polmvs.normals.estimator import smallest_eigenvectors
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Array: TypeAlias = NDArray[np.float64]
 
-COARSE_PIXELS = 16384  # that the first rounds take, at least
-COARSE_ROUNDS = 6
-FINE_ROUNDS = 2  # over all pixels
-NUM_RUNS = 32  # of pixels from whose scatter the covariance is taken, at least
-MIN_CONDITIONING = 0.01
-MAX_STEP = 0.3  # rad
-MEDIAN_PIXELS = 32768  # of which a median is taken, at least
-MIN_DEVIATION = 0.01  # in units of sigma: keeps exact data from a division by zero
-OUTLIER = 4.0  # robust deviations
-
 
 CHUNK = 8192  # pixels worked on at a time: the temporaries stay in the cache
 TINY = 1e-12
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneTolerances:
+    """How the normal of a plane is searched for and judged.
+
+    Attributes
+    ----------
+    coarse_pixels : that the first rounds take, at least; time only.
+    coarse_rounds : on these. Guess.
+    fine_rounds : over all pixels. Guess.
+    num_runs : of pixels from whose scatter the covariance is taken, at least. Guess.
+    min_conditioning : ratio of singular values under which rows have rank 1. Guess.
+    max_step : rad, of a Gauss-Newton step. Guess.
+    median_pixels : of which a median is taken, at least; time only.
+    min_deviation : in units of sigma: keeps exact data from a division by zero.
+    outlier_deviations : robust ones, from which a pixel is an outlier. Derived: 1 of 16,000
+        right ones.
+    """
+
+    coarse_pixels: int = 16384
+    coarse_rounds: int = 6
+    fine_rounds: int = 2
+    num_runs: int = 32
+    min_conditioning: float = 0.01
+    max_step: float = 0.3
+    median_pixels: int = 32768
+    min_deviation: float = 0.01
+    outlier_deviations: float = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +109,7 @@ def plane_normal(
     *,
     robust: bool = True,
     initial_normal: Floats | None = None,
+    tolerances: PlaneTolerances = PlaneTolerances(),
 ) -> PlaneEstimate:
     """Normal that the pixels of one view share (paper, "Single-view Normal Estimation").
 
@@ -103,6 +123,7 @@ def plane_normal(
     robust : maximum likelihood with a Cauchy loss whose scale is the residuals' own, or the
         paper's eigenvector, which weighs all pixels alike.
     initial_normal : (3,), start of the robust estimator; the paper's eigenvector where None.
+    tolerances : of this step.
 
     Returns
     -------
@@ -114,18 +135,28 @@ def plane_normal(
     if num < 2:
         return _no_estimate(num)
     if not robust:
-        return _describe(_facing(_eigenvector(angle_model, samples), samples), samples, None)
-    coarse = np.ascontiguousarray(samples[:, :: max(1, num // COARSE_PIXELS)])
+        return _describe(
+            _facing(_eigenvector(angle_model, samples), samples),
+            samples,
+            None,
+            tolerances=tolerances,
+        )
+    coarse = np.ascontiguousarray(samples[:, :: max(1, num // tolerances.coarse_pixels)])
     normal = _eigenvector(angle_model, coarse)
     if initial_normal is not None:
         normal = np.array(initial_normal, np.float64)
     scale = CAUCHY_SCALE
-    for loss_scale in annealed_scales(COARSE_ROUNDS, num_final=COARSE_ROUNDS - 2):
-        scale = residual_scale(phase_errors(normal, coarse) * np.sqrt(coarse[4])) * loss_scale
-        normal = _improve(normal, normal_equations(normal, coarse, scale))
-    for _ in range(FINE_ROUNDS):
-        normal = _improve(normal, normal_equations(normal, samples, scale))
-    return _describe(_facing(normal, samples), samples, scale)
+    for loss_scale in annealed_scales(
+        tolerances.coarse_rounds, num_final=tolerances.coarse_rounds - 2
+    ):
+        scale = (
+            residual_scale(phase_errors(normal, coarse) * np.sqrt(coarse[4]), tolerances=tolerances)
+            * loss_scale
+        )
+        normal = _improve(normal, normal_equations(normal, coarse, scale), tolerances=tolerances)
+    for _ in range(tolerances.fine_rounds):
+        normal = _improve(normal, normal_equations(normal, samples, scale), tolerances=tolerances)
+    return _describe(_facing(normal, samples), samples, scale, tolerances=tolerances)
 
 
 def phase_residuals(angle_model: AngleModel, normal: Floats, axial: Floats, rays: Floats) -> Floats:
@@ -161,18 +192,20 @@ def _eigenvector(angle_model: AngleModel, samples: Floats) -> Array:
     return smallest_eigenvectors(entries[:, None])[1][:, 0]
 
 
-def residual_scale(normalized_errors: Floats) -> float:
+def residual_scale(
+    normalized_errors: Floats, *, tolerances: PlaneTolerances = PlaneTolerances()
+) -> float:
     """Deviation of errors, from the median of their size; at least ``MIN_DEVIATION``."""
-    return max(robust_deviation(normalized_errors), MIN_DEVIATION)
+    return max(robust_deviation(normalized_errors), tolerances.min_deviation)
 
 
-def _improve(normal: Array, equations: NormalEquations) -> Array:
+def _improve(normal: Array, equations: NormalEquations, *, tolerances: PlaneTolerances) -> Array:
     """Gauss-Newton step on the sphere, none along a direction of which nothing is known."""
     basis = tangents(normal)
     matrix = basis @ equations.matrix @ basis.T
     gradient = basis @ equations.scores.sum(axis=0)
-    step = -np.linalg.pinv(matrix, rcond=MIN_CONDITIONING**2, hermitian=True) @ gradient
-    step *= min(1.0, MAX_STEP / max(float(np.linalg.norm(step)), TINY))
+    step = -np.linalg.pinv(matrix, rcond=tolerances.min_conditioning**2, hermitian=True) @ gradient
+    step *= min(1.0, tolerances.max_step / max(float(np.linalg.norm(step)), TINY))
     moved = normal + step @ basis
     return np.asarray(moved / np.linalg.norm(moved))
 
@@ -190,25 +223,27 @@ def _facing(normal: Array, samples: Floats) -> Array:
     return -normal if float(np.array([x, y, 1.0]) @ normal) > 0 else normal
 
 
-def _describe(normal: Array, samples: Floats, scale: float | None) -> PlaneEstimate:
+def _describe(
+    normal: Array, samples: Floats, scale: float | None, *, tolerances: PlaneTolerances
+) -> PlaneEstimate:
     """Quality of a normal on the pixels that it was made from."""
     num = samples.shape[1]
-    run_length = min(CHUNK, max(1, num // NUM_RUNS))
+    run_length = min(CHUNK, max(1, num // tolerances.num_runs))
     equations = normal_equations(normal, samples, scale, run_length=run_length)
     basis = tangents(normal)
     eigenvalues, axes = np.linalg.eigh(basis @ equations.matrix @ basis.T)
     conditioning = float(np.sqrt(max(eigenvalues[0], 0) / max(eigenvalues[1], TINY)))
-    valid = conditioning >= MIN_CONDITIONING
+    valid = conditioning >= tolerances.min_conditioning
     covariance, sigma = np.full((3, 3), np.nan), np.inf
     if valid:
         across = axes.T @ basis
         in_plane = _covariance(equations, across / eigenvalues[:, None])
         covariance = across.T @ in_plane @ across
         sigma = float(np.sqrt(np.linalg.eigvalsh(in_plane)[-1]))
-    step = max(1, num // MEDIAN_PIXELS)
+    step = max(1, num // tolerances.median_pixels)
     some = np.abs(equations.errors[::step])
     normalized = some * np.sqrt(samples[4, ::step])
-    limit = OUTLIER * residual_scale(normalized)
+    limit = tolerances.outlier_deviations * residual_scale(normalized, tolerances=tolerances)
     return PlaneEstimate(
         normal=normal,
         valid=valid,

@@ -30,14 +30,32 @@ Array: TypeAlias = NDArray[np.float64]
 Mask: TypeAlias = NDArray[np.bool_]
 
 BLOCK_PX = 4
-NUM_HYPOTHESES = 400  # pairs of rows per plane
-NUM_SCORED = 2000  # blocks on which they are scored
-NUM_REFINED = 8  # of the best hypotheses that are refined
-MAX_REACH = 40  # blocks between the two of a pair, at most
-MIN_CROSS = 0.02  # sine of the angle between the two rows of a pair, at least
-COHERENCE_BLOCKS = 5  # side of the window in which most blocks have to agree
-COHERENT_SHARE = 0.6
-MODEL_SIGMA = 0.01  # rad; error of a block's phase that does not average out
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchTolerances:
+    """How planes are searched for.
+
+    Attributes
+    ----------
+    num_hypotheses : pairs of rows per plane. Guess.
+    num_scored : blocks on which they are scored. Guess; time only.
+    num_refined : of the best hypotheses that are refined. Guess.
+    max_reach : blocks between the two of a pair, at most. Guess.
+    min_cross : sine of the angle between the two rows of a pair, at least. Guess.
+    coherence_blocks : side of the window in which most blocks have to agree. Guess.
+    coherent_share : of that window. Derived: the majority, with a margin.
+    model_sigma : rad; error of a block's phase that does not average out. Guess.
+    """
+
+    num_hypotheses: int = 400
+    num_scored: int = 2000
+    num_refined: int = 8
+    max_reach: int = 40
+    min_cross: float = 0.02
+    coherence_blocks: int = 5
+    coherent_share: float = 0.6
+    model_sigma: float = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,6 +114,7 @@ def find_planes(
     max_residual_deg: float = 3.0,
     min_angle_deg: float = 5.0,
     seed: int = 0,
+    tolerances: SearchTolerances = SearchTolerances(),
 ) -> list[FoundPlane]:
     """Find the planes of a view, the largest support first.
 
@@ -112,6 +131,7 @@ def find_planes(
     min_angle_deg : between the normals of two planes; what differs by less is the same plane
         under light that the model does not explain.
     seed : of the random pairs.
+    tolerances : of this step.
 
     Returns
     -------
@@ -119,26 +139,34 @@ def find_planes(
     """
     if axial.shape != (2, *mask.shape) or rays.shape != (3, *mask.shape):
         raise ValueError(f"{axial.shape=}, {rays.shape=}, {mask.shape=}.")
-    blocks = _average(angle_model, axial, rays, sigma, mask)
+    blocks = _average(angle_model, axial, rays, sigma, mask, tolerances=tolerances)
     limit = np.full(blocks.known.shape, 0.0)
     limit[blocks.known] = np.hypot(np.radians(max_residual_deg), 3 * blocks.sigma)
-    min_blocks = max(int(min_share * np.count_nonzero(blocks.known)), COHERENCE_BLOCKS**2)
+    min_blocks = max(
+        int(min_share * np.count_nonzero(blocks.known)), tolerances.coherence_blocks**2
+    )
     rng = np.random.default_rng(seed)
     left = blocks.known.copy()
     normals: list[Array] = []
     while len(normals) < max_planes and np.count_nonzero(left) >= min_blocks:
-        normal, support = _best_plane(blocks, left, limit, min_blocks, rng)
+        normal, support = _best_plane(blocks, left, limit, min_blocks, rng, tolerances=tolerances)
         if np.count_nonzero(support) < min_blocks:
             break
         left &= ~support
         if all(abs(float(normal @ other)) < np.cos(np.radians(min_angle_deg)) for other in normals):
             normals.append(normal)
-    labels = _assign(blocks, normals, limit, min_blocks)
+    labels = _assign(blocks, normals, limit, min_blocks, tolerances=tolerances)
     return _finish(angle_model, axial, rays, sigma, mask, labels)
 
 
 def _average(
-    angle_model: AngleModel, axial: Floats, rays: Floats, sigma: Floats, mask: Mask
+    angle_model: AngleModel,
+    axial: Floats,
+    rays: Floats,
+    sigma: Floats,
+    mask: Mask,
+    *,
+    tolerances: SearchTolerances,
 ) -> _Blocks:
     """Average a phase map over blocks, weighted by precision; half a block has to be known."""
     length = np.hypot(axial[0], axial[1])
@@ -152,7 +180,9 @@ def _average(
     means = np.stack([_block_sums(weight * u)[known] for u in unit]) / total
     mean_rays = np.stack([_block_sums(np.where(usable, r, 0))[known] for r in rays])
     mean_rays /= np.sqrt((mean_rays * mean_rays).sum(axis=0))
-    return _Blocks(angle_model, known, means, mean_rays, np.sqrt(1 / total + MODEL_SIGMA**2))
+    return _Blocks(
+        angle_model, known, means, mean_rays, np.sqrt(1 / total + tolerances.model_sigma**2)
+    )
 
 
 def _block_sums(image: NDArray[Any]) -> Array:
@@ -163,25 +193,40 @@ def _block_sums(image: NDArray[Any]) -> Array:
 
 
 def _best_plane(
-    blocks: _Blocks, left: Mask, limit: Floats, min_blocks: int, rng: np.random.Generator
+    blocks: _Blocks,
+    left: Mask,
+    limit: Floats,
+    min_blocks: int,
+    rng: np.random.Generator,
+    *,
+    tolerances: SearchTolerances,
 ) -> tuple[Array, Mask]:
     """The best hypothesis about the blocks left, refined, and its coherent support."""
     best, support = np.full(3, np.nan), np.zeros_like(left)
-    for hypothesis in _hypotheses(blocks, left, limit, rng):
+    for hypothesis in _hypotheses(blocks, left, limit, rng, tolerances=tolerances):
         normal: Array = hypothesis
-        inside = _coherent(blocks.residuals(normal) < limit, left, min_blocks // 2)
+        inside = _coherent(
+            blocks.residuals(normal) < limit, left, min_blocks // 2, tolerances=tolerances
+        )
         for _ in range(4):
             if np.count_nonzero(inside) < min_blocks // 2:
                 break
             normal = blocks.refine(inside, normal).normal
-            inside = _coherent(blocks.residuals(normal) < limit, left, min_blocks // 2)
+            inside = _coherent(
+                blocks.residuals(normal) < limit, left, min_blocks // 2, tolerances=tolerances
+            )
         if np.count_nonzero(inside) > np.count_nonzero(support):
             best, support = normal, inside
     return best, support
 
 
 def _hypotheses(
-    blocks: _Blocks, left: Mask, limit: Floats, rng: np.random.Generator
+    blocks: _Blocks,
+    left: Mask,
+    limit: Floats,
+    rng: np.random.Generator,
+    *,
+    tolerances: SearchTolerances,
 ) -> list[Array]:
     """Normals of pairs of rows near each other, those first that most blocks agree with."""
     rows = np.full((*left.shape, 3), np.nan)
@@ -190,33 +235,33 @@ def _hypotheses(
     )
     height, width = left.shape
     where = np.argwhere(left)
-    first = where[rng.integers(len(where), size=NUM_HYPOTHESES)]
-    reach = np.geomspace(4, MAX_REACH, NUM_HYPOTHESES)[:, None]
+    first = where[rng.integers(len(where), size=tolerances.num_hypotheses)]
+    reach = np.geomspace(4, tolerances.max_reach, tolerances.num_hypotheses)[:, None]
     second = first + np.rint(rng.uniform(-1, 1, first.shape) * reach).astype(np.int64)
     second = np.clip(second, 0, [height - 1, width - 1])
     normals = np.cross(rows[tuple(first.T)], rows[tuple(second.T)])
     length = np.linalg.norm(normals, axis=1)
-    usable = left[tuple(second.T)] & (length > MIN_CROSS)
+    usable = left[tuple(second.T)] & (length > tolerances.min_cross)
     normals = normals[usable] / length[usable, None]
     some = left[blocks.known]
     samples = stack_samples(
         blocks.angle_model, blocks.axial[:, some], blocks.rays[:, some], blocks.sigma[some]
     )
-    step = max(1, samples.shape[1] // NUM_SCORED)
+    step = max(1, samples.shape[1] // tolerances.num_scored)
     limits = limit[left][::step]
     scores = [
         np.count_nonzero(np.abs(phase_errors(normal, samples[:, ::step])) < limits)
         for normal in normals
     ]
-    return list(normals[np.argsort(scores)[::-1][:NUM_REFINED]])
+    return list(normals[np.argsort(scores)[::-1][: tolerances.num_refined]])
 
 
-def _coherent(agree: Mask, left: Mask, min_blocks: int) -> Mask:
+def _coherent(agree: Mask, left: Mask, min_blocks: int, *, tolerances: SearchTolerances) -> Mask:
     """Blocks left in whose neighbourhood most agree, in areas of some size."""
-    window = (COHERENCE_BLOCKS, COHERENCE_BLOCKS)
+    window = (tolerances.coherence_blocks, tolerances.coherence_blocks)
     agreeing = cv2.blur((agree & left).astype(np.float32), window)
     present = cv2.blur(left.astype(np.float32), window)
-    inside = left & (agreeing > COHERENT_SHARE * present)
+    inside = left & (agreeing > tolerances.coherent_share * present)
     num, labels, stats, _ = cv2.connectedComponentsWithStats(
         inside.astype(np.uint8), connectivity=4
     )
@@ -226,7 +271,12 @@ def _coherent(agree: Mask, left: Mask, min_blocks: int) -> Mask:
 
 
 def _assign(
-    blocks: _Blocks, normals: Sequence[Array], limit: Floats, min_blocks: int
+    blocks: _Blocks,
+    normals: Sequence[Array],
+    limit: Floats,
+    min_blocks: int,
+    *,
+    tolerances: SearchTolerances,
 ) -> NDArray[np.int64]:
     """Number of the plane of each block (H', W'), -1 for none."""
     labels = np.full(blocks.known.shape, -1, np.int64)
@@ -234,13 +284,16 @@ def _assign(
         return labels
     for _ in range(2):
         residuals = np.stack([blocks.residuals(normal) for normal in normals])
-        smooth = [_mean_where(np.minimum(r, 2 * limit), blocks.known) for r in residuals]
+        smooth = [
+            _mean_where(np.minimum(r, 2 * limit), blocks.known, tolerances=tolerances)
+            for r in residuals
+        ]
         nearest = np.argmin(smooth, axis=0)
         labels[:] = -1
         refined = []
         for index, normal in enumerate(normals):
             agree = (residuals[index] < limit) & (nearest == index)
-            inside = _coherent(agree, blocks.known, min_blocks // 2)
+            inside = _coherent(agree, blocks.known, min_blocks // 2, tolerances=tolerances)
             inside &= nearest == index
             labels[inside] = index
             enough = np.count_nonzero(inside) >= min_blocks
@@ -249,9 +302,9 @@ def _assign(
     return labels
 
 
-def _mean_where(image: Floats, known: Mask) -> Floats:
+def _mean_where(image: Floats, known: Mask, *, tolerances: SearchTolerances) -> Floats:
     """Mean over the known blocks of a window."""
-    window = (COHERENCE_BLOCKS, COHERENCE_BLOCKS)
+    window = (tolerances.coherence_blocks, tolerances.coherence_blocks)
     total = cv2.blur(np.where(known, image, 0).astype(np.float32), window)
     return np.asarray(total / np.maximum(cv2.blur(known.astype(np.float32), window), 1e-6))
 

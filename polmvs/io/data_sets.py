@@ -1,0 +1,443 @@
+"""Public multi-view polarization sets: their layouts, told by the names of files and folders.
+
+====================  ===========================================================================
+``ppa4p3d``           ``images/`` raw mosaics with gamma 0.5, ``cams/`` MVSNet texts
+``PISR``              ``raw/`` colour mosaics as ``.npy``, or ``aop/ dop/ image/``; ``mask/``;
+                      ``intrinsics.npz``, ``cameras_sphere.npz``, ``gamma<value>.txt``
+``PANDORA``           ``images_stokes/NAME_{s0,s0p1,s0p2}.hdr`` with s1 = s0p1 - s0, s2 = s0p2 - s0,
+                      or ``images_raw/`` dumps of Mono12p; ``mask/``; ``sparse/0``
+``NeRSP``             ``s0/ s1/ s2/`` arrays; ``cameras.npz``; masks in the alpha of
+                      ``input_azimuth_maps/``
+``MVAS``              ``input_azimuth_maps/`` (16 bit, pi a full scale, clockwise), ``mask/`` or
+                      alpha, ``sparse/0``
+====================  ===========================================================================
+
+``cameras.npz`` and ``cameras_sphere.npz`` are those of IDR and NeuS: ``world_mat_<i or name>`` is
+the projection ``K [R t]`` (4x4), pixels counted from the centre of the first.
+
+A set is described by :class:`DataSet`; what is not in a form that a capture is read from (PANDORA's
+images, azimuth maps) is converted to Stokes images by :func:`load_converted`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import rq
+
+from polmvs.camera import PinholeCamera
+from polmvs.config import BayerOrder, CaptureKind, CaptureOptions, Light, Packing
+from polmvs.errors import DataError
+from polmvs.geometry import RigidTransform, nearest_rotation
+from polmvs.io.images import decode_image, read_bytes
+from polmvs.io.intrinsics import Intrinsics, from_opencv_matrix
+from polmvs.io.layouts import is_author_layout, read_camera_text
+from polmvs.io.raw_formats import read_raw
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+PANDORA_SIZE = (2448, 2048)  # of its dumps, px
+IMAGE_SUFFIXES = (".png", ".jpg", ".npy", ".raw", ".hdr", ".exr")
+MAX_NPZ_BYTES = 1 << 28
+
+
+class DataSetKind(StrEnum):
+    """Whose layout a set has."""
+
+    PPA4P3D = "ppa4p3d"
+    PISR = "PISR"
+    PANDORA = "PANDORA"
+    NERSP = "NeRSP"
+    MVAS = "MVAS"
+
+
+class PosedImage(NamedTuple):
+    """A camera as a set gives it.
+
+    Attributes
+    ----------
+    name : of the image, a stem with ``.png``, as in COLMAP models.
+    intrinsics : of the polarization images.
+    cam_from_world : in the set's world.
+    """
+
+    name: str
+    intrinsics: Intrinsics
+    cam_from_world: RigidTransform
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataSet:
+    """A public set as a capture.
+
+    Attributes
+    ----------
+    kind : whose layout.
+    folder : as given.
+    capture : folder that a capture is read from as it is; None where :func:`load_converted` makes
+        its Stokes images first.
+    options : how it is read.
+    names : stems of the images, sorted.
+    cameras : given poses; empty where ``sparse`` has them.
+    sparse : COLMAP model of the set, if it brings one.
+    masks : file of the mask by stem; in the alpha channel where it has one, else where not black.
+    light : reflection that the angles are of, where the set says so.
+    """
+
+    kind: DataSetKind
+    folder: Path
+    capture: Path | None
+    options: CaptureOptions
+    names: tuple[str, ...]
+    cameras: tuple[PosedImage, ...]
+    sparse: Path | None
+    masks: Mapping[str, Path]
+    light: Light | None = None
+
+
+def recognise_data_set(folder: Path) -> DataSetKind | None:
+    """Whose layout a folder has; None of none known."""
+
+    def has(*names: str) -> bool:
+        return all((folder / name).exists() for name in names)
+
+    if is_author_layout(folder):
+        return DataSetKind.PPA4P3D
+    if has("cameras_sphere.npz") and (has("raw") or has("aop", "dop")):
+        return DataSetKind.PISR
+    if has("images_stokes") or has("images_raw", "sparse"):
+        return DataSetKind.PANDORA
+    if has("s0", "s1", "s2"):
+        return DataSetKind.NERSP
+    if has("input_azimuth_maps"):
+        return DataSetKind.MVAS
+    return None
+
+
+def read_data_set(folder: Path, bayer: BayerOrder = BayerOrder.RGGB) -> DataSet:
+    """Describe a public set.
+
+    Parameters
+    ----------
+    folder : of one object or scene.
+    bayer : colours of raw colour mosaics, which no set says.
+
+    Raises
+    ------
+    DataError
+        The layout is none known, or a file of it is missing or damaged.
+    """
+    if not folder.is_dir():
+        raise DataError(folder, "no such folder.")
+    kind = recognise_data_set(folder)
+    readers = {
+        DataSetKind.PPA4P3D: _read_ppa4p3d,
+        DataSetKind.PISR: _read_pisr,
+        DataSetKind.PANDORA: _read_pandora,
+        DataSetKind.NERSP: _read_nersp,
+        DataSetKind.MVAS: _read_mvas,
+    }
+    if kind is None:
+        known = ", ".join(DataSetKind)
+        raise DataError(folder, f"has the layout of no set that is known ({known}).")
+    return readers[kind](folder, bayer)
+
+
+def load_converted(data_set: DataSet, stem: str) -> tuple[Image, Image, Image]:
+    """Stokes images s0, s1, s2 ``(H, W)`` or ``(H, W, 3)`` of an image of PANDORA or MVAS.
+
+    Of an azimuth map the light is taken as fully polarised in the mask and unpolarised off it, and
+    s0 is the intensity image's where there is one of that name and size, else 1.
+
+    Raises
+    ------
+    DataError
+        A file is missing or damaged.
+    """
+    if data_set.capture is not None:
+        raise ValueError(f"{data_set.kind} is read as it is, from {data_set.capture}.")
+    if data_set.kind is DataSetKind.PANDORA:
+        place = data_set.folder / "images_stokes"
+        planes = [
+            np.asarray(read_raw(place / f"{stem}_{name}.hdr").samples, np.float32)
+            for name in ("s0", "s0p1", "s0p2")
+        ]
+        if len({plane.shape for plane in planes}) != 1:
+            raise DataError(place / f"{stem}_s0.hdr", "its three images differ in size.")
+        return planes[0], planes[1] - planes[0], planes[2] - planes[0]
+    return _from_azimuth(data_set, stem)
+
+
+def read_set_mask(path: Path) -> Mask:
+    """A mask (H, W): where alpha is not 0, else where any channel is not.
+
+    Raises
+    ------
+    DataError
+        The file is missing or damaged.
+    """
+    image = decode_image(path, read_bytes(path))
+    if image.ndim == 2:
+        return np.asarray(image != 0)
+    if image.shape[2] == 4:
+        return np.asarray(image[..., 3] != 0)
+    return np.asarray((image != 0).any(axis=-1))
+
+
+def _read_ppa4p3d(folder: Path, bayer: BayerOrder) -> DataSet:
+    images = _files(folder / "images", (".png",))
+    width, height = _size_of(next(iter(images.values())))
+    cameras = []
+    for index, stem in enumerate(images):
+        path = folder / "cams" / f"{stem}_cam.txt"
+        if not path.is_file():
+            path = folder / "cams" / f"{index:08d}_cam.txt"
+        view = read_camera_text(path, f"{stem}.png", width // 2, height // 2)
+        assert isinstance(view.camera, PinholeCamera)
+        camera = view.camera
+        intrinsics = Intrinsics(
+            model="PINHOLE",
+            width=camera.width,
+            height=camera.height,
+            params=(camera.fx, camera.fy, camera.cx, camera.cy),
+        )
+        cameras.append(PosedImage(view.name, intrinsics, view.cam_from_world))
+    return DataSet(
+        kind=DataSetKind.PPA4P3D,
+        folder=folder,
+        capture=folder / "images",
+        options=CaptureOptions(gamma=0.5),
+        names=tuple(images),
+        cameras=tuple(cameras),
+        sparse=None,
+        masks={},
+    )
+
+
+def _read_pisr(folder: Path, bayer: BayerOrder) -> DataSet:
+    raw = (folder / "raw").is_dir()
+    images = _files(folder / ("raw" if raw else "aop"), (".npy",))
+    gamma = 1.0
+    for path in sorted(folder.glob("gamma*.txt")):
+        match = re.fullmatch(r"gamma(\d+(?:\.\d+)?)", path.stem)
+        if match is None:
+            raise DataError(path, "names no gamma; gamma0.5.txt is expected.")
+        gamma = float(match[1])
+    lens = _read_npz(folder / "intrinsics.npz")
+    width, height = _size_of(next(iter(images.values())))
+    if raw:
+        width, height = width // 2, height // 2
+    path = folder / "intrinsics.npz"
+    try:
+        matrix = _matrix(lens["camera_matrix"], (3, 3))
+        distortion = np.ravel(lens["dist_coeffs"]).astype(np.float64)
+        intrinsics = from_opencv_matrix(matrix, distortion, width, height)
+    except (KeyError, ValueError) as error:
+        raise DataError(path, f"holds no camera that can be used: {error}.") from error
+    cameras = [
+        camera._replace(intrinsics=intrinsics)
+        for camera in _read_world_mats(folder / "cameras_sphere.npz", tuple(images), width, height)
+    ]
+    options = CaptureOptions(kind=CaptureKind.AOLP)
+    if raw:
+        options = CaptureOptions(gamma=gamma, bayer=bayer, full_scale=4095)
+    return DataSet(
+        kind=DataSetKind.PISR,
+        folder=folder,
+        capture=folder / "raw" if raw else folder,
+        options=options,
+        names=tuple(images),
+        cameras=tuple(cameras),
+        sparse=None,
+        masks=_files(folder / "mask", (".png",), needed=False),
+    )
+
+
+def _read_pandora(folder: Path, bayer: BayerOrder) -> DataSet:
+    stokes = (folder / "images_stokes").is_dir()
+    if stokes:
+        found = _files(folder / "images_stokes", (".hdr", ".exr"))
+        names = sorted({stem[: -len("_s0")] for stem in found if stem.endswith("_s0")})
+        for name in names:
+            for part in ("s0p1", "s0p2"):
+                if f"{name}_{part}" not in found:
+                    raise DataError(folder / "images_stokes", f"lacks {name}_{part}.hdr.")
+    else:
+        names = sorted(_files(folder / "images_raw", (".raw",)))
+    if not names:
+        raise DataError(folder / "images_stokes", "holds no NAME_s0.hdr.")
+    options = CaptureOptions(full_scale=1.0)
+    if not stokes:
+        options = CaptureOptions(
+            width=PANDORA_SIZE[0], height=PANDORA_SIZE[1], packing=Packing.MONO12P, bayer=bayer,
+            full_scale=4095,
+        )  # fmt: skip
+    return DataSet(
+        kind=DataSetKind.PANDORA,
+        folder=folder,
+        capture=None if stokes else folder / "images_raw",
+        options=options,
+        names=tuple(names),
+        cameras=(),
+        sparse=_sparse_of(folder),
+        masks=_files(folder / "mask", (".png",), needed=False),
+    )
+
+
+def _read_nersp(folder: Path, bayer: BayerOrder) -> DataSet:
+    images = _files(folder / "s0", (".npy",))
+    width, height = _size_of(next(iter(images.values())))
+    return DataSet(
+        kind=DataSetKind.NERSP,
+        folder=folder,
+        capture=folder,
+        options=CaptureOptions(kind=CaptureKind.STOKES),
+        names=tuple(images),
+        cameras=_read_world_mats(folder / "cameras.npz", tuple(images), width, height),
+        sparse=None,
+        masks=_files(folder / "input_azimuth_maps", (".png",), needed=False)
+        or _files(folder / "mask", (".png",), needed=False),
+    )
+
+
+def _read_mvas(folder: Path, bayer: BayerOrder) -> DataSet:
+    images = _files(folder / "input_azimuth_maps", (".png",))
+    masks = _files(folder / "mask", (".png",), needed=False)
+    return DataSet(
+        kind=DataSetKind.MVAS,
+        folder=folder,
+        capture=None,
+        # Azimuths of normals, clockwise from +x: the phase of diffuse light.
+        options=CaptureOptions(clockwise=True, full_scale=1.0),
+        names=tuple(images),
+        cameras=(),
+        sparse=_sparse_of(folder),
+        masks=masks or images,
+        light=Light.DIFFUSE,
+    )
+
+
+def _from_azimuth(data_set: DataSet, stem: str) -> tuple[Image, Image, Image]:
+    path = data_set.folder / "input_azimuth_maps" / f"{stem}.png"
+    image = decode_image(path, read_bytes(path))
+    plane = image if image.ndim == 2 else image[..., 0]
+    if plane.dtype not in (np.uint8, np.uint16):
+        raise DataError(path, "is no 8- or 16-bit azimuth map.")
+    angle = np.asarray(plane * (np.pi / np.iinfo(plane.dtype).max), np.float32)
+    mask = read_set_mask(data_set.masks.get(stem, path))
+    if mask.shape != angle.shape:
+        raise DataError(data_set.masks[stem], f"is not of the size of {path.name}.")
+    s0 = np.ones(angle.shape, np.float32)
+    for place in ("image", "images", "images_SfM"):
+        for suffix in (".png", ".jpg"):
+            shown = data_set.folder / place / f"{stem}{suffix}"
+            if shown.is_file():
+                samples = read_raw(shown).samples
+                if samples.shape[:2] == angle.shape:
+                    gray = samples if samples.ndim == 2 else samples.mean(axis=-1)
+                    s0 = np.asarray(gray / np.iinfo(samples.dtype).max, np.float32)
+                    # An unlit pixel has no phase; these maps give one all the same.
+                    s0 = np.maximum(s0, np.float32(0.02))
+    polarized = np.where(mask, s0, 0).astype(np.float32)
+    return s0, polarized * np.cos(2 * angle), polarized * np.sin(2 * angle)
+
+
+def _files(folder: Path, suffixes: tuple[str, ...], *, needed: bool = True) -> dict[str, Path]:
+    """Files of a folder by stem, sorted."""
+    if not folder.is_dir():
+        if needed:
+            raise DataError(folder, "no such folder in the set.")
+        return {}
+    found = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in suffixes}
+    if needed and not found:
+        raise DataError(folder, f"holds no file of {', '.join(suffixes)}.")
+    return found
+
+
+def _sparse_of(folder: Path) -> Path | None:
+    """The COLMAP model of a set."""
+    for place in (folder / "sparse" / "0", folder / "sparse"):
+        if any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return place
+    return None
+
+
+def _size_of(path: Path) -> tuple[int, int]:
+    header = read_raw(path).header
+    return header.width, header.height
+
+
+def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """Arrays of numbers by name.
+
+    Raises
+    ------
+    DataError
+        The file is missing, damaged or too large.
+    """
+    try:
+        if path.stat().st_size > MAX_NPZ_BYTES:
+            raise DataError(path, "is too large for cameras.")
+        with np.load(path, allow_pickle=False) as content:
+            return {name: content[name] for name in content.files}
+    except OSError as error:
+        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+    except Exception as error:  # zipfile and NumPy's header parser raise many kinds
+        raise DataError(path, "is no readable .npz of cameras; copy the set again.") from error
+
+
+def _read_world_mats(
+    path: Path, stems: tuple[str, ...], width: int, height: int
+) -> tuple[PosedImage, ...]:
+    """Cameras of IDR and NeuS, by name or by place in the order of names."""
+    content = _read_npz(path)
+    cameras = []
+    for index, stem in enumerate(stems):
+        keys = [f"world_mat_{stem}", f"world_mat_{index}"]
+        key = next((key for key in keys if key in content), None)
+        if key is None:
+            raise DataError(path, f"has no {keys[0]} and no {keys[1]}.")
+        try:
+            matrix, pose = _decompose(_matrix(content[key], (4, 4), (3, 4))[:3])
+            intrinsics = from_opencv_matrix(_without_skew(matrix), [], width, height)
+        except ValueError as error:
+            raise DataError(path, f"{key} is no camera: {error}.") from error
+        cameras.append(PosedImage(f"{stem}.png", intrinsics, pose))
+    return tuple(cameras)
+
+
+def _decompose(projection: Array) -> tuple[Array, RigidTransform]:
+    """``K [R t]`` into its parts; K has a positive diagonal and a last element of 1."""
+    if not np.isfinite(projection).all() or abs(np.linalg.det(projection[:, :3])) < 1e-12:
+        raise ValueError("it is singular")
+    scaled = projection * np.sign(np.linalg.det(projection[:, :3]))
+    matrix, rotation = rq(scaled[:, :3])
+    signs = np.diag(np.sign(np.diag(matrix)))
+    matrix, rotation = matrix @ signs, signs @ rotation
+    nearest = nearest_rotation(rotation)
+    if nearest is None:
+        raise ValueError("it holds no rotation")
+    translation = np.linalg.solve(matrix, scaled[:, 3])
+    return matrix / matrix[2, 2], RigidTransform(nearest, translation)
+
+
+def _without_skew(matrix: Array) -> Array:
+    """A calibration matrix without the skew that rounding leaves."""
+    if abs(matrix[0, 1]) > 1e-3 * matrix[0, 0]:
+        raise ValueError(f"its axes are skewed by {matrix[0, 1]:.3g} px")
+    return np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1.0]])
+
+
+def _matrix(values: NDArray[Any], *shapes: tuple[int, int]) -> Array:
+    if values.shape not in shapes or values.dtype.kind not in "fiu":
+        raise ValueError(f"it is {values.shape}, not {shapes[0]}")
+    return np.asarray(values, np.float64)

@@ -1,0 +1,320 @@
+"""Public sets written in their real layout from the demo: same phases, poses and masks."""
+
+import json
+import struct
+
+import cv2
+import numpy as np
+import pytest
+from capture_writer import PATTERN, bits_of_stream, split_mosaic, stokes_of
+
+from polmvs.camera import PinholeCamera, pixel_centers
+from polmvs.colmap.models import read_model, reconstruction_of_views, write_reconstruction
+from polmvs.config import BayerOrder, CaptureKind, Light
+from polmvs.errors import DataError, OptionError
+from polmvs.geometry import RigidTransform
+from polmvs.io.data_sets import DataSetKind, read_data_set, recognise_data_set
+from polmvs.io.raw_formats import read_raw
+from polmvs.pipeline.data_set_import import import_data_set
+from polmvs.polarization.capture import open_capture
+from polmvs.polarization.stokes import axial_difference
+from polmvs.scene import View
+
+STEMS = ("000", "003", "007")
+WIDTH, HEIGHT = 916, 768  # multiples of 4, for colour
+
+
+@pytest.fixture(scope="module")
+def source(demo_capture):
+    """Linear mosaics, views and masks of three of the demo's images, by stem."""
+    truth = json.loads((demo_capture / "gt" / "cameras.json").read_text())["images"]
+    rng = np.random.default_rng(0)
+    result = {}
+    for stem in STEMS:
+        raw = read_raw(demo_capture / "raw" / f"{stem}.png").samples[:, :WIDTH]
+        share = np.clip((raw + rng.uniform(-0.5, 0.5, raw.shape)) / 255, 0, 1)
+        K = np.array(truth[f"{stem}.png"]["K"])
+        pose = np.array(truth[f"{stem}.png"]["cam_from_world"])
+        camera = PinholeCamera(
+            width=WIDTH // 2, height=HEIGHT // 2,
+            fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2],
+        )  # fmt: skip
+        view = View(
+            name=f"{stem}.png",
+            camera=camera,
+            cam_from_world=RigidTransform(pose[:, :3], pose[:, 3]),
+        )
+        mask = cv2.imread(str(demo_capture / "gt" / f"{stem}_mask.png"), -1)[:, : WIDTH // 2] > 0
+        result[stem] = (share, view, mask)
+    return result
+
+
+def opencv_matrix(view):
+    K = view.camera.K.copy()
+    K[:2, 2] -= 0.5
+    return K
+
+
+def world_mat(view):
+    pose = np.column_stack([view.cam_from_world.rotation, view.cam_from_world.translation])
+    return np.vstack([3.7 * opencv_matrix(view) @ pose, [0, 0, 0, 1]])  # of any scale
+
+
+def save_masks(folder, source, stems):
+    folder.mkdir()
+    for stem, (_, _, mask) in zip(stems, source.values(), strict=True):
+        cv2.imwrite(str(folder / f"{stem}.png"), 255 * mask.astype(np.uint8))
+
+
+def save_sparse(folder, source, stems):
+    folder.parent.mkdir()
+    views = [
+        View(name=f"{stem}.png", camera=view.camera, cam_from_world=view.cam_from_world)
+        for stem, (_, view, _) in zip(stems, source.values(), strict=True)
+    ]
+    write_reconstruction(reconstruction_of_views(views), folder)
+
+
+def colours(image):
+    """Three channels whose mean is the image, times a half as the sets have it."""
+    return 0.5 * np.dstack([0.8 * image, image, 1.2 * image]).astype(np.float32)
+
+
+def ppa4p3d(root, source):
+    (root / "images").mkdir(parents=True)
+    (root / "cams").mkdir()
+    stems = [f"{k:08d}" for k in range(len(source))]
+    for stem, (share, view, _) in zip(stems, source.values(), strict=True):
+        cv2.imwrite(
+            str(root / "images" / f"{stem}.png"), np.rint(255 * np.sqrt(share)).astype(np.uint8)
+        )
+        pose = np.eye(4)
+        pose[:3] = np.column_stack([view.cam_from_world.rotation, view.cam_from_world.translation])
+        lines = ["extrinsic", *(" ".join(map(repr, map(float, row))) for row in pose), ""]
+        K = opencv_matrix(view)
+        lines += ["intrinsic", *(" ".join(map(repr, map(float, row))) for row in K), ""]
+        (root / "cams" / f"{stem}_cam.txt").write_text("\n".join([*lines, "0.2 0.01 100 1.2", ""]))
+    return stems
+
+
+def pisr_cameras(root, source):
+    _, view, _ = next(iter(source.values()))
+    np.savez(root / "intrinsics.npz", camera_matrix=opencv_matrix(view), dist_coeffs=np.zeros(5))
+    mats = {f"world_mat_{k}": world_mat(v) for k, (_, v, _) in enumerate(source.values())}
+    mats |= {f"scale_mat_{k}": np.eye(4) for k in range(len(source))}
+    np.savez(root / "cameras_sphere.npz", **mats)
+
+
+def pisr(root, source):
+    (root / "raw").mkdir(parents=True)
+    stems = [f"{k:03d}" for k in range(len(source))]
+    for stem, (share, _, _) in zip(stems, source.values(), strict=True):
+        np.save(root / "raw" / f"{stem}.npy", np.rint(4095 * np.sqrt(share)).astype(np.uint16))
+    pisr_cameras(root, source)
+    (root / "gamma0.5.txt").write_text("")
+    save_masks(root / "mask", source, stems)
+    return stems
+
+
+def pisr_maps(root, source):
+    stems = [f"{k:03d}" for k in range(len(source))]
+    for name in ("aop", "dop", "image"):
+        (root / name).mkdir(parents=True)
+    for stem, (share, _, _) in zip(stems, source.values(), strict=True):
+        s = stokes_of(share)
+        np.save(root / "aop" / f"{stem}.npy", 0.5 * np.arctan2(s["s2"], s["s1"]))
+        np.save(root / "dop" / f"{stem}.npy", np.hypot(s["s1"], s["s2"]) / s["s0"].clip(1e-6))
+        rgb = np.clip(np.rint(colours(s["s0"]) * 255), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(root / "image" / f"{stem}.png"), rgb)
+    pisr_cameras(root, source)
+    return stems
+
+
+def pandora(root, source):
+    (root / "images_stokes").mkdir(parents=True)
+    stems = [f"{k + 1:02d}" for k in range(len(source))]
+    for stem, (share, _, _) in zip(stems, source.values(), strict=True):
+        s = stokes_of(share)
+        for name, image in (
+            ("s0", s["s0"]),
+            ("s0p1", s["s0"] + s["s1"]),
+            ("s0p2", s["s0"] + s["s2"]),
+        ):
+            cv2.imwrite(str(root / "images_stokes" / f"{stem}_{name}.hdr"), colours(image))
+    save_masks(root / "mask", source, stems)
+    save_sparse(root / "sparse" / "0", source, stems)
+    return stems
+
+
+def nersp(root, source):
+    stems = [f"{k:04d}" for k in range(len(source))]
+    for name in ("s0", "s1", "s2", "image", "input_azimuth_maps"):
+        (root / name).mkdir(parents=True)
+    for stem, (share, _, mask) in zip(stems, source.values(), strict=True):
+        s = stokes_of(share)
+        for name in ("s0", "s1", "s2"):
+            np.save(root / name / f"{stem}.npy", colours(s[name]))
+        rgba = np.zeros((*mask.shape, 4), np.uint16)
+        rgba[..., 3] = 65535 * mask
+        cv2.imwrite(str(root / "input_azimuth_maps" / f"{stem}.png"), rgba)
+        cv2.imwrite(str(root / "image" / f"{stem}.png"), np.zeros(mask.shape, np.uint8))
+    mats = {f"world_mat_{k}": world_mat(v) for k, (_, v, _) in enumerate(source.values())}
+    np.savez(root / "cameras.npz", **mats, scale_mat_0=np.eye(4))
+    return stems
+
+
+def mvas(root, source):
+    stems = [f"{k:02d}" for k in range(len(source))]
+    (root / "input_azimuth_maps").mkdir(parents=True)
+    (root / "images").mkdir()
+    for stem, (share, _, _) in zip(stems, source.values(), strict=True):
+        s = stokes_of(share)
+        azimuth = np.mod(-0.5 * np.arctan2(s["s2"], s["s1"]), np.pi)  # clockwise
+        cv2.imwrite(
+            str(root / "input_azimuth_maps" / f"{stem}.png"),
+            np.rint(azimuth / np.pi * 65535).astype(np.uint16),
+        )
+        gray = np.clip(np.rint(s["s0"] * 255), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(root / "images" / f"{stem}.png"), gray)
+    save_masks(root / "mask", source, stems)
+    save_sparse(root / "sparse" / "0", source, stems)
+    return stems
+
+
+SETS = {
+    # Writer, kind, largest median error of the AoLP on the part, degrees.
+    "ppa4p3d": (ppa4p3d, DataSetKind.PPA4P3D, 1.0),
+    "PISR": (pisr, DataSetKind.PISR, 4.0),  # colours: a quarter of the samples each
+    "PISR, maps": (pisr_maps, DataSetKind.PISR, 0.01),
+    "PANDORA": (pandora, DataSetKind.PANDORA, 1.0),
+    "NeRSP": (nersp, DataSetKind.NERSP, 0.01),
+    "MVAS": (mvas, DataSetKind.MVAS, 0.01),
+}
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_sets_are_read_as_they_are_published(tmp_path, source, name):
+    write, kind, worst = SETS[name]
+    root, out = tmp_path / "set", tmp_path / "out"
+    stems = write(root, source)
+    assert recognise_data_set(root) is kind
+    before = sorted(p.as_posix() for p in root.rglob("*"))
+    imported = import_data_set(root, out)
+    assert sorted(p.as_posix() for p in root.rglob("*")) == before
+    assert imported.data_set.names == tuple(stems)
+    assert imported.light is (Light.DIFFUSE if kind is DataSetKind.MVAS else None)
+    options = imported.data_set.options
+    if imported.data_set.capture is None:
+        from dataclasses import replace
+
+        options = replace(options, kind=CaptureKind.STOKES)
+    capture = open_capture(imported.capture, options)
+    assert (capture.width, capture.height) == (WIDTH // 2, HEIGHT // 2)
+    views = {view.name: view for view in read_model(imported.sparse).views}
+    for image, stem, (share, view, mask) in zip(capture.names, stems, source.values(), strict=True):
+        stokes = capture.load(image)
+        expected = stokes_of(share)
+        strong = np.hypot(expected["s1"], expected["s2"]) > 0.2 * expected["s0"]
+        seen = strong & stokes.valid & mask
+        assert seen.sum() > 1000
+        aolp = 0.5 * np.arctan2(expected["s2"], expected["s1"])
+        error = np.degrees(np.abs(axial_difference(stokes.aolp, aolp)))[seen]
+        assert np.median(error) < worst
+        read = views[f"{stem}.png"]
+        xy = pixel_centers(WIDTH // 2, HEIGHT // 2)[::50, ::50]
+        np.testing.assert_allclose(read.camera.rays(xy), view.camera.rays(xy), atol=1e-6)
+        np.testing.assert_allclose(
+            read.cam_from_world.rotation, view.cam_from_world.rotation, atol=1e-6
+        )
+        np.testing.assert_allclose(
+            read.cam_from_world.translation, view.cam_from_world.translation, atol=1e-6
+        )
+        if imported.masks is not None:
+            saved = cv2.imread(str(imported.masks / f"{stem}.png"), -1)
+            np.testing.assert_array_equal(saved > 0, mask)
+    if imported.data_set.cameras:
+        assert imported.num_points > 50
+
+
+def test_pandora_dumps(tmp_path, source, monkeypatch):
+    monkeypatch.setattr("polmvs.io.data_sets.PANDORA_SIZE", (WIDTH, HEIGHT))
+    root = tmp_path / "set"
+    pandora(root, source)
+    for path in (root / "images_stokes").iterdir():
+        path.unlink()
+    (root / "images_stokes").rmdir()
+    (root / "images_raw").mkdir()
+    for k, (share, _, _) in enumerate(source.values()):
+        samples = np.rint(share * 4095).astype(np.uint16)
+        (root / "images_raw" / f"{k + 1:02d}.raw").write_bytes(bits_of_stream(samples, 12))
+    data_set = read_data_set(root, BayerOrder.GRBG)
+    assert data_set.capture == root / "images_raw"
+    capture = open_capture(data_set.capture, data_set.options)
+    s0 = capture.load("01.raw").s0
+    expected = split_mosaic(next(iter(source.values()))[0], PATTERN).sum(axis=0) / 2
+    assert np.median(np.abs(s0 - expected)) < 0.02
+
+
+def test_masks_of_the_mosaics_size_are_halved(tmp_path, source):
+    root = tmp_path / "set"
+    stems = pandora(root, source)
+    for stem, (_, _, mask) in zip(stems, source.values(), strict=True):
+        big = np.kron(mask.astype(np.uint8), np.ones((2, 2), np.uint8))
+        cv2.imwrite(str(root / "mask" / f"{stem}.png"), 255 * big)
+    imported = import_data_set(root, tmp_path / "out")
+    saved = cv2.imread(str(imported.masks / f"{stems[0]}.png"), -1)
+    np.testing.assert_array_equal(saved > 0, source[STEMS[0]][2])
+
+
+def damage(root, name, content):
+    path = root / name
+    if content is None:
+        path.unlink()
+    else:
+        path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("write", "name", "content", "words"),
+    [
+        (nersp, "cameras.npz", None, r"cameras\.npz: cannot be read"),
+        (nersp, "cameras.npz", b"PK", "no readable .npz"),
+        (nersp, "s1/0001.npy", None, "0001"),
+        (pandora, "images_stokes/02_s0p1.hdr", None, "lacks 02_s0p1"),
+        (pandora, "images_stokes/02_s0p1.hdr", b"#?RADIANCE\n", "02_s0p1"),
+        (pandora, "mask/02.png", None, "no mask of 02"),
+        (pisr_maps, "intrinsics.npz", b"", "intrinsics.npz"),
+        (ppa4p3d, "cams/00000001_cam.txt", b"extrinsic", "00000001_cam"),
+        (mvas, "input_azimuth_maps/01.png", struct.pack("<4i", 1, 2, 3, 4), "01.png"),
+    ],
+)
+def test_damaged_sets_name_the_file_and_leave_nothing(
+    tmp_path, source, write, name, content, words
+):
+    root = tmp_path / "set"
+    write(root, source)
+    damage(root, name, content)
+    with pytest.raises((DataError, OptionError), match=words):
+        import_data_set(root, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_world_mats_that_are_no_cameras(tmp_path, source):
+    root = tmp_path / "set"
+    nersp(root, source)
+    for bad in (np.zeros((4, 4)), np.eye(3), np.full((4, 4), np.nan)):
+        np.savez(root / "cameras.npz", **{f"world_mat_{k}": bad for k in range(3)})
+        with pytest.raises(DataError, match="world_mat_0 is no camera"):
+            read_data_set(root)
+    np.savez(root / "cameras.npz", other=np.eye(4))
+    with pytest.raises(DataError, match="has no world_mat_0000 and no world_mat_0"):
+        read_data_set(root)
+
+
+def test_unknown_layouts_and_existing_targets(tmp_path, source):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="no set that is known"):
+        import_data_set(tmp_path / "empty", tmp_path / "out")
+    mvas(tmp_path / "set", source)
+    with pytest.raises(OptionError, match="exists"):
+        import_data_set(tmp_path / "set", tmp_path / "empty")
