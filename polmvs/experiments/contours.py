@@ -25,7 +25,14 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel, ExperimentOptions
 from polmvs.errors import DataError
 from polmvs.evaluation.metrics import FAR_M
-from polmvs.experiments.data import OnProgress, Scene, Truth, load_view, require_counted
+from polmvs.experiments.data import (
+    EXACT_SIGMA,
+    OnProgress,
+    Scene,
+    Truth,
+    load_view,
+    require_counted,
+)
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.io.layouts import BoardTruth
 from polmvs.neighbors import nearest_points
@@ -366,7 +373,9 @@ def _normals(
     """Normals (N, 3) in the frame of the first view, NaN where the views do not give one."""
     first = maps[0].view.cam_from_world
     rows = gather_rows(AngleModel.PPA, first.inverse() * points_in_cam, maps, range_maps)
-    estimate = solve_normals(rows.rows, rows.rays, rows.sigma, robust=False)
+    # As in the paper, which knows of no noise: two rows that cross give a normal.
+    sigma = np.where(np.isfinite(rows.sigma), EXACT_SIGMA, np.inf)
+    estimate = solve_normals(rows.rows, rows.rays, sigma, robust=False)
     return np.asarray(estimate.normals @ first.rotation.T, np.float64)
 
 
