@@ -24,11 +24,28 @@ Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-SHARP_SMOOTHING_PX = 0.7
-FINE_SMOOTHING_PX = 1.5
-COARSE_SMOOTHING_PX = 5.0  # bridges marks and frontal spots
-MODEL_SIGMA = 0.014  # rad; error of a phase that noise does not explain, strongly polarised light
-MIXTURE_SIGMA = 0.006  # rad x DoLP; light of the other kind mixed in turns the phase by this / DoLP
+
+@dataclass(frozen=True, kw_only=True)
+class PhaseTolerances:
+    """How phases are smoothed, and how certain they are beside their noise.
+
+    Attributes
+    ----------
+    sharp_smoothing_px : of the lowest DoLP of single pixels. Guess.
+    fine_smoothing_px : of the phase. Guess.
+    coarse_smoothing_px : of the phase where few pixels count: it bridges marks and frontal
+        spots. Guess.
+    model_sigma : rad; error of the phase of strongly polarised light that noise does not
+        explain. Measured on the shared captures.
+    mixture_sigma : rad times DoLP; light of the other kind mixed in turns the phase by this
+        over the DoLP. Measured on the shared captures.
+    """
+
+    sharp_smoothing_px: float = 0.7
+    fine_smoothing_px: float = 1.5
+    coarse_smoothing_px: float = 5.0
+    model_sigma: float = 0.014
+    mixture_sigma: float = 0.006
 
 
 @dataclass(frozen=True)
@@ -78,6 +95,8 @@ def build_phase_map(
     sigma: Image,
     region: Region,
     light: Light,
+    *,
+    tolerances: PhaseTolerances = PhaseTolerances(),
 ) -> PhaseMap:
     """Smooth the Stokes images over the reliable pixels and turn them into phase and precision.
 
@@ -87,32 +106,37 @@ def build_phase_map(
     sigma : (H, W) float32, standard deviation of s1 and of s2.
     region : of this view.
     light : which reflection dominates; specular light turns the phase by pi/2 from the AoLP.
+    tolerances : of this step.
     """
     weight = region.reliable.astype(np.float32)
     stokes = np.dstack([s0, s1, s2, np.square(sigma)])
-    fine, fine_weight = _normalized_smoothing(stokes, weight, FINE_SMOOTHING_PX)
-    coarse, coarse_weight = _normalized_smoothing(stokes, weight, COARSE_SMOOTHING_PX)
+    fine, fine_weight = _normalized_smoothing(stokes, weight, tolerances.fine_smoothing_px)
+    coarse, coarse_weight = _normalized_smoothing(stokes, weight, tolerances.coarse_smoothing_px)
     use_fine = fine_weight > 0.25
     smoothed = np.where(use_fine[..., None], fine, coarse)
-    width_px = np.where(use_fine, FINE_SMOOTHING_PX, COARSE_SMOOTHING_PX)
+    width_px = np.where(use_fine, tolerances.fine_smoothing_px, tolerances.coarse_smoothing_px)
     share = np.where(use_fine, fine_weight, coarse_weight)
     with np.errstate(divide="ignore", invalid="ignore"):
         axial = phase_sign(light) * smoothed[..., 1:3] / smoothed[..., :1]
         dolp = np.linalg.norm(axial, axis=-1)
         # A Gaussian of width w averages 4 pi w^2 independent pixels.
         noise = np.sqrt(smoothed[..., 3] / (4 * np.pi * width_px**2 * share)) / smoothed[..., 0]
-        variance = MODEL_SIGMA**2 + (MIXTURE_SIGMA**2 + (0.5 * noise) ** 2) / dolp**2
+        variance = (
+            tolerances.model_sigma**2 + (tolerances.mixture_sigma**2 + (0.5 * noise) ** 2) / dolp**2
+        )
         precision = np.where(region.inside & (share > 0.02), 1 / variance, 0)
     samples = np.dstack([axial, precision]).astype(np.float32)
     np.nan_to_num(samples, copy=False, nan=0.0)
     diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
     intensity = np.asarray(s0, np.float32)
-    return PhaseMap(view, region, samples, intensity, diffuse, _lowest_dolp(stokes))
+    return PhaseMap(
+        view, region, samples, intensity, diffuse, _lowest_dolp(stokes, tolerances=tolerances)
+    )
 
 
-def _lowest_dolp(stokes: Image) -> NDArray[np.uint8]:
+def _lowest_dolp(stokes: Image, *, tolerances: PhaseTolerances) -> NDArray[np.uint8]:
     """Lowest DoLP in the 3x3 px about each pixel, in 1/255."""
-    sharp = smooth(stokes[..., :3], SHARP_SMOOTHING_PX)
+    sharp = smooth(stokes[..., :3], tolerances.sharp_smoothing_px)
     dolp = np.hypot(sharp[..., 1], sharp[..., 2]) / np.maximum(sharp[..., 0], 1e-6)
     quantised = (255 * np.clip(dolp, 0, 1)).astype(np.uint8)
     lowest = cv2.erode(quantised, np.ones((3, 3), np.uint8))

@@ -296,7 +296,7 @@ def test_the_search_is_bounded_and_says_so(board, monkeypatch):
     monkeypatch.setattr(
         "polmvs.surface.parts._pieces_of", lambda phase_map: 40 * found[id(phase_map)]
     )
-    monkeypatch.setattr(pieces, "place_piece", nowhere)
+    monkeypatch.setattr("polmvs.surface.parts.place_piece", nowhere)
     seeds, reports = find_part_seeds(
         AngleModel.PPA, board.maps, NO_SEEDS, ABOUT, placements_per_view=3, on_progress=told.append
     )

@@ -16,7 +16,7 @@ from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal
 from polmvs.normals.single_view.search import FoundPlane, find_planes
 from polmvs.polarization.angle_models import correct_stokes, phase_sign
 from polmvs.polarization.capture import open_image
-from polmvs.polarization.phase_map import MIXTURE_SIGMA, MODEL_SIGMA
+from polmvs.polarization.phase_map import PhaseTolerances
 from polmvs.polarization.stokes import Stokes
 
 Image = NDArray[np.float32]
@@ -98,15 +98,16 @@ def load_stokes(path: Path, options: CaptureOptions) -> Stokes:
     return open_image(path, options).load(path.name)
 
 
-def phase_sigma(stokes: Stokes) -> Image:
+def phase_sigma(stokes: Stokes, *, tolerances: PhaseTolerances | None = None) -> Image:
     """Deviation of the phase (H, W), rad: noise, the model's error, and light of the other kind.
 
     As in :mod:`polmvs.polarization.phase_map`, for single pixels; infinite or NaN where there is
     no polarisation.
     """
+    t = tolerances or PhaseTolerances()
     with np.errstate(divide="ignore", invalid="ignore"):
-        noise = MIXTURE_SIGMA**2 + np.square(0.5 * stokes.sigma / stokes.s0)
-        return np.asarray(np.sqrt(MODEL_SIGMA**2 + noise / np.square(stokes.dolp)), np.float32)
+        noise = t.mixture_sigma**2 + np.square(0.5 * stokes.sigma / stokes.s0)
+        return np.asarray(np.sqrt(t.model_sigma**2 + noise / np.square(stokes.dolp)), np.float32)
 
 
 def polygon_mask(corners: Sequence[Sequence[float]], shape: tuple[int, int]) -> Mask:
