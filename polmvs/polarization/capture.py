@@ -419,12 +419,8 @@ def open_files(files: CaptureFiles, options: CaptureOptions | None = None) -> Ca
 
 def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
     _require_fitting_options(files, options)
-    header, levels, orientations, sampled = _survey(files, options)
-    steps = _lossy_steps(sampled)
-    divisor = 1
-    if files.kind is CaptureKind.MOSAIC:
-        divisor = 1 if options.resolution is Resolution.FULL else 2
     calibration = None
+    full_scale = options.full_scale
     if options.calibration is not None:
         calibration = read_calibration(options.calibration)
         if calibration.pattern != options.pattern:
@@ -432,6 +428,12 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
                 f"is of the pattern {calibration.pattern}, `capture.pattern` is {options.pattern}.",
                 field="capture.calibration",
             )
+        full_scale = full_scale if full_scale is not None else calibration.full_scale
+    header, levels, orientations, sampled = _survey(files, options, full_scale)
+    steps = _lossy_steps(sampled)
+    divisor = 1
+    if files.kind is CaptureKind.MOSAIC:
+        divisor = 1 if options.resolution is Resolution.FULL else 2
     capture = Capture(
         folder=files.folder,
         files=files,
@@ -487,7 +489,7 @@ def _require_fitting_options(files: CaptureFiles, options: CaptureOptions) -> No
 
 
 def _survey(
-    files: CaptureFiles, options: CaptureOptions
+    files: CaptureFiles, options: CaptureOptions, full_scale: float | None
 ) -> tuple[RawHeader, Levels, tuple[int, ...], list[RawImage]]:
     """Header and levels of all files, their orientations, and a few of them decoded."""
     counts = LevelCounts()
@@ -518,7 +520,7 @@ def _survey(
                     _require_same(*first, path, header)
     if first is None:
         raise DataError(files.folder, "holds no views.")
-    levels = decide_levels(counts, options.full_scale)
+    levels = decide_levels(counts, full_scale)
     if files.kind is CaptureKind.AOLP:
         levels = Levels(
             bit_depth=0,
