@@ -501,7 +501,7 @@ def intensity_image_8bit(stokes: Stokes, white: float) -> NDArray[np.uint8]:
 
 
 def _angle_images(height: int, width: int) -> Image:
-    """This thread's four angle images, which no result refers to.
+    """Four angle images of this thread, which no result refers to.
 
     New memory for them would take a third of the time that a frame of 5 Mpx takes.
     """
