@@ -6,6 +6,7 @@ Nothing here imports what the commands do, so that ``--help`` is quick.
 from __future__ import annotations
 
 from dataclasses import MISSING, dataclass
+from enum import StrEnum
 from pathlib import Path
 
 from polmvs.cli.call import FileOptions, TerminalOptions
@@ -171,6 +172,64 @@ class ExperimentRun(OptionGroup, group="run", in_files=False):
     workers: int = option(default_num_workers(), "processes to share the views among", least=1)
 
 
+class CalibrationKind(StrEnum):
+    """What is calibrated."""
+
+    CAMERA = "camera"
+    POLARIZERS = "polarizers"
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    capture: Path = option(MISSING, CAPTURE_HELP, positional=True)
+    sheet: Path | None = option(
+        None, "PNG to write: intensity, AoLP and DoLP of up to eight views", metavar="PNG"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    kind: CalibrationKind = option(MISSING, ", ".join(CalibrationKind), positional=True)
+    capture: Path = option(
+        MISSING,
+        "camera: capture of a board; polarizers: folder with unpolarized/, polarized/ (files "
+        "named by the polarizer's angle, 045_01.png) and dark/",
+        positional=True,
+    )
+    out: Path = option(
+        MISSING, "file to write: .txt of a camera, .toml of polarizers", positional=True
+    )
+    overwrite: bool = option(False, "replace an existing OUT")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardOptions(OptionGroup, group="board"):
+    """The board of 'calibrate camera'."""
+
+    cols: int | None = option(None, "squares from left to right", least=3)
+    rows: int | None = option(None, "squares from top to bottom", least=3)
+    square: float = option(1.0, "side of a square, in any unit", above=0)
+    dictionary: str | None = option(
+        None, "of a ChArUco board's markers, such as DICT_4X4_50; without it a checkerboard"
+    )
+    marker: float | None = option(
+        None, "side of a marker, in the unit of a square; by default three quarters", above=0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolarizerFrames(OptionGroup, group="polarizers"):
+    """The frames of 'calibrate polarizers'."""
+
+    per_sample: bool = option(
+        False, "a value for each sample instead of each channel; needs tens of frames"
+    )
+
+
 # Options in the order in which data meets them.
 TO_POSES = (CaptureOptions, SfmOptions, ReferenceOptions)
 TO_NORMALS = (*TO_POSES, RegionOptions, NormalOptions)
@@ -259,6 +318,25 @@ COMMANDS = (
         help_text="normals of planes in one raw image, and which model fits it",
         run="polmvs.cli.plane:plane",
         groups=(PlaneArguments, PlaneOptions, CaptureOptions, FileOptions, TerminalOptions),
+    ),
+    Command(
+        name="inspect",
+        help_text="what a capture's files are, how they are exposed, and pictures of them",
+        run="polmvs.cli.captures:inspect",
+        groups=(InspectArguments, CaptureOptions, FileOptions, TerminalOptions),
+    ),
+    Command(
+        name="calibrate",
+        help_text="a camera's intrinsics from a board, or its polarizers from frames of a lamp",
+        run="polmvs.cli.captures:calibrate",
+        groups=(
+            CalibrateArguments,
+            BoardOptions,
+            PolarizerFrames,
+            CaptureOptions,
+            FileOptions,
+            TerminalOptions,
+        ),
     ),
     Command(
         name="experiment",

@@ -57,6 +57,7 @@ class PolarizerCalibration:
     flat : file of (H, W) float32, response of each sample to unpolarised light, mean 1.
     angle_map, diattenuation_map : files of (H, W) float32, of each sample; in place of
         ``angles_deg`` and ``diattenuations``.
+    full_scale : value of a saturated sample of the frames, which the dark frame is a share of.
     """
 
     pattern: Pattern
@@ -67,6 +68,7 @@ class PolarizerCalibration:
     flat: Path | None = None
     angle_map: Path | None = None
     diattenuation_map: Path | None = None
+    full_scale: float | None = None
 
     @property
     def extinction_ratios(self) -> tuple[float, ...]:
@@ -123,6 +125,7 @@ class PolarizerResponse:
     gains, angles_deg, diattenuations : (4,), see :class:`PolarizerCalibration`.
     dark, flat, angle_map, diattenuation_map : (H, W) float32, or None.
     residual : rms of the fit to the frames of the polarizer, share of their mean.
+    full_scale : value of a saturated sample of the frames, if it is known.
     """
 
     pattern: Pattern
@@ -134,6 +137,7 @@ class PolarizerResponse:
     angle_map: Image | None
     diattenuation_map: Image | None
     residual: float
+    full_scale: float | None = None
 
 
 def measure_response(
@@ -230,6 +234,8 @@ def write_calibration(path: Path, response: PolarizerResponse) -> PolarizerCalib
         f"angles_deg = {_numbers(response.angles_deg)}",
         f"diattenuations = {_numbers(response.diattenuations)}",
     ]
+    if response.full_scale is not None:
+        lines.append(f"full_scale = {response.full_scale!r}")
     for name in ("dark", "flat", "angle_map", "diattenuation_map"):
         array = getattr(response, name)
         if array is not None:
@@ -254,7 +260,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
         raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
     except (ValueError, RecursionError) as error:
         raise DataError(path, "is no TOML file of a calibration.") from error
-    known = {"version", "pattern", "gains", "angles_deg", "diattenuations"}
+    known = {"version", "pattern", "gains", "angles_deg", "diattenuations", "full_scale"}
     arrays = ("dark", "flat", "angle_map", "diattenuation_map")
     unknown = set(content) - known - set(arrays)
     if unknown or content.get("version") != VERSION:
@@ -278,6 +284,9 @@ def read_calibration(path: Path) -> PolarizerCalibration:
         raise DataError(
             path, "angles_deg are those of the channels 0, 45, 90, 135, in this order."
         ) from error
+    scale = content.get("full_scale")
+    if scale is not None and not (type(scale) in (int, float) and 0 < scale < np.inf):
+        raise DataError(path, "full_scale must be a positive number.")
     files = {}
     for name in arrays:
         if name in content:
@@ -295,6 +304,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
         flat=files.get("flat"),
         angle_map=files.get("angle_map"),
         diattenuation_map=files.get("diattenuation_map"),
+        full_scale=None if scale is None else float(scale),
     )
 
 

@@ -47,13 +47,28 @@ def find_quantization(raw: NDArray[Any]) -> NDArray[np.float64] | None:
     (8, 8) float64, rows for vertical frequencies: the step; where all coefficients are zero, twice
     the largest that samples between may have had, a step that would have hidden them.
     """
-    blocks = _blocks(raw)
-    if len(blocks) < MIN_BLOCKS:
+    steps, rhythmic, silent = _rhythm(_blocks(raw))
+    if rhythmic < MIN_RHYTHMIC:
         return None
-    coefficients = _dct(blocks)
+    # Samples with a rhythm of their own (rendered, without noise) have it on every grid.
+    if 2 * _rhythm(_blocks(raw[BLOCK // 2 :, BLOCK // 2 :]))[1] > rhythmic:
+        return None
+    # Whatever a step removed was below half of it; steps grow with the frequency.
+    known = steps[steps > 1.0].max()
+    steps[silent & (steps == 1.0)] = known
+    return steps
+
+
+def _rhythm(
+    blocks: NDArray[np.float32],
+) -> tuple[NDArray[np.float64], int, NDArray[np.bool_]]:
+    """Steps (8, 8), 1 where none is seen; at how many frequencies; and where all is zero."""
     steps = np.ones((BLOCK, BLOCK))
-    rhythmic = 0
     silent = np.zeros((BLOCK, BLOCK), np.bool_)
+    rhythmic = 0
+    if len(blocks) < MIN_BLOCKS:
+        return steps, rhythmic, silent
+    coefficients = _dct(blocks)
     for v in range(BLOCK):
         for u in range(BLOCK):
             values = np.abs(coefficients[:, v, u])
@@ -61,13 +76,8 @@ def find_quantization(raw: NDArray[Any]) -> NDArray[np.float64] | None:
             if step is not None:
                 rhythmic += v + u > 0
                 steps[v, u] = step
-            silent[v, u] = np.mean(values > 1.0) < 0.02
-    if rhythmic < MIN_RHYTHMIC:
-        return None
-    # Whatever a step removed was below half of it; steps grow with the frequency.
-    known = steps[steps > 1.0].max()
-    steps[silent & (steps == 1.0)] = known
-    return steps
+            silent[v, u] = np.mean(values > MIN_MAGNITUDE) < 0.02
+    return steps, rhythmic, silent
 
 
 def lossy_variance(steps: NDArray[np.float64], *, scale: float) -> float:

@@ -21,6 +21,7 @@ Image: TypeAlias = NDArray[np.float32]
 ANGLES_DEG: Final = (0, 45, 90, 135)
 # A sample lies 0.25 half-size px from the centre of its cell and its next neighbour 0.75 px on
 # the other side, along each axis.
+FILTERED = (np.uint8, np.uint16, np.float32)  # types that OpenCV filters as they are
 NEAR, FAR = 0.75, 0.25
 # Variance of an interpolated sample over that of a raw one: (0.75^2 + 0.25^2) for each axis.
 INTERPOLATION_NOISE_GAIN: Final = (NEAR**2 + FAR**2) ** 2
@@ -52,7 +53,13 @@ def linearize(raw: NDArray[Any], *, gamma: float = 1.0, full_scale: float | None
     return np.asarray(table.astype(np.float32)[raw])
 
 
-def split_mosaic(raw: NDArray[Any], pattern: tuple[int, int, int, int]) -> Image:
+def split_mosaic(
+    raw: NDArray[Any],
+    pattern: tuple[int, int, int, int],
+    *,
+    scale: float = 1.0,
+    out: Image | None = None,
+) -> Image:
     """Four angle images, each interpolated to the centres of the 2x2 cells.
 
     Bilinear, which is exact on a linear ramp. Measured on the project's captures against the
@@ -63,6 +70,8 @@ def split_mosaic(raw: NDArray[Any], pattern: tuple[int, int, int, int]) -> Image
     ----------
     raw : (H, W), H and W even, linear.
     pattern : polarizer angles of a 2x2 cell, row by row, degrees.
+    scale : factor to the images, which integer samples get without a pass of their own.
+    out : (4, H/2, W/2) float32 to write them into; None for a new array.
 
     Returns
     -------
@@ -72,12 +81,15 @@ def split_mosaic(raw: NDArray[Any], pattern: tuple[int, int, int, int]) -> Image
     _require_cells(raw)
     _require_pattern(pattern)
     height, width = raw.shape
-    images = np.empty((4, height // 2, width // 2), np.float32)
+    images = np.empty((4, height // 2, width // 2), np.float32) if out is None else out
     for cell, angle in enumerate(pattern):
         row, col = divmod(cell, 2)
-        samples = np.ascontiguousarray(raw[row::2, col::2], np.float32)
-        images[ANGLES_DEG.index(angle)] = cv2.sepFilter2D(
-            samples, cv2.CV_32F, _taps(col), _taps(row), borderType=cv2.BORDER_REPLICATE
+        site = raw[row::2, col::2]
+        samples = np.ascontiguousarray(site, None if site.dtype in FILTERED else np.float32)
+        across = _taps(col) * np.float32(scale)
+        image = images[ANGLES_DEG.index(angle)]
+        cv2.sepFilter2D(
+            samples, cv2.CV_32F, across, _taps(row), dst=image, borderType=cv2.BORDER_REPLICATE
         )
     return images
 

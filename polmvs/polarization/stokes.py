@@ -140,7 +140,10 @@ class NoiseModel(NamedTuple):
 
     def variance(self, s0: Image) -> Image:
         """Variance (H, W) at the intensities ``s0``."""
-        return np.asarray(self.constant + self.slope * np.maximum(s0, 0), np.float32)
+        variance = np.maximum(s0, np.float32(0))
+        variance *= np.float32(self.slope)
+        variance += np.float32(self.constant)
+        return np.asarray(variance, np.float32)
 
 
 def stokes_from_intensities(
@@ -167,18 +170,20 @@ def stokes_from_intensities(
     if clipped.shape != intensities.shape[1:]:
         raise ValueError(f"{clipped.shape=} but expected {intensities.shape[1:]}.")
     i0, i45, i90, i135 = np.asarray(intensities, np.float32)
+    # Half of the time of a frame is memory for new arrays: each is used as often as it can be.
     even, odd = i0 + i90, i45 + i135
     redundancy = even - odd
     even += odd
     s0 = np.multiply(even, np.float32(0.5), out=even)
-    valid = ~clipped & (s0 >= 2.0 * darkness)
-    s1, s2 = i0 - i90, i45 - i135
+    s1, s2 = np.subtract(i0, i90, out=odd), i45 - i135
+    valid = s0 >= np.float32(2.0 * darkness)
+    valid &= ~clipped
     noise = estimate_noise(s0, redundancy, valid, quantum=quantum)
+    gain_sigma = _gain_sigma(s0, s1, s2, redundancy[None], valid)
     variance = noise.variance(s0)
     variance += _mismatch_variance(s0, redundancy, valid, variance)
     if lossy_variance > 0:
         variance += np.float32(lossy_variance)
-    gain_sigma = _gain_sigma(s0, s1, s2, redundancy[None], valid)
     sigma = np.sqrt(variance, out=variance)
     return Stokes(s0=s0, s1=s1, s2=s2, sigma=sigma, valid=valid, gain_sigma=gain_sigma)
 
@@ -483,7 +488,8 @@ def _mismatch_variance(s0: Image, redundancy: Image, valid: Mask, noise: Image) 
     lit = valid[sample] & (s0[sample] > 0)
     if lit.any():
         offset = float(np.median(redundancy[sample][lit] / s0[sample][lit]))
-    squared = np.square(redundancy - np.float32(offset) * s0)
+    rest = cv2.addWeighted(redundancy, 1.0, s0, -offset, 0.0)
+    squared = np.square(rest, out=rest)
     local = cv2.blur(squared, (MISMATCH_WINDOW_PX, MISMATCH_WINDOW_PX))
-    excess = cv2.addWeighted(local, 0.5, noise, -MISMATCH_RATIO, 0.0)
+    excess = cv2.addWeighted(local, 0.5, noise, -MISMATCH_RATIO, 0.0, dst=squared)
     return np.asarray(np.maximum(excess, 0, out=excess))

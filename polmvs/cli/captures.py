@@ -1,0 +1,115 @@
+"""The commands on a capture's files alone: inspect it, and calibrate its camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from polmvs.cli.call import Call
+from polmvs.cli.commands import (
+    BoardOptions,
+    CalibrateArguments,
+    CalibrationKind,
+    InspectArguments,
+    PolarizerFrames,
+)
+from polmvs.cli.flags import in_flags
+from polmvs.cli.terminal import Terminal
+from polmvs.config import CaptureOptions
+from polmvs.errors import DataError, OptionError
+from polmvs.io.intrinsics import write_intrinsics
+from polmvs.polarization.calibration import write_calibration
+from polmvs.polarization.calibration_frames import calibrate_polarizers
+from polmvs.polarization.capture import intensity_image_8bit, open_capture
+from polmvs.polarization.inspection import inspect_capture, write_contact_sheet
+from polmvs.poses.board_calibration import Board, calibrate_camera
+
+
+def inspect(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs inspect``."""
+    arguments = call.get(InspectArguments)
+    if arguments.sheet is not None and arguments.sheet.is_dir():
+        raise OptionError("is a folder; name a PNG file.", field="arguments.sheet")
+    capture = open_capture(arguments.capture, call.get(CaptureOptions))
+    with terminal.stage("inspect", len(capture.names)) as report:
+        inspection = inspect_capture(capture, on_progress=report)
+    lines = list(inspection.lines)
+    if arguments.sheet is not None:
+        write_contact_sheet(arguments.sheet, capture)
+        lines.append(f"{arguments.sheet}: contact sheet")
+    content = {
+        "notes": capture.notes,
+        "levels": capture.levels,
+        "pattern_check": capture.pattern_check,
+        "white": inspection.white,
+        "views": inspection.views,
+        "warnings": inspection.warnings,
+    }
+    terminal.show(in_flags("\n".join(lines)), content)
+    return 0
+
+
+def calibrate(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs calibrate``."""
+    arguments = call.get(CalibrateArguments)
+    if arguments.out.exists() and not arguments.overwrite:
+        raise OptionError(f"{arguments.out}: exists. Give `arguments.overwrite` to replace it.")
+    if not arguments.out.parent.is_dir():
+        raise DataError(arguments.out.parent, "no such folder.")
+    if arguments.kind is CalibrationKind.CAMERA:
+        return _camera(call, terminal, arguments.capture, arguments.out)
+    per_sample = call.get(PolarizerFrames).per_sample
+    response = calibrate_polarizers(
+        arguments.capture, call.get(CaptureOptions), per_sample=per_sample
+    )
+    stored = write_calibration(arguments.out, response)
+    channels = zip(
+        (0, 45, 90, 135),
+        stored.gains,
+        stored.angles_deg,
+        stored.extinction_ratios,
+        strict=True,
+    )
+    lines = [
+        f"{nominal:>3} deg: gain {gain:.4f}, angle {angle:.2f} deg, extinction ratio {ratio:.0f}:1"
+        for nominal, gain, angle, ratio in channels
+    ]
+    lines.append(f"{arguments.out}: residual {100 * response.residual:.2f} % of the mean")
+    content = {
+        "gains": stored.gains,
+        "angles_deg": stored.angles_deg,
+        "diattenuations": stored.diattenuations,
+        "residual": response.residual,
+    }
+    terminal.show("\n".join(lines), content)
+    return 0
+
+
+def _camera(call: Call, terminal: Terminal, folder: Path, out: Path) -> int:
+    """Intrinsics from pictures of a board."""
+    given = call.get(BoardOptions)
+    if given.cols is None or given.rows is None:
+        raise OptionError("a board needs --cols and --rows, its squares along each side.")
+    capture = open_capture(folder, call.get(CaptureOptions))
+    white = capture.exposure()
+    pictures = {name: intensity_image_8bit(capture.load(name), white) for name in capture.names}
+    board = Board(
+        cols=given.cols,
+        rows=given.rows,
+        square=given.square,
+        dictionary=given.dictionary,
+        marker=given.marker,
+    )
+    try:
+        found = calibrate_camera(pictures, board)
+    except ValueError as error:
+        raise DataError(folder, str(error)) from error
+    comment = f"rms {found.rms_px:.3f} px over {len(found.views)} views of a board"
+    write_intrinsics(out, found.intrinsics, comment)
+    lines = [
+        f"{len(found.views)} of {len(pictures)} pictures show the board, in "
+        f"{100 * found.coverage:.0f} % of the image; rms {found.rms_px:.3f} px",
+        found.intrinsics.line,
+        f"{out}: give it as --camera {out}",
+    ]
+    terminal.show("\n".join(lines), found)
+    return 0

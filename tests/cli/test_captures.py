@@ -1,0 +1,142 @@
+"""``polmvs inspect`` and ``polmvs calibrate`` end to end."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from boards import CHECKER, pictures
+
+from polmvs.camera import PinholeCamera
+from polmvs.io.intrinsics import read_intrinsics
+from polmvs.polarization.calibration import read_calibration
+from polmvs.synthetic.captures import Plane, render_mosaic, ring_of_views
+from polmvs.synthetic.sensor import faulty_sensor
+
+SHAPE = (96, 128)
+
+
+def test_inspect_says_what_a_capture_is(cli, demo_capture, tmp_path):
+    status, out, _ = cli("inspect", demo_capture, "--sheet", tmp_path / "sheet.png")
+    assert status == 0
+    assert "10 views, raw mosaics; files of 918x768 px, uint8" in out
+    assert "fits, or a turned or mirrored one" in out
+    assert "is clipped in 001.png, 002.png" in out
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet.shape[1] == 6 * 326
+    status, out, _ = cli("inspect", demo_capture, "--json")
+    content = json.loads(out)
+    assert len(content["views"]) == 10
+    assert content["levels"]["full_scale"] == 255
+
+
+def test_inspect_warns_of_bad_captures(cli, tmp_path):
+    rng = np.random.default_rng(0)
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    for name, level in (("a", 2), ("b", 20)):
+        noise = rng.poisson(level, (240, 320)).astype(np.float32)
+        blurred = cv2.GaussianBlur(noise, (0, 0), 8)
+        cv2.imwrite(str(folder / f"{name}.png"), np.rint(blurred).astype(np.uint8))
+    status, out, _ = cli("inspect", folder)
+    assert status == 0
+    for words in ("too little polarised light", "expose more", "are polarised", "factor of"):
+        assert words in out, words
+
+
+def test_inspect_knows_a_colour_sensor(cli, tmp_path):
+    camera = PinholeCamera(width=160, height=120, fx=150, fy=150, cx=80, cy=60)
+    view = ring_of_views(1, camera)[0]
+    mosaic = render_mosaic(view, Plane(point=np.zeros(3), normal=[0, 0, 1]), s0=0.8)
+    for block, gain in enumerate((0.5, 1.0, 1.0, 0.7)):
+        for i in (0, 1):
+            for j in (0, 1):
+                mosaic[2 * (block // 2) + i :: 4, 2 * (block % 2) + j :: 4] *= gain
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "a.png"), np.rint(255 * mosaic).astype(np.uint8))
+    assert "--bayer" in cli("inspect", folder)[1]
+    assert "2x2 rhythm" not in cli("inspect", folder, "--bayer", "rggb")[1]
+
+
+def write_frames(folder, sensor, *, polarized=True):
+    rng = np.random.default_rng(0)
+
+    def save(name, s0, dolp=0.0, angle=0.0):
+        twice = 2 * np.radians(angle)
+        light = s0 * np.array([1.0, dolp * np.cos(twice), dolp * np.sin(twice)])
+        samples = sensor.expose(np.broadcast_to(light[:, None, None], (3, *SHAPE)), rng)
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        deep = np.clip(np.rint(samples * 4095), 0, 4095).astype(np.uint16)
+        cv2.imwrite(str(path), deep)
+
+    for k in range(4):
+        save(f"unpolarized/{k}.png", 1.5)
+        save(f"dark/{k}.png", 0.0)
+        for angle in (0, 30, 60, 90, 120, 150) if polarized else ():
+            save(f"polarized/{angle:03d}_{k}.png", 0.8, 1.0, angle)
+
+
+@pytest.mark.parametrize("per_sample", [False, True])
+def test_calibrate_polarizers(cli, tmp_path, per_sample):
+    sensor = faulty_sensor(SHAPE, np.random.default_rng(0))
+    write_frames(tmp_path / "frames", sensor)
+    out_file = tmp_path / "sensor.toml"
+    flags = ["--full-scale", 4095, *(["--per-sample"] if per_sample else [])]
+    status, out, err = cli("calibrate", "polarizers", tmp_path / "frames", out_file, *flags)
+    assert status == 0, err
+    assert "extinction ratio" in out
+    read = read_calibration(out_file)
+    assert read.full_scale == 4095
+    site = (1, 1), (0, 1), (0, 0), (1, 0)  # of 0, 45, 90, 135
+    angles = [sensor.angle_deg[s] for s in site]
+    np.testing.assert_allclose(read.angles_deg, angles, atol=0.1)
+    assert (read.flat is not None) is per_sample
+    if not per_sample:
+        gains = np.array([sensor.gain[s] for s in site])
+        np.testing.assert_allclose(read.gains, gains / gains.mean(), atol=2e-3)
+    status, _, err = cli("calibrate", "polarizers", tmp_path / "frames", out_file)
+    assert status == 2
+    assert "exists" in err
+
+
+def test_frames_that_cannot_be_used(cli, tmp_path):
+    out = tmp_path / "sensor.toml"
+    (tmp_path / "empty").mkdir()
+    assert "neither" in cli("calibrate", "polarizers", tmp_path / "empty", out)[2]
+    sensor = faulty_sensor(SHAPE, np.random.default_rng(0))
+    write_frames(tmp_path / "bright", sensor, polarized=False)
+    cv2.imwrite(str(tmp_path / "bright" / "unpolarized" / "9.png"), np.full(SHAPE, 4095, np.uint16))
+    assert "clipped" in cli("calibrate", "polarizers", tmp_path / "bright", out)[2]
+    write_frames(tmp_path / "misnamed", sensor)
+    folder = tmp_path / "misnamed" / "polarized"
+    (folder / "000_0.png").rename(folder / "zero.png")
+    flags = ("--full-scale", 4095)
+    assert "angle" in cli("calibrate", "polarizers", tmp_path / "misnamed", out, *flags)[2]
+    assert not out.exists()
+
+
+def test_calibrate_camera_needs_a_board(cli, demo_capture, tmp_path):
+    out = tmp_path / "camera.txt"
+    status, _, err = cli("calibrate", "camera", demo_capture, out)
+    assert status == 2
+    assert "squares" in err
+    status, _, err = cli("calibrate", "camera", demo_capture, out, "--cols", 9, "--rows", 7)
+    assert status == 1
+    assert "0 of 10 pictures" in err
+    assert not out.exists()
+
+
+def test_calibrate_camera_writes_a_colmap_camera(cli, tmp_path):
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    for name, picture in pictures(CHECKER).items():
+        # An unpolarised mosaic: every sample of a cell is the picture's.
+        cv2.imwrite(str(folder / name), np.kron(picture, np.ones((2, 2), np.uint8)))
+    out = tmp_path / "camera.txt"
+    status, text, err = cli("calibrate", "camera", folder, out, "--cols", 9, "--rows", 7)
+    assert status == 0, err
+    assert "6 of 6" in text
+    camera = read_intrinsics(out)
+    np.testing.assert_allclose(camera.params[:4], [620, 622, 319.0, 241.5], atol=3)
