@@ -153,3 +153,4 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
     if (found_mask & ~certain).sum() > tol.max_unknown_share * certain.size:
         return certain
     return np.asarray(found_mask)
+
