@@ -257,11 +257,11 @@ def refine(
         expected = 1.2 * mesh.face_areas.sum() / edge**2
         if number and expected > tol.max_vertices:
             edge = float(np.sqrt(1.2 * mesh.face_areas.sum() / tol.max_vertices))
-        moved = np.full(1, np.inf)
+        moved = np.zeros(len(mesh.vertices))
         for step in range(level.num_steps):
             # A mesh that has moved far is uneven and may intersect itself; one that has not is
             # left alone, for the grid rounds its creases.
-            if np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge:
+            if step == 0 or np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge:
                 mesh = remeshed(mesh, edge)
                 moved = np.zeros(len(mesh.vertices))
             if not len(mesh.faces):

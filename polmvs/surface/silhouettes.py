@@ -14,9 +14,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
+from polmvs.camera import sample_image
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.surface.surface_view import Silhouette
+from polmvs.surface.surface_view import Silhouette, signed_distance_px
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -36,6 +38,11 @@ class SilhouetteTolerances:
     far_px : reach in pixels that resemble it much. Guess; the inside of a mug is 60 px across.
     object_quantile : share of the region's pixels whose intensity stands for it. Guess.
     cut_rounds : of the graph cut; a fourth changes under 0.5 % of the pixels (mug).
+    edge_reach_px : of the search for a step of intensity about an outline. The region's Stokes
+        images are smoothed over 2 px, so that strong polarisation leaks by about as much.
+    edge_prior_px : deviation of that step from the region's border. Guess.
+    edge_contrast : least step, as a share of the brighter side. Guess.
+    edge_smoothing_px : of the shifts along the outline. Guess.
     max_unknown_share : of the image; beyond it the cut has run into the surroundings. Guess.
     """
 
@@ -47,6 +54,10 @@ class SilhouetteTolerances:
     object_quantile: float = 0.85
     cut_rounds: int = 3
     max_unknown_share: float = 0.5
+    edge_reach_px: float = 4.0
+    edge_prior_px: float = 2.5
+    edge_contrast: float = 0.15
+    edge_smoothing_px: float = 1.5
 
 
 REFERENCE_FOCAL_PX = 445.0
@@ -77,8 +88,12 @@ def _silhouette(phase_map: PhaseMap, mask_given: bool, tol: SilhouetteTolerances
     certain = _cleaned(inside, scale, tol)
     if not certain.any():
         return Silhouette(certain, certain)
-    possible = _continued(certain, np.asarray(phase_map.intensity, np.float32), scale, tol)
-    return Silhouette(certain, possible)
+    intensity = np.asarray(phase_map.intensity, np.float32)
+    possible = _continued(certain, intensity, scale, tol)
+    inner = _outline_shift(certain, intensity, scale, tol)
+    sharp = bool((possible == certain).all())
+    outer = inner if sharp else _outline_shift(possible, intensity, scale, tol)
+    return Silhouette(certain, possible, inner, outer)
 
 
 def _cleaned(mask: Mask, scale: float, tol: SilhouetteTolerances) -> Mask:
@@ -154,3 +169,58 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
         return certain
     return np.asarray(found_mask)
 
+
+
+def _outline_shift(
+    mask: Mask, intensity: Image, scale: float, tol: SilhouetteTolerances
+) -> Image | None:
+    """By how much the step of intensity at a mask's border lies outside of it.
+
+    Returns
+    -------
+    (H, W) px, at each pixel that of the nearest place of the border; None without a border.
+    """
+    border = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    rows, cols = np.nonzero(border)
+    if len(rows) < 10:
+        return None
+    distance = signed_distance_px(mask)
+    smooth = cv2.GaussianBlur(distance, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
+    outwards = np.stack(
+        [cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)], axis=-1
+    )[rows, cols]
+    outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-6)
+    step = 0.25
+    reach = tol.edge_reach_px * max(scale, 1.0)
+    along = np.arange(-reach - 1, reach + 1 + step, step)
+    # The border runs half a pixel outside of its pixels' centres.
+    centers = np.stack([cols + 0.5, rows + 0.5], axis=1)
+    places = centers[:, None] + outwards[:, None] * (along[:, None] - distance[rows, cols][:, None, None])
+    profile = sample_image(intensity, places)
+    slope = np.abs(ndimage.gaussian_filter1d(profile, 2.0, axis=1, order=1)) / step
+    contrast = slope * 2 * step * 2.5 / np.maximum(profile.max(axis=1, keepdims=True), 1e-6)
+    score = contrast * np.exp(-0.5 * (along / (tol.edge_prior_px * max(scale, 1.0))) ** 2)
+    score[:, np.abs(along) > reach] = 0
+    best = score.argmax(axis=1)
+    index = np.arange(len(best))
+    found = along[best] + step * _vertex_of_parabola(
+        score[index, best - 1], score[index, best], score[index, np.minimum(best + 1, len(along) - 1)]
+    )
+    weight = np.clip(contrast[index, best] / tol.edge_contrast - 1, 0, 1)
+    shifts, weights = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
+    shifts[rows, cols], weights[rows, cols] = weight * found, weight
+    width = tol.edge_smoothing_px * max(scale, 1.0)
+    shifts = cv2.GaussianBlur(shifts, (0, 0), width)
+    weights = cv2.GaussianBlur(weights, (0, 0), width)
+    mean = np.where(weights > 1e-4, shifts / np.maximum(weights, 1e-4), 0)
+    nearest = ndimage.distance_transform_edt(
+        ~border, return_distances=False, return_indices=True
+    )
+    return mean[nearest[0], nearest[1]].astype(np.float32)
+
+
+def _vertex_of_parabola(before: Array, at: Array, after: Array) -> Array:
+    """Place of the maximum of a parabola through three values, in steps from the middle one."""
+    bend = before - 2 * at + after
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(bend < 0, np.clip(0.5 * (before - after) / bend, -0.5, 0.5), 0.0)

@@ -31,20 +31,24 @@ class Silhouette:
     ----------
     certain : (H, W) bool, on an object.
     possible : (H, W) bool, on an object or unknown; holds ``certain``.
+    inner_shift, outer_shift : (H, W) float32, px, by how much the outlines of the two lie farther
+        outside than the borders of their pixels; None: not at all.
     """
 
     certain: Mask
     possible: Mask
+    inner_shift: Image | None = None
+    outer_shift: Image | None = None
 
     @cached_property
     def inner(self) -> Image:
         """(H, W, 3): signed distance to ``certain`` in px, negative inside, and its gradient."""
-        return _distance_field(self.certain)
+        return _distance_field(self.certain, self.inner_shift)
 
     @cached_property
     def outer(self) -> Image:
         """(H, W, 3): as ``inner``, of ``possible``."""
-        return self.inner if self.is_sharp else _distance_field(self.possible)
+        return self.inner if self.is_sharp else _distance_field(self.possible, self.outer_shift)
 
     @cached_property
     def is_sharp(self) -> bool:
@@ -65,10 +69,12 @@ def signed_distance_px(mask: Mask) -> Image:
     return np.where(mask, 0.5 - inside, outside - 0.5).astype(np.float32)
 
 
-def _distance_field(mask: Mask) -> Image:
+def _distance_field(mask: Mask, shift: Image | None) -> Image:
     distance = cv2.GaussianBlur(
         signed_distance_px(mask), (0, 0), FIELD_SMOOTHING_PX, borderType=cv2.BORDER_REPLICATE
     )
+    if shift is not None:
+        distance = np.asarray(distance - shift, np.float32)
     dx = cv2.Sobel(distance, cv2.CV_32F, 1, 0, scale=1 / 8)
     dy = cv2.Sobel(distance, cv2.CV_32F, 0, 1, scale=1 / 8)
     return np.dstack([distance, dx, dy]).astype(np.float32)

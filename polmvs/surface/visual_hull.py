@@ -41,7 +41,7 @@ class HullTolerances:
     min_plane_share : of the sparse points of the surroundings that lie in a supporting plane.
     """
 
-    step_px: float = 3.0
+    step_px: float = 4.0
     max_cells: int = 6_000_000
     wrong_share: float = 0.1
     min_seen_share: float = 0.34
