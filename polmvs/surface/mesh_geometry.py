@@ -174,7 +174,7 @@ class RayScene:
         return RayHits(distance, np.where(np.isfinite(distance), face, -1), barycentric)
 
     def closest(self, points: Floats) -> tuple[Array, NDArray[np.int64], NDArray[np.float32]]:
-        """Closest point ``(N, 3)``, its face ``(N,)`` and its barycentric coordinates ``(N, 3)``."""
+        """Closest points ``(N, 3)``, their faces ``(N,)`` and places in these ``(N, 3)``."""
         found = self._scene.compute_closest_points(self._tensor(self._local(points)))
         uv = found["primitive_uvs"].numpy()
         place = found["points"].numpy().astype(np.float64) + self._origin
@@ -276,9 +276,10 @@ def mesh_from_grid(values: NDArray[np.float32], origin: Array, step: float) -> T
                 total += np.where(crosses[:, None], point, 0)
                 num += crosses
         # Quads about the grid's edges along this axis, away from its border.
-        lower = tuple(slice(0, n - 1) if d == axis else slice(1, n - 1) for d, n in enumerate(shape))
-        upper = tuple(slice(1, n) if d == axis else slice(1, n - 1) for d, n in enumerate(shape))
-        edge = np.argwhere(inside[lower] != inside[upper])
+        inner = [slice(1, n - 1) for n in shape]
+        lower, upper = list(inner), list(inner)
+        lower[axis], upper[axis] = slice(0, -1), slice(1, None)
+        edge = np.argwhere(inside[tuple(lower)] != inside[tuple(upper)])
         offset = np.ones(3, np.int64)
         offset[axis] = 0
         edge = edge + offset

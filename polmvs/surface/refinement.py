@@ -19,7 +19,8 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
 from polmvs.camera import sample_image
-from polmvs.config import Model
+from polmvs.config import AngleModel
+from polmvs.fitting import robust_deviation
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, visible_points
 from polmvs.surface.surface_view import SurfaceView, phase_rows
 
@@ -64,7 +65,9 @@ class RefinementTolerances:
     phase_correlation : faces over which the phases' errors are alike, because the model of the
         light makes them and not noise: outlines and points count this much more than so many
         rows would let them. Measured: with 1, a bias of the phases bends `dome` by 1.5 mm.
-    rim_sigma_px : of an outline, per pixel of its length. Its errors are alike over ten or so.
+    rim_sigma_px : least deviation of an outline; its residuals may show a larger one. Measured:
+        0.3; 0.7 costs 30 % on general shapes.
+    rim_length_px : of an outline along which its errors are alike. Guess.
     outline_bias_px : by which all silhouettes together may be too wide or too narrow.
     point_sigma_px : least deviation of a known point, in footprints. Guess.
     smoothness : deviation of the scale-free curvature from its surroundings' mean. Measured: 0.02
@@ -88,9 +91,10 @@ class RefinementTolerances:
     independent_px: float = 4.0
     min_cosine: float = 0.15
     phase_correlation: float = 100.0
-    rim_sigma_px: float = 1.0
+    rim_sigma_px: float = 0.3
+    rim_length_px: float = 10.0
     outline_bias_px: float = 0.7
-    point_sigma_px: float = 0.5
+    point_sigma_px: float = 0.3
     smoothness: float = 0.04
     smoothness_memory: float = 0.8
     damping: float = 0.5
@@ -140,6 +144,17 @@ class _Equations:
         self._data.append(blocks.ravel())
         self.gradient += np.bincount(vertices.ravel(), gradient.ravel(), self.num)
 
+    def noise(self, rng: np.random.Generator) -> Array:
+        """A random gradient ``(num,)`` with the matrix as its covariance."""
+        total = np.zeros(self.num)
+        for cols, data in zip(self._cols, self._data, strict=True):
+            blocks = data.reshape(-1, 3, 3)
+            values, vectors = np.linalg.eigh(blocks)
+            random = rng.standard_normal(values.shape) * np.sqrt(np.maximum(values, 0))
+            drawn = (vectors @ random[:, :, None])[..., 0]
+            total += np.bincount(cols.reshape(-1, 3, 3)[:, 0].ravel(), drawn.ravel(), self.num)
+        return total
+
     def matrix(self) -> sparse.csr_array:
         """The sum, ``(num, num)``."""
         shape = (self.num, self.num)
@@ -182,11 +197,10 @@ class _SharedError:
 
 @dataclass(frozen=True)
 class FaceRows:
-    """Phase rows of the views that see some of a mesh's faces.
+    """Phase rows of a view at the faces of a mesh that it sees.
 
     Attributes
     ----------
-    view : index of the view.
     face : (K,) indices.
     residual : (K,) ``m . n``.
     variance : (K,) of the residual.
@@ -194,7 +208,6 @@ class FaceRows:
     cosine : (K,) between normal and direction to the camera.
     """
 
-    view: int
     face: Indices
     residual: Array
     variance: Array
@@ -206,8 +219,8 @@ def face_rows(
     mesh: TriangleMesh,
     scene: RayScene,
     view: SurfaceView,
-    index: int,
-    angle_model: Model,
+    angle_model: AngleModel,
+    row_sigma: float,
     tolerances: RefinementTolerances,
     other_light: Mask | None = None,
 ) -> FaceRows:
@@ -226,14 +239,14 @@ def face_rows(
     face, cosine, rows = face[known], cosine[known], found.rows[known]
     turn, precision = found.turn[known], found.precision[known]
     residual = (rows * mesh.face_normals[face]).sum(axis=1)
-    variance = (1 - cosine**2) * turn**2 / precision + tolerances.row_sigma**2
-    return FaceRows(index, face, residual, variance, rows, cosine)
+    variance = (1 - cosine**2) * turn**2 / precision + row_sigma**2
+    return FaceRows(face, residual, variance, rows, cosine)
 
 
 def refine(
     mesh: TriangleMesh,
     views: Sequence[SurfaceView],
-    angle_model: Model,
+    angle_model: AngleModel,
     footprint: float,
     *,
     known: KnownPoints | None = None,
@@ -252,6 +265,7 @@ def refine(
     on_progress : called with 1 after each step.
     """
     tol = tolerances or RefinementTolerances()
+    row_sigma = tol.row_sigma
     for number, level in enumerate(tol.levels):
         edge = level.edge_px * footprint
         expected = 1.2 * mesh.face_areas.sum() / edge**2
@@ -266,10 +280,13 @@ def refine(
                 moved = np.zeros(len(mesh.vertices))
             if not len(mesh.faces):
                 return mesh
-            mesh, displacement, change = _step(
-                mesh, views, angle_model, footprint, edge, level, known, tol
+            system = _system(
+                mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol
             )
+            mesh, displacement = _step(mesh, system, edge, tol)
             moved = moved + displacement
+            free = displacement[system.free]
+            change = float(np.sqrt(np.mean(free**2))) if len(free) else 0.0
             logger.info(
                 "edges of %.1f px, %d vertices: moved by %.3f px.",
                 edge / footprint,
@@ -280,45 +297,144 @@ def refine(
                 on_progress(1)
             if change < max(tol.converged_px, 0.03 * level.edge_px) * footprint and step > 1:
                 break
+        # A model that leaves something out (OPA the perspective) errs by more than its phases'
+        # noise; held against that, most of its rows were outliers. Every model is treated alike.
+        row_sigma = max(tol.row_sigma, system.row_error)
     return mesh
 
 
-def _step(
+@dataclass(frozen=True)
+class _System:
+    """Normal equations of one mesh.
+
+    Attributes
+    ----------
+    equations : of the views and the known points.
+    bias : of all silhouettes.
+    smooth, pull : matrix ``(V, V)`` and gradient ``(V,)`` of the smoothness, and the matrix
+        ``(V, V)`` whose product with its own transpose is the former.
+    free : (V,) bool, vertices of faces that some view sees.
+    row_error : robust deviation of the phase rows' residuals.
+    """
+
+    equations: _Equations
+    bias: _SharedError
+    smooth: sparse.csr_array
+    pull: Array
+    smooth_factor: sparse.csr_array
+    free: Mask
+    row_error: float
+
+
+def _system(
     mesh: TriangleMesh,
     views: Sequence[SurfaceView],
-    angle_model: Model,
+    angle_model: AngleModel,
     footprint: float,
     edge: float,
     level: Level,
     known: KnownPoints | None,
+    row_sigma: float,
     tol: RefinementTolerances,
-) -> tuple[TriangleMesh, Array, float]:
-    """One Gauss-Newton step: the new mesh, the displacements ``(V,)``, and the root mean square
-    of those of what is seen."""
+) -> _System:
     scene = RayScene(mesh)
     equations = _Equations(len(mesh.vertices))
-    seen = _add_phases(equations, mesh, scene, views, angle_model, footprint, level, tol)
-    edges = outline_candidates(mesh)
+    seen, error = _add_phases(
+        equations, mesh, scene, views, angle_model, footprint, level, row_sigma, tol
+    )
+    edges = shared_edges(mesh)
     bias = _SharedError(len(mesh.vertices), tol.phase_correlation / tol.outline_bias_px**2)
-    for view in views:
-        if view.has_outline:
-            _add_rims(equations, bias, mesh, scene, view, edges, level, tol)
+    rims = [_rim_rows(mesh, scene, view, edges, level) for view in views if view.has_outline]
+    _add_rims(equations, bias, rims, level, tol)
     if known is not None and len(known.points) and seen.any():
         _add_points(equations, mesh, seen, known, footprint, level, tol)
-    matrix, gradient = equations.matrix(), equations.gradient
-    smooth, pull = _smoothness(mesh, edge, tol)
-    matrix = matrix + smooth
-    gradient = gradient + pull
+    smooth, pull, factor = _smoothness(mesh, edge, tol)
     free = np.zeros(len(mesh.vertices), np.bool_)
     free[mesh.faces[seen]] = True
-    damping = np.where(free, tol.damping, tol.unseen_damping) * edge
-    shared = bias.column()
-    gradient = gradient - shared * bias.offset()
+    return _System(equations, bias, smooth, pull, factor, free, error)
+
+
+def _step(
+    mesh: TriangleMesh, system: _System, edge: float, tol: RefinementTolerances
+) -> tuple[TriangleMesh, Array]:
+    """One Gauss-Newton step: the new mesh and the displacements ``(V,)``."""
+    matrix = system.equations.matrix() + system.smooth
+    shared = system.bias.column()
+    gradient = system.equations.gradient + system.pull - shared * system.bias.offset()
+    damping = np.where(system.free, tol.damping, tol.unseen_damping) * edge
     displacement = -solve(matrix, gradient, 1 / damping**2, shared)
     displacement = np.clip(np.nan_to_num(displacement), -edge, edge)
-    moved = mesh.moved(displacement[:, None] * mesh.vertex_normals)
-    change = float(np.sqrt(np.mean(displacement[free] ** 2))) if free.any() else 0.0
-    return moved, displacement, change
+    return mesh.moved(displacement[:, None] * mesh.vertex_normals), displacement
+
+
+def place_deviations(
+    mesh: TriangleMesh,
+    views: Sequence[SurfaceView],
+    angle_model: AngleModel,
+    footprint: float,
+    *,
+    known: KnownPoints | None = None,
+    tolerances: RefinementTolerances | None = None,
+    num_samples: int = 24,
+    seed: int = 0,
+) -> Array:
+    """Standard deviation ``(V,)`` of the place along the normal of each vertex of a refined mesh.
+
+    From samples of the energy's normal distribution: the solution for residuals with random
+    errors of the size that their weights state. Errors of the phases that faces share and the
+    bias of the outlines are part of it. Large where only smoothness carries a vertex.
+
+    Parameters
+    ----------
+    mesh, views, angle_model, footprint, known : as in :func:`refine`.
+    num_samples : the deviation of a deviation is one over the root of twice as many.
+    seed : of the random numbers.
+    """
+    tol = tolerances or RefinementTolerances()
+    num, rng = len(mesh.vertices), np.random.default_rng(seed)
+    if not num:
+        return np.zeros(0)
+    edge = mesh.mean_edge
+    system = _system(
+        mesh, views, angle_model, footprint, edge, tol.levels[-1], known, tol.row_sigma, tol
+    )
+    matrix = system.equations.matrix() + system.smooth
+    shared = system.bias.column()
+    # Nothing but the energy holds the surface here; what no view sees is not asked for.
+    loose = np.where(system.free, 100.0, tol.unseen_damping) * edge
+    total = np.zeros(num)
+    for _ in range(num_samples):
+        noise = system.equations.noise(rng)
+        noise += system.smooth_factor @ rng.standard_normal(num)
+        noise += system.bias.noise(rng)
+        total += solve(matrix, noise, 1 / loose**2, shared) ** 2
+    sigma = np.sqrt(tol.phase_correlation * total / num_samples)
+    return np.where(system.free, sigma, np.inf)
+
+
+def median_residual(
+    mesh: TriangleMesh,
+    views: Sequence[SurfaceView],
+    angle_model: AngleModel,
+    tolerances: RefinementTolerances | None = None,
+) -> tuple[float, float]:
+    """What the phases show of the angle model's own error on a refined mesh.
+
+    Returns
+    -------
+    row_sigma : robust deviation of ``m . n``, at least that of the tolerances.
+    median : of the absolute residuals; 0 without any.
+    """
+    tol = tolerances or RefinementTolerances()
+    scene = RayScene(mesh)
+    residuals = np.concatenate(
+        [np.zeros(0)]
+        + [face_rows(mesh, scene, v, angle_model, tol.row_sigma, tol).residual for v in views]
+    )
+    if not len(residuals):
+        return tol.row_sigma, 0.0
+    sigma = robust_deviation(residuals)
+    return max(tol.row_sigma, sigma), float(np.median(np.abs(residuals)))
 
 
 def solve(matrix: sparse.csr_array, right: Array, damping: Array, shared: Array) -> Array:
@@ -353,12 +469,19 @@ def _add_phases(
     mesh: TriangleMesh,
     scene: RayScene,
     views: Sequence[SurfaceView],
-    angle_model: Model,
+    angle_model: AngleModel,
     footprint: float,
     level: Level,
+    row_sigma: float,
     tol: RefinementTolerances,
-) -> Mask:
-    """Add the rows of all views; which faces ``(F,)`` some view sees."""
+) -> tuple[Mask, float]:
+    """Add the rows of all views.
+
+    Returns
+    -------
+    is_seen : (F,) faces that some view sees.
+    error : robust deviation of the rows' residuals.
+    """
     num_faces = len(mesh.faces)
     blocks, gradient = np.zeros((num_faces, 3, 3)), np.zeros((num_faces, 3))
     is_seen = np.zeros(num_faces, np.bool_)
@@ -367,8 +490,9 @@ def _add_phases(
     share = np.minimum(mesh.face_areas / (tol.independent_px * footprint**2), 1.0)
     reach = min(0.5 * mesh.mean_edge, 1.5 * footprint)
     steepest = 0.5 / footprint
-    for index, view in enumerate(views):
-        seen = face_rows(mesh, scene, view, index, angle_model, tol)
+    residuals = [np.zeros(0)]
+    for view in views:
+        seen = face_rows(mesh, scene, view, angle_model, row_sigma, tol)
         face = seen.face
         is_seen[face] = True
         if not len(face):
@@ -383,13 +507,15 @@ def _add_phases(
         weight = (scale / (scale + residual**2)) ** 2 / seen.variance * share[face]
         blocks[face] += weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :]
         gradient[face] += (weight * residual)[:, None] * jacobian
+        residuals.append(residual)
     equations.add_blocks(mesh.faces, blocks, gradient)
-    return is_seen
+    everything = np.concatenate(residuals)
+    return is_seen, robust_deviation(everything) if len(everything) else 0.0
 
 
 def _row_slope(
     view: SurfaceView,
-    angle_model: Model,
+    angle_model: AngleModel,
     points: Array,
     normals: Array,
     rows: Array,
@@ -406,7 +532,7 @@ def _row_slope(
 
 
 @dataclass(frozen=True)
-class OutlineEdges:
+class SharedEdges:
     """Edges of a mesh with the two faces that share each.
 
     Attributes
@@ -419,7 +545,7 @@ class OutlineEdges:
     faces: Indices
 
 
-def outline_candidates(mesh: TriangleMesh) -> OutlineEdges:
+def shared_edges(mesh: TriangleMesh) -> SharedEdges:
     """All edges that two faces share."""
     num = len(mesh.faces)
     ends = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -428,7 +554,7 @@ def outline_candidates(mesh: TriangleMesh) -> OutlineEdges:
     order = np.argsort(key, kind="stable")
     paired = np.flatnonzero(key[order][1:] == key[order][:-1])
     first, second = order[paired], order[paired + 1]
-    return OutlineEdges(ends[first], np.stack([face[first], face[second]], axis=1))
+    return SharedEdges(ends[first], np.stack([face[first], face[second]], axis=1))
 
 
 @dataclass(frozen=True)
@@ -447,9 +573,7 @@ class Rim:
     length_px: Array
 
 
-def find_rim(
-    mesh: TriangleMesh, scene: RayScene, view: SurfaceView, edges: OutlineEdges
-) -> Rim:
+def find_rim(mesh: TriangleMesh, scene: RayScene, view: SurfaceView, edges: SharedEdges) -> Rim:
     """The outline of a mesh in a view: edges between faces to and fro with nothing behind them."""
     towards = view.center - mesh.centers
     front = (towards * mesh.face_normals).sum(axis=1) > 0
@@ -489,21 +613,22 @@ def rim_residuals(view: SurfaceView, xy: Array) -> tuple[Array, Array]:
     return chosen[:, 0], chosen[:, 1:]
 
 
-def _add_rims(
-    equations: _Equations,
-    bias: _SharedError,
-    mesh: TriangleMesh,
-    scene: RayScene,
-    view: SurfaceView,
-    edges: OutlineEdges,
-    level: Level,
-    tol: RefinementTolerances,
-) -> None:
+@dataclass(frozen=True)
+class _RimRows:
+    """Residuals (K,) of a view's outline, px, with their vertices (K, 3) and lengths (K,)."""
+
+    vertices: Indices
+    jacobian: Array
+    residual: Array
+    length_px: Array
+
+
+def _rim_rows(
+    mesh: TriangleMesh, scene: RayScene, view: SurfaceView, edges: SharedEdges, level: Level
+) -> _RimRows:
     rim = find_rim(mesh, scene, view, edges)
     residual, gradient = rim_residuals(view, rim.xy)
     near = np.abs(residual) < level.rim_gate_px
-    if not near.any():
-        return
     ends, residual, gradient = rim.ends[near], residual[near], gradient[near]
     # Both ends move the point by half of their own displacements.
     jacobian = np.zeros((len(ends), 3))
@@ -514,13 +639,28 @@ def _add_rims(
         ahead, _ = view.project(middle + step)
         behind, _ = view.project(middle - step)
         jacobian[:, column] = 0.5 * (gradient * (ahead - behind)).sum(axis=1) / (2 * reach)
-    scale = max(1.0, 0.5 * level.rim_gate_px) ** 2
-    weight = rim.length_px[near] * (scale / (scale + residual**2)) ** 2 / tol.rim_sigma_px**2
-    weight *= tol.phase_correlation
     vertices = np.column_stack([ends, ends[:, 0]])
-    jacobian = np.nan_to_num(jacobian)
-    equations.add(vertices, jacobian, residual, weight)
-    bias.add(vertices, jacobian, residual, weight)
+    return _RimRows(vertices, np.nan_to_num(jacobian), residual, rim.length_px[near])
+
+
+def _add_rims(
+    equations: _Equations,
+    bias: _SharedError,
+    rims: Sequence[_RimRows],
+    level: Level,
+    tol: RefinementTolerances,
+) -> None:
+    """Add the outlines of all views, as certain as their residuals show them to be."""
+    residuals = np.concatenate([np.zeros(0), *(rim.residual for rim in rims)])
+    if not len(residuals):
+        return
+    sigma = max(tol.rim_sigma_px, robust_deviation(residuals - np.median(residuals)))
+    scale = max(3 * tol.rim_sigma_px, 0.5 * level.rim_gate_px) ** 2
+    for rim in rims:
+        weight = rim.length_px * (scale / (scale + rim.residual**2)) ** 2
+        weight *= tol.phase_correlation / (tol.rim_length_px * sigma**2)
+        equations.add(rim.vertices, rim.jacobian, rim.residual, weight)
+        bias.add(rim.vertices, rim.jacobian, rim.residual, weight)
 
 
 def _add_points(
@@ -550,7 +690,7 @@ def _add_points(
 
 def _smoothness(
     mesh: TriangleMesh, edge: float, tol: RefinementTolerances
-) -> tuple[sparse.csr_array, Array]:
+) -> tuple[sparse.csr_array, Array, sparse.csr_array]:
     """Curvature free of scale, drawn to most of its own surroundings' mean."""
     normals = mesh.vertex_normals
     laplacian = sparse.eye_array(len(mesh.vertices)) - mesh.neighbor_mean
@@ -562,5 +702,6 @@ def _smoothness(
     change = sparse.coo_array((data, (rows, cols)), shape=laplacian.shape).tocsr()
     residual = curvature - target
     weight = 1 / (1 + (residual / (5 * tol.smoothness)) ** 2) ** 2 / tol.smoothness**2
-    matrix = sparse.csr_array(change.T @ (sparse.diags_array(weight) @ change))
-    return matrix, np.asarray(change.T @ (weight * residual))
+    factor = sparse.csr_array(change.T @ sparse.diags_array(np.sqrt(weight)))
+    matrix = sparse.csr_array(factor @ factor.T)
+    return matrix, np.asarray(factor @ (np.sqrt(weight) * residual)), factor

@@ -170,7 +170,6 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
     return np.asarray(found_mask)
 
 
-
 def _outline_shift(
     mask: Mask, intensity: Image, scale: float, tol: SilhouetteTolerances
 ) -> Image | None:
@@ -195,7 +194,9 @@ def _outline_shift(
     along = np.arange(-reach - 1, reach + 1 + step, step)
     # The border runs half a pixel outside of its pixels' centres.
     centers = np.stack([cols + 0.5, rows + 0.5], axis=1)
-    places = centers[:, None] + outwards[:, None] * (along[:, None] - distance[rows, cols][:, None, None])
+    places = centers[:, None] + outwards[:, None] * (
+        along[:, None] - distance[rows, cols][:, None, None]
+    )
     profile = sample_image(intensity, places)
     slope = np.abs(ndimage.gaussian_filter1d(profile, 2.0, axis=1, order=1)) / step
     contrast = slope * 2 * step * 2.5 / np.maximum(profile.max(axis=1, keepdims=True), 1e-6)
@@ -204,7 +205,9 @@ def _outline_shift(
     best = score.argmax(axis=1)
     index = np.arange(len(best))
     found = along[best] + step * _vertex_of_parabola(
-        score[index, best - 1], score[index, best], score[index, np.minimum(best + 1, len(along) - 1)]
+        score[index, best - 1],
+        score[index, best],
+        score[index, np.minimum(best + 1, len(along) - 1)],
     )
     weight = np.clip(contrast[index, best] / tol.edge_contrast - 1, 0, 1)
     shifts, weights = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
@@ -213,9 +216,7 @@ def _outline_shift(
     shifts = cv2.GaussianBlur(shifts, (0, 0), width)
     weights = cv2.GaussianBlur(weights, (0, 0), width)
     mean = np.where(weights > 1e-4, shifts / np.maximum(weights, 1e-4), 0)
-    nearest = ndimage.distance_transform_edt(
-        ~border, return_distances=False, return_indices=True
-    )
+    nearest = ndimage.distance_transform_edt(~border, return_distances=False, return_indices=True)
     return mean[nearest[0], nearest[1]].astype(np.float32)
 
 

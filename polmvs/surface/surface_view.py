@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import View, sample_image
-from polmvs.config import Model
-from polmvs.polarization.angle_models import rows_from_axial
-from polmvs.polarization.phase_map import PhaseMap
+from polmvs.camera import sample_image
+from polmvs.config import AngleModel
+from polmvs.polarization.angle_models import rows_from_axial, tilt_turn
+from polmvs.polarization.phase_map import PhaseMap, view_rays
+from polmvs.scene import View
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -151,7 +152,7 @@ class PhaseRows:
 
 
 def phase_rows(
-    view: SurfaceView, angle_model: Model, points: Floats, other_light: Mask | None = None
+    view: SurfaceView, angle_model: AngleModel, points: Floats, other_light: Mask | None = None
 ) -> PhaseRows:
     """Rows ``m`` with ``m . n = 0`` of one view at points of space.
 
@@ -181,13 +182,33 @@ def phase_rows(
     return PhaseRows(in_world, np.where(known, precision, 0.0), turn)
 
 
-def surface_view(phase_map: PhaseMap, silhouette: Silhouette) -> SurfaceView:
-    """The record of a view from its phase map and silhouette."""
-    certain = silhouette.certain
+def surface_view(
+    phase_map: PhaseMap,
+    silhouette: Silhouette,
+    angle_model: AngleModel,
+    *,
+    tilt_aware: bool = True,
+) -> SurfaceView:
+    """The record of a view from its phase map and silhouette.
+
+    Parameters
+    ----------
+    phase_map : corrected for tilted polarizers where ``angle_model`` is that.
+    silhouette : of the objects in this view.
+    angle_model : whose rows the phase will give.
+    tilt_aware : as :func:`polmvs.normals.rows.gather_rows`.
+    """
+    samples = np.array(phase_map.samples, np.float32)
+    if tilt_aware and angle_model is not AngleModel.TILTED:
+        known = samples[..., 2] > 0
+        diffuse = np.asarray(phase_map.diffuse)[known]
+        cos2, sin2, precision = samples[known].T
+        turn = tilt_turn(cos2, sin2, view_rays(phase_map.view)[known], diffuse=diffuse)
+        samples[known, 2] = 1 / (1 / precision + turn**2)
     return SurfaceView(
         view=phase_map.view,
-        samples=np.ascontiguousarray(phase_map.samples, np.float32),
+        samples=samples,
         intensity=np.asarray(phase_map.intensity, np.float32),
         silhouette=silhouette,
-        has_outline=bool(certain.any() and not silhouette.possible.all()),
+        has_outline=bool(silhouette.certain.any() and not silhouette.possible.all()),
     )

@@ -7,8 +7,9 @@ plane on which the objects stand, as the sparse points of the surroundings show 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,16 +119,45 @@ def supporting_plane(
 
 @dataclass(frozen=True)
 class VisualHull:
-    """A closed mesh about the objects and what it was made with.
+    """The hull as a function on a grid.
 
     Attributes
     ----------
-    mesh : empty where the silhouettes have nothing in common.
+    values : (X, Y, Z) float32 on a grid, negative inside; see :func:`hull_values`.
+    origin : (3,), place of the first grid point.
+    step : distance of neighbours.
     footprint : length that a pixel covers at the objects, world units.
     """
 
-    mesh: TriangleMesh
+    values: NDArray[np.float32]
+    origin: Array
+    step: float
     footprint: float
+
+    @cached_property
+    def mesh(self) -> TriangleMesh:
+        """Closed surface; empty where the silhouettes have nothing in common."""
+        return relaxed(mesh_from_grid(self.values, self.origin, self.step))
+
+    def carved(
+        self,
+        free: Sequence[Callable[[Array], Floats]],
+        tolerances: HullTolerances | None = None,
+    ) -> VisualHull:
+        """Without what is known to be free space.
+
+        Parameters
+        ----------
+        free : functions of points ``(N, 3)`` that give signed distances ``(N,)``, positive where
+            space is free.
+        """
+        near = self.values < 4 * self.step
+        points = self.origin + self.step * np.argwhere(near)
+        values = self.values.copy()
+        for function in free:
+            values[near] = np.maximum(values[near], function(points).astype(np.float32))
+        tol = tolerances or HullTolerances()
+        return replace(self, values=_without_specks(values, self.step, tol))
 
 
 def visual_hull(
@@ -147,30 +177,26 @@ def visual_hull(
     """
     tol = tolerances or HullTolerances()
     used = [view for view in views if view.has_outline]
-    nothing = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    nothing = VisualHull(np.ones((2, 2, 2), np.float32), np.zeros(3), 1.0, 1.0)
     if len(used) < 2:
-        return VisualHull(nothing, 0.0)
+        return nothing
     wrong = round(tol.wrong_share * len(used)) if num_wrong is None else num_wrong
     center = _meeting_point(used)
     distance = float(np.median([np.linalg.norm(view.center - center) for view in used]))
-    footprint = float(
-        np.median([distance / view.view.camera.mean_focal_px for view in used])
-    )
+    footprint = float(np.median([distance / view.view.camera.mean_focal_px for view in used]))
     low, high = center - distance, center + distance
     for num_cells in (32, 48, 64):
         step = float((high - low).max() / num_cells)
         values = _values_on_grid(used, low, high, step, wrong, plane, tol)
         near = np.argwhere(values < 1.8 * step)  # the diagonal of a cell
         if not len(near):
-            return VisualHull(nothing, footprint)
+            return nothing
         low, high = low + (near.min(axis=0) - 1) * step, low + (near.max(axis=0) + 1) * step
-    fine = max(
-        tol.step_px * footprint, float(np.prod(high - low) / tol.max_cells) ** (1 / 3)
-    )
+    fine = max(tol.step_px * footprint, float(np.prod(high - low) / tol.max_cells) ** (1 / 3))
     low, high = low - 3 * fine, high + 3 * fine
     values = _refined(used, low, high, fine, wrong, plane, tol)
     values = _cleaned(values, fine, tol)
-    return VisualHull(relaxed(mesh_from_grid(values, low, fine)), footprint)
+    return VisualHull(values, low, fine, footprint)
 
 
 def _meeting_point(views: Sequence[SurfaceView]) -> Array:
@@ -266,28 +292,38 @@ def _refined(
     values = ndimage.map_coordinates(coarse, grid, order=1, mode="nearest").astype(np.float32)
     close = ndimage.grey_dilation(coarse, size=3) * ndimage.grey_erosion(coarse, size=3) <= 0
     near = close | (np.abs(coarse) < limit)
-    fine_near = near[np.ix_(*(np.minimum(np.rint(np.arange(n) / ratio).astype(int), near.shape[d] - 1)
-                              for d, n in enumerate(shape)))]
+    fine_near = near[
+        np.ix_(
+            *(
+                np.minimum(np.rint(np.arange(n) / ratio).astype(int), near.shape[d] - 1)
+                for d, n in enumerate(shape)
+            )
+        )
+    ]
     return _values_on_grid(
         views, low, high, step, num_wrong, plane, tol, where=fine_near, values=values
     )
 
 
-def _cleaned(
-    values: NDArray[np.float32], step: float, tol: HullTolerances
-) -> NDArray[np.float32]:
+def _cleaned(values: NDArray[np.float32], step: float, tol: HullTolerances) -> NDArray[np.float32]:
     """Smoothed, closed at the grid's border, without pieces too small for objects."""
     limit = np.float32(4 * step)
     values = np.clip(values, -limit, limit)
     for axis in range(3):
         border = np.moveaxis(values, axis, 0)
         border[0], border[-1] = limit, limit
-    values = ndimage.gaussian_filter(values, 0.7)
+    return _without_specks(ndimage.gaussian_filter(values, 0.7), step, tol)
+
+
+def _without_specks(
+    values: NDArray[np.float32], step: float, tol: HullTolerances
+) -> NDArray[np.float32]:
+    """Pieces too small for objects filled with outside, in place."""
     labels, num = ndimage.label(values < 0)
     if num > 1:
         size = np.bincount(labels.ravel())
         size[0] = 0
         small = size < max(30, tol.min_piece_share * size.max())
         small[0] = False
-        values[small[labels]] = limit
-    return np.asarray(values)
+        values[small[labels]] = np.float32(4 * step)
+    return values
