@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
+from polmvs.io.clouds import Mesh
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds, View
 from polmvs.surface.dense_view import DenseView, lattice_xy
@@ -90,7 +91,7 @@ class Undetermined:
     reason: str
 
 
-def num_steps(num_views: int) -> int:
+def num_surface_steps(num_views: int) -> int:
     """How often :func:`reconstruct_surface` and the rendering of its views report at most."""
     refinement = sum(level.num_steps for level in RefinementTolerances().levels)
     return refinement + NUM_FINAL_STEPS + num_views
@@ -209,6 +210,17 @@ def _deviations(
     total = weight.sum(axis=1)
     mean = (np.where(known_corners, corners, 0) * weight).sum(axis=1) / np.maximum(total, 1e-9)
     return np.where(total > 1e-6, mean, np.inf)
+
+
+def supported_mesh(surface: GlobalSurface) -> Mesh:
+    """What the views bear out of the surface, with the normals of the phases."""
+    faces = surface.mesh.faces[surface.supported]
+    used, compact = np.unique(faces, return_inverse=True)
+    return Mesh(
+        vertices=surface.mesh.vertices[used],
+        normals=surface.normals[used],
+        triangles=compact.reshape(-1, 3).astype(np.int32),
+    )
 
 
 def surface_points(

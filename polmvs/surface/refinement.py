@@ -77,7 +77,8 @@ class RefinementTolerances:
     remesh_after : displacement of a fiftieth of the vertices after which a mesh is made anew, in
         edges. Guess.
     unseen_damping : of a vertex that no view sees, in edges; smoothness alone would melt it.
-    converged_px : root mean square of displacements of what is seen that ends a level. Guess.
+    converged : root mean square of displacements of what is seen that ends a level, in edges.
+        Guess.
     visible_slack : by which the mesh may hide a face's centre, in edges.
     max_vertices : of a mesh; finer levels are left out. From the time allowed.
     """
@@ -100,7 +101,7 @@ class RefinementTolerances:
     damping: float = 0.5
     remesh_after: float = 2.0
     unseen_damping: float = 0.02
-    converged_px: float = 0.02
+    converged: float = 0.03
     visible_slack: float = 0.5
     max_vertices: int = 120_000
 
@@ -295,7 +296,9 @@ def refine(
             )
             if on_progress is not None:
                 on_progress(1)
-            if change < max(tol.converged_px, 0.03 * level.edge_px) * footprint and step > 1:
+            if change < tol.converged * edge and step > 1:
+                if on_progress is not None:
+                    on_progress(level.num_steps - step - 1)
                 break
         # A model that leaves something out (OPA the perspective) errs by more than its phases'
         # noise; held against that, most of its rows were outliers. Every model is treated alike.
