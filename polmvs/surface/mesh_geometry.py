@@ -19,9 +19,13 @@ Floats = NDArray[np.floating]
 Faces = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-NUM_SIGN_RAYS = 3  # whose majority tells inside from outside, should one graze an edge
+# Of rays whose majority tells inside from outside, should one graze an edge; along no axis.
+SIGN_DIRECTIONS = (
+    np.array([0.36, 0.48, 0.80]),
+    np.array([-0.70, 0.10, 0.71]),
+    np.array([0.25, -0.83, -0.50]),
+)
 BAND_CELLS = 3  # half width of the band about a mesh in which distances are computed
-FAR_BEHIND = 1e-9
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,7 @@ class RayScene:
         # Open3D computes in float32: coordinates are taken from the mesh's centre.
         self._origin = mesh.vertices.mean(axis=0) if len(mesh.vertices) else np.zeros(3)
         self._tensor = o3d.core.Tensor
+        self._face_normals = mesh.face_normals
         self._scene: Any = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
             self._tensor(self._local(mesh.vertices)),
@@ -181,11 +186,34 @@ class RayScene:
         face = found["primitive_ids"].numpy().astype(np.int64)
         return place, face, np.column_stack([1 - uv[:, 0] - uv[:, 1], uv])
 
-    def signed_distance(self, points: Floats) -> NDArray[np.float32]:
-        """Distance ``(N,)`` to the mesh, negative inside of it."""
-        query = self._tensor(self._local(points))
-        signed = self._scene.compute_signed_distance(query, nsamples=NUM_SIGN_RAYS)
-        return np.asarray(signed.numpy(), np.float32)
+    def signed_distance(
+        self, points: Floats, *, num_rays: int = len(SIGN_DIRECTIONS)
+    ) -> NDArray[np.float32]:
+        """Distance ``(N,)`` to the mesh, negative inside of it.
+
+        Inside is what the mesh winds about: where it overlaps itself too.
+
+        Parameters
+        ----------
+        points : (N, 3).
+        num_rays : odd, up to 3, whose majority decides: one may graze an edge.
+        """
+        local = self._local(points)
+        distance = np.asarray(self._scene.compute_distance(self._tensor(local)).numpy(), np.float32)
+        votes = np.zeros(len(points), np.int64)
+        for direction in SIGN_DIRECTIONS[:num_rays]:
+            votes += self._windings(local, direction) > 0
+        return np.where(2 * votes > num_rays, -distance, distance)
+
+    def _windings(self, local: NDArray[np.float32], direction: Array) -> NDArray[np.int64]:
+        """How often ``(N,)`` more a ray leaves the mesh than it enters it."""
+        rays = np.empty((len(local), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = local, direction
+        hits = self._scene.list_intersections(self._tensor(rays))
+        face = hits["primitive_ids"].numpy().astype(np.int64)
+        leaves = np.sign(self._face_normals[face] @ direction)
+        count = np.bincount(hits["ray_ids"].numpy().astype(np.int64), leaves, len(local))
+        return np.rint(count).astype(np.int64)
 
 
 def visible_points(
@@ -339,10 +367,22 @@ def remeshed(
         band[tuple(place.astype(np.int64).T)] = True
     band = ndimage.binary_dilation(band, iterations=BAND_CELLS)
     index = np.argwhere(band)
-    distance = RayScene(mesh).signed_distance(origin + step * index)
+    scene = RayScene(mesh)
     limit = np.float32(BAND_CELLS * step)
-    values = np.full(shape, limit, np.float32)
-    values[band] = np.clip(distance, -limit, limit)
+    values = np.full(shape, np.nan, np.float32)
+    values[band] = scene.signed_distance(origin + step * index, num_rays=1)
+    # The sign cannot change between neighbours that are farther from the mesh than each other.
+    doubtful = np.zeros(shape, np.bool_)
+    for axis in range(3):
+        first, second = (np.moveaxis(values, axis, 0)[part] for part in (slice(-1), slice(1, None)))
+        apart = np.minimum(np.abs(first), np.abs(second)) > 1.01 * step
+        jumps = (first * second < 0) & apart
+        for part in (slice(-1), slice(1, None)):
+            np.moveaxis(doubtful, axis, 0)[part] |= jumps
+    if doubtful.any():
+        values[doubtful] = scene.signed_distance(origin + step * np.argwhere(doubtful))
+    values[band] = np.clip(values[band], -limit, limit)
+    values[~band] = limit
     pieces, num_pieces = ndimage.label(~band)
     # Outside of the band a piece has the sign that the band has beside it.
     if num_pieces > 1:

@@ -126,9 +126,8 @@ class _Equations:
 
     num: int
     gradient: Array = field(init=False)
-    _rows: list[Indices] = field(default_factory=list)
-    _cols: list[Indices] = field(default_factory=list)
-    _data: list[Array] = field(default_factory=list)
+    _vertices: list[Indices] = field(default_factory=list)
+    _blocks: list[Array] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.gradient = np.zeros(self.num)
@@ -140,29 +139,30 @@ class _Equations:
 
     def add_blocks(self, vertices: Indices, blocks: Array, gradient: Array) -> None:
         """Sums ``(N, 3, 3)`` and ``(N, 3)`` of such residuals."""
-        self._rows.append(np.repeat(vertices, 3, axis=1).ravel())
-        self._cols.append(np.tile(vertices, (1, 3)).ravel())
-        self._data.append(blocks.ravel())
+        self._vertices.append(vertices)
+        self._blocks.append(blocks)
         self.gradient += np.bincount(vertices.ravel(), gradient.ravel(), self.num)
 
     def noise(self, rng: np.random.Generator) -> Array:
         """A random gradient ``(num,)`` with the matrix as its covariance."""
         total = np.zeros(self.num)
-        for cols, data in zip(self._cols, self._data, strict=True):
-            blocks = data.reshape(-1, 3, 3)
+        for vertices, blocks in zip(self._vertices, self._blocks, strict=True):
             values, vectors = np.linalg.eigh(blocks)
             random = rng.standard_normal(values.shape) * np.sqrt(np.maximum(values, 0))
             drawn = (vectors @ random[:, :, None])[..., 0]
-            total += np.bincount(cols.reshape(-1, 3, 3)[:, 0].ravel(), drawn.ravel(), self.num)
+            total += np.bincount(vertices.ravel(), drawn.ravel(), self.num)
         return total
 
     def matrix(self) -> sparse.csr_array:
         """The sum, ``(num, num)``."""
         shape = (self.num, self.num)
-        if not self._data:
+        if not self._blocks:
             return sparse.csr_array(shape, dtype=np.float64)
-        indices = (np.concatenate(self._rows), np.concatenate(self._cols))
-        return sparse.coo_array((np.concatenate(self._data), indices), shape=shape).tocsr()
+        rows = [np.repeat(vertices, 3, axis=1).ravel() for vertices in self._vertices]
+        cols = [np.tile(vertices, (1, 3)).ravel() for vertices in self._vertices]
+        data = np.concatenate([blocks.ravel() for blocks in self._blocks])
+        indices = (np.concatenate(rows), np.concatenate(cols))
+        return sparse.coo_array((data, indices), shape=shape).tocsr()
 
 
 @dataclass
@@ -175,25 +175,35 @@ class _SharedError:
 
     num: int
     prior: float
-    _slope: Array = field(init=False)
+    slope: Array = field(init=False)
     _weight: float = 0.0
     _residual: float = 0.0
 
     def __post_init__(self) -> None:
-        self._slope = np.zeros(self.num)
+        self.slope = np.zeros(self.num)
 
     def add(self, vertices: Indices, jacobian: Array, residual: Array, weight: Array) -> None:
         """Residuals as in :meth:`_Equations.add`."""
         weighted = (weight[:, None] * jacobian).ravel()
-        self._slope += np.bincount(vertices.ravel(), weighted, self.num)
+        self.slope += np.bincount(vertices.ravel(), weighted, self.num)
         self._weight += float(weight.sum())
         self._residual += float(weight @ residual)
 
     def column(self) -> Array:
-        return self._slope / np.sqrt(self._weight + self.prior)
+        """The vector u ``(num,)`` of the class's text."""
+        return self.slope / np.sqrt(self._weight + self.prior)
 
     def offset(self) -> float:
+        """Factor of u on the right side."""
         return self._residual / float(np.sqrt(self._weight + self.prior))
+
+    def deviation(self, response: Array) -> float:
+        """Deviation of the error itself once all is solved.
+
+        ``response`` (num,) is the solution, without the error, for ``slope`` as right side.
+        """
+        left = self._weight + self.prior - float(self.slope @ response)
+        return float(1 / np.sqrt(max(left, self.prior)))
 
 
 @dataclass(frozen=True)
@@ -402,15 +412,18 @@ def place_deviations(
         mesh, views, angle_model, footprint, edge, tol.levels[-1], known, tol.row_sigma, tol
     )
     matrix = system.equations.matrix() + system.smooth
-    shared = system.bias.column()
     # Nothing but the energy holds the surface here; what no view sees is not asked for.
     loose = np.where(system.free, 100.0, tol.unseen_damping) * edge
+    no_bias = np.zeros(num)
+    biased = solve(matrix, system.bias.slope, 1 / loose**2, no_bias)
+    biased *= system.bias.deviation(biased)
     total = np.zeros(num)
     for _ in range(num_samples):
         noise = system.equations.noise(rng)
         noise += system.smooth_factor @ rng.standard_normal(num)
-        noise += system.bias.noise(rng)
-        total += solve(matrix, noise, 1 / loose**2, shared) ** 2
+        # The bias that all outlines share, as if it were known: its own sample comes on top.
+        sample = solve(matrix, noise, 1 / loose**2, no_bias)
+        total += (sample + rng.standard_normal() * biased) ** 2
     sigma = np.sqrt(tol.phase_correlation * total / num_samples)
     return np.where(system.free, sigma, np.inf)
 
@@ -425,7 +438,7 @@ def median_residual(
 
     Returns
     -------
-    row_sigma : robust deviation of ``m . n``, at least that of the tolerances.
+    error : robust deviation of ``m . n``.
     median : of the absolute residuals; 0 without any.
     """
     tol = tolerances or RefinementTolerances()
@@ -435,9 +448,8 @@ def median_residual(
         + [face_rows(mesh, scene, v, angle_model, tol.row_sigma, tol).residual for v in views]
     )
     if not len(residuals):
-        return tol.row_sigma, 0.0
-    sigma = robust_deviation(residuals)
-    return max(tol.row_sigma, sigma), float(np.median(np.abs(residuals)))
+        return 0.0, 0.0
+    return robust_deviation(residuals), float(np.median(np.abs(residuals)))
 
 
 def solve(matrix: sparse.csr_array, right: Array, damping: Array, shared: Array) -> Array:

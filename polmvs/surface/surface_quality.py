@@ -190,6 +190,7 @@ def fit_normals(
     angle_model: AngleModel,
     *,
     row_sigma: float,
+    row_error: float,
     tolerances: QualityTolerances | None = None,
 ) -> VertexNormals:
     """Normals from the phases of all views at the places of the mesh, which stay.
@@ -198,8 +199,9 @@ def fit_normals(
 
     Parameters
     ----------
-    mesh, views, angle_model, row_sigma : as in :func:`face_evidence`. The deviation of a row that
-        noise does not explain is no smaller for many views, and bounds that of the normal.
+    mesh, views, angle_model, row_sigma : as in :func:`face_evidence`.
+    row_error : deviation of ``m . n`` that the surface shows. Views share some of it, so that it
+        does not average out: half of it is added to the normals' deviations. Guess.
     """
     tol = tolerances or QualityTolerances()
     num = len(mesh.vertices)
@@ -234,8 +236,7 @@ def fit_normals(
         good = estimate.valid & (apart < tol.trusted_deg + 3 * estimate.sigma_deg)
         good &= estimate.residual < 3 * row_sigma
         normals[part][good] = estimate.normals[good]
-        # Errors that views share do not average out.
-        shared = np.degrees(row_sigma) / 2
+        shared = np.degrees(0.5 * row_error)
         sigma[part] = np.where(good, np.hypot(estimate.sigma_deg, shared), np.inf)
         counted[part] = estimate.num_rows
     return VertexNormals(normals, sigma, counted)
