@@ -83,7 +83,7 @@ class TriangleMesh:
     def vertex_areas(self) -> Array:
         """Area ``(V,)``, a third of the faces' at each vertex."""
         third = np.repeat(self.face_areas / 3, 3)
-        return np.bincount(self.faces.ravel(), third, len(self.vertices))
+        return np.asarray(np.bincount(self.faces.ravel(), third, len(self.vertices)), np.float64)
 
     @cached_property
     def adjacency(self) -> sparse.csr_array:
