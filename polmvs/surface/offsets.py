@@ -75,6 +75,9 @@ class OffsetTolerances:
     max_cost : median loss over the views above which the phases contradict a face: as many
         deviations as ``cost_sigmas``. Derived.
     leak : conductance to nowhere of a place that contradicts its face. Guess.
+    snap_cells : width of the band in which a border is moved to the strongest line. Guess: a mark
+        beside a border can draw the walk over it by as much.
+    seed_weight : chance that a walk ends on a point that it passes, over that of a step. Guess.
     min_claim : chance of a place for its likeliest face, under which it has none. Guess.
     min_share : of the seen views in whose region a place must lie. Guess: one view in six wrong.
     min_cosine : between a face's normal and the direction to a view that counts.
@@ -110,6 +113,8 @@ class OffsetTolerances:
     cost_sigmas: float = 3.0
     max_cost: float = 0.5
     leak: float = 0.01
+    snap_cells: float = 5.0
+    seed_weight: float = 0.2
     min_claim: float = 0.25
     min_share: float = 0.84
     min_cosine: float = 0.1
@@ -468,7 +473,9 @@ def _labels(
     surface_cost = _surface_cost(grid, rise.max(axis=0), maps, first_hit, tol)
     labels = np.full(grid.shape, NO_FACE)
     for round_index in range(tol.num_rounds):
-        claims = np.zeros((len(group), *grid.shape))
+        claims, jumps = np.zeros((2, len(group), *grid.shape))
+        taken = np.zeros(grid.shape, np.bool_)  # by something that the faces do not explain
+        explained = np.zeros(grid.shape, np.bool_)
         for number, face in enumerate(group):
             hidden = None
             if round_index > 0:
@@ -476,12 +483,59 @@ def _labels(
             on_grid = grid.cells(seeds.points_in_world[face.members])
             near = _distance_to(on_grid, grid.shape) < 0.5 * tol.mark_px
             evidence = _evidence(places[number], face, maps, features, near, hidden, tol)
+            fits = (evidence.cost < tol.max_cost) & (evidence.cost < surface_cost + tol.better_by)
+            taken |= evidence.possible & ~fits
+            explained |= evidence.possible & fits
             possible = evidence.possible & (evidence.cost < surface_cost + tol.better_by)
             claims[number] = _claim(number, group, seeds, grid, evidence, possible, tol)
-        best = claims.argmax(axis=0)
-        labels = np.where(claims.max(axis=0) > tol.min_claim, best, NO_FACE)
+            jumps[number] = evidence.jump
+        labels = np.where(claims.max(axis=0) > tol.min_claim, claims.argmax(axis=0), NO_FACE)
+        # Nothing hides the border of a higher face: it shows where the lower one begins.
+        height = np.where(claims > 0.5, rise, -np.inf)
+        labels = np.where(claims.max(axis=0) > 0.5, height.argmax(axis=0), labels)
         labels = _without_small(labels, len(group), tol)
+        for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1)):
+            labels = _snapped(labels, int(number), jumps[number], tol)
+        taken = ndimage.binary_opening(taken & ~explained, iterations=2)
+        labels = _continued(labels, taken, tol)
     return np.asarray(labels, np.int64)
+
+
+def _snapped(
+    labels: NDArray[np.int64], number: int, jump: Array, tol: OffsetTolerances
+) -> NDArray[np.int64]:
+    """Borders of a face moved to the strongest line within a few cells: the walk again, from its sides."""
+    own = labels == number
+    core = ndimage.distance_transform_edt(own) > tol.snap_cells
+    rest = ndimage.distance_transform_edt(~own) > tol.snap_cells
+    if not core.any() or not rest.any():
+        return labels
+    band = ~core & ~rest
+    adjacency, degree = _walk(jump, tol)
+    inner, outer = np.flatnonzero(band), np.flatnonzero(core)
+    right = adjacency[inner][:, outer].sum(axis=1)
+    chance = np.zeros(labels.size)
+    chance[inner] = _solved(adjacency[inner][:, inner], degree[inner], np.asarray(right))
+    flooded = core | (chance.reshape(labels.shape) > 0.5)
+    others = np.where(own, NO_FACE, labels)
+    nearest = ndimage.distance_transform_edt(own, return_distances=False, return_indices=True)
+    given_back = others[tuple(nearest)]
+    return np.where(flooded, number, np.where(own, given_back, labels))
+
+
+def _continued(
+    labels: NDArray[np.int64], taken: Mask, tol: OffsetTolerances
+) -> NDArray[np.int64]:
+    """Labels carried on to cells near them that nothing else takes.
+
+    Beside a face, where the views show no part, there is nothing that a label could wrongly carve;
+    but the first surface may stand there in a rim as wide as the silhouettes are unsure.
+    """
+    if not (labels != NO_FACE).any():
+        return labels
+    distance, nearest = ndimage.distance_transform_edt(labels == NO_FACE, return_indices=True)
+    carried = labels[tuple(nearest)]
+    return np.where((distance <= tol.min_radius_cells) & ~taken, carried, labels)
 
 
 def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
@@ -699,37 +753,44 @@ def _claim(
         else:
             others = np.minimum(others, near)
     starts = (own < tol.seed_cells) & (own < others) & possible
-    ends = ~possible | ((others < tol.seed_cells) & (others < own))
+    ends = (others < tol.seed_cells) & (others < own) & possible
     if not starts.any():
         return np.zeros(grid.shape)
-    cells = np.arange(starts.size).reshape(grid.shape)
-    jump = evidence.jump.astype(np.float64)
-    weight = 1 / (1 + (jump / tol.line_steps) ** 2) ** tol.line_power
+    adjacency, degree = _walk(evidence.jump.astype(np.float64), tol)
+    # A walk may end on any point it passes, so that a single false one does not decide.
+    ending = tol.seed_weight * (starts | ends).ravel()
+    leak = tol.leak * np.clip(evidence.cost.astype(np.float64).ravel() / tol.max_cost - 1, 0, 1)
+    free = np.flatnonzero(possible)
+    right = tol.seed_weight * starts.ravel()[free].astype(np.float64)
+    claim = np.zeros(starts.size)
+    claim[free] = _solved(
+        adjacency[free][:, free], (degree + leak + ending + 1e-9)[free], right
+    )
+    return np.asarray(claim.reshape(grid.shape))
+
+
+def _walk(jump: Array, tol: OffsetTolerances) -> tuple[sparse.csr_array, Array]:
+    """Chances of a step between neighbouring cells ``(H W, H W)``, small across lines; and sums."""
+    cells = np.arange(jump.size).reshape(jump.shape)
+    weight = 1 / (1 + (jump.ravel() / tol.line_steps) ** 2) ** tol.line_power
     tails = np.concatenate([cells[:, :-1].ravel(), cells[:-1].ravel()])
     heads = np.concatenate([cells[:, 1:].ravel(), cells[1:].ravel()])
-    flat_weight = weight.ravel()
-    between = np.minimum(flat_weight[tails], flat_weight[heads])
-    leak = tol.leak * np.clip(evidence.cost / tol.max_cost - 1, 0, 1)
-    known = (starts | ends).ravel()
-    free = np.flatnonzero(~known)
-    claim = starts.astype(np.float64).ravel()
-    if len(free):
-        num = starts.size
-        pairs = (np.concatenate([tails, heads]), np.concatenate([heads, tails]))
-        adjacency = sparse.coo_array(
-            (np.concatenate([between, between]), pairs), shape=(num, num)
-        ).tocsr()
-        degree = np.asarray(adjacency.sum(axis=1)).ravel() + leak.ravel() + 1e-9
-        laplacian = sparse.csr_array(sparse.diags_array(degree) - adjacency)[free]
-        right = -(laplacian[:, np.flatnonzero(known)] @ claim[known])
-        factors = splu(
-            sparse.csc_array(laplacian[:, free]),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-        claim[free] = factors.solve(right)
-    return np.asarray(claim.reshape(grid.shape))
+    between = np.minimum(weight[tails], weight[heads])
+    pairs = (np.concatenate([tails, heads]), np.concatenate([heads, tails]))
+    both = np.concatenate([between, between])
+    adjacency = sparse.coo_array((both, pairs), shape=(jump.size, jump.size)).tocsr()
+    return adjacency, np.asarray(adjacency.sum(axis=1)).ravel()
+
+
+def _solved(adjacency: sparse.csr_array, degree: Array, right: Array) -> Array:
+    """Solution of ``(diag(degree) - adjacency) x = right``."""
+    factors = splu(
+        sparse.csc_array(sparse.diags_array(degree) - adjacency),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    return np.asarray(factors.solve(right))
 
 
 def _distance_to(cells: Array, shape: tuple[int, int]) -> Array:
