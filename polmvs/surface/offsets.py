@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
-from polmvs.polarization.angle_models import rows_from_axial
+from polmvs.normals.rows import Rows, gather_rows
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
 
@@ -252,7 +252,7 @@ def find_faces(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tupl
     points, normals = seeds.points_in_world, seeds.normals_in_world
     sigma = np.maximum(seeds.sigma, 1e-12)
     rng = np.random.default_rng(0)
-    left = np.isfinite(normals).all(axis=1) & np.isfinite(points).all(axis=1)
+    left: Mask = np.asarray(np.isfinite(normals).all(axis=1) & np.isfinite(points).all(axis=1))
     agree = np.cos(np.radians(tol.normal_deg))
     faces: list[Face] = []
     while left.sum() >= tol.min_points:
@@ -309,9 +309,7 @@ def _fitted(seeds: Seeds, members: NDArray[np.int64], tol: OffsetTolerances) -> 
     return Face(normal, float(normal @ center), members)
 
 
-def _without_interlopers(
-    faces: Sequence[Face], points: Array, tol: OffsetTolerances
-) -> list[Face]:
+def _without_interlopers(faces: Sequence[Face], points: Array, tol: OffsetTolerances) -> list[Face]:
     """Faces whose seeds do not lie, sideways, among those of a larger face of like normal."""
     kept: list[Face] = []
     for face in faces:
@@ -337,7 +335,9 @@ def stepped_faces(
     faces: Sequence[Face],
     seeds: Seeds,
     maps: Sequence[PhaseMap],
+    angle_model: AngleModel,
     *,
+    tilt_aware: bool = True,
     signed_distance: SignedDistance | None = None,
     first_hit: FirstHit | None = None,
     tolerances: OffsetTolerances | None = None,
@@ -348,7 +348,8 @@ def stepped_faces(
     ----------
     faces : of :func:`find_faces`.
     seeds : whose members they are.
-    maps : phase maps of the views; their rows are those of PPA (tilted maps are corrected).
+    maps : phase maps of the views.
+    angle_model, tilt_aware : of the rows, as in :func:`polmvs.normals.rows.gather_rows`.
     signed_distance : of points ``(N, 3)`` to the first surface. Groups whose seeds all lie on it
         are left out. None: all are looked at.
     first_hit : distance and normal where rays from ``(N, 3)`` along ``(3,)`` first meet the first
@@ -356,19 +357,20 @@ def stepped_faces(
     tolerances : numbers of the search.
     """
     tol = tolerances or OffsetTolerances()
+    features = [_features(phase_map, tol) for phase_map in maps] if faces else []
+    scene = _Scene(maps, angle_model, tilt_aware, features)
     found = []
     for group in _grouped(faces, tol):
         points = seeds.points_in_world[np.concatenate([face.members for face in group])]
         footprint = _footprint(points, maps)
         if signed_distance is not None and not any(
-            _is_off(face, seeds, signed_distance, tol.off_footprints * footprint)
-            for face in group
+            _is_off(face, seeds, signed_distance, tol.off_footprints * footprint) for face in group
         ):
             continue
         grid = _grid_over(group, points, maps, footprint, tol)
         if grid is None:
             continue
-        labels = _labels(group, seeds, grid, maps, first_hit, tol)
+        labels = _labels(group, seeds, grid, scene, first_hit, tol)
         if (labels != NO_FACE).any():
             found.append(SteppedFaces(tuple(group), grid, labels))
     return tuple(found)
@@ -441,7 +443,23 @@ def _grid_over(
     step = max(footprint, float(np.sqrt(np.prod(size) / tol.max_cells)))
     rows_cols = np.ceil(size / step).astype(np.int64) + 1
     origin = center + start[0] * first + start[1] * second
-    return FaceGrid(origin, first, second, face.normal, step, (int(rows_cols[0]), int(rows_cols[1])))
+    return FaceGrid(
+        origin, first, second, face.normal, step, (int(rows_cols[0]), int(rows_cols[1]))
+    )
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """Phase maps, which rows they have, and the images (H, W, 4) whose steps show borders."""
+
+    maps: Sequence[PhaseMap]
+    angle_model: AngleModel
+    tilt_aware: bool
+    features: Sequence[Image]
+
+    def rows(self, points: Array) -> Rows:
+        """Rows of points ``(N, 3)``."""
+        return gather_rows(self.angle_model, points, self.maps, tilt_aware=self.tilt_aware)
 
 
 @dataclass(frozen=True)
@@ -462,15 +480,14 @@ def _labels(
     group: Sequence[Face],
     seeds: Seeds,
     grid: FaceGrid,
-    maps: Sequence[PhaseMap],
+    scene: _Scene,
     first_hit: FirstHit | None,
     tol: OffsetTolerances,
 ) -> NDArray[np.int64]:
     """Number of the face at each cell, ``NO_FACE`` where the views show none."""
-    features = [_features(phase_map, tol) for phase_map in maps]
     places = [grid.points(face) for face in group]
     rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
-    surface_cost = _surface_cost(grid, rise.max(axis=0), maps, first_hit, tol)
+    surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit, tol)
     labels = np.full(grid.shape, NO_FACE)
     for round_index in range(tol.num_rounds):
         claims, jumps = np.zeros((2, len(group), *grid.shape))
@@ -479,10 +496,10 @@ def _labels(
         for number, face in enumerate(group):
             hidden = None
             if round_index > 0:
-                hidden = _hidden(number, group, places[number], rise, grid, labels, maps)
+                hidden = _hidden(number, group, places[number], grid, labels, scene.maps)
             on_grid = grid.cells(seeds.points_in_world[face.members])
             near = _distance_to(on_grid, grid.shape) < 0.5 * tol.mark_px
-            evidence = _evidence(places[number], face, maps, features, near, hidden, tol)
+            evidence = _evidence(places[number], face, scene, near, hidden, tol)
             fits = (evidence.cost < tol.max_cost) & (evidence.cost < surface_cost + tol.better_by)
             taken |= evidence.possible & ~fits
             explained |= evidence.possible & fits
@@ -504,7 +521,7 @@ def _labels(
 def _snapped(
     labels: NDArray[np.int64], number: int, jump: Array, tol: OffsetTolerances
 ) -> NDArray[np.int64]:
-    """Borders of a face moved to the strongest line within a few cells: the walk again, from its sides."""
+    """Borders of a face moved to the strongest line near: the walk again, from both sides."""
     own = labels == number
     core = ndimage.distance_transform_edt(own) > tol.snap_cells
     rest = ndimage.distance_transform_edt(~own) > tol.snap_cells
@@ -523,9 +540,7 @@ def _snapped(
     return np.where(flooded, number, np.where(own, given_back, labels))
 
 
-def _continued(
-    labels: NDArray[np.int64], taken: Mask, tol: OffsetTolerances
-) -> NDArray[np.int64]:
+def _continued(labels: NDArray[np.int64], taken: Mask, tol: OffsetTolerances) -> NDArray[np.int64]:
     """Labels carried on to cells near them that nothing else takes.
 
     Beside a face, where the views show no part, there is nothing that a label could wrongly carve;
@@ -555,76 +570,64 @@ def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
     dull = phase_map.lowest_dolp < 255 * tol.mark_dolp_share * dolp
     mark = dull & (intensity > tol.mark_contrast * about + tol.dark)
-    mark = cv2.dilate(mark.astype(np.uint8), np.ones((tol.mark_margin_px,) * 2, np.uint8))
+    kernel = np.ones((tol.mark_margin_px,) * 2, np.uint8)
+    on_mark = cv2.dilate(mark.astype(np.uint8), kernel)
     logarithm = np.log(cv2.GaussianBlur(intensity, (0, 0), tol.smoothing_px) + tol.dark)
     samples = phase_map.samples[..., :2]
-    return np.dstack([logarithm, samples, 1 - mark]).astype(np.float32)
+    return np.dstack([logarithm, samples, 1 - on_mark]).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class _Sight:
-    """One view's sight of points: pixels (..., 2), and whether it can see them (...)."""
+def _losses(
+    rows: Rows, normals: Floats, tol: OffsetTolerances
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Loss in [0, 1] of each row (K, N), NaN where it does not count, and cosines to the views.
 
-    xy: Array
-    rays: Array
-    seen: Mask
-
-
-def _sight(points: Array, normal: Array, phase_map: PhaseMap, tol: OffsetTolerances) -> _Sight:
-    view = phase_map.view
-    in_cam = np.asarray(view.cam_from_world * points)
-    rays = in_cam / np.maximum(np.linalg.norm(in_cam, axis=-1, keepdims=True), 1e-300)
-    xy = np.asarray(view.camera.project(in_cam))
-    size = np.array([view.camera.width, view.camera.height])
+    Parameters
+    ----------
+    rows : of N points.
+    normals : (3, 1) or (3, N).
+    """
+    normals = np.asarray(normals, np.float32)
+    cosine = -(rows.rays * normals[:, None]).sum(axis=0)
+    residual = (rows.rows * normals[:, None]).sum(axis=0)
     with np.errstate(invalid="ignore"):
-        seen = ((xy >= 1) & (xy <= size - 1)).all(axis=-1)
-    normal_in_cam = normal @ view.cam_from_world.rotation.T
-    seen &= -(rays * normal_in_cam).sum(axis=-1) > tol.min_cosine
-    return _Sight(xy, rays, seen)
-
-
-def _phase_loss(
-    sight: _Sight, normal: Array, phase_map: PhaseMap, tol: OffsetTolerances
-) -> Array:
-    """Loss (...) in [0, 1] of a view's phases for a normal; NaN where it has none."""
-    normal_in_cam = normal @ phase_map.view.cam_from_world.rotation.T
-    cos2, sin2, precision = np.moveaxis(sample_image(phase_map.samples, sight.xy), -1, 0)
-    rays = sight.rays.reshape(-1, 3)
-    rows = rows_from_axial(AngleModel.PPA, cos2.ravel(), sin2.ravel(), rays)
-    rows = np.asarray(rows, np.float64).reshape(sight.rays.shape)
-    residual = (rows * normal_in_cam).sum(axis=-1)
-    turn = (rows[..., 0] ** 2 + rows[..., 1] ** 2) / np.maximum(sight.rays[..., 2], 1e-9)
-    sine2 = 1 - (sight.rays * normal_in_cam).sum(axis=-1) ** 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        variance = sine2 * turn**2 / precision + tol.phase_floor**2
-        z2 = residual**2 / variance / tol.cost_sigmas**2
-    known = sight.seen & (precision > 0) & np.isfinite(z2)
-    return np.where(known, z2 / (1 + z2), np.nan)
+        variance = (1 - cosine**2) * np.square(rows.sigma) + np.float32(tol.phase_floor**2)
+        z2 = np.square(residual) / (variance * np.float32(tol.cost_sigmas**2))
+        loss = z2 / (1 + z2)
+    counts = np.isfinite(rows.sigma) & (cosine > tol.min_cosine)
+    return np.where(counts, loss, np.nan).astype(np.float32), cosine
 
 
 def _evidence(
     places: Array,
     face: Face,
-    maps: Sequence[PhaseMap],
-    features: Sequence[Image],
+    scene: _Scene,
     near_points: Mask,
     hidden: Sequence[Mask] | None,
     tol: OffsetTolerances,
 ) -> _Evidence:
     """What the views say; ``near_points`` (H, W): where steps may be those of printed marks."""
     shape = places.shape[:2]
-    jumps = np.full((len(maps), *shape), np.nan, np.float32)
-    losses = np.full((len(maps), *shape), np.nan, np.float32)
-    inside = np.zeros(shape)
-    num_seen = np.zeros(shape)
-    for k, (phase_map, images) in enumerate(zip(maps, features, strict=True)):
-        sight = _sight(places, face.normal, phase_map, tol)
-        seen = sight.seen if hidden is None else sight.seen & ~hidden[k]
-        shown = phase_map.shows_surface(sight.xy.astype(np.float32)) & seen
+    num_views = len(scene.maps)
+    rows = scene.rows(places.reshape(-1, 3))
+    losses, cosines = (
+        values.reshape(num_views, *shape) for values in _losses(rows, face.normal[:, None], tol)
+    )
+    jumps = np.full((num_views, *shape), np.nan, np.float32)
+    inside, num_seen = np.zeros(shape), np.zeros(shape)
+    for k, (phase_map, images) in enumerate(zip(scene.maps, scene.features, strict=True)):
+        xy = np.asarray(phase_map.view.camera.project(phase_map.view.cam_from_world * places))
+        size = np.array([phase_map.view.camera.width, phase_map.view.camera.height])
+        with np.errstate(invalid="ignore"):
+            seen = ((xy >= 1) & (xy <= size - 1)).all(axis=-1)
+        seen &= cosines[k] > tol.min_cosine
+        if hidden is not None:
+            seen &= ~hidden[k]
+        shown = phase_map.shows_surface(xy.astype(np.float32)) & seen
         num_seen += seen
         inside += shown
-        losses[k] = np.where(shown, _phase_loss(sight, face.normal, phase_map, tol), np.nan)
-        values = sample_image(images, sight.xy)
+        losses[k] = np.where(shown, losses[k], np.nan)
+        values = sample_image(images, xy)
         plain = shown & ((values[..., 3] == 1) | ~near_points)
         jumps[k] = np.where(plain, _steps(values[..., :3], plain, tol), np.nan)
     possible = (num_seen >= tol.min_views) & (inside >= tol.min_share * num_seen)
@@ -659,7 +662,7 @@ def _steps(values: Image, shown: Mask, tol: OffsetTolerances) -> Image:
 def _surface_cost(
     grid: FaceGrid,
     top: Array,
-    maps: Sequence[PhaseMap],
+    scene: _Scene,
     first_hit: FirstHit | None,
     tol: OffsetTolerances,
 ) -> Image:
@@ -669,46 +672,21 @@ def _surface_cost(
         return cost
     rows, cols = np.indices(grid.shape)
     far = float(max(grid.shape) * grid.step)
-    start = grid.origin + grid.step * (
-        rows[..., None] * grid.first + cols[..., None] * grid.second
-    )
+    start = grid.origin + grid.step * (rows[..., None] * grid.first + cols[..., None] * grid.second)
     start = start + (top[..., None] + far) * grid.axis
     distance, normals = first_hit(start.reshape(-1, 3), -grid.axis)
     hit = np.isfinite(distance)
     points = start.reshape(-1, 3)[hit] - np.asarray(distance, np.float64)[hit, None] * grid.axis
-    losses = np.full((len(maps), int(hit.sum())), np.nan, np.float32)
-    for k, phase_map in enumerate(maps):
-        losses[k] = _loss_at(points, np.asarray(normals)[hit], phase_map, tol)
+    losses = _losses(scene.rows(points), np.asarray(normals)[hit].T, tol)[0]
     flat = cost.reshape(-1)
     flat[hit] = _median(losses[:, None])[0]
     return cost
-
-
-def _loss_at(
-    points: Array, normals: Floats, phase_map: PhaseMap, tol: OffsetTolerances
-) -> Array:
-    """Loss (N,) of one view at points with normals of their own; NaN where it sees none."""
-    view = phase_map.view
-    in_cam = np.asarray(view.cam_from_world * points)
-    rays = in_cam / np.maximum(np.linalg.norm(in_cam, axis=-1, keepdims=True), 1e-300)
-    xy = np.asarray(view.camera.project(in_cam))
-    cos2, sin2, precision = np.moveaxis(sample_image(phase_map.samples, xy), -1, 0)
-    rows = np.asarray(rows_from_axial(AngleModel.PPA, cos2, sin2, rays), np.float64)
-    local = np.asarray(normals, np.float64) @ view.cam_from_world.rotation.T
-    cosine = -(rays * local).sum(axis=-1)
-    turn = (rows[:, 0] ** 2 + rows[:, 1] ** 2) / np.maximum(rays[:, 2], 1e-9)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        variance = (1 - cosine**2) * turn**2 / precision + tol.phase_floor**2
-        z2 = (rows * local).sum(axis=-1) ** 2 / variance / tol.cost_sigmas**2
-    known = (precision > 0) & (cosine > tol.min_cosine) & np.isfinite(z2)
-    return np.where(known, z2 / (1 + z2), np.nan)
 
 
 def _hidden(
     number: int,
     group: Sequence[Face],
     places: Array,
-    rise: Array,
     grid: FaceGrid,
     labels: NDArray[np.int64],
     maps: Sequence[PhaseMap],
@@ -763,9 +741,7 @@ def _claim(
     free = np.flatnonzero(possible)
     right = tol.seed_weight * starts.ravel()[free].astype(np.float64)
     claim = np.zeros(starts.size)
-    claim[free] = _solved(
-        adjacency[free][:, free], (degree + leak + ending + 1e-9)[free], right
-    )
+    claim[free] = _solved(adjacency[free][:, free], (degree + leak + ending + 1e-9)[free], right)
     return np.asarray(claim.reshape(grid.shape))
 
 
