@@ -58,8 +58,8 @@ class OffsetTolerances:
     num_near : neighbours that tell whether points of a face lie among those of another. Guess.
     max_cells : of a grid. Memory and time: one solution takes 7 us a cell.
     smoothing_px : of the intensity before its steps are measured.
-    dark : intensity below which steps are noise, full scales: one count of eight bits.
-    min_scale : least step of noise, relative intensity per cell: synthetic images have none.
+    dark : intensity by which a mark must at least be brighter, full scales: one count of 8 bits.
+    min_scale : least step of noise per cell, of roots of full scales: synthetic images have none.
     view_share : share of the views that see a place, which must show a line there. A wall of a
         convex part is seen by about half of the views around it. Guess: half of these.
     line_steps : of noise, from which a step hampers the walk. Guess.
@@ -219,20 +219,24 @@ class SteppedFaces:
         return np.asarray((self.grid.points(face) - self.grid.origin) @ self.grid.axis)
 
     def _beside(self, inside: Mask) -> Image:
-        """Signed distance (H, W) to a set of cells, world units, negative inside."""
-        far = np.float32(max(self.grid.shape))
-        if not inside.any():
-            return np.full(inside.shape, far * self.grid.step, np.float32)
-        outwards = ndimage.distance_transform_edt(~inside)
-        inwards = ndimage.distance_transform_edt(inside) if not inside.all() else far
-        signed = np.where(inside, 0.5 - inwards, outwards - 0.5)
-        smooth = ndimage.gaussian_filter(signed, 1.0, mode="nearest")
+        """Signed distance (H, W) to a set of cells, world units, negative inside, smoothed."""
+        smooth = ndimage.gaussian_filter(cells_beside(inside), 1.0, mode="nearest")
         return np.asarray(smooth * self.grid.step, np.float32)
 
     def _interpolated(self, image: Image, cells: Array) -> Array:
         """Values at fractional cells ``(2, N)``; those of the border beyond it."""
         found = ndimage.map_coordinates(image, cells, order=1, mode="nearest")
         return np.asarray(found, np.float64)
+
+
+def cells_beside(inside: Mask) -> Array:
+    """Signed distance (H, W) in cells to the border of a set of cells, negative inside."""
+    far = float(max(inside.shape))
+    if not inside.any():
+        return np.full(inside.shape, far)
+    outwards = ndimage.distance_transform_edt(~inside)
+    inwards = ndimage.distance_transform_edt(inside) if not inside.all() else far
+    return np.where(inside, 0.5 - inwards, outwards - 0.5)
 
 
 def find_faces(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tuple[Face, ...]:
@@ -357,8 +361,9 @@ def stepped_faces(
     tolerances : numbers of the search.
     """
     tol = tolerances or OffsetTolerances()
-    features = [_features(phase_map, tol) for phase_map in maps] if faces else []
-    scene = _Scene(maps, angle_model, tilt_aware, features)
+    if not faces:
+        return ()
+    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=tol)
     found = []
     for group in _grouped(faces, tol):
         points = seeds.points_in_world[np.concatenate([face.members for face in group])]
@@ -449,7 +454,7 @@ def _grid_over(
 
 
 @dataclass(frozen=True)
-class _Scene:
+class FaceScene:
     """Phase maps, which rows they have, and the images (H, W, 4) whose steps show borders."""
 
     maps: Sequence[PhaseMap]
@@ -462,8 +467,21 @@ class _Scene:
         return gather_rows(self.angle_model, points, self.maps, tilt_aware=self.tilt_aware)
 
 
+def face_scene(
+    maps: Sequence[PhaseMap],
+    angle_model: AngleModel,
+    *,
+    tilt_aware: bool = True,
+    tolerances: OffsetTolerances | None = None,
+) -> FaceScene:
+    """What is asked about faces, from the views' phase maps."""
+    tol = tolerances or OffsetTolerances()
+    features = [_features(phase_map, tol) for phase_map in maps]
+    return FaceScene(maps, angle_model, tilt_aware, features)
+
+
 @dataclass(frozen=True)
-class _Evidence:
+class FaceEvidence:
     """What the views say about a face over the cells of a grid.
 
     ``jump`` (H, W): steps of the image in units of noise that a share of the views exceeds;
@@ -480,7 +498,7 @@ def _labels(
     group: Sequence[Face],
     seeds: Seeds,
     grid: FaceGrid,
-    scene: _Scene,
+    scene: FaceScene,
     first_hit: FirstHit | None,
     tol: OffsetTolerances,
 ) -> NDArray[np.int64]:
@@ -499,7 +517,7 @@ def _labels(
                 hidden = _hidden(number, group, places[number], grid, labels, scene.maps)
             on_grid = grid.cells(seeds.points_in_world[face.members])
             near = _distance_to(on_grid, grid.shape) < 0.5 * tol.mark_px
-            evidence = _evidence(places[number], face, scene, near, hidden, tol)
+            evidence = face_evidence(places[number], face, scene, near, hidden, tol)
             fits = (evidence.cost < tol.max_cost) & (evidence.cost < surface_cost + tol.better_by)
             taken |= evidence.possible & ~fits
             explained |= evidence.possible & fits
@@ -512,19 +530,28 @@ def _labels(
         labels = np.where(claims.max(axis=0) > 0.5, height.argmax(axis=0), labels)
         labels = _without_small(labels, len(group), tol)
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1)):
-            labels = _snapped(labels, int(number), jumps[number], tol)
+            labels = snapped_border(labels, int(number), jumps[number], tol)
         taken = ndimage.binary_opening(taken & ~explained, iterations=2)
         labels = _continued(labels, taken, tol)
     return np.asarray(labels, np.int64)
 
 
-def _snapped(
-    labels: NDArray[np.int64], number: int, jump: Array, tol: OffsetTolerances
+def snapped_border(
+    labels: NDArray[np.int64],
+    number: int,
+    jump: Array,
+    tol: OffsetTolerances,
+    band_cells: float | None = None,
 ) -> NDArray[np.int64]:
-    """Borders of a face moved to the strongest line near: the walk again, from both sides."""
+    """Labels (H, W), the border of one face moved to the strongest line near it.
+
+    The walk again, from both sides of a band of ``band_cells`` (by default the tolerances') on
+    either side of the border.
+    """
+    width = tol.snap_cells if band_cells is None else band_cells
     own = labels == number
-    core = ndimage.distance_transform_edt(own) > tol.snap_cells
-    rest = ndimage.distance_transform_edt(~own) > tol.snap_cells
+    core = ndimage.distance_transform_edt(own) > width
+    rest = ndimage.distance_transform_edt(~own) > width
     if not core.any() or not rest.any():
         return labels
     band = ~core & ~rest
@@ -554,7 +581,7 @@ def _continued(labels: NDArray[np.int64], taken: Mask, tol: OffsetTolerances) ->
 
 
 def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
-    """Images (H, W, 4): logarithm of intensity, polarisation (2), and 1 off printed marks.
+    """Images (H, W, 4): root of intensity, polarisation (2), and 1 off printed marks.
 
     The first three show borders by their steps. A mark is smaller than ``mark_px``, brighter than
     what is about it, and less polarised.
@@ -572,12 +599,13 @@ def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
     mark = dull & (intensity > tol.mark_contrast * about + tol.dark)
     kernel = np.ones((tol.mark_margin_px,) * 2, np.uint8)
     on_mark = cv2.dilate(mark.astype(np.uint8), kernel)
-    logarithm = np.log(cv2.GaussianBlur(intensity, (0, 0), tol.smoothing_px) + tol.dark)
+    # The root has the same photon noise everywhere; smoothed after it, a step keeps its place.
+    root = cv2.GaussianBlur(np.sqrt(np.maximum(intensity, 0)), (0, 0), tol.smoothing_px)
     samples = phase_map.samples[..., :2]
-    return np.dstack([logarithm, samples, 1 - on_mark]).astype(np.float32)
+    return np.dstack([root, samples, 1 - on_mark]).astype(np.float32)
 
 
-def _losses(
+def row_losses(
     rows: Rows, normals: Floats, tol: OffsetTolerances
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Loss in [0, 1] of each row (K, N), NaN where it does not count, and cosines to the views.
@@ -598,20 +626,20 @@ def _losses(
     return np.where(counts, loss, np.nan).astype(np.float32), cosine
 
 
-def _evidence(
+def face_evidence(
     places: Array,
     face: Face,
-    scene: _Scene,
+    scene: FaceScene,
     near_points: Mask,
     hidden: Sequence[Mask] | None,
     tol: OffsetTolerances,
-) -> _Evidence:
+) -> FaceEvidence:
     """What the views say; ``near_points`` (H, W): where steps may be those of printed marks."""
     shape = places.shape[:2]
     num_views = len(scene.maps)
     rows = scene.rows(places.reshape(-1, 3))
     losses, cosines = (
-        values.reshape(num_views, *shape) for values in _losses(rows, face.normal[:, None], tol)
+        values.reshape(num_views, *shape) for values in row_losses(rows, face.normal[:, None], tol)
     )
     jumps = np.full((num_views, *shape), np.nan, np.float32)
     inside, num_seen = np.zeros(shape), np.zeros(shape)
@@ -635,10 +663,10 @@ def _evidence(
     ordered = -np.sort(-np.nan_to_num(jumps, nan=-1.0), axis=0)
     rank = np.floor(tol.view_share * np.maximum(count - 1, 0)).astype(np.int64)
     jump = np.maximum(np.take_along_axis(ordered, rank[None], axis=0)[0], 0)
-    return _Evidence(jump, _median(losses), possible)
+    return FaceEvidence(jump, median_loss(losses), possible)
 
 
-def _median(losses: Image) -> Image:
+def median_loss(losses: Image) -> Image:
     """Median (H, W) over the first axis without NaN; 1 where all are."""
     count = np.isfinite(losses).sum(axis=0)
     ordered = np.sort(np.where(np.isfinite(losses), losses, 2.0), axis=0)
@@ -662,7 +690,7 @@ def _steps(values: Image, shown: Mask, tol: OffsetTolerances) -> Image:
 def _surface_cost(
     grid: FaceGrid,
     top: Array,
-    scene: _Scene,
+    scene: FaceScene,
     first_hit: FirstHit | None,
     tol: OffsetTolerances,
 ) -> Image:
@@ -677,9 +705,9 @@ def _surface_cost(
     distance, normals = first_hit(start.reshape(-1, 3), -grid.axis)
     hit = np.isfinite(distance)
     points = start.reshape(-1, 3)[hit] - np.asarray(distance, np.float64)[hit, None] * grid.axis
-    losses = _losses(scene.rows(points), np.asarray(normals)[hit].T, tol)[0]
+    losses = row_losses(scene.rows(points), np.asarray(normals)[hit].T, tol)[0]
     flat = cost.reshape(-1)
-    flat[hit] = _median(losses[:, None])[0]
+    flat[hit] = median_loss(losses[:, None])[0]
     return cost
 
 
@@ -718,7 +746,7 @@ def _claim(
     group: Sequence[Face],
     seeds: Seeds,
     grid: FaceGrid,
-    evidence: _Evidence,
+    evidence: FaceEvidence,
     possible: Mask,
     tol: OffsetTolerances,
 ) -> Array:
