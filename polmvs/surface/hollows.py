@@ -1,11 +1,11 @@
 """Hollows that see only themselves: the inside of a mug.
 
 A vessel's mouth is dark: light that comes out of it has been reflected several times, and its
-phase says nothing of a normal. Silhouettes close the mouth with a cap, which no view's phase
-supports, in the middle of a flat ring that the phases do support: the rim. The rim's inner line,
-seen at one place by several views, is the mouth's border. How thick the wall is shows at the rim;
-where it is of one thickness all around, a wall of that thickness is presumed to go on below, and
-the inside follows the outside. That is a presumption, not a measurement: each hollow carries its
+phase says nothing of a normal. Silhouettes close the mouth with a flat cap, which no view's phase
+supports, in the middle of a ring in the same plane that the phases do support: the rim. It lies at
+the offset at which its lines in the views meet, and its inner line is the mouth's border.
+How thick the wall is shows at the rim; where it is of one thickness all around, a wall of that
+thickness is presumed to go on below, and the inside follows the outside. That is a presumption, not a measurement: each hollow carries its
 thickness and how much it varies, and points on its walls should be labelled accordingly. Where
 the rim's width varies nothing is presumed.
 """
@@ -13,17 +13,17 @@ the rim's width varies nothing is presumed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy import ndimage
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
+from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import Seeds
 from polmvs.surface.offsets import (
     NO_FACE,
     Face,
@@ -33,7 +33,9 @@ from polmvs.surface.offsets import (
     SignedDistance,
     cells_beside,
     face_evidence,
+    face_lines,
     face_scene,
+    find_faces,
     median_loss,
     row_losses,
     snapped_border,
@@ -51,18 +53,24 @@ class HollowTolerances:
 
     Attributes
     ----------
+    max_samples : faces of the surface among which planes are sought.
+    max_planes : of the surface that are looked at, largest first. Guess: a box has six.
+    num_trials : random triples per plane; one of a twentieth of the surface is missed once in
+        ten searches.
+    surface_sigma : deviation of the surface from its planes. Guess: cells are two wide.
+    surface_normal_deg : of its normals from theirs. Guess: those of a carved hull are rough.
+    min_part : share of a plane's faces that is rim, and that is mouth, at least. Guess.
     min_cosine : between a face's normal and the direction to a view that is asked. Guess.
-    min_views : that see a place which is doubted.
-    min_phase_share : of these views that must have a phase there, or it is doubted. Guess.
-    min_radius : of a cap, as a disc. Guess: as for the smallest face.
-    flat_cosine : of the angle between the normals of a cap, or of a rim, and their mean, on
-        average. Guess: a membrane sags.
-    rim_width : of the ring about a cap that must be supported. Guess.
-    min_rim_sectors : of eight about the cap in which there is a rim; one may be hidden.
-    rim_deviation : of the rim from a plane, root mean square. Guess.
+    min_views : that a normal, and a comparison of brightness, need.
+    min_phase_share : of the views that must have a phase at a face of the rim. Guess.
+    min_radius : of a mouth, as a disc. Guess.
+    focus_range : of the sweep of the rim's offset. Guess: what a hull may be off.
+    focus_share : of the views, which must show a line at one place to make it count there. Guess.
+    max_gap : of the rim, half its length (a mark, a reflection). Guess.
     max_brightness : of the mouth over the rim, median over the views. A second reflection on
         glass of ior 1.5 leaves a tenth to a half of the light of the first at 45 to 75 deg. Guess.
-    snap_cells : by which the border of the cap may be off the mouth's. Guess.
+    rim_width : over which the rim's brightness is taken. Guess.
+    snap_cells : by which the enclosed cells may be off the mouth's border. Guess.
     wall_depth : under the rim at which the wall's thickness is measured: below its rounding.
     thickness_spread : robust deviation of the wall's thickness around the rim, as a share of it;
         one footprint is always allowed. Guess.
@@ -71,16 +79,22 @@ class HollowTolerances:
     max_cells : of the grid of a hollow.
     """
 
+    max_samples: int = 3000
+    max_planes: int = 8
+    num_trials: int = 1000
+    surface_sigma: float = 1.0
+    surface_normal_deg: float = 25.0
+    min_part: float = 0.15
     min_cosine: float = 0.3
     min_views: int = 3
     min_phase_share: float = 0.5
     min_radius: float = 8.0
-    flat_cosine: float = 0.8
-    rim_width: float = 6.0
-    min_rim_sectors: int = 7
-    rim_deviation: float = 1.5
+    focus_range: float = 4.0
+    focus_share: float = 0.75
+    max_gap: float = 4.0
     max_brightness: float = 0.3
-    snap_cells: float = 8.0
+    rim_width: float = 6.0
+    snap_cells: float = 5.0
     wall_depth: float = 3.0
     thickness_spread: float = 0.15
     growth: float = 0.5
@@ -95,7 +109,6 @@ class Hollow:
     Attributes
     ----------
     rim : plane of the mouth; its members are faces of the surface on the rim.
-    cap : (M,) int64, faces of the surface that close the mouth; no view supports them.
     grid : across the mouth.
     thickness : of the wall, world units.
     thickness_sigma : its robust deviation around the rim, world units.
@@ -105,7 +118,6 @@ class Hollow:
     """
 
     rim: Face
-    cap: NDArray[np.int64]
     grid: FaceGrid
     thickness: float
     thickness_sigma: float
@@ -125,13 +137,12 @@ class Hollow:
 
 @dataclass(frozen=True)
 class SurfaceFaces:
-    """Small faces of a closed surface, as the views see it.
+    """Small faces of a closed surface.
 
     Attributes
     ----------
     centers, normals : (F, 3), world; unit normals outwards.
     areas : (F,).
-    seen : (K, F) bool, which views have the face in their image, facing them and not hidden.
     signed_distance : of points ``(N, 3)`` to the surface, negative inside.
     footprint : length that a pixel covers at the surface, world units.
     """
@@ -139,31 +150,8 @@ class SurfaceFaces:
     centers: Array
     normals: Array
     areas: Array
-    seen: Mask
     signed_distance: SignedDistance
     footprint: float
-
-
-def unsupported_faces(
-    surface: SurfaceFaces,
-    scene: FaceScene,
-    tolerances: HollowTolerances | None = None,
-    offset_tolerances: OffsetTolerances | None = None,
-) -> tuple[Mask, Mask]:
-    """Faces that their views' phases support, and those they do not, each ``(F,)``.
-
-    Faces that fewer than ``min_views`` see well are neither.
-    """
-    tol, face_tol = tolerances or HollowTolerances(), offset_tolerances or OffsetTolerances()
-    losses, cosines = row_losses(scene.rows(surface.centers), surface.normals.T, face_tol)
-    judged = surface.seen & (cosines > tol.min_cosine)
-    has_phase = judged & np.isfinite(losses)
-    num = judged.sum(axis=0)
-    cost = median_loss(np.where(has_phase, losses, np.nan)[:, None])[0]
-    enough = num >= tol.min_views
-    supported = has_phase.sum(axis=0) >= tol.min_phase_share * num
-    supported &= cost < face_tol.max_cost
-    return enough & supported, enough & ~supported
 
 
 def find_hollows(
@@ -179,129 +167,161 @@ def find_hollows(
 
     Parameters
     ----------
-    surface : refined, so that its outside and the rims are right to a footprint.
-    maps : phase maps of the views, as ``surface.seen`` counts them.
+    surface : the visual hull or better; its outside decides where the hollow's walls are.
+    maps : phase maps of the views.
     angle_model, tilt_aware : of the rows, as in :func:`polmvs.normals.rows.gather_rows`.
     tolerances, offset_tolerances : numbers of the search, and of the borders.
     """
     tol, face_tol = tolerances or HollowTolerances(), offset_tolerances or OffsetTolerances()
-    if surface.seen.shape != (len(maps), len(surface.centers)):
-        raise ValueError(f"{surface.seen.shape=} but expected {(len(maps), len(surface.centers))}.")
+    if not len(surface.centers) or len(maps) < tol.min_views:
+        return ()
     scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=face_tol)
-    supported, doubted = unsupported_faces(surface, scene, tol, face_tol)
-    found = []
-    for cap in _caps(surface, doubted, tol):
-        rim = _rim(surface, cap, supported, tol)
-        if rim is None:
+    found: list[Hollow] = []
+    for flat in _flat_pieces(surface, tol, face_tol):
+        rim = _rim(surface, flat, scene, tol, face_tol)
+        if rim is None or any(_is_same(rim, other.rim, surface) for other in found):
             continue
-        grid, mouth = _mouth(surface, cap, rim, scene, tol, face_tol)
+        grid = _grid_about(surface, rim, tol)
+        rim = _in_focus(rim, grid, scene, surface.footprint, tol, face_tol)
+        mouth = _mouth(rim, grid, scene, tol, face_tol)
         if not mouth.any() or not _is_dark(mouth, grid.points(rim), maps, tol):
             continue
-        hollow = _hollow(surface, cap, rim, grid, mouth, tol)
+        hollow = _hollow(surface, rim, grid, mouth, tol)
         if hollow is not None:
             found.append(hollow)
     return tuple(found)
 
 
-def _caps(surface: SurfaceFaces, doubted: Mask, tol: HollowTolerances) -> list[NDArray[np.int64]]:
-    """Connected, about flat pieces of doubted faces that are large enough for a mouth."""
-    index = np.flatnonzero(doubted)
-    if not len(index):
-        return []
-    reach = max(2 * float(np.sqrt(np.median(surface.areas[index]))), surface.footprint)
-    pairs = cKDTree(surface.centers[index]).query_pairs(reach, output_type="ndarray")
-    links = sparse.coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(index),) * 2)
-    labels = connected_components(links, directed=False)[1]
-    area = np.bincount(labels, surface.areas[index])
-    least = np.pi * (tol.min_radius * surface.footprint) ** 2
-    caps = [index[labels == label] for label in np.flatnonzero(area > least)]
-    return [cap for cap in caps if _flatness(surface, cap) > tol.flat_cosine]
-
-
-def _mean_normal(surface: SurfaceFaces, faces: NDArray[np.int64]) -> Array:
-    """Mean of normals, weighted by area; its length tells how flat they lie."""
-    weight = surface.areas[faces] / surface.areas[faces].sum()
-    return np.asarray(weight @ surface.normals[faces])
-
-
-def _flatness(surface: SurfaceFaces, faces: NDArray[np.int64]) -> float:
-    return float(np.linalg.norm(_mean_normal(surface, faces)))
+def _flat_pieces(
+    surface: SurfaceFaces, tol: HollowTolerances, face_tol: OffsetTolerances
+) -> tuple[Face, ...]:
+    """The largest planes of a surface, with the faces (of all) that lie in them."""
+    rng = np.random.default_rng(0)
+    share = surface.areas / surface.areas.sum()
+    num = min(tol.max_samples, len(share))
+    chosen = np.sort(rng.choice(len(share), num, replace=False, p=share))
+    sigma = np.full(num, tol.surface_sigma * surface.footprint)
+    seeds = Seeds(surface.centers[chosen], surface.normals[chosen], sigma)
+    least = np.pi * (tol.min_radius * surface.footprint) ** 2 / surface.areas.sum()
+    search = replace(
+        face_tol,
+        min_points=max(int(least * num), 10),
+        normal_deg=tol.surface_normal_deg,
+        min_normal_sigma_deg=tol.surface_normal_deg,
+        plane_sigmas=1.5,
+        num_trials=tol.num_trials,
+    )
+    faces = find_faces(seeds, search, max_faces=tol.max_planes)
+    return tuple(replace(face, members=chosen[face.members]) for face in faces)
 
 
 def _rim(
-    surface: SurfaceFaces, cap: NDArray[np.int64], supported: Mask, tol: HollowTolerances
-) -> Face | None:
-    """Plane of the supported faces about a cap, if they surround it and lie in one."""
-    axis = _mean_normal(surface, cap)
-    axis /= np.linalg.norm(axis)
-    candidates = np.flatnonzero(supported & (surface.normals @ axis > tol.flat_cosine))
-    if not len(candidates):
-        return None
-    distance = cKDTree(surface.centers[cap]).query(surface.centers[candidates])[0]
-    ring = candidates[distance < tol.rim_width * surface.footprint]
-    limit = tol.rim_deviation * surface.footprint
-    height = np.zeros(len(ring))
-    for _ in range(3):
-        ring = (
-            ring[np.abs(height) <= max(2 * limit, 2 * float(np.median(np.abs(height))))]
-            if (len(ring))
-            else ring
-        )
-        if len(ring) < tol.min_rim_sectors:
-            return None
-        center = surface.centers[ring].mean(axis=0)
-        normal = np.linalg.svd(surface.centers[ring] - center, full_matrices=False)[2][2]
-        normal *= np.sign(normal @ axis)
-        height = (surface.centers[ring] - center) @ normal
-    if (
-        np.sqrt(np.mean(height**2)) > limit
-        or normal @ _mean_normal(surface, ring) < tol.flat_cosine
-    ):
-        return None
-    tangents = np.linalg.svd(normal[None])[2][1:]
-    across = (surface.centers[ring] - surface.centers[cap].mean(axis=0)) @ tangents.T
-    sector = np.floor((np.arctan2(across[:, 1], across[:, 0]) / np.pi + 1) * 4).astype(np.int64) % 8
-    if len(np.unique(sector)) < tol.min_rim_sectors:
-        return None
-    return Face(normal, float(center @ normal), ring)
-
-
-def _mouth(
     surface: SurfaceFaces,
-    cap: NDArray[np.int64],
-    rim: Face,
+    flat: Face,
     scene: FaceScene,
     tol: HollowTolerances,
     face_tol: OffsetTolerances,
-) -> tuple[FaceGrid, Mask]:
-    """A grid across the mouth, and the cells of the mouth: the cap's, up to the rim's line."""
+) -> Face | None:
+    """The plane turned to the normal that the phases of its faces have; None for no mouth.
+
+    A mouth in its rim: a part of the faces has phases, and a part has not, or ones that
+    contradict.
+    """
+    rows = scene.rows(surface.centers[flat.members])
+    facing = -np.einsum("ikn,i->kn", rows.rays, flat.normal) > tol.min_cosine
+    sigma = np.where(facing, rows.sigma, np.inf)
+    start = np.repeat(flat.normal[:, None], len(flat.members), axis=1)
+    estimate = solve_normals(rows.rows, rows.rays, sigma, initial_normals=start)
+    turned = np.nan_to_num(estimate.normals) @ flat.normal
+    agree = estimate.valid & (estimate.num_rows >= tol.min_views)
+    agree &= turned > np.cos(np.radians(tol.surface_normal_deg))
+    if agree.sum() < 10:
+        return None
+    normal = np.median(estimate.normals[agree], axis=0)
+    normal /= np.linalg.norm(normal)
+    losses = row_losses(rows, normal[:, None], face_tol)[0]
+    losses = np.where(facing, losses, np.nan)
+    has_phase = np.isfinite(losses).sum(axis=0) >= tol.min_phase_share * facing.sum(axis=0)
+    supported = has_phase & (median_loss(losses[:, None])[0] < face_tol.max_cost)
+    share = float(supported.mean())
+    if not tol.min_part <= share <= 1 - tol.min_part:
+        return None
+    offset = float(np.median(surface.centers[flat.members[supported]] @ normal))
+    return Face(normal, offset, flat.members[supported])
+
+
+def _is_same(rim: Face, other: Face, surface: SurfaceFaces) -> bool:
+    """Whether two rims are of the same mouth."""
+    near = np.abs(other.height(surface.centers[rim.members])) < 4 * surface.footprint
+    return bool(near.mean() > 0.5)
+
+
+def _grid_about(surface: SurfaceFaces, rim: Face, tol: HollowTolerances) -> FaceGrid:
+    """A grid across the rim that holds all of the surface below it."""
     tangents = np.linalg.svd(rim.normal[None])[2][1:]
     first, second = tangents[0], np.cross(rim.normal, tangents[0])
-    center = surface.centers[cap].mean(axis=0)
+    members = surface.centers[rim.members]
+    center = 0.5 * (members.min(axis=0) + members.max(axis=0))
     center = center - rim.height(center) * rim.normal
-    # Below its mouth a vessel may be wider: twice as wide at most.
-    reach = 2 * float(np.linalg.norm(surface.centers[rim.members] - center, axis=1).max())
-    half = int(np.ceil(reach / surface.footprint))
+    radius = float(np.linalg.norm(members - center, axis=1).max())
+    # Below its mouth a vessel may be wider: half as wide again at most.
+    half = int(np.ceil(1.5 * radius / surface.footprint))
     step = surface.footprint
     origin = center - half * step * (first + second)
-    grid = FaceGrid(origin, first, second, rim.normal, step, (2 * half + 1, 2 * half + 1))
+    return FaceGrid(origin, first, second, rim.normal, step, (2 * half + 1, 2 * half + 1))
 
-    places = grid.cells(np.concatenate([surface.centers[cap], surface.centers[rim.members]]))
-    lattice = np.indices(grid.shape).reshape(2, -1).T
-    distance, nearest = cKDTree(places).query(lattice)
-    spacing = 2 * np.sqrt(np.median(surface.areas[cap])) / step
-    mouth = ((nearest < len(cap)) & (distance < spacing + 1)).reshape(grid.shape)
-    mouth = np.asarray(ndimage.binary_fill_holes(mouth), np.bool_)
-    pieces, num = ndimage.label(mouth)
-    if num > 1:
-        mouth = pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])
+
+def _in_focus(
+    rim: Face,
+    grid: FaceGrid,
+    scene: FaceScene,
+    footprint: float,
+    tol: HollowTolerances,
+    face_tol: OffsetTolerances,
+) -> Face:
+    """The rim at the offset at which its lines in the views meet (a sweep)."""
+
+    def strength(shift: float) -> float:
+        face = replace(rim, offset=rim.offset + shift * footprint)
+        return float(face_lines(grid.points(face), face, scene, face_tol, tol.focus_share).sum())
+
+    shifts = np.arange(-tol.focus_range, tol.focus_range + 0.5)
+    sums = np.array([strength(shift) for shift in shifts])
+    best = int(np.clip(sums.argmax(), 1, len(sums) - 2))
+    below, here, above = sums[best - 1 : best + 2]
+    bend = below - 2 * here + above
+    vertex = np.clip(0.5 * (below - above) / bend, -1, 1) if bend < 0 else 0.0
+    return replace(rim, offset=rim.offset + float(shifts[best] + vertex) * footprint)
+
+
+def _mouth(
+    rim: Face,
+    grid: FaceGrid,
+    scene: FaceScene,
+    tol: HollowTolerances,
+    face_tol: OffsetTolerances,
+) -> Mask:
+    """Cells (H, W) that the supported cells of the rim enclose, up to the rim's inner line."""
     nothing_near = np.zeros(grid.shape, np.bool_)
     evidence = face_evidence(grid.points(rim), rim, scene, nothing_near, None, face_tol)
-    labels = np.where(mouth, 0, NO_FACE)
+    supported = evidence.possible & (evidence.cost < face_tol.max_cost)
+    closed = ndimage.binary_closing(supported, iterations=round(tol.max_gap))
+    enclosed = np.asarray(ndimage.binary_fill_holes(closed), np.bool_) & ~closed
+    enclosed = np.asarray(ndimage.binary_opening(enclosed, iterations=2), np.bool_)
+    pieces, num = ndimage.label(enclosed)
+    if num == 0:
+        return enclosed
+    mouth = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+    if mouth.sum() < np.pi * tol.min_radius**2:
+        return np.zeros(grid.shape, np.bool_)
     snapped = snapped_border(
-        labels, 0, evidence.jump.astype(np.float64), face_tol, band_cells=tol.snap_cells
+        np.where(mouth, 0, NO_FACE),
+        0,
+        evidence.jump.astype(np.float64),
+        face_tol,
+        band_cells=tol.snap_cells,
     )
-    return grid, np.asarray(snapped == 0)
+    return np.asarray(snapped == 0)
 
 
 def _is_dark(mouth: Mask, places: Array, maps: Sequence[PhaseMap], tol: HollowTolerances) -> bool:
@@ -328,7 +348,6 @@ def _is_dark(mouth: Mask, places: Array, maps: Sequence[PhaseMap], tol: HollowTo
 
 def _hollow(
     surface: SurfaceFaces,
-    cap: NDArray[np.int64],
     rim: Face,
     grid: FaceGrid,
     mouth: Mask,
@@ -376,4 +395,4 @@ def _hollow(
     field = np.minimum(np.stack(layers), floor[:, None, None])
     field = np.concatenate([np.repeat(field[:1], above, axis=0), field])
     field = ndimage.gaussian_filter(field, (1.0, 1.0, 1.0), mode="nearest") * step
-    return Hollow(rim, cap, grid, thickness * step, sigma * step, field.astype(np.float32), -above)
+    return Hollow(rim, grid, thickness * step, sigma * step, field.astype(np.float32), -above)

@@ -239,13 +239,16 @@ def cells_beside(inside: Mask) -> Array:
     return np.where(inside, 0.5 - inwards, outwards - 0.5)
 
 
-def find_faces(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tuple[Face, ...]:
+def find_faces(
+    seeds: Seeds, tolerances: OffsetTolerances | None = None, *, max_faces: int | None = None
+) -> tuple[Face, ...]:
     """Planes through seeds whose normals agree with them, those of most seeds first.
 
     Parameters
     ----------
     seeds : sparse points on the part with normals from the phases.
     tolerances : numbers of the search.
+    max_faces : after which it ends.
 
     Returns
     -------
@@ -259,7 +262,7 @@ def find_faces(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tupl
     left: Mask = np.asarray(np.isfinite(normals).all(axis=1) & np.isfinite(points).all(axis=1))
     agree = np.cos(np.radians(tol.normal_deg))
     faces: list[Face] = []
-    while left.sum() >= tol.min_points:
+    while left.sum() >= tol.min_points and (max_faces is None or len(faces) < max_faces):
         index = np.flatnonzero(left)
         triples = index[rng.integers(0, len(index), (tol.num_trials, 3))]
         a, b, c = np.moveaxis(points[triples], 1, 0)
@@ -634,36 +637,76 @@ def face_evidence(
     hidden: Sequence[Mask] | None,
     tol: OffsetTolerances,
 ) -> FaceEvidence:
-    """What the views say; ``near_points`` (H, W): where steps may be those of printed marks."""
+    """What the views say of a face at places ``(H, W, 3)`` on it.
+
+    Parameters
+    ----------
+    places, face : the face over a grid.
+    scene : the views.
+    near_points : (H, W) bool, where steps may be those of printed marks.
+    hidden : per view, places ``(H, W)`` that it does not see.
+    tol : numbers.
+    """
     shape = places.shape[:2]
-    num_views = len(scene.maps)
-    rows = scene.rows(places.reshape(-1, 3))
-    losses, cosines = (
-        values.reshape(num_views, *shape) for values in row_losses(rows, face.normal[:, None], tol)
-    )
-    jumps = np.full((num_views, *shape), np.nan, np.float32)
+    losses = row_losses(scene.rows(places.reshape(-1, 3)), face.normal[:, None], tol)[0]
+    losses = losses.reshape(-1, *shape)
+    jumps = np.full(losses.shape, np.nan, np.float32)
     inside, num_seen = np.zeros(shape), np.zeros(shape)
-    for k, (phase_map, images) in enumerate(zip(scene.maps, scene.features, strict=True)):
-        xy = np.asarray(phase_map.view.camera.project(phase_map.view.cam_from_world * places))
-        size = np.array([phase_map.view.camera.width, phase_map.view.camera.height])
-        with np.errstate(invalid="ignore"):
-            seen = ((xy >= 1) & (xy <= size - 1)).all(axis=-1)
-        seen &= cosines[k] > tol.min_cosine
+    for k, phase_map in enumerate(scene.maps):
+        xy, seen = _seen(places, face, phase_map, tol)
         if hidden is not None:
             seen &= ~hidden[k]
-        shown = phase_map.shows_surface(xy.astype(np.float32)) & seen
+        shown = seen & phase_map.shows_surface(xy)
         num_seen += seen
         inside += shown
         losses[k] = np.where(shown, losses[k], np.nan)
-        values = sample_image(images, xy)
-        plain = shown & ((values[..., 3] == 1) | ~near_points)
-        jumps[k] = np.where(plain, _steps(values[..., :3], plain, tol), np.nan)
+        jumps[k] = _line_steps(scene.features[k], xy, shown, near_points, tol)
     possible = (num_seen >= tol.min_views) & (inside >= tol.min_share * num_seen)
+    return FaceEvidence(_shared_lines(jumps, tol.view_share), median_loss(losses), possible)
+
+
+def face_lines(
+    places: Array, face: Face, scene: FaceScene, tol: OffsetTolerances, view_share: float
+) -> Image:
+    """Steps (H, W) in units of noise that a share of the views shows at places (H, W, 3)."""
+    jumps = np.full((len(scene.maps), *places.shape[:2]), np.nan, np.float32)
+    nothing_near = np.zeros(places.shape[:2], np.bool_)
+    for k, phase_map in enumerate(scene.maps):
+        xy, seen = _seen(places, face, phase_map, tol)
+        jumps[k] = _line_steps(scene.features[k], xy, seen, nothing_near, tol)
+    return _shared_lines(jumps, view_share)
+
+
+def _seen(
+    places: Array, face: Face, phase_map: PhaseMap, tol: OffsetTolerances
+) -> tuple[Image, Mask]:
+    """Pixels (H, W, 2) of places on a face, and whether the view can see them."""
+    view = phase_map.view
+    xy = np.asarray(view.camera.project(view.cam_from_world * places))
+    size = np.array([view.camera.width, view.camera.height])
+    with np.errstate(invalid="ignore"):
+        seen = ((xy >= 1) & (xy <= size - 1)).all(axis=-1)
+    towards = view.center_in_world - places
+    cosine = (towards @ face.normal) / np.maximum(np.linalg.norm(towards, axis=-1), 1e-300)
+    return xy.astype(np.float32), np.asarray(seen & (cosine > tol.min_cosine))
+
+
+def _line_steps(
+    images: Image, xy: Image, shown: Mask, near_points: Mask, tol: OffsetTolerances
+) -> Image:
+    """Steps (H, W) of one view's images, NaN where it does not count."""
+    values = sample_image(images, xy)
+    plain = shown & ((values[..., 3] == 1) | ~near_points)
+    return np.where(plain, _steps(values[..., :3], plain, tol), np.nan).astype(np.float32)
+
+
+def _shared_lines(jumps: Image, view_share: float) -> Image:
+    """Steps (H, W) that a share of the views (K, H, W) exceeds."""
     count = np.isfinite(jumps).sum(axis=0)
     ordered = -np.sort(-np.nan_to_num(jumps, nan=-1.0), axis=0)
-    rank = np.floor(tol.view_share * np.maximum(count - 1, 0)).astype(np.int64)
-    jump = np.maximum(np.take_along_axis(ordered, rank[None], axis=0)[0], 0)
-    return FaceEvidence(jump, median_loss(losses), possible)
+    rank = np.floor(view_share * np.maximum(count - 1, 0)).astype(np.int64)
+    jump = np.take_along_axis(ordered, rank[None], axis=0)[0]
+    return np.asarray(np.maximum(jump, 0), np.float32)
 
 
 def median_loss(losses: Image) -> Image:
