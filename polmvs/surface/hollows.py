@@ -3,11 +3,11 @@
 A vessel's mouth is dark: light that comes out of it has been reflected several times, and its
 phase says nothing of a normal. Silhouettes close the mouth with a flat cap, which no view's phase
 supports, in the middle of a ring in the same plane that the phases do support: the rim. It lies at
-the offset at which its lines in the views meet, and its inner line is the mouth's border.
-How thick the wall is shows at the rim; where it is of one thickness all around, a wall of that
-thickness is presumed to go on below, and the inside follows the outside. That is a presumption, not a measurement: each hollow carries its
-thickness and how much it varies, and points on its walls should be labelled accordingly. Where
-the rim's width varies nothing is presumed.
+the offset at which its lines in the views meet, and its inner line is the mouth's border. How
+thick the wall is shows at the rim; where it is of one thickness all around, a wall of that
+thickness is presumed to go on below, and the inside follows the outside. That is a presumption,
+not a measurement: each hollow carries its thickness and how much it varies, and points on its
+walls should be labelled accordingly. Where the rim's width varies nothing is presumed.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ class HollowTolerances:
     surface_sigma : deviation of the surface from its planes. Guess: cells are two wide.
     surface_normal_deg : of its normals from theirs. Guess: those of a carved hull are rough.
     min_part : share of a plane's faces that is rim, and that is mouth, at least. Guess.
+    min_sectors : of eight about what has no phase, in which there must be some that has. Guess:
+        one may be hidden.
     min_cosine : between a face's normal and the direction to a view that is asked. Guess.
     min_views : that a normal, and a comparison of brightness, need.
     min_phase_share : of the views that must have a phase at a face of the rim. Guess.
@@ -71,11 +73,13 @@ class HollowTolerances:
         glass of ior 1.5 leaves a tenth to a half of the light of the first at 45 to 75 deg. Guess.
     rim_width : over which the rim's brightness is taken. Guess.
     snap_cells : by which the enclosed cells may be off the mouth's border. Guess.
-    wall_depth : under the rim at which the wall's thickness is measured: below its rounding.
+    wall_depth : under the rim at which the wall's thickness is measured: below the rounding that
+        the surface has there. Guess: three of its cells.
     thickness_spread : robust deviation of the wall's thickness around the rim, as a share of it;
         one footprint is always allowed. Guess.
     growth : of a hollow's half width per depth. A bottle's shoulders are not presumed. Guess.
     above : height of a cap's bulge over the rim that is cut off. Guess.
+    layer_cells : distance of the layers, and of the cells at which the surface is asked.
     max_cells : of the grid of a hollow.
     """
 
@@ -85,6 +89,7 @@ class HollowTolerances:
     surface_sigma: float = 1.0
     surface_normal_deg: float = 25.0
     min_part: float = 0.15
+    min_sectors: int = 7
     min_cosine: float = 0.3
     min_views: int = 3
     min_phase_share: float = 0.5
@@ -95,10 +100,11 @@ class HollowTolerances:
     max_brightness: float = 0.3
     rim_width: float = 6.0
     snap_cells: float = 5.0
-    wall_depth: float = 3.0
+    wall_depth: float = 6.0
     thickness_spread: float = 0.15
     growth: float = 0.5
     above: float = 12.0
+    layer_cells: int = 3
     max_cells: int = 6_000_000
 
 
@@ -112,9 +118,10 @@ class Hollow:
     grid : across the mouth.
     thickness : of the wall, world units.
     thickness_sigma : its robust deviation around the rim, world units.
-    field : (D, H, W) float32, signed distance to the hollow's walls in layers of ``grid.step``
-        from ``first_layer`` downwards, positive in the hollow.
-    first_layer : depth of the first layer below the rim, in steps (negative: above).
+    field : (D, H, W) float32, signed distance to the hollow's walls in layers across the mouth,
+        positive in the hollow.
+    layer_step : distance of the layers, world units.
+    first_layer : depth of the first layer below the rim, in layers (negative: above).
     """
 
     rim: Face
@@ -122,12 +129,13 @@ class Hollow:
     thickness: float
     thickness_sigma: float
     field: Image
+    layer_step: float
     first_layer: int
 
     def values(self, points: Floats) -> Array:
         """Signed distance ``(N,)`` of points, positive in the hollow's free space."""
         points = np.asarray(points, np.float64)
-        depth = -self.rim.height(points) / self.grid.step - self.first_layer
+        depth = -self.rim.height(points) / self.layer_step - self.first_layer
         cells = self.grid.cells(points)
         place = np.stack([depth, cells[..., 0], cells[..., 1]])
         outside = -float(max(self.field.shape)) * self.grid.step
@@ -184,7 +192,9 @@ def find_hollows(
         grid = _grid_about(surface, rim, tol)
         rim = _in_focus(rim, grid, scene, surface.footprint, tol, face_tol)
         mouth = _mouth(rim, grid, scene, tol, face_tol)
-        if not mouth.any() or not _is_dark(mouth, grid.points(rim), maps, tol):
+        inner = ndimage.binary_erosion(mouth, iterations=3)
+        places = grid.points(rim)
+        if not _is_dark(places[inner], places[_ring_about(mouth, tol)], maps, tol):
             continue
         hollow = _hollow(surface, rim, grid, mouth, tol)
         if hollow is not None:
@@ -246,7 +256,15 @@ def _rim(
     share = float(supported.mean())
     if not tol.min_part <= share <= 1 - tol.min_part:
         return None
-    offset = float(np.median(surface.centers[flat.members[supported]] @ normal))
+    places = surface.centers[flat.members]
+    tangents = np.linalg.svd(normal[None])[2][1:]
+    x, y = tangents @ (places[supported] - np.median(places[~supported], axis=0)).T
+    sectors = np.unique(np.floor((np.arctan2(y, x) / np.pi + 1) * 4).astype(np.int64) % 8)
+    if len(sectors) < tol.min_sectors:
+        return None
+    if not _is_dark(places[~supported], places[supported], scene.maps, tol):
+        return None
+    offset = float(np.median(places[supported] @ normal))
     return Face(normal, offset, flat.members[supported])
 
 
@@ -324,26 +342,29 @@ def _mouth(
     return np.asarray(snapped == 0)
 
 
-def _is_dark(mouth: Mask, places: Array, maps: Sequence[PhaseMap], tol: HollowTolerances) -> bool:
-    """Whether the mouth is much darker than its rim in most views that show both."""
-    inner = ndimage.binary_erosion(mouth, iterations=3)
-    width = max(round(0.5 * tol.rim_width), 1)
-    ring = ndimage.binary_dilation(mouth, iterations=2 + width)
-    ring &= ~ndimage.binary_dilation(mouth, iterations=2)
+def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: HollowTolerances) -> bool:
+    """Whether points ``(N, 3)`` are much darker than others in most views that show both."""
     ratios = []
     for phase_map in maps:
         medians = []
-        for cells in (inner, ring):
-            xy = phase_map.view.camera.project(phase_map.view.cam_from_world * places[cells])
+        for points in (inner, ring):
+            xy = phase_map.view.camera.project(phase_map.view.cam_from_world * points)
             size = np.array([phase_map.view.camera.width, phase_map.view.camera.height])
             with np.errstate(invalid="ignore"):
                 shown = ((xy >= 1) & (xy <= size - 1)).all(axis=-1)
-            if shown.mean() > 0.5:
+            if len(points) and shown.mean() > 0.5:
                 intensity = np.asarray(phase_map.intensity, np.float32)
                 medians.append(float(np.median(sample_image(intensity, xy[shown]))))
         if len(medians) == 2:
             ratios.append(medians[0] / max(medians[1], 1e-9))
     return len(ratios) >= tol.min_views and float(np.median(ratios)) < tol.max_brightness
+
+
+def _ring_about(mouth: Mask, tol: HollowTolerances) -> Mask:
+    """Cells (H, W) of the rim about a mouth, off the line between them."""
+    line = ndimage.binary_dilation(mouth, iterations=2)
+    ring = ndimage.binary_dilation(line, iterations=max(round(0.5 * tol.rim_width), 1))
+    return np.asarray(ring & ~line, np.bool_)
 
 
 def _hollow(
@@ -354,17 +375,26 @@ def _hollow(
     tol: HollowTolerances,
 ) -> Hollow | None:
     """The hollow under a mouth, its wall as thick as at the rim; None where that varies."""
-    step = grid.step
-    places = grid.points(rim)
     border = mouth & ~ndimage.binary_erosion(mouth)
+    spacing = tol.layer_cells
+    rim_places = grid.points(rim)[::spacing, ::spacing]
 
-    def outside_of(layer: int) -> tuple[Array, bool]:
-        """Distance (H, W) in cells to the outer wall, negative inside, and whether any is."""
-        points = (places - layer * step * rim.normal).reshape(-1, 3)
-        inside = np.asarray(surface.signed_distance(points) < 0).reshape(grid.shape)
+    def outside_of(depth: float) -> tuple[Array, bool]:
+        """Distance (H, W) in cells to the outer wall, negative inside, and whether any is.
+
+        The surface is asked on every third cell: between them its distance is about linear.
+        """
+        points = rim_places - depth * grid.step * rim.normal
+        coarse = np.asarray(surface.signed_distance(points.reshape(-1, 3)), np.float64)
+        index = np.indices(grid.shape) / spacing
+        fine = ndimage.map_coordinates(
+            coarse.reshape(points.shape[:2]), index, order=1, mode="nearest"
+        )
+        # What the silhouettes left open inside of the wall is no wall.
+        inside = np.asarray(ndimage.binary_fill_holes(fine < 0), np.bool_)
         return cells_beside(inside), bool(inside.any())
 
-    wall = -outside_of(round(tol.wall_depth))[0][border] - 0.5
+    wall = -outside_of(tol.wall_depth)[0][border] - 0.5
     thickness = float(np.median(wall))
     sigma = 1.4826 * float(np.median(np.abs(wall - thickness)))
     if thickness <= 1 or sigma > max(tol.thickness_spread * thickness, 1.0):
@@ -373,26 +403,35 @@ def _hollow(
     layers = [free]
     most = tol.max_cells // mouth.size
     while len(layers) < most:
-        away, any_inside = outside_of(len(layers))
+        depth = spacing * len(layers)
+        away, any_inside = outside_of(depth)
         if not any_inside:
             break
         # At the rim its line is known; below it the wall's thickness takes over.
-        known = min(len(layers) / tol.wall_depth, 1.0)
+        known = min(depth / tol.wall_depth, 1.0)
         presumed = known * (-away - thickness) + (1 - known) * layers[0]
-        free = np.minimum(presumed, layers[-1] + tol.growth)
+        free = np.minimum(presumed, layers[-1] + tol.growth * spacing)
         pieces = ndimage.label(free > 0)[0]
         linked = np.unique(pieces[(layers[-1] > 0) & (pieces > 0)])
         free = np.where((pieces > 0) & ~np.isin(pieces, linked), -0.5, free)
         if not (free > 0).any():
             break
         layers.append(free)
-    depth = np.arange(len(layers), dtype=np.float64)
+    depths = spacing * np.arange(len(layers), dtype=np.float64)
     # The bottom is as thick as the wall, at least.
-    floor = len(layers) - thickness - depth
+    floor = spacing * len(layers) - thickness - depths
     if floor[0] <= tol.min_radius:
         return None
-    above = round(tol.above)
+    above = int(np.ceil(tol.above / spacing))
     field = np.minimum(np.stack(layers), floor[:, None, None])
     field = np.concatenate([np.repeat(field[:1], above, axis=0), field])
-    field = ndimage.gaussian_filter(field, (1.0, 1.0, 1.0), mode="nearest") * step
-    return Hollow(rim, grid, thickness * step, sigma * step, field.astype(np.float32), -above)
+    field = ndimage.gaussian_filter(field, (0.5, 1.0, 1.0), mode="nearest") * grid.step
+    return Hollow(
+        rim=rim,
+        grid=grid,
+        thickness=thickness * grid.step,
+        thickness_sigma=sigma * grid.step,
+        field=field.astype(np.float32),
+        layer_step=spacing * grid.step,
+        first_layer=-above,
+    )
