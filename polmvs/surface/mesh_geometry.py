@@ -5,6 +5,7 @@ Ray casting is Open3D's (Embree), imported where a mesh is first cast on.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -341,7 +342,12 @@ def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
 
 
 def remeshed(
-    mesh: TriangleMesh, step: float, *, smoothing: float = 0.5, min_cells: int = 30
+    mesh: TriangleMesh,
+    step: float,
+    *,
+    free: Sequence[Callable[[Array], Floats]] = (),
+    smoothing: float = 0.5,
+    min_cells: int = 30,
 ) -> TriangleMesh:
     """The mesh again with edges of about ``step``, through its signed distance on a grid.
 
@@ -352,6 +358,8 @@ def remeshed(
     ----------
     mesh : closed.
     step : of the grid, world units.
+    free : functions of points ``(N, 3)`` that give signed distances ``(N,)``, positive where space
+        is free: it is carved out, its borders unsmoothed.
     smoothing : width of a Gaussian on the distances, in steps.
     """
     if not len(mesh.faces):
@@ -393,6 +401,11 @@ def remeshed(
         values[(negative > 0.5 * total)[pieces] & (pieces > 0)] = -limit
     if smoothing > 0:
         values = ndimage.gaussian_filter(values, smoothing)
+    if free:
+        inner = values < limit
+        points = origin + step * np.argwhere(inner)
+        for function in free:
+            values[inner] = np.maximum(values[inner], np.minimum(function(points), limit))
     _drop_small(values, min_cells, limit)
     return relaxed(mesh_from_grid(values, origin, step))
 
