@@ -46,8 +46,9 @@ class Light(StrEnum):
 
 
 class Method(StrEnum):
-    """How ranges spread over a view's region."""
+    """How the surface comes from the phases."""
 
+    SURFACE = "surface"
     INTEGRATE = "integrate"
     CONTOUR = "contour"
 
@@ -438,6 +439,7 @@ class PropagationOptions(OptionGroup, group="propagation"):
 
     method: Method = option(
         Method.INTEGRATE,
+        "'surface': one mesh that all views agree on, from their silhouettes and phases; "
         "'integrate': multi-view normals over the region's pixels, coarse to fine; 'contour': "
         "along phase contours, as in the paper",
     )

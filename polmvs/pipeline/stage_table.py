@@ -190,13 +190,15 @@ def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
         propagation=run.options.propagation,
         fusion=run.options.fusion,
         tilt_aware=run.options.normals.tilt_aware_weights,
+        masks_given=run.options.region.mask is not None,
         workers=run.workers,
         on_progress=run.on_progress,
     )
 
 
 def _make_mesh(model: AngleModel, run: StageInput) -> mesh.MeshResult:
-    return mesh.make_mesh(run.run_folder.cloud(model), run.run_folder.mesh(model))
+    folder = run.run_folder
+    return mesh.make_mesh(folder.cloud(model), folder.views(model), folder.mesh(model))
 
 
 def _write_workspace(model: AngleModel, run: StageInput) -> dense_workspace.DenseWorkspaceResult:
@@ -349,7 +351,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             angle_model=model,
             reads=(HERE.sparse, HERE.images, HERE.maps(model), track_normals, HERE.seeds),
             writes=(cloud, views),
-            decides=(TILT_AWARE, "propagation", "fusion"),
+            decides=(TILT_AWARE, "region.mask", "propagation", "fusion"),
             work=partial(_densify, model),
             result=densify.DensifyResult,
             num_steps=lambda run: densify.num_densify_steps(run.num_views, run.options.propagation),
@@ -358,7 +360,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             name=f"mesh_{model}",
             command=EXPORT,
             angle_model=model,
-            reads=(cloud,),
+            reads=(cloud, views),
             writes=(HERE.mesh(model),),
             work=partial(_make_mesh, model),
             result=mesh.MeshResult,

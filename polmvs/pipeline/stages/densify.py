@@ -23,7 +23,7 @@ from polmvs.colmap.dense_workspace import (
 from polmvs.colmap.filling import previous_backups
 from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, FusionOptions, Method, PropagationOptions, Surroundings
-from polmvs.io.clouds import Cloud, write_cloud
+from polmvs.io.clouds import Cloud, write_cloud, write_mesh
 from polmvs.io.images import read_gray
 from polmvs.parallel import Workers
 from polmvs.pipeline.monitor import OnProgress, no_progress
@@ -37,13 +37,25 @@ from polmvs.surface.consensus import hidden_by
 from polmvs.surface.contour import propagate
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse, no_points
+from polmvs.surface.global_surface import (
+    Undetermined,
+    num_surface_steps,
+    reconstruct_surface,
+    render_view,
+    supported_mesh,
+    surface_points,
+)
 from polmvs.surface.integration import integrate, plan_rounds
 from polmvs.surface.kept_depth import kept_cloud
+from polmvs.surface.mesh_geometry import RayScene
 from polmvs.surface.surroundings import SparseSurroundings, sparse_surroundings, stereo_surroundings
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T", bound=np.generic)
+
+SURFACE_MESH = "surface.ply"  # among the views of a run: the mesh that they are rendered from
+FINEST_SPACING_PX = 0.25  # of points that are not to be merged, in footprints of a pixel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,12 +88,15 @@ def densify(
     propagation: PropagationOptions | None = None,
     fusion: FusionOptions | None = None,
     tilt_aware: bool = True,
+    masks_given: bool = False,
     workers: Workers | None = None,
     on_progress: OnProgress = no_progress,
 ) -> DensifyResult:
-    """Spread the seeds over the region of every view and fuse the views into one cloud.
+    """One dense cloud, and the depth and normals of every view.
 
-    Without a region or seeds the surface has no points.
+    By the method ``surface`` both come from one mesh that all views agree on, where their
+    silhouettes bound the objects. Else the seeds are spread over the region of every view and the
+    views fused; without a region or seeds the surface then has no points.
 
     Parameters
     ----------
@@ -93,6 +108,7 @@ def densify(
     views : folder to write, with the dense depth and normals of each view.
     propagation, fusion : defaults where None.
     tilt_aware : as ``NormalOptions.tilt_aware_weights``.
+    masks_given : the regions of the phase maps are the user's masks.
 
     Raises
     ------
@@ -107,25 +123,90 @@ def densify(
     with scratch(views) as folder, workers.stopped_on_error():
         new_views = folder / "views"
         new_views.mkdir()
-        fused = _dense_surface(
-            model,
-            phase_maps,
-            known,
-            propagation,
-            fusion,
-            folder,
-            new_views,
-            tilt_aware=tilt_aware,
-            workers=workers,
-            on_progress=on_progress,
-        )
+        fused, presumed = None, np.zeros(0, np.bool_)
+        if propagation.method is Method.SURFACE:
+            fused, presumed = _global_surface(
+                model,
+                phase_maps,
+                known,
+                sparse_surroundings(read_model(sparse).tracks, phase_maps).points,
+                propagation,
+                fusion,
+                new_views,
+                tilt_aware=tilt_aware,
+                masks_given=masks_given,
+                on_progress=on_progress,
+            )
+        if fused is None:
+            fused = _dense_surface(
+                model,
+                phase_maps,
+                known,
+                propagation,
+                fusion,
+                folder,
+                new_views,
+                tilt_aware=tilt_aware,
+                workers=workers,
+                on_progress=on_progress,
+            )
         surface = surface_cloud(fused)
+        surface.scalars["kind"][: len(presumed)][presumed] = PointKind.PRESUMED
         around = _surroundings_cloud(
             sparse, fused, phase_maps, fusion, given, folder / "around", workers=workers
         )
         replace_folder(new_views, views)
     write_cloud(cloud, _join_clouds(surface, around))
     return DensifyResult(num_points=len(surface.points), num_surroundings=len(around.points))
+
+
+def _global_surface(
+    model: AngleModel,
+    maps: Sequence[PhaseMap],
+    seeds: Seeds,
+    surroundings: NDArray[np.float64],
+    propagation: PropagationOptions,
+    fusion: FusionOptions,
+    views: Path,
+    *,
+    tilt_aware: bool,
+    masks_given: bool,
+    on_progress: OnProgress,
+) -> tuple[FusedCloud | None, NDArray[np.bool_]]:
+    """The surface of all views, and which of its points are presumed.
+
+    Its mesh and its depth in each view go to ``views``. None where silhouettes do not bound the
+    objects.
+    """
+    surface = reconstruct_surface(
+        model,
+        maps,
+        seeds,
+        surroundings,
+        masks_given=masks_given,
+        tilt_aware=tilt_aware,
+        min_views=fusion.min_views,
+        on_progress=on_progress,
+    )
+    if isinstance(surface, Undetermined):
+        logger.warning(
+            "%s: no surface from all views, for %s; views are integrated one by one.",
+            model,
+            surface.reason,
+        )
+        return None, np.zeros(0, np.bool_)
+    for sentence in surface.contradictions.warnings():
+        logger.warning("%s: %s.", model, sentence)
+    scene = RayScene(surface.mesh)
+    for phase_map in maps:
+        dense = render_view(surface, scene, phase_map.view, propagation.stride_px)
+        if dense is not None:
+            store_dense_view(dense, views / phase_map.view.name)
+        on_progress(1)
+    spacing = fusion.voxel if fusion.voxel is not None else fusion.voxel_px * surface.footprint
+    found = surface_points(surface, maps, spacing or FINEST_SPACING_PX * surface.footprint)
+    write_mesh(views / SURFACE_MESH, supported_mesh(surface))
+    return found
 
 
 def _dense_surface(
@@ -145,7 +226,7 @@ def _dense_surface(
     num_inside = sum(int(phase_map.region.inside.sum()) for phase_map in maps)
     if num_inside == 0 or len(seeds.sigma) == 0:
         return no_points()
-    spread = integrate if propagation.method is Method.INTEGRATE else propagate
+    spread = propagate if propagation.method is Method.CONTOUR else integrate
     dense = spread(
         model,
         maps,
@@ -176,6 +257,8 @@ def _dense_surface(
 
 def num_densify_steps(num_views: int, options: PropagationOptions) -> int:
     """How many steps :func:`densify` reports."""
+    if options.method is Method.SURFACE:
+        return num_surface_steps(num_views)
     if options.method is Method.INTEGRATE:
         return (len(plan_rounds(options)) + 1) * num_views
     return (options.num_rounds + 2) * num_views

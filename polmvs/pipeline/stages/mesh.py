@@ -1,11 +1,12 @@
-"""Stage ``mesh_MODEL``: a Poisson mesh of the polarised surfaces of a dense cloud."""
+"""Stage ``mesh_MODEL``: a mesh of the polarised surfaces, that of all views or Poisson's."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from polmvs.io.clouds import read_cloud, write_mesh
+from polmvs.io.clouds import read_cloud, read_mesh, write_mesh
+from polmvs.pipeline.stages.densify import SURFACE_MESH
 from polmvs.scene import PointKind
 from polmvs.surface.poisson import MIN_POINTS, poisson_mesh
 
@@ -25,14 +26,19 @@ class MeshResult:
         return f"{self.num_triangles:,} triangles"
 
 
-def make_mesh(cloud: Path, target: Path) -> MeshResult:
-    """Mesh of the polarised surfaces of a cloud; none of too few points.
+def make_mesh(cloud: Path, views: Path, target: Path) -> MeshResult:
+    """Mesh of the polarised surfaces: what cloud and views were made from, or Poisson's of a cloud.
 
     Parameters
     ----------
     cloud : PLY that :func:`polmvs.pipeline.stages.densify.densify` wrote.
-    target : PLY of the mesh.
+    views : folder that it wrote; holds a mesh where one surface came from all views.
+    target : PLY of the mesh; not written where a cloud has too few points.
     """
+    if (views / SURFACE_MESH).is_file():
+        surface = read_mesh(views / SURFACE_MESH)
+        write_mesh(target, surface)
+        return MeshResult(num_triangles=len(surface.triangles))
     loaded = read_cloud(cloud)
     kinds = loaded.scalars.get("kind")
     if kinds is None or int((kinds == PointKind.SURFACE).sum()) < MIN_POINTS:

@@ -1,0 +1,385 @@
+"""One surface from all views: from phase maps to a mesh with what is known of it.
+
+Silhouettes, their hull, its refinement by all phases, and what the views bear out of it. Clouds,
+meshes and the depth and normal maps of the views are made from that one surface.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import sample_image
+from polmvs.config import AngleModel
+from polmvs.io.clouds import Mesh
+from polmvs.neighbors import voxel_representatives
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import Seeds, View
+from polmvs.surface.dense_view import DenseView, lattice_xy
+from polmvs.surface.fusion import FusedCloud, no_points
+from polmvs.surface.hollows import SurfaceFaces, find_hollows
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, sample_surface
+from polmvs.surface.offsets import find_faces, stepped_faces
+from polmvs.surface.refinement import (
+    KnownPoints,
+    RefinementTolerances,
+    median_residual,
+    place_deviations,
+    refine,
+)
+from polmvs.surface.silhouettes import find_silhouettes
+from polmvs.surface.surface_quality import (
+    Contradictions,
+    FaceEvidence,
+    face_evidence,
+    find_contradictions,
+    fit_normals,
+    supported_faces,
+)
+from polmvs.surface.surface_view import SurfaceView, surface_view
+from polmvs.surface.visual_hull import supporting_plane, visual_hull
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+OnProgress = Callable[[int], None]
+
+MIN_VIEWS = 3  # with an outline: the hull of two cones is no shape
+MAX_FILLED_SHARE = 0.35  # of the image's border on the objects, where a silhouette bounds little
+REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured on spheres
+COARSE_EDGE_PX = 6.0  # of the mesh on which deviations are sampled; they are smooth
+NUM_FINAL_STEPS = 3  # of the progress: evidence, normals, deviations
+
+
+@dataclass(frozen=True)
+class GlobalSurface:
+    """A surface and what is known of it.
+
+    Attributes
+    ----------
+    mesh : all of it, closed, parts that no view bears out included.
+    supported : (F,) bool, faces that the views bear out.
+    evidence : of the faces.
+    normals : (V, 3) unit, from the phases at the vertices.
+    sigma_deg : (V,) standard deviation of the normal, degrees; inf where unknown.
+    sigma : (V,) standard deviation of the place along the normal, world units; inf where unknown.
+    footprint : length that a pixel covers at the surface, world units.
+    contradictions : with the data.
+    presumed : (F,) bool, faces that no phase shows: walls of hollows, presumed as thick inside as
+        the rim shows them.
+    """
+
+    mesh: TriangleMesh
+    supported: Mask
+    evidence: FaceEvidence
+    normals: Array
+    sigma_deg: Array
+    sigma: Array
+    footprint: float
+    contradictions: Contradictions
+    presumed: Mask
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """Why there is no surface from all views.
+
+    Attributes
+    ----------
+    reason : a clause without its end, such as "no view shows a polarised region".
+    """
+
+    reason: str
+
+
+def num_surface_steps(num_views: int) -> int:
+    """How often :func:`reconstruct_surface` and the rendering of its views report at most."""
+    refinement = sum(level.num_steps for level in RefinementTolerances().levels)
+    return refinement + NUM_FINAL_STEPS + num_views
+
+
+def reconstruct_surface(
+    angle_model: AngleModel,
+    maps: Sequence[PhaseMap],
+    seeds: Seeds,
+    surroundings: Floats,
+    *,
+    masks_given: bool = False,
+    tilt_aware: bool = True,
+    min_views: int = 2,
+    tolerances: RefinementTolerances | None = None,
+    on_progress: OnProgress | None = None,
+) -> GlobalSurface | Undetermined:
+    """The surface on which all views agree.
+
+    Parameters
+    ----------
+    angle_model : of the phase maps.
+    maps : of all views.
+    seeds : points of the surface.
+    surroundings : (N, 3), sparse points beside it.
+    masks_given : the maps' regions are the user's masks.
+    tilt_aware : as :func:`polmvs.normals.rows.gather_rows`.
+    min_views : that must bear out a part.
+    tolerances : of the refinement.
+    on_progress : called with 1 after each step.
+    """
+    report = on_progress if on_progress is not None else lambda count: None
+    silhouettes = find_silhouettes(maps, masks_given=masks_given)
+    views = [
+        surface_view(phase_map, silhouette, angle_model, tilt_aware=tilt_aware)
+        for phase_map, silhouette in zip(maps, silhouettes, strict=True)
+    ]
+    if reason := _no_hull(views):
+        return Undetermined(reason)
+    plane = supporting_plane(surroundings, np.array([view.center for view in views]))
+    hull = visual_hull(views, plane)
+    if not len(hull.mesh.faces):
+        return Undetermined("the polarised regions of the views have no common object")
+    logger.info("visual hull: %d vertices.", len(hull.mesh.vertices))
+    steps = stepped_faces(
+        find_faces(seeds),
+        seeds,
+        maps,
+        angle_model,
+        tilt_aware=tilt_aware,
+        signed_distance=RayScene(hull.mesh).signed_distance,
+        first_hit=_first_hit(hull.mesh),
+    )
+    if steps:
+        logger.info("%d groups of faces that silhouettes do not tell apart.", len(steps))
+        hull = hull.carved([group.values for group in steps])
+    hollows = find_hollows(
+        SurfaceFaces(
+            hull.mesh.centers,
+            hull.mesh.face_normals,
+            hull.mesh.face_areas,
+            RayScene(hull.mesh).signed_distance,
+            hull.footprint,
+        ),
+        maps,
+        angle_model,
+        tilt_aware=tilt_aware,
+    )
+    # Rows of a tilted map are those of PPA: its samples are corrected.
+    rows = AngleModel.OPA if angle_model is AngleModel.OPA else AngleModel.PPA
+    known = KnownPoints(seeds.points_in_world, seeds.sigma)
+    mesh = refine(
+        hull.mesh,
+        views,
+        rows,
+        hull.footprint,
+        known=known,
+        tolerances=tolerances,
+        on_progress=on_progress,
+    )
+    # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
+    carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
+    if carvings and len(mesh.faces):
+        mesh = remeshed(mesh, mesh.mean_edge / REMESHED_EDGE, free=carvings, smoothing=0)
+    if not len(mesh.faces):
+        return Undetermined("the surface vanishes under the phases of the views")
+    row_error, median = median_residual(mesh, views, rows)
+    row_sigma = max(row_error, RefinementTolerances().row_sigma)
+    evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
+    supported = supported_faces(mesh, evidence, min_views=min_views)
+    seen = evidence.num_views >= min_views
+    supported |= seen & _lie_on(mesh, [group.values for group in steps])
+    presumed = seen & ~supported & _lie_on(mesh, [hollow.values for hollow in hollows])
+    supported |= presumed
+    report(1)
+    normals = fit_normals(mesh, views, rows, row_sigma=row_sigma, row_error=row_error)
+    report(1)
+    sigma = _deviations(mesh, views, rows, hull.footprint, known)
+    report(1)
+    contradictions = find_contradictions(mesh, evidence, supported, views, median)
+    return GlobalSurface(
+        mesh=mesh,
+        supported=supported,
+        evidence=evidence,
+        normals=normals.normals,
+        sigma_deg=normals.sigma_deg,
+        sigma=sigma,
+        footprint=hull.footprint,
+        contradictions=contradictions,
+        presumed=presumed,
+    )
+
+
+def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:
+    """Distance ``(N,)`` and normal ``(N, 3)`` where rays along one direction first meet a mesh."""
+    scene = RayScene(mesh)
+
+    def first_hit(origins: Array, direction: Array) -> tuple[Floats, Floats]:
+        hits = scene.cast(origins, np.broadcast_to(direction, origins.shape))
+        return hits.distance, mesh.face_normals[hits.face]
+
+    return first_hit
+
+
+def _lie_on(mesh: TriangleMesh, carvings: Sequence[Callable[[Array], Floats]]) -> Mask:
+    """Which faces ``(F,)`` are borders of carved space."""
+    found = np.zeros(len(mesh.faces), np.bool_)
+    for values in carvings:
+        found |= np.abs(values(mesh.centers)) < mesh.mean_edge
+    return found
+
+
+def _no_hull(views: Sequence[SurfaceView]) -> str | None:
+    """Why silhouettes do not bound the objects, if they do not."""
+    outlined = [view for view in views if view.has_outline]
+    if not any(view.silhouette.certain.any() for view in views):
+        return "no view shows a polarised region"
+    if len(outlined) < MIN_VIEWS:
+        return f"{len(outlined)} views show an outline of an object, of {MIN_VIEWS} needed"
+    borders = [_border_share(view.silhouette.certain) for view in outlined]
+    if float(np.median(borders)) > MAX_FILLED_SHARE:
+        return "the polarised object fills the images"
+    return None
+
+
+def _border_share(mask: Mask) -> float:
+    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    return float(border.mean())
+
+
+def _deviations(
+    mesh: TriangleMesh,
+    views: Sequence[SurfaceView],
+    angle_model: AngleModel,
+    footprint: float,
+    known: KnownPoints,
+) -> Array:
+    """Deviations of the vertices, sampled on a coarser mesh if that saves time."""
+    coarse = remeshed(mesh, COARSE_EDGE_PX * footprint)
+    if not len(coarse.faces):
+        coarse = mesh
+    sigma = place_deviations(coarse, views, angle_model, footprint, known=known)
+    _, face, barycentric = RayScene(coarse).closest(mesh.vertices)
+    corners = sigma[coarse.faces[face]]
+    known_corners = np.isfinite(corners)
+    weight = barycentric * known_corners
+    total = weight.sum(axis=1)
+    mean = (np.where(known_corners, corners, 0) * weight).sum(axis=1) / np.maximum(total, 1e-9)
+    return np.where(total > 1e-6, mean, np.inf)
+
+
+def supported_mesh(surface: GlobalSurface) -> Mesh:
+    """What the views bear out of the surface, with the normals of the phases."""
+    faces = surface.mesh.faces[surface.supported]
+    used, compact = np.unique(faces, return_inverse=True)
+    return Mesh(
+        vertices=surface.mesh.vertices[used],
+        normals=surface.normals[used],
+        triangles=compact.reshape(-1, 3).astype(np.int32),
+    )
+
+
+def surface_points(
+    surface: GlobalSurface, maps: Sequence[PhaseMap], spacing: float, *, max_points: int = 2_000_000
+) -> tuple[FusedCloud, Mask]:
+    """Points spread evenly over what the views bear out, and which of them ``(N,)`` are presumed.
+
+    Parameters
+    ----------
+    surface : of all views.
+    maps : of the views, for the intensity.
+    spacing : mean distance of neighbours, world units.
+    max_points : the spacing grows beyond that.
+    """
+    mesh = surface.mesh
+    area = float(mesh.face_areas[surface.supported].sum())
+    if area <= 0:
+        return no_points(), np.zeros(0, np.bool_)
+    # Random places leave gaps: of three times as many, one in each voxel.
+    num = int(min(max(3 * area / spacing**2, 1), 3 * max_points))
+    face, barycentric = sample_surface(
+        mesh, surface.supported.astype(np.float64), num, np.random.default_rng(0)
+    )
+    points = mesh.points_at(face, barycentric)
+    kept = voxel_representatives(points, max(spacing, np.sqrt(area / max_points)))
+    face, barycentric, points = face[kept], barycentric[kept], points[kept]
+    normals = _interpolated(surface.normals, mesh, face, barycentric)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    cloud = FusedCloud(
+        points=points,
+        normals=normals,
+        intensity=_intensity(points, normals, maps),
+        num_views=surface.evidence.num_views[face].astype(np.int32),
+        sigma_deg=_finite(_interpolated(surface.sigma_deg, mesh, face, barycentric)),
+        sigma=_finite(_interpolated(surface.sigma, mesh, face, barycentric)),
+    )
+    return cloud, surface.presumed[face]
+
+
+def _finite(values: Array) -> NDArray[np.float32]:
+    """Deviations as they are written: NaN where unknown."""
+    return np.where(np.isfinite(values), values, np.nan).astype(np.float32)
+
+
+def _interpolated(
+    values: Array, mesh: TriangleMesh, face: NDArray[np.int64], barycentric: Floats
+) -> Array:
+    """Values ``(V, ...)`` of vertices at points of faces."""
+    corners = values[mesh.faces[face]]
+    weights = barycentric.reshape(*barycentric.shape, *([1] * (corners.ndim - 2)))
+    return np.asarray((corners * weights).sum(axis=1))
+
+
+def _intensity(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> NDArray[np.float32]:
+    """Mean intensity ``(N,)`` of the views that face each point."""
+    total, count = np.zeros(len(points)), np.zeros(len(points))
+    for phase_map in maps:
+        faces = np.flatnonzero(phase_map.view.faces(points, normals))
+        xy = phase_map.view.project(points[faces])
+        values = sample_image(np.asarray(phase_map.intensity, np.float32), xy)
+        seen = values > 0
+        total[faces[seen]] += values[seen]
+        count[faces[seen]] += 1
+    return (total / np.maximum(count, 1)).astype(np.float32)
+
+
+def render_view(
+    surface: GlobalSurface, scene: RayScene, view: View, stride_px: int
+) -> DenseView | None:
+    """Depth and normals of the surface in one view; None where it sees nothing of it.
+
+    Parameters
+    ----------
+    surface : of all views.
+    scene : of the surface's mesh, all of it: parts that no view bears out hide others as well.
+    view : to render.
+    stride_px : distance of the lattice's points, px.
+    """
+    mesh = surface.mesh
+    num_rows, num_cols = view.camera.height // stride_px, view.camera.width // stride_px
+    xy = lattice_xy(num_rows, num_cols, stride_px).reshape(-1, 2)
+    rays = view.rays_in_world(xy)
+    hits = scene.cast(view.center_in_world, rays)
+    index = np.flatnonzero(hits.face >= 0)
+    index = index[surface.supported[hits.face[index]]]
+    face, barycentric = hits.face[index], hits.barycentric[index]
+    cosine = -(mesh.face_normals[face] * rays[index]).sum(axis=1)
+    front = cosine > 0
+    index, face, barycentric, cosine = index[front], face[front], barycentric[front], cosine[front]
+    if not len(index):
+        return None
+    shape = (num_rows, num_cols)
+    range_map, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    sigma, sigma_deg = (np.full(shape, np.nan, np.float32) for _ in range(2))
+    normal_map = np.full((*shape, 3), np.nan, np.float32)
+    normals = _interpolated(surface.normals, mesh, face, barycentric)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    along = _interpolated(surface.sigma, mesh, face, barycentric) / np.maximum(cosine, 0.1)
+    range_map.ravel()[index] = hits.distance[index]
+    normal_map.reshape(-1, 3)[index] = normals
+    sigma.ravel()[index] = _finite(along)
+    sigma_deg.ravel()[index] = _finite(_interpolated(surface.sigma_deg, mesh, face, barycentric))
+    confidence.ravel()[index] = surface.evidence.agreement[face]
+    return DenseView(stride_px, range_map, normal_map, sigma_deg, sigma, confidence)

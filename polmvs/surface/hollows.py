@@ -1,0 +1,437 @@
+"""Hollows that see only themselves: the inside of a mug.
+
+A vessel's mouth is dark: light that comes out of it has been reflected several times, and its
+phase says nothing of a normal. Silhouettes close the mouth with a flat cap, which no view's phase
+supports, in the middle of a ring in the same plane that the phases do support: the rim. It lies at
+the offset at which its lines in the views meet, and its inner line is the mouth's border. How
+thick the wall is shows at the rim; where it is of one thickness all around, a wall of that
+thickness is presumed to go on below, and the inside follows the outside. That is a presumption,
+not a measurement: each hollow carries its thickness and how much it varies, and points on its
+walls should be labelled accordingly. Where the rim's width varies nothing is presumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from polmvs.camera import sample_image
+from polmvs.config import AngleModel
+from polmvs.normals.estimator import solve_normals
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import Seeds
+from polmvs.surface.offsets import (
+    NO_FACE,
+    Face,
+    FaceGrid,
+    FaceScene,
+    OffsetTolerances,
+    SignedDistance,
+    cells_beside,
+    face_evidence,
+    face_lines,
+    face_scene,
+    find_faces,
+    median_loss,
+    row_losses,
+    snapped_border,
+)
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HollowTolerances:
+    """Numbers of the search for hollows; lengths in footprints of a pixel.
+
+    Attributes
+    ----------
+    max_samples : faces of the surface among which planes are sought.
+    max_planes : of the surface that are looked at, largest first. Guess: a box has six.
+    num_trials : random triples per plane; one of a twentieth of the surface is missed once in
+        ten searches.
+    surface_sigma : deviation of the surface from its planes. Guess: cells are two wide.
+    surface_normal_deg : of its normals from theirs. Guess: those of a carved hull are rough.
+    min_part : share of a plane's faces that is rim, and that is mouth, at least. Guess.
+    min_sectors : of eight about what has no phase, in which there must be some that has. Guess:
+        one may be hidden.
+    min_cosine : between a face's normal and the direction to a view that is asked. Guess.
+    min_views : that a normal, and a comparison of brightness, need.
+    min_phase_share : of the views that must have a phase at a face of the rim. Guess.
+    min_radius : of a mouth, as a disc. Guess.
+    focus_range : of the sweep of the rim's offset. Guess: what a hull may be off.
+    focus_share : of the views, which must show a line at one place to make it count there. Guess.
+    max_gap : of the rim, half its length (a mark, a reflection). Guess.
+    max_brightness : of the mouth over the rim, median over the views. A second reflection on
+        glass of ior 1.5 leaves a tenth to a half of the light of the first at 45 to 75 deg. Guess.
+    rim_width : over which the rim's brightness is taken. Guess.
+    snap_cells : by which the enclosed cells may be off the mouth's border. Guess.
+    wall_depth : under the rim at which the wall's thickness is measured: below the rounding that
+        the surface has there. Guess: three of its cells.
+    thickness_spread : robust deviation of the wall's thickness around the rim, as a share of it;
+        one footprint is always allowed. Guess.
+    growth : of a hollow's half width per depth. A bottle's shoulders are not presumed. Guess.
+    above : height of a cap's bulge over the rim that is cut off. Guess.
+    layer_cells : distance of the layers, and of the cells at which the surface is asked.
+    max_cells : of the grid of a hollow.
+    """
+
+    max_samples: int = 3000
+    max_planes: int = 8
+    num_trials: int = 1000
+    surface_sigma: float = 1.0
+    surface_normal_deg: float = 25.0
+    min_part: float = 0.15
+    min_sectors: int = 7
+    min_cosine: float = 0.3
+    min_views: int = 3
+    min_phase_share: float = 0.5
+    min_radius: float = 8.0
+    focus_range: float = 4.0
+    focus_share: float = 0.75
+    max_gap: float = 4.0
+    max_brightness: float = 0.3
+    rim_width: float = 6.0
+    snap_cells: float = 5.0
+    wall_depth: float = 6.0
+    thickness_spread: float = 0.15
+    growth: float = 0.5
+    above: float = 12.0
+    layer_cells: int = 3
+    max_cells: int = 6_000_000
+
+
+@dataclass(frozen=True)
+class Hollow:
+    """Free space inside of a vessel.
+
+    Attributes
+    ----------
+    rim : plane of the mouth; its members are faces of the surface on the rim.
+    grid : across the mouth.
+    thickness : of the wall, world units.
+    thickness_sigma : its robust deviation around the rim, world units.
+    field : (D, H, W) float32, signed distance to the hollow's walls in layers across the mouth,
+        positive in the hollow.
+    layer_step : distance of the layers, world units.
+    first_layer : depth of the first layer below the rim, in layers (negative: above).
+    """
+
+    rim: Face
+    grid: FaceGrid
+    thickness: float
+    thickness_sigma: float
+    field: Image
+    layer_step: float
+    first_layer: int
+
+    def values(self, points: Floats) -> Array:
+        """Signed distance ``(N,)`` of points, positive in the hollow's free space."""
+        points = np.asarray(points, np.float64)
+        depth = -self.rim.height(points) / self.layer_step - self.first_layer
+        cells = self.grid.cells(points)
+        place = np.stack([depth, cells[..., 0], cells[..., 1]])
+        outside = -float(max(self.field.shape)) * self.grid.step
+        found = ndimage.map_coordinates(self.field, place, order=1, mode="constant", cval=outside)
+        return np.asarray(found, np.float64)
+
+
+@dataclass(frozen=True)
+class SurfaceFaces:
+    """Small faces of a closed surface.
+
+    Attributes
+    ----------
+    centers, normals : (F, 3), world; unit normals outwards.
+    areas : (F,).
+    signed_distance : of points ``(N, 3)`` to the surface, negative inside.
+    footprint : length that a pixel covers at the surface, world units.
+    """
+
+    centers: Array
+    normals: Array
+    areas: Array
+    signed_distance: SignedDistance
+    footprint: float
+
+
+def find_hollows(
+    surface: SurfaceFaces,
+    maps: Sequence[PhaseMap],
+    angle_model: AngleModel,
+    *,
+    tilt_aware: bool = True,
+    tolerances: HollowTolerances | None = None,
+    offset_tolerances: OffsetTolerances | None = None,
+) -> tuple[Hollow, ...]:
+    """Mouths that a surface closes with a cap, and the hollows presumed behind them.
+
+    Parameters
+    ----------
+    surface : the visual hull or better; its outside decides where the hollow's walls are.
+    maps : phase maps of the views.
+    angle_model, tilt_aware : of the rows, as in :func:`polmvs.normals.rows.gather_rows`.
+    tolerances, offset_tolerances : numbers of the search, and of the borders.
+    """
+    tol, face_tol = tolerances or HollowTolerances(), offset_tolerances or OffsetTolerances()
+    if not len(surface.centers) or len(maps) < tol.min_views:
+        return ()
+    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=face_tol)
+    found: list[Hollow] = []
+    for flat in _flat_pieces(surface, tol, face_tol):
+        rim = _rim(surface, flat, scene, tol, face_tol)
+        if rim is None or any(_is_same(rim, other.rim, surface) for other in found):
+            continue
+        grid = _grid_about(surface, rim, tol)
+        rim = _in_focus(rim, grid, scene, surface.footprint, tol, face_tol)
+        mouth = _mouth(rim, grid, scene, tol, face_tol)
+        inner = ndimage.binary_erosion(mouth, iterations=3)
+        places = grid.points(rim)
+        if not _is_dark(places[inner], places[_ring_about(mouth, tol)], maps, tol):
+            continue
+        hollow = _hollow(surface, rim, grid, mouth, tol)
+        if hollow is not None:
+            found.append(hollow)
+    return tuple(found)
+
+
+def _flat_pieces(
+    surface: SurfaceFaces, tol: HollowTolerances, face_tol: OffsetTolerances
+) -> tuple[Face, ...]:
+    """The largest planes of a surface, with the faces (of all) that lie in them."""
+    rng = np.random.default_rng(0)
+    share = surface.areas / surface.areas.sum()
+    num = min(tol.max_samples, len(share))
+    chosen = np.sort(rng.choice(len(share), num, replace=False, p=share))
+    sigma = np.full(num, tol.surface_sigma * surface.footprint)
+    seeds = Seeds(surface.centers[chosen], surface.normals[chosen], sigma)
+    least = np.pi * (tol.min_radius * surface.footprint) ** 2 / surface.areas.sum()
+    search = replace(
+        face_tol,
+        min_points=max(int(least * num), 10),
+        normal_deg=tol.surface_normal_deg,
+        min_normal_sigma_deg=tol.surface_normal_deg,
+        plane_sigmas=1.5,
+        num_trials=tol.num_trials,
+    )
+    faces = find_faces(seeds, search, max_faces=tol.max_planes)
+    return tuple(replace(face, members=chosen[face.members]) for face in faces)
+
+
+def _rim(
+    surface: SurfaceFaces,
+    flat: Face,
+    scene: FaceScene,
+    tol: HollowTolerances,
+    face_tol: OffsetTolerances,
+) -> Face | None:
+    """The plane turned to the normal that the phases of its faces have; None for no mouth.
+
+    A mouth in its rim: a part of the faces has phases, and a part has not, or ones that
+    contradict.
+    """
+    rows = scene.rows(surface.centers[flat.members])
+    facing = -np.einsum("ikn,i->kn", rows.rays, flat.normal) > tol.min_cosine
+    sigma = np.where(facing, rows.sigma, np.inf)
+    start = np.repeat(flat.normal[:, None], len(flat.members), axis=1)
+    estimate = solve_normals(rows.rows, rows.rays, sigma, initial_normals=start)
+    turned = np.nan_to_num(estimate.normals) @ flat.normal
+    agree = estimate.valid & (estimate.num_rows >= tol.min_views)
+    agree &= turned > np.cos(np.radians(tol.surface_normal_deg))
+    if agree.sum() < 10:
+        return None
+    normal = np.median(estimate.normals[agree], axis=0)
+    normal /= np.linalg.norm(normal)
+    losses = row_losses(rows, normal[:, None], face_tol)[0]
+    losses = np.where(facing, losses, np.nan)
+    has_phase = np.isfinite(losses).sum(axis=0) >= tol.min_phase_share * facing.sum(axis=0)
+    supported = has_phase & (median_loss(losses[:, None])[0] < face_tol.max_cost)
+    share = float(supported.mean())
+    if not tol.min_part <= share <= 1 - tol.min_part:
+        return None
+    places = surface.centers[flat.members]
+    tangents = np.linalg.svd(normal[None])[2][1:]
+    x, y = tangents @ (places[supported] - np.median(places[~supported], axis=0)).T
+    sectors = np.unique(np.floor((np.arctan2(y, x) / np.pi + 1) * 4).astype(np.int64) % 8)
+    if len(sectors) < tol.min_sectors:
+        return None
+    if not _is_dark(places[~supported], places[supported], scene.maps, tol):
+        return None
+    offset = float(np.median(places[supported] @ normal))
+    return Face(normal, offset, flat.members[supported])
+
+
+def _is_same(rim: Face, other: Face, surface: SurfaceFaces) -> bool:
+    """Whether two rims are of the same mouth."""
+    near = np.abs(other.height(surface.centers[rim.members])) < 4 * surface.footprint
+    return bool(near.mean() > 0.5)
+
+
+def _grid_about(surface: SurfaceFaces, rim: Face, tol: HollowTolerances) -> FaceGrid:
+    """A grid across the rim that holds all of the surface below it."""
+    tangents = np.linalg.svd(rim.normal[None])[2][1:]
+    first, second = tangents[0], np.cross(rim.normal, tangents[0])
+    members = surface.centers[rim.members]
+    center = 0.5 * (members.min(axis=0) + members.max(axis=0))
+    center = center - rim.height(center) * rim.normal
+    radius = float(np.linalg.norm(members - center, axis=1).max())
+    # Below its mouth a vessel may be wider: half as wide again at most.
+    half = int(np.ceil(1.5 * radius / surface.footprint))
+    step = surface.footprint
+    origin = center - half * step * (first + second)
+    return FaceGrid(origin, first, second, rim.normal, step, (2 * half + 1, 2 * half + 1))
+
+
+def _in_focus(
+    rim: Face,
+    grid: FaceGrid,
+    scene: FaceScene,
+    footprint: float,
+    tol: HollowTolerances,
+    face_tol: OffsetTolerances,
+) -> Face:
+    """The rim at the offset at which its lines in the views meet (a sweep)."""
+
+    def strength(shift: float) -> float:
+        face = replace(rim, offset=rim.offset + shift * footprint)
+        return float(face_lines(grid.points(face), face, scene, face_tol, tol.focus_share).sum())
+
+    shifts = np.arange(-tol.focus_range, tol.focus_range + 0.5)
+    sums = np.array([strength(shift) for shift in shifts])
+    best = int(np.clip(sums.argmax(), 1, len(sums) - 2))
+    below, here, above = sums[best - 1 : best + 2]
+    bend = below - 2 * here + above
+    vertex = np.clip(0.5 * (below - above) / bend, -1, 1) if bend < 0 else 0.0
+    return replace(rim, offset=rim.offset + float(shifts[best] + vertex) * footprint)
+
+
+def _mouth(
+    rim: Face,
+    grid: FaceGrid,
+    scene: FaceScene,
+    tol: HollowTolerances,
+    face_tol: OffsetTolerances,
+) -> Mask:
+    """Cells (H, W) that the supported cells of the rim enclose, up to the rim's inner line."""
+    nothing_near = np.zeros(grid.shape, np.bool_)
+    evidence = face_evidence(grid.points(rim), rim, scene, nothing_near, None, face_tol)
+    supported = evidence.possible & (evidence.cost < face_tol.max_cost)
+    closed = ndimage.binary_closing(supported, iterations=round(tol.max_gap))
+    enclosed = np.asarray(ndimage.binary_fill_holes(closed), np.bool_) & ~closed
+    enclosed = np.asarray(ndimage.binary_opening(enclosed, iterations=2), np.bool_)
+    pieces, num = ndimage.label(enclosed)
+    if num == 0:
+        return enclosed
+    mouth = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+    if mouth.sum() < np.pi * tol.min_radius**2:
+        return np.zeros(grid.shape, np.bool_)
+    snapped = snapped_border(
+        np.where(mouth, 0, NO_FACE),
+        0,
+        evidence.jump.astype(np.float64),
+        face_tol,
+        band_cells=tol.snap_cells,
+    )
+    return np.asarray(snapped == 0)
+
+
+def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: HollowTolerances) -> bool:
+    """Whether points ``(N, 3)`` are much darker than others in most views that show both."""
+    ratios = []
+    for phase_map in maps:
+        medians = []
+        for points in (inner, ring):
+            xy = phase_map.view.camera.project(phase_map.view.cam_from_world * points)
+            size = np.array([phase_map.view.camera.width, phase_map.view.camera.height])
+            with np.errstate(invalid="ignore"):
+                shown = ((xy >= 1) & (xy <= size - 1)).all(axis=-1)
+            if len(points) and shown.mean() > 0.5:
+                intensity = np.asarray(phase_map.intensity, np.float32)
+                medians.append(float(np.median(sample_image(intensity, xy[shown]))))
+        if len(medians) == 2:
+            ratios.append(medians[0] / max(medians[1], 1e-9))
+    return len(ratios) >= tol.min_views and float(np.median(ratios)) < tol.max_brightness
+
+
+def _ring_about(mouth: Mask, tol: HollowTolerances) -> Mask:
+    """Cells (H, W) of the rim about a mouth, off the line between them."""
+    line = ndimage.binary_dilation(mouth, iterations=2)
+    ring = ndimage.binary_dilation(line, iterations=max(round(0.5 * tol.rim_width), 1))
+    return np.asarray(ring & ~line, np.bool_)
+
+
+def _hollow(
+    surface: SurfaceFaces,
+    rim: Face,
+    grid: FaceGrid,
+    mouth: Mask,
+    tol: HollowTolerances,
+) -> Hollow | None:
+    """The hollow under a mouth, its wall as thick as at the rim; None where that varies."""
+    border = mouth & ~ndimage.binary_erosion(mouth)
+    spacing = tol.layer_cells
+    rim_places = grid.points(rim)[::spacing, ::spacing]
+
+    def outside_of(depth: float) -> tuple[Array, bool]:
+        """Distance (H, W) in cells to the outer wall, negative inside, and whether any is.
+
+        The surface is asked on every third cell: between them its distance is about linear.
+        """
+        points = rim_places - depth * grid.step * rim.normal
+        coarse = np.asarray(surface.signed_distance(points.reshape(-1, 3)), np.float64)
+        index = np.indices(grid.shape) / spacing
+        fine = ndimage.map_coordinates(
+            coarse.reshape(points.shape[:2]), index, order=1, mode="nearest"
+        )
+        # What the silhouettes left open inside of the wall is no wall.
+        inside = np.asarray(ndimage.binary_fill_holes(fine < 0), np.bool_)
+        return cells_beside(inside), bool(inside.any())
+
+    wall = -outside_of(tol.wall_depth)[0][border] - 0.5
+    thickness = float(np.median(wall))
+    sigma = 1.4826 * float(np.median(np.abs(wall - thickness)))
+    if thickness <= 1 or sigma > max(tol.thickness_spread * thickness, 1.0):
+        return None
+    free = -cells_beside(mouth)
+    layers = [free]
+    most = tol.max_cells // mouth.size
+    while len(layers) < most:
+        depth = spacing * len(layers)
+        away, any_inside = outside_of(depth)
+        if not any_inside:
+            break
+        # At the rim its line is known; below it the wall's thickness takes over.
+        known = min(depth / tol.wall_depth, 1.0)
+        presumed = known * (-away - thickness) + (1 - known) * layers[0]
+        free = np.minimum(presumed, layers[-1] + tol.growth * spacing)
+        pieces = ndimage.label(free > 0)[0]
+        linked = np.unique(pieces[(layers[-1] > 0) & (pieces > 0)])
+        free = np.where((pieces > 0) & ~np.isin(pieces, linked), -0.5, free)
+        if not (free > 0).any():
+            break
+        layers.append(free)
+    depths = spacing * np.arange(len(layers), dtype=np.float64)
+    # The bottom is as thick as the wall, at least.
+    floor = spacing * len(layers) - thickness - depths
+    if floor[0] <= tol.min_radius:
+        return None
+    above = int(np.ceil(tol.above / spacing))
+    field = np.minimum(np.stack(layers), floor[:, None, None])
+    field = np.concatenate([np.repeat(field[:1], above, axis=0), field])
+    field = ndimage.gaussian_filter(field, (0.5, 1.0, 1.0), mode="nearest") * grid.step
+    return Hollow(
+        rim=rim,
+        grid=grid,
+        thickness=thickness * grid.step,
+        thickness_sigma=sigma * grid.step,
+        field=field.astype(np.float32),
+        layer_step=spacing * grid.step,
+        first_layer=-above,
+    )

@@ -1,0 +1,452 @@
+"""Triangle meshes as arrays: normals, neighbourhoods, ray casting, and extraction from a grid.
+
+Ray casting is Open3D's (Embree), imported where a mesh is first cast on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse.csgraph import connected_components
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Faces = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+# Of rays whose majority tells inside from outside, should one graze an edge; along no axis.
+SIGN_DIRECTIONS = (
+    np.array([0.36, 0.48, 0.80]),
+    np.array([-0.70, 0.10, 0.71]),
+    np.array([0.25, -0.83, -0.50]),
+)
+BAND_CELLS = 3  # half width of the band about a mesh in which distances are computed
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """A triangle mesh; what is derived from it is computed once.
+
+    Attributes
+    ----------
+    vertices : (V, 3) float64, world.
+    faces : (F, 3) int64, indices of vertices, anticlockwise seen from outside.
+    """
+
+    vertices: Array
+    faces: Faces
+
+    @cached_property
+    def corners(self) -> Array:
+        """Vertices of each face, ``(F, 3, 3)``."""
+        return np.asarray(self.vertices[self.faces])
+
+    @cached_property
+    def centers(self) -> Array:
+        """Centroids ``(F, 3)``."""
+        return np.asarray(self.corners.mean(axis=1))
+
+    @cached_property
+    def _crosses(self) -> Array:
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        return np.asarray(np.cross(b - a, c - a))
+
+    @cached_property
+    def face_areas(self) -> Array:
+        """Areas ``(F,)``."""
+        return np.asarray(0.5 * np.linalg.norm(self._crosses, axis=1))
+
+    @cached_property
+    def face_normals(self) -> Array:
+        """Unit normals ``(F, 3)``; 0 for a face without area."""
+        return np.asarray(self._crosses / np.maximum(2 * self.face_areas, 1e-300)[:, None])
+
+    @cached_property
+    def vertex_normals(self) -> Array:
+        """Unit normals ``(V, 3)``, means of the faces' weighted by area; 0 without any."""
+        total = np.stack(
+            [
+                np.bincount(self.faces.ravel(), np.repeat(column, 3), len(self.vertices))
+                for column in self._crosses.T
+            ],
+            axis=-1,
+        )
+        length = np.linalg.norm(total, axis=1, keepdims=True)
+        return np.asarray(total / np.maximum(length, 1e-300))
+
+    @cached_property
+    def vertex_areas(self) -> Array:
+        """Area ``(V,)``, a third of the faces' at each vertex."""
+        third = np.repeat(self.face_areas / 3, 3)
+        return np.asarray(np.bincount(self.faces.ravel(), third, len(self.vertices)), np.float64)
+
+    @cached_property
+    def adjacency(self) -> sparse.csr_array:
+        """Symmetric ``(V, V)`` matrix with ones at the edges."""
+        tail = self.faces[:, [0, 1, 2]].ravel()
+        head = self.faces[:, [1, 2, 0]].ravel()
+        num = len(self.vertices)
+        ones = np.ones(2 * len(tail))
+        indices = (np.concatenate([tail, head]), np.concatenate([head, tail]))
+        matrix = sparse.coo_array((ones, indices), shape=(num, num)).tocsr()
+        matrix.data[:] = 1.0
+        return matrix
+
+    @cached_property
+    def neighbor_mean(self) -> sparse.csr_array:
+        """``(V, V)``: the mean over the neighbours of each vertex."""
+        degree = np.asarray(self.adjacency.sum(axis=1)).ravel()
+        return sparse.csr_array(sparse.diags_array(1 / np.maximum(degree, 1)) @ self.adjacency)
+
+    @cached_property
+    def mean_edge(self) -> float:
+        """Mean length of an edge."""
+        ends = self.corners - np.roll(self.corners, 1, axis=1)
+        return float(np.linalg.norm(ends, axis=-1).mean()) if len(self.faces) else 0.0
+
+    @cached_property
+    def face_components(self) -> NDArray[np.int64]:
+        """Label ``(F,)`` of the connected piece of each face, from 0."""
+        labels = connected_components(self.adjacency, directed=False)[1]
+        _, compact = np.unique(labels[self.faces[:, 0]], return_inverse=True)
+        return np.asarray(compact, np.int64)
+
+    def moved(self, displacement: Array) -> TriangleMesh:
+        """Vertices displaced by ``(V, 3)``."""
+        return TriangleMesh(self.vertices + displacement, self.faces)
+
+    def only(self, kept: Mask) -> TriangleMesh:
+        """The ``kept`` (F,) faces and the vertices that they use."""
+        faces = self.faces[kept]
+        used, compact = np.unique(faces, return_inverse=True)
+        return TriangleMesh(self.vertices[used], compact.reshape(-1, 3).astype(np.int64))
+
+    def points_at(self, face: NDArray[np.int64], barycentric: Floats) -> Array:
+        """Points ``(N, 3)`` at barycentric coordinates ``(N, 3)`` of faces ``(N,)``."""
+        return np.asarray((self.corners[face] * barycentric[..., None]).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class RayHits:
+    """Where rays first meet a mesh.
+
+    Attributes
+    ----------
+    distance : (N,) in lengths of the ray's direction; inf where it meets nothing.
+    face : (N,) int64, -1 where it meets nothing.
+    barycentric : (N, 3) of the hit in its face.
+    """
+
+    distance: NDArray[np.float32]
+    face: NDArray[np.int64]
+    barycentric: NDArray[np.float32]
+
+
+class RayScene:
+    """A mesh to cast rays on and to measure distances to."""
+
+    def __init__(self, mesh: TriangleMesh) -> None:
+        import open3d as o3d
+
+        # Open3D computes in float32: coordinates are taken from the mesh's centre.
+        self._origin = mesh.vertices.mean(axis=0) if len(mesh.vertices) else np.zeros(3)
+        self._tensor = o3d.core.Tensor
+        self._face_normals = mesh.face_normals
+        self._scene: Any = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(self._local(mesh.vertices)),
+            self._tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
+        )
+
+    def _local(self, points: Floats) -> NDArray[np.float32]:
+        return np.ascontiguousarray(points - self._origin, np.float32)
+
+    def cast(self, origins: Floats, directions: Floats) -> RayHits:
+        """First hits of rays from ``origins`` (3,) or (N, 3) along ``directions`` (N, 3)."""
+        rays = np.empty((len(directions), 6), np.float32)
+        rays[:, :3] = self._local(origins)
+        rays[:, 3:] = directions
+        hits = self._scene.cast_rays(self._tensor(rays))
+        distance = hits["t_hit"].numpy()
+        face = hits["primitive_ids"].numpy().astype(np.int64)
+        uv = hits["primitive_uvs"].numpy()
+        barycentric = np.column_stack([1 - uv[:, 0] - uv[:, 1], uv])
+        return RayHits(distance, np.where(np.isfinite(distance), face, -1), barycentric)
+
+    def closest(self, points: Floats) -> tuple[Array, NDArray[np.int64], NDArray[np.float32]]:
+        """Closest points ``(N, 3)``, their faces ``(N,)`` and places in these ``(N, 3)``."""
+        found = self._scene.compute_closest_points(self._tensor(self._local(points)))
+        uv = found["primitive_uvs"].numpy()
+        place = found["points"].numpy().astype(np.float64) + self._origin
+        face = found["primitive_ids"].numpy().astype(np.int64)
+        return place, face, np.column_stack([1 - uv[:, 0] - uv[:, 1], uv])
+
+    def signed_distance(
+        self, points: Floats, *, num_rays: int = len(SIGN_DIRECTIONS)
+    ) -> NDArray[np.float32]:
+        """Distance ``(N,)`` to the mesh, negative inside of it.
+
+        Inside is what the mesh winds about: where it overlaps itself too.
+
+        Parameters
+        ----------
+        points : (N, 3).
+        num_rays : odd, up to 3, whose majority decides: one may graze an edge.
+        """
+        local = self._local(points)
+        distance = np.asarray(self._scene.compute_distance(self._tensor(local)).numpy(), np.float32)
+        votes = np.zeros(len(points), np.int64)
+        for direction in SIGN_DIRECTIONS[:num_rays]:
+            votes += self._windings(local, direction) > 0
+        return np.where(2 * votes > num_rays, -distance, distance)
+
+    def _windings(self, local: NDArray[np.float32], direction: Array) -> NDArray[np.int64]:
+        """How often ``(N,)`` more a ray leaves the mesh than it enters it."""
+        rays = np.empty((len(local), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = local, direction
+        hits = self._scene.list_intersections(self._tensor(rays))
+        face = hits["primitive_ids"].numpy().astype(np.int64)
+        leaves = np.sign(self._face_normals[face] @ direction)
+        count = np.bincount(hits["ray_ids"].numpy().astype(np.int64), leaves, len(local))
+        return np.rint(count).astype(np.int64)
+
+
+def visible_points(
+    scene: RayScene,
+    center: Array,
+    points: Floats,
+    normals: Floats,
+    *,
+    tolerance: float,
+    min_cosine: float,
+    candidates: Mask | None = None,
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Which points of the surface a camera sees.
+
+    Parameters
+    ----------
+    scene : the mesh that may hide them.
+    center : (3,), of the camera.
+    points, normals : (N, 3).
+    tolerance : distance by which the mesh may lie in front of a point.
+    min_cosine : between normal and direction to the camera.
+    candidates : (N,) bool, points worth asking for.
+
+    Returns
+    -------
+    index : (K,) of the visible ones.
+    rays : (K, 3) unit, from the camera to them.
+    cosine : (K,) between normal and direction to the camera.
+    """
+    away = points - center
+    distance = np.linalg.norm(away, axis=1)
+    rays = away / np.maximum(distance, 1e-300)[:, None]
+    cosine = -(rays * normals).sum(axis=1)
+    facing = cosine > min_cosine
+    index = np.flatnonzero(facing if candidates is None else facing & candidates)
+    if len(index):
+        hit = scene.cast(center, rays[index]).distance
+        index = index[hit > distance[index] - tolerance]
+    return index, rays[index], cosine[index]
+
+
+def mesh_from_grid(values: NDArray[np.float32], origin: Array, step: float) -> TriangleMesh:
+    """Surface at zero of a function on a grid, by surface nets.
+
+    One vertex for each cell that the surface passes, at the mean of its crossings of the cell's
+    edges, and a quad for each edge of the grid that it crosses: triangles are far more even than
+    those of marching cubes. Values are negative inside.
+
+    Parameters
+    ----------
+    values : (X, Y, Z); positive on the grid's border, or the surface is open there.
+    origin : (3,), place of ``values[0, 0, 0]``.
+    step : distance of neighbours.
+    """
+    inside = values < 0
+    shape = np.array(values.shape)
+    cells = shape - 1
+    # Cells whose corners differ.
+    count = sum(
+        inside[i : i + cells[0], j : j + cells[1], k : k + cells[2]].astype(np.int8)
+        for i in (0, 1)
+        for j in (0, 1)
+        for k in (0, 1)
+    )
+    active = (count > 0) & (count < 8)
+    cell = np.argwhere(active)
+    if not len(cell):
+        return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    number = np.full(tuple(cells), -1, np.int64)
+    number[active] = np.arange(len(cell))
+    total, num = np.zeros((len(cell), 3)), np.zeros(len(cell))
+    faces = []
+    for axis in range(3):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        for a in (0, 1):
+            for b in (0, 1):
+                low = cell.copy()
+                low[:, first] += a
+                low[:, second] += b
+                high = low.copy()
+                high[:, axis] += 1
+                at_low, at_high = values[tuple(low.T)], values[tuple(high.T)]
+                crosses = (at_low < 0) != (at_high < 0)
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    share = np.where(crosses, at_low / (at_low - at_high), 0.0)
+                point = (low - cell).astype(np.float64)
+                point[:, axis] += share
+                total += np.where(crosses[:, None], point, 0)
+                num += crosses
+        # Quads about the grid's edges along this axis, away from its border.
+        inner = [slice(1, n - 1) for n in shape]
+        lower, upper = list(inner), list(inner)
+        lower[axis], upper[axis] = slice(0, -1), slice(1, None)
+        edge = np.argwhere(inside[tuple(lower)] != inside[tuple(upper)])
+        offset = np.ones(3, np.int64)
+        offset[axis] = 0
+        edge = edge + offset
+        unit_a, unit_b = np.eye(3, dtype=np.int64)[first], np.eye(3, dtype=np.int64)[second]
+        ring = [edge - unit_a - unit_b, edge - unit_b, edge, edge - unit_a]
+        quad = np.stack([number[tuple(corner.T)] for corner in ring], axis=1)
+        outwards = inside[tuple(edge.T)]
+        quad[~outwards] = quad[~outwards][:, ::-1]
+        faces.append(quad)
+    vertices = origin + step * (cell + total / num[:, None])
+    return TriangleMesh(vertices, _split_quads(vertices, np.concatenate(faces)))
+
+
+def _split_quads(vertices: Array, quads: NDArray[np.int64]) -> Faces:
+    """Two triangles for each quad, along its shorter diagonal."""
+    a, b, c, d = (vertices[quads[:, i]] for i in range(4))
+    along = np.linalg.norm(a - c, axis=1) <= np.linalg.norm(b - d, axis=1)
+    first = np.where(along[:, None], quads[:, [0, 1, 2]], quads[:, [1, 2, 3]])
+    second = np.where(along[:, None], quads[:, [0, 2, 3]], quads[:, [1, 3, 0]])
+    return np.concatenate([first, second])
+
+
+def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
+    """Vertices moved along the surface towards the mean of their neighbours."""
+    for _ in range(rounds):
+        towards = mesh.neighbor_mean @ mesh.vertices - mesh.vertices
+        normals = mesh.vertex_normals
+        towards -= (towards * normals).sum(axis=1, keepdims=True) * normals
+        mesh = mesh.moved(0.5 * towards)
+    return mesh
+
+
+def remeshed(
+    mesh: TriangleMesh,
+    step: float,
+    *,
+    free: Sequence[Callable[[Array], Floats]] = (),
+    smoothing: float = 0.5,
+    min_cells: int = 30,
+) -> TriangleMesh:
+    """The mesh again with edges of about ``step``, through its signed distance on a grid.
+
+    The new mesh does not intersect itself; pieces that met are joined, and pieces that enclose
+    fewer than ``min_cells`` cells are gone.
+
+    Parameters
+    ----------
+    mesh : closed.
+    step : of the grid, world units.
+    free : functions of points ``(N, 3)`` that give signed distances ``(N,)``, positive where space
+        is free: it is carved out, its borders unsmoothed.
+    smoothing : width of a Gaussian on the distances, in steps.
+    """
+    if not len(mesh.faces):
+        return mesh
+    origin = mesh.vertices.min(axis=0) - (BAND_CELLS + 1) * step
+    shape = tuple(
+        int(n) for n in np.ceil((np.ptp(mesh.vertices, axis=0)) / step) + 2 * BAND_CELLS + 3
+    )
+    band = np.zeros(shape, np.bool_)
+    num = int(np.ceil(1 + 2 * mesh.mean_edge / step))
+    for weights in _simplex_lattice(num):
+        place = np.rint((np.tensordot(weights, mesh.corners, (0, 1)) - origin) / step)
+        band[tuple(place.astype(np.int64).T)] = True
+    band = ndimage.binary_dilation(band, iterations=BAND_CELLS)
+    index = np.argwhere(band)
+    scene = RayScene(mesh)
+    limit = np.float32(BAND_CELLS * step)
+    values = np.full(shape, np.nan, np.float32)
+    values[band] = scene.signed_distance(origin + step * index, num_rays=1)
+    # The sign cannot change between neighbours that are farther from the mesh than each other.
+    doubtful = np.zeros(shape, np.bool_)
+    for axis in range(3):
+        first, second = (np.moveaxis(values, axis, 0)[part] for part in (slice(-1), slice(1, None)))
+        apart = np.minimum(np.abs(first), np.abs(second)) > 1.01 * step
+        jumps = (first * second < 0) & apart
+        for part in (slice(-1), slice(1, None)):
+            np.moveaxis(doubtful, axis, 0)[part] |= jumps
+    if doubtful.any():
+        values[doubtful] = scene.signed_distance(origin + step * np.argwhere(doubtful))
+    values[band] = np.clip(values[band], -limit, limit)
+    values[~band] = limit
+    pieces, num_pieces = ndimage.label(~band)
+    # Outside of the band a piece has the sign that the band has beside it.
+    if num_pieces > 1:
+        beside = ndimage.grey_dilation(np.where(band, 0, pieces), size=(3, 3, 3))
+        touching = band & (beside > 0)
+        negative = np.bincount(beside[touching], values[touching] < 0, num_pieces + 1)
+        total = np.bincount(beside[touching], minlength=num_pieces + 1)
+        values[(negative > 0.5 * total)[pieces] & (pieces > 0)] = -limit
+    if smoothing > 0:
+        values = ndimage.gaussian_filter(values, smoothing)
+    if free:
+        inner = values < limit
+        points = origin + step * np.argwhere(inner)
+        for function in free:
+            values[inner] = np.maximum(values[inner], np.minimum(function(points), limit))
+    _drop_small(values, min_cells, limit)
+    return relaxed(mesh_from_grid(values, origin, step))
+
+
+def _drop_small(values: NDArray[np.float32], min_cells: int, outside: np.float32) -> None:
+    """Fill inside pieces of fewer than ``min_cells`` grid points with ``outside``, in place."""
+    labels, num = ndimage.label(values < 0)
+    if num > 1:
+        small = np.bincount(labels.ravel()) < min_cells
+        small[0] = False
+        values[small[labels]] = outside
+
+
+def _simplex_lattice(num: int) -> Array:
+    """Barycentric coordinates ``(K, 3)`` that cover a triangle, ``num`` to an edge."""
+    i, j = np.meshgrid(np.arange(num + 1), np.arange(num + 1), indexing="ij")
+    inside = i + j <= num
+    lattice = np.stack([i[inside], j[inside], num - i[inside] - j[inside]], axis=1)
+    return np.asarray(lattice / num)
+
+
+def sample_surface(
+    mesh: TriangleMesh, weights: Floats, num: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Array]:
+    """Faces ``(N,)`` and barycentric coordinates ``(N, 3)`` of points spread evenly over a mesh.
+
+    Parameters
+    ----------
+    mesh : the surface.
+    weights : (F,), share of each face that counts, 0 to 1.
+    num : expected number of points.
+    rng : random numbers.
+    """
+    area = mesh.face_areas * weights
+    total = float(area.sum())
+    if total <= 0:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
+    # Stratified: the running area passes a whole number where a point falls.
+    running = np.concatenate([[0.0], np.cumsum(area)]) * (num / total) + rng.random()
+    count = np.diff(np.floor(running)).astype(np.int64)
+    face = np.repeat(np.arange(len(area)), count)
+    root, share = np.sqrt(rng.random(len(face))), rng.random(len(face))
+    barycentric = np.column_stack([1 - root, root * (1 - share), root * share])
+    return face, barycentric

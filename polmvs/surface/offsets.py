@@ -1,0 +1,866 @@
+"""Flat faces whose offset silhouettes and phases do not see: steps, lids, recesses.
+
+Phases fix normals; on parallel faces they are alike, and a silhouette's cones stay above whatever
+lies lower than its rim. Sparse points on the faces know better: those that share a plane, and
+whose phases have its normal, show that there is a face and where. How far it reaches is decided on
+a grid in the face's own plane. Seen in all views at the right offset, its border and its marks
+stay where they are, and lines that lie on other faces wander from view to view: a line that
+several views show at the same place is a border. Each face's points then claim what they reach
+without crossing such a line (a random walker, Grady 2006), and what their phases do not
+contradict. Space above a claimed place is free: its signed distance carves the first surface, with
+walls between the faces that no smoothness has rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
+
+from polmvs.camera import sample_image
+from polmvs.config import AngleModel
+from polmvs.normals.rows import Rows, gather_rows
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import Seeds
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+SignedDistance: TypeAlias = Callable[[Array], Floats]
+FirstHit: TypeAlias = Callable[[Array, Array], tuple[Floats, Floats]]
+
+NO_FACE = -1
+REFERENCE_FOCAL_PX = 445.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffsetTolerances:
+    """Numbers of the search for faces and of their borders.
+
+    Attributes
+    ----------
+    min_points : of a face. Three lie in a plane by chance.
+    num_trials : random triples of points per face; a face of a tenth of the points is then missed
+        once in 1000 searches. Derived.
+    plane_sigmas : distance of a point to its face over its standard deviation. Derived (99.7 %).
+    normal_deg : largest angle between a point's normal and its face. Guess: several deviations.
+    min_normal_sigma_deg : deviation of the mean of the points' normals (sensor and model, alike
+        for all points). Measured on board: 0.2.
+    same_group_deg : faces whose normals differ less share a grid.
+    num_near : neighbours that tell whether points of a face lie among those of another. Guess.
+    max_cells : of a grid. Memory and time: one solution takes 7 us a cell.
+    smoothing_px : of the intensity before its steps are measured.
+    dark : intensity by which a mark must at least be brighter, full scales: one count of 8 bits.
+    min_scale : least step of noise per cell, of roots of full scales: synthetic images have none.
+    view_share : share of the views that see a place, which must show a line there. A wall of a
+        convex part is seen by about half of the views around it. Guess: half of these.
+    line_steps : of noise, from which a step hampers the walk. Guess.
+    line_power : of the weights; the greater, the more the walk keeps to borders. Guess.
+    mark_px : greatest width of a printed mark, at a focal length of 445 px. Guess.
+    mark_contrast : of a mark's intensity to what is about it. As for the region's marks.
+    mark_dolp_share : of the DoLP about a mark in its own, at most. As for the seeds.
+    mark_margin_px : square about a pixel of a mark that is left out: its smoothed outline.
+    seed_cells : radius about a sparse point that belongs to its face. Guess: its uncertainty.
+    phase_floor : residual that noise does not explain, sine. Prototype: 0.03 on curved meshes; a
+        plane has no faults of its own.
+    cost_sigmas : of the robust loss of a residual. Guess.
+    max_cost : median loss over the views above which the phases contradict a face: as many
+        deviations as ``cost_sigmas``. Derived.
+    leak : conductance to nowhere of a place that contradicts its face. Guess.
+    snap_cells : width of the band in which a border is moved to the strongest line. Guess: a mark
+        beside a border can draw the walk over it by as much.
+    seed_weight : chance that a walk ends on a point that it passes, over that of a step. Guess.
+    min_claim : chance of a place for its likeliest face, under which it has none. Guess.
+    min_share : of the seen views in whose region a place must lie. Guess: one view in six wrong.
+    min_cosine : between a face's normal and the direction to a view that counts.
+    min_views : that see a place.
+    min_radius_cells : of a face's area: smaller ones are tangent planes of curved surfaces. Guess.
+    off_footprints : distance of a face's points to the given surface, in footprints of a pixel,
+        from which the surface does not explain them. Guess: a first surface's cells are 2 wide.
+    better_by : median loss by which the given surface must explain the views better than a face
+        to keep its place. Guess.
+    num_rounds : of labels and visibility; a third changes nothing on step.
+    """
+
+    min_points: int = 4
+    num_trials: int = 2000
+    plane_sigmas: float = 3.0
+    normal_deg: float = 4.0
+    min_normal_sigma_deg: float = 0.2
+    same_group_deg: float = 30.0
+    num_near: int = 5
+    max_cells: int = 160_000
+    smoothing_px: float = 1.0
+    dark: float = 1 / 255
+    min_scale: float = 0.003
+    view_share: float = 0.25
+    line_steps: float = 4.0
+    line_power: float = 2.0
+    mark_px: float = 20.0
+    mark_contrast: float = 1.5
+    mark_dolp_share: float = 0.85
+    mark_margin_px: int = 5
+    seed_cells: float = 2.0
+    phase_floor: float = 0.015
+    cost_sigmas: float = 3.0
+    max_cost: float = 0.5
+    leak: float = 0.01
+    snap_cells: float = 5.0
+    seed_weight: float = 0.2
+    min_claim: float = 0.25
+    min_share: float = 0.84
+    min_cosine: float = 0.1
+    min_views: int = 2
+    min_radius_cells: float = 12.0
+    off_footprints: float = 2.0
+    better_by: float = 0.3
+    num_rounds: int = 2
+
+
+@dataclass(frozen=True)
+class Face:
+    """A plane that sparse points show: points x with ``normal . x = offset``.
+
+    Attributes
+    ----------
+    normal : (3,) unit, towards the cameras.
+    offset : world units.
+    members : (M,) int64, the seeds on it.
+    """
+
+    normal: Array
+    offset: float
+    members: NDArray[np.int64]
+
+    def height(self, points: Floats) -> Array:
+        """Signed distance ``(...)`` of points ``(..., 3)``, positive on the cameras' side."""
+        return np.asarray(points @ self.normal - self.offset, np.float64)
+
+
+@dataclass(frozen=True)
+class FaceGrid:
+    """A grid of cells across a direction; each face is a height over it.
+
+    Attributes
+    ----------
+    origin : (3,), place of cell (0, 0) at height 0.
+    first, second, axis : (3,) unit, along rows, along columns, and the direction of heights.
+    step : side of a cell, world units.
+    shape : rows, columns.
+    """
+
+    origin: Array
+    first: Array
+    second: Array
+    axis: Array
+    step: float
+    shape: tuple[int, int]
+
+    def cells(self, points: Floats) -> Array:
+        """Row and column ``(..., 2)`` of points ``(..., 3)``, fractional."""
+        local = np.asarray(points, np.float64) - self.origin
+        return np.stack([local @ self.first, local @ self.second], axis=-1) / self.step
+
+    def points(self, face: Face) -> Array:
+        """Points ``(H, W, 3)`` of a face over all cells."""
+        rows, cols = np.indices(self.shape)
+        base = self.origin + self.step * (
+            rows[..., None] * self.first + cols[..., None] * self.second
+        )
+        rise = -face.height(base) / (self.axis @ face.normal)
+        return np.asarray(base + rise[..., None] * self.axis)
+
+
+@dataclass(frozen=True)
+class SteppedFaces:
+    """Faces of about one normal, and where on a grid each is what the cameras see.
+
+    Attributes
+    ----------
+    faces : by number.
+    grid : of the labels.
+    labels : (H, W) int64, number of the face, ``NO_FACE`` where none is shown.
+    """
+
+    faces: tuple[Face, ...]
+    grid: FaceGrid
+    labels: NDArray[np.int64]
+
+    def values(self, points: Floats) -> Array:
+        """Signed distance ``(N,)`` of points to what the faces leave: positive in free space.
+
+        Space is free above a face's own cells, in the direction of the axis; above cells without
+        a face nothing is said, and the value is negative there. The maximum of this and of another
+        shape's signed distance is that shape, carved.
+        """
+        points = np.asarray(points, np.float64)
+        cells = np.moveaxis(self.grid.cells(points), -1, 0)
+        solid = self._interpolated(self._beside(self.labels == NO_FACE), cells)
+        heights = np.stack([self._rise(face) for face in self.faces])
+        at_label = np.take_along_axis(heights, np.maximum(self.labels, 0)[None], axis=0)[0]
+        for number, face in enumerate(self.faces):
+            # A face goes on below those that stand on it: no border inside of the solid.
+            own = self.labels == number
+            under = own | (self.labels == NO_FACE) | (at_label >= heights[number])
+            if own.any():
+                across = self._interpolated(self._beside(under), cells)
+                solid = np.minimum(solid, np.maximum(across, face.height(points)))
+        return solid
+
+    def _rise(self, face: Face) -> Array:
+        return np.asarray((self.grid.points(face) - self.grid.origin) @ self.grid.axis)
+
+    def _beside(self, inside: Mask) -> Image:
+        """Signed distance (H, W) to a set of cells, world units, negative inside, smoothed."""
+        smooth = ndimage.gaussian_filter(cells_beside(inside), 1.0, mode="nearest")
+        return np.asarray(smooth * self.grid.step, np.float32)
+
+    def _interpolated(self, image: Image, cells: Array) -> Array:
+        """Values at fractional cells ``(2, N)``; those of the border beyond it."""
+        found = ndimage.map_coordinates(image, cells, order=1, mode="nearest")
+        return np.asarray(found, np.float64)
+
+
+def cells_beside(inside: Mask) -> Array:
+    """Signed distance (H, W) in cells to the border of a set of cells, negative inside."""
+    far = float(max(inside.shape))
+    if not inside.any():
+        return np.full(inside.shape, far)
+    outwards = ndimage.distance_transform_edt(~inside)
+    inwards = ndimage.distance_transform_edt(inside) if not inside.all() else far
+    return np.where(inside, 0.5 - inwards, outwards - 0.5)
+
+
+def find_faces(
+    seeds: Seeds, tolerances: OffsetTolerances | None = None, *, max_faces: int | None = None
+) -> tuple[Face, ...]:
+    """Planes through seeds whose normals agree with them, those of most seeds first.
+
+    Parameters
+    ----------
+    seeds : sparse points on the part with normals from the phases.
+    tolerances : numbers of the search.
+    max_faces : after which it ends.
+
+    Returns
+    -------
+    Faces without common seeds. Points among those of a larger face, but off it, are no face of
+    their own (mirror images and false matches).
+    """
+    tol = tolerances or OffsetTolerances()
+    points, normals = seeds.points_in_world, seeds.normals_in_world
+    sigma = np.maximum(seeds.sigma, 1e-12)
+    rng = np.random.default_rng(0)
+    left: Mask = np.asarray(np.isfinite(normals).all(axis=1) & np.isfinite(points).all(axis=1))
+    agree = np.cos(np.radians(tol.normal_deg))
+    faces: list[Face] = []
+    while left.sum() >= tol.min_points and (max_faces is None or len(faces) < max_faces):
+        index = np.flatnonzero(left)
+        triples = index[rng.integers(0, len(index), (tol.num_trials, 3))]
+        a, b, c = np.moveaxis(points[triples], 1, 0)
+        across = np.cross(b - a, c - a)
+        length = np.linalg.norm(across, axis=1)
+        mean = normals[triples].sum(axis=1)
+        across *= np.sign((across * mean).sum(axis=1) / np.maximum(length, 1e-300))[:, None]
+        trial = across / np.maximum(length, 1e-300)[:, None]
+        aligned = (trial * mean).sum(axis=1) > agree * np.linalg.norm(mean, axis=1)
+        # A plane through three points of one mark turns with their noise.
+        wide = length > (tol.plane_sigmas * sigma[triples].max(axis=1)) ** 2
+        usable = wide & aligned & (length > 0)
+        if not usable.any():
+            break
+        trial, a = trial[usable], a[usable]
+        distance = np.abs(points[index] @ trial.T - (a * trial).sum(axis=1))
+        inlier = distance < tol.plane_sigmas * sigma[index, None]
+        inlier &= normals[index] @ trial.T > agree
+        members = index[inlier[:, int(inlier.sum(axis=0).argmax())]]
+        face = None
+        for _ in range(5):
+            if len(members) < tol.min_points:
+                break
+            face = _fitted(seeds, members, tol)
+            near = np.abs(face.height(points[index])) < tol.plane_sigmas * sigma[index]
+            members = index[near & (normals[index] @ face.normal > agree)]
+        if face is None or len(members) < tol.min_points:
+            break
+        faces.append(Face(face.normal, face.offset, members))
+        left[members] = False
+    return tuple(_without_interlopers(faces, points, tol))
+
+
+def _fitted(seeds: Seeds, members: NDArray[np.int64], tol: OffsetTolerances) -> Face:
+    """The plane of most likelihood for the places and the normals of some seeds."""
+    points, normals = seeds.points_in_world[members], seeds.normals_in_world[members]
+    weight = 1 / np.maximum(seeds.sigma[members], 1e-12) ** 2
+    center = weight @ points / weight.sum()
+    mean = normals.mean(axis=0)
+    mean /= np.linalg.norm(mean)
+    normal = mean
+    for _ in range(4):
+        tangents = np.linalg.svd(normal[None])[2][1:]
+        certain = 1 / np.radians(tol.min_normal_sigma_deg) ** 2
+        along = (points - center) @ tangents.T
+        matrix = (along * weight[:, None]).T @ along + certain * np.eye(2)
+        right = -(along * weight[:, None]).T @ ((points - center) @ normal)
+        right += certain * (tangents @ (mean - normal))
+        normal = normal + np.linalg.solve(matrix, right) @ tangents
+        normal /= np.linalg.norm(normal)
+    return Face(normal, float(normal @ center), members)
+
+
+def _without_interlopers(faces: Sequence[Face], points: Array, tol: OffsetTolerances) -> list[Face]:
+    """Faces whose seeds do not lie, sideways, among those of a larger face of like normal."""
+    kept: list[Face] = []
+    for face in faces:
+        alike = [
+            other
+            for other in kept
+            if face.normal @ other.normal > np.cos(np.radians(tol.same_group_deg))
+        ]
+        if alike:
+            tangents = np.linalg.svd(face.normal[None])[2][1:]
+            own = points[face.members] @ tangents.T
+            others = np.concatenate([points[other.members] for other in alike]) @ tangents.T
+            tree = cKDTree(np.concatenate([own, others]))
+            num = min(tol.num_near + 1, len(own) + len(others))
+            near = np.atleast_2d(tree.query(own, num)[1])
+            if np.mean(near[:, 1:] < len(own)) < 0.5:
+                continue
+        kept.append(face)
+    return kept
+
+
+def stepped_faces(
+    faces: Sequence[Face],
+    seeds: Seeds,
+    maps: Sequence[PhaseMap],
+    angle_model: AngleModel,
+    *,
+    tilt_aware: bool = True,
+    signed_distance: SignedDistance | None = None,
+    first_hit: FirstHit | None = None,
+    tolerances: OffsetTolerances | None = None,
+) -> tuple[SteppedFaces, ...]:
+    """Groups of faces of like normal that a first surface does not explain, with their extents.
+
+    Parameters
+    ----------
+    faces : of :func:`find_faces`.
+    seeds : whose members they are.
+    maps : phase maps of the views.
+    angle_model, tilt_aware : of the rows, as in :func:`polmvs.normals.rows.gather_rows`.
+    signed_distance : of points ``(N, 3)`` to the first surface. Groups whose seeds all lie on it
+        are left out. None: all are looked at.
+    first_hit : distance and normal where rays from ``(N, 3)`` along ``(3,)`` first meet the first
+        surface (inf where they do not): it keeps the places that it explains better.
+    tolerances : numbers of the search.
+    """
+    tol = tolerances or OffsetTolerances()
+    if not faces:
+        return ()
+    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=tol)
+    found = []
+    for group in _grouped(faces, tol):
+        points = seeds.points_in_world[np.concatenate([face.members for face in group])]
+        footprint = _footprint(points, maps)
+        if signed_distance is not None and not any(
+            _is_off(face, seeds, signed_distance, tol.off_footprints * footprint) for face in group
+        ):
+            continue
+        grid = _grid_over(group, points, maps, footprint, tol)
+        if grid is None:
+            continue
+        labels = _labels(group, seeds, grid, scene, first_hit, tol)
+        if (labels != NO_FACE).any():
+            found.append(SteppedFaces(tuple(group), grid, labels))
+    return tuple(found)
+
+
+def _grouped(faces: Sequence[Face], tol: OffsetTolerances) -> list[list[Face]]:
+    groups: list[list[Face]] = []
+    for face in faces:
+        for group in groups:
+            if face.normal @ group[0].normal > np.cos(np.radians(tol.same_group_deg)):
+                group.append(face)
+                break
+        else:
+            groups.append([face])
+    return groups
+
+
+def _is_off(face: Face, seeds: Seeds, signed_distance: SignedDistance, limit: float) -> bool:
+    distance = signed_distance(seeds.points_in_world[face.members])
+    return bool(np.median(np.abs(distance)) > limit)
+
+
+def _footprint(points: Array, maps: Sequence[PhaseMap]) -> float:
+    """Length that a pixel covers at the points, median over the views."""
+    center = np.median(points, axis=0)
+    return float(
+        np.median(
+            [
+                np.linalg.norm(m.view.center_in_world - center) / m.view.camera.mean_focal_px
+                for m in maps
+            ]
+        )
+    )
+
+
+def _grid_over(
+    group: Sequence[Face],
+    points: Array,
+    maps: Sequence[PhaseMap],
+    footprint: float,
+    tol: OffsetTolerances,
+) -> FaceGrid | None:
+    """A grid over all that the views' regions show in the plane of the group's largest face."""
+    face = group[0]
+    tangents = np.linalg.svd(face.normal[None])[2][1:]
+    first, second = tangents[0], np.cross(face.normal, tangents[0])
+    center = points.mean(axis=0)
+    low, high = np.full((len(maps), 2), np.nan), np.full((len(maps), 2), np.nan)
+    for k, phase_map in enumerate(maps):
+        rows, cols = np.nonzero(phase_map.region.inside[::4, ::4])
+        if not len(rows):
+            continue
+        xy = np.stack([4.0 * cols + 0.5, 4.0 * rows + 0.5], axis=1)
+        rays = phase_map.view.camera.rays(xy) @ phase_map.view.cam_from_world.rotation
+        origin = phase_map.view.center_in_world
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = -face.height(origin) / (rays @ face.normal)
+        hit = np.isfinite(distance) & (distance > 0) & (rays @ face.normal < -tol.min_cosine)
+        if hit.any():
+            local = origin + distance[hit, None] * rays[hit] - center
+            place = np.stack([local @ first, local @ second], axis=1)
+            low[k], high[k] = place.min(axis=0), place.max(axis=0)
+    if np.isfinite(low).all(axis=1).sum() < tol.min_views:
+        return None
+    # A region may run to the horizon in one view: what half of the views show is enough.
+    own = np.stack([(points - center) @ first, (points - center) @ second], axis=1)
+    margin = tol.min_radius_cells * footprint
+    start = np.minimum(np.nanmedian(low, axis=0), own.min(axis=0)) - margin
+    size = np.maximum(np.nanmedian(high, axis=0), own.max(axis=0)) + margin - start
+    step = max(footprint, float(np.sqrt(np.prod(size) / tol.max_cells)))
+    rows_cols = np.ceil(size / step).astype(np.int64) + 1
+    origin = center + start[0] * first + start[1] * second
+    return FaceGrid(
+        origin, first, second, face.normal, step, (int(rows_cols[0]), int(rows_cols[1]))
+    )
+
+
+@dataclass(frozen=True)
+class FaceScene:
+    """Phase maps, which rows they have, and the images (H, W, 4) whose steps show borders."""
+
+    maps: Sequence[PhaseMap]
+    angle_model: AngleModel
+    tilt_aware: bool
+    features: Sequence[Image]
+
+    def rows(self, points: Array) -> Rows:
+        """Rows of points ``(N, 3)``."""
+        return gather_rows(self.angle_model, points, self.maps, tilt_aware=self.tilt_aware)
+
+
+def face_scene(
+    maps: Sequence[PhaseMap],
+    angle_model: AngleModel,
+    *,
+    tilt_aware: bool = True,
+    tolerances: OffsetTolerances | None = None,
+) -> FaceScene:
+    """What is asked about faces, from the views' phase maps."""
+    tol = tolerances or OffsetTolerances()
+    features = [_features(phase_map, tol) for phase_map in maps]
+    return FaceScene(maps, angle_model, tilt_aware, features)
+
+
+@dataclass(frozen=True)
+class FaceEvidence:
+    """What the views say about a face over the cells of a grid.
+
+    ``jump`` (H, W): steps of the image in units of noise that a share of the views exceeds;
+    ``cost`` (H, W): median robust loss of the phases, 1 where no view has one;
+    ``possible`` (H, W): whether the views show the part there.
+    """
+
+    jump: Image
+    cost: Image
+    possible: Mask
+
+
+def _labels(
+    group: Sequence[Face],
+    seeds: Seeds,
+    grid: FaceGrid,
+    scene: FaceScene,
+    first_hit: FirstHit | None,
+    tol: OffsetTolerances,
+) -> NDArray[np.int64]:
+    """Number of the face at each cell, ``NO_FACE`` where the views show none."""
+    places = [grid.points(face) for face in group]
+    rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
+    surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit, tol)
+    labels = np.full(grid.shape, NO_FACE)
+    for round_index in range(tol.num_rounds):
+        claims, jumps = np.zeros((2, len(group), *grid.shape))
+        taken = np.zeros(grid.shape, np.bool_)  # by something that the faces do not explain
+        explained = np.zeros(grid.shape, np.bool_)
+        for number, face in enumerate(group):
+            hidden = None
+            if round_index > 0:
+                hidden = _hidden(number, group, places[number], grid, labels, scene.maps)
+            on_grid = grid.cells(seeds.points_in_world[face.members])
+            near = _distance_to(on_grid, grid.shape) < 0.5 * tol.mark_px
+            evidence = face_evidence(places[number], face, scene, near, hidden, tol)
+            fits = (evidence.cost < tol.max_cost) & (evidence.cost < surface_cost + tol.better_by)
+            taken |= evidence.possible & ~fits
+            explained |= evidence.possible & fits
+            possible = evidence.possible & (evidence.cost < surface_cost + tol.better_by)
+            claims[number] = _claim(number, group, seeds, grid, evidence, possible, tol)
+            jumps[number] = evidence.jump
+        labels = np.where(claims.max(axis=0) > tol.min_claim, claims.argmax(axis=0), NO_FACE)
+        # Nothing hides the border of a higher face: it shows where the lower one begins.
+        height = np.where(claims > 0.5, rise, -np.inf)
+        labels = np.where(claims.max(axis=0) > 0.5, height.argmax(axis=0), labels)
+        labels = _without_small(labels, len(group), tol)
+        for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1)):
+            labels = snapped_border(labels, int(number), jumps[number], tol)
+        taken = ndimage.binary_opening(taken & ~explained, iterations=2)
+        labels = _continued(labels, taken, tol)
+    return np.asarray(labels, np.int64)
+
+
+def snapped_border(
+    labels: NDArray[np.int64],
+    number: int,
+    jump: Array,
+    tol: OffsetTolerances,
+    band_cells: float | None = None,
+) -> NDArray[np.int64]:
+    """Labels (H, W), the border of one face moved to the strongest line near it.
+
+    The walk again, from both sides of a band of ``band_cells`` (by default the tolerances') on
+    either side of the border.
+    """
+    width = tol.snap_cells if band_cells is None else band_cells
+    own = labels == number
+    core = ndimage.distance_transform_edt(own) > width
+    rest = ndimage.distance_transform_edt(~own) > width
+    if not core.any() or not rest.any():
+        return labels
+    band = ~core & ~rest
+    adjacency, degree = _walk(jump, tol)
+    inner, outer = np.flatnonzero(band), np.flatnonzero(core)
+    right = adjacency[inner][:, outer].sum(axis=1)
+    chance = np.zeros(labels.size)
+    chance[inner] = _solved(adjacency[inner][:, inner], degree[inner], np.asarray(right))
+    flooded = core | (chance.reshape(labels.shape) > 0.5)
+    others = np.where(own, NO_FACE, labels)
+    nearest = ndimage.distance_transform_edt(own, return_distances=False, return_indices=True)
+    given_back = others[tuple(nearest)]
+    return np.where(flooded, number, np.where(own, given_back, labels))
+
+
+def _continued(labels: NDArray[np.int64], taken: Mask, tol: OffsetTolerances) -> NDArray[np.int64]:
+    """Labels carried on to cells near them that nothing else takes.
+
+    Beside a face, where the views show no part, there is nothing that a label could wrongly carve;
+    but the first surface may stand there in a rim as wide as the silhouettes are unsure.
+    """
+    if not (labels != NO_FACE).any():
+        return labels
+    distance, nearest = ndimage.distance_transform_edt(labels == NO_FACE, return_indices=True)
+    carried = labels[tuple(nearest)]
+    return np.where((distance <= tol.min_radius_cells) & ~taken, carried, labels)
+
+
+def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
+    """Images (H, W, 4): root of intensity, polarisation (2), and 1 off printed marks.
+
+    The first three show borders by their steps. A mark is smaller than ``mark_px``, brighter than
+    what is about it, and less polarised.
+    """
+    intensity = np.asarray(phase_map.intensity, np.float32)
+    scale = phase_map.view.camera.mean_focal_px / REFERENCE_FOCAL_PX
+    size = 2 * round(0.5 * tol.mark_px * scale) + 1
+    about = cv2.morphologyEx(
+        cv2.GaussianBlur(intensity, (0, 0), tol.smoothing_px),
+        cv2.MORPH_OPEN,
+        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)),
+    )
+    dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
+    dull = phase_map.lowest_dolp < 255 * tol.mark_dolp_share * dolp
+    mark = dull & (intensity > tol.mark_contrast * about + tol.dark)
+    kernel = np.ones((tol.mark_margin_px,) * 2, np.uint8)
+    on_mark = cv2.dilate(mark.astype(np.uint8), kernel)
+    # The root has the same photon noise everywhere; smoothed after it, a step keeps its place.
+    root = cv2.GaussianBlur(np.sqrt(np.maximum(intensity, 0)), (0, 0), tol.smoothing_px)
+    samples = phase_map.samples[..., :2]
+    return np.dstack([root, samples, 1 - on_mark]).astype(np.float32)
+
+
+def row_losses(
+    rows: Rows, normals: Floats, tol: OffsetTolerances
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Loss in [0, 1] of each row (K, N), NaN where it does not count, and cosines to the views.
+
+    Parameters
+    ----------
+    rows : of N points.
+    normals : (3, 1) or (3, N).
+    """
+    normals = np.asarray(normals, np.float32)
+    cosine = -(rows.rays * normals[:, None]).sum(axis=0)
+    residual = (rows.rows * normals[:, None]).sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        variance = (1 - cosine**2) * np.square(rows.sigma) + np.float32(tol.phase_floor**2)
+        z2 = np.square(residual) / (variance * np.float32(tol.cost_sigmas**2))
+        loss = z2 / (1 + z2)
+    counts = np.isfinite(rows.sigma) & (cosine > tol.min_cosine)
+    return np.where(counts, loss, np.nan).astype(np.float32), cosine
+
+
+def face_evidence(
+    places: Array,
+    face: Face,
+    scene: FaceScene,
+    near_points: Mask,
+    hidden: Sequence[Mask] | None,
+    tol: OffsetTolerances,
+) -> FaceEvidence:
+    """What the views say of a face at places ``(H, W, 3)`` on it.
+
+    Parameters
+    ----------
+    places, face : the face over a grid.
+    scene : the views.
+    near_points : (H, W) bool, where steps may be those of printed marks.
+    hidden : per view, places ``(H, W)`` that it does not see.
+    tol : numbers.
+    """
+    shape = places.shape[:2]
+    losses = row_losses(scene.rows(places.reshape(-1, 3)), face.normal[:, None], tol)[0]
+    losses = losses.reshape(-1, *shape)
+    jumps = np.full(losses.shape, np.nan, np.float32)
+    inside, num_seen = np.zeros(shape), np.zeros(shape)
+    for k, phase_map in enumerate(scene.maps):
+        xy, seen = _seen(places, face, phase_map, tol)
+        if hidden is not None:
+            seen &= ~hidden[k]
+        shown = seen & phase_map.shows_surface(xy)
+        num_seen += seen
+        inside += shown
+        losses[k] = np.where(shown, losses[k], np.nan)
+        jumps[k] = _line_steps(scene.features[k], xy, shown, near_points, tol)
+    possible = (num_seen >= tol.min_views) & (inside >= tol.min_share * num_seen)
+    return FaceEvidence(_shared_lines(jumps, tol.view_share), median_loss(losses), possible)
+
+
+def face_lines(
+    places: Array, face: Face, scene: FaceScene, tol: OffsetTolerances, view_share: float
+) -> Image:
+    """Steps (H, W) in units of noise that a share of the views shows at places (H, W, 3)."""
+    jumps = np.full((len(scene.maps), *places.shape[:2]), np.nan, np.float32)
+    nothing_near = np.zeros(places.shape[:2], np.bool_)
+    for k, phase_map in enumerate(scene.maps):
+        xy, seen = _seen(places, face, phase_map, tol)
+        jumps[k] = _line_steps(scene.features[k], xy, seen, nothing_near, tol)
+    return _shared_lines(jumps, view_share)
+
+
+def _seen(
+    places: Array, face: Face, phase_map: PhaseMap, tol: OffsetTolerances
+) -> tuple[Image, Mask]:
+    """Pixels (H, W, 2) of places on a face, and whether the view can see them."""
+    view = phase_map.view
+    xy = np.asarray(view.camera.project(view.cam_from_world * places))
+    size = np.array([view.camera.width, view.camera.height])
+    with np.errstate(invalid="ignore"):
+        seen = ((xy >= 1) & (xy <= size - 1)).all(axis=-1)
+    towards = view.center_in_world - places
+    cosine = (towards @ face.normal) / np.maximum(np.linalg.norm(towards, axis=-1), 1e-300)
+    return xy.astype(np.float32), np.asarray(seen & (cosine > tol.min_cosine))
+
+
+def _line_steps(
+    images: Image, xy: Image, shown: Mask, near_points: Mask, tol: OffsetTolerances
+) -> Image:
+    """Steps (H, W) of one view's images, NaN where it does not count."""
+    values = sample_image(images, xy)
+    plain = shown & ((values[..., 3] == 1) | ~near_points)
+    return np.where(plain, _steps(values[..., :3], plain, tol), np.nan).astype(np.float32)
+
+
+def _shared_lines(jumps: Image, view_share: float) -> Image:
+    """Steps (H, W) that a share of the views (K, H, W) exceeds."""
+    count = np.isfinite(jumps).sum(axis=0)
+    ordered = -np.sort(-np.nan_to_num(jumps, nan=-1.0), axis=0)
+    rank = np.floor(view_share * np.maximum(count - 1, 0)).astype(np.int64)
+    jump = np.take_along_axis(ordered, rank[None], axis=0)[0]
+    return np.asarray(np.maximum(jump, 0), np.float32)
+
+
+def median_loss(losses: Image) -> Image:
+    """Median (H, W) over the first axis without NaN; 1 where all are."""
+    count = np.isfinite(losses).sum(axis=0)
+    ordered = np.sort(np.where(np.isfinite(losses), losses, 2.0), axis=0)
+    middle = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0)[None], axis=0)[0]
+    return np.where(count > 0, middle, 1.0).astype(np.float32)
+
+
+def _steps(values: Image, shown: Mask, tol: OffsetTolerances) -> Image:
+    """Steps (H, W) of images (H, W, C) over the cells, each in units of its own noise."""
+    total = np.zeros(shown.shape, np.float32)
+    well = ndimage.binary_erosion(shown, border_value=0)
+    if not well.any():
+        return total
+    for channel in np.moveaxis(values, -1, 0):
+        step = np.hypot(*np.gradient(channel))
+        scale = max(1.4826 * float(np.median(step[well])), tol.min_scale)
+        total = np.maximum(total, np.where(well, step / scale, 0)).astype(np.float32)
+    return total
+
+
+def _surface_cost(
+    grid: FaceGrid,
+    top: Array,
+    scene: FaceScene,
+    first_hit: FirstHit | None,
+    tol: OffsetTolerances,
+) -> Image:
+    """Median loss (H, W) of the phases on the given surface above the cells; 1 without one."""
+    cost = np.ones(grid.shape, np.float32)
+    if first_hit is None:
+        return cost
+    rows, cols = np.indices(grid.shape)
+    far = float(max(grid.shape) * grid.step)
+    start = grid.origin + grid.step * (rows[..., None] * grid.first + cols[..., None] * grid.second)
+    start = start + (top[..., None] + far) * grid.axis
+    distance, normals = first_hit(start.reshape(-1, 3), -grid.axis)
+    hit = np.isfinite(distance)
+    points = start.reshape(-1, 3)[hit] - np.asarray(distance, np.float64)[hit, None] * grid.axis
+    losses = row_losses(scene.rows(points), np.asarray(normals)[hit].T, tol)[0]
+    flat = cost.reshape(-1)
+    flat[hit] = median_loss(losses[:, None])[0]
+    return cost
+
+
+def _hidden(
+    number: int,
+    group: Sequence[Face],
+    places: Array,
+    grid: FaceGrid,
+    labels: NDArray[np.int64],
+    maps: Sequence[PhaseMap],
+) -> list[Mask]:
+    """Per view, the cells (H, W) of a face that others of the group hide, as they are labelled."""
+    hidden = []
+    size = np.array(grid.shape)
+    for phase_map in maps:
+        covered = np.zeros(grid.shape, np.bool_)
+        center = phase_map.view.center_in_world
+        away = places - center
+        for other, face in enumerate(group):
+            if other == number or not (labels == other).any():
+                continue
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = -face.height(center) / (away @ face.normal)
+            between = (share > 0) & (share < 1)
+            meeting = center + np.where(between, share, 0.0)[..., None] * away
+            cell = np.rint(grid.cells(meeting)).astype(np.int64)
+            on_grid = between & ((cell >= 0) & (cell < size)).all(axis=-1)
+            cell = np.clip(cell, 0, size - 1)
+            covered |= on_grid & (labels[cell[..., 0], cell[..., 1]] == other)
+        hidden.append(covered)
+    return hidden
+
+
+def _claim(
+    number: int,
+    group: Sequence[Face],
+    seeds: Seeds,
+    grid: FaceGrid,
+    evidence: FaceEvidence,
+    possible: Mask,
+    tol: OffsetTolerances,
+) -> Array:
+    """Chance (H, W) that a walk from a cell, hampered by lines, ends on this face's points."""
+    own, others = (np.full(grid.shape, np.inf) for _ in range(2))
+    for other, face in enumerate(group):
+        near = _distance_to(grid.cells(seeds.points_in_world[face.members]), grid.shape)
+        if other == number:
+            own = near
+        else:
+            others = np.minimum(others, near)
+    starts = (own < tol.seed_cells) & (own < others) & possible
+    ends = (others < tol.seed_cells) & (others < own) & possible
+    if not starts.any():
+        return np.zeros(grid.shape)
+    adjacency, degree = _walk(evidence.jump.astype(np.float64), tol)
+    # A walk may end on any point it passes, so that a single false one does not decide.
+    ending = tol.seed_weight * (starts | ends).ravel()
+    leak = tol.leak * np.clip(evidence.cost.astype(np.float64).ravel() / tol.max_cost - 1, 0, 1)
+    free = np.flatnonzero(possible)
+    right = tol.seed_weight * starts.ravel()[free].astype(np.float64)
+    claim = np.zeros(starts.size)
+    claim[free] = _solved(adjacency[free][:, free], (degree + leak + ending + 1e-9)[free], right)
+    return np.asarray(claim.reshape(grid.shape))
+
+
+def _walk(jump: Array, tol: OffsetTolerances) -> tuple[sparse.csr_array, Array]:
+    """Chances of a step between neighbouring cells ``(H W, H W)``, small across lines; and sums."""
+    cells = np.arange(jump.size).reshape(jump.shape)
+    weight = 1 / (1 + (jump.ravel() / tol.line_steps) ** 2) ** tol.line_power
+    tails = np.concatenate([cells[:, :-1].ravel(), cells[:-1].ravel()])
+    heads = np.concatenate([cells[:, 1:].ravel(), cells[1:].ravel()])
+    between = np.minimum(weight[tails], weight[heads])
+    pairs = (np.concatenate([tails, heads]), np.concatenate([heads, tails]))
+    both = np.concatenate([between, between])
+    adjacency = sparse.coo_array((both, pairs), shape=(jump.size, jump.size)).tocsr()
+    return adjacency, np.asarray(adjacency.sum(axis=1)).ravel()
+
+
+def _solved(adjacency: sparse.csr_array, degree: Array, right: Array) -> Array:
+    """Solution of ``(diag(degree) - adjacency) x = right``."""
+    factors = splu(
+        sparse.csc_array(sparse.diags_array(degree) - adjacency),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    return np.asarray(factors.solve(right))
+
+
+def _distance_to(cells: Array, shape: tuple[int, int]) -> Array:
+    """Distance (H, W) in cells to the nearest of some points, fractional cells ``(M, 2)``."""
+    mask = np.ones(shape, np.bool_)
+    place = np.rint(cells).astype(np.int64)
+    place = place[((place >= 0) & (place < shape)).all(axis=1)]
+    mask[tuple(place.T)] = False
+    if mask.all():
+        return np.full(shape, np.inf)
+    return np.asarray(ndimage.distance_transform_edt(mask), np.float64)
+
+
+def _without_small(
+    labels: NDArray[np.int64], num_faces: int, tol: OffsetTolerances
+) -> NDArray[np.int64]:
+    """Labels without pieces smaller than a disc of ``min_radius_cells``; these go to none."""
+    least = np.pi * tol.min_radius_cells**2
+    kept = labels.copy()
+    for number in range(num_faces):
+        pieces, num = ndimage.label(labels == number)
+        if num:
+            small = np.bincount(pieces.ravel()) < least
+            small[0] = False
+            kept[small[pieces]] = NO_FACE
+    return kept

@@ -1,0 +1,225 @@
+"""Silhouettes of the polarised objects with doubt: on, off or unknown, for each pixel of each view.
+
+The polarised region of a view is on the objects. Where they are dark, frontal or show mixed light
+they are hardly polarised, and the region ends too early: pixels that continue it and look like it
+rather than like the surroundings (a cut of the graph of pixels by intensity) are unknown. Views
+check one another: what a view alone claims, or alone denies, is unknown as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from polmvs.camera import sample_image
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.surface.surface_view import Silhouette, signed_distance_px
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SilhouetteTolerances:
+    """Numbers of the search for silhouettes; lengths are for a focal length of 445 px.
+
+    Attributes
+    ----------
+    min_speck_px : least area of a piece of the region. Guess.
+    min_hole_px : least area of a hole in it, smaller ones are marks. Guess.
+    closing_px : width of gaps that are closed. Guess.
+    near_px : reach of the continuation in pixels that resemble the region a little. Guess.
+    far_px : reach in pixels that resemble it much. Guess; the inside of a mug is 60 px across.
+    object_quantile : share of the region's pixels whose intensity stands for it. Guess.
+    cut_rounds : of the graph cut; a fourth changes under 0.5 % of the pixels (mug).
+    edge_reach_px : of the search for a step of intensity about an outline. The region's Stokes
+        images are smoothed over 2 px, so that strong polarisation leaks by about as much.
+    edge_prior_px : deviation of that step from the region's border. Guess.
+    edge_contrast : least step, as a share of the brighter side. Guess.
+    edge_smoothing_px : of the shifts along the outline. Guess.
+    max_unknown_share : of the image; beyond it the cut has run into the surroundings. Guess.
+    """
+
+    min_speck_px: int = 30
+    min_hole_px: int = 60
+    closing_px: int = 5
+    near_px: int = 10
+    far_px: int = 40
+    object_quantile: float = 0.85
+    cut_rounds: int = 3
+    max_unknown_share: float = 0.5
+    edge_reach_px: float = 4.0
+    edge_prior_px: float = 2.5
+    edge_contrast: float = 0.15
+    edge_smoothing_px: float = 1.5
+
+
+REFERENCE_FOCAL_PX = 445.0
+
+
+def find_silhouettes(
+    maps: Sequence[PhaseMap],
+    *,
+    masks_given: bool,
+    tolerances: SilhouetteTolerances | None = None,
+) -> list[Silhouette]:
+    """Silhouette of each view from its region and intensity.
+
+    Parameters
+    ----------
+    maps : phase maps of the views.
+    masks_given : the regions are the user's masks; they are certain.
+    """
+    tol = tolerances or SilhouetteTolerances()
+    return [_silhouette(phase_map, masks_given, tol) for phase_map in maps]
+
+
+def _silhouette(phase_map: PhaseMap, mask_given: bool, tol: SilhouetteTolerances) -> Silhouette:
+    inside = np.asarray(phase_map.region.inside, np.bool_)
+    if mask_given or not inside.any():
+        return Silhouette(inside, inside)
+    scale = phase_map.view.camera.mean_focal_px / REFERENCE_FOCAL_PX
+    certain = _cleaned(inside, scale, tol)
+    if not certain.any():
+        return Silhouette(certain, certain)
+    intensity = np.asarray(phase_map.intensity, np.float32)
+    possible = _continued(certain, intensity, scale, tol)
+    inner = _outline_shift(certain, intensity, scale, tol)
+    sharp = bool((possible == certain).all())
+    outer = inner if sharp else _outline_shift(possible, intensity, scale, tol)
+    return Silhouette(certain, possible, inner, outer)
+
+
+def _cleaned(mask: Mask, scale: float, tol: SilhouetteTolerances) -> Mask:
+    """The mask without specks, gaps and pinholes."""
+    area = scale * scale
+    pixels = _without_small(mask, tol.min_speck_px * area, connectivity=8).astype(np.uint8)
+    size = 2 * round(0.5 * (tol.closing_px - 1) * scale) + 1
+    holes = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)) == 0
+    return ~_without_small(holes, tol.min_hole_px * area, connectivity=4)
+
+
+def _without_small(mask: Mask, min_area: float, *, connectivity: int) -> Mask:
+    num, labels, stats, _ = cv2.connectedComponentsWithStats(
+        mask.astype(np.uint8), connectivity=connectivity
+    )
+    kept = stats[:, cv2.CC_STAT_AREA] >= min_area
+    kept[0] = False
+    return np.asarray(kept[labels]) if num > 1 else np.zeros(mask.shape, np.bool_)
+
+
+def _ellipse(radius: int) -> NDArray[np.uint8]:
+    size = (2 * radius + 1, 2 * radius + 1)
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size), np.uint8)
+
+
+def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTolerances) -> Mask:
+    """The mask and the pixels that continue it, by a graph cut on intensity (GrabCut)."""
+    white = max(float(np.percentile(intensity, 95)), 1e-9)
+    bright = np.sqrt(np.clip(intensity / white, 0, 1)).astype(np.float32)
+    smooth = cv2.GaussianBlur(bright, (0, 0), 1.5)
+    darkest = cv2.erode(bright, np.ones((5, 5), np.uint8))
+    features = (255 * np.dstack([bright, smooth, darkest])).astype(np.uint8)
+
+    pixels = certain.astype(np.uint8)
+    like = np.quantile(bright[certain], tol.object_quantile)
+    near = cv2.dilate(pixels, _ellipse(round(tol.near_px * scale))) > 0
+    far = cv2.dilate(pixels, _ellipse(round(tol.far_px * scale))) > 0
+    searched = near | (far & (smooth < like))
+    labels = np.full(certain.shape, cv2.GC_BGD, np.uint8)
+    labels[searched] = cv2.GC_PR_BGD
+    labels[searched & (bright < like)] = cv2.GC_PR_FGD
+    labels[certain] = cv2.GC_PR_FGD
+    labels[cv2.erode(pixels, np.ones((5, 5), np.uint8)) > 0] = cv2.GC_FGD
+    rows, cols = np.flatnonzero(searched.any(axis=1)), np.flatnonzero(searched.any(axis=0))
+    margin = round(20 * scale)
+    box = (
+        slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
+        slice(max(cols[0] - margin, 0), cols[-1] + margin + 1),
+    )
+    cut = np.ascontiguousarray(labels[box])
+    objects = np.isin(cut, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    if objects.all() or not objects.any():
+        return certain
+    cv2.setRNGSeed(0)
+    cv2.grabCut(
+        np.ascontiguousarray(features[box]),
+        cut,
+        (0, 0, 1, 1),  # not used: the labels are the start
+        np.zeros((1, 65)),
+        np.zeros((1, 65)),
+        tol.cut_rounds,
+        cv2.GC_INIT_WITH_MASK,
+    )
+    found = np.zeros(certain.shape, np.uint8)
+    found[box] = np.isin(cut, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    opened = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    pieces = cv2.connectedComponents((opened | certain).astype(np.uint8))[1]
+    held = np.unique(pieces[certain])
+    found_mask = np.isin(pieces, held[held > 0])
+    found_mask = ~_without_small(~found_mask, tol.min_hole_px * scale**2, connectivity=4)
+    if (found_mask & ~certain).sum() > tol.max_unknown_share * certain.size:
+        return certain
+    return np.asarray(found_mask)
+
+
+def _outline_shift(
+    mask: Mask, intensity: Image, scale: float, tol: SilhouetteTolerances
+) -> Image | None:
+    """By how much the step of intensity at a mask's border lies outside of it.
+
+    Returns
+    -------
+    (H, W) px, at each pixel that of the nearest place of the border; None without a border.
+    """
+    border = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    rows, cols = np.nonzero(border)
+    if len(rows) < 10:
+        return None
+    distance = signed_distance_px(mask)
+    smooth_distance = cv2.GaussianBlur(distance, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
+    slopes = [cv2.Sobel(smooth_distance, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)]
+    outwards = np.stack(slopes, axis=-1)[rows, cols]
+    outwards = outwards / np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-6)
+    step = 0.25
+    reach = tol.edge_reach_px * max(scale, 1.0)
+    along = np.arange(-reach - 1, reach + 1 + step, step)
+    # The border runs half a pixel outside of its pixels' centres.
+    centers = np.stack([cols + 0.5, rows + 0.5], axis=1)
+    places = centers[:, None] + outwards[:, None] * (
+        along[:, None] - distance[rows, cols][:, None, None]
+    )
+    profile = sample_image(intensity, places)
+    slope = np.abs(ndimage.gaussian_filter1d(profile, 2.0, axis=1, order=1)) / step
+    contrast = slope * 2 * step * 2.5 / np.maximum(profile.max(axis=1, keepdims=True), 1e-6)
+    score = contrast * np.exp(-0.5 * (along / (tol.edge_prior_px * max(scale, 1.0))) ** 2)
+    score[:, np.abs(along) > reach] = 0
+    best = score.argmax(axis=1)
+    index = np.arange(len(best))
+    found = along[best] + step * _vertex_of_parabola(
+        score[index, best - 1],
+        score[index, best],
+        score[index, np.minimum(best + 1, len(along) - 1)],
+    )
+    weight = np.clip(contrast[index, best] / tol.edge_contrast - 1, 0, 1)
+    shifts, weights = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
+    shifts[rows, cols], weights[rows, cols] = weight * found, weight
+    width = tol.edge_smoothing_px * max(scale, 1.0)
+    total = np.asarray(cv2.GaussianBlur(shifts, (0, 0), width), np.float32)
+    share = np.asarray(cv2.GaussianBlur(weights, (0, 0), width), np.float32)
+    mean = np.where(share > 1e-4, total / np.maximum(share, 1e-4), 0).astype(np.float32)
+    nearest = ndimage.distance_transform_edt(~border, return_distances=False, return_indices=True)
+    return np.asarray(mean[nearest[0], nearest[1]])
+
+
+def _vertex_of_parabola(before: Array, at: Array, after: Array) -> Array:
+    """Place of the maximum of a parabola through three values, in steps from the middle one."""
+    bend = before - 2 * at + after
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(bend < 0, np.clip(0.5 * (before - after) / bend, -0.5, 0.5), 0.0)

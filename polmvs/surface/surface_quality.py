@@ -1,0 +1,331 @@
+"""What is known of a surface and what is not: evidence for its faces, normals at fixed places.
+
+A part of the mesh that fewer than two views see, that their silhouettes deny, or that most of
+their phases contradict is no result: only smoothness, or the limits of the hull, put it there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from polmvs.camera import sample_image
+from polmvs.config import AngleModel
+from polmvs.normals.estimator import solve_normals
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
+from polmvs.surface.refinement import RefinementTolerances, face_rows
+from polmvs.surface.surface_view import SurfaceView, phase_rows
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+CHUNK = 20_000  # vertices whose normals are solved at a time; bounds memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class QualityTolerances:
+    """When a part of a surface counts as a result.
+
+    Attributes
+    ----------
+    min_cosine : between normal and viewing direction, for a view to see a face.
+    outside_px : by which a face must lie beyond a silhouette to be denied by it. Guess: twice the
+        deviation of an outline with its bias.
+    max_outside_share : of the views that see a face, to deny it. Guess: two of six.
+    row_sigmas, row_sine : a phase contradicts a normal from this many deviations and this sine on.
+        Guess: 5, and 12 deg, beyond what mixed light and facets explain.
+    max_contradicting_share : of the phases at a face. Guess.
+    smoothing_rounds : of the shares over neighbouring faces: single faces are noisy. Guess.
+    trusted_deg : by which the normal that the phases give at a place may differ from the mesh's,
+        beside three deviations. Guess.
+    """
+
+    min_cosine: float = 0.1
+    outside_px: float = 1.5
+    max_outside_share: float = 0.34
+    row_sigmas: float = 5.0
+    row_sine: float = 0.2
+    max_contradicting_share: float = 0.6
+    smoothing_rounds: int = 2
+    trusted_deg: float = 10.0
+
+
+@dataclass(frozen=True)
+class FaceEvidence:
+    """What the views say of each face of a mesh.
+
+    Attributes
+    ----------
+    num_views : (F,) int, views that see it.
+    num_outside : (F,) int, those whose silhouettes it lies outside of.
+    num_rows : (F,) int, those with a phase there.
+    num_contradicting : (F,) int, those whose phase contradicts its normal.
+    """
+
+    num_views: NDArray[np.int64]
+    num_outside: NDArray[np.int64]
+    num_rows: NDArray[np.int64]
+    num_contradicting: NDArray[np.int64]
+
+    @property
+    def agreement(self) -> Array:
+        """Share ``(F,)`` of the phases that agree with the normal; 0 without any."""
+        agreeing = self.num_rows - self.num_contradicting
+        return np.asarray(agreeing / np.maximum(self.num_rows, 1), np.float64)
+
+
+def face_evidence(
+    mesh: TriangleMesh,
+    views: Sequence[SurfaceView],
+    angle_model: AngleModel,
+    *,
+    row_sigma: float,
+    tolerances: QualityTolerances | None = None,
+) -> FaceEvidence:
+    """Ask all views about all faces.
+
+    Parameters
+    ----------
+    mesh : refined.
+    views : what each view says.
+    angle_model : of the rows.
+    row_sigma : deviation of ``m . n`` that noise does not explain.
+    """
+    tol = tolerances or QualityTolerances()
+    counts = np.zeros((4, len(mesh.faces)), np.int64)
+    if not len(mesh.faces):
+        return FaceEvidence(*counts)
+    scene = RayScene(mesh)
+    rows_tolerances = RefinementTolerances(min_cosine=tol.min_cosine)
+    for view in views:
+        seen, _, _ = visible_points(
+            scene,
+            view.center,
+            mesh.centers,
+            mesh.face_normals,
+            tolerance=rows_tolerances.visible_slack * mesh.mean_edge,
+            min_cosine=tol.min_cosine,
+        )
+        xy, _ = view.project(mesh.centers[seen])
+        inside = view.in_image(xy, 2.0)
+        seen, xy = seen[inside], xy[inside]
+        counts[0, seen] += 1
+        if view.has_outline:
+            beyond = sample_image(view.silhouette.outer[..., 0], xy) > tol.outside_px
+            counts[1, seen[beyond]] += 1
+        rows = face_rows(mesh, scene, view, angle_model, row_sigma, rows_tolerances)
+        residual = np.abs(rows.residual)
+        wrong = residual > np.maximum(tol.row_sigmas * np.sqrt(rows.variance), tol.row_sine)
+        counts[2, rows.face] += 1
+        counts[3, rows.face[wrong]] += 1
+    return FaceEvidence(*counts)
+
+
+def supported_faces(
+    mesh: TriangleMesh,
+    evidence: FaceEvidence,
+    *,
+    min_views: int = 2,
+    tolerances: QualityTolerances | None = None,
+) -> Mask:
+    """Which faces ``(F,)`` the views bear out.
+
+    Parameters
+    ----------
+    mesh : that the evidence is of.
+    evidence : of its faces.
+    min_views : that must see a face, and have a phase there.
+    """
+    tol = tolerances or QualityTolerances()
+    if not len(mesh.faces):
+        return np.zeros(0, np.bool_)
+    counts = np.stack(
+        [evidence.num_views, evidence.num_outside, evidence.num_rows, evidence.num_contradicting]
+    )
+    smooth = _smoothed(mesh, counts.astype(np.float64).T, tol.smoothing_rounds).T
+    views, outside, rows, contradicting = smooth
+    denied = outside > np.maximum(tol.max_outside_share * views, 1.5)
+    contradicted = contradicting > tol.max_contradicting_share * rows
+    return np.asarray(
+        (evidence.num_views >= min_views) & (rows >= min_views - 0.5) & ~denied & ~contradicted
+    )
+
+
+def _smoothed(mesh: TriangleMesh, values: Array, rounds: int) -> Array:
+    """Means ``(F, C)`` of values ``(F, C)`` over faces that share a vertex, in rounds."""
+    num_faces, num = len(mesh.faces), len(mesh.vertices)
+    ones = np.ones(3 * num_faces)
+    indices = (mesh.faces.ravel(), np.repeat(np.arange(num_faces), 3))
+    incidence = sparse.coo_array((ones, indices), shape=(num, num_faces)).tocsr()
+    degree = np.maximum(np.asarray(incidence.sum(axis=1)).ravel(), 1)[:, None]
+    for _ in range(rounds):
+        values = np.asarray(incidence.T @ ((incidence @ values) / degree)) / 3
+    return values
+
+
+@dataclass(frozen=True)
+class VertexNormals:
+    """Normals of a mesh's vertices at their places.
+
+    Attributes
+    ----------
+    normals : (V, 3) unit, world: the phases' where they agree with the mesh, else the mesh's.
+    sigma_deg : (V,) standard deviation, degrees; inf where the phases give none.
+    num_views : (V,) int, views whose phases count.
+    """
+
+    normals: Array
+    sigma_deg: Array
+    num_views: NDArray[np.int64]
+
+
+def fit_normals(
+    mesh: TriangleMesh,
+    views: Sequence[SurfaceView],
+    angle_model: AngleModel,
+    *,
+    row_sigma: float,
+    row_error: float,
+    tolerances: QualityTolerances | None = None,
+) -> VertexNormals:
+    """Normals from the phases of all views at the places of the mesh, which stay.
+
+    A mesh's own normals are noisier: they are differences of places.
+
+    Parameters
+    ----------
+    mesh, views, angle_model, row_sigma : as in :func:`face_evidence`.
+    row_error : deviation of ``m . n`` that the surface shows. Views share some of it, so that it
+        does not average out: half of it is added to the normals' deviations. Guess.
+    """
+    tol = tolerances or QualityTolerances()
+    num = len(mesh.vertices)
+    normals, sigma = mesh.vertex_normals.copy(), np.full(num, np.inf)
+    counted = np.zeros(num, np.int64)
+    scene = RayScene(mesh) if num else None
+    for start in range(0, num, CHUNK):
+        part = slice(start, min(start + CHUNK, num))
+        points, own = mesh.vertices[part], mesh.vertex_normals[part]
+        shape = (len(views), len(points))
+        rows = np.full((3, *shape), np.nan, np.float32)
+        rays = np.zeros((3, *shape), np.float32)
+        turns = np.full(shape, np.inf, np.float32)
+        for index, view in enumerate(views):
+            assert scene is not None  # there are vertices
+            seen, directions, _ = visible_points(
+                scene,
+                view.center,
+                points,
+                own,
+                tolerance=0.5 * mesh.mean_edge,
+                min_cosine=tol.min_cosine,
+            )
+            found = phase_rows(view, angle_model, points[seen])
+            known = found.precision > 0
+            rows[:, index, seen[known]] = found.rows[known].T
+            rays[:, index, seen] = directions.T
+            turns[index, seen[known]] = found.turn[known] / np.sqrt(found.precision[known])
+        estimate = solve_normals(rows, rays, turns, initial_normals=own.T)
+        cosine = np.clip((estimate.normals * own).sum(axis=1), -1, 1)
+        apart = np.degrees(np.arccos(cosine))
+        good = estimate.valid & (apart < tol.trusted_deg + 3 * estimate.sigma_deg)
+        good &= estimate.residual < 3 * row_sigma
+        normals[part][good] = estimate.normals[good]
+        shared = np.degrees(0.5 * row_error)
+        sigma[part] = np.where(good, np.hypot(estimate.sigma_deg, shared), np.inf)
+        counted[part] = estimate.num_rows
+    return VertexNormals(normals, sigma, counted)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contradictions:
+    """How far a surface and the data that it was made from disagree.
+
+    Attributes
+    ----------
+    phase_sine : median of the absolute residuals of the phases.
+    contradicted_share : of the area that two views see, where most phases contradict the normal.
+    denied_share : of that area, which silhouettes deny.
+    uncovered_share : mean over the views of the share of the silhouette that the surface leaves
+        uncovered.
+    """
+
+    phase_sine: float
+    contradicted_share: float
+    denied_share: float
+    uncovered_share: float
+
+    def warnings(self) -> list[str]:
+        """Sentences for what a user should know; none if the surface fits its data."""
+        found = []
+        if self.contradicted_share > 0.1:
+            found.append(
+                f"on {self.contradicted_share:.0%} of the surface most phases contradict it; "
+                "these parts are left out"
+            )
+        if self.denied_share > 0.1:
+            found.append(
+                f"{self.denied_share:.0%} of the surface lies outside of the silhouettes of views "
+                "that see it; these parts are left out"
+            )
+        if self.uncovered_share > 0.1:
+            found.append(
+                f"{self.uncovered_share:.0%} of the polarised regions are not covered by the "
+                "surface: views contradict each other, or a part is missing"
+            )
+        return found
+
+
+def find_contradictions(
+    mesh: TriangleMesh,
+    evidence: FaceEvidence,
+    supported: Mask,
+    views: Sequence[SurfaceView],
+    phase_sine: float,
+    *,
+    tolerances: QualityTolerances | None = None,
+    stride_px: int = 4,
+) -> Contradictions:
+    """Hold a surface against the views.
+
+    Parameters
+    ----------
+    mesh, evidence : the surface.
+    supported : (F,) faces that are kept.
+    views : what each view says.
+    phase_sine : median of the absolute residuals of the phases.
+    stride_px : distance of the pixels that are asked, px.
+    """
+    tol = tolerances or QualityTolerances()
+    area = mesh.face_areas * (evidence.num_views >= 2)
+    total = max(float(area.sum()), 1e-300)
+    contradicted = evidence.num_contradicting > tol.max_contradicting_share * np.maximum(
+        evidence.num_rows, 1
+    )
+    denied = evidence.num_outside > np.maximum(tol.max_outside_share * evidence.num_views, 1.5)
+    uncovered = [_uncovered_share(mesh.only(supported), view, stride_px) for view in views]
+    known = [share for share in uncovered if np.isfinite(share)]
+    return Contradictions(
+        phase_sine=phase_sine,
+        contradicted_share=float(area[contradicted].sum()) / total,
+        denied_share=float(area[denied].sum()) / total,
+        uncovered_share=float(np.mean(known)) if known else 0.0,
+    )
+
+
+def _uncovered_share(mesh: TriangleMesh, view: SurfaceView, stride_px: int) -> float:
+    """Share of the certain silhouette where no surface is; NaN without one."""
+    half = stride_px // 2
+    rows, cols = np.nonzero(view.silhouette.certain[half::stride_px, half::stride_px])
+    if not len(rows):
+        return float("nan")
+    if not len(mesh.faces):
+        return 1.0
+    xy = np.stack([cols, rows], axis=1) * stride_px + half + 0.5
+    hits = RayScene(mesh).cast(view.center, view.view.rays_in_world(xy))
+    return float(np.mean(hits.face < 0))

@@ -1,0 +1,214 @@
+"""What one view says about points and surfaces in space: its record for the global surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import sample_image
+from polmvs.config import AngleModel
+from polmvs.polarization.angle_models import rows_from_axial, tilt_turn
+from polmvs.polarization.phase_map import PhaseMap, view_rays
+from polmvs.scene import View
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+FIELD_SMOOTHING_PX = 0.8  # of the distance to a silhouette; takes the steps of its pixels out
+FAR_PX = 1000.0  # distance to a silhouette that the view does not have
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """Outline of the polarised objects in one view, with doubt.
+
+    Attributes
+    ----------
+    certain : (H, W) bool, on an object.
+    possible : (H, W) bool, on an object or unknown; holds ``certain``.
+    inner_shift, outer_shift : (H, W) float32, px, by how much the outlines of the two lie farther
+        outside than the borders of their pixels; None: not at all.
+    """
+
+    certain: Mask
+    possible: Mask
+    inner_shift: Image | None = None
+    outer_shift: Image | None = None
+
+    @cached_property
+    def inner(self) -> Image:
+        """(H, W, 3): signed distance to ``certain`` in px, negative inside, and its gradient."""
+        return _distance_field(self.certain, self.inner_shift)
+
+    @cached_property
+    def outer(self) -> Image:
+        """(H, W, 3): as ``inner``, of ``possible``."""
+        return self.inner if self.is_sharp else _distance_field(self.possible, self.outer_shift)
+
+    @cached_property
+    def is_sharp(self) -> bool:
+        """Whether no pixel is unknown."""
+        return bool((self.certain == self.possible).all())
+
+
+def signed_distance_px(mask: Mask) -> Image:
+    """Distance (H, W) to the border of a mask, px, negative inside."""
+    pixels = mask.astype(np.uint8)
+    if not mask.any():
+        return np.full(mask.shape, FAR_PX, np.float32)
+    if mask.all():
+        return np.full(mask.shape, -FAR_PX, np.float32)
+    outside = cv2.distanceTransform(1 - pixels, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    inside = cv2.distanceTransform(pixels, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # The border runs half a pixel from the centres beside it.
+    return np.where(mask, 0.5 - inside, outside - 0.5).astype(np.float32)
+
+
+def _distance_field(mask: Mask, shift: Image | None) -> Image:
+    distance = cv2.GaussianBlur(
+        signed_distance_px(mask), (0, 0), FIELD_SMOOTHING_PX, borderType=cv2.BORDER_REPLICATE
+    )
+    if shift is not None:
+        distance = np.asarray(distance - shift, np.float32)
+    dx = cv2.Sobel(distance, cv2.CV_32F, 1, 0, scale=1 / 8)
+    dy = cv2.Sobel(distance, cv2.CV_32F, 0, 1, scale=1 / 8)
+    return np.dstack([distance, dx, dy]).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class SurfaceView:
+    """One posed view for the global surface.
+
+    Attributes
+    ----------
+    view : name, camera and pose.
+    samples : (H, W, 3) float32, ``dolp cos 2 phase``, ``dolp sin 2 phase`` and the inverse
+        variance of the phase (1 / rad^2; 0: no phase here), of a phase map.
+    intensity : (H, W) float32, s0.
+    silhouette : of the objects.
+    has_outline : whether the silhouette may carve and pull: some pixels on it and some off it.
+    """
+
+    view: View
+    samples: Image
+    intensity: Image
+    silhouette: Silhouette
+    has_outline: bool = True
+
+    @property
+    def width(self) -> int:
+        """Image width, px."""
+        return self.view.camera.width
+
+    @property
+    def height(self) -> int:
+        """Image height, px."""
+        return self.view.camera.height
+
+    @cached_property
+    def center(self) -> Array:
+        """Camera centre ``(3,)`` in the world."""
+        return self.view.center_in_world
+
+    def to_camera(self, points: Floats) -> Array:
+        """World points ``(N, 3)`` in the camera frame."""
+        return np.asarray(self.view.cam_from_world * np.asarray(points, np.float64))
+
+    def project(self, points: Floats) -> tuple[Array, Array]:
+        """Image coordinates ``(N, 2)``, NaN behind the camera, and depths z ``(N,)``."""
+        in_cam = self.to_camera(points)
+        return np.asarray(self.view.camera.project(in_cam)), in_cam[:, 2]
+
+    def in_image(self, xy: Floats, margin_px: float = 0.0) -> Mask:
+        """Which image coordinates ``(N, 2)`` lie in the image; not those that are NaN."""
+        low, high = margin_px, np.array([self.width, self.height]) - margin_px
+        return np.asarray(((xy >= low) & (xy <= high)).all(axis=-1))
+
+    def footprint(self, points: Floats) -> Array:
+        """Length ``(N,)`` in space that a pixel covers at points, across the optical axis."""
+        return np.abs(self.to_camera(points)[:, 2]) / self.view.camera.mean_focal_px
+
+
+@dataclass(frozen=True)
+class PhaseRows:
+    """Constraint rows of one view at points.
+
+    Attributes
+    ----------
+    rows : (N, 3) unit, world; 0 where the view has no phase.
+    precision : (N,) inverse variance of the phase, 1 / rad^2; 0 where it has none.
+    turn : (N,) by how much the row turns about the ray per turn of the phase.
+    """
+
+    rows: Array
+    precision: Array
+    turn: Array
+
+
+def phase_rows(
+    view: SurfaceView, angle_model: AngleModel, points: Floats, other_light: Mask | None = None
+) -> PhaseRows:
+    """Rows ``m`` with ``m . n = 0`` of one view at points of space.
+
+    Parameters
+    ----------
+    view : with its phase.
+    angle_model : OPA, or PPA; the samples of a tilted map are those of PPA.
+    points : (N, 3), world.
+    other_light : (N,) bool, points whose light is of the other kind than the phase map presumes
+        (diffuse instead of specular or the reverse): their phase is turned by pi/2.
+    """
+    in_cam = view.to_camera(points)
+    xy = view.view.camera.project(in_cam)
+    rays = in_cam / np.maximum(np.linalg.norm(in_cam, axis=1, keepdims=True), 1e-300)
+    cos2, sin2, precision = (
+        np.asarray(column, np.float64) for column in sample_image(view.samples, xy).T
+    )
+    if other_light is not None:
+        sign = np.where(other_light, -1.0, 1.0)
+        cos2, sin2 = sign * cos2, sign * sin2
+    rows = np.asarray(rows_from_axial(angle_model, cos2, sin2, rays), np.float64)
+    known = (precision > 0) & np.isfinite(rows).all(axis=1) & (rays[:, 2] > 0)
+    rows = np.where(known[:, None], rows, 0.0)
+    # d psi / d phase = (1 - (v.d)^2) / v_z, its inverse by the row's own components.
+    turn = (rows[:, 0] ** 2 + rows[:, 1] ** 2) / np.where(known, rays[:, 2], 1.0)
+    in_world = rows @ view.view.cam_from_world.rotation
+    return PhaseRows(in_world, np.where(known, precision, 0.0), turn)
+
+
+def surface_view(
+    phase_map: PhaseMap,
+    silhouette: Silhouette,
+    angle_model: AngleModel,
+    *,
+    tilt_aware: bool = True,
+) -> SurfaceView:
+    """The record of a view from its phase map and silhouette.
+
+    Parameters
+    ----------
+    phase_map : corrected for tilted polarizers where ``angle_model`` is that.
+    silhouette : of the objects in this view.
+    angle_model : whose rows the phase will give.
+    tilt_aware : as :func:`polmvs.normals.rows.gather_rows`.
+    """
+    samples = np.array(phase_map.samples, np.float32)
+    if tilt_aware and angle_model is not AngleModel.TILTED:
+        known = samples[..., 2] > 0
+        diffuse = np.asarray(phase_map.diffuse)[known]
+        cos2, sin2, precision = samples[known].T
+        turn = tilt_turn(cos2, sin2, view_rays(phase_map.view)[known], diffuse=diffuse)
+        samples[known, 2] = 1 / (1 / precision + turn**2)
+    return SurfaceView(
+        view=phase_map.view,
+        samples=samples,
+        intensity=np.asarray(phase_map.intensity, np.float32),
+        silhouette=silhouette,
+        has_outline=bool(silhouette.certain.any() and not silhouette.possible.all()),
+    )

@@ -1,0 +1,329 @@
+"""The visual hull of silhouettes, robust against single wrong views, bounded by what is around.
+
+The value of a point is, of its signed distances to the views' silhouettes (pixels times the
+length that one covers there), the k-th largest: k - 1 views may deny it wrongly. Space behind the
+plane on which the objects stand, as the sparse points of the surroundings show it, is outside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from polmvs.camera import sample_image
+from polmvs.surface.mesh_geometry import TriangleMesh, mesh_from_grid, relaxed
+from polmvs.surface.surface_view import SurfaceView
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+OUTSIDE = np.float32(1e6)
+CHUNK = 400_000  # points at a time
+
+
+@dataclass(frozen=True, kw_only=True)
+class HullTolerances:
+    """Numbers of the hull.
+
+    Attributes
+    ----------
+    step_px : of the finest grid, in footprints of a pixel. Half the first mesh's edges.
+    max_cells : of a grid: 4 bytes each for a few arrays. From the memory allowed.
+    wrong_share : of the views that may deny a point wrongly. Measured: 3 of 18 to 20 views.
+    min_seen_share : of the views that must have a point in their image. Guess.
+    min_piece_share : of the largest piece's volume; smaller ones are no objects. Guess.
+    plane_distance : of inliers to the supporting plane, as a share of the cameras' distance.
+    min_plane_share : of the sparse points of the surroundings that lie in a supporting plane.
+    """
+
+    step_px: float = 4.0
+    max_cells: int = 6_000_000
+    wrong_share: float = 0.1
+    min_seen_share: float = 0.34
+    min_piece_share: float = 0.01
+    plane_distance: float = 0.004
+    min_plane_share: float = 0.25
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Points x with ``normal . x = offset``; free space is where it is greater."""
+
+    normal: Array
+    offset: float
+
+    def height(self, points: Floats) -> Array:
+        """Signed distance ``(N,)`` of points ``(N, 3)``."""
+        return np.asarray(points @ self.normal - self.offset)
+
+
+def supporting_plane(
+    surroundings: Floats,
+    centers: Array,
+    *,
+    tolerances: HullTolerances | None = None,
+    num_trials: int = 400,
+    seed: int = 0,
+) -> Plane | None:
+    """The plane on which the objects stand, if the points around them show one.
+
+    Parameters
+    ----------
+    surroundings : (N, 3), sparse points beside the objects.
+    centers : (C, 3), of the cameras; they lie on the free side.
+    num_trials : random triples of points.
+    seed : of the random numbers.
+
+    Returns
+    -------
+    None where fewer than ``min_plane_share`` of the points lie in one plane, or cameras are on
+    both sides.
+    """
+    tol = tolerances or HullTolerances()
+    num = len(surroundings)
+    if num < 20:
+        return None
+    rng = np.random.default_rng(seed)
+    middle = np.median(surroundings, axis=0)
+    limit = tol.plane_distance * float(np.median(np.linalg.norm(centers - middle, axis=1)))
+    picks = rng.integers(0, num, (num_trials, 3))
+    a, b, c = (surroundings[picks[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    usable = length > 1e-12
+    normals, a = normals[usable] / length[usable, None], a[usable]
+    tested = surroundings[rng.permutation(num)[:2000]]
+    distances = np.abs(tested @ normals.T - (a * normals).sum(axis=1))
+    best = int((distances < limit).sum(axis=0).argmax())
+    normal, offset = normals[best], float(a[best] @ normals[best])
+    for _ in range(3):
+        inliers = surroundings[np.abs(surroundings @ normal - offset) < limit]
+        if len(inliers) < 3:
+            return None
+        center = inliers.mean(axis=0)
+        normal = np.linalg.svd(inliers - center, full_matrices=False)[2][2]
+        offset = float(center @ normal)
+    heights = centers @ normal - offset
+    if np.median(heights) < 0:
+        normal, offset, heights = -normal, -offset, -heights
+    if len(inliers) < tol.min_plane_share * num or heights.min() < 0:
+        return None
+    return Plane(normal, offset)
+
+
+@dataclass(frozen=True)
+class VisualHull:
+    """The hull as a function on a grid.
+
+    Attributes
+    ----------
+    values : (X, Y, Z) float32 on a grid, negative inside; see :func:`hull_values`.
+    origin : (3,), place of the first grid point.
+    step : distance of neighbours.
+    footprint : length that a pixel covers at the objects, world units.
+    """
+
+    values: NDArray[np.float32]
+    origin: Array
+    step: float
+    footprint: float
+
+    @cached_property
+    def mesh(self) -> TriangleMesh:
+        """Closed surface; empty where the silhouettes have nothing in common."""
+        return relaxed(mesh_from_grid(self.values, self.origin, self.step))
+
+    def carved(
+        self,
+        free: Sequence[Callable[[Array], Floats]],
+        tolerances: HullTolerances | None = None,
+    ) -> VisualHull:
+        """Without what is known to be free space.
+
+        Parameters
+        ----------
+        free : functions of points ``(N, 3)`` that give signed distances ``(N,)``, positive where
+            space is free.
+        """
+        near = self.values < 4 * self.step
+        points = self.origin + self.step * np.argwhere(near)
+        values = self.values.copy()
+        for function in free:
+            values[near] = np.maximum(values[near], function(points).astype(np.float32))
+        tol = tolerances or HullTolerances()
+        return replace(self, values=_without_specks(values, self.step, tol))
+
+
+def visual_hull(
+    views: Sequence[SurfaceView],
+    plane: Plane | None = None,
+    *,
+    num_wrong: int | None = None,
+    tolerances: HullTolerances | None = None,
+) -> VisualHull:
+    """Carve space by the views' silhouettes; unknown pixels do not carve.
+
+    Parameters
+    ----------
+    views : those without an outline are left out.
+    plane : what lies behind it is outside.
+    num_wrong : views that may deny a point wrongly; by default a share of the views.
+    """
+    tol = tolerances or HullTolerances()
+    used = [view for view in views if view.has_outline]
+    nothing = VisualHull(np.ones((2, 2, 2), np.float32), np.zeros(3), 1.0, 1.0)
+    if len(used) < 2:
+        return nothing
+    wrong = round(tol.wrong_share * len(used)) if num_wrong is None else num_wrong
+    center = _meeting_point(used)
+    distance = float(np.median([np.linalg.norm(view.center - center) for view in used]))
+    footprint = float(np.median([distance / view.view.camera.mean_focal_px for view in used]))
+    low, high = center - distance, center + distance
+    for num_cells in (32, 48, 64):
+        step = float((high - low).max() / num_cells)
+        values = _values_on_grid(used, low, high, step, wrong, plane, tol)
+        near = np.argwhere(values < 1.8 * step)  # the diagonal of a cell
+        if not len(near):
+            return nothing
+        low, high = low + (near.min(axis=0) - 1) * step, low + (near.max(axis=0) + 1) * step
+    fine = max(tol.step_px * footprint, float(np.prod(high - low) / tol.max_cells) ** (1 / 3))
+    low, high = low - 3 * fine, high + 3 * fine
+    values = _refined(used, low, high, fine, wrong, plane, tol)
+    values = _cleaned(values, fine, tol)
+    return VisualHull(values, low, fine, footprint)
+
+
+def _meeting_point(views: Sequence[SurfaceView]) -> Array:
+    """Point nearest to the rays through the middles of the silhouettes."""
+    matrix, right = np.zeros((3, 3)), np.zeros(3)
+    for view in views:
+        rows, cols = np.nonzero(view.silhouette.certain | view.silhouette.possible)
+        middle = np.array([[np.median(cols) + 0.5, np.median(rows) + 0.5]])
+        ray = view.view.camera.rays(middle)[0] @ view.view.cam_from_world.rotation
+        across = np.eye(3) - np.outer(ray, ray)
+        matrix += across
+        right += across @ view.center
+    return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
+
+
+def hull_values(
+    views: Sequence[SurfaceView],
+    points: Floats,
+    num_wrong: int,
+    plane: Plane | None,
+    tolerances: HullTolerances | None = None,
+) -> NDArray[np.float32]:
+    """Signed distance ``(N,)`` to the hull's cones at points ``(N, 3)``, negative inside."""
+    tol = tolerances or HullTolerances()
+    largest = np.full((num_wrong + 1, len(points)), -OUTSIDE, np.float32)
+    num_seen = np.zeros(len(points), np.int32)
+    for view in views:
+        xy, z = view.project(points)
+        seen = view.in_image(xy, 1.0) & (z > 0)
+        pixels = sample_image(view.silhouette.outer[..., 0], xy)
+        value = np.where(seen, pixels * (z / view.view.camera.mean_focal_px), -OUTSIDE)
+        value = value.astype(np.float32)
+        num_seen += seen
+        for rank in range(num_wrong + 1):
+            greater = np.maximum(largest[rank], value)
+            value = np.minimum(largest[rank], value)
+            largest[rank] = greater
+    # Of few views that see a point, fewer may be wrong.
+    chosen = np.minimum((tol.wrong_share * num_seen + 0.5).astype(np.int64), num_wrong)
+    values = largest[chosen, np.arange(len(points))]
+    values = np.where(num_seen < max(2, tol.min_seen_share * len(views)), OUTSIDE, values)
+    if plane is not None:
+        values = np.maximum(values, -plane.height(points)).astype(np.float32)
+    return values
+
+
+def _grid(low: Array, high: Array, step: float) -> tuple[int, ...]:
+    return tuple(int(n) for n in np.ceil((high - low) / step) + 1)
+
+
+def _values_on_grid(
+    views: Sequence[SurfaceView],
+    low: Array,
+    high: Array,
+    step: float,
+    num_wrong: int,
+    plane: Plane | None,
+    tol: HullTolerances,
+    where: Mask | None = None,
+    values: NDArray[np.float32] | None = None,
+) -> NDArray[np.float32]:
+    """Hull values on a grid, or at the points ``where`` of one with ``values`` elsewhere."""
+    shape = _grid(low, high, step)
+    if values is None:
+        values = np.zeros(shape, np.float32)
+    flat = values.reshape(-1)
+    chosen = np.arange(flat.size) if where is None else np.flatnonzero(where)
+    for start in range(0, len(chosen), CHUNK):
+        some = chosen[start : start + CHUNK]
+        points = low + step * np.stack(np.unravel_index(some, shape), axis=1)
+        flat[some] = hull_values(views, points, num_wrong, plane, tol)
+    return values
+
+
+def _refined(
+    views: Sequence[SurfaceView],
+    low: Array,
+    high: Array,
+    step: float,
+    num_wrong: int,
+    plane: Plane | None,
+    tol: HullTolerances,
+) -> NDArray[np.float32]:
+    """Values on the fine grid, computed only where the coarse one comes near to zero."""
+    ratio = 4
+    shape = _grid(low, high, step)
+    coarse_high = low + (np.array(shape) + ratio) * step
+    coarse = _values_on_grid(views, low, coarse_high, ratio * step, num_wrong, plane, tol)
+    limit = np.float32(1.8 * ratio * step)
+    coarse = np.clip(coarse, -limit, limit)
+    index = np.meshgrid(*(np.arange(n) / ratio for n in shape), indexing="ij", sparse=True)
+    grid = [np.broadcast_to(i, shape) for i in index]
+    values = ndimage.map_coordinates(coarse, grid, order=1, mode="nearest").astype(np.float32)
+    close = ndimage.grey_dilation(coarse, size=3) * ndimage.grey_erosion(coarse, size=3) <= 0
+    near = close | (np.abs(coarse) < limit)
+    fine_near = near[
+        np.ix_(
+            *(
+                np.minimum(np.rint(np.arange(n) / ratio).astype(int), near.shape[d] - 1)
+                for d, n in enumerate(shape)
+            )
+        )
+    ]
+    return _values_on_grid(
+        views, low, high, step, num_wrong, plane, tol, where=fine_near, values=values
+    )
+
+
+def _cleaned(values: NDArray[np.float32], step: float, tol: HullTolerances) -> NDArray[np.float32]:
+    """Smoothed, closed at the grid's border, without pieces too small for objects."""
+    limit = np.float32(4 * step)
+    values = np.clip(values, -limit, limit)
+    for axis in range(3):
+        border = np.moveaxis(values, axis, 0)
+        border[0], border[-1] = limit, limit
+    return _without_specks(ndimage.gaussian_filter(values, 0.7), step, tol)
+
+
+def _without_specks(
+    values: NDArray[np.float32], step: float, tol: HullTolerances
+) -> NDArray[np.float32]:
+    """Pieces too small for objects filled with outside, in place."""
+    labels, num = ndimage.label(values < 0)
+    if num > 1:
+        size = np.bincount(labels.ravel())
+        size[0] = 0
+        small = size < max(30, tol.min_piece_share * size.max())
+        small[0] = False
+        values[small[labels]] = np.float32(4 * step)
+    return values

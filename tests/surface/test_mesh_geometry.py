@@ -1,0 +1,123 @@
+import numpy as np
+import pytest
+
+from polmvs.surface.mesh_geometry import (
+    RayScene,
+    TriangleMesh,
+    mesh_from_grid,
+    relaxed,
+    remeshed,
+    sample_surface,
+    visible_points,
+)
+from analytic_objects import sphere, torus, union
+
+
+def extracted(distance, half=1.6, step=0.08) -> TriangleMesh:
+    axis = np.arange(-half, half + step, step)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    values = distance(grid).astype(np.float32)
+    return mesh_from_grid(values, np.full(3, -half), step)
+
+
+def euler_number(mesh: TriangleMesh) -> int:
+    return len(mesh.vertices) - mesh.adjacency.nnz // 2 + len(mesh.faces)
+
+
+def enclosed_volume(mesh: TriangleMesh) -> float:
+    a, b, c = np.moveaxis(mesh.corners, 1, 0)
+    return float((np.cross(a, b) * c).sum() / 6)
+
+
+def test_extraction_of_a_sphere_is_closed_outward_and_accurate():
+    mesh = extracted(sphere())
+    assert euler_number(mesh) == 2
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.05 * 0.08
+    assert ((mesh.face_normals * mesh.centers).sum(axis=1) > 0.98).all()
+    assert enclosed_volume(mesh) == pytest.approx(4 / 3 * np.pi, rel=0.01)
+    assert mesh.face_areas.sum() == pytest.approx(4 * np.pi, rel=0.01)
+
+
+def test_extraction_keeps_a_hole_and_two_pieces():
+    assert euler_number(extracted(torus())) == 0
+    pair = extracted(union(sphere(0.5, (-0.8, 0, 0)), sphere(0.5, (0.8, 0, 0))))
+    assert euler_number(pair) == 4
+    assert set(pair.face_components) == {0, 1}
+
+
+def test_extraction_of_nothing_is_empty():
+    mesh = mesh_from_grid(np.ones((4, 4, 4), np.float32), np.zeros(3), 1.0)
+    assert len(mesh.vertices) == len(mesh.faces) == 0
+    assert len(remeshed(mesh, 0.1).faces) == 0
+
+
+def test_triangles_are_even():
+    mesh = relaxed(extracted(sphere()))
+    assert mesh.face_areas.min() > 0.2 * np.median(mesh.face_areas)
+
+
+@pytest.mark.parametrize("step", [0.05, 0.12])
+def test_remeshing_keeps_shape_and_topology(step):
+    mesh = remeshed(extracted(torus()), step)
+    assert euler_number(mesh) == 0
+    assert np.abs(torus()(mesh.vertices)).max() < 0.25 * step
+    assert 0.6 * step < mesh.mean_edge < 1.2 * step
+
+
+def test_remeshing_joins_pieces_that_met_and_drops_specks():
+    first = extracted(sphere(0.6, (-0.4, 0, 0)))
+    second = extracted(sphere(0.6, (0.4, 0, 0)))
+    speck = extracted(sphere(0.09, (0, 0, 1.4)))
+    parts = [first, second, speck]
+    offsets = np.cumsum([0] + [len(m.vertices) for m in parts[:-1]])
+    crossing = TriangleMesh(
+        np.concatenate([m.vertices for m in parts]),
+        np.concatenate([m.faces + o for m, o in zip(parts, offsets, strict=True)]),
+    )
+    mesh = remeshed(crossing, 0.08)
+    assert euler_number(mesh) == 2
+    assert mesh.vertices[:, 2].max() < 1.0
+
+
+def test_distances_and_hits_far_from_the_origin():
+    far = np.array([1e4, -2e4, 500.0])
+    mesh = extracted(sphere())
+    scene = RayScene(TriangleMesh(mesh.vertices + far, mesh.faces))
+    points = far + np.array([[0.0, 0, 0.5], [0, 0, 2.0]])
+    assert scene.signed_distance(points) == pytest.approx([-0.5, 1.0], abs=0.01)
+    hits = scene.cast(far + [0, 0, 5.0], np.array([[0, 0, -1.0], [0, 0, 1.0]]))
+    assert hits.distance[0] == pytest.approx(4.0, abs=0.01)
+    assert hits.face[1] == -1
+
+
+def test_a_camera_sees_the_near_side_only():
+    mesh = extracted(union(sphere(0.5), sphere(0.5, (-1.05, 0, 0))))
+    center = np.array([4.0, 0, 0])
+    index, rays, cosine = visible_points(
+        RayScene(mesh),
+        center,
+        mesh.centers,
+        mesh.face_normals,
+        tolerance=0.02,
+        min_cosine=0.1,
+    )
+    assert (mesh.centers[index, 0] > 0).all()  # the second sphere hides behind the first
+    assert (cosine > 0.1).all()
+    assert np.linalg.norm(rays, axis=1) == pytest.approx(1)
+    near = (mesh.centers[:, 0] > -0.5) & (
+        ((center - mesh.centers) * mesh.face_normals).sum(axis=1) > 0.5
+    )
+    assert np.isin(np.flatnonzero(near), index).mean() > 0.99
+
+
+def test_samples_lie_on_the_wanted_faces_evenly():
+    mesh = extracted(sphere())
+    upper = (mesh.centers[:, 2] > 0).astype(float)
+    face, barycentric = sample_surface(mesh, upper, 20_000, np.random.default_rng(0))
+    points = mesh.points_at(face, barycentric)
+    assert abs(len(points) - 20_000) <= 1
+    assert (points[:, 2] > -0.05).all()
+    # Archimedes: heights on a sphere are uniform.
+    assert np.mean(points[:, 2] < 0.5) == pytest.approx(0.5, abs=0.02)
+    none = sample_surface(mesh, 0 * upper, 100, np.random.default_rng(0))
+    assert len(none[0]) == 0

@@ -1,0 +1,118 @@
+"""Faces and their borders on analytic plates with steps and recesses."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from polmvs.camera import PinholeCamera
+from polmvs.config import AngleModel
+from polmvs.scene import Seeds
+from polmvs.surface.offsets import find_faces, stepped_faces
+from polmvs.synthetic.captures import Group, Plane, render_view, ring_of_views
+from tests.scenes import phase_map_of
+
+CAMERA = PinholeCamera(width=320, height=256, fx=270.0, fy=270.0, cx=160.0, cy=128.0)
+PLATE, BOX = 0.14, 0.055  # half sides, m
+FOOTPRINT = 0.6 / 270
+SIGMA = 2e-4
+
+
+def unit(vector):
+    return np.asarray(vector, float) / np.linalg.norm(vector)
+
+
+def tilted(deg):
+    return np.array([np.sin(np.radians(deg)), 0.0, np.cos(np.radians(deg))])
+
+
+def walls(half, top_normal, top_point, low):
+    """Sides of a box from a (tilted) top down to height ``low``, each as one upright rectangle."""
+    # Uprights of constant height would stick out of a tilted top: strips of the height under it.
+    strips = []
+    num = 1 if abs(top_normal[0]) < 1e-9 else 24
+    edges = np.linspace(-half, half, num + 1)
+    height = top_point[2] - top_normal[0] / top_normal[2] * (edges - top_point[0])
+    for sign in (-1, 1):
+        for a, b, h in zip(edges[:-1], edges[1:], 0.5 * (height[:-1] + height[1:]), strict=True):
+            middle = [0.5 * (a + b), sign * half, 0.5 * (h + low)]
+            extent = (0.5 * (b - a), 0.5 * abs(h - low))
+            strips.append(Plane(middle, [0.0, 1.0, 0.0], extent))
+        h = height[0] if sign < 0 else height[-1]
+        extent = (half, 0.5 * abs(h - low))
+        strips.append(Plane([sign * half, 0.0, 0.5 * (h + low)], [1.0, 0.0, 0.0], extent))
+    return strips
+
+
+@dataclass(frozen=True)
+class Scene:
+    maps: list
+    seeds: Seeds
+    true_height: object  # of (N, 2)
+
+
+def step_scene(height, tilt_deg=0.0, num_views=9, noise=SIGMA, frame=False):
+    """A plate with a box on it (or a recess in it), ten and nine points on the two faces."""
+    normal = tilted(tilt_deg)
+    lift = BOX * np.tan(np.radians(tilt_deg))  # so that the lower edge of the top is at height
+    top = np.array([0.0, 0.0, height + np.sign(height) * lift])
+    side = BOX / normal[2]
+    surfaces = [Plane(top, normal, (side, BOX)), *walls(BOX, normal, top, 0.0)]
+    if height > 0:
+        surfaces.append(Plane([0, 0, 0], [0, 0, 1], (PLATE, PLATE)))
+    else:
+        wide, middle = 0.5 * (PLATE - BOX), 0.5 * (PLATE + BOX)
+        for sign in (-1, 1):
+            surfaces.append(Plane([sign * middle, 0, 0], [0, 0, 1], (wide, PLATE)))
+            surfaces.append(Plane([0, sign * middle, 0], [0, 0, 1], (BOX, wide)))
+    views = ring_of_views(num_views, CAMERA, distance=0.6, elevation_deg=50, roll_deg=10)
+    maps = [
+        phase_map_of(render_view(view, Group(surfaces), s0=0.2, background=0.6)) for view in views
+    ]
+    rng = np.random.default_rng(1)
+    grid = np.stack(np.meshgrid([-0.6, 0.0, 0.6], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
+    on_top = BOX * grid
+    ring = np.linspace(0, 2 * np.pi, 10, endpoint=False)
+    on_plate = 0.097 * np.stack([np.cos(ring), np.sin(ring)], axis=1)
+    rise = top[2] - normal[0] / normal[2] * on_top[:, 0]
+    points = np.concatenate([np.column_stack([on_top, rise]), np.pad(on_plate, ((0, 0), (0, 1)))])
+    normals = np.concatenate([np.tile(normal, (9, 1)), np.tile([0.0, 0.0, 1.0], (10, 1))])
+    points += rng.normal(0, noise, points.shape)
+    normals = unit_rows(normals + rng.normal(0, 0.003, normals.shape))
+
+    def true_height(xy):
+        inside = (np.abs(xy) < BOX).all(axis=-1)
+        return np.where(inside, top[2] - normal[0] / normal[2] * xy[..., 0], 0.0)
+
+    return Scene(maps, Seeds(points, normals, np.full(len(points), SIGMA)), true_height)
+
+
+def unit_rows(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def column_points(num=4000, seed=0):
+    """Points above and below the plate and the box, off the borders by three footprints."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (num, 3)) * [0.9 * PLATE, 0.9 * PLATE, 0.06]
+    from_wall = np.abs(np.abs(points[:, :2]).max(axis=1) - BOX)
+    return points[from_wall > 3 * FOOTPRINT]
+
+
+@pytest.mark.parametrize(
+    ("height", "tilt_deg"), [(0.03, 0.0), (0.01, 0.0), (0.03, 15.0), (-0.02, 0.0)]
+)
+def test_space_above_the_faces_of_a_step_is_free(height, tilt_deg):
+    scene = step_scene(height, tilt_deg)
+    faces = find_faces(scene.seeds)
+    assert sorted(len(face.members) for face in faces) == [9, 10]
+    (group,) = stepped_faces(faces, scene.seeds, scene.maps, AngleModel.PPA)
+    points = column_points()
+    above = points[:, 2] - scene.true_height(points[:, :2])
+    clear = np.abs(above) > 1e-3
+    free = group.values(points) > 0
+    assert np.mean(free[clear] == (above[clear] > 0)) > 0.99
+    # Near a face its distance is the value itself, to a fraction of a millimetre.
+    near = (np.abs(above) < 3e-3) & (np.abs(np.abs(points[:, :2]).max(axis=1) - BOX) > 0.015)
+    cosine = np.where(np.abs(points[near, :2]).max(axis=1) < BOX, np.cos(np.radians(tilt_deg)), 1)
+    assert np.quantile(np.abs(group.values(points[near]) - above[near] * cosine), 0.95) < 5e-4
