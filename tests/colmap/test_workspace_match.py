@@ -9,6 +9,7 @@ import pytest
 from dense_scenes import board_scene
 from test_conventions import random_rotation
 
+from polmvs.colmap.cameras import rescaled_camera
 from polmvs.colmap.dense_workspace import (
     common_views,
     image_correlation,
@@ -165,7 +166,7 @@ def test_workspace_of_the_full_mosaic(scene):
     image = scene.image("000.png")
     double = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR).astype(float)
     double *= np.tile([[1.2, 0.9], [0.8, 1.1]], (128, 160))
-    camera = view.camera.rescaled(320, 256)
+    camera = rescaled_camera(view.camera, 320, 256)
     target = undistorted_camera(camera)
     undistorted, _ = warp_image(double.clip(0, 255).astype(np.uint8), camera, target)
     assert image_correlation(undistorted.astype(np.uint8), target, image, view) > 0.9

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -202,13 +203,17 @@ def test_existing_model_is_not_replaced(files: tuple[Path, Path], tmp_path: Path
 
 
 def test_script(
-    files: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    files: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path = Path(__file__).parents[2] / "pipelines" / "known_poses.py"
     spec = importlib.util.spec_from_file_location("pipelines_known_poses", path)
     assert spec is not None
     assert spec.loader is not None
     script = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, script)  # dataclasses look their module up
     spec.loader.exec_module(script)
     arguments = [*map(str, files), str(tmp_path / "new")]
     assert script.main(arguments) == 0
