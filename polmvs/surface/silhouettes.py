@@ -131,10 +131,10 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
     like = np.quantile(bright[certain], tol.object_quantile)
     near = cv2.dilate(pixels, _ellipse(round(tol.near_px * scale))) > 0
     far = cv2.dilate(pixels, _ellipse(round(tol.far_px * scale))) > 0
-    searched = near | (far & (smooth < like))
+    searched = near | (far & (smooth <= like))
     labels = np.full(certain.shape, cv2.GC_BGD, np.uint8)
     labels[searched] = cv2.GC_PR_BGD
-    labels[searched & (bright < like)] = cv2.GC_PR_FGD
+    labels[searched & (bright <= like)] = cv2.GC_PR_FGD
     labels[certain] = cv2.GC_PR_FGD
     labels[cv2.erode(pixels, np.ones((5, 5), np.uint8)) > 0] = cv2.GC_FGD
     rows, cols = np.flatnonzero(searched.any(axis=1)), np.flatnonzero(searched.any(axis=0))
