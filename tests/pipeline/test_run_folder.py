@@ -89,8 +89,8 @@ def test_run_of_the_version_before_is_refused_by_name_and_version(tmp_path: Path
     run_folder.run_file.write_text(json.dumps(content))
     message = (
         rf"{tmp_path}: holds a run of polmvs 0\.1\.0, whose run\.json has schema version 1; this "
-        r"is polmvs .*, which reads version 2 .*Give another OUT, or `run\.overwrite` to delete "
-        r"that run"
+        r"is polmvs .*, which reads version 2 .*Give another OUT, or begin anew there: .*with "
+        r"`run\.overwrite` delete that run"
     )
     with pytest.raises(DataError, match=message):
         prepare_output(run_folder, overwrite=False, resume=True)
