@@ -214,7 +214,8 @@ def _read_current(run_folder: RunFolder) -> dict[str, Any]:
             run_folder.root,
             f"holds a run of polmvs {program}, whose {RUN_FILE} has schema version {found}; this "
             f"is polmvs {__version__}, which reads version {SCHEMA_VERSION} and cannot go on with "
-            "it. Give another OUT, or `run.overwrite` to delete that run.",
+            "it. Give another OUT, or begin anew there: reconstruct or compare with "
+            "`run.overwrite` delete that run.",
         )
     return content
 

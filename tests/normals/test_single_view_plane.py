@@ -97,6 +97,38 @@ def test_noise_is_averaged_and_sigma_is_honest():
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.3
 
 
+def test_covariance_is_that_of_the_errors():
+    """Squared errors in units of the covariance have a mean of 2: one for each direction."""
+    rng = np.random.default_rng(3)
+    some = np.linspace(0, RAYS.shape[1] - 1, 4000).astype(int)
+    rays, sigma = RAYS[:, some], np.full(4000, 0.05)
+    phase = phase_from_normal(AngleModel.PPA, NORMAL, rays.T)
+    squared, errors, covariances = [], [], []
+    for _ in range(80):
+        estimate = plane_normal(AngleModel.PPA, axial_of(phase, rng, sigma), rays, sigma)
+        error = estimate.normal - NORMAL
+        inverse = np.linalg.pinv(estimate.covariance, rcond=1e-6, hermitian=True)
+        squared.append(error @ inverse @ error)
+        errors.append(error)
+        covariances.append(estimate.covariance)
+        variance = np.linalg.eigvalsh(estimate.covariance)
+        assert np.degrees(np.sqrt(variance[2])) == pytest.approx(estimate.sigma_deg)
+        np.testing.assert_allclose(estimate.covariance @ estimate.normal, 0, atol=1e-15)
+    assert 1.2 < np.mean(squared) < 2.8  # 80 of chi-squared with 2: 2 +- 0.22; the scatter is noisy
+    found, stated = np.cov(np.transpose(errors)), np.mean(covariances, axis=0)
+    across = np.linalg.eigh(stated)[1][:, 1:]
+    ratio = np.diag(across.T @ found @ across) / np.diag(across.T @ stated @ across)
+    assert ((ratio > 0.5) & (ratio < 1.6)).all()
+
+
+def test_no_covariance_where_the_rows_have_rank_one():
+    axial = plane_axial(model=AngleModel.OPA)
+    estimate = plane_normal(AngleModel.OPA, axial, RAYS, np.full(RAYS.shape[1], 0.02))
+    assert not estimate.valid
+    assert np.isnan(estimate.covariance).all()
+    assert estimate.sigma_deg == np.inf
+
+
 def test_the_bias_of_the_eigenvector_is_not_in_the_robust_one():
     rng = np.random.default_rng(2)
     sigma = np.full(RAYS.shape[1], 0.15)

@@ -225,8 +225,8 @@ def test_contradictory_scale_names_both(
 @pytest.mark.parametrize(
     ("ends", "message"),
     [
-        (("000.png", "999.png", 1), "999.png is neither a reconstructed image"),
-        (("000.png", "123456789", 1), "123456789 is neither a reconstructed image"),
+        (("000.png", "999.png", 1), "999.png, which is neither a reconstructed image"),
+        (("000.png", "123456789", 1), "123456789, which is neither a reconstructed image"),
         (("000.png", "000", 1), "are at one place"),
     ],
 )

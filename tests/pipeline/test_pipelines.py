@@ -27,10 +27,16 @@ def test_there_are_scripts() -> None:
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        load(name).main(["--help"])
-    assert stop.value.code == 0
-    assert "usage:" in capsys.readouterr().out
+    assert help_status(load(name)) == 0
+    assert "usage:" in capsys.readouterr().out.lower()
+
+
+def help_status(script: ModuleType) -> int:
+    """Exit status of ``--help``, which some parsers return and others raise."""
+    try:
+        return script.main(["--help"])
+    except SystemExit as stop:
+        return int(stop.code or 0)
 
 
 def test_reconstruct_goes_on_with_a_run(

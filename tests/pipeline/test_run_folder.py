@@ -18,7 +18,13 @@ from polmvs.pipeline.record import (
     versions,
     write_record,
 )
-from polmvs.pipeline.run_folder import RunFolder, discard, has_content, replacing
+from polmvs.pipeline.run_folder import (
+    SURFACE_MESH,
+    RunFolder,
+    discard,
+    has_content,
+    replacing,
+)
 from polmvs.pipeline.runner import load_record, prepare_output
 from polmvs.pipeline.stage_table import written_names
 from polmvs.pipeline.stages.images import ImagesResult
@@ -32,6 +38,9 @@ def finished_run(root: Path) -> RunFolder:
         (root / folder / name).write_bytes(b"x")
     for model in AngleModel:
         run_folder.cloud(model).write_bytes(b"x")
+        run_folder.views(model).mkdir()
+        for name in ("a.png.range.npy", SURFACE_MESH):
+            (run_folder.views(model) / name).write_bytes(b"x")
         run_folder.sparse_cloud(model).write_bytes(b"x")
     run_folder.metrics.write_text("{}")
     stage = StageRecord(
@@ -89,8 +98,8 @@ def test_run_of_the_version_before_is_refused_by_name_and_version(tmp_path: Path
     run_folder.run_file.write_text(json.dumps(content))
     message = (
         rf"{tmp_path}: holds a run of polmvs 0\.1\.0, whose run\.json has schema version 1; this "
-        r"is polmvs .*, which reads version 2 .*Give another OUT, or `run\.overwrite` to delete "
-        r"that run"
+        r"is polmvs .*, which reads version 2 .*Give another OUT, or begin anew there: .*with "
+        r"`run\.overwrite` delete that run"
     )
     with pytest.raises(DataError, match=message):
         prepare_output(run_folder, overwrite=False, resume=True)

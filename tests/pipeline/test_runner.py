@@ -28,7 +28,7 @@ from polmvs.pipeline.jobs import Job, compare, reconstruct
 from polmvs.pipeline.monitor import NoMonitor
 from polmvs.pipeline.record import Record, read_record
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.runner import Run
+from polmvs.pipeline.runner import Run, prepare_output
 from polmvs.pipeline.stage_table import StageSpec, stage_table
 from polmvs.polarization.capture import open_capture
 from polmvs.scene import SparseModel, some_tracks
@@ -325,6 +325,9 @@ def test_stages_keep_to_their_entries(
     for name, total in monitor.totals.items():
         if total is not None:
             assert monitor.steps[name] == total, name
+    # Whatever a stage wrote is known to be a run's own.
+    assert prepare_output(RunFolder(out), overwrite=True, resume=False) == Record()
+    assert list(out.iterdir()) == []
 
 
 def watch(options, group: str, monitor: Snapshots, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ from polmvs.io.clouds import Cloud, write_cloud, write_mesh
 from polmvs.io.images import read_gray
 from polmvs.parallel import Workers
 from polmvs.pipeline.monitor import OnProgress, no_progress
-from polmvs.pipeline.run_folder import replace_folder, scratch
+from polmvs.pipeline.run_folder import SURFACE_MESH, replace_folder, scratch
 from polmvs.pipeline.stages.maps import open_maps, posed_views
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.polarization.capture import DISPLAY_GAMMA
@@ -54,7 +54,6 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T", bound=np.generic)
 
-SURFACE_MESH = "surface.ply"  # among the views of a run: the mesh that they are rendered from
 FINEST_SPACING_PX = 0.25  # of points that are not to be merged, in footprints of a pixel
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polmvs.io.clouds import read_cloud, read_mesh, write_mesh
-from polmvs.pipeline.stages.densify import SURFACE_MESH
+from polmvs.pipeline.run_folder import SURFACE_MESH
 from polmvs.scene import PointKind
 from polmvs.surface.poisson import MIN_POINTS, poisson_mesh
 
