@@ -99,6 +99,12 @@ def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
         place = f"{error.filename}: " if error.filename else ""
         _complain(terminal, prog, f"error: {place}{error.strerror or error}.")
         return 1
+    except ImportError as error:  # of a package, or of a library of the system that it needs
+        _trace(logging.DEBUG)
+        _complain(
+            terminal, prog, f"error: {error}. Run 'polmvs doctor', which says what is missing."
+        )
+        return 1
     except Exception as error:
         from concurrent.futures.process import BrokenProcessPool
 

@@ -482,6 +482,19 @@ def test_internal_error_is_one_line_and_the_rest_is_in_the_log(
     assert "Traceback" in (out / "polmvs.log").read_text()
 
 
+def test_a_missing_package_is_named(
+    cli, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*args: object, **kwargs: object) -> None:
+        raise ModuleNotFoundError("No module named 'open3d'")
+
+    monkeypatch.setattr("polmvs.pipeline.stages.images.write_images", fail)
+    status, _, err = cli("sfm", capture, tmp_path / "out")
+    assert status == 1
+    assert err.startswith("polmvs sfm: error: No module named 'open3d'. Run 'polmvs doctor'")
+    assert err.count("\n") == 1
+
+
 def test_traceback_of_a_user_error_is_in_the_log_if_asked_for(
     cli, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

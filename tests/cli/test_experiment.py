@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -133,11 +134,12 @@ def test_poses_of_other_images(refused, tmp_path) -> None:
 
 
 @pytest.fixture
-def page():
+def page(monkeypatch):
     """The script ``pipelines/paper.py`` as a module."""
     path = Path(__file__).parents[2] / "pipelines" / "paper.py"
     spec = importlib.util.spec_from_file_location("paper", path)
     module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
 
