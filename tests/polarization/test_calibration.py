@@ -89,6 +89,21 @@ def capture_of(folder, sensor, seed=5):
     return small.aolp, small.mask & (small.dolp > 0.1)
 
 
+def test_the_dark_level_is_taken_off(tmp_path):
+    sensor = faulty_sensor(SHAPE, np.random.default_rng(0), dark=0.05)
+    _, where = capture_of(tmp_path / "capture", sensor)
+    write_calibration(tmp_path / "camera.toml", response_of(sensor))
+    levels = {}
+    for name, path in (("before", None), ("after", tmp_path / "camera.toml")):
+        options = CaptureOptions(full_scale=4095, calibration=path)
+        levels[name] = np.median(
+            open_capture(tmp_path / "capture", options).load("a.png").s0[where]
+        )
+    # The gains' mean, which is set to 1, is that of four draws of 2 %.
+    assert levels["after"] == pytest.approx(0.9, rel=0.03)
+    assert levels["before"] == pytest.approx(0.9 + 4 * 0.05 / 2, rel=0.03)
+
+
 def aolp_errors(folder, options, truth, where):
     stokes = open_capture(folder, options).load("a.png")
     inside = cv2.erode(where.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
