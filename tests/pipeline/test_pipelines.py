@@ -27,10 +27,12 @@ def test_there_are_scripts() -> None:
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        load(name).main(["--help"])
-    assert stop.value.code == 0
-    assert "usage:" in capsys.readouterr().out
+    try:
+        status = load(name).main(["--help"])
+    except SystemExit as stop:
+        status = stop.code
+    assert status == 0
+    assert "usage:" in capsys.readouterr().out.lower()
 
 
 def test_reconstruct_goes_on_with_a_run(
