@@ -45,7 +45,7 @@ def test_errors_name_the_field() -> None:
 def test_text_names_choices_and_paths() -> None:
     assert PropagationOptions(method="contour").method is Method.CONTOUR
     assert SfmOptions(sparse="model").sparse == Path("model")
-    with pytest.raises(OptionError, match="must be one of integrate, contour, not magic"):
+    with pytest.raises(OptionError, match=r"must be one of .*contour, not magic"):
         PropagationOptions(method="magic")
 
 

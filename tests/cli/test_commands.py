@@ -8,7 +8,7 @@ from polmvs.config import COMPARED_MODELS
 
 def test_demo_prints_both_models_and_no_progress(demo_run: Path, cli) -> None:
     """The same lines as the finished run's, which goes on without anything left to do."""
-    status, out, err = cli("demo", demo_run, "--resume")
+    status, out, err = cli("demo", demo_run, "--resume", "--no-report")
     assert (status, err) == (0, "")
     lines = out.splitlines()
     names = [model.upper() for model in COMPARED_MODELS]
@@ -21,7 +21,7 @@ def test_demo_prints_both_models_and_no_progress(demo_run: Path, cli) -> None:
 
 
 def test_json_of_a_job_is_all_that_is_printed(demo_run: Path, cli) -> None:
-    status, out, err = cli("demo", demo_run, "--resume", "--json")
+    status, out, err = cli("demo", demo_run, "--resume", "--json", "--no-report")
     content = json.loads(out)
     assert (status, err) == (0, "")
     assert content["out"] == str(demo_run)
@@ -30,12 +30,12 @@ def test_json_of_a_job_is_all_that_is_printed(demo_run: Path, cli) -> None:
 
 
 def test_quiet_leaves_the_result(demo_run: Path, cli) -> None:
-    _, text, _ = cli("demo", demo_run, "--resume")
-    assert cli("demo", demo_run, "--resume", "--quiet") == (0, text, "")
+    _, text, _ = cli("demo", demo_run, "--resume", "--no-report")
+    assert cli("demo", demo_run, "--resume", "--quiet", "--no-report") == (0, text, "")
 
 
 def test_verbose_shows_every_stage(demo_run: Path, cli) -> None:
-    status, _, err = cli("demo", demo_run, "--resume", "-v")
+    status, _, err = cli("demo", demo_run, "--resume", "-v", "--no-report")
     assert status == 0
     assert "\nposes                finished earlier\n" in err
     assert "poses: begins" in (demo_run / "polmvs.log").read_text()

@@ -10,7 +10,7 @@ from polmvs.cli import doctor
 
 def test_all_works(cli) -> None:
     status, out, err = cli("doctor")
-    assert (status, err) == (0, "")
+    assert (status, err) == (0, ""), out
     assert out.splitlines()[-1] == "all works"
     for what in ("cores", "memory", "pycolmap", "open3d", "self-test: worker processes"):
         assert f"  {what} " in out
