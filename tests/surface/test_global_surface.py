@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from analytic_objects import looking_at, phase_maps_of, ring_of_views, sphere, trace, union
+
 from polmvs.config import AngleModel
 from polmvs.polarization.region import Region
 from polmvs.scene import Seeds
@@ -101,7 +101,7 @@ def test_one_wrong_mask_and_one_wrong_pose_do_no_harm(maps):
     corner = empty.copy()
     corner[:20, :20] = True
     wrong_mask = replace(maps[0], region=Region(corner, corner, empty))
-    turned = looking_at(maps[5].view.center_in_world + [0.0, 0.0, 0.4], name="005.png")
+    turned = looking_at(maps[5].view.center_in_world + np.array([0.0, 0.0, 0.4]), name="005.png")
     wrong_pose = replace(maps[5], view=turned)
     found = reconstruct([wrong_mask, *maps[1:5], wrong_pose, *maps[6:]])
     assert not isinstance(found, Undetermined)
