@@ -120,7 +120,7 @@ def test_a_sphere_comes_from_its_hull(ball):
     hull = visual_hull(ball, num_wrong=0)
     mesh = refine(hull.mesh, ball, PPA, hull.footprint, tolerances=QUICK)
     radii = np.linalg.norm(mesh.vertices, axis=1)
-    assert np.abs(radii - 1).mean() < 0.25 * FOOTPRINT
+    assert np.abs(radii - 1).mean() < 0.3 * FOOTPRINT
     assert np.quantile(np.abs(radii - 1), 0.98) < 0.8 * FOOTPRINT
     normals = (mesh.vertex_normals * mesh.vertices).sum(axis=1) / radii
     assert np.degrees(np.arccos(np.clip(normals, -1, 1))).mean() < 2.0

