@@ -11,8 +11,8 @@ changes, too. The chain begins at the first stage that reads the constant, from 
 unchanged run. ``OUT/results.jsonl`` grows by a line for each run; a study that was stopped goes on
 with what is missing.
 
-A figure has moved if it differs by more than its rounding and by more than three deviations of
-its noise: that of runs on the same capture with a sensor's noise added anew.
+A figure has moved if it differs by more than its rounding and by more than chance explains: the
+scatter of runs on the same capture with a sensor's noise added anew.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ PACKAGE = Path(polmvs.__file__).parent
 MODEL = AngleModel.PPA
 FACTORS = (2.0, 0.5)
 NUM_NOISY = 4  # runs on the same capture with other noise
-NUM_SIGMAS = 3.0
-CLEAR_LIMITS = 2.0  # of a figure's limit: a constant that moves one by more is not run again
+NUM_SIGMAS = 5.8  # Student's t of 99 % for a deviation from four runs
+CLEAR_LIMITS = 1.5  # of a figure's limit: a constant that moves one by more is not run again
 COMMANDS = ("sfm", "normals", "densify", "export")  # in order; each reads what those before wrote
 WAYS = {  # flags of each command under which other parts of the package run
     "default": {},
@@ -84,7 +84,7 @@ ROUNDING = {  # by which figures may differ unnoticed; all others by a share of 
     "map_normal_deg": 0.01,
     "track_normal_deg": 0.02,
 }
-RELATIVE_ROUNDING = 0.01
+RELATIVE_ROUNDING = 0.05  # numbers of points and seeds
 SPEED = "cpu_s"  # shared machines time badly: only a large change of it is one
 SPEED_ROUNDING = 0.25
 
@@ -841,7 +841,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     run_forked(_undone(bare, bases, args.out), bases, args.out, args.workers)
     for index in range(len(bases)):
         for factor in FACTORS:
-            todo = [c for c in chosen if bases[index].is_of_use(c)]
+            told = told_of(bases[index], factor, read_results(args.out))
+            todo = [c for c in chosen if bases[index].is_of_use(c) and c.key not in told]
             if not args.all:
                 table = tabulate(args.out, constants)
                 todo = [c for c in todo if not _is_settled(table[c.key])]
@@ -862,21 +863,32 @@ def halves_of_moved(
     factor: float,
 ) -> list[tuple[Constant, ...]]:
     """Two halves of each group of several constants that together move something."""
-    noise = noise_of(results).get((base.capture.name, base.way), {})
-    at = {
-        (r["constant"], r["factor"]): r
-        for r in results
-        if (r["capture"], r["way"]) == (base.capture.name, base.way)
-    }
+    told = told_of(base, factor, results)
     halves = []
     for group in groups:
-        line = at["+".join(c.key for c in group), factor]
-        moved, refused = effect_of(line, at["noise", 0.0], noise)
-        moved.pop(SPEED, None)
-        if len(group) > 1 and (moved or refused):
+        if any(constant.key not in told for constant in group):
             middle = len(group) // 2
             halves += [group[:middle], group[middle:]]
     return halves
+
+
+def told_of(base: Base, factor: float, results: Sequence[dict[str, Any]]) -> set[str]:
+    """Constants whose effect on a base is known: run alone, or in a group that moves nothing."""
+    at = (base.capture.name, base.way)
+    lines = [line for line in results if (line["capture"], line["way"]) == at]
+    noise = noise_of(lines).get(at, {})
+    still = next((r for r in lines if r["constant"] == "noise" and r["factor"] == 0), None)
+    told: set[str] = set()
+    if still is None:
+        return told
+    for line in lines:
+        keys = line["constant"].split("+")
+        if line["constant"] == "noise" or line["factor"] != factor:
+            continue
+        moved, refused = effect_of(line, still, noise)
+        if len(keys) == 1 or not (refused or moved.keys() - {SPEED}):
+            told.update(keys)
+    return told
 
 
 def _is_settled(entry: dict[str, Any]) -> bool:

@@ -124,9 +124,9 @@ def test_effect_counts_moves_beyond_rounding_and_noise(study):
     still = {"figures": {"f_1mm": 0.9, "depth_rmse_mm": 0.2, "normal_deg": math.nan}, "seconds": {}}
     line = {"figures": {"f_1mm": 0.9005, "depth_rmse_mm": 0.5, "normal_deg": 1.0, "cpu_s": 0.0}}
     line["commands"] = []
-    moved, refused = study.effect_of(line, still, {"depth_rmse_mm": 0.05})
+    moved, refused = study.effect_of(line, still, {"depth_rmse_mm": 0.02})
     assert list(moved) == ["depth_rmse_mm"]
-    assert moved["depth_rmse_mm"][2] == pytest.approx(0.3 / 0.15)
+    assert moved["depth_rmse_mm"][2] == pytest.approx(0.3 / (study.NUM_SIGMAS * 0.02))
     assert refused == ""
     assert study.effect_of({"identical": True}, still, {}) == ({}, "")
     assert study.effect_of({"error": "ValueError: no"}, still, {}) == ({}, "ValueError: no")
