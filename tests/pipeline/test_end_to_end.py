@@ -182,10 +182,10 @@ def start(out: Path, *arguments: str) -> subprocess.Popen[str]:
 def kill(process: subprocess.Popen[str]) -> None:
     """Kill a run and its workers without notice."""
     os.killpg(process.pid, signal.SIGKILL)
-    process.communicate(timeout=60)
+    process.communicate(timeout=300)
 
 
-def wait_until(holds, process: subprocess.Popen[str], timeout_s: float = 60) -> None:
+def wait_until(holds, process: subprocess.Popen[str], timeout_s: float = 300) -> None:
     deadline = time.monotonic() + timeout_s
     while not holds():
         assert process.poll() is None, process.communicate()[1]
@@ -229,7 +229,7 @@ def test_interrupt_keeps_finished_stages_only(demo_run: Path, tmp_path: Path, nu
     process = start(out, "--resume")
     wait_until((out / ".views_opa.tmp").exists, process)
     process.send_signal(number)
-    stdout, stderr = process.communicate(timeout=60)
+    stdout, stderr = process.communicate(timeout=300)
     assert process.returncode == 130
     assert stderr == ("polmvs demo: interrupted; finished stages are kept, go on with --resume\n")
     assert stdout == ""
