@@ -41,7 +41,7 @@ from polmvs.surface.surface_quality import (
     supported_faces,
 )
 from polmvs.surface.surface_view import SurfaceView, surface_view
-from polmvs.surface.visual_hull import supporting_plane, visual_hull
+from polmvs.surface.visual_hull import VisualHull, supporting_plane, visual_hull
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +52,8 @@ OnProgress = Callable[[int], None]
 
 MIN_VIEWS = 3  # with an outline: the hull of two cones is no shape
 MAX_FILLED_SHARE = 0.35  # of the image's border on the objects, where a silhouette bounds little
+SEEN_SEEDS = 0.75  # share of the seeds that a coarse surface without steps passes. Guess.
+MISSED_FOOTPRINTS = 1.0  # by which it misses the others on `step`: 1 to 4; on `dome` 0.5
 REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured on spheres
 COARSE_EDGE_PX = 6.0  # of the mesh on which deviations are sampled; they are smooth
 NUM_FINAL_STEPS = 3  # of the progress: evidence, normals, deviations
@@ -167,7 +169,7 @@ def reconstruct_surface(
         )
 
     mesh = coarsely(hull.mesh, on_progress)
-    steps = _steps(mesh, seeds, maps, angle_model, tilt_aware=tilt_aware)
+    steps = _steps(hull, mesh, seeds, maps, angle_model, tilt_aware=tilt_aware)
     if steps:
         logger.info("%d groups of faces that silhouettes do not tell apart.", len(steps))
         hull = hull.carved([group.values for group in steps])
@@ -217,15 +219,19 @@ def reconstruct_surface(
 
 
 def _steps(
-    mesh: TriangleMesh,
+    hull: VisualHull,
+    coarse: TriangleMesh,
     seeds: Seeds,
     maps: Sequence[PhaseMap],
     angle_model: AngleModel,
     *,
     tilt_aware: bool,
 ) -> tuple[SteppedFaces, ...]:
-    """Faces that the seeds show and a coarse surface does not explain."""
-    if not len(mesh.faces):
+    """Faces that the seeds show and the silhouettes do not, where a coarse surface misses seeds."""
+    if not len(coarse.faces) or not len(seeds.sigma):
+        return ()
+    off = np.abs(RayScene(coarse).signed_distance(seeds.points_in_world))
+    if np.quantile(off, SEEN_SEEDS) < MISSED_FOOTPRINTS * hull.footprint:
         return ()
     return stepped_faces(
         find_faces(seeds),
@@ -233,8 +239,8 @@ def _steps(
         maps,
         angle_model,
         tilt_aware=tilt_aware,
-        signed_distance=RayScene(mesh).signed_distance,
-        first_hit=_first_hit(mesh),
+        signed_distance=RayScene(hull.mesh).signed_distance,
+        first_hit=_first_hit(hull.mesh),
     )
 
 
