@@ -340,22 +340,16 @@ def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
     return mesh
 
 
-def remeshed(
-    mesh: TriangleMesh, step: float, *, smoothing: float = 0.5, min_cells: int = 30
-) -> TriangleMesh:
-    """The mesh again with edges of about ``step``, through its signed distance on a grid.
+def distance_grid(mesh: TriangleMesh, step: float) -> tuple[NDArray[np.float32], Array]:
+    """Signed distances to a closed mesh on a grid about it, negative inside, and its origin.
 
-    The new mesh does not intersect itself; pieces that met are joined, and pieces that enclose
-    fewer than ``min_cells`` cells are gone.
+    Exact in a band of ``BAND_CELLS`` about the mesh; farther off they are as large as its width.
 
     Parameters
     ----------
-    mesh : closed.
+    mesh : closed, with faces.
     step : of the grid, world units.
-    smoothing : width of a Gaussian on the distances, in steps.
     """
-    if not len(mesh.faces):
-        return mesh
     origin = mesh.vertices.min(axis=0) - (BAND_CELLS + 1) * step
     shape = tuple(
         int(n) for n in np.ceil((np.ptp(mesh.vertices, axis=0)) / step) + 2 * BAND_CELLS + 3
@@ -391,13 +385,34 @@ def remeshed(
         negative = np.bincount(beside[touching], values[touching] < 0, num_pieces + 1)
         total = np.bincount(beside[touching], minlength=num_pieces + 1)
         values[(negative > 0.5 * total)[pieces] & (pieces > 0)] = -limit
+    return values, origin
+
+
+def remeshed(
+    mesh: TriangleMesh, step: float, *, smoothing: float = 0.5, min_cells: int = 30
+) -> TriangleMesh:
+    """The mesh again with edges of about ``step``, through its signed distance on a grid.
+
+    The new mesh does not intersect itself; pieces that met are joined, and pieces that enclose
+    fewer than ``min_cells`` cells are gone.
+
+    Parameters
+    ----------
+    mesh : closed.
+    step : of the grid, world units.
+    smoothing : width of a Gaussian on the distances, in steps.
+    """
+    if not len(mesh.faces):
+        return mesh
+    values, origin = distance_grid(mesh, step)
+    limit = np.float32(BAND_CELLS * step)
     if smoothing > 0:
         values = ndimage.gaussian_filter(values, smoothing)
-    _drop_small(values, min_cells, limit)
+    drop_small(values, min_cells, limit)
     return relaxed(mesh_from_grid(values, origin, step))
 
 
-def _drop_small(values: NDArray[np.float32], min_cells: int, outside: np.float32) -> None:
+def drop_small(values: NDArray[np.float32], min_cells: int, outside: np.float32) -> None:
     """Fill inside pieces of fewer than ``min_cells`` grid points with ``outside``, in place."""
     labels, num = ndimage.label(values < 0)
     if num > 1:
