@@ -112,7 +112,7 @@ class OffsetTolerances:
     phase_floor: float = 0.015
     cost_sigmas: float = 3.0
     max_cost: float = 0.5
-    leak: float = 0.01
+    leak: float = 0.1
     snap_cells: float = 5.0
     seed_weight: float = 0.2
     min_claim: float = 0.25
@@ -535,7 +535,7 @@ def _labels(
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1)):
             labels = snapped_border(labels, int(number), jumps[number], tol)
         taken = ndimage.binary_opening(taken & ~explained, iterations=2)
-        labels = _continued(labels, taken, tol)
+        labels = _continued(np.where(taken, NO_FACE, labels), taken, tol)
     return np.asarray(labels, np.int64)
 
 
