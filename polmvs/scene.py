@@ -206,9 +206,14 @@ class SparseModel:
 
 
 class PointKind(IntEnum):
-    """What a point of a cloud is: on a polarised part, or how it was found beside one."""
+    """What a point of a cloud is: on a polarised part, or how it was found beside one.
+
+    ``PRESUMED`` is on a part where no phase shows it: the inner wall of a vessel, presumed to be
+    as thick as its rim.
+    """
 
     SURFACE = 0
     SPARSE = 1
     STEREO = 2
     COLMAP = 3
+    PRESUMED = 4

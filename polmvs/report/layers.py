@@ -29,7 +29,7 @@ EYE_DISTANCE = 3.2  # from the target, in radii of the part: all of it in a fiel
 EYE_ELEVATION_DEG = 35.0
 SPACING_SAMPLES = 2000  # points whose nearest neighbour is looked up; their median errs by 1 %
 NORMAL_NOTE = "red and green: sideways, blue: up; grey: no normal"
-KIND_COLORS = ("#0072b2", "#999999", "#e69f00", "#009e73")  # by PointKind
+KIND_COLORS = ("#0072b2", "#999999", "#e69f00", "#009e73", "#cc79a7")  # by PointKind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ KIND = Channel(
     label="kind of point",
     low=0,
     high=len(PointKind),
-    classes=("polarised surface", "sparse point", "stereo", "given workspace"),
+    classes=("polarised surface", "sparse point", "stereo", "given workspace", "presumed"),
 )
 
 

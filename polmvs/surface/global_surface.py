@@ -16,11 +16,14 @@ from numpy.typing import NDArray
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.io.clouds import Mesh
+from polmvs.neighbors import voxel_representatives
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds, View
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
+from polmvs.surface.hollows import SurfaceFaces, find_hollows
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, sample_surface
+from polmvs.surface.offsets import find_faces, stepped_faces
 from polmvs.surface.refinement import (
     KnownPoints,
     RefinementTolerances,
@@ -49,6 +52,7 @@ OnProgress = Callable[[int], None]
 
 MIN_VIEWS = 3  # with an outline: the hull of two cones is no shape
 MAX_FILLED_SHARE = 0.35  # of the image's border on the objects, where a silhouette bounds little
+REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured on spheres
 COARSE_EDGE_PX = 6.0  # of the mesh on which deviations are sampled; they are smooth
 NUM_FINAL_STEPS = 3  # of the progress: evidence, normals, deviations
 
@@ -67,6 +71,8 @@ class GlobalSurface:
     sigma : (V,) standard deviation of the place along the normal, world units; inf where unknown.
     footprint : length that a pixel covers at the surface, world units.
     contradictions : with the data.
+    presumed : (F,) bool, faces that no phase shows: walls of hollows, presumed as thick inside as
+        the rim shows them.
     """
 
     mesh: TriangleMesh
@@ -77,6 +83,7 @@ class GlobalSurface:
     sigma: Array
     footprint: float
     contradictions: Contradictions
+    presumed: Mask
 
 
 @dataclass(frozen=True)
@@ -136,6 +143,30 @@ def reconstruct_surface(
     if not len(hull.mesh.faces):
         return Undetermined("the polarised regions of the views have no common object")
     logger.info("visual hull: %d vertices.", len(hull.mesh.vertices))
+    steps = stepped_faces(
+        find_faces(seeds),
+        seeds,
+        maps,
+        angle_model,
+        tilt_aware=tilt_aware,
+        signed_distance=RayScene(hull.mesh).signed_distance,
+        first_hit=_first_hit(hull.mesh),
+    )
+    if steps:
+        logger.info("%d groups of faces that silhouettes do not tell apart.", len(steps))
+        hull = hull.carved([group.values for group in steps])
+    hollows = find_hollows(
+        SurfaceFaces(
+            hull.mesh.centers,
+            hull.mesh.face_normals,
+            hull.mesh.face_areas,
+            RayScene(hull.mesh).signed_distance,
+            hull.footprint,
+        ),
+        maps,
+        angle_model,
+        tilt_aware=tilt_aware,
+    )
     # Rows of a tilted map are those of PPA: its samples are corrected.
     rows = AngleModel.OPA if angle_model is AngleModel.OPA else AngleModel.PPA
     known = KnownPoints(seeds.points_in_world, seeds.sigma)
@@ -148,12 +179,20 @@ def reconstruct_surface(
         tolerances=tolerances,
         on_progress=on_progress,
     )
+    # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
+    carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
+    if carvings and len(mesh.faces):
+        mesh = remeshed(mesh, mesh.mean_edge / REMESHED_EDGE, free=carvings, smoothing=0)
     if not len(mesh.faces):
         return Undetermined("the surface vanishes under the phases of the views")
     row_error, median = median_residual(mesh, views, rows)
     row_sigma = max(row_error, RefinementTolerances().row_sigma)
     evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
     supported = supported_faces(mesh, evidence, min_views=min_views)
+    seen = evidence.num_views >= min_views
+    supported |= seen & _lie_on(mesh, [group.values for group in steps])
+    presumed = seen & ~supported & _lie_on(mesh, [hollow.values for hollow in hollows])
+    supported |= presumed
     report(1)
     normals = fit_normals(mesh, views, rows, row_sigma=row_sigma, row_error=row_error)
     report(1)
@@ -169,7 +208,27 @@ def reconstruct_surface(
         sigma=sigma,
         footprint=hull.footprint,
         contradictions=contradictions,
+        presumed=presumed,
     )
+
+
+def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:
+    """Distance ``(N,)`` and normal ``(N, 3)`` where rays along one direction first meet a mesh."""
+    scene = RayScene(mesh)
+
+    def first_hit(origins: Array, direction: Array) -> tuple[Floats, Floats]:
+        hits = scene.cast(origins, np.broadcast_to(direction, origins.shape))
+        return hits.distance, mesh.face_normals[hits.face]
+
+    return first_hit
+
+
+def _lie_on(mesh: TriangleMesh, carvings: Sequence[Callable[[Array], Floats]]) -> Mask:
+    """Which faces ``(F,)`` are borders of carved space."""
+    found = np.zeros(len(mesh.faces), np.bool_)
+    for values in carvings:
+        found |= np.abs(values(mesh.centers)) < mesh.mean_edge
+    return found
 
 
 def _no_hull(views: Sequence[SurfaceView]) -> str | None:
@@ -178,9 +237,7 @@ def _no_hull(views: Sequence[SurfaceView]) -> str | None:
     if not any(view.silhouette.certain.any() for view in views):
         return "no view shows a polarised region"
     if len(outlined) < MIN_VIEWS:
-        return (
-            f"{len(outlined)} views show an outline of an object, of {MIN_VIEWS} needed"
-        )
+        return f"{len(outlined)} views show an outline of an object, of {MIN_VIEWS} needed"
     borders = [_border_share(view.silhouette.certain) for view in outlined]
     if float(np.median(borders)) > MAX_FILLED_SHARE:
         return "the polarised object fills the images"
@@ -226,8 +283,8 @@ def supported_mesh(surface: GlobalSurface) -> Mesh:
 
 def surface_points(
     surface: GlobalSurface, maps: Sequence[PhaseMap], spacing: float, *, max_points: int = 2_000_000
-) -> FusedCloud:
-    """Points spread evenly over what the views bear out.
+) -> tuple[FusedCloud, Mask]:
+    """Points spread evenly over what the views bear out, and which of them ``(N,)`` are presumed.
 
     Parameters
     ----------
@@ -239,15 +296,18 @@ def surface_points(
     mesh = surface.mesh
     area = float(mesh.face_areas[surface.supported].sum())
     if area <= 0:
-        return no_points()
-    num = int(min(max(area / spacing**2, 1), max_points))
+        return no_points(), np.zeros(0, np.bool_)
+    # Random places leave gaps: of three times as many, one in each voxel.
+    num = int(min(max(3 * area / spacing**2, 1), 3 * max_points))
     face, barycentric = sample_surface(
         mesh, surface.supported.astype(np.float64), num, np.random.default_rng(0)
     )
     points = mesh.points_at(face, barycentric)
+    kept = voxel_representatives(points, max(spacing, np.sqrt(area / max_points)))
+    face, barycentric, points = face[kept], barycentric[kept], points[kept]
     normals = _interpolated(surface.normals, mesh, face, barycentric)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    return FusedCloud(
+    cloud = FusedCloud(
         points=points,
         normals=normals,
         intensity=_intensity(points, normals, maps),
@@ -255,6 +315,7 @@ def surface_points(
         sigma_deg=_finite(_interpolated(surface.sigma_deg, mesh, face, barycentric)),
         sigma=_finite(_interpolated(surface.sigma, mesh, face, barycentric)),
     )
+    return cloud, surface.presumed[face]
 
 
 def _finite(values: Array) -> NDArray[np.float32]:

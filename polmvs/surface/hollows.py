@@ -142,11 +142,6 @@ class Hollow:
         found = ndimage.map_coordinates(self.field, place, order=1, mode="constant", cval=outside)
         return np.asarray(found, np.float64)
 
-    def on_walls(self, points: Floats, tolerance: float) -> Mask:
-        """Which points ``(N, 3)`` lie on the presumed walls below the rim."""
-        below = self.rim.height(points) < -tolerance
-        return np.asarray((np.abs(self.values(points)) < tolerance) & below)
-
 
 @dataclass(frozen=True)
 class SurfaceFaces:

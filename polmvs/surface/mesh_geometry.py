@@ -5,6 +5,7 @@ Ray casting is Open3D's (Embree), imported where a mesh is first cast on.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -83,7 +84,7 @@ class TriangleMesh:
     def vertex_areas(self) -> Array:
         """Area ``(V,)``, a third of the faces' at each vertex."""
         third = np.repeat(self.face_areas / 3, 3)
-        return np.bincount(self.faces.ravel(), third, len(self.vertices))
+        return np.asarray(np.bincount(self.faces.ravel(), third, len(self.vertices)), np.float64)
 
     @cached_property
     def adjacency(self) -> sparse.csr_array:
@@ -340,16 +341,29 @@ def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
     return mesh
 
 
-def distance_grid(mesh: TriangleMesh, step: float) -> tuple[NDArray[np.float32], Array]:
-    """Signed distances to a closed mesh on a grid about it, negative inside, and its origin.
+def remeshed(
+    mesh: TriangleMesh,
+    step: float,
+    *,
+    free: Sequence[Callable[[Array], Floats]] = (),
+    smoothing: float = 0.5,
+    min_cells: int = 30,
+) -> TriangleMesh:
+    """The mesh again with edges of about ``step``, through its signed distance on a grid.
 
-    Exact in a band of ``BAND_CELLS`` about the mesh; farther off they are as large as its width.
+    The new mesh does not intersect itself; pieces that met are joined, and pieces that enclose
+    fewer than ``min_cells`` cells are gone.
 
     Parameters
     ----------
-    mesh : closed, with faces.
+    mesh : closed.
     step : of the grid, world units.
+    free : functions of points ``(N, 3)`` that give signed distances ``(N,)``, positive where space
+        is free: it is carved out, its borders unsmoothed.
+    smoothing : width of a Gaussian on the distances, in steps.
     """
+    if not len(mesh.faces):
+        return mesh
     origin = mesh.vertices.min(axis=0) - (BAND_CELLS + 1) * step
     shape = tuple(
         int(n) for n in np.ceil((np.ptp(mesh.vertices, axis=0)) / step) + 2 * BAND_CELLS + 3
@@ -385,34 +399,18 @@ def distance_grid(mesh: TriangleMesh, step: float) -> tuple[NDArray[np.float32],
         negative = np.bincount(beside[touching], values[touching] < 0, num_pieces + 1)
         total = np.bincount(beside[touching], minlength=num_pieces + 1)
         values[(negative > 0.5 * total)[pieces] & (pieces > 0)] = -limit
-    return values, origin
-
-
-def remeshed(
-    mesh: TriangleMesh, step: float, *, smoothing: float = 0.5, min_cells: int = 30
-) -> TriangleMesh:
-    """The mesh again with edges of about ``step``, through its signed distance on a grid.
-
-    The new mesh does not intersect itself; pieces that met are joined, and pieces that enclose
-    fewer than ``min_cells`` cells are gone.
-
-    Parameters
-    ----------
-    mesh : closed.
-    step : of the grid, world units.
-    smoothing : width of a Gaussian on the distances, in steps.
-    """
-    if not len(mesh.faces):
-        return mesh
-    values, origin = distance_grid(mesh, step)
-    limit = np.float32(BAND_CELLS * step)
     if smoothing > 0:
         values = ndimage.gaussian_filter(values, smoothing)
-    drop_small(values, min_cells, limit)
+    if free:
+        inner = values < limit
+        points = origin + step * np.argwhere(inner)
+        for function in free:
+            values[inner] = np.maximum(values[inner], np.minimum(function(points), limit))
+    _drop_small(values, min_cells, limit)
     return relaxed(mesh_from_grid(values, origin, step))
 
 
-def drop_small(values: NDArray[np.float32], min_cells: int, outside: np.float32) -> None:
+def _drop_small(values: NDArray[np.float32], min_cells: int, outside: np.float32) -> None:
     """Fill inside pieces of fewer than ``min_cells`` grid points with ``outside``, in place."""
     labels, num = ndimage.label(values < 0)
     if num > 1:

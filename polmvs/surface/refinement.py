@@ -191,7 +191,7 @@ class _SharedError:
 
     def column(self) -> Array:
         """The vector u ``(num,)`` of the class's text."""
-        return self.slope / np.sqrt(self._weight + self.prior)
+        return np.asarray(self.slope / np.sqrt(self._weight + self.prior))
 
     def offset(self) -> float:
         """Factor of u on the right side."""

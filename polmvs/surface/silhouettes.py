@@ -101,8 +101,7 @@ def _cleaned(mask: Mask, scale: float, tol: SilhouetteTolerances) -> Mask:
     area = scale * scale
     pixels = _without_small(mask, tol.min_speck_px * area, connectivity=8).astype(np.uint8)
     size = 2 * round(0.5 * (tol.closing_px - 1) * scale) + 1
-    pixels = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
-    holes = pixels == 0
+    holes = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)) == 0
     return ~_without_small(holes, tol.min_hole_px * area, connectivity=4)
 
 
@@ -132,10 +131,10 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
     like = np.quantile(bright[certain], tol.object_quantile)
     near = cv2.dilate(pixels, _ellipse(round(tol.near_px * scale))) > 0
     far = cv2.dilate(pixels, _ellipse(round(tol.far_px * scale))) > 0
-    searched = near | (far & (smooth < like))
+    searched = near | (far & (smooth <= like))
     labels = np.full(certain.shape, cv2.GC_BGD, np.uint8)
     labels[searched] = cv2.GC_PR_BGD
-    labels[searched & (bright < like)] = cv2.GC_PR_FGD
+    labels[searched & (bright <= like)] = cv2.GC_PR_FGD
     labels[certain] = cv2.GC_PR_FGD
     labels[cv2.erode(pixels, np.ones((5, 5), np.uint8)) > 0] = cv2.GC_FGD
     rows, cols = np.flatnonzero(searched.any(axis=1)), np.flatnonzero(searched.any(axis=0))
@@ -152,7 +151,7 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
     cv2.grabCut(
         np.ascontiguousarray(features[box]),
         cut,
-        None,
+        (0, 0, 1, 1),  # not used: the labels are the start
         np.zeros((1, 65)),
         np.zeros((1, 65)),
         tol.cut_rounds,
@@ -160,8 +159,8 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
     )
     found = np.zeros(certain.shape, np.uint8)
     found[box] = np.isin(cut, (cv2.GC_FGD, cv2.GC_PR_FGD))
-    found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) | pixels
-    pieces = cv2.connectedComponents(found)[1]
+    opened = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    pieces = cv2.connectedComponents((opened | certain).astype(np.uint8))[1]
     held = np.unique(pieces[certain])
     found_mask = np.isin(pieces, held[held > 0])
     found_mask = ~_without_small(~found_mask, tol.min_hole_px * scale**2, connectivity=4)
@@ -184,11 +183,10 @@ def _outline_shift(
     if len(rows) < 10:
         return None
     distance = signed_distance_px(mask)
-    smooth = cv2.GaussianBlur(distance, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
-    outwards = np.stack(
-        [cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)], axis=-1
-    )[rows, cols]
-    outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-6)
+    smooth_distance = cv2.GaussianBlur(distance, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
+    slopes = [cv2.Sobel(smooth_distance, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)]
+    outwards = np.stack(slopes, axis=-1)[rows, cols]
+    outwards = outwards / np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-6)
     step = 0.25
     reach = tol.edge_reach_px * max(scale, 1.0)
     along = np.arange(-reach - 1, reach + 1 + step, step)
@@ -213,11 +211,11 @@ def _outline_shift(
     shifts, weights = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
     shifts[rows, cols], weights[rows, cols] = weight * found, weight
     width = tol.edge_smoothing_px * max(scale, 1.0)
-    shifts = cv2.GaussianBlur(shifts, (0, 0), width)
-    weights = cv2.GaussianBlur(weights, (0, 0), width)
-    mean = np.where(weights > 1e-4, shifts / np.maximum(weights, 1e-4), 0)
+    total = np.asarray(cv2.GaussianBlur(shifts, (0, 0), width), np.float32)
+    share = np.asarray(cv2.GaussianBlur(weights, (0, 0), width), np.float32)
+    mean = np.where(share > 1e-4, total / np.maximum(share, 1e-4), 0).astype(np.float32)
     nearest = ndimage.distance_transform_edt(~border, return_distances=False, return_indices=True)
-    return mean[nearest[0], nearest[1]].astype(np.float32)
+    return np.asarray(mean[nearest[0], nearest[1]])
 
 
 def _vertex_of_parabola(before: Array, at: Array, after: Array) -> Array:

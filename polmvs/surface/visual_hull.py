@@ -235,8 +235,8 @@ def hull_values(
             value = np.minimum(largest[rank], value)
             largest[rank] = greater
     # Of few views that see a point, fewer may be wrong.
-    rank = np.minimum((tol.wrong_share * num_seen + 0.5).astype(np.int64), num_wrong)
-    values = largest[rank, np.arange(len(points))]
+    chosen = np.minimum((tol.wrong_share * num_seen + 0.5).astype(np.int64), num_wrong)
+    values = largest[chosen, np.arange(len(points))]
     values = np.where(num_seen < max(2, tol.min_seen_share * len(views)), OUTSIDE, values)
     if plane is not None:
         values = np.maximum(values, -plane.height(points)).astype(np.float32)

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from analytic_objects import sphere, torus, union
 
 from polmvs.surface.mesh_geometry import (
     RayScene,
@@ -10,7 +11,6 @@ from polmvs.surface.mesh_geometry import (
     sample_surface,
     visible_points,
 )
-from analytic_objects import sphere, torus, union
 
 
 def extracted(distance, half=1.6, step=0.08) -> TriangleMesh:
@@ -85,7 +85,7 @@ def test_distances_and_hits_far_from_the_origin():
     scene = RayScene(TriangleMesh(mesh.vertices + far, mesh.faces))
     points = far + np.array([[0.0, 0, 0.5], [0, 0, 2.0]])
     assert scene.signed_distance(points) == pytest.approx([-0.5, 1.0], abs=0.01)
-    hits = scene.cast(far + [0, 0, 5.0], np.array([[0, 0, -1.0], [0, 0, 1.0]]))
+    hits = scene.cast(far + np.array([0, 0, 5.0]), np.array([[0, 0, -1.0], [0, 0, 1.0]]))
     assert hits.distance[0] == pytest.approx(4.0, abs=0.01)
     assert hits.face[1] == -1
 

@@ -123,9 +123,9 @@ def densify(
     with scratch(views) as folder, workers.stopped_on_error():
         new_views = folder / "views"
         new_views.mkdir()
-        fused = None
+        fused, presumed = None, np.zeros(0, np.bool_)
         if propagation.method is Method.SURFACE:
-            fused = _global_surface(
+            fused, presumed = _global_surface(
                 model,
                 phase_maps,
                 known,
@@ -151,6 +151,7 @@ def densify(
                 on_progress=on_progress,
             )
         surface = surface_cloud(fused)
+        surface.scalars["kind"][: len(presumed)][presumed] = PointKind.PRESUMED
         around = _surroundings_cloud(
             sparse, fused, phase_maps, fusion, given, folder / "around", workers=workers
         )
@@ -171,10 +172,11 @@ def _global_surface(
     tilt_aware: bool,
     masks_given: bool,
     on_progress: OnProgress,
-) -> FusedCloud | None:
-    """The surface of all views, its mesh and its depth in each view in ``views``.
+) -> tuple[FusedCloud | None, NDArray[np.bool_]]:
+    """The surface of all views, and which of its points are presumed.
 
-    None where silhouettes do not bound the objects.
+    Its mesh and its depth in each view go to ``views``. None where silhouettes do not bound the
+    objects.
     """
     surface = reconstruct_surface(
         model,
@@ -192,7 +194,7 @@ def _global_surface(
             model,
             surface.reason,
         )
-        return None
+        return None, np.zeros(0, np.bool_)
     for sentence in surface.contradictions.warnings():
         logger.warning("%s: %s.", model, sentence)
     scene = RayScene(surface.mesh)
@@ -202,9 +204,9 @@ def _global_surface(
             store_dense_view(dense, views / phase_map.view.name)
         on_progress(1)
     spacing = fusion.voxel if fusion.voxel is not None else fusion.voxel_px * surface.footprint
-    cloud = surface_points(surface, maps, spacing or FINEST_SPACING_PX * surface.footprint)
+    found = surface_points(surface, maps, spacing or FINEST_SPACING_PX * surface.footprint)
     write_mesh(views / SURFACE_MESH, supported_mesh(surface))
-    return cloud
+    return found
 
 
 def _dense_surface(

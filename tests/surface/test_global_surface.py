@@ -1,0 +1,151 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analytic_objects import looking_at, phase_maps_of, ring_of_views, sphere, trace, union
+from polmvs.config import AngleModel
+from polmvs.polarization.region import Region
+from polmvs.scene import Seeds
+from polmvs.surface.global_surface import (
+    Undetermined,
+    num_surface_steps,
+    reconstruct_surface,
+    render_view,
+    supported_mesh,
+    surface_points,
+)
+from polmvs.surface.mesh_geometry import RayScene
+from polmvs.surface.refinement import Level, RefinementTolerances
+from polmvs.surface.surface_quality import Contradictions
+
+PPA = AngleModel.PPA
+NO_SEEDS = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+NOTHING = np.zeros((0, 3))
+FOOTPRINT = 5 / 150
+QUICK = RefinementTolerances(
+    levels=(
+        Level(edge_px=4.0, num_steps=8, loss_scale=12.0, rim_gate_px=25.0),
+        Level(edge_px=2.5, num_steps=4, loss_scale=4.0, rim_gate_px=4.0),
+    )
+)
+VIEWS = ring_of_views(12, elevations=(10.0, 45.0))
+
+
+@pytest.fixture(scope="module")
+def maps():
+    return phase_maps_of(sphere(), VIEWS, noise=np.radians(0.5))
+
+
+def reconstruct(maps, **kwargs):
+    return reconstruct_surface(PPA, maps, NO_SEEDS, NOTHING, tolerances=QUICK, **kwargs)
+
+
+@pytest.fixture(scope="module")
+def surface(maps):
+    found = reconstruct(maps)
+    assert not isinstance(found, Undetermined)
+    return found
+
+
+def test_the_cloud_lies_on_the_object_with_its_normals(surface, maps):
+    cloud, presumed = surface_points(surface, maps, 0.5 * FOOTPRINT)
+    radii = np.linalg.norm(cloud.points, axis=1)
+    assert not presumed.any()
+    assert np.quantile(np.abs(radii - 1), 0.95) < FOOTPRINT
+    angle = np.degrees(np.arccos(np.clip((cloud.normals * cloud.points).sum(1) / radii, -1, 1)))
+    assert np.mean(angle) < 1.5
+    assert cloud.num_views.min() >= 2
+    assert np.median(cloud.intensity) == pytest.approx(0.1, abs=0.02)
+
+
+def test_deviations_hold(surface, maps):
+    cloud, _ = surface_points(surface, maps, 0.5 * FOOTPRINT)
+    known = np.isfinite(cloud.sigma)
+    error = np.abs(np.linalg.norm(cloud.points, axis=1) - 1)
+    assert known.mean() > 0.9
+    assert np.mean(error[known] < 2 * cloud.sigma[known]) > 0.9
+    assert np.median(cloud.sigma[known]) < 2 * FOOTPRINT  # and says something
+
+
+def test_what_no_view_sees_is_left_out(surface):
+    """All cameras look down: the lowest part of the ball faces none of them."""
+    heights = surface.mesh.centers[:, 2]
+    assert not surface.supported[heights < -0.97].any()
+    assert surface.supported[heights > 0].mean() > 0.98
+    mesh = supported_mesh(surface)
+    assert mesh.vertices[:, 2].min() > -0.99
+    assert np.linalg.norm(mesh.normals, axis=1) == pytest.approx(1)
+
+
+def test_rendered_depth_is_the_objects(surface):
+    dense = render_view(surface, RayScene(surface.mesh), VIEWS[3], 2)
+    assert dense is not None
+    ranges, _ = trace(sphere(), VIEWS[3])
+    # Lattice points lie on corners of pixels: the four about them bracket the range.
+    smooth = ranges[1:-1:2, 1:-1:2]
+    found = dense.range_map[: smooth.shape[0], : smooth.shape[1]]
+    both = (found > 0) & np.isfinite(smooth) & (smooth < 4.5)
+    assert both.sum() > 300
+    assert np.median(np.abs(found - smooth)[both]) < FOOTPRINT
+    assert (dense.range_map > 0).sum() == dense.known.sum()
+
+
+def test_a_view_that_sees_nothing_has_no_depth(surface):
+    away = looking_at((5.0, 0, 1.0), target=(10.0, 0, 1.0))
+    assert render_view(surface, RayScene(surface.mesh), away, 2) is None
+
+
+def test_one_wrong_mask_and_one_wrong_pose_do_no_harm(maps):
+    empty = np.zeros_like(maps[0].region.inside)
+    corner = empty.copy()
+    corner[:20, :20] = True
+    wrong_mask = replace(maps[0], region=Region(corner, corner, empty))
+    turned = looking_at(maps[5].view.center_in_world + [0.0, 0.0, 0.4], name="005.png")
+    wrong_pose = replace(maps[5], view=turned)
+    found = reconstruct([wrong_mask, *maps[1:5], wrong_pose, *maps[6:]])
+    assert not isinstance(found, Undetermined)
+    radii = np.linalg.norm(found.mesh.centers[found.supported], axis=1)
+    assert np.median(np.abs(radii - 1)) < 1.5 * FOOTPRINT
+
+
+def test_several_objects():
+    pair = union(sphere(0.45, (0.75, 0, 0)), sphere(0.45, (-0.75, 0, 0)))
+    found = reconstruct(phase_maps_of(pair, VIEWS))
+    assert not isinstance(found, Undetermined)
+    assert len(set(found.mesh.face_components)) == 2
+    assert np.median(np.abs(pair(found.mesh.vertices))) < FOOTPRINT
+
+
+def with_regions(maps, inside):
+    none = np.zeros(inside.shape, bool)
+    return [replace(m, region=Region(inside, inside, none)) for m in maps]
+
+
+def test_undetermined_is_said(maps):
+    none = np.zeros_like(maps[0].region.inside)
+    assert "no view shows" in reconstruct(with_regions(maps, none)).reason
+    assert "fills the images" in reconstruct(with_regions(maps, ~none)).reason or "outline" in (
+        reconstruct(with_regions(maps, ~none)).reason
+    )
+    assert "of 3 needed" in reconstruct(maps[:2]).reason
+    corner = none.copy()
+    corner[:9, :9] = True
+    assert "no common object" in reconstruct(with_regions(maps, corner)).reason
+
+
+def test_progress_is_within_what_is_announced(maps):
+    steps = []
+    reconstruct_surface(
+        PPA, maps[:4], NO_SEEDS, NOTHING, tolerances=QUICK, on_progress=steps.append
+    )
+    assert 0 < sum(steps) <= num_surface_steps(4)
+
+
+def test_contradictions_are_put_in_words():
+    fine = Contradictions(
+        phase_sine=0.01, contradicted_share=0.02, denied_share=0.0, uncovered_share=0.03
+    )
+    assert fine.warnings() == []
+    bad = replace(fine, contradicted_share=0.4, denied_share=0.2, uncovered_share=0.5)
+    assert [w.split()[0] for w in bad.warnings()] == ["on", "20%", "50%"]

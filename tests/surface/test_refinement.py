@@ -1,0 +1,209 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from analytic_objects import box, phase_maps_of, ring_of_views, sphere, torus
+from test_mesh_geometry import euler_number, extracted
+
+from polmvs.config import AngleModel
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
+from polmvs.surface.refinement import (
+    KnownPoints,
+    Level,
+    RefinementTolerances,
+    _Equations,
+    _SharedError,
+    face_rows,
+    find_rim,
+    normal_changes,
+    place_deviations,
+    refine,
+    shared_edges,
+    solve,
+)
+from polmvs.surface.surface_view import Silhouette, phase_rows, surface_view
+from polmvs.surface.visual_hull import visual_hull
+
+PPA = AngleModel.PPA
+FOOTPRINT = 5 / 150
+QUICK = RefinementTolerances(
+    levels=(
+        Level(edge_px=4.0, num_steps=8, loss_scale=12.0, rim_gate_px=25.0),
+        Level(edge_px=2.5, num_steps=4, loss_scale=4.0, rim_gate_px=4.0),
+    )
+)
+
+
+def views_of(distance, views=None, **kwargs):
+    views = views or ring_of_views(12, elevations=(0.0, 45.0, -35.0))
+    return [
+        surface_view(m, Silhouette(m.region.inside, m.region.inside), PPA, tilt_aware=False)
+        for m in phase_maps_of(distance, views, **kwargs)
+    ]
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return views_of(sphere())
+
+
+def test_rows_of_exact_phases_are_tangents(ball):
+    mesh = extracted(sphere(), step=0.05)
+    exact = TriangleMesh(
+        mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True), mesh.faces
+    )
+    rows = face_rows(exact, RayScene(exact), ball[0], PPA, 0.03, RefinementTolerances())
+    assert len(rows.face) > 0.3 * len(exact.faces)
+    inner = rows.cosine > 0.4
+    assert np.median(np.abs(rows.residual[inner])) < 0.01
+    assert (rows.variance >= 0.03**2).all()
+
+
+def test_rows_of_the_other_light_are_across(ball):
+    points = ball[0].center + 4.0 * ball[0].view.rays_in_world(np.array([[70.0, 50.0]]))
+    own = phase_rows(ball[0], PPA, points)
+    other = phase_rows(ball[0], PPA, points, np.array([True]))
+    assert abs((own.rows * other.rows).sum()) < 0.1
+
+
+def test_the_change_of_normals_is_their_derivative():
+    mesh = extracted(torus(), step=0.2)
+    change = normal_changes(mesh)
+    rng = np.random.default_rng(0)
+    displacement = 1e-6 * rng.standard_normal(len(mesh.vertices))
+    moved = mesh.moved(displacement[:, None] * mesh.vertex_normals)
+    found = moved.face_normals - mesh.face_normals
+    predicted = (change * displacement[mesh.faces][:, :, None]).sum(axis=1)
+    predicted -= (predicted * mesh.face_normals).sum(axis=1, keepdims=True) * mesh.face_normals
+    assert found == pytest.approx(predicted, abs=1e-3 * np.abs(predicted).max())
+
+
+def test_the_rim_is_the_outline_of_the_mesh(ball):
+    mesh = extracted(sphere(), step=0.1)
+    rim = find_rim(mesh, RayScene(mesh), ball[0], shared_edges(mesh))
+    center, _ = ball[0].project(np.zeros((1, 3)))
+    radii = np.linalg.norm(rim.xy - center, axis=1)
+    expected = 150 * 1 / np.sqrt(25 - 1)
+    assert np.median(radii) == pytest.approx(expected, abs=0.3)
+    # Turning edges zigzag about the outline: their length is that of it and more.
+    assert 0.8 < rim.length_px.sum() / (2 * np.pi * expected) < 2.5
+
+
+def test_every_inner_edge_is_shared_once():
+    mesh = extracted(sphere(), step=0.2)
+    edges = shared_edges(mesh)
+    assert len(edges.ends) == mesh.adjacency.nnz // 2
+    assert (edges.faces[:, 0] != edges.faces[:, 1]).all()
+
+
+def test_a_shared_error_is_eliminated_exactly():
+    rng = np.random.default_rng(0)
+    jacobian, residual = rng.standard_normal((40, 3)), rng.standard_normal(40)
+    weight, vertices = rng.uniform(0.5, 2, 40), rng.integers(0, 8, (40, 3))
+    equations, shared = _Equations(8), _SharedError(8, prior=3.0)
+    equations.add(vertices, jacobian, residual, weight)
+    shared.add(vertices, jacobian, residual, weight)
+    column = shared.column()
+    gradient = equations.gradient - column * shared.offset()
+    found = solve(equations.matrix(), -gradient, np.full(8, 0.1), column)
+    # The same with the error as a ninth unknown.
+    full = np.zeros((40, 9))
+    for index in range(3):
+        np.add.at(full, (np.arange(40), vertices[:, index]), jacobian[:, index])
+    full[:, 8] = -1
+    normal = full.T @ (weight[:, None] * full) + np.diag([0.1] * 8 + [3.0])
+    expected = np.linalg.solve(normal, -full.T @ (weight * residual))[:8]
+    assert found == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
+
+
+def test_a_sphere_comes_from_its_hull(ball):
+    hull = visual_hull(ball, num_wrong=0)
+    mesh = refine(hull.mesh, ball, PPA, hull.footprint, tolerances=QUICK)
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    assert np.abs(radii - 1).mean() < 0.25 * FOOTPRINT
+    assert np.quantile(np.abs(radii - 1), 0.98) < 0.8 * FOOTPRINT
+    normals = (mesh.vertex_normals * mesh.vertices).sum(axis=1) / radii
+    assert np.degrees(np.arccos(np.clip(normals, -1, 1))).mean() < 2.0
+
+
+def test_the_hole_of_a_torus_stays_and_noise_averages_out():
+    views = views_of(
+        torus(), ring_of_views(12, elevations=(15.0, 45.0, 70.0)), noise=np.radians(2.0)
+    )
+    hull = visual_hull(views, num_wrong=0)
+    mesh = refine(hull.mesh, views, PPA, hull.footprint, tolerances=QUICK)
+    assert euler_number(mesh) == 0
+    upper = mesh.vertices[:, 2] > 0
+    assert np.abs(torus()(mesh.vertices[upper])).mean() < 0.5 * FOOTPRINT
+
+
+def test_faces_of_a_box_become_flat():
+    views = views_of(box(), ring_of_views(12, elevations=(15.0, 40.0, 65.0)))
+    hull = visual_hull(views, num_wrong=0)
+    mesh = refine(hull.mesh, views, PPA, hull.footprint, tolerances=QUICK)
+    top = mesh.vertices[
+        (np.abs(mesh.vertices[:, 0]) < 0.6)
+        & (np.abs(mesh.vertices[:, 1]) < 0.4)
+        & (mesh.vertices[:, 2] > 0.3)
+    ]
+    assert np.std(top[:, 2]) < 0.15 * FOOTPRINT
+    assert abs(np.mean(top[:, 2]) - 0.5) < 1.0 * FOOTPRINT
+
+
+def test_known_points_place_what_outlines_misplace(ball):
+    """All silhouettes are two pixels too wide; the phases of a sphere hardly see its scale."""
+    import cv2
+
+    wide = []
+    for view in ball:
+        mask = cv2.dilate(view.silhouette.certain.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        wide.append(replace(view, silhouette=Silhouette(mask, mask)))
+    rng = np.random.default_rng(0)
+    points = rng.standard_normal((80, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    known = KnownPoints(points, np.full(80, 0.3 * FOOTPRINT))
+    hull = visual_hull(wide, num_wrong=0)
+    alone, helped = (
+        refine(hull.mesh, wide, PPA, hull.footprint, known=k, tolerances=QUICK)
+        for k in (None, known)
+    )
+    error = [np.mean(np.linalg.norm(m.vertices, axis=1) - 1) / FOOTPRINT for m in (alone, helped)]
+    assert error[0] > 1.0
+    assert abs(error[1]) < 0.5 * error[0]
+
+
+def test_outliers_among_known_points_lose(ball):
+    rng = np.random.default_rng(0)
+    points = rng.standard_normal((40, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points[:8] *= 0.75  # mirror images inside
+    known = KnownPoints(points, np.full(40, 0.3 * FOOTPRINT))
+    hull = visual_hull(ball, num_wrong=0)
+    mesh = refine(hull.mesh, ball, PPA, hull.footprint, known=known, tolerances=QUICK)
+    assert np.linalg.norm(mesh.vertices, axis=1).min() > 0.95
+
+
+def test_progress_is_whole(ball):
+    hull = visual_hull(ball, num_wrong=0)
+    steps = []
+    refine(hull.mesh, ball, PPA, hull.footprint, tolerances=QUICK, on_progress=steps.append)
+    assert sum(steps) == sum(level.num_steps for level in QUICK.levels)
+
+
+def test_an_empty_mesh_stays_empty(ball):
+    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    assert len(refine(empty, ball, PPA, FOOTPRINT).faces) == 0
+
+
+def test_deviations_are_larger_where_less_is_known(ball):
+    mesh = extracted(sphere(), step=0.12)
+    sigma = place_deviations(mesh, ball, PPA, FOOTPRINT, num_samples=8)
+    known = KnownPoints(np.array([[0, 0, 1.0]] * 20), np.full(20, 0.1 * FOOTPRINT))
+    helped = place_deviations(mesh, ball, PPA, FOOTPRINT, known=known, num_samples=8)
+    top = mesh.vertices[:, 2] > 0.97
+    assert np.isfinite(sigma).all()
+    assert np.mean(helped[top]) < np.mean(sigma[top])
+    one_side = [view for view in ball if view.center[0] > 0][:2]
+    few = place_deviations(mesh, one_side, PPA, FOOTPRINT, num_samples=8)
+    behind = mesh.vertices[:, 0] < -0.5
+    assert np.isinf(few[behind]).any()

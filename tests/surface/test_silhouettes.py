@@ -1,0 +1,124 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from analytic_objects import looking_at, phase_map_of, sphere
+
+from polmvs.polarization.region import Region
+from polmvs.surface.silhouettes import find_silhouettes
+from polmvs.surface.surface_view import FAR_PX, Silhouette, signed_distance_px
+
+VIEW = looking_at((5.0, 0, 2.0))
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return phase_map_of(sphere(), VIEW)
+
+
+def with_region(phase_map, inside):
+    return replace(phase_map, region=Region(inside, inside, np.zeros_like(inside)))
+
+
+def only_silhouette(phase_map, *, masks_given=False):
+    (found,) = find_silhouettes([phase_map], masks_given=masks_given)
+    return found
+
+
+def test_the_border_of_a_mask_runs_between_its_pixels():
+    mask = np.zeros((20, 30), bool)
+    mask[:, :10] = True
+    distance = signed_distance_px(mask)
+    assert distance[5, 9] == -0.5
+    assert distance[5, 10] == 0.5
+    assert distance[5, 0] == -9.5
+
+
+@pytest.mark.parametrize(("full", "sign"), [(True, -1), (False, 1)])
+def test_a_mask_without_border_is_far(full, sign):
+    assert (signed_distance_px(np.full((8, 9), full)) == sign * FAR_PX).all()
+
+
+def test_gradient_of_a_silhouette_points_outwards(ball):
+    silhouette = only_silhouette(ball)
+    distance, dx, dy = np.moveaxis(silhouette.inner, -1, 0)
+    ring = np.abs(distance) < 3
+    rows, cols = np.nonzero(ring)
+    outwards = np.stack([cols, rows], 1) - [np.mean(cols), np.mean(rows)]
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    assert ((dx[ring] * outwards[:, 0] + dy[ring] * outwards[:, 1]) > 0.85).all()
+
+
+def test_user_masks_are_certain(ball):
+    inside = ball.region.inside.copy()
+    inside[50:54, 60:64] = False  # a hole as small as a mark stays if the user drew it
+    silhouette = only_silhouette(with_region(ball, inside), masks_given=True)
+    assert (silhouette.certain == inside).all()
+    assert silhouette.is_sharp
+
+
+def test_specks_gaps_and_marks_are_cleaned(ball):
+    inside = ball.region.inside.copy()
+    clean = only_silhouette(ball).certain
+    inside[2, 2] = True
+    inside[50:52, 60:63] = False
+    assert (only_silhouette(with_region(ball, inside)).certain == clean).all()
+
+
+def test_a_large_hole_stays(ball):
+    inside = ball.region.inside.copy()
+    inside[48:62, 60:72] = False
+    silhouette = only_silhouette(with_region(replace(ball, intensity=_bright_hole(ball)), inside))
+    assert not silhouette.possible[52:58, 64:68].any()
+
+
+def _bright_hole(ball):
+    intensity = ball.intensity.copy()
+    intensity[48:62, 60:72] = 0.6
+    return intensity
+
+
+def test_dark_pixels_that_go_on_are_unknown(ball):
+    inside = ball.region.inside
+    left = inside.copy()
+    left[:, 86:] = False  # unpolarised there, as dark as the rest
+    silhouette = only_silhouette(with_region(ball, left))
+    missing = inside & ~left
+    assert (silhouette.possible & missing).sum() > 0.9 * missing.sum()
+    assert not (silhouette.certain & missing)[:, 89:].any()
+    assert (silhouette.possible & ~inside).sum() < 0.02 * inside.sum()
+
+
+def test_outlines_follow_the_step_of_intensity(ball):
+    """A region that has leaked over the object's border by two pixels."""
+    import cv2
+
+    grown = cv2.dilate(ball.region.inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    true = signed_distance_px(ball.region.inside)
+    ring = np.abs(true) < 0.6
+    before = signed_distance_px(grown)[ring]
+    after = only_silhouette(with_region(ball, grown)).inner[..., 0][ring]
+    assert np.median(before) < -1.4
+    assert abs(np.median(after)) < 0.5
+
+
+def test_nothing_polarised_gives_an_empty_silhouette(ball):
+    silhouette = only_silhouette(with_region(ball, np.zeros_like(ball.region.inside)))
+    assert not silhouette.possible.any()
+
+
+def test_the_nearer_outline_counts_in_doubt():
+    from polmvs.config import AngleModel
+    from polmvs.surface.refinement import rim_residuals
+    from polmvs.surface.surface_view import surface_view
+
+    ball = phase_map_of(sphere(), VIEW)
+    certain = np.zeros((112, 132), bool)
+    certain[30:80, 30:60] = True
+    possible = certain.copy()
+    possible[30:80, 60:90] = True
+    view = surface_view(ball, Silhouette(certain, possible), AngleModel.PPA)
+    xy = np.array([[62.0, 55.0], [88.0, 55.0], [58.0, 55.0]])
+    residual, gradient = rim_residuals(view, xy)
+    assert residual == pytest.approx([2, -2, -2], abs=0.1)
+    assert gradient[:, 0] == pytest.approx(1, abs=0.05)
