@@ -531,9 +531,6 @@ def _labels(
             claims[number] = _claim(number, group, seeds, grid, evidence, possible, tol)
             jumps[number] = evidence.jump
         labels = np.where(claims.max(axis=0) > tol.min_claim, claims.argmax(axis=0), NO_FACE)
-        # Nothing hides the border of a higher face: it shows where the lower one begins.
-        height = np.where(claims > 0.5, rise, -np.inf)
-        labels = np.where(claims.max(axis=0) > 0.5, height.argmax(axis=0), labels)
         labels = _without_small(labels, len(group), tol)
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1)):
             labels = snapped_border(labels, int(number), jumps[number], tol)
