@@ -67,6 +67,8 @@ class OffsetTolerances:
     mark_px : greatest width of a printed mark, at a focal length of 445 px. Guess.
     mark_contrast : of a mark's intensity to what is about it. As for the region's marks.
     mark_dolp_share : of the DoLP about a mark in its own, at most. As for the seeds.
+    mark_share : of the views that show a place, which must show a mark there. Guess: a wall of a
+        convex part is seen by half of them.
     mark_margin_px : square about a pixel of a mark that is left out: its smoothed outline.
     seed_cells : radius about a sparse point that belongs to its face. Guess: its uncertainty.
     phase_floor : residual that noise does not explain, sine. Prototype: 0.03 on curved meshes; a
@@ -107,12 +109,13 @@ class OffsetTolerances:
     mark_px: float = 20.0
     mark_contrast: float = 1.5
     mark_dolp_share: float = 0.85
+    mark_share: float = 0.6
     mark_margin_px: int = 5
     seed_cells: float = 2.0
     phase_floor: float = 0.015
     cost_sigmas: float = 3.0
     max_cost: float = 0.5
-    leak: float = 0.01
+    leak: float = 0.1
     snap_cells: float = 5.0
     seed_weight: float = 0.2
     min_claim: float = 0.25
@@ -528,14 +531,11 @@ def _labels(
             claims[number] = _claim(number, group, seeds, grid, evidence, possible, tol)
             jumps[number] = evidence.jump
         labels = np.where(claims.max(axis=0) > tol.min_claim, claims.argmax(axis=0), NO_FACE)
-        # Nothing hides the border of a higher face: it shows where the lower one begins.
-        height = np.where(claims > 0.5, rise, -np.inf)
-        labels = np.where(claims.max(axis=0) > 0.5, height.argmax(axis=0), labels)
         labels = _without_small(labels, len(group), tol)
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1)):
             labels = snapped_border(labels, int(number), jumps[number], tol)
         taken = ndimage.binary_opening(taken & ~explained, iterations=2)
-        labels = _continued(labels, taken, tol)
+        labels = _continued(np.where(taken, NO_FACE, labels), taken, tol)
     return np.asarray(labels, np.int64)
 
 
@@ -651,7 +651,7 @@ def face_evidence(
     losses = row_losses(scene.rows(places.reshape(-1, 3)), face.normal[:, None], tol)[0]
     losses = losses.reshape(-1, *shape)
     jumps = np.full(losses.shape, np.nan, np.float32)
-    inside, num_seen = np.zeros(shape), np.zeros(shape)
+    inside, num_seen, num_marks = np.zeros((3, *shape))
     for k, phase_map in enumerate(scene.maps):
         xy, seen = _seen(places, face, phase_map, tol)
         if hidden is not None:
@@ -660,7 +660,12 @@ def face_evidence(
         num_seen += seen
         inside += shown
         losses[k] = np.where(shown, losses[k], np.nan)
-        jumps[k] = _line_steps(scene.features[k], xy, shown, near_points, tol)
+        jumps[k], marks = _line_steps(scene.features[k], xy, shown, tol)
+        num_marks += marks
+    # What is printed on the face is a mark in all views, what is printed on a wall beside it is
+    # not at the same place.
+    printed = near_points & (num_marks > tol.mark_share * inside)
+    jumps[:, printed] = np.nan
     possible = (num_seen >= tol.min_views) & (inside >= tol.min_share * num_seen)
     return FaceEvidence(_shared_lines(jumps, tol.view_share), median_loss(losses), possible)
 
@@ -670,10 +675,9 @@ def face_lines(
 ) -> Image:
     """Steps (H, W) in units of noise that a share of the views shows at places (H, W, 3)."""
     jumps = np.full((len(scene.maps), *places.shape[:2]), np.nan, np.float32)
-    nothing_near = np.zeros(places.shape[:2], np.bool_)
     for k, phase_map in enumerate(scene.maps):
         xy, seen = _seen(places, face, phase_map, tol)
-        jumps[k] = _line_steps(scene.features[k], xy, seen, nothing_near, tol)
+        jumps[k] = _line_steps(scene.features[k], xy, seen, tol)[0]
     return _shared_lines(jumps, view_share)
 
 
@@ -691,13 +695,11 @@ def _seen(
     return xy.astype(np.float32), np.asarray(seen & (cosine > tol.min_cosine))
 
 
-def _line_steps(
-    images: Image, xy: Image, shown: Mask, near_points: Mask, tol: OffsetTolerances
-) -> Image:
-    """Steps (H, W) of one view's images, NaN where it does not count."""
+def _line_steps(images: Image, xy: Image, shown: Mask, tol: OffsetTolerances) -> tuple[Image, Mask]:
+    """Steps (H, W) of one view's images, NaN where it shows nothing, and where it shows a mark."""
     values = sample_image(images, xy)
-    plain = shown & ((values[..., 3] == 1) | ~near_points)
-    return np.where(plain, _steps(values[..., :3], plain, tol), np.nan).astype(np.float32)
+    steps = np.where(shown, _steps(values[..., :3], shown, tol), np.nan)
+    return steps.astype(np.float32), np.asarray(shown & (values[..., 3] < 1))
 
 
 def _shared_lines(jumps: Image, view_share: float) -> Image:

@@ -9,7 +9,7 @@ from polmvs.camera import PinholeCamera
 from polmvs.config import AngleModel
 from polmvs.scene import Seeds
 from polmvs.surface.offsets import find_faces, stepped_faces
-from polmvs.synthetic.captures import Group, Plane, render_view, ring_of_views
+from polmvs.synthetic.captures import Group, Plane, Sphere, render_view, ring_of_views
 from tests.scenes import phase_map_of
 
 CAMERA = PinholeCamera(width=320, height=256, fx=270.0, fy=270.0, cx=160.0, cy=128.0)
@@ -116,3 +116,77 @@ def test_space_above_the_faces_of_a_step_is_free(height, tilt_deg):
     near = (np.abs(above) < 3e-3) & (np.abs(np.abs(points[:, :2]).max(axis=1) - BOX) > 0.015)
     cosine = np.where(np.abs(points[near, :2]).max(axis=1) < BOX, np.cos(np.radians(tilt_deg)), 1)
     assert np.quantile(np.abs(group.values(points[near]) - above[near] * cosine), 0.95) < 5e-4
+
+
+def test_a_surface_that_explains_all_points_is_left_alone():
+    scene = step_scene(0.03, num_views=3)
+
+    def exact(points):
+        return points[:, 2] - scene.true_height(points[:, :2])
+
+    faces = find_faces(scene.seeds)
+    assert (
+        stepped_faces(faces, scene.seeds, scene.maps, AngleModel.PPA, signed_distance=exact) == ()
+    )
+    # A plain box: one face, on the surface that silhouettes give.
+    plain = Seeds(
+        *(a[9:] for a in (scene.seeds.points_in_world, scene.seeds.normals_in_world)),
+        scene.seeds.sigma[9:],
+    )
+    (face,) = find_faces(plain)
+    found = stepped_faces(
+        [face], plain, scene.maps, AngleModel.PPA, signed_distance=lambda points: points[:, 2]
+    )
+    assert found == ()
+
+
+@pytest.mark.parametrize("knows_the_ball", [False, True])
+def test_what_stands_on_a_face_is_not_carved(knows_the_ball):
+    radius, center = 0.04, np.array([0.0, 0.0, 0.03])
+    ball = Sphere(center, radius)
+    surface = Group([Plane([0, 0, 0], [0, 0, 1], (PLATE, PLATE)), ball])
+    views = ring_of_views(9, CAMERA, distance=0.6, elevation_deg=50, roll_deg=10)
+    maps = [phase_map_of(render_view(view, surface, s0=0.2, background=0.6)) for view in views]
+    ring = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    points = 0.1 * np.stack([np.cos(ring), np.sin(ring), np.zeros(12)], axis=1)
+    seeds = Seeds(points, np.tile([0.0, 0.0, 1.0], (12, 1)), np.full(12, SIGMA))
+    first_hit = None
+    if knows_the_ball:
+
+        def first_hit(origins, direction):
+            return ball.intersect(origins, np.broadcast_to(direction, origins.shape))
+
+    (group,) = stepped_faces(find_faces(seeds), seeds, maps, AngleModel.PPA, first_hit=first_hit)
+    rng = np.random.default_rng(0)
+    inside = rng.normal(size=(500, 3))
+    inside = center + 0.8 * radius * inside / np.linalg.norm(inside, axis=1, keepdims=True)
+    inside = inside[inside[:, 2] > 0.004]
+    assert np.mean(group.values(inside) > 0) < 0.01
+    assert (group.values(points + np.array([0, 0, 0.01])) > 0.005).all()
+
+
+def test_false_matches_among_the_points_of_a_face_are_no_face():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.1, 0.1, (40, 2)), np.zeros(40)])
+    points[30:, 2] = -0.004  # mirror images, all at one depth
+    normals = unit_rows(np.array([0.0, 0.0, 1.0]) + rng.normal(0, 0.003, (40, 3)))
+    points += rng.normal(0, SIGMA, points.shape)
+    (face,) = find_faces(Seeds(points, normals, np.full(40, SIGMA)))
+    assert set(face.members) <= set(range(30))
+    assert len(face.members) >= 28
+    assert abs(face.offset) < SIGMA
+    np.testing.assert_allclose(face.normal, [0, 0, 1], atol=2e-3)
+
+
+def test_points_of_a_curved_surface_or_too_few_make_no_large_face():
+    rng = np.random.default_rng(0)
+    normals = unit_rows(rng.normal(size=(60, 3)) + np.array([0, 0, 2]))
+    ball = Seeds(0.05 * normals, normals, np.full(60, SIGMA))
+    # Neighbours that share a tangent plane by chance, at most.
+    assert all(len(face.members) < 8 for face in find_faces(ball))
+    flat = np.column_stack([rng.uniform(size=(3, 2)), np.zeros(3)])
+    few = Seeds(flat, np.tile([0.0, 0.0, 1.0], (3, 1)), np.full(3, SIGMA))
+    assert find_faces(few) == ()
+    unknown = Seeds(0.05 * normals, np.full((60, 3), np.nan), np.full(60, SIGMA))
+    assert find_faces(unknown) == ()
+    assert stepped_faces((), few, [], AngleModel.PPA) == ()
