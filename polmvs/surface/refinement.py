@@ -100,7 +100,7 @@ class RefinementTolerances:
     phase_correlation: float = 400.0
     rim_sigma_px: float = 0.3
     rim_length_px: float = 10.0
-    outline_bias_px: float = 0.1
+    outline_bias_px: float = 0.2
     min_known: int = 10
     point_sigma_px: float = 0.3
     smoothness: float = 0.04
@@ -728,7 +728,7 @@ def _add_points(
     face, residual, sigma = face[near], residual[near], sigma[near]
     along = (mesh.vertex_normals[mesh.faces[face]] * normals[near][:, None]).sum(axis=-1)
     jacobian = barycentric[near] * along
-    scale = np.maximum(4 * sigma, 0.25 * level.rim_gate_px * footprint) ** 2
+    scale = np.maximum(4 * sigma, 0.1 * level.rim_gate_px * footprint) ** 2
     weight = tol.phase_correlation * (scale / (scale + residual**2)) ** 2 / sigma**2
     equations.add(mesh.faces[face], jacobian, residual, weight)
     return int(near.sum())
