@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
 from polmvs.surface.hollows import SurfaceFaces, find_hollows
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, sample_surface
-from polmvs.surface.offsets import SteppedFaces, find_faces, stepped_faces
+from polmvs.surface.offsets import find_faces, stepped_faces
 from polmvs.surface.refinement import (
     KnownPoints,
     RefinementTolerances,
@@ -41,7 +41,7 @@ from polmvs.surface.surface_quality import (
     supported_faces,
 )
 from polmvs.surface.surface_view import SurfaceView, surface_view
-from polmvs.surface.visual_hull import VisualHull, supporting_plane, visual_hull
+from polmvs.surface.visual_hull import supporting_plane, visual_hull
 
 logger = logging.getLogger(__name__)
 
@@ -52,8 +52,6 @@ OnProgress = Callable[[int], None]
 
 MIN_VIEWS = 3  # with an outline: the hull of two cones is no shape
 MAX_FILLED_SHARE = 0.35  # of the image's border on the objects, where a silhouette bounds little
-SEEN_SEEDS = 0.75  # share of the seeds that a coarse surface without steps passes. Guess.
-MISSED_FOOTPRINTS = 1.0  # by which it misses the others on `step`: 1 to 4; on `dome` 0.5
 REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured on spheres
 COARSE_EDGE_PX = 6.0  # of the mesh on which deviations are sampled; they are smooth
 NUM_FINAL_STEPS = 3  # of the progress: evidence, normals, deviations
@@ -145,6 +143,18 @@ def reconstruct_surface(
     if not len(hull.mesh.faces):
         return Undetermined("the polarised regions of the views have no common object")
     logger.info("visual hull: %d vertices.", len(hull.mesh.vertices))
+    steps = stepped_faces(
+        find_faces(seeds),
+        seeds,
+        maps,
+        angle_model,
+        tilt_aware=tilt_aware,
+        signed_distance=RayScene(hull.mesh).signed_distance,
+        first_hit=_first_hit(hull.mesh),
+    )
+    if steps:
+        logger.info("%d groups of faces that silhouettes do not tell apart.", len(steps))
+        hull = hull.carved([group.values for group in steps])
     hollows = find_hollows(
         SurfaceFaces(
             hull.mesh.centers,
@@ -160,31 +170,15 @@ def reconstruct_surface(
     # Rows of a tilted map are those of PPA: its samples are corrected.
     rows = AngleModel.OPA if angle_model is AngleModel.OPA else AngleModel.PPA
     known = KnownPoints(seeds.points_in_world, seeds.sigma)
-    tol = tolerances or RefinementTolerances()
-    coarse, fine = replace(tol, levels=tol.levels[:1]), replace(tol, levels=tol.levels[1:])
-
-    def coarsely(start: TriangleMesh, progress: OnProgress | None) -> TriangleMesh:
-        return refine(
-            start, views, rows, hull.footprint, known=known, tolerances=coarse, on_progress=progress
-        )
-
-    mesh = coarsely(hull.mesh, on_progress)
-    steps = _steps(hull, mesh, seeds, maps, angle_model, tilt_aware=tilt_aware)
-    if steps:
-        logger.info("%d groups of faces that silhouettes do not tell apart.", len(steps))
-        hull = hull.carved([group.values for group in steps])
-        mesh = coarsely(hull.mesh, None)
-    if len(mesh.faces):
-        mesh = refine(
-            mesh,
-            views,
-            rows,
-            hull.footprint,
-            known=known,
-            row_sigma=median_residual(mesh, views, rows)[0],
-            tolerances=fine,
-            on_progress=on_progress,
-        )
+    mesh = refine(
+        hull.mesh,
+        views,
+        rows,
+        hull.footprint,
+        known=known,
+        tolerances=tolerances,
+        on_progress=on_progress,
+    )
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
     if carvings and len(mesh.faces):
@@ -215,32 +209,6 @@ def reconstruct_surface(
         footprint=hull.footprint,
         contradictions=contradictions,
         presumed=presumed,
-    )
-
-
-def _steps(
-    hull: VisualHull,
-    coarse: TriangleMesh,
-    seeds: Seeds,
-    maps: Sequence[PhaseMap],
-    angle_model: AngleModel,
-    *,
-    tilt_aware: bool,
-) -> tuple[SteppedFaces, ...]:
-    """Faces that the seeds show and the silhouettes do not, where a coarse surface misses seeds."""
-    if not len(coarse.faces) or not len(seeds.sigma):
-        return ()
-    off = np.abs(RayScene(coarse).signed_distance(seeds.points_in_world))
-    if np.quantile(off, SEEN_SEEDS) < MISSED_FOOTPRINTS * hull.footprint:
-        return ()
-    return stepped_faces(
-        find_faces(seeds),
-        seeds,
-        maps,
-        angle_model,
-        tilt_aware=tilt_aware,
-        signed_distance=RayScene(hull.mesh).signed_distance,
-        first_hit=_first_hit(hull.mesh),
     )
 
 
