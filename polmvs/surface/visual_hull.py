@@ -38,6 +38,9 @@ class HullTolerances:
     wrong_share : of the views that may deny a point wrongly. Measured: 3 of 18 to 20 views.
     min_seen_share : of the views that must have a point in their image. Guess.
     min_piece_share : of the largest piece's volume; smaller ones are no objects. Guess.
+    depth_px : by which the hull reaches below the supporting plane, where no view sees it, in
+        footprints: two edges of the coarsest mesh. Measured: a plate on the demo's table vanishes
+        with 0.
     plane_distance : of inliers to the supporting plane, as a share of the cameras' distance.
     min_plane_share : of the sparse points of the surroundings that lie in a supporting plane.
     """
@@ -47,6 +50,7 @@ class HullTolerances:
     wrong_share: float = 0.1
     min_seen_share: float = 0.34
     min_piece_share: float = 0.01
+    depth_px: float = 12.0
     plane_distance: float = 0.004
     min_plane_share: float = 0.25
 
@@ -239,7 +243,10 @@ def hull_values(
     values = largest[chosen, np.arange(len(points))]
     values = np.where(num_seen < max(2, tol.min_seen_share * len(views)), OUTSIDE, values)
     if plane is not None:
-        values = np.maximum(values, -plane.height(points)).astype(np.float32)
+        # Deeper than the plane: a thin plate on it must not be thinner than a coarse mesh's edges.
+        z = np.median([view.footprint(points) for view in views], axis=0)
+        floor = -plane.height(points) - tol.depth_px * z
+        values = np.maximum(values, floor).astype(np.float32)
     return values
 
 
