@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds, View
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
-from polmvs.surface.hollows import SurfaceFaces, find_hollows
+from polmvs.surface.hollows import Hollow, SurfaceFaces, find_hollows
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, sample_surface
 from polmvs.surface.offsets import find_faces, stepped_faces
 from polmvs.surface.refinement import (
@@ -155,30 +155,22 @@ def reconstruct_surface(
     if steps:
         logger.info("%d groups of faces that silhouettes do not tell apart.", len(steps))
         hull = hull.carved([group.values for group in steps])
-    hollows = find_hollows(
-        SurfaceFaces(
-            hull.mesh.centers,
-            hull.mesh.face_normals,
-            hull.mesh.face_areas,
-            RayScene(hull.mesh).signed_distance,
-            hull.footprint,
-        ),
-        maps,
-        angle_model,
-        tilt_aware=tilt_aware,
-    )
     # Rows of a tilted map are those of PPA: its samples are corrected.
     rows = AngleModel.OPA if angle_model is AngleModel.OPA else AngleModel.PPA
     known = KnownPoints(seeds.points_in_world, seeds.sigma)
+    tolerances = tolerances or RefinementTolerances()
+    # Coarse edges would round the steps away that were just carved.
+    levels = tolerances.levels[1:] if steps else tolerances.levels
     mesh = refine(
         hull.mesh,
         views,
         rows,
         hull.footprint,
         known=known,
-        tolerances=tolerances,
+        tolerances=replace(tolerances, levels=levels),
         on_progress=on_progress,
     )
+    hollows = _hollows((mesh, hull.mesh), hull.footprint, maps, angle_model, tilt_aware)
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
     if carvings and len(mesh.faces):
@@ -210,6 +202,30 @@ def reconstruct_surface(
         contradictions=contradictions,
         presumed=presumed,
     )
+
+
+def _hollows(
+    meshes: Sequence[TriangleMesh],
+    footprint: float,
+    maps: Sequence[PhaseMap],
+    angle_model: AngleModel,
+    tilt_aware: bool,
+) -> tuple[Hollow, ...]:
+    """Hollows of the first of some meshes that has any: a refined outer wall places the inner."""
+    for mesh in meshes:
+        if not len(mesh.faces):
+            continue
+        faces = SurfaceFaces(
+            mesh.centers,
+            mesh.face_normals,
+            mesh.face_areas,
+            RayScene(mesh).signed_distance,
+            footprint,
+        )
+        found = find_hollows(faces, maps, angle_model, tilt_aware=tilt_aware)
+        if found:
+            return tuple(found)
+    return ()
 
 
 def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:

@@ -307,12 +307,21 @@ class _Search:
     def _views(self, members: Sequence[_Member]) -> list[View]:
         return [self.maps[member.piece[0]].view for member in members]
 
-    def _middle(self, piece: PieceId, placement: Placement) -> float:
-        """Log-range at which another view sees the middle of a placed surface's piece."""
+    def _middle(self, piece: PieceId, placement: Placement) -> float | None:
+        """Log-range at which another view sees the middle of a placed surface's piece.
+
+        None where nothing of the surface has a place: the scene's own bounds must do.
+        """
         view = self.maps[piece[0]].view
         points = points_of(placement.surface, placement.center)
-        cosine = view.facing_cosines(points, placement.surface.normals)
-        points = points[cosine > np.minimum(MIN_COSINE, np.median(cosine))]
+        known = np.isfinite(points).all(axis=-1)
+        points = points[known]
+        if not len(points):
+            return None
+        cosine = np.nan_to_num(
+            view.facing_cosines(points, placement.surface.normals[known]), nan=-1.0
+        )
+        points = points[cosine >= min(MIN_COSINE, float(np.median(cosine)))]
         xy = view.project(points)
         outline = self.pieces[piece[0]][piece[1]].outline
         gap = np.linalg.norm(xy - np.median(outline, axis=0), axis=-1)

@@ -17,6 +17,7 @@ def run_copy(demo_run: Path, tmp_path: Path) -> Path:
 
 def test_report_makes_the_page_again(cli, run_copy: Path) -> None:
     page = run_copy / "report.html"
+    assert cli("report", run_copy)[0] == 0  # of the record as it is now
     first = page.read_bytes()
     page.unlink()
     status, text, _ = cli("report", run_copy)

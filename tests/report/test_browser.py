@@ -52,14 +52,21 @@ class Opened:
         self.page.goto(report.as_uri())
         self.page.wait_for_selector("#view3d[data-ready=true]", timeout=120_000)
 
+    def settle(self) -> None:
+        """Let what was asked for be drawn: the view draws in the next frame."""
+        self.page.wait_for_timeout(100)
+        self.page.evaluate(
+            "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+        )
+
     def shot(self, selector: str) -> bytes:
         """What one element looks like, once the next frames are drawn."""
-        self.page.wait_for_timeout(300)
+        self.settle()
         return self.page.locator(selector).screenshot()
 
     def drawing(self, pane: str = "left") -> str:
         """The picture on a pane's canvas, once the next frames are drawn."""
-        self.page.wait_for_timeout(300)
+        self.settle()
         return self.page.evaluate(
             "name => document.querySelector(`[data-pane=${name}] canvas`).toDataURL()", pane
         )
