@@ -18,7 +18,7 @@ from polmvs.config import AngleModel
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Seeds, View
+from polmvs.scene import KEYPOINT_SIGMA_PX, Seeds, View
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
 from polmvs.surface.hollows import Hollow, SurfaceFaces, find_hollows
@@ -159,17 +159,27 @@ def reconstruct_surface(
     rows = AngleModel.OPA if angle_model is AngleModel.OPA else AngleModel.PPA
     known = KnownPoints(seeds.points_in_world, seeds.sigma)
     tolerances = tolerances or RefinementTolerances()
-    # Coarse edges would round the steps away that were just carved.
-    levels = tolerances.levels[1:] if steps else tolerances.levels
-    mesh = refine(
-        hull.mesh,
-        views,
-        rows,
-        hull.footprint,
-        known=known,
-        tolerances=replace(tolerances, levels=levels),
-        on_progress=on_progress,
-    )
+    # Coarse edges round the steps away that were just carved, and the rims of plates; without them
+    # what is far from its hull does not come all the way. The known points tell which it was, as
+    # far as points can whose keypoints err by half a pixel.
+    schedules = [tolerances.levels, *([tolerances.levels[1:]] if steps else [])]
+    refined = [
+        refine(
+            hull.mesh,
+            views,
+            rows,
+            hull.footprint,
+            known=known,
+            tolerances=replace(tolerances, levels=levels),
+            on_progress=on_progress if number == 0 else None,
+        )
+        for number, levels in enumerate(schedules)
+    ]
+    mesh, *finer = refined
+    for other in finer:
+        allowed = _distance_of(seeds, mesh) + KEYPOINT_SIGMA_PX * hull.footprint
+        if _distance_of(seeds, other) <= allowed:
+            mesh = other
     hollows = _hollows((mesh, hull.mesh), hull.footprint, maps, angle_model, tilt_aware)
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
@@ -202,6 +212,15 @@ def reconstruct_surface(
         contradictions=contradictions,
         presumed=presumed,
     )
+
+
+def _distance_of(seeds: Seeds, mesh: TriangleMesh) -> float:
+    """Median distance of the known points from a surface; infinite of none, 0 without points."""
+    if not len(mesh.faces):
+        return np.inf
+    if not len(seeds.sigma):
+        return 0.0
+    return float(np.median(np.abs(RayScene(mesh).signed_distance(seeds.points_in_world))))
 
 
 def _hollows(
