@@ -12,9 +12,17 @@ from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import store_phase_map
 from polmvs.polarization.region import Region
 from polmvs.scene import Seeds
-from polmvs.surface.outlines import FAR_PX, OutlineErrors, find_pieces, piece_nodes
+from polmvs.surface.outlines import (
+    FAR_PX,
+    OutlineErrors,
+    Reference,
+    find_pieces,
+    piece_nodes,
+)
 from polmvs.surface.parts import (
     Placement,
+    _nowhere,
+    _Search,
     contradicted,
     find_part_seeds,
     join_seeds,
@@ -326,3 +334,22 @@ def test_two_boards_are_two_parts():
     for board, mine in zip(boards, (left, ~left), strict=True):
         error = heights(board, seeds.points_in_world[mine])
         assert np.abs(np.median(error)) < 0.5 * FOOTPRINT
+
+
+def test_a_surface_without_places_gives_no_middle_to_look_about(board):
+    """Another view of such a piece is searched within the scene's bounds, not within NaN's."""
+    pieces_of_views = [
+        find_pieces(phase_map.region, phase_map.intensity) for phase_map in board.maps
+    ]
+    search = _Search(AngleModel.PPA, board.maps, pieces_of_views, set(), ABOUT, 3, Workers())
+    reference = Reference(board.maps, pieces_of_views, 0, True)
+    nodes = piece_nodes(board.maps[0], pieces_of_views[0][0])
+    nowhere = _nowhere(reference, nodes)
+    unplaced = replace(
+        nowhere, surface=replace(nodes.surface, log_range=np.full(len(nodes.surface.xy), np.nan))
+    )
+    assert search._middle((1, 0), unplaced) is None
+    placed = replace(
+        nowhere, surface=replace(nodes.surface, log_range=np.zeros(len(nodes.surface.xy)))
+    )
+    assert np.isfinite(search._middle((1, 0), placed))
