@@ -438,7 +438,7 @@ class PropagationOptions(OptionGroup, group="propagation"):
     """How ranges spread from the seeds over the polarised region."""
 
     method: Method = option(
-        Method.SURFACE,
+        Method.INTEGRATE,
         "'surface': one mesh that all views agree on, from their silhouettes and phases; "
         "'integrate': multi-view normals over the region's pixels, coarse to fine; 'contour': "
         "along phase contours, as in the paper",
