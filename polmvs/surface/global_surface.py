@@ -18,7 +18,7 @@ from polmvs.config import AngleModel
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import KEYPOINT_SIGMA_PX, Seeds, View
+from polmvs.scene import Seeds, View
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
 from polmvs.surface.hollows import Hollow, SurfaceFaces, find_hollows
@@ -160,8 +160,7 @@ def reconstruct_surface(
     known = KnownPoints(seeds.points_in_world, seeds.sigma)
     tolerances = tolerances or RefinementTolerances()
     # Coarse edges round the steps away that were just carved, and the rims of plates; without them
-    # what is far from its hull does not come all the way. The known points tell which it was, as
-    # far as points can whose keypoints err by half a pixel.
+    # what is far from its hull does not come all the way. The known points tell which it was.
     schedules = [tolerances.levels, *([tolerances.levels[1:]] if steps else [])]
     refined = [
         refine(
@@ -175,11 +174,7 @@ def reconstruct_surface(
         )
         for number, levels in enumerate(schedules)
     ]
-    mesh, *finer = refined
-    for other in finer:
-        allowed = _distance_of(seeds, mesh) + KEYPOINT_SIGMA_PX * hull.footprint
-        if _distance_of(seeds, other) <= allowed:
-            mesh = other
+    mesh = min(refined, key=lambda one: _distance_of(seeds, one))
     hollows = _hollows((mesh, hull.mesh), hull.footprint, maps, angle_model, tilt_aware)
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
