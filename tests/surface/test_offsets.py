@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scenes import phase_map_of
 
 from polmvs.camera import PinholeCamera
 from polmvs.config import AngleModel
 from polmvs.scene import Seeds
 from polmvs.surface.offsets import find_faces, stepped_faces
 from polmvs.synthetic.captures import Group, Plane, Sphere, render_view, ring_of_views
-from tests.scenes import phase_map_of
 
 CAMERA = PinholeCamera(width=320, height=256, fx=270.0, fy=270.0, cx=160.0, cy=128.0)
 PLATE, BOX = 0.14, 0.055  # half sides, m
