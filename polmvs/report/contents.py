@@ -121,7 +121,6 @@ def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[Pictu
             "AoLP",
             "angle of linear polarisation in cyclic colours, faint where the DoLP is low",
             pictures.angle_picture(aolp, strength=dolp / FULL_DOLP),
-            wheel=True,
         ),
         _picture(
             "DoLP",
@@ -232,6 +231,5 @@ def _picture(
     rgb: NDArray[np.uint8],
     *,
     scale: tuple[str, str, str] | None = None,
-    wheel: bool = False,
 ) -> Picture:
-    return Picture(title=title, alt=alt, uri=pictures.data_uri(rgb), scale=scale, wheel=wheel)
+    return Picture(title=title, alt=alt, uri=pictures.data_uri(rgb), scale=scale)

@@ -23,14 +23,12 @@ class Picture:
     alt : for who cannot see it.
     uri : the coded picture.
     scale : lowest, highest and colour map of the legend; None without one.
-    wheel : its legend is the wheel of angles.
     """
 
     title: str
     alt: str
     uri: str
     scale: tuple[str, str, str] | None = None
-    wheel: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -183,7 +183,7 @@ def reconstruct_surface(
     if not len(mesh.faces):
         return Undetermined("the surface vanishes under the phases of the views")
     row_error, median = median_residual(mesh, views, rows)
-    row_sigma = max(row_error, RefinementTolerances().row_sigma)
+    row_sigma = max(row_error, tolerances.row_sigma)
     evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
     supported = supported_faces(mesh, evidence, min_views=min_views)
     seen = evidence.num_views >= min_views
