@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from polmvs.errors import DataError, PolmvsError
 from polmvs.io.images import write_bytes
+from polmvs.io.temporary import remove_temporary, temporary_path
 
 Array = NDArray[np.float64]
 
@@ -129,7 +130,7 @@ def write_cloud(path: str | Path, cloud: Cloud) -> None:
         If the file cannot be written.
     """
     target = Path(path)
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp.ply")
+    temporary = temporary_path(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         if len(cloud.points):
@@ -142,7 +143,7 @@ def write_cloud(path: str | Path, cloud: Cloud) -> None:
     except OSError as error:
         raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        remove_temporary(temporary)
 
 
 def _empty_ply(cloud: Cloud) -> bytes:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 
 from polmvs.errors import DataError
+from polmvs.io.temporary import remove_temporary, temporary_path
 
 
 @contextmanager
@@ -28,13 +27,10 @@ def new_folder(folder: str | PathLike[str], *, overwrite: bool = False) -> Itera
     target = Path(folder)
     if target.exists() and not overwrite and not (target.is_dir() and not any(target.iterdir())):
         raise DataError(target, "exists already. Remove it or choose another folder.")
-    temporary: Path | None = None
+    temporary = temporary_path(target)
+    content = temporary / "content"
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-        # mkdtemp's folder is the owner's alone; one that mkdir makes has the usual rights.
-        content = temporary / "content"
-        content.mkdir()
+        content.mkdir(parents=True)
         yield content
         replaced = temporary / "replaced"
         if target.exists():
@@ -48,5 +44,4 @@ def new_folder(folder: str | PathLike[str], *, overwrite: bool = False) -> Itera
     except OSError as error:
         raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
     finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
+        remove_temporary(temporary)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError
+from polmvs.io.temporary import remove_temporary, temporary_path
 
 PathArg: TypeAlias = str | PathLike[str]
 
@@ -100,22 +101,14 @@ def write_bytes(path: PathArg, data: bytes) -> None:
     # A rename would put a plain file in the place of a device such as /dev/null.
     if target.exists() and not target.is_file():
         raise DataError(target, "exists and is no plain file. Choose another name.")
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    temporary = temporary_path(target)
     try:
         temporary.write_bytes(data)
         os.replace(temporary, target)
     except OSError as error:
         raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
     finally:
-        _remove_quietly(temporary)
-
-
-def _remove_quietly(path: Path) -> None:
-    """Remove a file that may not exist, without hiding the error that led here."""
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        return
+        remove_temporary(temporary)
 
 
 def read_bytes(path: PathArg) -> bytes:

@@ -56,9 +56,18 @@ def require_apart(
         raise OptionError(f"{run_folder.root}: OUT is the capture's own folder. Give another OUT.")
     places = [root / name for name in written]
     for path in (capture, *others):
-        resolved = path.resolve()
-        if any(resolved == place or place in resolved.parents for place in places):
-            raise OptionError(f"{path}: lies where OUT's results go. Give another OUT.")
+        for resolved in _real_places(path):
+            if any(resolved == place or place in resolved.parents for place in places):
+                raise OptionError(f"{path}: lies where OUT's results go. Give another OUT.")
+
+
+def _real_places(path: Path) -> list[Path]:
+    """Where an input lies, and what links in it lead to."""
+    try:
+        links = [entry for entry in path.iterdir() if entry.is_symlink()] if path.is_dir() else []
+        return [entry.resolve() for entry in (path, *links)]
+    except (OSError, RuntimeError) as error:  # a circle of links
+        raise DataError(path, f"cannot be followed ({error}).") from error
 
 
 def identity_of(capture: Capture) -> CaptureIdentity:
