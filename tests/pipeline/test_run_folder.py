@@ -34,7 +34,11 @@ from polmvs.pipeline.stages.images import ImagesResult
 def finished_run(root: Path) -> RunFolder:
     """An output folder with one file of each kind."""
     run_folder = RunFolder(root)
-    for folder, name in (("images", "a.png"), ("sparse", "cameras.bin"), ("maps", "a.png.region.npy")):
+    for folder, name in (
+        ("images", "a.png"),
+        ("sparse", "cameras.bin"),
+        ("maps", "a.png.region.npy"),
+    ):
         (root / folder).mkdir(parents=True)
         (root / folder / name).write_bytes(b"x")
     for model in AngleModel:
@@ -264,8 +268,12 @@ def test_replacing_a_folder_is_whole_or_not_at_all(tmp_path: Path) -> None:
         raise KeyboardInterrupt
     assert (maps / "a.npy").read_bytes() == b"1"
     with replacing(maps) as folder:
-        (folder / "b.npy").write_bytes(b"3")
-    assert [path.name for path in tmp_path.rglob("*")] == ["maps", "b.npy"]
+        (folder / "a.npy").write_bytes(b"3")
+    assert [path.name for path in tmp_path.rglob("*")] == ["maps", "a.npy"]
+    (maps / "mine.npy").write_bytes(b"4")
+    with pytest.raises(DataError, match=r"mine\.npy: was not written"), replacing(maps) as folder:
+        (folder / "a.npy").write_bytes(b"5")
+    assert (maps / "a.npy").read_bytes() == b"3"
 
 
 def test_nothing_is_discarded_where_a_foreign_file_lies(tmp_path: Path) -> None:
@@ -276,7 +284,7 @@ def test_nothing_is_discarded_where_a_foreign_file_lies(tmp_path: Path) -> None:
         discard(paths)
     assert run_folder.metrics.exists()
     (tmp_path / "maps" / "mine.txt").unlink()
-    discard(paths)
+    discard(paths, {"a.png"})
     assert not any(path.exists() for path in paths)
 
 
