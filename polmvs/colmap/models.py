@@ -34,7 +34,7 @@ from polmvs.colmap.cameras import (
 )
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
-from polmvs.io.folders import new_folder
+from polmvs.io.folders import new_folder, require_unicode
 from polmvs.scene import SparseModel, Tracks, View, match_names, short_list
 
 PathArg = str | PathLike[str]
@@ -113,6 +113,7 @@ def find_model(path: PathArg) -> Path:
         No such folder, or no complete model in it.
     """
     root = Path(path)
+    require_unicode(root)
     if not root.is_dir():
         raise DataError(root, "is no folder." if root.exists() else "no such folder.")
     for folder in (root, root / "0", root / "sparse", root / "sparse" / "0"):

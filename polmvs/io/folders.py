@@ -1,4 +1,4 @@
-"""Folders that appear whole or not at all."""
+"""Folders that appear whole or not at all, and names that the libraries can take."""
 
 from __future__ import annotations
 
@@ -9,6 +9,23 @@ from pathlib import Path
 
 from polmvs.errors import DataError
 from polmvs.io.temporary import remove_temporary, temporary_path
+
+
+def require_unicode(path: str | PathLike[str]) -> None:
+    """Refuse a name that is no text: COLMAP's binding takes none, and crashes on some.
+
+    Raises
+    ------
+    DataError
+        The name's bytes are not UTF-8, or Python runs in a locale that knows no others.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise DataError(
+            ascii(str(path)),
+            "is a name that is not UTF-8 here. Rename it, or set PYTHONUTF8=1 if it is.",
+        ) from error
 
 
 @contextmanager

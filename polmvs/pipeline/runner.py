@@ -21,6 +21,7 @@ from polmvs.colmap.cameras import quiet_colmap
 from polmvs.config import Options, RunOptions, plain_options, show_value, to_plain
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.evaluation.tables import format_table, number
+from polmvs.io.folders import require_unicode
 from polmvs.parallel import Workers
 from polmvs.pipeline.checks import (
     check_input,
@@ -269,10 +270,10 @@ def open_run(
         The input is unusable, or the run folder is, or another run is at work in it.
     """
     monitor = monitor if monitor is not None else NoMonitor()
-    run_folder = RunFolder(out)
-    require_apart(
-        run_folder, capture=capture_folder, others=inputs_of(options), written=written_names()
-    )
+    run_folder, others = RunFolder(out), inputs_of(options)
+    for path in (capture_folder, out, *others):
+        require_unicode(path)
+    require_apart(run_folder, capture=capture_folder, others=others, written=written_names())
     overwrite, resume = run_options.overwrite and not continues, run_options.resume or continues
     with quiet_colmap():
         capture = open_capture(capture_folder, options.capture)
