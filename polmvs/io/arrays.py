@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from polmvs.errors import DataError
 from polmvs.io.images import write_bytes
 
+MAX_REASON = 120  # characters of NumPy's words
+
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
     """Write an ``.npy`` file whole or not at all, into a folder that there is.
@@ -39,13 +41,14 @@ def map_array(path: Path) -> NDArray[Any]:
     try:
         stamp = path.stat().st_mtime_ns
         return _map_array(path, stamp)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # the header goes through Python's own parser
+        reason = " ".join(str(error).split())[:MAX_REASON]
         raise DataError(
-            path, f"cannot be read ({error}); run again with `run.overwrite`."
+            path, f"cannot be read ({reason}); run again with `run.overwrite`."
         ) from error
 
 
 @lru_cache(maxsize=256)
 def _map_array(path: Path, stamp: int) -> NDArray[Any]:
     # A plain array over the map: OpenCV takes it without a copy.
-    return np.asarray(np.load(path, mmap_mode="r"))
+    return np.asarray(np.lib.format.open_memmap(path, mode="r"))

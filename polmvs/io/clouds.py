@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from polmvs.errors import DataError, PolmvsError
 from polmvs.io.ply import read_ply, read_ply_header, write_ply
+from polmvs.scene import MAX_COORDINATE
 
 Array = NDArray[np.float64]
 
 NORMALS = ("nx", "ny", "nz")
 COLORS = ("red", "green", "blue")
-MAX_COORDINATE = 1e12  # of a point in any unit; a guess: beyond it squares lose all that matters
 
 
 @dataclass(frozen=True)

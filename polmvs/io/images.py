@@ -19,6 +19,8 @@ from polmvs.io.temporary import remove_temporary, temporary_path
 PathArg: TypeAlias = str | PathLike[str]
 
 SILENT = 0  # OpenCV's log level
+PNG_CHANNELS = {2: 3, 4: 2, 6: 4}  # by colour type; 1 of all others
+DEFLATE_RATIO = 1032  # by which zlib compresses at the very best
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 BROKEN = "Copy it again from the camera or take it out of the folder."
 
@@ -165,3 +167,7 @@ def check_png(path: PathArg, data: bytes) -> None:
         if zlib.crc32(view[position + 4 : end - 4]) != checksum:
             raise DataError(path, f"is damaged: wrong checksum at byte {position}. {BROKEN}")
         position = end
+    width, height, bits, kind_of_colour = struct.unpack_from(">IIBB", view, 16)
+    row = -(-width * bits * PNG_CHANNELS.get(kind_of_colour, 1) // 8)
+    if not width or not height or row * height > DEFLATE_RATIO * len(view):
+        raise DataError(path, f"is damaged: it cannot hold {width}x{height} px. {BROKEN}")

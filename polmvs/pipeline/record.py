@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import sys
@@ -16,7 +15,7 @@ from typing import Any, TypeVar
 from polmvs._version import __version__
 from polmvs.config import AngleModel
 from polmvs.errors import DataError
-from polmvs.io.typed_json import from_json, write_json
+from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
 
 try:
@@ -222,7 +221,7 @@ def _read_current(run_folder: RunFolder) -> dict[str, Any]:
 
 def _read_content(run_folder: RunFolder) -> dict[str, Any]:
     try:
-        content = json.loads(run_folder.run_file.read_text(encoding="utf-8"))
+        content = parse_json(run_folder.run_file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise DataError(
             run_folder.root, f"holds no run of polmvs ({RUN_FILE} is missing)."
