@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import typing as npt
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError
@@ -30,22 +31,30 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def map_array(path: Path) -> NDArray[Any]:
+def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:
     """Map an ``.npy`` file into memory, read only.
+
+    Parameters
+    ----------
+    kind : type of its rows, or a kind of number that it must hold; None for any.
 
     Raises
     ------
     DataError
-        If the file is missing or damaged.
+        If the file is missing, damaged or of another type.
     """
     try:
         stamp = path.stat().st_mtime_ns
-        return _map_array(path, stamp)
+        array = _map_array(path, stamp)
     except Exception as error:  # the header goes through Python's own parser
         reason = " ".join(str(error).split())[:MAX_REASON]
         raise DataError(
             path, f"cannot be read ({reason}); run again with `run.overwrite`."
         ) from error
+    rows = isinstance(kind, np.dtype)
+    if kind is not None and not (array.dtype == kind if rows else np.issubdtype(array.dtype, kind)):
+        raise DataError(path, "holds something else; run again with `run.overwrite`.")
+    return array
 
 
 @lru_cache(maxsize=256)

@@ -16,12 +16,14 @@ import data_set_writer
 import numpy as np
 import pycolmap
 from dense_scenes import OPENCV, PINHOLE, board_scene
+from scenes import phase_map_of
 
 from polmvs.camera import PinholeCamera
 from polmvs.cli.call import read_config
 from polmvs.colmap.dense_workspace import open_dense_workspace
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.config import (
+    AngleModel,
     CaptureOptions,
     Options,
     groups_of,
@@ -51,11 +53,15 @@ from polmvs.pipeline.record import Record, read_image_names, read_options
 from polmvs.pipeline.run_folder import RunFolder, mark_own_workspace, require_own
 from polmvs.pipeline.run_lock import locked
 from polmvs.pipeline.runner import load_record
+from polmvs.pipeline.stages.normals import NORMALS_TYPE
+from polmvs.pipeline.stages.seeds import SEEDS_TYPE, load_seeds, seed_tracks
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.phase_map import open_phase_map, store_phase_map
 from polmvs.poses.known_poses import retriangulate
 from polmvs.poses.metric_frame import read_centers
 from polmvs.scene import View, point_sigmas
-from polmvs.synthetic.captures import ring_of_views
+from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
+from polmvs.synthetic.captures import Plane, render_view, ring_of_views
 
 
 class Kind(NamedTuple):
@@ -295,6 +301,32 @@ def use_run(folder: Path) -> None:
         options_from_plain(record.options, str(run_folder.run_file))
 
 
+def write_stage_files(folder: Path) -> None:
+    """What the stages hand to each other in files: phase maps, normals, seeds, dense views."""
+    view = some_views(1)[0]
+    flat = np.full((8, 12), 0.5, np.float32)
+    store_phase_map(
+        phase_map_of(render_view(view, Plane(np.zeros(3), np.array([0, 0, 1.0])))), folder
+    )
+    store_dense_view(
+        DenseView(2, flat, np.dstack([flat] * 3), flat, flat, flat), folder / view.name
+    )
+    np.save(folder / "normals.npy", np.zeros(4, NORMALS_TYPE))
+    seeds = np.zeros(3, SEEDS_TYPE)
+    seeds["track"] = (-1, 0, 3)
+    np.save(folder / "seeds.npy", seeds)
+
+
+def use_stage_files(folder: Path) -> None:
+    view = some_views(1)[0]
+    np.asarray(open_phase_map(view, folder).samples)
+    found = find_dense_view(folder / view.name)
+    assert found is not None
+    found.known.sum()
+    load_seeds(AngleModel.OPA, folder / "seeds.npy", folder / "normals.npy")
+    seed_tracks(folder / "seeds.npy", 4)
+
+
 def write_marked(folder: Path) -> None:
     (folder / "dense" / "stereo").mkdir(parents=True)
     (folder / "dense" / "stereo" / "fusion.cfg").write_text("a.png\n")
@@ -408,6 +440,7 @@ KINDS: dict[str, Kind] = {
         lambda folder: np.save(folder / "a.npy", SHARE), lambda folder: map_array(folder / "a.npy")
     ),
     "run": Kind(write_run, use_run),
+    "stage files": Kind(write_stage_files, use_stage_files),
     "marker": Kind(write_marked, lambda folder: require_own(folder / "dense")),
     "lock": Kind(write_lock, use_lock),
     "calibration": Kind(write_calibration_file, use_calibration),
