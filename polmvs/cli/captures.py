@@ -40,6 +40,7 @@ def inspect(call: Call, terminal: Terminal) -> int:
         "notes": capture.notes,
         "levels": capture.levels,
         "pattern_check": capture.pattern_check,
+        "linearity_check": capture.linearity_check,
         "white": inspection.white,
         "views": inspection.views,
         "warnings": inspection.warnings,

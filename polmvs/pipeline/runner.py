@@ -295,6 +295,7 @@ def open_run(
         )
         run.require_same_options(taken_over)
         record.capture, record.images = identity, tuple(image_names(capture))
+        record.notes = capture.notes
         record.command_line, record.versions = tuple(command_line), versions()
         record.options = to_plain(options)
         run.save()

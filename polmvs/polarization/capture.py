@@ -11,7 +11,7 @@ import logging
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,8 @@ from polmvs.io.raw_formats import (
 from polmvs.polarization.bit_depth import LevelCounts, Levels, decide_levels
 from polmvs.polarization.calibration import PolarizerCalibration, read_calibration
 from polmvs.polarization.exposures import merge_exposures
-from polmvs.polarization.lossy import find_quantization, lossy_variance
+from polmvs.polarization.linearity import LinearityCheck, check_linearity
+from polmvs.polarization.lossy import BLOCK, find_quantization, lossy_variance
 from polmvs.polarization.mosaic import (
     clipped_cells,
     linearize,
@@ -87,7 +88,7 @@ class Capture:
     calibration : of the polarizers, if there is one.
     lossy_steps : (64,) steps of the JPEG that the samples were, row by row; None if none.
     orientations : TIFF orientations that occur; the samples are as stored.
-    pattern_check : of a monochrome mosaic's pattern; None for others.
+    pattern_check, linearity_check : of a monochrome mosaic's pattern and gamma; None for others.
     """
 
     folder: Path
@@ -101,6 +102,7 @@ class Capture:
     lossy_steps: tuple[float, ...] | None = None
     orientations: tuple[int, ...] = (UPRIGHT,)
     pattern_check: PatternCheck | None = None
+    linearity_check: LinearityCheck | None = None
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -146,6 +148,8 @@ class Capture:
         lines.extend(self.warnings)
         if self.pattern_check is not None:
             lines.append(self.pattern_check.message)
+        if self.linearity_check is not None and self.linearity_check.fits is not False:
+            lines.append(self.linearity_check.message)
         return tuple(lines)
 
     @property
@@ -163,6 +167,8 @@ class Capture:
                 "compressed with loss (JPEG), which blurs the polarizers into each other; the "
                 "stated noise is widened by it. Record PNG or TIFF"
             )
+        if self.linearity_check is not None and self.linearity_check.fits is False:
+            lines.append(self.linearity_check.message)
         return tuple(lines)
 
     def load(self, name: str) -> Stokes:
@@ -184,6 +190,9 @@ class Capture:
             case CaptureKind.AOLP:
                 stokes = self._from_maps(view)
         options = self.options
+        mosaic = self.files.kind is CaptureKind.MOSAIC
+        if self.lossy_steps is not None and not (mosaic and options.resolution is Resolution.HALF):
+            stokes = replace(stokes, lossy_block_px=float(BLOCK))
         return turned_axes(stokes, zero_deg=options.zero_deg, clockwise=options.clockwise)
 
     def load_mosaic(self, name: str) -> Image:
@@ -474,6 +483,7 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
         lossy_steps=steps,
         orientations=orientations,
         pattern_check=_check_pattern(files, options, levels, sampled),
+        linearity_check=_check_linearity(files, options, levels, sampled),
     )
     for warning in capture.warnings:
         logger.warning("%s: %s.", files.folder, warning)
@@ -655,6 +665,16 @@ def _check_pattern(
             raise OptionError(f"{files.folder}: {check.message}.")
         logger.warning("%s: %s.", files.folder, check.message)
     return check
+
+
+def _check_linearity(
+    files: CaptureFiles, options: CaptureOptions, levels: Levels, sampled: Sequence[RawImage]
+) -> LinearityCheck | None:
+    """Check the gamma of a monochrome mosaic."""
+    if files.kind is not CaptureKind.MOSAIC or options.bayer is not None:
+        return None
+    shares = [linearize(raw.samples, gamma=1.0, full_scale=levels.full_scale) for raw in sampled]
+    return check_linearity(shares, options.pattern, options.saturation, options.gamma)
 
 
 def _planes_of_stokes(path: Path, array: NDArray[Any]) -> NDArray[Any]:

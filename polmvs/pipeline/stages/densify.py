@@ -348,10 +348,14 @@ def _surroundings_cloud(
         return surface_cloud(kept_cloud(given, surface.points), PointKind.COLMAP)
     tracks = read_model(sparse).tracks
     if options.surroundings is Surroundings.STEREO:
-        return surface_cloud(
-            stereo_surroundings(tracks, maps, folder, workers=workers), PointKind.STEREO
+        found = stereo_surroundings(tracks, maps, folder, workers=workers)
+        if len(found.points):
+            return surface_cloud(found, PointKind.STEREO)
+        logger.warning(
+            "`fusion.surroundings` stereo finds no points: too few views lie near enough to each "
+            "other to be matched and confirmed. The sparse points are kept; record more views."
         )
-    if options.surroundings is Surroundings.SPARSE:
+    if options.surroundings is not Surroundings.NONE:
         return _sparse_cloud(sparse_surroundings(tracks, maps))
     return surface_cloud(surface[np.zeros(len(surface.points), np.bool_)])
 

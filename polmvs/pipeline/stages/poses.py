@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
-from polmvs.colmap.sfm import run_sfm
+from polmvs.colmap.sfm import NoModelError, run_sfm
+from polmvs.colmap.sfm_failure import why_no_model
 from polmvs.config import ReferenceOptions, SfmOptions
+from polmvs.errors import DataError
 from polmvs.io.clouds import preload
 from polmvs.io.images import read_gray
 from polmvs.pipeline.monitor import OnProgress, no_progress
@@ -110,9 +112,12 @@ def find_poses(
         on_progress(1)
 
     with scratch(target) as folder:
-        model = run_sfm(
-            images, names, folder / "work", folder / "sparse", options or SfmOptions(), on_step
-        )
+        options, work = options or SfmOptions(), folder / "work"
+        try:
+            model = run_sfm(images, names, work, folder / "sparse", options, on_step)
+        except NoModelError as error:
+            reason = why_no_model(work / "database.db", options)
+            raise DataError(images, f"SfM finds no model: {reason}") from error
         frame = _take_frame(model, images, reference, folder / "sparse")
         replace_folder(folder / "sparse", target)
     return _result(model, images, frame)
