@@ -18,7 +18,7 @@ from polmvs.pipeline.record import CaptureIdentity, Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.maps import find_mask
-from polmvs.pipeline.stages.poses import fit_model
+from polmvs.pipeline.stages.sfm import fit_model
 from polmvs.polarization.capture import Capture
 from polmvs.poses.alignment import MIN_CAMERAS
 from polmvs.poses.image_check import (

@@ -18,6 +18,7 @@ from polmvs.errors import DataError
 RUN_FILE = "run.json"
 LOG_FILE = "polmvs.log"
 SURFACE_MESH = "surface.ply"  # among dense views: the mesh that they are rendered from
+CAMERA_MODES = "camera_modes.npy"  # beside the model of SfM: what its camera leaves open
 DENSE_MARKER = "polmvs-files.txt"  # in a COLMAP workspace: the files that were written with it
 
 
@@ -38,9 +39,19 @@ class RunFolder:
         return self.root / "images"
 
     @property
+    def sfm(self) -> Path:
+        """COLMAP model as SfM found it, in its own frame."""
+        return self.root / "sfm"
+
+    @property
     def sparse(self) -> Path:
         """COLMAP model, binary."""
         return self.root / "sparse"
+
+    @property
+    def camera_modes(self) -> Path:
+        """What an estimated camera leaves open, in the frame of ``sparse``."""
+        return self.root / "tracks" / "camera.npy"
 
     @property
     def seeds(self) -> Path:
@@ -105,6 +116,7 @@ HERE = RunFolder(Path())  # its paths are those within any run folder
 
 # What a run writes in its folders, by folder; images are known by name from the record.
 FOLDER_PATTERNS = {
+    HERE.sfm.name: ("*.bin", CAMERA_MODES),
     HERE.sparse.name: ("*.bin",),
     HERE.seeds.parent.name: ("*.npy",),
     **{HERE.maps(model).name: ("*.npy",) for model in AngleModel},

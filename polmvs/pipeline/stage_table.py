@@ -32,6 +32,7 @@ from polmvs.pipeline.stages import (
     normals,
     poses,
     seeds,
+    sfm,
     sparse_cloud,
 )
 from polmvs.polarization.capture import Capture
@@ -110,19 +111,23 @@ def _write_images(run: StageInput) -> images.ImagesResult:
     )
 
 
-def _find_poses(run: StageInput) -> poses.PosesResult:
-    folder, options = run.run_folder, run.options
-    if run.given_model is not None and options.sfm.sparse is not None:
-        return poses.take_poses(
-            run.given_model, options.sfm.sparse, folder.images, folder.sparse, options.reference
-        )
-    return poses.find_poses(
+def _find_model(run: StageInput) -> sfm.SfmResult:
+    folder, options = run.run_folder, run.options.sfm
+    if run.given_model is not None and options.sparse is not None:
+        return sfm.take_model(run.given_model, options.sparse, folder.sfm)
+    names = list(images.image_names(run.capture))
+    return sfm.find_model(folder.images, names, folder.sfm, options, on_progress=run.on_progress)
+
+
+def _place_model(run: StageInput) -> poses.PosesResult:
+    folder = run.run_folder
+    return poses.place_model(
+        folder.sfm,
         folder.images,
-        list(images.image_names(run.capture)),
+        images.image_names(run.capture),
         folder.sparse,
-        options.sfm,
-        options.reference,
-        on_progress=run.on_progress,
+        folder.camera_modes,
+        run.options.reference,
     )
 
 
@@ -181,6 +186,7 @@ def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
     return densify.densify(
         model,
         sparse=folder.sparse,
+        camera_modes=folder.camera_modes,
         images=folder.images,
         maps=folder.maps(model),
         track_normals=folder.track_normals(model),
@@ -257,14 +263,23 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             num_steps=lambda run: len(run.capture.names),
         ),
         StageSpec(
-            name="poses",
+            name="sfm",
             command=SFM,
             reads=(HERE.images,),
-            writes=(HERE.sparse,),
-            decides=("sfm", "reference"),
-            work=_find_poses,
+            writes=(HERE.sfm,),
+            decides=("sfm",),
+            work=_find_model,
+            result=sfm.SfmResult,
+            num_steps=lambda run: None if run.given_model else sfm.NUM_SFM_STEPS,
+        ),
+        StageSpec(
+            name="poses",
+            command=SFM,
+            reads=(HERE.images, HERE.sfm),
+            writes=(HERE.sparse, HERE.camera_modes),
+            decides=("reference",),
+            work=_place_model,
             result=poses.PosesResult,
-            num_steps=lambda run: None if run.given_model else poses.NUM_SFM_STEPS,
         ),
         StageSpec(
             name="maps",
@@ -349,7 +364,10 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             name=f"densify_{model}",
             command=DENSIFY,
             angle_model=model,
-            reads=(HERE.sparse, HERE.images, HERE.maps(model), track_normals, HERE.seeds),
+            reads=(
+                *(HERE.sparse, HERE.camera_modes, HERE.images),
+                *(HERE.maps(model), track_normals, HERE.seeds),
+            ),
             writes=(cloud, views),
             decides=(TILT_AWARE, "region.mask", "propagation", "fusion"),
             work=partial(_densify, model),

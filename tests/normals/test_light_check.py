@@ -12,7 +12,6 @@ from polmvs.synthetic.captures import Sphere, render_view
 OTHER = {Light.SPECULAR: Light.DIFFUSE, Light.DIFFUSE: Light.SPECULAR}
 
 
-
 def ball_scene(light: Light, sensor: str) -> Scene:
     """A ball, whose light is polarised all round its rim under either kind of reflection."""
     views, ball = board_scene(6).views, Sphere(center=np.zeros(3), radius=0.2)
