@@ -18,6 +18,7 @@ from typing import Any
 
 from polmvs.config import AngleModel, Options
 from polmvs.evaluation.comparison import SparseFigures
+from polmvs.evaluation.trust import Trust
 from polmvs.parallel import Workers
 from polmvs.pipeline.monitor import OnProgress
 from polmvs.pipeline.record import Record
@@ -34,6 +35,7 @@ from polmvs.pipeline.stages import (
     seeds,
     sfm,
     sparse_cloud,
+    trust,
 )
 from polmvs.polarization.capture import Capture
 from polmvs.scene import SparseModel
@@ -199,6 +201,17 @@ def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
         masks_given=run.options.region.mask is not None,
         workers=run.workers,
         on_progress=run.on_progress,
+    )
+
+
+def _find_trust(model: AngleModel, run: StageInput) -> Trust:
+    folder = run.run_folder
+    return trust.find_trust(
+        model,
+        sparse=folder.sparse,
+        maps=folder.maps(model),
+        sparse_cloud=folder.sparse_cloud(model),
+        cloud=folder.cloud(model),
     )
 
 
@@ -373,6 +386,15 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             work=partial(_densify, model),
             result=densify.DensifyResult,
             num_steps=lambda run: densify.num_densify_steps(run.num_views, run.options.propagation),
+        ),
+        StageSpec(
+            name=f"trust_{model}",
+            command=EXPORT,
+            angle_model=model,
+            reads=(HERE.sparse, HERE.maps(model), HERE.sparse_cloud(model), cloud),
+            writes=(),
+            work=partial(_find_trust, model),
+            result=Trust,
         ),
         StageSpec(
             name=f"mesh_{model}",
