@@ -98,7 +98,7 @@ def test_run_of_the_version_before_is_refused_by_name_and_version(tmp_path: Path
     run_folder.run_file.write_text(json.dumps(content))
     message = (
         rf"{tmp_path}: holds a run of polmvs 0\.1\.0, whose run\.json has schema version 1; this "
-        r"is polmvs .*, which reads version 2 .*Give another OUT, or begin anew there: .*with "
+        r"is polmvs .*, which reads version 3 .*Give another OUT, or begin anew there: .*with "
         r"`run\.overwrite` delete that run"
     )
     with pytest.raises(DataError, match=message):

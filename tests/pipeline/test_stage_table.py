@@ -97,7 +97,7 @@ def test_stale_stages_leave_other_models_alone() -> None:
     table = stage_table()
     assert names(with_dependent(["mesh_ppa"], table)) == ["mesh_ppa"]
     assert names(with_dependent(["densify_tilted"], table)) == [
-        *("densify_tilted", "mesh_tilted", "dense_tilted", "evaluation")
+        *("densify_tilted", "trust_tilted", "mesh_tilted", "dense_tilted", "evaluation")
     ]
     stale = names(with_dependent(["normals_ppa"], table))  # which the seeds are chosen by
     assert {"seeds", "sparse_cloud_opa", "densify_opa", "dense_ppa", "evaluation"} <= set(stale)
