@@ -271,21 +271,25 @@ class Capture:
         clipped = clipped_cells(raw, threshold, colour=options.bayer is not None, full=full)
         if options.bayer is not None:
             colours = split_colour_mosaic(linear, options.pattern, options.bayer, full=full)
-            return self._one_colour([self._stokes(colour, clipped) for colour in colours])
+            return self._one_colour(
+                [self._stokes(colour, clipped, index) for index, colour in enumerate(colours)]
+            )
         split = split_mosaic_full if full else split_mosaic
         return self._stokes(split(linear, options.pattern), clipped)
 
-    def _stokes(self, images: Image, clipped: Mask) -> Stokes:
-        """Stokes images of a mosaic's four angle images."""
+    def _stokes(self, images: Image, clipped: Mask, colour: int | None = None) -> Stokes:
+        """Stokes images of a mosaic's four angle images, of one colour or of a monochrome one."""
         darkness, quantum, lossy = self.options.darkness, self._quantum, self._lossy_variance
         if self.calibration is None:
             return stokes_from_intensities(
                 images, clipped, darkness=darkness, quantum=quantum, lossy_variance=lossy
             )
         shape = (self.header.height, self.header.width)
+        full = self.options.resolution is Resolution.FULL
+        analyzers = self.calibration.analyzers(shape, full=full)
         return stokes_by_least_squares(
             images,
-            self.calibration.analyzers(shape, full=self.options.resolution is Resolution.FULL),
+            analyzers if colour is None else analyzers[colour],
             clipped,
             darkness=darkness,
             quantum=quantum,
@@ -463,6 +467,12 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
         if calibration.pattern != options.pattern:
             raise OptionError(
                 f"is of the pattern {calibration.pattern}, `capture.pattern` is {options.pattern}.",
+                field="capture.calibration",
+            )
+        if calibration.bayer is not options.bayer:
+            of = "a monochrome sensor" if calibration.bayer is None else calibration.bayer
+            raise OptionError(
+                f"is of {of}, `capture.bayer` is {options.bayer or 'not given'}.",
                 field="capture.calibration",
             )
         full_scale = full_scale if full_scale is not None else calibration.full_scale

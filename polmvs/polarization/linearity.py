@@ -90,7 +90,7 @@ class LinearityCheck:
         likely = _round_gamma(self.found, self.log_sigma)
         return (
             f"`capture.gamma` {self.given:g} does not fit: the sums of perpendicular samples show "
-            f"an encoding gamma of {self.found:.2f} +- {self.found * self.log_sigma:.2f}. Give "
+            f"an encoding gamma of {self.found:.2f} +- {self.found * self.log_sigma:.1g}. Give "
             f"`capture.gamma` {likely:g}"
         )
 
