@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from polmvs.camera import xy_from_opencv
+from polmvs.camera import PinholeCamera, xy_from_opencv
 from polmvs.errors import DataError
 from polmvs.io.images import write_bytes
 from polmvs.io.typed_json import parse_json
@@ -82,6 +82,20 @@ class Intrinsics:
             for name, value in zip(names, self.params, strict=True)
         )
         return Intrinsics(model=self.model, width=width, height=height, params=params)
+
+    @property
+    def pinhole(self) -> PinholeCamera:
+        """The camera without its distortion."""
+        named = dict(zip(COLMAP_MODELS[self.model], self.params, strict=True))
+        focal = named.get("f", 0.0)
+        return PinholeCamera(
+            width=self.width,
+            height=self.height,
+            fx=named.get("fx", focal),
+            fy=named.get("fy", focal),
+            cx=named["cx"],
+            cy=named["cy"],
+        )
 
     @property
     def line(self) -> str:

@@ -26,8 +26,9 @@ except ImportError:  # Windows
 R = TypeVar("R")
 
 # Of ``run.json``; to be raised with every change of the record or of what a stage gives.
-# 1: the first releases, which did not name it. 2: stages with their results.
-SCHEMA_VERSION = 2
+# 1: the first releases, which did not name it. 2: stages with their results. 3: SfM as a stage of
+# its own, trust, notes on the capture.
+SCHEMA_VERSION = 3
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pycolmap", "open3d")
 
 
@@ -65,7 +66,7 @@ class CaptureIdentity:
     ----------
     folder : of the raw mosaics.
     width, height : of the polarization images, px.
-    bytes : size of each file by its name.
+    bytes : size of each file by its path in the folder.
     """
 
     folder: Path
@@ -89,6 +90,7 @@ class Record:
     command_line : how the run was last called; empty where a script did.
     capture : the images that it is of.
     images : names of the files in ``images/``.
+    notes : what was recognised of the capture and decided about it, one line each.
     options : resolved options of the last call, in terms of JSON.
     versions : of the software.
     stages : finished ones, in order.
@@ -100,6 +102,7 @@ class Record:
     command_line: tuple[str, ...] = ()
     capture: CaptureIdentity | None = None
     images: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     stages: tuple[StageRecord, ...] = ()

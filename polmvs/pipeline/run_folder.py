@@ -21,6 +21,7 @@ RUN_FILE = "run.json"
 LOG_FILE = "polmvs.log"
 SURFACE_MESH = "surface.ply"  # among dense views: the mesh that they are rendered from
 NOT_OURS = "was not written by polmvs. Move it out of the way."
+CAMERA_MODES = "camera_modes.npy"  # beside the model of SfM: what its camera leaves open
 DENSE_MARKER = "polmvs-files.txt"  # in a COLMAP workspace: the files that were written with it
 
 
@@ -41,9 +42,19 @@ class RunFolder:
         return self.root / "images"
 
     @property
+    def sfm(self) -> Path:
+        """COLMAP model as SfM found it, in its own frame."""
+        return self.root / "sfm"
+
+    @property
     def sparse(self) -> Path:
         """COLMAP model, binary."""
         return self.root / "sparse"
+
+    @property
+    def camera_modes(self) -> Path:
+        """What an estimated camera leaves open, in the frame of ``sparse``."""
+        return self.root / "tracks" / "camera.npy"
 
     @property
     def seeds(self) -> Path:
@@ -106,11 +117,14 @@ class RunFolder:
 
 HERE = RunFolder(Path())  # its paths are those within any run folder
 
+_MODEL_FILES = {f"{name}.bin" for name in ("cameras", "images", "points3D", "rigs", "frames")}
 # What a run writes in its folders, by folder.
 FOLDER_FILES = {
-    HERE.sparse.name: {f"{n}.bin" for n in ("cameras", "images", "points3D", "rigs", "frames")},
+    HERE.sfm.name: {*_MODEL_FILES, CAMERA_MODES},
+    HERE.sparse.name: _MODEL_FILES,
     HERE.seeds.parent.name: {
         HERE.seeds.name,
+        HERE.camera_modes.name,
         *(HERE.track_normals(model).name for model in AngleModel),
     },
     **{HERE.views(model).name: {SURFACE_MESH} for model in AngleModel},

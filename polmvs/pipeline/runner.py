@@ -277,6 +277,8 @@ def open_run(
     overwrite, resume = run_options.overwrite and not continues, run_options.resume or continues
     with quiet_colmap():
         capture = open_capture(capture_folder, options.capture)
+        if run_folder.run_file.is_file() and (run_options.resume or continues):
+            require_same_capture(load_record(run_folder), identity_of(capture), run_folder)
         given_model = check_input(capture, options, min_images)
         if continues:
             load_record(run_folder)
@@ -298,6 +300,7 @@ def open_run(
         )
         run.require_same_options(taken_over)
         record.capture, record.images = identity, tuple(image_names(capture))
+        record.notes = capture.notes
         record.command_line, record.versions = tuple(command_line), versions()
         record.options = to_plain(options)
         run.save()
@@ -411,7 +414,7 @@ def timing_table(records: Mapping[str, Record]) -> str:
         seconds = {stage.name: stage.seconds for stage in record.stages}
         peak = max((stage.peak_rss_mb for stage in record.stages), default=None)
         total += [number(sum(seconds.values())), number(peak, 1, 0)]
-        rest += [number(sum(t for name, t in seconds.items() if name != "poses")), ""]
+        rest += [number(sum(t for name, t in seconds.items() if name not in ("sfm", "poses"))), ""]
         wall += [number(record.wall_s), ""]
     return format_table(header, [*rows, total, rest, wall])
 
