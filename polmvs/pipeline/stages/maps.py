@@ -6,6 +6,7 @@ sensor's polarizers and lie in a folder of their own.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +17,7 @@ from polmvs.config import AngleModel, Light, RegionOptions
 from polmvs.errors import DataError
 from polmvs.io.images import read_mask
 from polmvs.normals.light import find_diffuse
+from polmvs.normals.light_check import check_light
 from polmvs.parallel import Workers
 from polmvs.pipeline.monitor import OnProgress, no_progress
 from polmvs.pipeline.run_folder import replacing
@@ -31,6 +33,8 @@ from polmvs.polarization.phase_map import (
 )
 from polmvs.polarization.region import find_region
 from polmvs.scene import Tracks, View
+
+logger = logging.getLogger(__name__)
 
 MIN_VIEWS = 3  # of normals: with two there is nothing left to check them by
 
@@ -105,6 +109,10 @@ def build_maps(
         num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
         if options.light is None and len(tracks.point3D_ids):
             num_diffuse = _turn_diffuse(tracks, maps, folder)
+        elif options.light is not None and len(tracks.point3D_ids):
+            check = check_light(tracks, maps, options.light)
+            if check.contradicted:
+                logger.warning("%s.", check.message)
     return MapsResult(num_region_px=num_inside, num_diffuse_px=num_diffuse)
 
 
@@ -193,7 +201,7 @@ def _build_map(
     s0, s1, s2 = stokes.s0, stokes.s1, stokes.s2
     region = find_region(s0, s1, s2, stokes.valid, min_dolp=options.min_dolp, mask=mask)
     light = options.light or Light.SPECULAR
-    store_phase_map(build_phase_map(view, s0, s1, s2, stokes.sigma, region, light), folder)
+    store_phase_map(build_phase_map(view, stokes, region, light), folder)
     return int(region.inside.sum())
 
 
