@@ -639,6 +639,13 @@ class RunOptions(OptionGroup, group="run", in_files=False):
     overwrite: bool = option(False, "delete an earlier run's results in OUT first")
     resume: bool = option(False, "go on with the run in OUT at its first unfinished stage")
     workers: int = option(default_num_workers(), "processes to share the views among", least=1)
+    scheduler: str | None = option(
+        None,
+        "address of a dask.distributed scheduler, such as tcp://10.0.0.1:8786, whose workers share "
+        "the views instead of processes here; they must have the same versions, and CAPTURE and "
+        "OUT on storage that they see under the same path",
+        metavar="ADDRESS",
+    )
 
     def check(self) -> None:
         """Not both."""
@@ -831,6 +838,15 @@ def plain_options(options: Options, paths: Iterable[str]) -> dict[str, Any]:
     whole = {name: option_paths(cls) for name, cls in groups.items()}
     every = [path for given in paths for path in whole.get(given, (given,))]
     return {path: to_plain(get_option(options, path)) for path in every}
+
+
+def with_absolute_paths(options: Options) -> Options:
+    """The same files and folders, named so that another process finds them."""
+    for path in option_paths():
+        value = get_option(options, path)
+        if isinstance(value, Path):
+            options = replace_option(options, path, value.absolute())
+    return options
 
 
 def _split(path: str) -> tuple[str, str]:

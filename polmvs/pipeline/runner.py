@@ -18,7 +18,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from polmvs.colmap.cameras import quiet_colmap
-from polmvs.config import Options, RunOptions, plain_options, show_value, to_plain
+from polmvs.config import (
+    Options,
+    RunOptions,
+    plain_options,
+    show_value,
+    to_plain,
+    with_absolute_paths,
+)
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.evaluation.tables import format_table, number
 from polmvs.parallel import Workers
@@ -267,11 +274,14 @@ def open_run(
         The input is unusable, or the run folder is.
     """
     monitor = monitor if monitor is not None else NoMonitor()
+    if run_options.scheduler is not None:  # whose workers have other working folders
+        capture_folder, out = capture_folder.absolute(), out.absolute()
+        options = with_absolute_paths(options)
     run_folder = RunFolder(out)
     require_apart(
         run_folder, capture=capture_folder, others=inputs_of(options), written=written_names()
     )
-    with quiet_colmap(), Workers(run_options.workers) as workers:
+    with quiet_colmap(), _workers(run_options, capture_folder, out, options) as workers:
         capture = open_capture(capture_folder, options.capture)
         given_model = check_input(capture, options, min_images)
         if continues:
@@ -305,6 +315,15 @@ def open_run(
             with suppress(PolmvsError):  # the first error is the one to report
                 run.save()
             raise
+
+
+def _workers(run_options: RunOptions, capture_folder: Path, out: Path, options: Options) -> Workers:
+    """Processes here, or those of a cluster that sees what they need."""
+    if run_options.scheduler is None:
+        return Workers(run_options.workers)
+    existing = next(folder for folder in (out, *out.parents) if folder.is_dir())
+    sources = [path for path in (capture_folder, *inputs_of(options)) if path.exists()]
+    return Workers.of_cluster(run_options.scheduler, [existing], sources)
 
 
 def load_record(run_folder: RunFolder) -> Record:
