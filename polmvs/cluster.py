@@ -14,18 +14,16 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 
 from polmvs._version import __version__
 from polmvs.errors import DataError, OptionError
-
-if TYPE_CHECKING:
-    from distributed import Client, Future
 
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pycolmap")
 SCATTERED_BYTES = 100_000  # of arguments, from which they do not pass through the scheduler's graph
@@ -87,58 +85,60 @@ class Cluster:
         except BaseException:
             self._client.close()
             raise
-        self._pending: set[Future[Any]] = set()
+        self._pending: set[Any] = set()
 
     @property
     def num_threads(self) -> int:
         """Tasks that the workers of now do at a time."""
         return sum(self._client.nthreads().values())
 
-    def map(self, function: Callable[..., Any], *iterables: Any) -> Iterator[Any]:
-        """Results in order; all tasks are submitted at once.
+    def outcomes(
+        self, function: Callable[..., Any], *iterables: Any
+    ) -> Iterator[Callable[[], Any]]:
+        """As :meth:`polmvs.parallel.Workers.outcomes`; all tasks are submitted at once."""
+        tasks = list(zip(*iterables, strict=False))
+        futures = [self._submit(function, task) for task in tasks]
+        ask = partial(self._result, function, tasks, futures)
+        return (partial(ask, index) for index in range(len(tasks)))
+
+    def _result(
+        self,
+        function: Callable[..., Any],
+        tasks: list[tuple[Any, ...]],
+        futures: list[Any],
+        index: int,
+    ) -> Any:
+        """Result of a task.
 
         Raises
         ------
         DataError
-            A task cost several workers their lives, or the scheduler does not come back.
+            The task cost several workers their lives, or the scheduler does not come back.
         """
-        tasks = list(zip(*iterables, strict=False))
-        futures = [self._submit(function, task) for task in tasks]
-        return self._results(function, tasks, futures)
-
-    def _results(
-        self,
-        function: Callable[..., Any],
-        tasks: Sequence[tuple[Any, ...]],
-        futures: list[Future[Any]],
-    ) -> Iterator[Any]:
         from distributed import KilledWorker
 
-        losses = 0
-        for index, task in enumerate(tasks):
-            while True:
-                try:
-                    result = futures[index].result()
-                    break
-                except KilledWorker as error:
-                    raise DataError(
-                        self.address,
-                        f"{error.allowed_failures + 1} workers were lost on the same task: out of "
-                        "memory? Give each worker more memory or fewer threads.",
-                    ) from error
-                except (CancelledError, OSError, TimeoutError) as error:
-                    losses += 1
-                    of_task = futures[index].status == "error"
-                    if of_task or losses > self.patience.max_losses:
-                        raise
-                    self._await_return(error)
-                    for later in range(index, len(tasks)):
-                        if futures[later].status != "finished":
-                            futures[later] = self._submit(function, tasks[later])
-            self._pending.discard(futures[index])
-            futures[index].release()
-            yield result
-            del result, task
+        for losses in count(1):
+            try:
+                result = futures[index].result()
+                break
+            except KilledWorker as error:
+                raise DataError(
+                    self.address,
+                    f"{error.allowed_failures + 1} workers were lost on the same task: out of "
+                    "memory? Give each worker more memory or fewer threads.",
+                ) from error
+            except (CancelledError, OSError, TimeoutError) as error:
+                of_task = futures[index].status == "error"
+                if of_task or losses > self.patience.max_losses:
+                    raise
+                self._await_return(error)
+                for later in range(index, len(tasks)):
+                    if futures[later].status != "finished":
+                        futures[later] = self._submit(function, tasks[later])
+        self._pending.discard(futures[index])
+        futures[index].release()
+        tasks[index] = ()  # nothing of it is held for those to come
+        return result
 
     def close(self, *, cancel: bool) -> None:
         """End the connection; the cluster stays."""
@@ -147,7 +147,7 @@ class Cluster:
         self._pending.clear()
         self._client.close()
 
-    def _submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Future[Any]:
+    def _submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Any:
         """One task; large arguments go to the workers past the scheduler's graph."""
         import cloudpickle  # comes with Dask; a script's own functions travel whole
 
@@ -155,7 +155,7 @@ class Cluster:
         payload: Any = packed
         if len(packed) > SCATTERED_BYTES:
             payload = self._client.scatter(packed, hash=False)
-        future: Future[Any] = self._client.submit(_work, own_versions(), payload, pure=False)
+        future = self._client.submit(_work, own_versions(), payload, pure=False)
         self._pending.add(future)
         return future
 
@@ -252,7 +252,7 @@ def own_versions() -> dict[str, str]:
     return found
 
 
-def _connect(address: str, patience: ClusterPatience) -> Client:
+def _connect(address: str, patience: ClusterPatience) -> Any:
     try:
         from distributed import Client
     except ImportError as error:

@@ -15,8 +15,10 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from pathlib import Path
 from types import TracebackType
@@ -33,8 +35,8 @@ POSIX = hasattr(signal, "pthread_sigmask")
 class Backend(Protocol):
     """Where work is done."""
 
-    def map(self, function: Callable[..., T], *iterables: Any) -> Iterator[T]:
-        """Results in order, as ``map`` gives them."""
+    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
+        """As :meth:`Workers.outcomes`."""
 
     def close(self, *, cancel: bool) -> None:
         """End what is under way, with ``cancel`` before its end; a later map begins anew."""
@@ -69,8 +71,17 @@ class Workers:
         return cls(cluster.num_threads, cluster)
 
     def map(self, function: Callable[..., T], *iterables: Any) -> Iterator[T]:
-        """Results in order, as ``map`` gives them."""
-        return self._backend.map(function, *iterables)
+        """Results in order, as ``map`` gives them; the first error ends it."""
+        outcomes = self._backend.outcomes(function, *iterables)
+        return (outcome() for outcome in outcomes)
+
+    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
+        """Of each task, in order, what gives its result or raises its error, to be called once.
+
+        The error of one stops no other. A task whose worker is lost is done again; that which
+        loses every worker raises ``BrokenProcessPool`` or a ``DataError``.
+        """
+        return self._backend.outcomes(function, *iterables)
 
     @contextmanager
     def stopped_on_error(self) -> Iterator[None]:
@@ -96,9 +107,9 @@ class Workers:
 class _ThisProcess:
     """No other one."""
 
-    def map(self, function: Callable[..., T], *iterables: Any) -> Iterator[T]:
-        """As ``map``."""
-        return map(function, *iterables)
+    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
+        """Tasks are done when they are asked for."""
+        return map(partial(partial, function), *iterables)
 
     def close(self, *, cancel: bool) -> None:
         """Do nothing."""
@@ -111,14 +122,50 @@ class _Processes:
         self.num = num
         self._pool: ProcessPoolExecutor | None = None
 
-    def map(self, function: Callable[..., T], *iterables: Any) -> Iterator[T]:
-        """As ``map``; all tasks are handed over at once."""
+    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
+        """All tasks are handed over at once."""
+        tasks = list(zip(*iterables, strict=False))
+        futures = [self._submit(function, task) for task in tasks]
+        ask = partial(self._result, function, tasks, futures)
+        return (partial(ask, index) for index in range(len(tasks)))
+
+    def _result(
+        self,
+        function: Callable[..., T],
+        tasks: list[tuple[Any, ...]],
+        futures: list[Future[T]],
+        index: int,
+    ) -> T:
+        """Result of a task. One that was lost with its worker is done again while no other is.
+
+        A killed worker takes all tasks with it, and which one killed it is not known.
+        """
+        task, future = tasks[index], futures[index]
+        tasks[index], futures[index] = (), Future()  # nothing of it is held for those to come
+        try:
+            return future.result()
+        except BrokenProcessPool:
+            self.close(cancel=True)
+            try:
+                return self._submit(function, task).result()
+            finally:
+                for later in range(index + 1, len(tasks)):
+                    done = futures[later].done() and not futures[later].cancelled()
+                    if not done or isinstance(futures[later].exception(), BrokenProcessPool):
+                        futures[later] = self._submit(function, tasks[later])
+
+    def _submit(self, function: Callable[..., T], task: tuple[Any, ...]) -> Future[T]:
         if self._pool is None:
             self._pool = ProcessPoolExecutor(
                 self.num, mp_context=get_context("spawn"), initializer=_start_worker
             )
         with _signals_held_back():
-            return self._pool.map(function, *iterables)
+            try:
+                return self._pool.submit(function, *task)
+            except BrokenProcessPool as error:  # by one of the tasks before, as is told of them
+                lost: Future[T] = Future()
+                lost.set_exception(error)
+                return lost
 
     def close(self, *, cancel: bool) -> None:
         """End the processes."""

@@ -96,25 +96,11 @@ def test_errors_of_tasks_arrive_whole(address) -> None:
         list(workers.map(fail, range(2)))
 
 
-def test_a_killed_worker_changes_nothing(address, tmp_path) -> None:
-    with Workers.of_cluster(address) as workers:
-        assert list(workers.map(die_once, [tmp_path] * 6, range(6))) == list(range(6))
-    assert (tmp_path / "died").exists()
-
-
-def test_a_task_that_kills_every_worker(address) -> None:
-    with (
-        Workers.of_cluster(address) as workers,
-        pytest.raises(DataError, match=f"{address}: .*workers were lost.*memory"),
-    ):
-        list(workers.map(die, [0]))
-
-
 def test_a_scheduler_that_comes_back(tmp_path) -> None:
     first = local_cluster()
     port = int(first.scheduler_address.rpartition(":")[2])
     cluster = Cluster(first.scheduler_address, patience=ClusterPatience(workers_s=10))
-    results = cluster.map(wait_for, [tmp_path / "go"] * 3, range(3))
+    results = Workers(2, cluster).map(wait_for, [tmp_path / "go"] * 3, range(3))
     first.close()
     with local_cluster(port=port):
         (tmp_path / "go").touch()
@@ -127,7 +113,7 @@ def test_a_scheduler_that_does_not(tmp_path) -> None:
     first = local_cluster(1)
     cluster = Cluster(first.scheduler_address, patience=ClusterPatience())
     cluster.patience = patience
-    results = cluster.map(wait_for, [tmp_path / "go"], [0])
+    results = Workers(2, cluster).map(wait_for, [tmp_path / "go"], [0])
     first.close()
     with pytest.raises(DataError, match=r"lost and did not come back.*`run\.resume`"):
         list(results)
@@ -172,3 +158,20 @@ def test_without_dask(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(OptionError, match=r"`run\.scheduler` needs .*polmvs\[dask\]"):
         Cluster("tcp://127.0.0.1:9")
+
+
+# Last, as the workers may not be back at once
+
+
+def test_a_killed_worker_changes_nothing(address, tmp_path) -> None:
+    with Workers.of_cluster(address) as workers:
+        assert list(workers.map(die_once, [tmp_path] * 6, range(6))) == list(range(6))
+    assert (tmp_path / "died").exists()
+
+
+def test_a_task_that_kills_every_worker(address) -> None:
+    with (
+        Workers.of_cluster(address) as workers,
+        pytest.raises(DataError, match=f"{address}: .*workers were lost.*memory"),
+    ):
+        list(workers.map(die, [0]))
