@@ -1,5 +1,6 @@
 """Intensity images of a printed capture, small, unordered and with their true cameras."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +29,20 @@ def printed_scene() -> PrintedScene:
 
 def write_printed_images(folder: Path, num_views: int, *, seed: int = 0) -> list[View]:
     """Write 8-bit intensity images into an existing folder; their views, by name."""
-    scene, rng = printed_scene(), np.random.default_rng(seed)
     views = orbit_views(num_views, CAMERA, seed=seed)
-    for view in views:
-        mosaic = render_printed_mosaic(view, scene)
-        noisy = add_noise(mosaic, rng=rng)
-        cells = noisy.reshape(CAMERA.height, 2, CAMERA.width, 2)
+    for view, mosaic in zip(views, noisy_mosaics(views, seed), strict=True):
+        cells = mosaic.reshape(CAMERA.height, 2, CAMERA.width, 2)
         write_png(folder / view.name, quantize(2 * cells.mean(axis=(1, 3))))
     return views
+
+
+def write_printed_capture(folder: Path, num_views: int, *, seed: int = 0) -> None:
+    """Write raw mosaics into an existing folder."""
+    views = orbit_views(num_views, CAMERA, seed=seed)
+    for view, mosaic in zip(views, noisy_mosaics(views, seed), strict=True):
+        write_png(folder / view.name, quantize(mosaic))
+
+
+def noisy_mosaics(views: list[View], seed: int) -> Iterator[np.ndarray]:
+    scene, rng = printed_scene(), np.random.default_rng(seed)
+    return (add_noise(render_printed_mosaic(view, scene), rng=rng) for view in views)

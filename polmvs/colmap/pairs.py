@@ -53,7 +53,7 @@ class PairTolerances:
     """
 
     max_exhaustive_images: int = 40
-    num_similar: int = 20
+    num_similar: int = 10
     num_in_time: int = 2
     sequential_overlap: int = 20
     num_words: int = 64

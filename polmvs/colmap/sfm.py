@@ -67,6 +67,10 @@ class SfmTolerances:
     min_tri_angle_deg : of a point that is kept; COLMAP's own.
     loss_scale_px : of the last adjustment's Cauchy loss; measured, about twice the error of a good
         keypoint.
+    max_cost_change : relative, of the sum of squares in an adjustment's step, at which it ends.
+        Measured: COLMAP's own 0 goes on to its last allowed step, for no digit of the cameras.
+    model_growth : factor in images or points at which the incremental mapper adjusts all anew;
+        measured: at COLMAP's own 1.1 it takes most of the mapper's time.
     min_views_principal_point : from which the principal point is freed; measured: of three views
         two captures of three got worse, of four none.
     max_principal_point_shift : of the image's width; a guess, more is an estimate gone astray.
@@ -80,6 +84,8 @@ class SfmTolerances:
     max_reproj_error_px: float = 2.0
     min_tri_angle_deg: float = 1.5
     loss_scale_px: float = 0.5
+    max_cost_change: float = 1e-6
+    model_growth: float = 1.3
     min_views_principal_point: int = 4
     max_principal_point_shift: float = 0.1
     max_images_two_view_tracks: int = 5
@@ -375,6 +381,9 @@ def _mapper_options(
     # ten views either way. Extraction and matching are the larger part and use all cores.
     pipeline.num_threads = 1
     pipeline.mapper.num_threads = 1
+    pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = tolerances.model_growth
+    pipeline.ba_global_function_tolerance = tolerances.max_cost_change
+    pipeline.ba_local_function_tolerance = tolerances.max_cost_change
     two_view_tracks = num_images <= tolerances.max_images_two_view_tracks
     pipeline.triangulation.ignore_two_view_tracks = not two_view_tracks
     if options.intrinsics is not None or options.camera is not None:
@@ -418,7 +427,9 @@ def _global_options(
         mapper.retriangulation,
     ):
         seeded.random_seed = options.seed
-    mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
+    solver = mapper.bundle_adjustment.ceres.solver_options
+    solver.num_threads = 1
+    solver.function_tolerance = tolerances.max_cost_change
     if options.intrinsics is not None or options.camera is not None:
         mapper.bundle_adjustment.refine_focal_length = False
         mapper.bundle_adjustment.refine_extra_params = False
@@ -499,6 +510,7 @@ def _adjust(
     bundle.print_summary = False
     bundle.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     bundle.ceres.loss_function_scale = tolerances.loss_scale_px
+    bundle.ceres.solver_options.function_tolerance = tolerances.max_cost_change
     bundle.ceres.solver_options.num_threads = 1  # sums over threads depend on their timing
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():

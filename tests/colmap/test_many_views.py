@@ -15,7 +15,7 @@ from polmvs.config import SfmOptions
 from polmvs.errors import DataError
 from polmvs.geometry import align_points
 
-NUM_VIEWS = 24
+NUM_VIEWS = 18
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_database_without_matches_or_with_more_pairs(capture, retrieved, tmp_pat
     pairs.write_text("".join(f"{a} {b}\n" for a in names[:4] for b in names if a < b))
     model = sfm(capture, tmp_path, database=database, pairs=str(pairs))
     assert np.median(center_errors_mm(model, views)) < 2.0
-    assert matched_pairs(tmp_path / "work" / "database.db") == 23 + 22 + 21 + 20
+    assert matched_pairs(tmp_path / "work" / "database.db") == 17 + 16 + 15 + 14
 
 
 def test_global_mapper(capture, retrieved, tmp_path):
@@ -139,7 +139,7 @@ SIZE = (CAMERA.width, CAMERA.height)
     ("statement", "message"),
     [
         ("DROP TABLE keypoints", "no table keypoints"),
-        ("UPDATE images SET name = 'x' || name", "names 0 of the capture's 24 images"),
+        ("UPDATE images SET name = 'x' || name", "names 0 of the capture's 18 images"),
         ("UPDATE cameras SET width = 600, height = 500", "600x500 px.*300x250 px"),
         ("UPDATE keypoints SET data = substr(data, 9)", r"damaged features of 000\.png"),
         ("UPDATE descriptors SET rows = rows - 1", r"damaged features of 000\.png"),
