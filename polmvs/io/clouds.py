@@ -1,4 +1,4 @@
-"""Point clouds and meshes as files: the only importer of Open3D, which takes seconds to import."""
+"""Point clouds and meshes as files, by Open3D."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from polmvs.errors import DataError, PolmvsError
 from polmvs.io.images import write_bytes
+from polmvs.io.open3d_import import import_open3d
 
 Array = NDArray[np.float64]
 
@@ -71,31 +72,19 @@ class Mesh:
     colors: NDArray[np.uint8] | None = None
 
 
-def _open3d() -> Any:
-    """Import Open3D where a cloud is handled, and only there."""
-    try:
-        import open3d
-    except ImportError as error:
-        raise PolmvsError(
-            f"Open3D cannot be imported ({error}); Open3D 0.20 needs the system library "
-            "libusb-1.0, version 0.19 does not."
-        ) from error
-    return open3d
-
-
 def preload() -> None:
     """Begin to import Open3D beside other work, such as that of COLMAP's mapper on one core."""
 
     def load() -> None:
         with suppress(PolmvsError):  # said when a cloud is written
-            _open3d()
+            import_open3d()
 
     threading.Thread(target=load, name="preload-open3d").start()
 
 
 def to_open3d(cloud: Cloud) -> Any:
     """Make an ``open3d.t.geometry.PointCloud``; points, normals and scalars as float32."""
-    o3d = _open3d()
+    o3d = import_open3d()
     points = np.ascontiguousarray(cloud.points, np.float32)
     result = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
     if cloud.normals is not None:
@@ -110,7 +99,7 @@ def to_open3d(cloud: Cloud) -> Any:
 
 def mesh_to_open3d(mesh: Mesh) -> Any:
     """Make an ``open3d.geometry.TriangleMesh`` with vertex normals."""
-    o3d = _open3d()
+    o3d = import_open3d()
     result = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.triangles)
     )
@@ -133,7 +122,7 @@ def write_cloud(path: str | Path, cloud: Cloud) -> None:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         if len(cloud.points):
-            written = _open3d().t.io.write_point_cloud(str(temporary), to_open3d(cloud))
+            written = import_open3d().t.io.write_point_cloud(str(temporary), to_open3d(cloud))
             if not written:
                 raise DataError(target, "cannot be written; is the disk full or read-only?")
         else:  # Open3D refuses clouds without points
@@ -167,7 +156,7 @@ def read_cloud(path: str | Path) -> Cloud:
     num_points = _checked_header(source)
     if num_points == 0:
         return Cloud(np.zeros((0, 3)))
-    o3d = _open3d()
+    o3d = import_open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         loaded = o3d.t.io.read_point_cloud(str(source))
     if "positions" not in loaded.point or len(loaded.point.positions) != num_points:
@@ -204,7 +193,7 @@ def show_in_viewer(paths: Sequence[str | Path]) -> None:
     PolmvsError
         There is no window to be had.
     """
-    o3d = _open3d()
+    o3d = import_open3d()
     shown = [
         {
             "name": Path(path).stem,
@@ -266,7 +255,7 @@ def solve_poisson(
     depth : of the octree; a cell is ``scale * extent / 2**depth`` wide.
     scale : side of the octree's cube over the points' extent.
     """
-    o3d = _open3d()
+    o3d = import_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.normals = o3d.utility.Vector3dVector(normals)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
@@ -324,7 +313,7 @@ def read_mesh(path: str | Path) -> Mesh:
         raise DataError(source, "holds no faces; give a PLY mesh.")
     if num_vertices == 0:
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    o3d = _open3d()
+    o3d = import_open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh = o3d.io.read_triangle_mesh(str(source))
     vertices, triangles = np.array(mesh.vertices), np.array(mesh.triangles, np.int32)
