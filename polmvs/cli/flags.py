@@ -227,6 +227,7 @@ def arguments_line(command: Command) -> str:
 
 
 def group_title(cls: type[OptionGroup]) -> str:
+    """Heading of a group of options."""
     text = (cls.__doc__ or "").splitlines()[0].rstrip(".")
     return f"{cls.group}: {text}" if cls.in_files else text
 
@@ -329,6 +330,7 @@ def _read_list(element: Any, text: str) -> tuple[Any, ...]:
 
 
 def metavar_of(info: FieldInfo) -> str:
+    """What stands for the value of an option or argument."""
     if isinstance(info.metavar, tuple):
         return " ".join(info.metavar)
     return info.metavar or (info.name.upper() if info.positional else _name(info.kind))
