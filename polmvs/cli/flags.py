@@ -22,7 +22,7 @@ from cyclopts.exceptions import CycloptsError, MissingArgumentError, UnusedCliTo
 from cyclopts.token import Token
 
 import polmvs
-from polmvs.cli.call import Call, FileOptions, TerminalOptions
+from polmvs.cli.call import Call, FileOptions, RecordingOptions, TerminalOptions
 from polmvs.config import (
     ExperimentOptions,
     FieldInfo,
@@ -41,6 +41,7 @@ _NAMED_IN_MESSAGES: tuple[type[OptionGroup], ...] = (
     PlaneOptions,
     ExperimentOptions,
     FileOptions,
+    RecordingOptions,
     TerminalOptions,
 )
 

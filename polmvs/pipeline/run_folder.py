@@ -18,6 +18,7 @@ from polmvs.errors import DataError
 RUN_FILE = "run.json"
 LOG_FILE = "polmvs.log"
 SURFACE_MESH = "surface.ply"  # among dense views: the mesh that they are rendered from
+SURFACE_LEVELS = "surface_{number}.ply"  # and those on its way: its hull, then after each level
 DENSE_MARKER = "polmvs-files.txt"  # in a COLMAP workspace: the files that were written with it
 
 
@@ -108,7 +109,10 @@ FOLDER_PATTERNS = {
     HERE.sparse.name: ("*.bin",),
     HERE.seeds.parent.name: ("*.npy",),
     **{HERE.maps(model).name: ("*.npy",) for model in AngleModel},
-    **{HERE.views(model).name: ("*.npy", SURFACE_MESH) for model in AngleModel},
+    **{
+        HERE.views(model).name: ("*.npy", SURFACE_MESH, SURFACE_LEVELS.format(number="[0-9]"))
+        for model in AngleModel
+    },
 }
 DENSE_FOLDERS = frozenset(HERE.dense(model).name for model in AngleModel)
 

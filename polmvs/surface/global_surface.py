@@ -115,6 +115,7 @@ def reconstruct_surface(
     min_views: int = 2,
     tolerances: RefinementTolerances | None = None,
     on_progress: OnProgress | None = None,
+    on_mesh: Callable[[TriangleMesh], None] | None = None,
 ) -> GlobalSurface | Undetermined:
     """The surface on which all views agree.
 
@@ -129,6 +130,7 @@ def reconstruct_surface(
     min_views : that must bear out a part.
     tolerances : of the refinement.
     on_progress : called with 1 after each step.
+    on_mesh : called with the hull, and with the mesh after each level of its refinement.
     """
     report = on_progress if on_progress is not None else lambda count: None
     silhouettes = find_silhouettes(maps, masks_given=masks_given)
@@ -162,6 +164,7 @@ def reconstruct_surface(
     # Coarse edges round the steps away that were just carved, and the rims of plates; without them
     # what is far from its hull does not come all the way. The known points tell which it was.
     schedules = [tolerances.levels, *([tolerances.levels[1:]] if steps else [])]
+    levels_of: list[list[TriangleMesh]] = [[] for _ in schedules]
     refined = [
         refine(
             hull.mesh,
@@ -171,10 +174,15 @@ def reconstruct_surface(
             known=known,
             tolerances=replace(tolerances, levels=levels),
             on_progress=on_progress if number == 0 else None,
+            on_level=levels_of[number].append,
         )
         for number, levels in enumerate(schedules)
     ]
-    mesh = min(refined, key=lambda one: _distance_of(seeds, one))
+    best = min(range(len(refined)), key=lambda number: _distance_of(seeds, refined[number]))
+    mesh = refined[best]
+    if on_mesh is not None:
+        for shown in (hull.mesh, *levels_of[best]):
+            on_mesh(shown)
     hollows = _hollows((mesh, hull.mesh), hull.footprint, maps, angle_model, tilt_aware)
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
