@@ -37,6 +37,8 @@ class PhaseTolerances:
         spots. Guess.
     model_sigma : rad; error of the phase of strongly polarised light that noise does not
         explain. Measured on the shared captures.
+    ridge : of the local linear fits, as a share of the window's variance: bounds their slopes
+        where few pixels count. Guess.
     mixture_sigma : rad times DoLP; light of the other kind mixed in turns the phase by this
         over the DoLP. Measured on the shared captures.
     """
@@ -44,6 +46,7 @@ class PhaseTolerances:
     sharp_smoothing_px: float = 0.7
     fine_smoothing_px: float = 1.5
     coarse_smoothing_px: float = 5.0
+    ridge: float = 0.02
     model_sigma: float = 0.014
     mixture_sigma: float = 0.006
 
@@ -109,18 +112,18 @@ def build_phase_map(
     tolerances : of this step.
     """
     weight = region.reliable.astype(np.float32)
-    stokes = np.dstack([s0, s1, s2, np.square(sigma)])
-    fine, fine_weight = _normalized_smoothing(stokes, weight, tolerances.fine_smoothing_px)
-    coarse, coarse_weight = _normalized_smoothing(stokes, weight, tolerances.coarse_smoothing_px)
-    use_fine = fine_weight > 0.25
-    smoothed = np.where(use_fine[..., None], fine, coarse)
-    width_px = np.where(use_fine, tolerances.fine_smoothing_px, tolerances.coarse_smoothing_px)
-    share = np.where(use_fine, fine_weight, coarse_weight)
+    stokes = np.dstack([s0, s1, s2])
+    variances = np.square(sigma)
+    fine = _smoothed(stokes, variances, weight, tolerances.fine_smoothing_px, tolerances.ridge)
+    coarse = _smoothed(stokes, variances, weight, tolerances.coarse_smoothing_px, tolerances.ridge)
+    use_fine = fine.share > 0.25
+    smoothed = np.where(use_fine[..., None], fine.values, coarse.values)
+    share = np.where(use_fine, fine.share, coarse.share)
     with np.errstate(divide="ignore", invalid="ignore"):
-        axial = phase_sign(light) * smoothed[..., 1:3] / smoothed[..., :1]
-        dolp = np.linalg.norm(axial, axis=-1)
-        # A Gaussian of width w averages 4 pi w^2 independent pixels.
-        noise = np.sqrt(smoothed[..., 3] / (4 * np.pi * width_px**2 * share)) / smoothed[..., 0]
+        lit = np.where(smoothed[..., :1] > 0, smoothed[..., :1], np.nan)
+        axial = phase_sign(light) * smoothed[..., 1:3] / lit
+        dolp = np.minimum(np.linalg.norm(axial, axis=-1), 1.0)
+        noise = np.sqrt(np.where(use_fine, fine.variance, coarse.variance)) / lit[..., 0]
         variance = (
             tolerances.model_sigma**2 + (tolerances.mixture_sigma**2 + (0.5 * noise) ** 2) / dolp**2
         )
@@ -216,13 +219,75 @@ def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMa
     return PhaseMap(view, region, samples, intensity, diffuse, lowest_dolp, folder, tilted)
 
 
-def _normalized_smoothing(
-    images: Image, weight: Image, sigma_px: float
-) -> tuple[NDArray[np.float32], Image]:
-    """Gaussian mean of the weighted pixels, and their share under the Gaussian."""
-    share = smooth(weight, sigma_px)
-    mean = smooth(images * weight[..., None], sigma_px) / np.maximum(share, 1e-6)[..., None]
-    return mean.astype(np.float32), share
+@dataclass(frozen=True)
+class _Smoothed:
+    """Images smoothed over the pixels that count.
+
+    ``values`` (H, W, C); ``variance`` (H, W) of each channel from the pixels' noise; ``share``
+    (H, W) of the window that counts.
+    """
+
+    values: Image
+    variance: Image
+    share: Image
+
+
+def _smoothed(
+    images: Image, variances: Image, weight: Image, sigma_px: float, ridge: float
+) -> _Smoothed:
+    """Local linear fits under a Gaussian window (first-order normalized convolution).
+
+    Beside an outline the pixels that count lie on one side. Their mean is that of a place further
+    inside, where a curved surface is less oblique: on the rim of `dome` it turned normals by 2 to 7
+    deg. A linear fit taken at the window's centre has no such bias.
+
+    Knutsson & Westin, CVPR 1993.
+
+    Parameters
+    ----------
+    images : (H, W, C).
+    variances : (H, W), of their noise.
+    weight : (H, W), 1 where a pixel counts, else 0.
+    sigma_px : of the window.
+    ridge : as in `PhaseTolerances`.
+    """
+    reach = int(np.ceil(4 * sigma_px))
+    place = np.arange(-reach, reach + 1, dtype=np.float32)
+    window = np.exp(-0.5 * (place / sigma_px) ** 2)
+    window /= window.sum()
+
+    def moment(image: Image, power_x: int, power_y: int, kernel: Image = window) -> Image:
+        along_x, along_y = (np.asarray(kernel * place**i, np.float32) for i in (power_x, power_y))
+        return np.asarray(
+            cv2.sepFilter2D(image, -1, along_x, along_y, borderType=cv2.BORDER_REPLICATE)
+        )
+
+    share = moment(weight, 0, 0)
+    total = np.maximum(share, 1e-6)
+    x, y = moment(weight, 1, 0) / total, moment(weight, 0, 1) / total
+    xx = moment(weight, 2, 0) / total - x * x + ridge * sigma_px**2
+    yy = moment(weight, 0, 2) / total - y * y + ridge * sigma_px**2
+    xy = moment(weight, 1, 1) / total - x * y
+    # Values at the centre: the mean less the slope times the centroid (x, y) of what counts.
+    scale = 1 / np.maximum(xx * yy - xy * xy, 1e-9)
+    lever_x, lever_y = scale * (yy * x - xy * y), scale * (xx * y - xy * x)
+    counted = images * weight[..., None]
+    constant = (1 + lever_x * x + lever_y * y) / total
+    by_x, by_y = lever_x / total, lever_y / total
+    values = np.asarray(constant[..., None] * moment(counted, 0, 0), np.float32)
+    values -= by_x[..., None] * moment(counted, 1, 0)
+    values -= by_y[..., None] * moment(counted, 0, 1)
+    # The same weights squared give the noise.
+    noisy, squared = weight * variances, np.asarray(window**2, np.float32)
+    second = {(i, j): moment(noisy, i, j, squared) for i in range(3) for j in range(3 - i)}
+    variance = (
+        constant**2 * second[0, 0]
+        + by_x**2 * second[2, 0]
+        + by_y**2 * second[0, 2]
+        + 2 * by_x * by_y * second[1, 1]
+        - 2 * constant * (by_x * second[1, 0] + by_y * second[0, 1])
+    )
+    return _Smoothed(values, np.maximum(variance, 0).astype(np.float32), share)
 
 
 def view_rays(view: View) -> NDArray[np.float32]:
