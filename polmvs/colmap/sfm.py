@@ -126,7 +126,7 @@ def run_sfm(
         _match(database, len(names), options.seed, tolerances)
         on_progress("mapping")
         mapper = _mapper_options(len(names), options, tolerances)
-        reconstruction = _map(database, image_folder, work_folder / "models", mapper)
+        reconstruction = _map(database, image_folder, names, work_folder / "models", mapper)
         on_progress("bundle adjustment")
         reconstruction = _refine(
             reconstruction,
@@ -359,7 +359,11 @@ def _mapper_options(
 
 
 def _map(
-    database: Path, image_folder: Path, models: Path, options: pycolmap.IncrementalPipelineOptions
+    database: Path,
+    image_folder: Path,
+    names: Sequence[str],
+    models: Path,
+    options: pycolmap.IncrementalPipelineOptions,
 ) -> pycolmap.Reconstruction:
     """The largest model that the incremental mapper makes."""
     shutil.rmtree(models, ignore_errors=True)
@@ -373,8 +377,13 @@ def _map(
     )
     if largest.num_reg_images() < 2:
         raise DataError(image_folder, f"SfM registers one image only. {NO_MODEL_REMEDY}")
-    if len(found) > 1:
-        logger.warning("SfM: the images fall into %d models; the largest is used.", len(found))
+    if len(found) > 1 and largest.num_reg_images() < len(names):
+        logger.warning(
+            "SfM: the images fall into %d models; the largest is used and has %d of %d images.",
+            len(found),
+            largest.num_reg_images(),
+            len(names),
+        )
     return largest
 
 
