@@ -114,6 +114,7 @@ class RenderArguments(OptionGroup, group="arguments", in_files=False):
         (640, 400), "of each panel, px", least=16, most=8192, metavar="WIDTH,HEIGHT"
     )
     plain: bool = option(False, "shade by the normals alone, without the surfaces' own grey")
+    part: bool = option(False, "show the surface alone, without points of the surroundings")
     overwrite: bool = option(False, "replace an existing PICTURE")
 
     def check(self) -> None:

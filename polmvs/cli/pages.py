@@ -23,6 +23,7 @@ from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.report.recording import num_recorded_steps, require_rerun, write_recording
 from polmvs.report.rendering import Viewpoint, contact_sheet
 from polmvs.report.report import write_report
+from polmvs.scene import PointKind
 
 
 def report(call: Call, terminal: Terminal) -> int:
@@ -93,6 +94,8 @@ def render(call: Call, terminal: Terminal) -> int:
     subjects: list[Cloud | Mesh] = [
         read_mesh(path) if has_triangles(path) else read_cloud(path) for path in arguments.files
     ]
+    if arguments.part:
+        subjects = [_part(one) if isinstance(one, Cloud) else one for one in subjects]
     viewpoints = [
         Viewpoint(elevation_deg=elevation, azimuth_deg=azimuth)
         for elevation, azimuth in product(arguments.elevations, arguments.azimuths)
@@ -107,3 +110,11 @@ def render(call: Call, terminal: Terminal) -> int:
     write_png(arguments.picture, np.ascontiguousarray(sheet[..., ::-1]))  # OpenCV counts BGR
     terminal.show(str(arguments.picture), {"picture": arguments.picture})
     return 0
+
+
+def _part(cloud: Cloud) -> Cloud:
+    """A cloud without points of the surroundings; all of one that does not tell."""
+    kind = cloud.scalars.get("kind")
+    if kind is None:
+        return cloud
+    return cloud.only(np.isin(kind, (PointKind.SURFACE, PointKind.PRESUMED)))
