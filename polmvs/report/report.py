@@ -353,7 +353,8 @@ def _sentence(given: _Given) -> str:
         return (
             f"{name} has an F-score of {number(second.cloud.f_score[0], 100, 1)} % at "
             f"{1e3 * near:g} mm, OPA {number(first.cloud.f_score[0], 100, 1)} %: oblique rays "
-            "turn the phase of a surface in a way that OPA takes for shape."
+            "turn the phase of a surface, which OPA, for which all rays are parallel, takes for "
+            "shape."
         )
     before = figures[opa].consistency.phase_residual.median_deg
     after = figures[main].consistency.phase_residual.median_deg

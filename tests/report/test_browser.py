@@ -164,6 +164,8 @@ def test_keys_turn_and_zoom(opened: Opened, key: str) -> None:
 
 def test_colours_frusta_and_layout_can_be_chosen(opened: Opened) -> None:
     page = opened.page
+    assert page.locator("[data-control=color]").input_value() == "error"  # there is a truth
+    page.select_option("[data-control=color]", "normal")
     start = opened.drawing()
     seen = {start}
     for name in ("intensity", "kind", "sigma", "error"):
