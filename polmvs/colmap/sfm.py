@@ -467,8 +467,13 @@ def _map(
     )
     if largest.num_reg_images() < 2:
         raise NoModelError(image_folder, f"SfM registers one image only. {NO_MODEL_REMEDY}")
-    if len(found) > 1:
-        logger.warning("SfM: the images fall into %d models; the largest is used.", len(found))
+    if len(found) > 1 and largest.num_reg_images() < len(names):
+        logger.warning(
+            "SfM: the images fall into %d models; the largest is used and has %d of %d images.",
+            len(found),
+            largest.num_reg_images(),
+            len(names),
+        )
     return largest
 
 

@@ -115,6 +115,7 @@ def reconstruct_surface(
     min_views: int = 2,
     tolerances: RefinementTolerances | None = None,
     on_progress: OnProgress | None = None,
+    on_mesh: Callable[[TriangleMesh], None] | None = None,
 ) -> GlobalSurface | Undetermined:
     """The surface on which all views agree.
 
@@ -129,6 +130,7 @@ def reconstruct_surface(
     min_views : that must bear out a part.
     tolerances : of the refinement.
     on_progress : called with 1 after each step.
+    on_mesh : called with the hull, and with the mesh after each level of its refinement.
     """
     report = on_progress if on_progress is not None else lambda count: None
     silhouettes = find_silhouettes(maps, masks_given=masks_given)
@@ -159,6 +161,8 @@ def reconstruct_surface(
     rows = AngleModel.OPA if angle_model is AngleModel.OPA else AngleModel.PPA
     known = KnownPoints(seeds.points_in_world, seeds.sigma)
     tolerances = tolerances or RefinementTolerances()
+    if on_mesh is not None:
+        on_mesh(hull.mesh)
     refined = refine(
         hull.mesh,
         views,
@@ -167,6 +171,7 @@ def reconstruct_surface(
         known=known,
         tolerances=tolerances,
         on_progress=on_progress,
+        on_level=on_mesh,
     )
     mesh = refined.mesh
     views = [replace(view, tilt_share=refined.tilt_share) for view in views]

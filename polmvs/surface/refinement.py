@@ -308,6 +308,7 @@ def refine(
     row_sigma: float = 0.0,
     tolerances: RefinementTolerances | None = None,
     on_progress: Callable[[int], None] | None = None,
+    on_level: Callable[[TriangleMesh], None] | None = None,
 ) -> Refined:
     """Move a closed mesh until the views' phases and silhouettes agree with it.
 
@@ -325,6 +326,7 @@ def refine(
     row_sigma : deviation of ``m . n`` that noise does not explain, if a coarser mesh has shown it.
     tolerances : numbers of the energy, with the levels to do.
     on_progress : called with the number of steps done.
+    on_level : called with the mesh after each level.
     """
     tol = tolerances or RefinementTolerances()
     row_sigma = max(tol.row_sigma, row_sigma)
@@ -368,6 +370,8 @@ def refine(
         # A model that leaves something out (OPA the perspective) errs by more than its phases'
         # noise; held against that, most of its rows were outliers. Every model is treated alike.
         row_sigma = max(tol.row_sigma, system.row_error)
+        if on_level is not None:
+            on_level(mesh)
     return Refined(mesh, tilt_share)
 
 
