@@ -34,6 +34,18 @@ class FileOptions(OptionGroup, group="file", in_files=False):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RecordingOptions(OptionGroup, group="recording", in_files=False):
+    """A recording to look at."""
+
+    rerun: Path | None = option(
+        None,
+        "recording to write for the Rerun viewer (extra 'rerun'): cameras, images, phases, clouds "
+        "and the surface as it refines, stage by stage",
+        metavar="FILE.rrd",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class TerminalOptions(OptionGroup, group="terminal", in_files=False):
     """What is shown."""
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError, PolmvsError
+from polmvs.io.open3d_import import import_open3d
 from polmvs.io.ply import read_ply, read_ply_header, write_ply
 from polmvs.scene import MAX_COORDINATE
 
@@ -67,32 +68,20 @@ class Mesh:
     colors: NDArray[np.uint8] | None = None
 
 
-def _open3d() -> Any:
-    """Import Open3D where a cloud is handled, and only there."""
-    try:
-        import open3d
-    except ImportError as error:
-        raise PolmvsError(
-            f"Open3D cannot be imported ({error}); Open3D 0.20 needs the system library "
-            "libusb-1.0, version 0.19 does not."
-        ) from error
-    return open3d
-
-
 def preload() -> None:
     """Begin to import Open3D beside other work, such as that of COLMAP's mapper on one core."""
 
     def load() -> None:
         # What is missing is said when it is needed; a program that ends meanwhile breaks it off.
         with suppress(Exception):
-            _open3d()
+            import_open3d()
 
     threading.Thread(target=load, name="preload-open3d").start()
 
 
 def to_open3d(cloud: Cloud) -> Any:
     """Make an ``open3d.t.geometry.PointCloud``; points, normals and scalars as float32."""
-    o3d = _open3d()
+    o3d = import_open3d()
     points = np.ascontiguousarray(cloud.points, np.float32)
     result = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
     if cloud.normals is not None:
@@ -107,7 +96,7 @@ def to_open3d(cloud: Cloud) -> Any:
 
 def mesh_to_open3d(mesh: Mesh) -> Any:
     """Make an ``open3d.geometry.TriangleMesh`` with vertex normals."""
-    o3d = _open3d()
+    o3d = import_open3d()
     result = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.triangles)
     )
@@ -208,7 +197,7 @@ def show_in_viewer(paths: Sequence[str | Path]) -> None:
     PolmvsError
         There is no window to be had.
     """
-    o3d = _open3d()
+    o3d = import_open3d()
     shown = [
         {
             "name": Path(path).stem,
@@ -237,7 +226,7 @@ def solve_poisson(
     depth : of the octree; a cell is ``scale * extent / 2**depth`` wide.
     scale : side of the octree's cube over the points' extent.
     """
-    o3d = _open3d()
+    o3d = import_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.normals = o3d.utility.Vector3dVector(normals)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):

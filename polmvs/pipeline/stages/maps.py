@@ -16,6 +16,7 @@ from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, Light, RegionOptions
 from polmvs.errors import DataError
 from polmvs.io.images import read_mask
+from polmvs.normals.axes_check import check_axes
 from polmvs.normals.light import find_diffuse
 from polmvs.normals.light_check import check_light
 from polmvs.parallel import Workers
@@ -107,12 +108,10 @@ def build_maps(
             on_progress(1)
         maps = [open_phase_map(view, folder) for view in views]
         num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
-        if options.light is None and len(tracks.point3D_ids):
-            num_diffuse = _turn_diffuse(tracks, maps, folder)
-        elif options.light is not None and len(tracks.point3D_ids):
-            check = check_light(tracks, maps, options.light)
-            if check.contradicted:
-                logger.warning("%s.", check.message)
+        if len(tracks.point3D_ids):
+            _warn_of_settings(capture, options.light, tracks, maps)
+            if options.light is None:
+                num_diffuse = _turn_diffuse(tracks, maps, folder)
     return MapsResult(num_region_px=num_inside, num_diffuse_px=num_diffuse)
 
 
@@ -203,6 +202,17 @@ def _build_map(
     light = options.light or Light.SPECULAR
     store_phase_map(build_phase_map(view, stokes, region, light), folder)
     return int(region.inside.sum())
+
+
+def _warn_of_settings(
+    capture: Capture, light: Light | None, tracks: Tracks, maps: Sequence[PhaseMap]
+) -> None:
+    """Say which setting the planes of incidence of all views contradict."""
+    axes = check_axes(tracks, maps)
+    if axes.change is not None:
+        logger.warning("%s.", axes.message(capture.options, capture.files.kind))
+    elif light is not None and (check := check_light(tracks, maps, light)).contradicted:
+        logger.warning("%s.", check.message)
 
 
 def _turn_diffuse(tracks: Tracks, maps: Sequence[PhaseMap], folder: Path) -> int:

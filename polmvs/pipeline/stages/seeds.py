@@ -7,6 +7,7 @@ placed by their outlines. PPA chooses them, so that a comparison of models start
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -110,14 +111,7 @@ def find_seeds(
                 "%d sparse points contradict the outlines and are no seeds.", dropped.sum()
             )
         on_tracks = on_tracks[~dropped]
-    for part in reports:
-        if part.doubt:
-            logger.warning(
-                "%s: a part of %d px without a sparse point stays undetermined: %s.",
-                part.view,
-                part.num_px,
-                part.doubt,
-            )
+    _warn_of_doubts([part for part in reports if part.doubt])
     _save(target, np.concatenate([on_tracks, on_parts]))
     return SeedsResult(num_track_seeds=len(on_tracks), num_part_seeds=len(on_parts), parts=reports)
 
@@ -165,6 +159,25 @@ def _require_tracks(source: Path, track: NDArray[np.int64], num_tracks: int) -> 
     """Refuse seeds of other sparse points."""
     if len(track) and not (track.min() >= NO_TRACK and track.max() < num_tracks):
         raise DataError(source, "is not of these sparse points; run again with `run.overwrite`.")
+
+
+def _warn_of_doubts(parts: Sequence[PartReport]) -> None:
+    """One line for all parts without a place, by the largest of them; the log has the others."""
+    if not parts:
+        return
+    first, *others = sorted(parts, key=lambda part: -part.num_px)
+    also = ""
+    if others:
+        also = f" (and {len(others)} smaller part{'s' * (len(others) > 1)}; see the log)"
+    logger.warning(
+        "%s: a part of %d px without a sparse point stays undetermined: %s%s.",
+        first.view,
+        first.num_px,
+        first.doubt,
+        also,
+    )
+    for part in others:
+        logger.info("%s: so does one of %d px: %s.", part.view, part.num_px, part.doubt)
 
 
 def _rows(seeds: Seeds, track: NDArray[np.int64]) -> NDArray[np.void]:
