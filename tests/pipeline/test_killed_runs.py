@@ -6,6 +6,7 @@ its own, is killed in `test_end_to_end.py`.
 
 import json
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,10 +16,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import content_of
+from helpers import content_of, stages_of
 
 from polmvs.camera import PinholeCamera
 from polmvs.colmap.models import write_model
+from polmvs.config import Options, RunOptions, SfmOptions
+from polmvs.errors import DataError
+from polmvs.pipeline.jobs import Job, reconstruct
+from polmvs.pipeline.monitor import NoMonitor
+from polmvs.pipeline.run_lock import locked
 from polmvs.scene import SparseModel, Tracks
 from polmvs.synthetic.captures import Plane, quantize, render_mosaic, ring_of_views
 
@@ -90,12 +96,12 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> list[object]:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(call: Call, given, tmp_path_factory) -> tuple[dict[str, bytes], float]:
-    """What a run writes, and how long it takes."""
+def undisturbed(call: Call, given, tmp_path_factory) -> tuple[dict[str, bytes], float, list[str]]:
+    """What a run writes, how long it takes, and its stages."""
     out = tmp_path_factory.mktemp("undisturbed") / "out"
     done = call("reconstruct", given[0], out, *given[1:], *FLAGS)
     assert (done["status"], done["stderr"]) == (0, "")
-    return results_of(out), done["seconds"]
+    return results_of(out), done["seconds"], stages_of(out)
 
 
 def results_of(out: Path) -> dict[str, bytes]:
@@ -106,7 +112,7 @@ def test_a_run_killed_at_any_moments_comes_to_the_same(
     call: Call, given, undisturbed, tmp_path: Path
 ) -> None:
     """Killed again and again on its way, so that what goes on is killed as well."""
-    expected, seconds = undisturbed
+    expected, seconds, _ = undisturbed
     rng = random.Random(0)
     num_kills, kills_of_runs = 0, list[int]()
     while num_kills < NUM_KILLS:
@@ -114,7 +120,7 @@ def test_a_run_killed_at_any_moments_comes_to_the_same(
         again = ["reconstruct", given[0], out, *given[1:], *FLAGS]
         kills = 0
         while kills < MAX_KILLS_OF_RUN:
-            done = call(*again, number=signal.SIGKILL, after=rng.uniform(0, 0.9 * seconds))
+            done = call(*again, number=signal.SIGKILL, after=rng.uniform(0, 0.5 * seconds))
             assert done["orphans"] == []
             if "--resume" not in again:
                 again.append("--resume")
@@ -129,3 +135,64 @@ def test_a_run_killed_at_any_moments_comes_to_the_same(
         kills_of_runs.append(kills)
         num_kills += kills
     assert max(kills_of_runs) > 1
+
+
+def test_a_run_interrupted_in_any_stage_goes_on(
+    call: Call, given, undisturbed, tmp_path: Path
+) -> None:
+    """By Ctrl-C and by a plain kill: one line, whole stages only, nothing and nobody left."""
+    expected, _, stages = undisturbed
+    out = tmp_path / "out"
+    again = ["reconstruct", given[0], out, *given[1:], *FLAGS]
+    for index, stage in enumerate(stages):
+        for number in (signal.SIGINT, signal.SIGTERM):
+            done = call(*again, number=number, stage=stage)
+            assert done["status"] == 130, (stage, number)
+            line = "interrupted; finished stages are kept, go on with --resume"
+            assert (done["stdout"], done["stderr"]) == ("", f"polmvs reconstruct: {line}\n")
+            assert done["orphans"] == []
+            assert stages_of(out) == stages[:index]
+            assert [path.name for path in out.rglob(".*")] == []
+            if "--resume" not in again:
+                again.append("--resume")
+    assert call(*again)["status"] == 0
+    assert results_of(out) == expected
+
+
+def test_a_second_run_beside_a_first_is_refused(
+    call: Call, given, undisturbed, tmp_path: Path
+) -> None:
+    """Whether it is to go on or to begin anew; the first one is not disturbed."""
+    out = tmp_path / "out"
+    again = ["reconstruct", given[0], out, *given[1:], *FLAGS]
+    with locked(out):
+        for flag in ("--resume", "--overwrite"):
+            done = call(*again, flag)
+            assert done["status"] == 1
+            assert "another run is at work in it (process" in done["stderr"]
+            assert done["stderr"].count("\n") == 1
+            assert [path.name for path in out.iterdir()] == [".polmvs-lock"]
+
+
+def test_an_input_that_vanishes_on_the_way_is_named(given, tmp_path: Path) -> None:
+    """What is finished stays, and the run goes on when it is back."""
+    capture, out = tmp_path / "capture", tmp_path / "out"
+    shutil.copytree(given[0], capture)
+
+    class Thief(NoMonitor):
+        def stage(self, name, total):
+            if name == "maps":
+                (capture / "003.png").unlink()
+            return super().stage(name, total)
+
+    job = Job(
+        capture=capture,
+        out=out,
+        options=Options(sfm=SfmOptions(sparse=given[2])),
+        run_options=RunOptions(workers=1),
+        monitor=Thief(),
+    )
+    with pytest.raises(DataError, match=r"003\.png: no such file"):
+        reconstruct(job)
+    assert stages_of(out) == ["images", "sfm", "poses"]
+    assert [path.name for path in out.rglob(".*")] == []
