@@ -8,7 +8,7 @@ from typing import Any
 
 import polmvs
 from polmvs.camera import PinholeCamera
-from polmvs.cli.call import Call
+from polmvs.cli.call import Call, RecordingOptions
 from polmvs.cli.commands import (
     ComparedModels,
     DemoArguments,
@@ -38,6 +38,7 @@ DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"
 
 def demo(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs demo``."""
+    _check_recording(call)
     truth = open_ground_truth(DEMO_CAPTURE)
     camera = truth.views[truth.names[0]].camera
     assert isinstance(camera, PinholeCamera)
@@ -58,6 +59,7 @@ def demo(call: Call, terminal: Terminal) -> int:
 
 def reconstruct(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs reconstruct``."""
+    _check_recording(call)
     model = call.get(ModelChoice).angle_model
     outcome = pipeline.reconstruct(job_of(call, terminal), model)
     return _show_cloud(_reported(outcome, call, terminal), model, terminal)
@@ -65,6 +67,7 @@ def reconstruct(call: Call, terminal: Terminal) -> int:
 
 def compare(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs compare``."""
+    _check_recording(call)
     models = call.get(ComparedModels).angle_models
     outcome = pipeline.compare(job_of(call, terminal), models)
     return _show_comparison(_reported(outcome, call, terminal), terminal)
@@ -109,12 +112,25 @@ def export(call: Call, terminal: Terminal) -> int:
 
 
 def _reported(outcome: pipeline.JobOutcome, call: Call, terminal: Terminal) -> pipeline.JobOutcome:
-    """Write the page that shows the results, if it is wanted."""
-    if call.get(ReportChoice).report:
-        from polmvs.cli.pages import make_report
+    """Write the page and the recording that show the results, if they are wanted."""
+    recording = call.get(RecordingOptions).rerun
+    if call.get(ReportChoice).report or recording is not None:
+        from polmvs.cli.pages import make_recording, make_report
 
-        make_report(outcome.run_folder, terminal)
+        if call.get(ReportChoice).report:
+            make_report(outcome.run_folder, terminal)
+        if recording is not None:
+            make_recording(outcome.run_folder, recording, terminal)
     return outcome
+
+
+def _check_recording(call: Call) -> None:
+    """Refuse a recording that cannot be made before the run, not after it."""
+    recording = call.get(RecordingOptions).rerun
+    if recording is not None:
+        from polmvs.report.recording import require_rerun
+
+        require_rerun(recording)
 
 
 def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeline.Job:

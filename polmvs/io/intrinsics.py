@@ -7,7 +7,6 @@ the polarization images exactly, since in COLMAP's convention scaling is multipl
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ import yaml
 from polmvs.camera import PinholeCamera, xy_from_opencv
 from polmvs.errors import DataError
 from polmvs.io.images import write_bytes
+from polmvs.io.typed_json import parse_json
 
 # Parameters that scale with the image come first; all others are distortion.
 COLMAP_MODELS = {
@@ -214,7 +214,7 @@ def _parse(path: Path, text: str) -> Any:
     """JSON, YAML, or OpenCV's dialect of YAML."""
     try:
         if text.lstrip().startswith(("{", "[")):
-            return json.loads(text)
+            return parse_json(text)
         if text.startswith("%YAML"):
             text = text.partition("\n")[2]
         return yaml.safe_load(text.replace("!!opencv-matrix", ""))

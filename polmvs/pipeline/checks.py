@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from polmvs.camera import PinholeCamera
+from polmvs.colmap.database import check_database
 from polmvs.colmap.dense_workspace import open_dense_workspace, require_same_frame
+from polmvs.colmap.pairs import read_pairs
 from polmvs.colmap.sfm import check_camera, check_intrinsics
 from polmvs.config import Options, ReferenceOptions, SfmOptions
 from polmvs.errors import DataError, OptionError
@@ -37,6 +39,8 @@ def inputs_of(options: Options) -> list[Path]:
     paths = (
         options.sfm.sparse,
         options.sfm.camera,
+        options.sfm.database,
+        options.sfm.pairs_file,
         options.capture.calibration,
         options.reference.reference,
         options.region.mask,
@@ -67,9 +71,18 @@ def require_apart(
         raise OptionError(f"{run_folder.root}: OUT is the capture's own folder. Give another OUT.")
     places = [root / name for name in written]
     for path in (capture, *others):
-        resolved = path.resolve()
-        if any(resolved == place or place in resolved.parents for place in places):
-            raise OptionError(f"{path}: lies where OUT's results go. Give another OUT.")
+        for resolved in _real_places(path):
+            if any(resolved == place or place in resolved.parents for place in places):
+                raise OptionError(f"{path}: lies where OUT's results go. Give another OUT.")
+
+
+def _real_places(path: Path) -> list[Path]:
+    """Where an input lies, and what links in it lead to."""
+    try:
+        links = [entry for entry in path.iterdir() if entry.is_symlink()] if path.is_dir() else []
+        return [entry.resolve() for entry in (path, *links)]
+    except (OSError, RuntimeError) as error:  # a circle of links
+        raise DataError(path, f"cannot be followed ({error}).") from error
 
 
 def identity_of(capture: Capture) -> CaptureIdentity:
@@ -150,6 +163,12 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
         check_intrinsics(options.sfm.intrinsics, capture.width, capture.height)
     if options.sfm.camera is not None:
         check_camera(options.sfm.camera, capture.width, capture.height)
+    names = list(image_names(capture))
+    if options.sfm.database is not None:
+        given = check_database(options.sfm.database, names, capture.width, capture.height)
+        names = list(given.ids)
+    if options.sfm.pairs_file is not None:
+        read_pairs(options.sfm.pairs_file, names)
     return None
 
 

@@ -205,13 +205,13 @@ def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMa
     DataError
         If a file is missing, damaged, or of another size than the view's camera.
     """
-    samples = map_array(folder / _samples_name(view.name, tilted))
-    intensity = map_array(folder / f"{view.name}.intensity.npy")
-    flags = map_array(folder / f"{view.name}.region.npy")
-    lowest_dolp = map_array(folder / f"{view.name}.dolp.npy")
+    samples = map_array(folder / _samples_name(view.name, tilted), np.floating)
+    intensity = map_array(folder / f"{view.name}.intensity.npy", np.floating)
+    flags = map_array(folder / f"{view.name}.region.npy", np.unsignedinteger)
+    lowest_dolp = map_array(folder / f"{view.name}.dolp.npy", np.unsignedinteger)
     size = (view.camera.height, view.camera.width)
     shapes = (samples.shape[:2], intensity.shape, flags.shape, lowest_dolp.shape)
-    if any(shape != size for shape in shapes):
+    if any(shape != size for shape in shapes) or samples.shape[2:] != (3,):
         reason = "has another size than its camera; give `run.overwrite`."
         raise DataError(folder / view.name, reason)
     region = Region((flags & 1) > 0, (flags & 2) > 0, (flags & 4) > 0)

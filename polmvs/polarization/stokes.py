@@ -14,9 +14,9 @@ reduction of the interpolation included. ``a`` and ``b`` are read from the image
 
 Where r is larger than such noise explains (edges, texture finer than a cell), s1 and s2 are
 wrong by as much, and sigma grows with the local mean of ``r^2 / 2``. Measured on ``board`` against
-the phase of the true normals (tilted polarizers, DoLP > 0.1): the median of |error| / sigma_aolp
-is 1.06 of a normal distribution's without that term, 0.92 with it, and the share of errors beyond
-5 sigma falls from 1.6 % to 0.3 %.
+the phase of the true normals (tilted polarizers, DoLP > 0.1): the median of
+``|error| / sigma_aolp`` is 1.06 of a normal distribution's without that term,
+0.92 with it, and the share of errors beyond 5 sigma falls from 1.6 % to 0.3 %.
 
 n images through polarizers at known angles leave n - 3 redundant combinations, which are treated
 alike. Three images, or Stokes images made elsewhere, leave none; there the noise is that of the

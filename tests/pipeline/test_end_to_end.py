@@ -193,6 +193,11 @@ def wait_until(holds, process: subprocess.Popen[str], timeout_s: float = 300) ->
         time.sleep(0.02)
 
 
+def unfinished(out: Path, name: str) -> bool:
+    """Whether a stage is at work on this folder."""
+    return any(out.glob(f".polmvs-*-{name}"))
+
+
 def copy_until(demo_run: Path, out: Path, last: str) -> None:
     """A run that was stopped after this stage."""
     shutil.copytree(demo_run, out)
@@ -203,14 +208,14 @@ def test_killed_run_goes_on_to_the_same_result(demo_run: Path, tmp_path: Path, c
     """Killed twice, in SfM and while it densifies; each time the finished stages stay."""
     out = tmp_path / "out"
     process = start(out)
-    wait_until((out / ".sparse.tmp").exists, process)
+    wait_until(lambda: unfinished(out, "sparse"), process)
     time.sleep(0.5)
     kill(process)
     assert not (out / "sparse").exists()
     assert stages_of(out) == ["images"]
 
     process = start(out, "--resume")
-    wait_until((out / ".views_opa.tmp").exists, process)
+    wait_until(lambda: unfinished(out, "views_opa"), process)
     kill(process)
     assert not (out / "opa.ply").exists()
     assert stages_of(out) == BEFORE_CLOUDS
@@ -227,7 +232,7 @@ def test_interrupt_keeps_finished_stages_only(demo_run: Path, tmp_path: Path, nu
     out = tmp_path / "out"
     copy_until(demo_run, out, BEFORE_CLOUDS[-1])
     process = start(out, "--resume")
-    wait_until((out / ".views_opa.tmp").exists, process)
+    wait_until(lambda: unfinished(out, "views_opa"), process)
     process.send_signal(number)
     stdout, stderr = process.communicate(timeout=300)
     assert process.returncode == 130

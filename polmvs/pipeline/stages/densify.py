@@ -23,11 +23,11 @@ from polmvs.colmap.dense_workspace import (
 from polmvs.colmap.filling import previous_backups
 from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, FusionOptions, Method, PropagationOptions, Surroundings
-from polmvs.io.clouds import Cloud, write_cloud, write_mesh
+from polmvs.io.clouds import Cloud, Mesh, write_cloud, write_mesh
 from polmvs.io.images import read_gray
 from polmvs.parallel import Workers
 from polmvs.pipeline.monitor import OnProgress, no_progress
-from polmvs.pipeline.run_folder import SURFACE_MESH, replace_folder, scratch
+from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, replace_folder, scratch
 from polmvs.pipeline.stages.maps import open_maps, posed_views
 from polmvs.pipeline.stages.poses import load_camera_modes
 from polmvs.pipeline.stages.seeds import load_seeds
@@ -49,7 +49,7 @@ from polmvs.surface.global_surface import (
 )
 from polmvs.surface.integration import integrate, plan_rounds
 from polmvs.surface.kept_depth import kept_cloud
-from polmvs.surface.mesh_geometry import RayScene
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.surroundings import SparseSurroundings, sparse_surroundings, stereo_surroundings
 
 logger = logging.getLogger(__name__)
@@ -185,6 +185,7 @@ def _global_surface(
     Its mesh and its depth in each view go to ``views``. None where silhouettes do not bound the
     objects.
     """
+    levels: list[TriangleMesh] = []
     surface = reconstruct_surface(
         model,
         maps,
@@ -194,6 +195,7 @@ def _global_surface(
         tilt_aware=tilt_aware,
         min_views=fusion.min_views,
         on_progress=on_progress,
+        on_mesh=levels.append,
     )
     if isinstance(surface, Undetermined):
         logger.warning(
@@ -213,6 +215,10 @@ def _global_surface(
     spacing = fusion.voxel if fusion.voxel is not None else fusion.voxel_px * surface.footprint
     found = surface_points(surface, maps, spacing or FINEST_SPACING_PX * surface.footprint)
     write_mesh(views / SURFACE_MESH, supported_mesh(surface))
+    for number, mesh in enumerate(levels):
+        faces = mesh.faces.astype(np.int32)
+        whole = Mesh(vertices=mesh.vertices, normals=mesh.vertex_normals, triangles=faces)
+        write_mesh(views / SURFACE_LEVELS.format(number=number), whole)
     return found
 
 

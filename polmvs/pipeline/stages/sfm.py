@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,9 +23,14 @@ from polmvs.pipeline.run_folder import CAMERA_MODES, replace_folder, scratch
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture
 from polmvs.scene import SparseModel, short_list
+from polmvs.separate import CrashError, run_separately
 
 logger = logging.getLogger(__name__)
 
+# Of SQLite and of the system, in the last words of a process of COLMAP's.
+FULL_DISK = re.compile("disk I/O error|database or disk is full|No space left|readonly database")
+CANNOT_WRITE = "cannot be written: is the disk full?"
+MAX_SAID = 120  # characters of COLMAP's words
 NUM_SFM_STEPS = 4  # that run_sfm reports
 # Of views: under it most points of a surface are seen by two or three views, of which none can be
 # told to be wrong.
@@ -92,7 +98,12 @@ def find_model(
     with scratch(target) as folder:
         work, new = folder / "work", folder / "sparse"
         try:
-            model = run_sfm(images, names, work, new, options, on_step)
+            # Where its database cannot be written COLMAP ends the process.
+            model = run_separately(_run_sfm, images, names, work, new, options, on_message=on_step)
+        except CrashError as error:
+            if not FULL_DISK.search(error.said):
+                raise
+            raise DataError(target.parent, CANNOT_WRITE) from error
         except NoModelError as error:
             reason = why_no_model(work / "database.db", options)
             raise DataError(images, f"SfM finds no model: {reason}") from error
@@ -118,6 +129,22 @@ def find_model(
             100 * bending,
         )
     return _result(model, focal_sigma=found.focal, bending=bending)
+
+
+def _run_sfm(
+    images: Path,
+    names: Sequence[str],
+    work: Path,
+    new: Path,
+    options: SfmOptions,
+    on_step: Callable[[str], None],
+) -> SparseModel:
+    """SfM, where what COLMAP says of a folder that it cannot work in is an error of that folder."""
+    try:
+        return run_sfm(images, names, work, new, options, on_step)
+    except RuntimeError as error:
+        said = " ".join(str(error).split())[:MAX_SAID]
+        raise DataError(new.parent.parent, f"{CANNOT_WRITE} COLMAP says: {said}") from error
 
 
 def fit_model(capture: Capture, source: Path) -> SparseModel:
