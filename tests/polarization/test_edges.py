@@ -35,4 +35,3 @@ def test_no_edge_is_a_polarised_region(resolution, blur_px):
         assert np.mean(stokes.dolp > 0.1) > 0.005
     region = find_region(stokes.s0, stokes.s1, stokes.s2, stokes.valid, min_dolp=0.1)
     assert not region.inside.any()
-
