@@ -45,7 +45,8 @@ def map_array(path: Path) -> NDArray[Any]:
         ) from error
 
 
-@lru_cache(maxsize=256)
+# Those of the views that are being looked at: what is mapped and read counts as resident memory.
+@lru_cache(maxsize=32)
 def _map_array(path: Path, stamp: int) -> NDArray[Any]:
     # A plain array over the map: OpenCV takes it without a copy.
     return np.asarray(np.load(path, mmap_mode="r"))
