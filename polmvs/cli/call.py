@@ -34,6 +34,18 @@ class FileOptions(OptionGroup, group="file", in_files=False):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RecordingOptions(OptionGroup, group="recording", in_files=False):
+    """A recording to look at."""
+
+    rerun: Path | None = option(
+        None,
+        "recording to write for the Rerun viewer (extra 'rerun'): cameras, images, phases, clouds "
+        "and the surface as it refines, stage by stage",
+        metavar="FILE.rrd",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class TerminalOptions(OptionGroup, group="terminal", in_files=False):
     """What is shown."""
 
@@ -136,7 +148,9 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
         raise OptionError(f"{path}: is no TOML file (not UTF-8).") from error
     try:
         content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError as error:
+        raise OptionError(f"{path}: is no TOML file (it is nested too deeply).") from error
+    except ValueError as error:  # of the parser, or an integer of thousands of digits
         raise OptionError(f"{path}: is no TOML file ({error}{_line_of(text, error)}).") from error
     known = {cls.group: cls for cls in groups}
     values = {}

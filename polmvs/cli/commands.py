@@ -9,7 +9,7 @@ from dataclasses import MISSING, dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from polmvs.cli.call import FileOptions, TerminalOptions
+from polmvs.cli.call import FileOptions, RecordingOptions, TerminalOptions
 from polmvs.cli.flags import Command
 from polmvs.config import (
     COMPARED_MODELS,
@@ -129,6 +129,7 @@ class RenderArguments(OptionGroup, group="arguments", in_files=False):
         (640, 400), "of each panel, px", least=16, most=8192, metavar="WIDTH,HEIGHT"
     )
     plain: bool = option(False, "shade by the normals alone, without the surfaces' own grey")
+    part: bool = option(False, "show the surface alone, without points of the surroundings")
     overwrite: bool = option(False, "replace an existing PICTURE")
 
     def check(self) -> None:
@@ -249,6 +250,7 @@ class PolarizerFrames(OptionGroup, group="polarizers"):
 TO_POSES = (CaptureOptions, SfmOptions, ReferenceOptions)
 TO_NORMALS = (*TO_POSES, RegionOptions, NormalOptions)
 TO_CLOUD = (*TO_NORMALS, PropagationOptions, FusionOptions)
+SHOWN = (ReportChoice, RecordingOptions)
 HOW = (RunOptions, FileOptions, TerminalOptions)
 
 COMMANDS = (
@@ -256,20 +258,20 @@ COMMANDS = (
         name="demo",
         help_text="compare OPA and PPA on the bundled capture of a glossy board",
         run="polmvs.cli.jobs:demo",
-        groups=(DemoArguments, ReportChoice, RunOptions, TerminalOptions),
+        groups=(DemoArguments, *SHOWN, RunOptions, TerminalOptions),
     ),
     Command(
         name="reconstruct",
         help_text="capture in, dense cloud of one model out",
         run="polmvs.cli.jobs:reconstruct",
-        groups=(JobArguments, ModelChoice, *TO_CLOUD, ExportOptions, ReportChoice, *HOW),
+        groups=(JobArguments, ModelChoice, *TO_CLOUD, ExportOptions, *SHOWN, *HOW),
     ),
     Command(
         name="compare",
         help_text="dense clouds of several models on the same poses, seeds and region, and figures "
         "that tell them apart",
         run="polmvs.cli.jobs:compare",
-        groups=(JobArguments, ComparedModels, *TO_CLOUD, EvaluationOptions, ReportChoice, *HOW),
+        groups=(JobArguments, ComparedModels, *TO_CLOUD, EvaluationOptions, *SHOWN, *HOW),
     ),
     Command(
         name="batch",
@@ -320,7 +322,7 @@ COMMANDS = (
         name="report",
         help_text="the page that shows a finished run, OUT/report.html, anew",
         run="polmvs.cli.pages:report",
-        groups=(FolderArguments, TerminalOptions),
+        groups=(FolderArguments, RecordingOptions, TerminalOptions),
     ),
     Command(
         name="view",

@@ -18,6 +18,8 @@ from polmvs._version import __version__
 from polmvs.cli.call import Call
 from polmvs.cli.terminal import Terminal
 from polmvs.config import default_num_workers
+from polmvs.errors import PolmvsError
+from polmvs.io.open3d_import import import_open3d
 
 # Distributions by the modules that they bring.
 PACKAGES = {
@@ -100,13 +102,8 @@ def package(module: str, name: str) -> Finding:
     lines = (found.read_text("WHEEL") or "").splitlines()
     tags = [line.partition(": ")[2] for line in lines if line.startswith("Tag: ")]
     where = f"wheel {tags[0]}" if tags else "no wheel"
-    finding = _tried(
-        name, lambda: f"{found.version}, {where}", before=lambda: import_module(module)
-    )
-    if not finding.works and "libusb" in finding.text:
-        remedy = "install the system package libusb-1.0 (Debian: apt install libusb-1.0-0)"
-        return Finding(what=name, text=f"{finding.text}; {remedy}", works=False)
-    return finding
+    load = import_open3d if module == "open3d" else lambda: import_module(module)
+    return _tried(name, lambda: f"{found.version}, {where}", before=load)
 
 
 def _tried(
@@ -117,7 +114,8 @@ def _tried(
         before()
         return Finding(what=what, text=work())
     except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        kind = "" if isinstance(error, PolmvsError) else f"{type(error).__name__}: "
+        reason = " ".join(f"{kind}{error}".split())
         return Finding(what=what, text=f"fails ({reason})", works=False)
 
 

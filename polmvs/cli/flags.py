@@ -22,7 +22,7 @@ from cyclopts.exceptions import CycloptsError, MissingArgumentError, UnusedCliTo
 from cyclopts.token import Token
 
 import polmvs
-from polmvs.cli.call import Call, FileOptions, TerminalOptions
+from polmvs.cli.call import Call, FileOptions, RecordingOptions, TerminalOptions
 from polmvs.config import (
     ExperimentOptions,
     FieldInfo,
@@ -41,6 +41,7 @@ _NAMED_IN_MESSAGES: tuple[type[OptionGroup], ...] = (
     PlaneOptions,
     ExperimentOptions,
     FileOptions,
+    RecordingOptions,
     TerminalOptions,
 )
 
@@ -151,7 +152,7 @@ def parse(commands: Sequence[Command], tokens: Sequence[str], prog: str, about: 
     given = {info.path: values[_key(info)] for info in infos if _key(info) in values}
     for info in infos:  # cyclopts lets several arguments be none
         if info.default is dataclasses.MISSING and info.path not in given:
-            raise UsageError(name, f"{_metavar(info)} is missing")
+            raise UsageError(name, f"{metavar_of(info)} is missing")
     call = Call(given=given, tables=chosen.tables, command_line=[prog, *tokens])
     return Parsed(prog=name, command=chosen, call=call)
 
@@ -205,10 +206,10 @@ def _complete(app: App, command: Command, prog: str, *, show_all: bool) -> None:
         names = ", ".join(cls.group for cls in hidden)
         lines.append(f"Options of earlier stages ({names}): {HELP_ALL}.")
     app.help = "\n\n".join([*lines, command.more] if command.more else lines)
-    app.usage = f"Usage: {prog} {_arguments(command)}[OPTIONS]"
+    app.usage = f"Usage: {prog} {arguments_line(command)}[OPTIONS]"
     parameters = []
     for rank, cls in enumerate((*command.groups, *command.earlier)):
-        panel = Group(_title(cls), sort_key=rank, show=cls not in hidden)
+        panel = Group(group_title(cls), sort_key=rank, show=cls not in hidden)
         infos = describe_fields(cls)
         if any(info.positional for info in infos):
             app.group_arguments = panel  # in place of cyclopts' own of this name
@@ -216,17 +217,18 @@ def _complete(app: App, command: Command, prog: str, *, show_all: bool) -> None:
     app.default(_Signature(sorted(parameters, key=lambda p: p.kind)))
 
 
-def _arguments(command: Command) -> str:
+def arguments_line(command: Command) -> str:
     """The command's arguments as its usage line has them."""
     infos = [info for cls in command.groups for info in describe_fields(cls) if info.positional]
-    texts = [_metavar(info) + " ..." * _is_list(info.kind) for info in infos]
+    texts = [metavar_of(info) + " ..." * _is_list(info.kind) for info in infos]
     required = [info.default is dataclasses.MISSING for info in infos]
     return "".join(
         f"{text} " if needed else f"[{text}] " for text, needed in zip(texts, required, strict=True)
     )
 
 
-def _title(cls: type[OptionGroup]) -> str:
+def group_title(cls: type[OptionGroup]) -> str:
+    """Heading of a group of options."""
     text = (cls.__doc__ or "").splitlines()[0].rstrip(".")
     return f"{cls.group}: {text}" if cls.in_files else text
 
@@ -261,7 +263,7 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
     if not info.positional:
         common["name"] = (info.flag, "-v") if info.flag == "--verbose" else info.flag
     if info.kind is not bool:
-        common["metavar"] = _metavar(info)
+        common["metavar"] = metavar_of(info)
     kind: Any = info.kind
     place: Any = inspect.Parameter.KEYWORD_ONLY
     elements = typing.get_args(kind) if typing.get_origin(kind) is tuple else ()
@@ -328,7 +330,8 @@ def _read_list(element: Any, text: str) -> tuple[Any, ...]:
         raise ValueError(f"{text!r} cannot be read as {_name(tuple[element, ...])}") from error
 
 
-def _metavar(info: FieldInfo) -> str:
+def metavar_of(info: FieldInfo) -> str:
+    """What stands for the value of an option or argument."""
     if isinstance(info.metavar, tuple):
         return " ".join(info.metavar)
     return info.metavar or (info.name.upper() if info.positional else _name(info.kind))

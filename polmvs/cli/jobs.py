@@ -8,7 +8,7 @@ from typing import Any
 
 import polmvs
 from polmvs.camera import PinholeCamera
-from polmvs.cli.call import Call
+from polmvs.cli.call import Call, RecordingOptions
 from polmvs.cli.commands import (
     ComparedModels,
     DemoArguments,
@@ -20,6 +20,7 @@ from polmvs.cli.flags import in_flags
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
 from polmvs.evaluation.tables import best_fit_lines
+from polmvs.evaluation.trust import Trust
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.pipeline import jobs as pipeline
 from polmvs.pipeline.record import read_options
@@ -37,6 +38,7 @@ DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"
 
 def demo(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs demo``."""
+    _check_recording(call)
     truth = open_ground_truth(DEMO_CAPTURE)
     camera = truth.views[truth.names[0]].camera
     assert isinstance(camera, PinholeCamera)
@@ -57,6 +59,7 @@ def demo(call: Call, terminal: Terminal) -> int:
 
 def reconstruct(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs reconstruct``."""
+    _check_recording(call)
     model = call.get(ModelChoice).angle_model
     outcome = pipeline.reconstruct(job_of(call, terminal), model)
     return _show_cloud(_reported(outcome, call, terminal), model, terminal)
@@ -64,6 +67,7 @@ def reconstruct(call: Call, terminal: Terminal) -> int:
 
 def compare(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs compare``."""
+    _check_recording(call)
     models = call.get(ComparedModels).angle_models
     outcome = pipeline.compare(job_of(call, terminal), models)
     return _show_comparison(_reported(outcome, call, terminal), terminal)
@@ -108,12 +112,25 @@ def export(call: Call, terminal: Terminal) -> int:
 
 
 def _reported(outcome: pipeline.JobOutcome, call: Call, terminal: Terminal) -> pipeline.JobOutcome:
-    """Write the page that shows the results, if it is wanted."""
-    if call.get(ReportChoice).report:
-        from polmvs.cli.pages import make_report
+    """Write the page and the recording that show the results, if they are wanted."""
+    recording = call.get(RecordingOptions).rerun
+    if call.get(ReportChoice).report or recording is not None:
+        from polmvs.cli.pages import make_recording, make_report
 
-        make_report(outcome.run_folder, terminal)
+        if call.get(ReportChoice).report:
+            make_report(outcome.run_folder, terminal)
+        if recording is not None:
+            make_recording(outcome.run_folder, recording, terminal)
     return outcome
+
+
+def _check_recording(call: Call) -> None:
+    """Refuse a recording that cannot be made before the run, not after it."""
+    recording = call.get(RecordingOptions).rerun
+    if recording is not None:
+        from polmvs.report.recording import require_rerun
+
+        require_rerun(recording)
 
 
 def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeline.Job:
@@ -146,7 +163,10 @@ def _show_cloud(outcome: pipeline.JobOutcome, model: AngleModel, terminal: Termi
     dense = outcome.find(DenseWorkspaceResult, model)
     if dense is not None and dense.folder is not None:
         lines.append(f"{dense.folder}: COLMAP dense workspace")
-    terminal.show("\n".join(lines), _content(outcome, terminal))
+    trust = outcome.find(Trust, model)
+    if trust is not None and cloud.num_points:
+        lines += map(str, trust.figures())
+    terminal.show(in_flags("\n".join(lines)), _content(outcome, terminal))
     return _status(outcome, terminal)
 
 

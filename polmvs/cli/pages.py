@@ -6,10 +6,11 @@ import os
 import sys
 import time
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 
-from polmvs.cli.call import Call
+from polmvs.cli.call import Call, RecordingOptions
 from polmvs.cli.commands import FolderArguments, RenderArguments
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel
@@ -19,14 +20,23 @@ from polmvs.io.images import write_png
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import load_record
 from polmvs.pipeline.stages.poses import PosesResult
+from polmvs.report.recording import num_recorded_steps, require_rerun, write_recording
 from polmvs.report.rendering import Viewpoint, contact_sheet
 from polmvs.report.report import write_report
+from polmvs.scene import PointKind
 
 
 def report(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs report``."""
-    path = make_report(RunFolder(call.get(FolderArguments).out), terminal)
-    terminal.show(str(path), {"report": path})
+    folder, recording = RunFolder(call.get(FolderArguments).out), call.get(RecordingOptions).rerun
+    if recording is not None:
+        require_rerun(recording)
+    path = make_report(folder, terminal)
+    shown = {"report": path}
+    if recording is not None:
+        make_recording(folder, recording, terminal)
+        shown["recording"] = str(recording)
+    terminal.show("\n".join(shown.values()), shown)
     return 0
 
 
@@ -39,6 +49,15 @@ def make_report(run_folder: RunFolder, terminal: Terminal) -> str:
     megabytes = path.stat().st_size / 1e6
     terminal.finished("report", time.perf_counter() - start, f"{path}, {megabytes:.1f} MB")
     return str(path)
+
+
+def make_recording(run_folder: RunFolder, path: Path, terminal: Terminal) -> None:
+    """Write a recording with a bar and a line, as for a stage."""
+    start = time.perf_counter()
+    with terminal.stage("recording", num_recorded_steps(run_folder)) as on_progress:
+        write_recording(run_folder, path, on_progress=on_progress)
+    megabytes = path.stat().st_size / 1e6
+    terminal.finished("recording", time.perf_counter() - start, f"{path}, {megabytes:.1f} MB")
 
 
 def view(call: Call, terminal: Terminal) -> int:
@@ -75,6 +94,8 @@ def render(call: Call, terminal: Terminal) -> int:
     subjects: list[Cloud | Mesh] = [
         read_mesh(path) if has_triangles(path) else read_cloud(path) for path in arguments.files
     ]
+    if arguments.part:
+        subjects = [_part(one) if isinstance(one, Cloud) else one for one in subjects]
     viewpoints = [
         Viewpoint(elevation_deg=elevation, azimuth_deg=azimuth)
         for elevation, azimuth in product(arguments.elevations, arguments.azimuths)
@@ -89,3 +110,11 @@ def render(call: Call, terminal: Terminal) -> int:
     write_png(arguments.picture, np.ascontiguousarray(sheet[..., ::-1]))  # OpenCV counts BGR
     terminal.show(str(arguments.picture), {"picture": arguments.picture})
     return 0
+
+
+def _part(cloud: Cloud) -> Cloud:
+    """A cloud without points of the surroundings; all of one that does not tell."""
+    kind = cloud.scalars.get("kind")
+    if kind is None:
+        return cloud
+    return cloud.only(np.isin(kind, (PointKind.SURFACE, PointKind.PRESUMED)))

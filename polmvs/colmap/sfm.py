@@ -53,6 +53,10 @@ NO_MODEL_REMEDY = (
 OnProgress = Callable[[str], None]
 
 
+class NoModelError(DataError):
+    """SfM finds no model; the database in its work folder tells why."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SfmTolerances:
     """What is asked of features, tracks and the camera beside COLMAP's own defaults.
@@ -457,14 +461,19 @@ def _map(
         found = pycolmap.incremental_mapping(*paths, _mapper_options(names, options, tolerances))
     shutil.rmtree(models)
     if not found:
-        raise DataError(image_folder, f"SfM finds no model of these images. {NO_MODEL_REMEDY}")
+        raise NoModelError(image_folder, f"SfM finds no model of these images. {NO_MODEL_REMEDY}")
     largest: pycolmap.Reconstruction = max(
         found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D())
     )
     if largest.num_reg_images() < 2:
-        raise DataError(image_folder, f"SfM registers one image only. {NO_MODEL_REMEDY}")
-    if len(found) > 1:
-        logger.warning("SfM: the images fall into %d models; the largest is used.", len(found))
+        raise NoModelError(image_folder, f"SfM registers one image only. {NO_MODEL_REMEDY}")
+    if len(found) > 1 and largest.num_reg_images() < len(names):
+        logger.warning(
+            "SfM: the images fall into %d models; the largest is used and has %d of %d images.",
+            len(found),
+            largest.num_reg_images(),
+            len(names),
+        )
     return largest
 
 

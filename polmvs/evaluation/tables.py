@@ -44,9 +44,9 @@ def pair(first: float | None, second: float | None) -> str:
 
 
 def best_fit_lines(comparison: Comparison) -> list[str]:
-    """Which model the capture's phases fit best, if there is anything to tell it by."""
+    """Which of several models the capture's phases fit best, if there is anything to tell it by."""
     best = comparison.best_fit
-    if best is None:
+    if best is None or len(comparison.models) < 2:
         return []
     residual = comparison.models[best].consistency.track_residual_median_deg
     return ["", f"The phases fit {best.upper()} best: {number(residual)} deg at the seeds."]

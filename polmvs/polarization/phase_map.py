@@ -102,38 +102,39 @@ class StoredPhaseMap(PhaseMap):
         assert self.folder is not None
         return StoredPhaseMap, (self.view, self.folder, self.tilted)
 
-    def _array(self, name: str) -> NDArray[Any]:
+    def _array(self, name: str, kind: type[np.generic]) -> NDArray[Any]:
         assert self.folder is not None
-        return map_array(self.folder / name)
+        return map_array(self.folder / name, kind)
 
     @property
-    def _flags(self) -> NDArray[np.uint8]:
-        return self._array(f"{self.view.name}.region.npy")
+    def flags(self) -> NDArray[np.uint8]:
+        """Region and light of each pixel (H, W), a bit each."""
+        return self._array(f"{self.view.name}.region.npy", np.unsignedinteger)
 
     @property
     def samples(self) -> Image:
         """See :class:`PhaseMap`."""
-        return self._array(_samples_name(self.view.name, self.tilted))
+        return self._array(_samples_name(self.view.name, self.tilted), np.floating)
 
     @property
     def intensity(self) -> Image:
         """See :class:`PhaseMap`."""
-        return self._array(f"{self.view.name}.intensity.npy")
+        return self._array(f"{self.view.name}.intensity.npy", np.floating)
 
     @property
     def lowest_dolp(self) -> NDArray[np.uint8]:
         """See :class:`PhaseMap`."""
-        return self._array(f"{self.view.name}.dolp.npy")
+        return self._array(f"{self.view.name}.dolp.npy", np.unsignedinteger)
 
     @property
     def region(self) -> Region:
         """See :class:`PhaseMap`."""
-        return _StoredRegion(self._flags)
+        return _StoredRegion(self.flags)
 
     @property
     def diffuse(self) -> Mask:
         """See :class:`PhaseMap`."""
-        return np.asarray((self._flags & 8) > 0)
+        return np.asarray((self.flags & 8) > 0)
 
 
 class _StoredRegion(Region):
@@ -166,10 +167,7 @@ class _StoredRegion(Region):
 
 def build_phase_map(
     view: View,
-    s0: Image,
-    s1: Image,
-    s2: Image,
-    sigma: Image,
+    stokes: Stokes,
     region: Region,
     light: Light,
     *,
@@ -179,35 +177,38 @@ def build_phase_map(
 
     Parameters
     ----------
-    s0, s1, s2 : (H, W) float32, Stokes images.
-    sigma : (H, W) float32, standard deviation of s1 and of s2.
+    stokes : of this view. Of its noise smoothing leaves what neighbours do not share; the errors
+        of compression are shared by whole blocks, those of the channels' gains by all pixels.
     region : of this view.
     light : which reflection dominates; specular light turns the phase by pi/2 from the AoLP.
     tolerances : of this step.
     """
     weight = region.reliable.astype(np.float32)
-    stokes = np.dstack([s0, s1, s2])
-    variances = np.square(sigma)
-    fine = _smoothed(stokes, variances, weight, tolerances.fine_smoothing_px, tolerances.ridge)
-    coarse = _smoothed(stokes, variances, weight, tolerances.coarse_smoothing_px, tolerances.ridge)
+    images = np.dstack([stokes.s0, stokes.s1, stokes.s2])
+    lossy = stokes.lossy_sigma**2
+    variances = np.maximum(np.square(stokes.sigma) - np.float32(lossy), 0)
+    fine = _smoothed(images, variances, weight, tolerances.fine_smoothing_px, tolerances.ridge)
+    coarse = _smoothed(images, variances, weight, tolerances.coarse_smoothing_px, tolerances.ridge)
     use_fine = fine.share > 0.25
     smoothed = np.where(use_fine[..., None], fine.values, coarse.values)
     share = np.where(use_fine, fine.share, coarse.share)
+    width_px = np.where(use_fine, tolerances.fine_smoothing_px, tolerances.coarse_smoothing_px)
     with np.errstate(divide="ignore", invalid="ignore"):
         lit = np.where(smoothed[..., :1] > 0, smoothed[..., :1], np.nan)
         axial = phase_sign(light) * smoothed[..., 1:3] / lit
         dolp = np.minimum(np.linalg.norm(axial, axis=-1), 1.0)
-        noise = np.sqrt(np.where(use_fine, fine.variance, coarse.variance)) / lit[..., 0]
-        variance = (
-            tolerances.model_sigma**2 + (tolerances.mixture_sigma**2 + (0.5 * noise) ** 2) / dolp**2
-        )
+        noise = np.where(use_fine, fine.variance, coarse.variance)
+        # A Gaussian of width w averages 4 pi w^2 independent pixels.
+        blocks = 4 * np.pi * width_px**2 * share / stokes.lossy_block_px**2
+        noise = (noise + lossy / np.maximum(blocks, 1)) / lit[..., 0] ** 2 + stokes.gain_sigma**2
+        variance = tolerances.model_sigma**2 + (tolerances.mixture_sigma**2 + noise / 4) / dolp**2
         precision = np.where(region.inside & (share > 0.02), 1 / variance, 0)
     samples = np.dstack([axial, precision]).astype(np.float32)
     np.nan_to_num(samples, copy=False, nan=0.0)
     diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
-    intensity = np.asarray(s0, np.float32)
+    intensity = np.asarray(stokes.s0, np.float32)
     return PhaseMap(
-        view, region, samples, intensity, diffuse, _lowest_dolp(stokes, tolerances=tolerances)
+        view, region, samples, intensity, diffuse, _lowest_dolp(images, tolerances=tolerances)
     )
 
 
@@ -280,9 +281,11 @@ def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMa
         If a file is missing, damaged, or of another size than the view's camera.
     """
     stored = StoredPhaseMap(view, folder, tilted)
+    samples = stored.samples
     size = (view.camera.height, view.camera.width)
-    images = (stored.samples[..., 0], stored.intensity, stored._flags, stored.lowest_dolp)
-    if any(image.shape != size for image in images):
+    shapes = (samples.shape[:2], stored.intensity.shape, stored.flags.shape)
+    fits = all(shape == size for shape in (*shapes, stored.lowest_dolp.shape))
+    if not fits or samples.shape[2:] != (3,):
         reason = "has another size than its camera; give `run.overwrite`."
         raise DataError(folder / view.name, reason)
     return stored

@@ -81,7 +81,7 @@ class Page:
     sentence : what came out, in one or two sentences.
     facts : name and value of what counts most.
     warnings : of the run, each with its remedy.
-    table : of the models' figures, if there are any.
+    tables : of the models' figures, if there are any: those to begin with, and all.
     views, plots : in order.
     scene : of the 3D view; None where no cloud has a point.
     thinned : points above which the clouds on the page are thinned; 0 if none is.
@@ -93,7 +93,7 @@ class Page:
     sentence: str
     facts: Sequence[tuple[str, str]]
     warnings: Sequence[str]
-    table: Table | None
+    tables: Sequence[Table]
     views: Sequence[ViewPage]
     plots: Sequence[Plot]
     scene: Scene3D | None

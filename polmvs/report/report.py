@@ -44,6 +44,15 @@ MAX_POINTS = 150_000  # of each cloud on the page: two clouds turn smoothly, and
 MAX_ERROR_M = 0.005  # top of the colour scale of distances from the truth
 ANGLE_BINS_DEG = np.arange(0.0, 91.0, 5.0)
 WHITE_PERCENTILE = 99.0  # of an image's intensities: shown white
+# Rows of the comparison that tell the models apart at a glance.
+HEADLINE = (
+    "part of the region covered, %",
+    "phase residual over all views, RMSE / median, deg",
+    "depth maps, RMSE, mm",
+    "F-score at 1 mm, %",
+    "Chamfer distance, mm",
+    "normal error, mean / median, deg",
+)
 MAIN = (AngleModel.PPA, AngleModel.TILTED, AngleModel.OPA)  # who stands for the run, in order
 
 
@@ -101,7 +110,7 @@ def write_report(
             sentence=_sentence(given),
             facts=_facts(given),
             warnings=tuple(w for stage in given.record.stages for w in stage.warnings),
-            table=_table(given),
+            tables=_tables(given),
             views=views,
             plots=_plots(given, samples),
             scene=_scene(given, layers, channels),
@@ -344,7 +353,8 @@ def _sentence(given: _Given) -> str:
         return (
             f"{name} has an F-score of {number(second.cloud.f_score[0], 100, 1)} % at "
             f"{1e3 * near:g} mm, OPA {number(first.cloud.f_score[0], 100, 1)} %: oblique rays "
-            "turn the phase of a surface in a way that OPA takes for shape."
+            "turn the phase of a surface, which OPA, for which all rays are parallel, takes for "
+            "shape."
         )
     before = figures[opa].consistency.phase_residual.median_deg
     after = figures[main].consistency.phase_residual.median_deg
@@ -377,11 +387,13 @@ def _facts(given: _Given) -> list[tuple[str, str]]:
     return facts
 
 
-def _table(given: _Given) -> Table | None:
+def _tables(given: _Given) -> tuple[Table, ...]:
+    """The figures to begin with, and all of them."""
     if given.comparison is None:
-        return None
+        return ()
     header, rows = comparison_rows(given.comparison)
-    return Table(header=header, rows=rows)
+    first = [row for row in rows if row[0] in HEADLINE]
+    return Table(header=header, rows=first), Table(header=header, rows=rows)
 
 
 def _plots(given: _Given, samples: Mapping[AngleModel, ErrorSamples]) -> list[Plot]:

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 
+from polmvs.io.open3d_import import import_open3d
+
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Faces = NDArray[np.int64]
@@ -152,8 +154,7 @@ class RayScene:
     """A mesh to cast rays on and to measure distances to."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        import open3d as o3d
-
+        o3d = import_open3d()
         # Open3D computes in float32: coordinates are taken from the mesh's centre.
         self._origin = mesh.vertices.mean(axis=0) if len(mesh.vertices) else np.zeros(3)
         self._tensor = o3d.core.Tensor

@@ -94,7 +94,9 @@ def test_render_draws_a_column_for_each_file(cli, demo_run: Path, tmp_path: Path
     assert (drawn[:, :200] < 250).any()
     assert (drawn[:, 200:] < 250).any()
     assert "exists" in refused(cli("render", *arguments), 2)
-    assert cli("render", *arguments, "--overwrite")[0] == 0
+    assert cli("render", *arguments, "--overwrite", "--part")[0] == 0
+    alone = cv2.imread(str(picture))  # without the surroundings' points
+    assert 0 < (alone < 250).sum() < (drawn < 250).sum()
 
 
 def test_render_refuses_what_it_cannot_draw(cli, demo_run: Path, tmp_path: Path) -> None:

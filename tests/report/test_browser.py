@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from polmvs.report.report import HEADLINE
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = (
     "--no-sandbox",
@@ -112,6 +114,18 @@ def test_nothing_is_loaded_and_nothing_complains(opened: Opened) -> None:
     assert opened.complaints == []
 
 
+def test_the_first_figures_are_few_and_the_others_open(opened: Opened) -> None:
+    first, whole = opened.page.locator("#summary table").all()
+    names = first.locator("tbody th").all_inner_texts()
+    assert names == [name for name in HEADLINE if name in names]
+    assert len(names) == len(HEADLINE)
+    assert not whole.is_visible()
+    opened.page.click("#summary summary")
+    assert whole.is_visible()
+    assert set(names) < set(whole.locator("tbody th").all_inner_texts())
+    opened.page.click("#summary summary")
+
+
 def test_both_panes_show_something_and_opa_is_not_ppa(opened: Opened) -> None:
     assert opened.colors("left") > 100
     assert opened.colors("right") > 100
@@ -150,6 +164,8 @@ def test_keys_turn_and_zoom(opened: Opened, key: str) -> None:
 
 def test_colours_frusta_and_layout_can_be_chosen(opened: Opened) -> None:
     page = opened.page
+    assert page.locator("[data-control=color]").input_value() == "error"  # there is a truth
+    page.select_option("[data-control=color]", "normal")
     start = opened.drawing()
     seen = {start}
     for name in ("intensity", "kind", "sigma", "error"):

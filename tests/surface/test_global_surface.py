@@ -142,6 +142,16 @@ def test_progress_is_within_what_is_announced(maps):
     assert 0 < sum(steps) <= num_surface_steps(4)
 
 
+def test_the_surface_is_shown_as_it_refines(maps):
+    """First the hull, then the mesh after each level; the last is near the result."""
+    shown = []
+    surface = reconstruct(maps, on_mesh=shown.append)
+    assert len(shown) == 1 + len(QUICK.levels)
+    sizes = [float(np.ptp(mesh.vertices, axis=0).max()) for mesh in shown]
+    assert sizes[-1] == pytest.approx(float(np.ptp(surface.mesh.vertices, axis=0).max()), rel=0.05)
+    assert sizes[0] >= sizes[-1]
+
+
 def test_contradictions_are_put_in_words():
     fine = Contradictions(
         phase_sine=0.01, contradicted_share=0.02, denied_share=0.0, uncovered_share=0.03

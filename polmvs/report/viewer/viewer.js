@@ -196,7 +196,7 @@ class Pane {
     if (this.object) {
       const focal = (0.5 * height * ratio) / Math.tan((0.5 * camera.fov * Math.PI) / 180);
       this.object.material.uniforms.pointSize.value =
-        2 * this.built.layer.spacing * focal * this.view.pointScale;
+        3 * this.built.layer.spacing * focal * this.view.pointScale;
     }
     this.renderer.setClearColor(getComputedStyle(this.element).getPropertyValue("--canvas").trim() || "#ffffff", 1);
     this.renderer.render(this.scene, camera);
@@ -211,7 +211,7 @@ class View {
     this.built = new Map();
     this.textures = new Map();
     this.blank = paletteTexture(["#888888"]);
-    this.color = "normal";
+    this.color = "error" in this.description.channels ? "error" : "normal";
     this.pointScale = 1;
     this.camera = new PerspectiveCamera(FIELD_DEG, 1, 0.01 * this.description.radius, 100 * this.description.radius);
     this.frusta = new LineSegments(
