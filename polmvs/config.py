@@ -917,7 +917,9 @@ def require_table(name: str, table: Any, known: Iterable[str], source: str) -> N
 
 def _decode(kind: Any, value: Any) -> Any:
     """What msgspec does not know of itself."""
-    if kind is Path and isinstance(value, str):
+    if kind is Path:
+        if not isinstance(value, str):
+            raise ValueError("Expected a path")
         return Path(value)
     raise NotImplementedError(f"no option is of type {kind}")
 

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from os import PathLike
 from typing import ClassVar
 
+MAX_REASON = 1000  # characters
+
 
 class PolmvsError(Exception):
     """A run cannot go on; the message is one line that says why and what to do."""
@@ -29,7 +31,7 @@ class DataError(PolmvsError):
     """
 
     def __init__(self, path: str | PathLike[str], reason: str) -> None:
-        super().__init__(f"{path}: {reason}")
+        super().__init__(f"{path}: {_short(reason)}")
         self.path = path
         self.reason = reason
 
@@ -54,13 +56,22 @@ class OptionError(PolmvsError):
     exit_status: ClassVar[int] = 2
 
     def __init__(self, reason: str, *, field: str | None = None) -> None:
-        super().__init__(f"`{field}` {reason}" if field is not None else reason)
+        text = _short(reason)
+        super().__init__(f"`{field}` {text}" if field is not None else text)
         self.reason = reason
         self.field = field
 
     def __reduce__(self) -> tuple[Callable[[str, str | None], OptionError], tuple[str, str | None]]:
         """Pickle the parts, so that the error of a worker process arrives whole."""
         return _option_error, (self.reason, self.field)
+
+
+def _short(reason: str) -> str:
+    """A reason without the middle of what it quotes, where a file has that far too long."""
+    if len(reason) <= MAX_REASON:
+        return reason
+    half = MAX_REASON // 2
+    return f"{reason[:half]} ... {reason[-half:]}"
 
 
 def _option_error(reason: str, field: str | None) -> OptionError:

@@ -122,12 +122,14 @@ def intersect_rays(centers: Array, rays: Array) -> Array:
     Returns
     -------
     (..., 3) float64
-        NaN where the rays are parallel.
+        NaN where the rays are parallel or not known.
     """
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
     matrix = across.sum(axis=-3)
     target = np.einsum("...vij,...vj->...i", across, centers)
+    known = np.isfinite(matrix).all(axis=(-2, -1)) & np.isfinite(target).all(axis=-1)
+    matrix = np.where(known[..., None, None], matrix, np.eye(3))
     parallel = np.linalg.eigvalsh(matrix)[..., 0] < 1e-12
     matrix = np.where(parallel[..., None, None], np.eye(3), matrix)
     points = np.linalg.solve(matrix, target[..., None])[..., 0]
-    return np.where(parallel[..., None], np.nan, points)
+    return np.where((parallel | ~known)[..., None], np.nan, points)

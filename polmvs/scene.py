@@ -22,6 +22,10 @@ KEYPOINT_SIGMA_PX = 0.5  # of a keypoint of SfM: the usual reprojection error af
 # Between a normal and the direction to the camera. A surface seen flatter than 6 degrees shows a
 # tenth of its pixels, and its range changes by ten footprints a pixel.
 MIN_FACING_COSINE = 0.1
+# Of a coordinate in any unit, and of a point from a camera that sees it. Guesses: beyond them
+# squares lose all that matters, or overflow, and no measurement lies there.
+MAX_COORDINATE = 1e12
+MIN_DISTANCE = 1e-12
 MAX_NAMES_SHOWN = 5
 
 
@@ -164,7 +168,8 @@ def point_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
     for k, view in enumerate(views):
         seen = tracks.obs_track[tracks.obs_view == k]
         to_point = tracks.points_in_world[seen] - view.center_in_world
-        distance = np.linalg.norm(to_point, axis=-1)
+        # A point in the camera itself is no measurement, but it must not make all NaN.
+        distance = np.maximum(np.linalg.norm(to_point, axis=-1), MIN_DISTANCE)
         ray = to_point / distance[:, None]
         precision = (view.camera.mean_focal_px / (KEYPOINT_SIGMA_PX * distance)) ** 2
         across = np.eye(3) - ray[:, :, None] * ray[:, None, :]

@@ -8,6 +8,7 @@ from polmvs.camera import PinholeCamera
 from polmvs.config import Light
 from polmvs.polarization.phase_map import PhaseMap, build_phase_map
 from polmvs.polarization.region import find_region
+from polmvs.polarization.stokes import Stokes
 from polmvs.scene import Seeds, Tracks, View
 from polmvs.synthetic.captures import Plane, SyntheticView, render_view, ring_of_views
 
@@ -60,7 +61,8 @@ def phase_map_of(rendered: SyntheticView, light: Light = Light.SPECULAR) -> Phas
     valid = np.ones(s0.shape, bool)
     region = find_region(s0, s1, s2, valid, min_dolp=0.1)
     sigma = np.full(s0.shape, 1e-3, np.float32)
-    return build_phase_map(rendered.view, s0, s1, s2, sigma, region, light)
+    stokes = Stokes(s0=s0, s1=s1, s2=s2, sigma=sigma, valid=valid)
+    return build_phase_map(rendered.view, stokes, region, light)
 
 
 def tracks_at(scene, points, views=None):

@@ -148,7 +148,9 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
         raise OptionError(f"{path}: is no TOML file (not UTF-8).") from error
     try:
         content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError as error:
+        raise OptionError(f"{path}: is no TOML file (it is nested too deeply).") from error
+    except ValueError as error:  # of the parser, or an integer of thousands of digits
         raise OptionError(f"{path}: is no TOML file ({error}{_line_of(text, error)}).") from error
     known = {cls.group: cls for cls in groups}
     values = {}

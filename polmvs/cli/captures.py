@@ -40,6 +40,7 @@ def inspect(call: Call, terminal: Terminal) -> int:
         "notes": capture.notes,
         "levels": capture.levels,
         "pattern_check": capture.pattern_check,
+        "linearity_check": capture.linearity_check,
         "white": inspection.white,
         "views": inspection.views,
         "warnings": inspection.warnings,
@@ -62,15 +63,16 @@ def calibrate(call: Call, terminal: Terminal) -> int:
         arguments.capture, call.get(CaptureOptions), per_sample=per_sample
     )
     stored = write_calibration(arguments.out, response)
+    blocks = ("",) if stored.bayer is None else tuple(f"{c} " for c in stored.bayer)
     channels = zip(
-        (0, 45, 90, 135),
+        [f"{block}{nominal:>3}" for block in blocks for nominal in (0, 45, 90, 135)],
         stored.gains,
         stored.angles_deg,
         stored.extinction_ratios,
         strict=True,
     )
     lines = [
-        f"{nominal:>3} deg: gain {gain:.4f}, angle {angle:.2f} deg, extinction ratio {ratio:.0f}:1"
+        f"{nominal} deg: gain {gain:.4f}, angle {angle:.2f} deg, extinction ratio {ratio:.0f}:1"
         for nominal, gain, angle, ratio in channels
     ]
     lines.append(f"{arguments.out}: residual {100 * response.residual:.2f} % of the mean")

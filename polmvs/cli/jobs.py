@@ -20,6 +20,7 @@ from polmvs.cli.flags import in_flags
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
 from polmvs.evaluation.tables import best_fit_lines
+from polmvs.evaluation.trust import Trust
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.pipeline import jobs as pipeline
 from polmvs.pipeline.record import read_options
@@ -162,7 +163,10 @@ def _show_cloud(outcome: pipeline.JobOutcome, model: AngleModel, terminal: Termi
     dense = outcome.find(DenseWorkspaceResult, model)
     if dense is not None and dense.folder is not None:
         lines.append(f"{dense.folder}: COLMAP dense workspace")
-    terminal.show("\n".join(lines), _content(outcome, terminal))
+    trust = outcome.find(Trust, model)
+    if trust is not None and cloud.num_points:
+        lines += map(str, trust.figures())
+    terminal.show(in_flags("\n".join(lines)), _content(outcome, terminal))
     return _status(outcome, terminal)
 
 

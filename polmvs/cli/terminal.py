@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -62,6 +64,18 @@ class _TerminalHandler(logging.Handler):
 
 class _LogFileHandler(logging.FileHandler):
     """A log on a full disk is no reason to complain in the middle of a run."""
+
+    def _open(self) -> TextIOWrapper:
+        """Append to a file, not to what a link or a pipe of its name leads to."""
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
+        flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+        # A name of a file need not be UTF-8.
+        return open(
+            os.open(self.baseFilename, flags, 0o666),
+            "a",
+            encoding="utf-8",
+            errors="backslashreplace",
+        )
 
     def handleError(self, record: logging.LogRecord) -> None:
         """Do nothing."""

@@ -33,14 +33,16 @@ from polmvs.colmap.cameras import (
     rescaled_camera,
 )
 from polmvs.errors import DataError
-from polmvs.geometry import RigidTransform
-from polmvs.io.folders import new_folder
-from polmvs.scene import SparseModel, Tracks, View, match_names, short_list
+from polmvs.geometry import RigidTransform, nearest_rotation
+from polmvs.io.folders import new_folder, require_unicode
+from polmvs.scene import MAX_COORDINATE, SparseModel, Tracks, View, match_names, short_list
 
 PathArg = str | PathLike[str]
 
 logger = logging.getLogger(__name__)
 
+MAX_SIDE = 1 << 16  # of an image, px; a guess, more is damage
+MAX_PARAM = 1e9  # of a camera's parameters; a guess as well
 MODEL_FILES = ("cameras", "images", "points3D")  # rigs and frames came with COLMAP 3.12
 
 
@@ -63,12 +65,31 @@ def read_model(path: PathArg) -> SparseModel:
         raise DataError(
             folder, "has no registered image. Run COLMAP again or leave out `sfm.sparse`."
         )
-    numbers = [view.cam_from_world.translation for view in sparse_model.views]
-    if not all(
-        np.isfinite(array).all() for array in (*numbers, sparse_model.tracks.points_in_world)
-    ):
-        raise DataError(folder, "is no sound COLMAP model (not all numbers in it are finite).")
+    if (reason := _unsound(sparse_model)) is not None:
+        raise DataError(folder, f"is no sound COLMAP model ({reason}). Export it again.")
     return sparse_model
+
+
+def _unsound(sparse_model: SparseModel) -> str | None:
+    """What is wrong with the numbers of a model, if anything is."""
+    for view in sparse_model.views:
+        camera, pose = view.camera, view.cam_from_world
+        sides = (camera.width, camera.height)
+        if not (min(sides) > 0 and max(sides) <= MAX_SIDE):
+            return f"the camera of {view.name} is {sides[0]}x{sides[1]} px"
+        params = camera_to_colmap(camera).params
+        if not (np.abs(params) <= MAX_PARAM).all() or not camera.mean_focal_px > 0:
+            return f"the camera of {view.name} is none"
+        if nearest_rotation(pose.rotation) is None:
+            return f"the pose of {view.name} is none"
+        if not (np.abs(pose.translation) <= MAX_COORDINATE).all():
+            return f"the place of {view.name} is not finite or absurd"
+    tracks = sparse_model.tracks
+    if not (np.abs(tracks.points_in_world) <= MAX_COORDINATE).all():
+        return "a point is not finite or absurd"
+    if not (np.abs(tracks.obs_xy) <= MAX_SIDE).all():
+        return "a keypoint is not finite or far from its image"
+    return None
 
 
 def read_reconstruction(path: PathArg) -> pycolmap.Reconstruction:
@@ -113,6 +134,7 @@ def find_model(path: PathArg) -> Path:
         No such folder, or no complete model in it.
     """
     root = Path(path)
+    require_unicode(root)
     if not root.is_dir():
         raise DataError(root, "is no folder." if root.exists() else "no such folder.")
     for folder in (root, root / "0", root / "sparse", root / "sparse" / "0"):
@@ -446,7 +468,8 @@ def _check_file(path: Path, record_end: Reader) -> None:
             complete = position == len(data)
     except OSError as error:
         raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
-    except (ValueError, struct.error):  # an empty file, a record past the end, no such model
+    # An empty file, a record past the end, no such model, a length that no file has.
+    except (ValueError, OverflowError, IndexError, struct.error):
         complete = False
     if not complete:
         raise DataError(path, "is truncated or no file of COLMAP's. Export the model again.")

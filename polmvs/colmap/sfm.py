@@ -42,6 +42,10 @@ NO_MODEL_REMEDY = (
 OnProgress = Callable[[str], None]
 
 
+class NoModelError(DataError):
+    """SfM finds no model; the database in its work folder tells why."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SfmTolerances:
     """What is asked of features, tracks and the camera beside COLMAP's own defaults.
@@ -371,12 +375,12 @@ def _map(
     found = pycolmap.incremental_mapping(database, image_folder, models, options)
     shutil.rmtree(models)
     if not found:
-        raise DataError(image_folder, f"SfM finds no model of these images. {NO_MODEL_REMEDY}")
+        raise NoModelError(image_folder, f"SfM finds no model of these images. {NO_MODEL_REMEDY}")
     largest: pycolmap.Reconstruction = max(
         found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D())
     )
     if largest.num_reg_images() < 2:
-        raise DataError(image_folder, f"SfM registers one image only. {NO_MODEL_REMEDY}")
+        raise NoModelError(image_folder, f"SfM registers one image only. {NO_MODEL_REMEDY}")
     if len(found) > 1 and largest.num_reg_images() < len(names):
         logger.warning(
             "SfM: the images fall into %d models; the largest is used and has %d of %d images.",

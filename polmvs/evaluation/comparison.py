@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,7 +23,7 @@ from polmvs.evaluation.truth_errors import (
 )
 from polmvs.io.clouds import Cloud, read_cloud
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
-from polmvs.io.typed_json import from_json
+from polmvs.io.typed_json import from_json, parse_json
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import Capture
 from polmvs.polarization.phase_map import PhaseMap
@@ -263,7 +262,7 @@ def read_comparison(path: Path) -> Comparison:
         It is missing, no such file, or of another version.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
         found = content.get("schema_version", 1)
         if found != SCHEMA_VERSION:
             raise DataError(

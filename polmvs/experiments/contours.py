@@ -9,13 +9,12 @@ over the reliable pixels.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -35,6 +34,7 @@ from polmvs.experiments.data import (
 )
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.io.layouts import BoardTruth
+from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import nearest_points
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import gather_rows
@@ -51,6 +51,7 @@ Indices = NDArray[np.int64]
 
 # What the experiment measures; these define the figures.
 INSET_PX = 4  # of the seeds: nearer to the edge the blurred light of the background is mixed in
+MIN_NORMAL = 1e-9  # length that a direction in a file must have; a guess, less is nothing
 MEASURED_PX = 1.0  # distance between the points of a contour that are measured
 MIN_SEEN_SHARE = 0.9  # of the seeds, that a second view must see
 
@@ -435,12 +436,10 @@ def open_surface(truth: Truth) -> TrueSurface:
     scene_path = truth.folder / "scene.json"
     if scene_path.is_file():
         try:
-            surface = json.loads(scene_path.read_text(encoding="utf-8"))["surface"]
+            surface = parse_json(scene_path.read_text(encoding="utf-8"))["surface"]
             if surface["type"] == "plane":
-                normal = np.array(surface["normal"], np.float64)
-                length = float(np.linalg.norm(normal))
-                return PlaneSurface(normal / length, float(surface["offset"]) / length)
-        except (OSError, ValueError, KeyError, TypeError) as error:
+                return _plane(surface["normal"], surface["offset"])
+        except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
             raise DataError(scene_path, f"does not describe the surface ({error}).") from error
     if not isinstance(truth, GroundTruth):
         raise DataError(truth.folder, "has no surface that contours can be measured against.")
@@ -449,6 +448,21 @@ def open_surface(truth: Truth) -> TrueSurface:
     return SampledSurface(
         sampling.points[part], sampling.normals[part].astype(np.float64), sampling.spacing_m
     )
+
+
+def _plane(normal: Any, offset: Any) -> PlaneSurface:
+    """The plane ``normal . x = offset``.
+
+    Raises
+    ------
+    TypeError, ValueError, OverflowError
+        The numbers make none.
+    """
+    along, level = np.array(normal, np.float64), float(offset)
+    length = float(np.linalg.norm(along))
+    if along.shape != (3,) or not (MIN_NORMAL < length < np.inf) or not np.isfinite(level):
+        raise ValueError("its plane has no normal of three numbers, or no offset")
+    return PlaneSurface(along / length, level / length)
 
 
 def line_set_bytes(lines: Sequence[Lines], *, stride: int = 4) -> bytes:

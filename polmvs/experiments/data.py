@@ -25,6 +25,7 @@ from polmvs.polarization.phase_map import PhaseMap, as_tilted, build_phase_map, 
 from polmvs.polarization.region import Region, find_region, smooth
 from polmvs.polarization.stokes import Stokes
 from polmvs.poses.alignment import Alignment, align_views
+from polmvs.poses.image_check import intensity_loader, require_cameras_of_images
 from polmvs.scene import View, find_name, match_names, short_list
 
 Array = NDArray[np.float64]
@@ -147,7 +148,7 @@ class ViewData:
     def phase_map(self, angle_model: AngleModel, region: Region) -> PhaseMap:
         """The package's own phase map: smoothed over the reliable pixels, with precisions."""
         s = self.sharp
-        measured = build_phase_map(self.view, s.s0, s.s1, s.s2, s.sigma, region, self.light)
+        measured = build_phase_map(self.view, s, region, self.light)
         return as_tilted(measured) if angle_model is AngleModel.TILTED else measured
 
     def plain_map(self, angle_model: AngleModel) -> PhaseMap:
@@ -197,6 +198,12 @@ def open_scene(
                 f"its cameras are {view.camera.width}x{view.camera.height} px, the polarization "
                 f"images {capture.width}x{capture.height} px; give the truth of this capture.",
             )
+    require_cameras_of_images(
+        views,
+        intensity_loader(capture, raw_of),
+        truth.folder,
+        "Give the ground truth of this capture.",
+    )
     alignment = None
     if sparse is not None:
         views, alignment = _estimated_views(sparse, capture, truth, list(raw_of))

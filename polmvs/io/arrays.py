@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import typing as npt
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError
 from polmvs.io.images import write_bytes
+
+MAX_REASON = 120  # characters of NumPy's words
 
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
@@ -28,24 +31,33 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def map_array(path: Path) -> NDArray[Any]:
+def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:
     """Map an ``.npy`` file into memory, read only.
+
+    Parameters
+    ----------
+    kind : type of its rows, or a kind of number that it must hold; None for any.
 
     Raises
     ------
     DataError
-        If the file is missing or damaged.
+        If the file is missing, damaged or of another type.
     """
     try:
         stamp = path.stat().st_mtime_ns
-        return _map_array(path, stamp)
-    except (OSError, ValueError, EOFError) as error:
+        array = _map_array(path, stamp)
+    except Exception as error:  # the header goes through Python's own parser
+        reason = " ".join(str(error).split())[:MAX_REASON]
         raise DataError(
-            path, f"cannot be read ({error}); run again with `run.overwrite`."
+            path, f"cannot be read ({reason}); run again with `run.overwrite`."
         ) from error
+    rows = isinstance(kind, np.dtype)
+    if kind is not None and not (array.dtype == kind if rows else np.issubdtype(array.dtype, kind)):
+        raise DataError(path, "holds something else; run again with `run.overwrite`.")
+    return array
 
 
 @lru_cache(maxsize=256)
 def _map_array(path: Path, stamp: int) -> NDArray[Any]:
     # A plain array over the map: OpenCV takes it without a copy.
-    return np.asarray(np.load(path, mmap_mode="r"))
+    return np.asarray(np.lib.format.open_memmap(path, mode="r"))

@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 from polmvs.config import CaptureKind
 from polmvs.errors import DataError, OptionError
+from polmvs.io.folders import require_unicode
 from polmvs.io.raw_formats import DUMP_SUFFIXES, FLOAT_SUFFIXES, LOSSY_SUFFIXES, SUFFIXES
 
 # Files of one folder are taken from the first of these groups that has any, so that a preview or
@@ -52,6 +53,7 @@ STOKES_ROLES = ("s0", "s1", "s2")
 MAP_ROLES = ("intensity", "aolp", "dolp")
 UNITS_S = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6}
 MAX_FILES = 200_000
+MAX_NAME_BYTES = 255 - 24  # the limit of file systems, less room for the endings of results
 NOT_VIEWS = frozenset({"gt", "mask", "masks", "sparse", "cams", "stereo"})  # folders beside views
 
 _END = r"\.(?P<suffix>[A-Za-z0-9]+)"
@@ -348,6 +350,7 @@ def _assemble(folder: Path, kind: CaptureKind, named: Sequence[_Named]) -> Captu
         first = next(iter(slots.values()))
         single = kind is CaptureKind.MOSAIC and len(exposures) == 1
         name = first.name if single else f"{view.replace('/', '_')}{first.suffix}"
+        _require_usable(folder, name)
         result.append(ViewFiles(name=name, files=files))
     # In the order of the names, as files are listed.
     result.sort(key=lambda view: view.name)
@@ -358,6 +361,15 @@ def _assemble(folder: Path, kind: CaptureKind, named: Sequence[_Named]) -> Captu
         exposures_s=tuple(exposures) if len(exposures) > 1 else (1.0,),
         views=tuple(result),
     )
+
+
+def _require_usable(folder: Path, name: str) -> None:
+    """Refuse names that fail only when COLMAP, or a file named after them, gets them."""
+    require_unicode(folder / name)
+    if len(name.encode()) > MAX_NAME_BYTES:
+        raise DataError(
+            folder, f"{name!r} is longer than {MAX_NAME_BYTES} bytes. Rename its files."
+        )
 
 
 def _images_in(folder: Path) -> list[Path]:

@@ -1,13 +1,11 @@
-"""Point clouds and meshes as files, by Open3D."""
+"""Point clouds and meshes: as files, and as Open3D's, which takes seconds to import."""
 
 from __future__ import annotations
 
-import os
-import re
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError, PolmvsError
-from polmvs.io.images import write_bytes
 from polmvs.io.open3d_import import import_open3d
+from polmvs.io.ply import read_ply, read_ply_header, write_ply
+from polmvs.scene import MAX_COORDINATE
 
 Array = NDArray[np.float64]
 
-PLY_BYTES = {
-    "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
-    "int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4,
-    "double": 8, "float64": 8,
-}  # fmt: skip
+NORMALS = ("nx", "ny", "nz")
+COLORS = ("red", "green", "blue")
 
 
 @dataclass(frozen=True)
@@ -76,7 +72,8 @@ def preload() -> None:
     """Begin to import Open3D beside other work, such as that of COLMAP's mapper on one core."""
 
     def load() -> None:
-        with suppress(PolmvsError):  # said when a cloud is written
+        # What is missing is said when it is needed; a program that ends meanwhile breaks it off.
+        with suppress(Exception):
             import_open3d()
 
     threading.Thread(target=load, name="preload-open3d").start()
@@ -117,31 +114,16 @@ def write_cloud(path: str | Path, cloud: Cloud) -> None:
     DataError
         If the file cannot be written.
     """
-    target = Path(path)
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp.ply")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if len(cloud.points):
-            written = import_open3d().t.io.write_point_cloud(str(temporary), to_open3d(cloud))
-            if not written:
-                raise DataError(target, "cannot be written; is the disk full or read-only?")
-        else:  # Open3D refuses clouds without points
-            temporary.write_bytes(_empty_ply(cloud))
-        os.replace(temporary, target)
-    except OSError as error:
-        raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _empty_ply(cloud: Cloud) -> bytes:
-    """A PLY of no points with the columns of the cloud."""
-    columns = ["float x", "float y", "float z", "float nx", "float ny", "float nz"]
-    columns += ["uchar red", "uchar green", "uchar blue"]
-    columns += [f"float {name}" for name in cloud.scalars]
-    lines = ["ply", "format binary_little_endian 1.0", "element vertex 0"]
-    lines += [f"property {c}" for c in columns]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode()
+    num = len(cloud.points)
+    columns = dict(zip("xyz", np.asarray(cloud.points).T, strict=True))
+    if cloud.normals is not None or num == 0:  # other programs look for these
+        normals = np.zeros((0, 3)) if cloud.normals is None else cloud.normals
+        columns |= dict(zip(NORMALS, normals.T, strict=True))
+    if cloud.colors is not None or num == 0:
+        colors = np.zeros((0, 3)) if cloud.colors is None else cloud.colors
+        columns |= dict(zip(COLORS, colors.astype(np.uint8).T, strict=True))
+    scalars = {name: np.asarray(values, np.float32) for name, values in cloud.scalars.items()}
+    write_ply(Path(path), {**columns, **scalars})
 
 
 def read_cloud(path: str | Path) -> Cloud:
@@ -150,25 +132,47 @@ def read_cloud(path: str | Path) -> Cloud:
     Raises
     ------
     DataError
-        If the file is missing or no point cloud.
+        If the file is missing, truncated, no point cloud, or has points that are nowhere.
     """
     source = Path(path)
-    num_points = _checked_header(source)
-    if num_points == 0:
-        return Cloud(np.zeros((0, 3)))
-    o3d = import_open3d()
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        loaded = o3d.t.io.read_point_cloud(str(source))
-    if "positions" not in loaded.point or len(loaded.point.positions) != num_points:
-        raise DataError(source, "cannot be read as a point cloud; is it truncated?")
-    columns = {name: loaded.point[name].numpy() for name in loaded.point}
-    normals = columns.pop("normals", None)
+    columns = dict(read_ply(source).vertices)
+    points = _points(source, columns)
+    normals, colors = _taken(columns, NORMALS), _taken(columns, COLORS)
     return Cloud(
-        points=columns.pop("positions").astype(np.float64),
+        points=points,
         normals=None if normals is None else normals.astype(np.float64),
-        colors=columns.pop("colors", None),
-        scalars={name: values.reshape(-1) for name, values in columns.items()},
+        colors=None if colors is None else _as_bytes(colors),
+        scalars=columns,
     )
+
+
+def _points(source: Path, columns: dict[str, NDArray[Any]]) -> Array:
+    """The places (N, 3) of the vertices; their columns are taken out."""
+    points = _taken(columns, tuple("xyz"))
+    if points is None:
+        raise DataError(source, "holds no x, y and z; give a PLY point cloud.")
+    # Not where one is not a number.
+    if not (np.abs(points) <= MAX_COORDINATE).all():
+        raise DataError(
+            source, f"has points that are not finite or beyond {MAX_COORDINATE:.0e}. Take them out."
+        )
+    return points.astype(np.float64)
+
+
+def _taken(columns: dict[str, NDArray[Any]], names: Sequence[str]) -> NDArray[Any] | None:
+    """Columns side by side (N, C), taken out of the others; None where one is missing."""
+    if not all(name in columns for name in names):
+        return None
+    return np.stack([columns.pop(name) for name in names], axis=-1)
+
+
+def _as_bytes(colors: NDArray[Any]) -> NDArray[np.uint8]:
+    """Colours of any type as 0 to 255: floats are shares of 1, wider integers of their range."""
+    if colors.dtype == np.uint8:
+        return colors
+    largest = 1.0 if colors.dtype.kind == "f" else float(np.iinfo(colors.dtype).max)
+    shares = np.nan_to_num(colors / largest, nan=0.0, posinf=1.0, neginf=0.0)
+    return np.asarray(np.rint(255 * np.clip(shares, 0, 1)), np.uint8)
 
 
 def has_triangles(path: str | Path) -> bool:
@@ -179,8 +183,8 @@ def has_triangles(path: str | Path) -> bool:
     DataError
         The file is missing or no PLY.
     """
-    lines, _ = _header(Path(path))
-    return any(line[:2] == ["element", "face"] and line[-1] != "0" for line in lines)
+    faces = read_ply_header(Path(path)).find("face")
+    return faces is not None and faces.num > 0
 
 
 def show_in_viewer(paths: Sequence[str | Path]) -> None:
@@ -207,39 +211,6 @@ def show_in_viewer(paths: Sequence[str | Path]) -> None:
         o3d.visualization.draw(shown, show_ui=True)
     except RuntimeError as error:
         raise PolmvsError(f"Open3D opens no window here ({error}).") from error
-
-
-def _header(source: Path) -> tuple[list[list[str]], int]:
-    """Words of the lines of a PLY's header, and where that ends."""
-    if not source.is_file():
-        raise DataError(source, "no such file; give a PLY point cloud.")
-    with source.open("rb") as file:
-        head = file.read(65536)
-    end = head.find(b"end_header")
-    if not head.startswith(b"ply") or end < 0:
-        raise DataError(source, "is no PLY file; give a PLY point cloud.")
-    return [line.split() for line in head[:end].decode("ascii", "replace").splitlines()], end
-
-
-def _checked_header(source: Path) -> int:
-    """Number of points that a PLY promises, once the file is known to be long enough.
-
-    Open3D fills a truncated file up with zeros.
-    """
-    lines, end = _header(source)
-    elements = [line for line in lines if line[:1] == ["element"]]
-    if not elements or elements[0][1:2] != ["vertex"] or not elements[0][-1].isdigit():
-        raise DataError(source, "holds no vertices; give a PLY point cloud.")
-    num_points = int(elements[0][-1])
-    start = lines.index(elements[0]) + 1
-    stop = lines.index(elements[1]) if len(elements) > 1 else len(lines)
-    types = [line[1] for line in lines[start:stop] if line[:1] == ["property"]]
-    ascii_format = ["format", "ascii", "1.0"] in lines
-    # An ASCII value takes two bytes at the least.
-    row_bytes = sum(2 if ascii_format else PLY_BYTES.get(name, 1) for name in types)
-    if source.stat().st_size < end + num_points * row_bytes:
-        raise DataError(source, "is truncated; write or copy it again.")
-    return num_points
 
 
 def solve_poisson(
@@ -273,26 +244,11 @@ def write_mesh(path: str | Path, mesh: Mesh) -> None:
     DataError
         If the file cannot be written.
     """
-    columns = [("float", "<f4", name) for name in ("x", "y", "z", "nx", "ny", "nz")]
-    values = [*mesh.vertices.T, *mesh.normals.T]
+    columns = dict(zip("xyz", mesh.vertices.T, strict=True))
+    columns |= dict(zip(NORMALS, mesh.normals.T, strict=True))
     if mesh.colors is not None:
-        columns += [("uchar", "u1", name) for name in ("red", "green", "blue")]
-        values += [*mesh.colors.T]
-    vertices = np.empty(len(mesh.vertices), [(name, code) for _, code, name in columns])
-    for (_, _, name), column in zip(columns, values, strict=True):
-        vertices[name] = column
-    faces = np.empty(len(mesh.triangles), [("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, mesh.triangles
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    lines += [f"property {kind} {name}" for kind, _, name in columns]
-    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-    header = ("\n".join([*lines, "end_header"]) + "\n").encode()
-    target = Path(path)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
-    write_bytes(target, header + vertices.tobytes() + faces.tobytes())
+        columns |= dict(zip(COLORS, mesh.colors.T, strict=True))
+    write_ply(Path(path), columns, mesh.triangles)
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -304,23 +260,20 @@ def read_mesh(path: str | Path) -> Mesh:
         If the file is missing, truncated or no mesh.
     """
     source = Path(path)
-    if not source.is_file():
-        raise DataError(source, "no such file; give a PLY mesh.")
-    num_vertices = _checked_header(source)
-    with source.open("rb") as file:
-        found = re.search(rb"^element face (\d+)", file.read(65536), re.MULTILINE)
-    if found is None:
+    content = read_ply(source, faces=True)
+    if content.triangles is None:
         raise DataError(source, "holds no faces; give a PLY mesh.")
-    if num_vertices == 0:
-        return Mesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-    o3d = import_open3d()
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        mesh = o3d.io.read_triangle_mesh(str(source))
-    vertices, triangles = np.array(mesh.vertices), np.array(mesh.triangles, np.int32)
-    if len(vertices) != num_vertices or len(triangles) < int(found[1]):
-        raise DataError(source, "cannot be read as a mesh; is it truncated?")
-    if not mesh.has_vertex_normals():
-        mesh.compute_vertex_normals()
-    colors = np.rint(255 * np.array(mesh.vertex_colors)).astype(np.uint8)
-    normals = np.array(mesh.vertex_normals)
-    return Mesh(vertices, normals, triangles.reshape(-1, 3), colors if len(colors) else None)
+    columns = dict(content.vertices)
+    vertices = _points(source, columns)
+    normals, colors = _taken(columns, NORMALS), _taken(columns, COLORS)
+    mesh = Mesh(
+        vertices=vertices,
+        normals=np.zeros_like(vertices) if normals is None else normals.astype(np.float64),
+        triangles=content.triangles.astype(np.int32),
+        colors=None if colors is None else _as_bytes(colors),
+    )
+    if normals is None and len(vertices):
+        computed = mesh_to_open3d(mesh)
+        computed.compute_vertex_normals()
+        mesh = replace(mesh, normals=np.array(computed.vertex_normals))
+    return mesh

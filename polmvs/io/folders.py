@@ -1,15 +1,31 @@
-"""Folders that appear whole or not at all."""
+"""Folders that appear whole or not at all, and names that the libraries can take."""
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 
 from polmvs.errors import DataError
+from polmvs.io.temporary import remove_temporary, temporary_path
+
+
+def require_unicode(path: str | PathLike[str]) -> None:
+    """Refuse a name that is no text: COLMAP's binding takes none, and crashes on some.
+
+    Raises
+    ------
+    DataError
+        The name's bytes are not UTF-8, or Python runs in a locale that knows no others.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise DataError(
+            ascii(str(path)),
+            "is a name that is not UTF-8 here. Rename it, or set PYTHONUTF8=1 if it is.",
+        ) from error
 
 
 @contextmanager
@@ -28,13 +44,10 @@ def new_folder(folder: str | PathLike[str], *, overwrite: bool = False) -> Itera
     target = Path(folder)
     if target.exists() and not overwrite and not (target.is_dir() and not any(target.iterdir())):
         raise DataError(target, "exists already. Remove it or choose another folder.")
-    temporary: Path | None = None
+    temporary = temporary_path(target)
+    content = temporary / "content"
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-        # mkdtemp's folder is the owner's alone; one that mkdir makes has the usual rights.
-        content = temporary / "content"
-        content.mkdir()
+        content.mkdir(parents=True)
         yield content
         replaced = temporary / "replaced"
         if target.exists():
@@ -48,5 +61,4 @@ def new_folder(folder: str | PathLike[str], *, overwrite: bool = False) -> Itera
     except OSError as error:
         raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
     finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
+        remove_temporary(temporary)

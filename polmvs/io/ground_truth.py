@@ -9,19 +9,19 @@ and, for each image, ``K`` of the half-size polarization image (COLMAP's pixel c
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation
+from polmvs.io.images import PNG_SIGNATURE, decode_image, read_bytes
+from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import in_cells_beside, voxel_representatives
 from polmvs.scene import View, find_name, stem_of
 
@@ -33,7 +33,6 @@ PART_SPACING_M = 0.0005
 OTHER_SPACING_M = 0.002
 NEAR_PART_M = 0.01  # other surfaces this near the part are sampled as finely as the part
 MAX_RELATIVE_BEND = 0.005  # second difference of inverse depth above which depth is discontinuous
-_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 _REMEDY = "copy the ground truth again"
 
 
@@ -186,21 +185,16 @@ def _map_path(folder: Path, name: str, kind: str) -> Path:
 
 def _read_png(path: Path) -> NDArray[np.generic]:
     """Decode a PNG as stored (colour as BGR); a truncated one is an error, not a grey area."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(path, f"cannot be read ({error.strerror}); {_REMEDY}.") from error
-    complete = data.startswith(_PNG_START) and data.endswith(_PNG_END)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if complete else None
-    if image is None:
-        raise DataError(path, f"not a whole PNG image; {_REMEDY}.")
-    return image
+    data = read_bytes(path)
+    if not data.startswith(PNG_SIGNATURE):
+        raise DataError(path, f"is no PNG image; {_REMEDY}.")
+    return decode_image(path, data)
 
 
 def read_views(path: Path) -> dict[str, View]:
     """Views by image name of a ``cameras.json``; DataError where it is malformed."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DataError(path, f"cannot be read as JSON ({error}); {_REMEDY}.") from error
     try:

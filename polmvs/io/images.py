@@ -14,10 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError
+from polmvs.io.temporary import remove_temporary, temporary_path
 
 PathArg: TypeAlias = str | PathLike[str]
 
 SILENT = 0  # OpenCV's log level
+PNG_CHANNELS = {2: 3, 4: 2, 6: 4}  # by colour type; 1 of all others
+DEFLATE_RATIO = 1032  # by which zlib compresses at the very best
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 BROKEN = "Copy it again from the camera or take it out of the folder."
 
@@ -100,22 +103,14 @@ def write_bytes(path: PathArg, data: bytes) -> None:
     # A rename would put a plain file in the place of a device such as /dev/null.
     if target.exists() and not target.is_file():
         raise DataError(target, "exists and is no plain file. Choose another name.")
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    temporary = temporary_path(target)
     try:
         temporary.write_bytes(data)
         os.replace(temporary, target)
     except OSError as error:
         raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
     finally:
-        _remove_quietly(temporary)
-
-
-def _remove_quietly(path: Path) -> None:
-    """Remove a file that may not exist, without hiding the error that led here."""
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        return
+        remove_temporary(temporary)
 
 
 def read_bytes(path: PathArg) -> bytes:
@@ -172,3 +167,7 @@ def check_png(path: PathArg, data: bytes) -> None:
         if zlib.crc32(view[position + 4 : end - 4]) != checksum:
             raise DataError(path, f"is damaged: wrong checksum at byte {position}. {BROKEN}")
         position = end
+    width, height, bits, kind_of_colour = struct.unpack_from(">IIBB", view, 16)
+    row = -(-width * bits * PNG_CHANNELS.get(kind_of_colour, 1) // 8)
+    if not width or not height or row * height > DEFLATE_RATIO * len(view):
+        raise DataError(path, f"is damaged: it cannot hold {width}x{height} px. {BROKEN}")

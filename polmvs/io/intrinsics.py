@@ -7,7 +7,6 @@ the polarization images exactly, since in COLMAP's convention scaling is multipl
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,9 +16,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from polmvs.camera import xy_from_opencv
+from polmvs.camera import PinholeCamera, xy_from_opencv
 from polmvs.errors import DataError
 from polmvs.io.images import write_bytes
+from polmvs.io.typed_json import parse_json
 
 # Parameters that scale with the image come first; all others are distortion.
 COLMAP_MODELS = {
@@ -82,6 +82,20 @@ class Intrinsics:
             for name, value in zip(names, self.params, strict=True)
         )
         return Intrinsics(model=self.model, width=width, height=height, params=params)
+
+    @property
+    def pinhole(self) -> PinholeCamera:
+        """The camera without its distortion."""
+        named = dict(zip(COLMAP_MODELS[self.model], self.params, strict=True))
+        focal = named.get("f", 0.0)
+        return PinholeCamera(
+            width=self.width,
+            height=self.height,
+            fx=named.get("fx", focal),
+            fy=named.get("fy", focal),
+            cx=named["cx"],
+            cy=named["cy"],
+        )
 
     @property
     def line(self) -> str:
@@ -200,7 +214,7 @@ def _parse(path: Path, text: str) -> Any:
     """JSON, YAML, or OpenCV's dialect of YAML."""
     try:
         if text.lstrip().startswith(("{", "[")):
-            return json.loads(text)
+            return parse_json(text)
         if text.startswith("%YAML"):
             text = text.partition("\n")[2]
         return yaml.safe_load(text.replace("!!opencv-matrix", ""))

@@ -28,7 +28,8 @@ from polmvs.camera import PinholeCamera, pixel_centers, xy_from_opencv
 from polmvs.config import CaptureOptions
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation
-from polmvs.io.images import write_bytes
+from polmvs.io.images import read_bytes, write_bytes
+from polmvs.io.raw_formats import read_npy
 from polmvs.scene import View, stem_of
 
 Array = NDArray[np.float64]
@@ -233,11 +234,8 @@ def write_dmb(path: Path, image: Image) -> None:
 
 def _read_npy(path: Path, num: int) -> Array:
     """Numbers of a ``.npy`` file."""
-    try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(path, f"cannot be read ({error}); copy the data again.") from error
-    if not isinstance(values, np.ndarray) or values.size != num or values.dtype.kind not in "fiu":
+    values = read_npy(path, read_bytes(path))
+    if values.size != num or values.dtype.kind not in "fiu":
         raise DataError(path, f"needs {num} numbers; copy the data again.")
     if not np.isfinite(values).all():
         raise DataError(path, "has numbers that are not finite; copy the data again.")

@@ -14,7 +14,6 @@ from __future__ import annotations
 import io
 import math
 import struct
-import tokenize
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +31,7 @@ SUFFIXES = frozenset(
     {".png", ".tif", ".tiff", ".bmp", ".pgm", ".npy", *DUMP_SUFFIXES, *LOSSY_SUFFIXES}
     | FLOAT_SUFFIXES
 )
+MAX_DIMS = 8  # of an array
 MAX_PIXELS = 1 << 28  # of one file; the largest polarization sensors have 2^25
 PNG_GRAY = 0  # colour type of a monochrome PNG without alpha
 UPRIGHT = 1  # orientation tag of an image that is stored as it is shown
@@ -127,7 +127,7 @@ def read_raw(path: PathArg, dump: DumpSize | None = None) -> RawImage:
     if suffix in DUMP_SUFFIXES:
         return RawImage(unpack(path, data, dump if dump is not None else DumpSize()))
     if data.startswith(b"\x93NUMPY"):
-        return RawImage(_as_samples(path, _read_npy(path, data)))
+        return RawImage(_as_samples(path, read_npy(path, data)))
     if data.startswith(b"v/1\x01"):
         return RawImage(_as_samples(path, _read_exr(path)))
     if data[:2] == b"P5":
@@ -264,8 +264,14 @@ def _colour_last(path: PathArg, image: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(image[..., 2::-1]) if image.shape[2] >= 3 else image[..., 0]
 
 
-def _read_npy(path: PathArg, data: bytes) -> NDArray[Any]:
-    """An array of numbers; its header is checked against the length before memory is taken."""
+def read_npy(path: PathArg, data: bytes) -> NDArray[Any]:
+    """An array of numbers; its header is checked against the length before memory is taken.
+
+    Raises
+    ------
+    DataError
+        The content is no NPY file, or truncated.
+    """
     stream = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(stream)
@@ -275,10 +281,16 @@ def _read_npy(path: PathArg, data: bytes) -> NDArray[Any]:
         }[version]
         shape, fortran, dtype = reader(stream)
         offset = stream.tell()
-    except (ValueError, KeyError, EOFError, SyntaxError, tokenize.TokenError, TypeError) as error:
+    except Exception as error:  # the header goes through Python's own parser
         raise DataError(path, f"is no readable NPY file. {BROKEN}") from error
     num = math.prod(shape)
-    if dtype.hasobject or num > 16 * MAX_PIXELS or num * dtype.itemsize != len(data) - offset:
+    sound = all(0 <= side <= 16 * MAX_PIXELS for side in shape) and len(shape) <= MAX_DIMS
+    if (
+        not sound
+        or dtype.hasobject
+        or not dtype.itemsize
+        or (num * dtype.itemsize != len(data) - offset)
+    ):
         raise DataError(path, f"is truncated or no array of numbers. {BROKEN}")
     flat = np.frombuffer(data, dtype, offset=offset)
     return flat.reshape(shape, order="F" if fortran else "C")

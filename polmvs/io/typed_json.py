@@ -6,7 +6,7 @@ import json
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -16,12 +16,33 @@ from polmvs.config import to_plain
 from polmvs.io.images import write_bytes
 
 T = TypeVar("T")
+Pairs = Callable[[list[tuple[str, Any]]], Any]
+
+MAX_SHOWN = 60  # characters of a file's own words in a message
 
 
 def write_json(path: Path, content: Any) -> None:
     """Write dataclasses, mappings and sequences, whole or not at all; NaN becomes null."""
     text = json.dumps(to_plain(content), indent=1, allow_nan=False)
     write_bytes(path, (text + "\n").encode())
+
+
+def parse_json(text: str, pairs: Pairs | None = None) -> Any:
+    """What a JSON text holds.
+
+    Parameters
+    ----------
+    pairs : makes something else than a dictionary of an object's keys and values.
+
+    Raises
+    ------
+    ValueError
+        It is no JSON, nested too deeply, or has an integer of thousands of digits.
+    """
+    try:
+        return json.loads(text, object_pairs_hook=pairs)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
 
 
 def from_json(kind: type[T], value: Any, where: str = "") -> T:
@@ -73,7 +94,7 @@ def _decode_dataclass(kind: Any, value: Any, where: str) -> Any:
     hints = typing.get_type_hints(kind)
     names = {field.name for field in fields(kind)}
     if unknown := sorted(content.keys() - names):
-        raise ValueError(f"{_place(where)} has an unknown key {unknown[0]!r}")
+        raise ValueError(f"{_place(where)} has an unknown key {unknown[0][:MAX_SHOWN]!r}")
     if missing := sorted(names - content.keys()):
         raise ValueError(f"{_place(where)} lacks {missing[0]!r}")
     return kind(
@@ -99,4 +120,4 @@ def _expect(value: Any, kind: Any, where: str) -> Any:
 
 
 def _place(where: str) -> str:
-    return where.lstrip(".") or "the file"
+    return where.lstrip(".")[:MAX_SHOWN] or "the file"

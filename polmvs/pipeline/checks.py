@@ -5,20 +5,31 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from polmvs.camera import PinholeCamera
 from polmvs.colmap.dense_workspace import open_dense_workspace, require_same_frame
 from polmvs.colmap.sfm import check_camera, check_intrinsics
-from polmvs.config import Options, ReferenceOptions
+from polmvs.config import Options, ReferenceOptions, SfmOptions
 from polmvs.errors import DataError, OptionError
-from polmvs.io.ground_truth import open_ground_truth
+from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.images import read_mask
 from polmvs.pipeline.record import CaptureIdentity, Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.maps import find_mask
-from polmvs.pipeline.stages.poses import fit_model
+from polmvs.pipeline.stages.sfm import fit_model
 from polmvs.polarization.capture import Capture
-from polmvs.poses.metric_frame import check_reference
-from polmvs.scene import SparseModel
+from polmvs.poses.alignment import MIN_CAMERAS
+from polmvs.poses.image_check import (
+    ImageLoader,
+    intensity_loader,
+    require_cameras_of_images,
+)
+from polmvs.poses.metric_frame import check_reference, frame_from_distance, read_centers
+from polmvs.scene import SparseModel, View, find_name, match_names, short_list
+
+MAX_CAMERA_DIFFERENCE = 0.01  # of the focal length, between options that say the same; a guess
 
 
 def inputs_of(options: Options) -> list[Path]:
@@ -56,9 +67,18 @@ def require_apart(
         raise OptionError(f"{run_folder.root}: OUT is the capture's own folder. Give another OUT.")
     places = [root / name for name in written]
     for path in (capture, *others):
-        resolved = path.resolve()
-        if any(resolved == place or place in resolved.parents for place in places):
-            raise OptionError(f"{path}: lies where OUT's results go. Give another OUT.")
+        for resolved in _real_places(path):
+            if any(resolved == place or place in resolved.parents for place in places):
+                raise OptionError(f"{path}: lies where OUT's results go. Give another OUT.")
+
+
+def _real_places(path: Path) -> list[Path]:
+    """Where an input lies, and what links in it lead to."""
+    try:
+        links = [entry for entry in path.iterdir() if entry.is_symlink()] if path.is_dir() else []
+        return [entry.resolve() for entry in (path, *links)]
+    except (OSError, RuntimeError) as error:  # a circle of links
+        raise DataError(path, f"cannot be followed ({error}).") from error
 
 
 def identity_of(capture: Capture) -> CaptureIdentity:
@@ -67,8 +87,13 @@ def identity_of(capture: Capture) -> CaptureIdentity:
         folder=capture.folder.absolute(),
         width=capture.width,
         height=capture.height,
-        bytes={path.name: path.stat().st_size for path in capture.paths},
+        bytes={_path_in(path, capture.folder): path.stat().st_size for path in capture.paths},
     )
+
+
+def _path_in(path: Path, folder: Path) -> str:
+    """Path of a file in a capture's folder; names alone repeat in folders by angle."""
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
 def require_same_capture(record: Record, identity: CaptureIdentity, run_folder: RunFolder) -> None:
@@ -108,17 +133,25 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
             f"holds {num_images} image{'s' * (num_images != 1)}; {min_images} or more are needed, "
             "better ten: views of the part from all around.",
         )
+    _check_counts(options, num_images)
     if options.region.mask is not None:
-        for image in image_names(capture):
-            read_mask(find_mask(options.region.mask, image), (capture.height, capture.width))
+        _check_masks(capture, options.region.mask)
+    load = intensity_loader(capture, image_names(capture))
     if options.evaluation.gt is not None:
-        open_ground_truth(options.evaluation.gt)
-    check_reference(options.reference)
+        require_truth_of_capture(open_ground_truth(options.evaluation.gt), capture, load)
+    _check_references(capture, options.reference)
     if options.export.in_place and options.fusion.workspace is None:
         raise OptionError("needs a `fusion.workspace` to fill.", field="export.in_place")
+    _check_camera_options(options.sfm)
     dense = open_dense_workspace(options.fusion.workspace) if options.fusion.workspace else None
     if options.sfm.sparse is not None:
         model = fit_model(capture, options.sfm.sparse)
+        if dense is None:  # images of a workspace are compared by themselves
+            remedy = "Give `sfm.sparse` of this capture, or leave it out."
+            require_cameras_of_images(model.views, load, options.sfm.sparse, remedy)
+        _check_same_camera(options.sfm, model, capture)
+        if options.reference.scale is not None:
+            frame_from_distance(model, *options.reference.scale)
         if dense is not None and options.reference == ReferenceOptions():
             require_same_frame(dense, model)
         return model
@@ -127,3 +160,122 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
     if options.sfm.camera is not None:
         check_camera(options.sfm.camera, capture.width, capture.height)
     return None
+
+
+def require_truth_of_capture(truth: GroundTruth, capture: Capture, load_image: ImageLoader) -> None:
+    """Refuse ground truth of another capture: by its names, its images' size, its cameras.
+
+    Parameters
+    ----------
+    load_image : of :func:`polmvs.poses.image_check.intensity_loader`.
+
+    Raises
+    ------
+    DataError
+        It is of another one.
+    """
+    names = image_names(capture)
+    matched = match_names(list(names), truth.names)
+    if len(matched) < MIN_CAMERAS:
+        raise DataError(
+            truth.cameras,
+            f"knows {len(matched)} of the {len(names)} images by name, {MIN_CAMERAS} are needed; "
+            f"its names are like {truth.names[0]!r}, the images' like {next(iter(names))!r}. Give "
+            "the ground truth of this capture.",
+        )
+    views = [
+        View(name=name, camera=true.camera, cam_from_world=true.cam_from_world)
+        for name, other in matched.items()
+        for true in (truth.views[other],)
+    ]
+    camera = views[0].camera
+    if (camera.width, camera.height) != (capture.width, capture.height):
+        raise DataError(
+            truth.cameras,
+            f"is of {camera.width}x{camera.height} px, the polarization images are "
+            f"{capture.width}x{capture.height} px. Give the ground truth of this capture.",
+        )
+    remedy = "Give the ground truth of this capture."
+    require_cameras_of_images(views, load_image, truth.cameras, remedy)
+
+
+def _check_counts(options: Options, num_images: int) -> None:
+    """Views that must agree cannot be more than there are."""
+    if options.fusion.min_views > num_images:
+        raise OptionError(
+            f"asks for points that {options.fusion.min_views} views confirm; the capture has "
+            f"{num_images}. Give {num_images} at most, better {min(2, num_images)}.",
+            field="fusion.min_views",
+        )
+
+
+def _check_masks(capture: Capture, folder: Path) -> None:
+    """Every image has a mask of its size, and some show the part."""
+    masks = [find_mask(folder, image) for image in image_names(capture)]
+    shown = [read_mask(path, (capture.height, capture.width)).any() for path in masks]
+    if not any(shown):
+        raise DataError(
+            masks[0],
+            "and all other masks are 0 everywhere; they must not be 0 on the part.",
+        )
+
+
+def _check_references(capture: Capture, options: ReferenceOptions) -> None:
+    """What is known of a metric frame's sources before there are poses."""
+    check_reference(options)
+    names = list(image_names(capture))
+    if options.reference is not None:
+        centers = read_centers(options.reference)
+        num = len(match_names(names, centers))
+        if num < MIN_CAMERAS:
+            raise DataError(
+                options.reference,
+                f"knows {num} of the {len(names)} images by name, {MIN_CAMERAS} are needed; its "
+                f"names are like {next(iter(centers))!r}, the images' like {names[0]!r}.",
+            )
+    for end in options.scale[:2] if options.scale is not None else ():
+        # A number may be a sparse point's id, which only a model tells.
+        if find_name(end, names) is None and not end.isdecimal():
+            raise OptionError(
+                f"names {end}, which is neither an image (such as {short_list(names[:2])}) nor "
+                "the id of a sparse point.",
+                field="reference.scale",
+            )
+
+
+def _check_camera_options(options: SfmOptions) -> None:
+    """A camera model is estimated only where no camera is given."""
+    if options.camera_model == SfmOptions().camera_model:
+        return
+    for name in ("intrinsics", "camera", "sparse"):
+        if getattr(options, name) is not None:
+            raise OptionError(
+                f"has no effect beside `sfm.{name}`, which brings its own. Leave one of them out.",
+                field="sfm.camera_model",
+            )
+
+
+def _check_same_camera(options: SfmOptions, model: SparseModel, capture: Capture) -> None:
+    """A camera beside a model, which brings its own, must be the same."""
+    if options.intrinsics is not None:
+        name, (fx, fy, cx, cy) = "intrinsics", options.intrinsics
+        given = PinholeCamera(
+            width=capture.width, height=capture.height, fx=fx, fy=fy, cx=cx, cy=cy
+        )
+    elif options.camera is not None:
+        name = "camera"
+        given = check_camera(options.camera, capture.width, capture.height).pinhole
+    else:
+        return
+    for view in model.views:
+        used = view.camera.mean_focal_px
+        center = view.camera.project(np.array([0.0, 0.0, 1.0]))
+        apart = (used - given.mean_focal_px, center[0] - given.cx, center[1] - given.cy)
+        if max(map(abs, apart)) > MAX_CAMERA_DIFFERENCE * used:
+            raise OptionError(
+                f"has focal length {given.mean_focal_px:.1f} and principal point "
+                f"{given.cx:.1f},{given.cy:.1f}; the model of `sfm.sparse`, whose camera is used, "
+                f"{used:.1f} and {center[0]:.1f},{center[1]:.1f}. Leave `sfm.{name}` out, or "
+                "correct it.",
+                field=f"sfm.{name}",
+            )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import sys
@@ -16,7 +15,7 @@ from typing import Any, TypeVar
 from polmvs._version import __version__
 from polmvs.config import AngleModel
 from polmvs.errors import DataError
-from polmvs.io.typed_json import from_json, write_json
+from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
 
 try:
@@ -27,8 +26,9 @@ except ImportError:  # Windows
 R = TypeVar("R")
 
 # Of ``run.json``; to be raised with every change of the record or of what a stage gives.
-# 1: the first releases, which did not name it. 2: stages with their results.
-SCHEMA_VERSION = 2
+# 1: the first releases, which did not name it. 2: stages with their results. 3: SfM as a stage of
+# its own, trust, notes on the capture.
+SCHEMA_VERSION = 3
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pycolmap", "open3d")
 
 
@@ -66,7 +66,7 @@ class CaptureIdentity:
     ----------
     folder : of the raw mosaics.
     width, height : of the polarization images, px.
-    bytes : size of each file by its name.
+    bytes : size of each file by its path in the folder.
     """
 
     folder: Path
@@ -90,6 +90,7 @@ class Record:
     command_line : how the run was last called; empty where a script did.
     capture : the images that it is of.
     images : names of the files in ``images/``.
+    notes : what was recognised of the capture and decided about it, one line each.
     options : resolved options of the last call, in terms of JSON.
     versions : of the software.
     stages : finished ones, in order.
@@ -101,6 +102,7 @@ class Record:
     command_line: tuple[str, ...] = ()
     capture: CaptureIdentity | None = None
     images: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     stages: tuple[StageRecord, ...] = ()
@@ -222,7 +224,7 @@ def _read_current(run_folder: RunFolder) -> dict[str, Any]:
 
 def _read_content(run_folder: RunFolder) -> dict[str, Any]:
     try:
-        content = json.loads(run_folder.run_file.read_text(encoding="utf-8"))
+        content = parse_json(run_folder.run_file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise DataError(
             run_folder.root, f"holds no run of polmvs ({RUN_FILE} is missing)."
@@ -253,13 +255,16 @@ def versions() -> dict[str, str]:
 
 
 def peak_rss_mb() -> float:
-    """Largest resident memory so far of this process and of its live workers, summed, MB.
+    """Largest resident memory so far of this process and of those that it started, MB.
+
+    Those that live are summed; of those that have ended the largest counts, if it is more.
 
     An upper bound: the processes need not have had their peaks at the same time, and what they
     share counts for each.
     """
     children = [_peak_of(child.pid) for child in active_children() if child.pid is not None]
-    return _own_peak() + sum(children)
+    ended = 0.0 if resource is None else _in_mb(resource.getrusage(resource.RUSAGE_CHILDREN))
+    return _own_peak() + max(sum(children), ended)
 
 
 def _own_peak() -> float:
@@ -267,8 +272,12 @@ def _own_peak() -> float:
     peak = _peak_of(os.getpid())
     if peak or resource is None:
         return peak
-    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return largest / 1e6 if sys.platform == "darwin" else largest / 1e3
+    return _in_mb(resource.getrusage(resource.RUSAGE_SELF))
+
+
+def _in_mb(usage: Any) -> float:
+    """The peak that the system states, in bytes or in kilobytes."""
+    return float(usage.ru_maxrss) / (1e6 if sys.platform == "darwin" else 1e3)
 
 
 def _peak_of(pid: int) -> float:

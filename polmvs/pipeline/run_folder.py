@@ -1,11 +1,12 @@
 """The run folder: the paths of its files, how they are written, and which of them are its own.
 
-Everything is written whole or not at all. What carries a temporary name belongs to an unfinished
-stage and is removed when the run goes on. Only what a run wrote is ever deleted.
+Everything is written whole or not at all. Only what a run wrote is ever deleted: what carries its
+token (:mod:`polmvs.pipeline.run_lock`), and results by their names. Links are not followed.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterable, Iterator, Set
 from contextlib import contextmanager
@@ -14,11 +15,15 @@ from pathlib import Path
 
 from polmvs.config import AngleModel
 from polmvs.errors import DataError
+from polmvs.io.temporary import remove_temporary, temporary_path
 
 RUN_FILE = "run.json"
 LOG_FILE = "polmvs.log"
 SURFACE_MESH = "surface.ply"  # among dense views: the mesh that they are rendered from
-SURFACE_LEVELS = "surface_{number}.ply"  # and those on its way: its hull, then after each level
+# and those on its way: its hull, then after each level
+SURFACE_LEVELS = tuple(f"surface_{number}.ply" for number in range(10))
+NOT_OURS = "was not written by polmvs. Move it out of the way."
+CAMERA_MODES = "camera_modes.npy"  # beside the model of SfM: what its camera leaves open
 DENSE_MARKER = "polmvs-files.txt"  # in a COLMAP workspace: the files that were written with it
 
 
@@ -39,9 +44,19 @@ class RunFolder:
         return self.root / "images"
 
     @property
+    def sfm(self) -> Path:
+        """COLMAP model as SfM found it, in its own frame."""
+        return self.root / "sfm"
+
+    @property
     def sparse(self) -> Path:
         """COLMAP model, binary."""
         return self.root / "sparse"
+
+    @property
+    def camera_modes(self) -> Path:
+        """What an estimated camera leaves open, in the frame of ``sparse``."""
+        return self.root / "tracks" / "camera.npy"
 
     @property
     def seeds(self) -> Path:
@@ -104,16 +119,22 @@ class RunFolder:
 
 HERE = RunFolder(Path())  # its paths are those within any run folder
 
-# What a run writes in its folders, by folder; images are known by name from the record.
-FOLDER_PATTERNS = {
-    HERE.sparse.name: ("*.bin",),
-    HERE.seeds.parent.name: ("*.npy",),
-    **{HERE.maps(model).name: ("*.npy",) for model in AngleModel},
-    **{
-        HERE.views(model).name: ("*.npy", SURFACE_MESH, SURFACE_LEVELS.format(number="[0-9]"))
-        for model in AngleModel
+_MODEL_FILES = {f"{name}.bin" for name in ("cameras", "images", "points3D", "rigs", "frames")}
+# What a run writes in its folders, by folder.
+FOLDER_FILES = {
+    HERE.sfm.name: {*_MODEL_FILES, CAMERA_MODES},
+    HERE.sparse.name: _MODEL_FILES,
+    HERE.seeds.parent.name: {
+        HERE.seeds.name,
+        HERE.camera_modes.name,
+        *(HERE.track_normals(model).name for model in AngleModel),
     },
+    **{HERE.views(model).name: {SURFACE_MESH, *SURFACE_LEVELS} for model in AngleModel},
 }
+# In these, files named IMAGE.part.npy as well; images are known by name from the record.
+FOLDERS_BY_IMAGE = frozenset(
+    name for model in AngleModel for name in (HERE.maps(model).name, HERE.views(model).name)
+)
 DENSE_FOLDERS = frozenset(HERE.dense(model).name for model in AngleModel)
 
 
@@ -123,13 +144,12 @@ DENSE_FOLDERS = frozenset(HERE.dense(model).name for model in AngleModel)
 @contextmanager
 def scratch(target: Path) -> Iterator[Path]:
     """A new folder beside ``target`` that goes when the work is done or fails."""
-    folder = target.with_name(f".{target.name}.tmp")
+    folder = temporary_path(target)
     try:
-        shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_temporary(folder)
 
 
 @contextmanager
@@ -154,55 +174,71 @@ def replace_folder(folder: Path, target: Path) -> None:
     DataError
         The other one holds files that no run wrote.
     """
-    if target.exists():
-        require_own(target, {file.name for file in folder.iterdir()})
+    if os.path.lexists(target):
+        require_own(target, also={file.name for file in folder.iterdir()})
         shutil.rmtree(target)
     folder.replace(target)
-
-
-def remove_temporary(root: Path) -> None:
-    """Remove what a killed run left half done."""
-    for folder in (root, root / HERE.seeds.parent):
-        for path in folder.glob(".*.tmp*"):
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
 
 
 # Deleting
 
 
-def require_own(folder: Path, names: Set[str] = frozenset()) -> None:
-    """Refuse to delete a folder with files other than these and those that a run writes in it.
+def require_own(
+    folder: Path, images: Set[str] = frozenset(), *, also: Set[str] = frozenset()
+) -> None:
+    """Refuse to delete a folder with files other than those that a run writes in it.
+
+    Parameters
+    ----------
+    images : names of the run's images.
+    also : names of further files that may go.
 
     Raises
     ------
     DataError
         There is one; it is named.
     """
-    if folder.name in DENSE_FOLDERS and not folder.is_symlink():
+    require_no_link(folder)
+    if not folder.is_dir():
+        raise DataError(folder, NOT_OURS)
+    if folder.name in DENSE_FOLDERS:
         _require_own_workspace(folder)
         return
-    patterns = FOLDER_PATTERNS.get(folder.name, ())
+    own = FOLDER_FILES.get(folder.name, set()) | also
+    if folder.name == HERE.images.name:
+        own |= images
     for file in folder.iterdir():
-        own = file.name in names or any(file.match(pattern) for pattern in patterns)
-        if folder.is_symlink() or file.is_dir() or not own:
-            raise DataError(file, "was not written by polmvs. Move it out of the way.")
+        of_image = folder.name in FOLDERS_BY_IMAGE and file.suffix == ".npy"
+        known = file.name in own or (of_image and file.name.rsplit(".", 2)[0] in images)
+        if not known or (file.is_dir() and not file.is_symlink()):
+            raise DataError(file, NOT_OURS)
 
 
-def discard(paths: Iterable[Path], names: Set[str] = frozenset()) -> None:
+def require_no_link(path: Path) -> None:
+    """Refuse a link in the place of a result: what it leads to is not the run's.
+
+    Raises
+    ------
+    DataError
+        It is one.
+    """
+    if path.is_symlink():
+        raise DataError(path, f"is a link and {NOT_OURS}")
+
+
+def discard(paths: Iterable[Path], images: Set[str] = frozenset()) -> None:
     """Delete files and folders that a run wrote, those that are there.
 
     Raises
     ------
     DataError
-        A folder holds files other than ``names`` and those that a run writes; nothing is deleted.
+        A folder holds files other than those that a run of these images writes; nothing is
+        deleted.
     """
-    present = [path for path in paths if path.exists() or path.is_symlink()]
+    present = [path for path in paths if os.path.lexists(path)]
     for path in present:
         if path.is_dir():
-            require_own(path, names)
+            require_own(path, images)
     for path in present:
         if path.is_dir():
             shutil.rmtree(path)
@@ -214,11 +250,17 @@ def _require_own_workspace(folder: Path) -> None:
     """Refuse to delete a COLMAP workspace that holds more than a run writes in it."""
     marker = folder / DENSE_MARKER
     if not marker.is_file():
-        raise DataError(folder, "was not written by polmvs. Move it out of the way.")
-    written = set(marker.read_text(encoding="utf-8").splitlines())
+        raise DataError(folder, NOT_OURS)
+    try:
+        written = {*marker.read_text(encoding="utf-8").splitlines(), DENSE_MARKER}
+    except (OSError, ValueError) as error:
+        raise DataError(
+            marker, f"cannot be read ({error}). Move {folder} out of the way."
+        ) from error
     for file in folder.rglob("*"):
-        if file.is_file() and file.relative_to(folder).as_posix() not in written | {DENSE_MARKER}:
-            raise DataError(file, "was not written by polmvs. Move it out of the way.")
+        plain = file.is_dir() and not file.is_symlink()
+        if not plain and file.relative_to(folder).as_posix() not in written:
+            raise DataError(file, NOT_OURS)
 
 
 def mark_own_workspace(folder: Path) -> None:
@@ -228,8 +270,8 @@ def mark_own_workspace(folder: Path) -> None:
     (folder / DENSE_MARKER).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def has_content(folder: Path) -> bool:
-    """Whether a folder exists and holds anything.
+def has_content(folder: Path, apart_from: Set[str] = frozenset()) -> bool:
+    """Whether a folder exists and holds anything but these names.
 
     Raises
     ------
@@ -237,7 +279,7 @@ def has_content(folder: Path) -> bool:
         It is a file, or cannot be read.
     """
     try:
-        return folder.exists() and any(folder.iterdir())
+        return folder.exists() and any(path.name not in apart_from for path in folder.iterdir())
     except NotADirectoryError as error:
         raise DataError(folder, "is a file; OUT must be a folder.") from error
     except OSError as error:

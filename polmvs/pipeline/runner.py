@@ -21,6 +21,7 @@ from polmvs.colmap.cameras import quiet_colmap
 from polmvs.config import Options, RunOptions, plain_options, show_value, to_plain
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.evaluation.tables import format_table, number
+from polmvs.io.folders import require_unicode
 from polmvs.parallel import Workers
 from polmvs.pipeline.checks import (
     check_input,
@@ -44,9 +45,10 @@ from polmvs.pipeline.run_folder import (
     RunFolder,
     discard,
     has_content,
-    remove_temporary,
+    require_no_link,
     require_own,
 )
+from polmvs.pipeline.run_lock import left_over_names, locked
 from polmvs.pipeline.stage_table import (
     StageInput,
     StageSpec,
@@ -246,7 +248,8 @@ def open_run(
 ) -> Iterator[Run]:
     """Check the input, make the run folder ready, and give the run.
 
-    Nothing is written or deleted before all input is found sound.
+    Nothing is written or deleted before all input is found sound, and no other run may work in the
+    folder meanwhile.
 
     Parameters
     ----------
@@ -264,23 +267,25 @@ def open_run(
     Raises
     ------
     DataError, OptionError
-        The input is unusable, or the run folder is.
+        The input is unusable, or the run folder is, or another run is at work in it.
     """
     monitor = monitor if monitor is not None else NoMonitor()
-    run_folder = RunFolder(out)
-    require_apart(
-        run_folder, capture=capture_folder, others=inputs_of(options), written=written_names()
-    )
-    with quiet_colmap(), Workers(run_options.workers) as workers:
+    run_folder, others = RunFolder(out), inputs_of(options)
+    for path in (capture_folder, out, *others):
+        require_unicode(path)
+    require_apart(run_folder, capture=capture_folder, others=others, written=written_names())
+    overwrite, resume = run_options.overwrite and not continues, run_options.resume or continues
+    with quiet_colmap():
         capture = open_capture(capture_folder, options.capture)
+        if run_folder.run_file.is_file() and (run_options.resume or continues):
+            require_same_capture(load_record(run_folder), identity_of(capture), run_folder)
         given_model = check_input(capture, options, min_images)
         if continues:
             load_record(run_folder)
-        record = prepare_output(
-            run_folder,
-            overwrite=run_options.overwrite and not continues,
-            resume=run_options.resume or continues,
-        )
+        require_usable(run_folder, overwrite=overwrite, resume=resume)
+    # Workers end before the lock: what they were at may be cleared away then.
+    with quiet_colmap(), locked(out), Workers(run_options.workers) as workers:
+        record = prepare_output(run_folder, overwrite=overwrite, resume=resume)
         identity = identity_of(capture)
         require_same_capture(record, identity, run_folder)
         run = Run(
@@ -295,6 +300,7 @@ def open_run(
         )
         run.require_same_options(taken_over)
         record.capture, record.images = identity, tuple(image_names(capture))
+        record.notes = capture.notes
         record.command_line, record.versions = tuple(command_line), versions()
         record.options = to_plain(options)
         run.save()
@@ -319,7 +325,7 @@ def load_record(run_folder: RunFolder) -> Record:
 
 
 def prepare_output(run_folder: RunFolder, *, overwrite: bool, resume: bool) -> Record:
-    """Make the run folder ready and give the record that the run starts from.
+    """Make the run folder ready, which is locked, and give the record that the run starts from.
 
     Parameters
     ----------
@@ -333,24 +339,37 @@ def prepare_output(run_folder: RunFolder, *, overwrite: bool, resume: bool) -> R
     DataError
         It cannot be made, or holds files with our names that no run of polmvs wrote.
     """
-    root = run_folder.root
-    occupied = has_content(root)
+    occupied = require_usable(run_folder, overwrite=overwrite, resume=resume)
     if occupied and resume:
-        record = load_record(run_folder)
-        remove_temporary(root)
-        return record
-    if occupied and not overwrite:
+        return load_record(run_folder)
+    if occupied:
+        _remove_results(run_folder)
+    return Record()
+
+
+def require_usable(run_folder: RunFolder, *, overwrite: bool, resume: bool) -> bool:
+    """Refuse a run folder that holds something else than what is to be taken over or deleted.
+
+    Returns
+    -------
+    Whether it holds anything; what a killed run left half done does not count.
+
+    Raises
+    ------
+    DataError, OptionError
+        As :func:`prepare_output`; nothing is changed.
+    """
+    root = run_folder.root
+    if not has_content(root, left_over_names(root)):
+        return False
+    if not (overwrite or resume):
         raise OptionError(
             f"{root}: exists and is not empty. Give `run.overwrite` to delete an earlier run in "
             "it, `run.resume` to go on with it, or another OUT."
         )
-    if occupied:
-        _remove_results(run_folder)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(root, f"cannot be made: {error.strerror or error}.") from error
-    return Record()
+    for name in written_names():
+        require_no_link(root / name)
+    return True
 
 
 def _remove_results(run_folder: RunFolder) -> None:
@@ -368,9 +387,8 @@ def _remove_results(run_folder: RunFolder) -> None:
     images = read_image_names(run_folder)
     folders = [path for path in present if path.is_dir()]
     for folder in folders:
-        require_own(folder, images if folder == run_folder.images else frozenset())
+        require_own(folder, images)
     try:
-        remove_temporary(root)
         for path in present:
             if path in folders:
                 shutil.rmtree(path)
@@ -396,7 +414,7 @@ def timing_table(records: Mapping[str, Record]) -> str:
         seconds = {stage.name: stage.seconds for stage in record.stages}
         peak = max((stage.peak_rss_mb for stage in record.stages), default=None)
         total += [number(sum(seconds.values())), number(peak, 1, 0)]
-        rest += [number(sum(t for name, t in seconds.items() if name != "poses")), ""]
+        rest += [number(sum(t for name, t in seconds.items() if name not in ("sfm", "poses"))), ""]
         wall += [number(record.wall_s), ""]
     return format_table(header, [*rows, total, rest, wall])
 

@@ -18,6 +18,7 @@ from typing import Any
 
 from polmvs.config import AngleModel, Options
 from polmvs.evaluation.comparison import SparseFigures
+from polmvs.evaluation.trust import Trust
 from polmvs.parallel import Workers
 from polmvs.pipeline.monitor import OnProgress
 from polmvs.pipeline.record import Record
@@ -32,7 +33,9 @@ from polmvs.pipeline.stages import (
     normals,
     poses,
     seeds,
+    sfm,
     sparse_cloud,
+    trust,
 )
 from polmvs.polarization.capture import Capture
 from polmvs.scene import SparseModel
@@ -110,19 +113,23 @@ def _write_images(run: StageInput) -> images.ImagesResult:
     )
 
 
-def _find_poses(run: StageInput) -> poses.PosesResult:
-    folder, options = run.run_folder, run.options
-    if run.given_model is not None and options.sfm.sparse is not None:
-        return poses.take_poses(
-            run.given_model, options.sfm.sparse, folder.images, folder.sparse, options.reference
-        )
-    return poses.find_poses(
+def _find_model(run: StageInput) -> sfm.SfmResult:
+    folder, options = run.run_folder, run.options.sfm
+    if run.given_model is not None and options.sparse is not None:
+        return sfm.take_model(run.given_model, options.sparse, folder.sfm)
+    names = list(images.image_names(run.capture))
+    return sfm.find_model(folder.images, names, folder.sfm, options, on_progress=run.on_progress)
+
+
+def _place_model(run: StageInput) -> poses.PosesResult:
+    folder = run.run_folder
+    return poses.place_model(
+        folder.sfm,
         folder.images,
-        list(images.image_names(run.capture)),
+        images.image_names(run.capture),
         folder.sparse,
-        options.sfm,
-        options.reference,
-        on_progress=run.on_progress,
+        folder.camera_modes,
+        run.options.reference,
     )
 
 
@@ -181,6 +188,7 @@ def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
     return densify.densify(
         model,
         sparse=folder.sparse,
+        camera_modes=folder.camera_modes,
         images=folder.images,
         maps=folder.maps(model),
         track_normals=folder.track_normals(model),
@@ -193,6 +201,17 @@ def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
         masks_given=run.options.region.mask is not None,
         workers=run.workers,
         on_progress=run.on_progress,
+    )
+
+
+def _find_trust(model: AngleModel, run: StageInput) -> Trust:
+    folder = run.run_folder
+    return trust.find_trust(
+        model,
+        sparse=folder.sparse,
+        maps=folder.maps(model),
+        sparse_cloud=folder.sparse_cloud(model),
+        cloud=folder.cloud(model),
     )
 
 
@@ -257,14 +276,23 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             num_steps=lambda run: len(run.capture.names),
         ),
         StageSpec(
-            name="poses",
+            name="sfm",
             command=SFM,
             reads=(HERE.images,),
-            writes=(HERE.sparse,),
-            decides=("sfm", "reference"),
-            work=_find_poses,
+            writes=(HERE.sfm,),
+            decides=("sfm",),
+            work=_find_model,
+            result=sfm.SfmResult,
+            num_steps=lambda run: None if run.given_model else sfm.NUM_SFM_STEPS,
+        ),
+        StageSpec(
+            name="poses",
+            command=SFM,
+            reads=(HERE.images, HERE.sfm),
+            writes=(HERE.sparse, HERE.camera_modes),
+            decides=("reference",),
+            work=_place_model,
             result=poses.PosesResult,
-            num_steps=lambda run: None if run.given_model else poses.NUM_SFM_STEPS,
         ),
         StageSpec(
             name="maps",
@@ -349,12 +377,24 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             name=f"densify_{model}",
             command=DENSIFY,
             angle_model=model,
-            reads=(HERE.sparse, HERE.images, HERE.maps(model), track_normals, HERE.seeds),
+            reads=(
+                *(HERE.sparse, HERE.camera_modes, HERE.images),
+                *(HERE.maps(model), track_normals, HERE.seeds),
+            ),
             writes=(cloud, views),
             decides=(TILT_AWARE, "region.mask", "propagation", "fusion"),
             work=partial(_densify, model),
             result=densify.DensifyResult,
             num_steps=lambda run: densify.num_densify_steps(run.num_views, run.options.propagation),
+        ),
+        StageSpec(
+            name=f"trust_{model}",
+            command=EXPORT,
+            angle_model=model,
+            reads=(HERE.sparse, HERE.maps(model), HERE.sparse_cloud(model), cloud),
+            writes=(),
+            work=partial(_find_trust, model),
+            result=Trust,
         ),
         StageSpec(
             name=f"mesh_{model}",

@@ -8,6 +8,10 @@ at t the sample's value is ``A + B cos 2t + C sin 2t`` with ``tan 2a = C / B`` a
 ``d = hypot(B, C) / A``. Each of the three is one number a channel (0, 45, 90, 135 degrees), or an
 array with a value for each sample.
 
+The four 2x2 blocks of a colour sensor's 4x4 cell are calibrated one by one, as if each were a
+sensor of its own, so that one number a channel is one of each block; gains are 1 in the mean of a
+block, since the colour of the lamp is not the sensor's.
+
 Extinction ratios themselves are unstable to estimate near d = 1; the diattenuation is what is
 fitted and stored (N. Hagen, S. Shibata, Y. Otani, Calibration and performance assessment of
 microgrid polarization cameras, Opt. Eng. 58(8), 2019).
@@ -24,10 +28,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.config import BayerOrder
 from polmvs.errors import DataError
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.images import write_bytes
-from polmvs.polarization.mosaic import ANGLES_DEG, split_mosaic, split_mosaic_full
+from polmvs.polarization.mosaic import (
+    ANGLES_DEG,
+    split_colour_mosaic,
+    split_mosaic,
+    split_mosaic_full,
+)
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -50,14 +60,16 @@ class PolarizerCalibration:
     ----------
     pattern : polarizer angles of a 2x2 cell that it is of, row by row, degrees.
     gains : (4,), response to unpolarised light of the channels 0, 45, 90, 135 degrees, mean 1;
-        ones where a flat field has them.
-    angles_deg : (4,), true angles of the channels, as displayed.
-    diattenuations : (4,), ``(E - 1) / (E + 1)``.
+        ones where a flat field has them. Of a colour sensor (16,): those of each 2x2 block of its
+        cell, row by row.
+    angles_deg : (4,) or (16,), true angles of the channels, as displayed.
+    diattenuations : (4,) or (16,), ``(E - 1) / (E + 1)``.
     dark : file of (H, W) float32, value of each sample without light, share of full scale.
     flat : file of (H, W) float32, response of each sample to unpolarised light, mean 1.
     angle_map, diattenuation_map : files of (H, W) float32, of each sample; in place of
         ``angles_deg`` and ``diattenuations``.
     full_scale : value of a saturated sample of the frames, which the dark frame is a share of.
+    bayer : colours of the 2x2 blocks of a colour sensor, row by row; None of a monochrome one.
     """
 
     pattern: Pattern
@@ -69,6 +81,7 @@ class PolarizerCalibration:
     angle_map: Path | None = None
     diattenuation_map: Path | None = None
     full_scale: float | None = None
+    bayer: BayerOrder | None = None
 
     @property
     def extinction_ratios(self) -> tuple[float, ...]:
@@ -95,13 +108,19 @@ class PolarizerCalibration:
         Returns
         -------
         (4, 3), or (4, 3, H/2, W/2), in full resolution (4, 3, H, W), where each sample has its
-        own. Interpolated as the samples are, so exact where the light is uniform.
+        own. Interpolated as the samples are, so exact where the light is uniform. Of a colour
+        sensor one of these for red, green and blue each: (3, 4, 3) and so on.
         """
-        twice = 2.0 * np.radians(np.asarray(self.angles_deg))
-        d = np.asarray(self.diattenuations)
         if self.angle_map is None and self.diattenuation_map is None:
-            rows = np.stack([np.ones(4), d * np.cos(twice), d * np.sin(twice)], axis=1)
-            return np.asarray(0.5 * np.asarray(self.gains)[:, None] * rows)
+            twice = 2.0 * np.radians(np.asarray(self.angles_deg))
+            d = np.asarray(self.diattenuations)
+            rows = np.stack([np.ones_like(d), d * np.cos(twice), d * np.sin(twice)], axis=1)
+            rows = 0.5 * np.asarray(self.gains)[:, None] * rows
+            if self.bayer is None:
+                return np.asarray(rows)
+            blocks, colours = rows.reshape(4, 4, 3), np.array(list(self.bayer))
+            # An image of green is the mean of two blocks.
+            return np.stack([blocks[colours == colour].mean(axis=0) for colour in "rgb"])
         gains = _per_sample(self.gains, self.pattern, shape)
         angle = _per_sample(self.angles_deg, self.pattern, shape)
         strength = _per_sample(self.diattenuations, self.pattern, shape)
@@ -110,8 +129,14 @@ class PolarizerCalibration:
         if self.diattenuation_map is not None:
             strength = _map_of(self.diattenuation_map, shape)
         twice = 2.0 * np.radians(angle)
-        split = split_mosaic_full if full else split_mosaic
         columns = [gains, gains * strength * np.cos(twice), gains * strength * np.sin(twice)]
+        if self.bayer is not None:
+            colour = [
+                0.5 * split_colour_mosaic(column, self.pattern, self.bayer, full=full)
+                for column in columns
+            ]
+            return np.stack(colour, axis=2)
+        split = split_mosaic_full if full else split_mosaic
         return np.stack([0.5 * split(column, self.pattern) for column in columns], axis=1)
 
 
@@ -122,10 +147,11 @@ class PolarizerResponse:
     Attributes
     ----------
     pattern : polarizer angles of a 2x2 cell, row by row.
-    gains, angles_deg, diattenuations : (4,), see :class:`PolarizerCalibration`.
+    gains, angles_deg, diattenuations : (4,) or (16,), see :class:`PolarizerCalibration`.
     dark, flat, angle_map, diattenuation_map : (H, W) float32, or None.
     residual : rms of the fit to the frames of the polarizer, share of their mean.
     full_scale : value of a saturated sample of the frames, if it is known.
+    bayer : of a colour sensor.
     """
 
     pattern: Pattern
@@ -138,6 +164,7 @@ class PolarizerResponse:
     diattenuation_map: Image | None
     residual: float
     full_scale: float | None = None
+    bayer: BayerOrder | None = None
 
 
 def measure_response(
@@ -217,6 +244,75 @@ def measure_response(
     )
 
 
+def measure_colour_response(
+    pattern: Pattern,
+    bayer: BayerOrder,
+    *,
+    unpolarized: Sequence[Image] = (),
+    polarized: Sequence[tuple[float, Image]] = (),
+    dark: Sequence[Image] = (),
+    per_sample: bool = False,
+) -> PolarizerResponse:
+    """As :func:`measure_response`, of a sensor whose 2x2 cells lie under a Bayer pattern.
+
+    Parameters
+    ----------
+    bayer : colours of the 2x2 blocks, row by row.
+
+    Raises
+    ------
+    ValueError
+        As there; or a side is no multiple of 4.
+    """
+    frames = [*unpolarized, *(frame for _, frame in polarized), *dark]
+    if any(side % 4 for frame in frames for side in frame.shape):
+        raise ValueError("frames of a colour sensor have sides that are multiples of 4.")
+    blocks = [
+        measure_response(
+            pattern,
+            unpolarized=[_block(frame, k) for frame in unpolarized],
+            polarized=[(angle, _block(frame, k)) for angle, frame in polarized],
+            dark=[_block(frame, k) for frame in dark],
+            per_sample=per_sample,
+        )
+        for k in range(4)
+    ]
+    return PolarizerResponse(
+        pattern=pattern,
+        gains=np.concatenate([block.gains for block in blocks]),
+        angles_deg=np.concatenate([block.angles_deg for block in blocks]),
+        diattenuations=np.concatenate([block.diattenuations for block in blocks]),
+        dark=_joined([block.dark for block in blocks]),
+        flat=_joined([block.flat for block in blocks]),
+        angle_map=_joined([block.angle_map for block in blocks]),
+        diattenuation_map=_joined([block.diattenuation_map for block in blocks]),
+        residual=float(np.sqrt(np.mean([block.residual**2 for block in blocks]))),
+        bayer=bayer,
+    )
+
+
+def _block(mosaic: Image, index: int) -> Image:
+    """The mosaic (H/2, W/2) of one of the four 2x2 blocks of a 4x4 cell."""
+    height, width = mosaic.shape
+    row, col = 2 * (index // 2), 2 * (index % 2)
+    cells = mosaic.reshape(height // 4, 4, width // 4, 4)[:, row : row + 2, :, col : col + 2]
+    return np.ascontiguousarray(cells.reshape(height // 2, width // 2))
+
+
+def _joined(blocks: Sequence[Image | None]) -> Image | None:
+    """The mosaic (H, W) of four blocks' mosaics; None where they have none."""
+    known = [block for block in blocks if block is not None]
+    if len(known) < 4:
+        return None
+    height, width = known[0].shape
+    cells = np.empty((height // 2, 4, width // 2, 4), np.float32)
+    for k, block in enumerate(known):
+        row, col = 2 * (k // 2), 2 * (k % 2)
+        split = block.reshape(height // 2, 2, width // 2, 2)
+        cells[:, row : row + 2, :, col : col + 2] = split
+    return cells.reshape(2 * height, 2 * width)
+
+
 def write_calibration(path: Path, response: PolarizerResponse) -> PolarizerCalibration:
     """Write a calibration as TOML with its arrays beside it, ``STEM_flat.npy`` and so on.
 
@@ -230,6 +326,7 @@ def write_calibration(path: Path, response: PolarizerResponse) -> PolarizerCalib
         f"version = {VERSION}",
         f"pattern = {list(response.pattern)}  # degrees, row by row",
         "# Channels 0, 45, 90, 135 degrees.",
+        *([] if response.bayer is None else [f'bayer = "{response.bayer}"  # four of each block']),
         f"gains = {_numbers(response.gains)}",
         f"angles_deg = {_numbers(response.angles_deg)}",
         f"diattenuations = {_numbers(response.diattenuations)}",
@@ -260,7 +357,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
         raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
     except (ValueError, RecursionError) as error:
         raise DataError(path, "is no TOML file of a calibration.") from error
-    known = {"version", "pattern", "gains", "angles_deg", "diattenuations", "full_scale"}
+    known = {"version", "pattern", "bayer", "gains", "angles_deg", "diattenuations", "full_scale"}
     arrays = ("dark", "flat", "angle_map", "diattenuation_map")
     unknown = set(content) - known - set(arrays)
     if unknown or content.get("version") != VERSION:
@@ -268,18 +365,23 @@ def read_calibration(path: Path) -> PolarizerCalibration:
             path,
             f"unknown key {min(unknown)!r}." if unknown else f"is not of version {VERSION}.",
         )
-    pattern = _four(path, content, "pattern", STANDARD)
+    pattern = _numbers_of(path, content, "pattern", STANDARD, 1)
     if sorted(pattern) != list(ANGLES_DEG):
         raise DataError(path, "pattern must hold 0, 45, 90 and 135 once each.")
+    bayer = content.get("bayer")
+    if bayer is not None and bayer not in list(BayerOrder):
+        raise DataError(path, f"bayer must be one of {', '.join(BayerOrder)}.")
+    blocks = 1 if bayer is None else 4
     values = {
-        "gains": _four(path, content, "gains", (1, 1, 1, 1)),
-        "angles_deg": _four(path, content, "angles_deg", ANGLES_DEG),
-        "diattenuations": _four(path, content, "diattenuations", (1, 1, 1, 1)),
+        "gains": _numbers_of(path, content, "gains", (1,) * 4, blocks),
+        "angles_deg": _numbers_of(path, content, "angles_deg", ANGLES_DEG, blocks),
+        "diattenuations": _numbers_of(path, content, "diattenuations", (1,) * 4, blocks),
     }
     if min(values["gains"]) <= 0.1 or not all(0 < d <= 1 for d in values["diattenuations"]):
         raise DataError(path, "gains must be positive and diattenuations lie in 0 to 1.")
     try:
-        _near_nominal(np.array(values["angles_deg"]))
+        for angles in np.reshape(values["angles_deg"], (-1, 4)):
+            _near_nominal(angles)
     except ValueError as error:
         raise DataError(
             path, "angles_deg are those of the channels 0, 45, 90, 135, in this order."
@@ -305,15 +407,19 @@ def read_calibration(path: Path) -> PolarizerCalibration:
         angle_map=files.get("angle_map"),
         diattenuation_map=files.get("diattenuation_map"),
         full_scale=None if scale is None else float(scale),
+        bayer=None if bayer is None else BayerOrder(bayer),
     )
 
 
-def _four(path: Path, content: dict[str, Any], key: str, default: Any) -> tuple[float, ...]:
-    """Four finite numbers."""
-    value = content.get(key, list(default))
-    good = isinstance(value, list) and len(value) == 4
+def _numbers_of(
+    path: Path, content: dict[str, Any], key: str, default: Sequence[float], blocks: int
+) -> tuple[float, ...]:
+    """Four finite numbers for each of some blocks."""
+    value = content.get(key, list(default) * blocks)
+    good = isinstance(value, list) and len(value) == 4 * blocks
     if not good or not all(type(v) in (int, float) and np.isfinite(v) for v in value):
-        raise DataError(path, f"{key} needs four numbers, of the channels 0, 45, 90, 135.")
+        each = "" if blocks == 1 else ", for each of the four 2x2 blocks"
+        raise DataError(path, f"{key} needs four numbers, of the channels 0, 45, 90, 135{each}.")
     return tuple(map(float, value))
 
 
@@ -338,10 +444,14 @@ def _map_of(path: Path, shape: tuple[int, ...]) -> Image:
 
 
 def _per_sample(values: Sequence[float], pattern: Pattern, shape: tuple[int, ...]) -> Image:
-    """Values of the channels 0, 45, 90, 135 at each sample's place."""
+    """Values of the channels 0, 45, 90, 135, of one block or of four, at each sample's place."""
     out = np.empty(shape, np.float32)
-    for cell, angle in enumerate(pattern):
-        out[cell // 2 :: 2, cell % 2 :: 2] = values[ANGLES_DEG.index(angle)]
+    blocks = np.reshape(values, (-1, 4))
+    period = 2 if len(blocks) == 1 else 4
+    for block, own in enumerate(blocks):
+        for cell, angle in enumerate(pattern):
+            row, col = 2 * (block // 2) + cell // 2, 2 * (block % 2) + cell % 2
+            out[row::period, col::period] = own[ANGLES_DEG.index(angle)]
     return out
 
 

@@ -9,8 +9,9 @@ transmission angle in degrees, ``045.png`` or ``045_01.png``, three angles or mo
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,11 @@ from numpy.typing import NDArray
 
 from polmvs.config import CaptureKind, CaptureOptions
 from polmvs.errors import DataError
-from polmvs.polarization.calibration import PolarizerResponse, measure_response
+from polmvs.polarization.calibration import (
+    PolarizerResponse,
+    measure_colour_response,
+    measure_response,
+)
 from polmvs.polarization.capture import Capture, open_capture
 
 Image = NDArray[np.float32]
@@ -44,8 +49,9 @@ def calibrate_polarizers(
         Frames are missing, misnamed, clipped, or do not fit the pattern.
     """
     chosen = replace(options or CaptureOptions(), kind=CaptureKind.MOSAIC, calibration=None)
+    measure: Callable[..., PolarizerResponse] = measure_response
     if chosen.bayer is not None:
-        raise DataError(folder, "colour sensors are calibrated by none of these frames.")
+        measure = partial(measure_colour_response, bayer=chosen.bayer)
     captures: dict[str, Capture] = {}
     for name in (POLARIZED, UNPOLARIZED, DARK):
         if (folder / name).is_dir():
@@ -62,7 +68,7 @@ def calibrate_polarizers(
             raise DataError(folder / POLARIZED / name, "its name does not begin with the angle.")
         polarized.append((float(match[0]), frame))
     try:
-        response = measure_response(
+        response = measure(
             chosen.pattern,
             unpolarized=[frame for _, frame in frames.get(UNPOLARIZED, [])],
             polarized=polarized,

@@ -11,7 +11,7 @@ import logging
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,8 @@ from polmvs.io.raw_formats import (
 from polmvs.polarization.bit_depth import LevelCounts, Levels, decide_levels
 from polmvs.polarization.calibration import PolarizerCalibration, read_calibration
 from polmvs.polarization.exposures import merge_exposures
-from polmvs.polarization.lossy import find_quantization, lossy_variance
+from polmvs.polarization.linearity import LinearityCheck, check_linearity
+from polmvs.polarization.lossy import BLOCK, find_quantization, lossy_variance
 from polmvs.polarization.mosaic import (
     clipped_cells,
     linearize,
@@ -87,7 +88,7 @@ class Capture:
     calibration : of the polarizers, if there is one.
     lossy_steps : (64,) steps of the JPEG that the samples were, row by row; None if none.
     orientations : TIFF orientations that occur; the samples are as stored.
-    pattern_check : of a monochrome mosaic's pattern; None for others.
+    pattern_check, linearity_check : of a monochrome mosaic's pattern and gamma; None for others.
     """
 
     folder: Path
@@ -101,6 +102,7 @@ class Capture:
     lossy_steps: tuple[float, ...] | None = None
     orientations: tuple[int, ...] = (UPRIGHT,)
     pattern_check: PatternCheck | None = None
+    linearity_check: LinearityCheck | None = None
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -146,6 +148,8 @@ class Capture:
         lines.extend(self.warnings)
         if self.pattern_check is not None:
             lines.append(self.pattern_check.message)
+        if self.linearity_check is not None and self.linearity_check.fits is not False:
+            lines.append(self.linearity_check.message)
         return tuple(lines)
 
     @property
@@ -163,6 +167,8 @@ class Capture:
                 "compressed with loss (JPEG), which blurs the polarizers into each other; the "
                 "stated noise is widened by it. Record PNG or TIFF"
             )
+        if self.linearity_check is not None and self.linearity_check.fits is False:
+            lines.append(self.linearity_check.message)
         return tuple(lines)
 
     def load(self, name: str) -> Stokes:
@@ -184,6 +190,9 @@ class Capture:
             case CaptureKind.AOLP:
                 stokes = self._from_maps(view)
         options = self.options
+        mosaic = self.files.kind is CaptureKind.MOSAIC
+        if self.lossy_steps is not None and not (mosaic and options.resolution is Resolution.HALF):
+            stokes = replace(stokes, lossy_block_px=float(BLOCK))
         return turned_axes(stokes, zero_deg=options.zero_deg, clockwise=options.clockwise)
 
     def load_mosaic(self, name: str) -> Image:
@@ -262,21 +271,25 @@ class Capture:
         clipped = clipped_cells(raw, threshold, colour=options.bayer is not None, full=full)
         if options.bayer is not None:
             colours = split_colour_mosaic(linear, options.pattern, options.bayer, full=full)
-            return self._one_colour([self._stokes(colour, clipped) for colour in colours])
+            return self._one_colour(
+                [self._stokes(colour, clipped, index) for index, colour in enumerate(colours)]
+            )
         split = split_mosaic_full if full else split_mosaic
         return self._stokes(split(linear, options.pattern), clipped)
 
-    def _stokes(self, images: Image, clipped: Mask) -> Stokes:
-        """Stokes images of a mosaic's four angle images."""
+    def _stokes(self, images: Image, clipped: Mask, colour: int | None = None) -> Stokes:
+        """Stokes images of a mosaic's four angle images, of one colour or of a monochrome one."""
         darkness, quantum, lossy = self.options.darkness, self._quantum, self._lossy_variance
         if self.calibration is None:
             return stokes_from_intensities(
                 images, clipped, darkness=darkness, quantum=quantum, lossy_variance=lossy
             )
         shape = (self.header.height, self.header.width)
+        full = self.options.resolution is Resolution.FULL
+        analyzers = self.calibration.analyzers(shape, full=full)
         return stokes_by_least_squares(
             images,
-            self.calibration.analyzers(shape, full=self.options.resolution is Resolution.FULL),
+            analyzers if colour is None else analyzers[colour],
             clipped,
             darkness=darkness,
             quantum=quantum,
@@ -456,6 +469,12 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
                 f"is of the pattern {calibration.pattern}, `capture.pattern` is {options.pattern}.",
                 field="capture.calibration",
             )
+        if calibration.bayer is not options.bayer:
+            of = "a monochrome sensor" if calibration.bayer is None else calibration.bayer
+            raise OptionError(
+                f"is of {of}, `capture.bayer` is {options.bayer or 'not given'}.",
+                field="capture.calibration",
+            )
         full_scale = full_scale if full_scale is not None else calibration.full_scale
     header, levels, orientations, sampled = _survey(files, options, full_scale)
     steps = _lossy_steps(sampled)
@@ -474,6 +493,7 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
         lossy_steps=steps,
         orientations=orientations,
         pattern_check=_check_pattern(files, options, levels, sampled),
+        linearity_check=_check_linearity(files, options, levels, sampled),
     )
     for warning in capture.warnings:
         logger.warning("%s: %s.", files.folder, warning)
@@ -655,6 +675,16 @@ def _check_pattern(
             raise OptionError(f"{files.folder}: {check.message}.")
         logger.warning("%s: %s.", files.folder, check.message)
     return check
+
+
+def _check_linearity(
+    files: CaptureFiles, options: CaptureOptions, levels: Levels, sampled: Sequence[RawImage]
+) -> LinearityCheck | None:
+    """Check the gamma of a monochrome mosaic."""
+    if files.kind is not CaptureKind.MOSAIC or options.bayer is not None:
+        return None
+    shares = [linearize(raw.samples, gamma=1.0, full_scale=levels.full_scale) for raw in sampled]
+    return check_linearity(shares, options.pattern, options.saturation, options.gamma)
 
 
 def _planes_of_stokes(path: Path, array: NDArray[Any]) -> NDArray[Any]:

@@ -6,6 +6,7 @@ AoLP as hue with its wheel, DoLP.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +31,8 @@ TILE_PX = 320  # width of one picture
 MARGIN_PX = 6
 HEADER_PX = 96
 CAPTION_PX = 22
-WHITE, GRAY, BLACK = (255, 255, 255), (160, 160, 160), (0, 0, 0)
+LINE_PX, CHARACTER_PX = 22, 8
+WHITE, GRAY, ORANGE = (255, 255, 255), (160, 160, 160), (60, 160, 255)  # BGR
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,14 +247,18 @@ def _tile(picture: Picture, caption: str) -> Picture:
 
 def _header(capture: Capture, width: int) -> Picture:
     """The wheel and what the capture is."""
-    header = np.zeros((HEADER_PX, width, 3), np.uint8)
     wheel = _wheel(HEADER_PX - 12)
-    header[6:-6, 6 : 6 + wheel.shape[1]] = wheel
     left = wheel.shape[1] + 14
-    lines = [str(capture.folder), *capture.notes]
-    for k, line in enumerate(lines[:4]):
-        room = (width - left) // 8
-        _write(header, line[:room], (left, 18 + 22 * k), WHITE if k == 0 else GRAY)
+    room = (width - left) // CHARACTER_PX
+    lines = [(str(capture.folder), WHITE)]
+    for note in capture.notes:  # whole: what a warning says to do stands at its end
+        colour = ORANGE if note in capture.warnings else GRAY
+        lines += [(line, colour) for line in textwrap.wrap(note, room)]
+    height = max(HEADER_PX, LINE_PX * len(lines) + 8)
+    header = np.zeros((height, width, 3), np.uint8)
+    header[6 : 6 + wheel.shape[0], 6 : 6 + wheel.shape[1]] = wheel
+    for k, (line, colour) in enumerate(lines):
+        _write(header, line, (left, 18 + LINE_PX * k), colour)
     return header
 
 

@@ -92,10 +92,7 @@ class PhaseMap:
 
 def build_phase_map(
     view: View,
-    s0: Image,
-    s1: Image,
-    s2: Image,
-    sigma: Image,
+    stokes: Stokes,
     region: Region,
     light: Light,
     *,
@@ -105,35 +102,38 @@ def build_phase_map(
 
     Parameters
     ----------
-    s0, s1, s2 : (H, W) float32, Stokes images.
-    sigma : (H, W) float32, standard deviation of s1 and of s2.
+    stokes : of this view. Of its noise smoothing leaves what neighbours do not share; the errors
+        of compression are shared by whole blocks, those of the channels' gains by all pixels.
     region : of this view.
     light : which reflection dominates; specular light turns the phase by pi/2 from the AoLP.
     tolerances : of this step.
     """
     weight = region.reliable.astype(np.float32)
-    stokes = np.dstack([s0, s1, s2])
-    variances = np.square(sigma)
-    fine = _smoothed(stokes, variances, weight, tolerances.fine_smoothing_px, tolerances.ridge)
-    coarse = _smoothed(stokes, variances, weight, tolerances.coarse_smoothing_px, tolerances.ridge)
+    images = np.dstack([stokes.s0, stokes.s1, stokes.s2])
+    lossy = stokes.lossy_sigma**2
+    variances = np.maximum(np.square(stokes.sigma) - np.float32(lossy), 0)
+    fine = _smoothed(images, variances, weight, tolerances.fine_smoothing_px, tolerances.ridge)
+    coarse = _smoothed(images, variances, weight, tolerances.coarse_smoothing_px, tolerances.ridge)
     use_fine = fine.share > 0.25
     smoothed = np.where(use_fine[..., None], fine.values, coarse.values)
     share = np.where(use_fine, fine.share, coarse.share)
+    width_px = np.where(use_fine, tolerances.fine_smoothing_px, tolerances.coarse_smoothing_px)
     with np.errstate(divide="ignore", invalid="ignore"):
         lit = np.where(smoothed[..., :1] > 0, smoothed[..., :1], np.nan)
         axial = phase_sign(light) * smoothed[..., 1:3] / lit
         dolp = np.minimum(np.linalg.norm(axial, axis=-1), 1.0)
-        noise = np.sqrt(np.where(use_fine, fine.variance, coarse.variance)) / lit[..., 0]
-        variance = (
-            tolerances.model_sigma**2 + (tolerances.mixture_sigma**2 + (0.5 * noise) ** 2) / dolp**2
-        )
+        noise = np.where(use_fine, fine.variance, coarse.variance)
+        # A Gaussian of width w averages 4 pi w^2 independent pixels.
+        blocks = 4 * np.pi * width_px**2 * share / stokes.lossy_block_px**2
+        noise = (noise + lossy / np.maximum(blocks, 1)) / lit[..., 0] ** 2 + stokes.gain_sigma**2
+        variance = tolerances.model_sigma**2 + (tolerances.mixture_sigma**2 + noise / 4) / dolp**2
         precision = np.where(region.inside & (share > 0.02), 1 / variance, 0)
     samples = np.dstack([axial, precision]).astype(np.float32)
     np.nan_to_num(samples, copy=False, nan=0.0)
     diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
-    intensity = np.asarray(s0, np.float32)
+    intensity = np.asarray(stokes.s0, np.float32)
     return PhaseMap(
-        view, region, samples, intensity, diffuse, _lowest_dolp(stokes, tolerances=tolerances)
+        view, region, samples, intensity, diffuse, _lowest_dolp(images, tolerances=tolerances)
     )
 
 
@@ -205,13 +205,13 @@ def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMa
     DataError
         If a file is missing, damaged, or of another size than the view's camera.
     """
-    samples = map_array(folder / _samples_name(view.name, tilted))
-    intensity = map_array(folder / f"{view.name}.intensity.npy")
-    flags = map_array(folder / f"{view.name}.region.npy")
-    lowest_dolp = map_array(folder / f"{view.name}.dolp.npy")
+    samples = map_array(folder / _samples_name(view.name, tilted), np.floating)
+    intensity = map_array(folder / f"{view.name}.intensity.npy", np.floating)
+    flags = map_array(folder / f"{view.name}.region.npy", np.unsignedinteger)
+    lowest_dolp = map_array(folder / f"{view.name}.dolp.npy", np.unsignedinteger)
     size = (view.camera.height, view.camera.width)
     shapes = (samples.shape[:2], intensity.shape, flags.shape, lowest_dolp.shape)
-    if any(shape != size for shape in shapes):
+    if any(shape != size for shape in shapes) or samples.shape[2:] != (3,):
         reason = "has another size than its camera; give `run.overwrite`."
         raise DataError(folder / view.name, reason)
     region = Region((flags & 1) > 0, (flags & 2) > 0, (flags & 4) > 0)

@@ -85,6 +85,9 @@ class Stokes:
     valid : (H, W) bool, False where a contributing sample is clipped or the pixel is dark.
     gain_sigma : standard deviation of s1 and of s2 that all pixels share, share of s0: what
         differing gains of the polarizer channels may do.
+    lossy_sigma : the part of ``sigma`` that lossy compression makes, which the pixels of a block
+        share.
+    lossy_block_px : side of such a block, px.
     """
 
     s0: Image
@@ -93,6 +96,8 @@ class Stokes:
     sigma: Image
     valid: Mask
     gain_sigma: float = 0.0
+    lossy_sigma: float = 0.0
+    lossy_block_px: float = 4.0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -185,7 +190,15 @@ def stokes_from_intensities(
     if lossy_variance > 0:
         variance += np.float32(lossy_variance)
     sigma = np.sqrt(variance, out=variance)
-    return Stokes(s0=s0, s1=s1, s2=s2, sigma=sigma, valid=valid, gain_sigma=gain_sigma)
+    return Stokes(
+        s0=s0,
+        s1=s1,
+        s2=s2,
+        sigma=sigma,
+        valid=valid,
+        gain_sigma=gain_sigma,
+        lossy_sigma=float(np.sqrt(lossy_variance)),
+    )
 
 
 def ideal_analyzers(angles_deg: ArrayLike) -> NDArray[np.float64]:
@@ -253,7 +266,15 @@ def stokes_by_least_squares(
     )
     gain_sigma = 0.0 if gains_known else _gain_sigma(s0, s1, s2, redundancy, valid)
     sigma = np.sqrt(variance + np.float32(lossy_variance))
-    return Stokes(s0=s0, s1=s1, s2=s2, sigma=sigma, valid=valid, gain_sigma=gain_sigma)
+    return Stokes(
+        s0=s0,
+        s1=s1,
+        s2=s2,
+        sigma=sigma,
+        valid=valid,
+        gain_sigma=gain_sigma,
+        lossy_sigma=float(np.sqrt(lossy_variance)),
+    )
 
 
 def stokes_from_maps(
@@ -319,6 +340,8 @@ def combine(images: list[Stokes]) -> Stokes:
         sigma=np.sqrt(np.asarray(variance, np.float32)),
         valid=np.logical_and.reduce([s.valid for _, s in used_images]),
         gain_sigma=float(np.sqrt(sum((w * s.gain_sigma) ** 2 for w, s in used_images))),
+        lossy_sigma=float(np.sqrt(sum((w * s.lossy_sigma) ** 2 for w, s in used_images))),
+        lossy_block_px=images[0].lossy_block_px,
     )
 
 

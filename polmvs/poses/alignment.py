@@ -33,11 +33,17 @@ class AlignmentTolerances:
     min_robust_cameras : from which cameras are left out; derived: of four any three agree.
     max_triples : of cameras from which the search starts; a guess, bounds the time. Of cameras
         half of which are wrong one triple in eight is right.
+    max_relative_rms : residual over the cameras' spread, beyond which they are of other captures;
+        a guess, unrelated centres give about 1.
+    max_turn_deg : median angle between the orientations, likewise. Three centres always fit well;
+        unrelated cameras about one object then look 30 degrees and more past each other. Guess.
     """
 
     outlier_floor: float = 0.005
     min_robust_cameras: int = 5
     max_triples: int = 500
+    max_relative_rms: float = 0.2
+    max_turn_deg: float = 15.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +94,8 @@ def align_views(
     Raises
     ------
     DataError
-        When fewer than three names match or the centres lie on one line.
+        When fewer than three names match, the centres lie on one line, or the cameras are not
+        those of one capture.
     """
     matched = match_names([view.name for view in views], true_views)
     pairs = [(view, true_views[matched[view.name]]) for view in views if view.name in matched]
@@ -112,13 +119,22 @@ def align_views(
         for (view, true), is_used in zip(pairs, used, strict=True)
         if is_used
     ]
+    spread = float(np.sqrt(((true_centers - true_centers.mean(axis=0)) ** 2).sum(1).mean()))
+    rms, turn_deg = float(np.sqrt((residuals**2).mean())), float(np.degrees(np.median(turns)))
+    if rms > tolerances.max_relative_rms * spread or turn_deg > tolerances.max_turn_deg:
+        raise DataError(
+            source,
+            f"its cameras cannot be those of the {len(pairs)} reconstructed images: aligned, they "
+            f"stay {1e3 * rms:.3g} mm (RMS, of a spread of {1e3 * spread:.3g} mm) and "
+            f"{turn_deg:.3g} deg apart. Give the ground truth of this capture, or better poses.",
+        )
     names = [view.name for view, _ in pairs]
     return truth_from_world, Alignment(
         scale=truth_from_world.scale,
-        rms_residual_mm=1e3 * float(np.sqrt((residuals**2).mean())),
+        rms_residual_mm=1e3 * rms,
         num_cameras=int(used.sum()),
         dropped=tuple(name for name, is_used in zip(names, used, strict=True) if not is_used),
-        rotation_error_median_deg=float(np.degrees(np.median(turns))),
+        rotation_error_median_deg=turn_deg,
     )
 
 

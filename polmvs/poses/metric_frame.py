@@ -6,7 +6,6 @@ only, and the frame's origin and axes stay. Several sources must agree in scale.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import SimilarityTransform, nearest_rotation
+from polmvs.io.typed_json import parse_json
 from polmvs.poses.alignment import MIN_CAMERAS, align_cameras, align_residuals
 from polmvs.poses.markers import (
     ScaleTolerances,
@@ -397,8 +397,8 @@ def read_centers(path: str | Path) -> dict[str, Array]:
 
 def _parse_json(path: Path, text: str) -> dict[str, Array]:
     try:
-        content = json.loads(text, object_pairs_hook=_unique_pairs)
-    except (ValueError, RecursionError) as error:
+        content = parse_json(text, _unique_pairs)
+    except ValueError as error:
         raise DataError(path, f"cannot be read as JSON ({error}).") from error
     images = content.get("images", content) if isinstance(content, dict) else None
     if not isinstance(images, dict):

@@ -247,10 +247,9 @@ def _models(record: Record) -> tuple[AngleModel, ...]:
 
 def _levels(views: Path) -> Iterator[Mesh]:
     """The hull and the levels that a run left, in their order."""
-    number = 0
-    while (path := views / SURFACE_LEVELS.format(number=number)).is_file():
-        yield read_mesh(path)
-        number += 1
+    for name in SURFACE_LEVELS:
+        if (views / name).is_file():
+            yield read_mesh(views / name)
 
 
 def _principal_point(camera: Camera) -> tuple[Sequence[float], Sequence[float]]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.errors import DataError
 from polmvs.io.arrays import map_array, save_array
 from polmvs.surface.log_range import log_range_increment
 
@@ -17,6 +18,7 @@ Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
+MAX_STRIDE = 1 << 16  # px, more than any image has
 NUM_NEAREST = 4  # known points that a point of the surface between them is made of
 MEMBERS = ("range", "normals", "sigma_deg", "sigma", "confidence")  # of a stored view
 
@@ -208,10 +210,20 @@ def store_dense_view(dense: DenseView, path: Path) -> DenseView:
 
 
 def open_dense_view(stride_px: int, path: Path) -> DenseView:
-    """Map a stored dense view into memory."""
+    """Map a stored dense view into memory.
+
+    Raises
+    ------
+    DataError
+        A file is missing, damaged, or of another size than the others.
+    """
     range_map, normals, sigma_deg, sigma, confidence = (
-        map_array(_member(path, name)) for name in MEMBERS
+        map_array(_member(path, name), np.floating) for name in MEMBERS
     )
+    size = range_map.shape
+    shapes = {sigma_deg.shape, sigma.shape, confidence.shape}
+    if len(size) != 2 or shapes != {size} or normals.shape != (*size, 3):
+        raise DataError(path, "its files differ in size; run again with `run.overwrite`.")
     return DenseView(stride_px, range_map, normals, sigma_deg, sigma, confidence, path)
 
 
@@ -219,7 +231,10 @@ def find_dense_view(path: Path) -> DenseView | None:
     """Map a stored dense view into memory that says itself what its stride is; None: no such."""
     if not _member(path, "stride").is_file():
         return None
-    return open_dense_view(int(map_array(_member(path, "stride"))), path)
+    stride = map_array(_member(path, "stride"), np.integer)
+    if stride.shape != () or not 0 < int(stride) < MAX_STRIDE:
+        raise DataError(_member(path, "stride"), "holds no stride; run again with `run.overwrite`.")
+    return open_dense_view(int(stride), path)
 
 
 def _member(path: Path, name: str) -> Path:

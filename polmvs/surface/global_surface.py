@@ -161,28 +161,20 @@ def reconstruct_surface(
     rows = AngleModel.OPA if angle_model is AngleModel.OPA else AngleModel.PPA
     known = KnownPoints(seeds.points_in_world, seeds.sigma)
     tolerances = tolerances or RefinementTolerances()
-    # Coarse edges round the steps away that were just carved, and the rims of plates; without them
-    # what is far from its hull does not come all the way. The known points tell which it was.
-    schedules = [tolerances.levels, *([tolerances.levels[1:]] if steps else [])]
-    levels_of: list[list[TriangleMesh]] = [[] for _ in schedules]
-    refined = [
-        refine(
-            hull.mesh,
-            views,
-            rows,
-            hull.footprint,
-            known=known,
-            tolerances=replace(tolerances, levels=levels),
-            on_progress=on_progress if number == 0 else None,
-            on_level=levels_of[number].append,
-        )
-        for number, levels in enumerate(schedules)
-    ]
-    best = min(range(len(refined)), key=lambda number: _distance_of(seeds, refined[number]))
-    mesh = refined[best]
     if on_mesh is not None:
-        for shown in (hull.mesh, *levels_of[best]):
-            on_mesh(shown)
+        on_mesh(hull.mesh)
+    refined = refine(
+        hull.mesh,
+        views,
+        rows,
+        hull.footprint,
+        known=known,
+        tolerances=tolerances,
+        on_progress=on_progress,
+        on_level=on_mesh,
+    )
+    mesh = refined.mesh
+    views = [replace(view, tilt_share=refined.tilt_share) for view in views]
     hollows = _hollows((mesh, hull.mesh), hull.footprint, maps, angle_model, tilt_aware)
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
@@ -215,15 +207,6 @@ def reconstruct_surface(
         contradictions=contradictions,
         presumed=presumed,
     )
-
-
-def _distance_of(seeds: Seeds, mesh: TriangleMesh) -> float:
-    """Median distance of the known points from a surface; infinite of none, 0 without points."""
-    if not len(mesh.faces):
-        return np.inf
-    if not len(seeds.sigma):
-        return 0.0
-    return float(np.median(np.abs(RayScene(mesh).signed_distance(seeds.points_in_world))))
 
 
 def _hollows(

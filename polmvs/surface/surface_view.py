@@ -88,11 +88,13 @@ class SurfaceView:
     Attributes
     ----------
     view : name, camera and pose.
-    samples : (H, W, 3) float32, ``dolp cos 2 phase``, ``dolp sin 2 phase`` and the inverse
-        variance of the phase (1 / rad^2; 0: no phase here), of a phase map.
+    samples : (H, W, 4) float32, ``dolp cos 2 phase``, ``dolp sin 2 phase``, the inverse variance
+        of the phase (1 / rad^2; 0: no phase here), of a phase map, and by how much tilted
+        polarizers would have turned the phase (rad; 0 where that is not asked).
     intensity : (H, W) float32, s0.
     silhouette : of the objects.
     has_outline : whether the silhouette may carve and pull: some pixels on it and some off it.
+    tilt_share : of that turn that is taken back: 0 for a sensor that obeys the angle model.
     """
 
     view: View
@@ -100,6 +102,7 @@ class SurfaceView:
     intensity: Image
     silhouette: Silhouette
     has_outline: bool = True
+    tilt_share: float = 0.0
 
     @property
     def width(self) -> int:
@@ -144,11 +147,13 @@ class PhaseRows:
     rows : (N, 3) unit, world; 0 where the view has no phase.
     precision : (N,) inverse variance of the phase, 1 / rad^2; 0 where it has none.
     turn : (N,) by how much the row turns about the ray per turn of the phase.
+    tilt : (N,) by how much tilted polarizers would turn the row about the ray, rad.
     """
 
     rows: Array
     precision: Array
     turn: Array
+    tilt: Array
 
 
 def phase_rows(
@@ -167,9 +172,12 @@ def phase_rows(
     in_cam = view.to_camera(points)
     xy = view.view.camera.project(in_cam)
     rays = in_cam / np.maximum(np.linalg.norm(in_cam, axis=1, keepdims=True), 1e-300)
-    cos2, sin2, precision = (
+    cos2, sin2, precision, tilt = (
         np.asarray(column, np.float64) for column in sample_image(view.samples, xy).T
     )
+    if view.tilt_share:
+        cos, sin = np.cos(2 * view.tilt_share * tilt), np.sin(2 * view.tilt_share * tilt)
+        cos2, sin2 = cos2 * cos - sin2 * sin, sin2 * cos + cos2 * sin
     if other_light is not None:
         sign = np.where(other_light, -1.0, 1.0)
         cos2, sin2 = sign * cos2, sign * sin2
@@ -179,7 +187,7 @@ def phase_rows(
     # d psi / d phase = (1 - (v.d)^2) / v_z, its inverse by the row's own components.
     turn = (rows[:, 0] ** 2 + rows[:, 1] ** 2) / np.where(known, rays[:, 2], 1.0)
     in_world = rows @ view.view.cam_from_world.rotation
-    return PhaseRows(in_world, np.where(known, precision, 0.0), turn)
+    return PhaseRows(in_world, np.where(known, precision, 0.0), turn, turn * tilt)
 
 
 def surface_view(
@@ -196,15 +204,16 @@ def surface_view(
     phase_map : corrected for tilted polarizers where ``angle_model`` is that.
     silhouette : of the objects in this view.
     angle_model : whose rows the phase will give.
-    tilt_aware : as :func:`polmvs.normals.rows.gather_rows`.
+    tilt_aware : keep by how much tilted polarizers would have turned the phases, which OPA and PPA
+        leave out, so that the share of it that all views agree on can be taken back.
     """
-    samples = np.array(phase_map.samples, np.float32)
+    samples = np.zeros((*phase_map.samples.shape[:2], 4), np.float32)
+    samples[..., :3] = phase_map.samples
     if tilt_aware and angle_model is not AngleModel.TILTED:
         known = samples[..., 2] > 0
         diffuse = np.asarray(phase_map.diffuse)[known]
-        cos2, sin2, precision = samples[known].T
-        turn = tilt_turn(cos2, sin2, view_rays(phase_map.view)[known], diffuse=diffuse)
-        samples[known, 2] = 1 / (1 / precision + turn**2)
+        cos2, sin2 = samples[known, :2].T
+        samples[known, 3] = tilt_turn(cos2, sin2, view_rays(phase_map.view)[known], diffuse=diffuse)
     return SurfaceView(
         view=phase_map.view,
         samples=samples,

@@ -360,7 +360,7 @@ def test_overwrite_loses_nothing_to_bad_input(cli, demo_run: Path, demo_capture:
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--gamma", "2"), "--gamma is 2 but the finished stage 'images'"),
+        (("--gamma", "1.1"), "--gamma is 1.1 but the finished stage 'images'"),
         (("--intrinsics", "400,400,230,190"), "--intrinsics is 400,400,230,190 but"),
         (("--min-dolp", "0.2"), "--min-dolp is 0.2 but the finished stage 'maps'"),
         (("--stride-px", "4"), "--stride-px is 4 but the finished stage 'densify_opa'"),

@@ -128,7 +128,7 @@ def test_missing_folder(tmp_path: Path) -> None:
 def test_truncated_image(copy: Path) -> None:
     path = copy / "000_depth.png"
     path.write_bytes(path.read_bytes()[:-2000])
-    with pytest.raises(DataError, match=r"000_depth\.png: not a whole PNG"):
+    with pytest.raises(DataError, match=r"000_depth\.png: is truncated"):
         open_ground_truth(copy).depth("000.png")
 
 

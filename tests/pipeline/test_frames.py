@@ -132,7 +132,7 @@ def test_reference_from_a_config_file(
 def test_reference_of_too_few_cameras(take_poses, out: Path, tmp_path: Path, true_centers) -> None:
     two = {name: true_centers[name] for name in ("000.png", "001.png")}
     err = refused(take_poses("--reference", write_lines(tmp_path / "two.txt", two)))
-    assert "two.txt: knows 2 of the 10 reconstructed images by name, 3 are needed" in err
+    assert "two.txt: knows 2 of the 10 images by name, 3 are needed" in err
     assert not (out / "sparse").exists()
     assert stages_of(out) == ["images"]
 
@@ -225,7 +225,7 @@ def test_contradictory_scale_names_both(
 @pytest.mark.parametrize(
     ("ends", "message"),
     [
-        (("000.png", "999.png", 1), "999.png, which is neither a reconstructed image"),
+        (("000.png", "999.png", 1), "999.png, which is neither an image"),
         (("000.png", "123456789", 1), "123456789, which is neither a reconstructed image"),
         (("000.png", "000", 1), "are at one place"),
     ],

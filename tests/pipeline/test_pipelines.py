@@ -66,7 +66,7 @@ def test_benchmark_prints_stages_of_several_runs(
     assert load("benchmark").main([str(demo_run), str(demo_run / "run.json")]) == 0
     lines = capsys.readouterr().out.splitlines()
     names = [line.split("|")[1].strip() for line in lines[2:]]
-    assert names[:3] == ["images", "poses", "maps"]
+    assert names[:4] == ["images", "sfm", "poses", "maps"]
     assert names[-3:] == ["all stages", "all but poses", "wall clock"]
     assert lines[0].count("peak MB") == 2
 

@@ -25,6 +25,7 @@ from polmvs.pipeline.run_folder import (
     has_content,
     replacing,
 )
+from polmvs.pipeline.run_lock import locked
 from polmvs.pipeline.runner import load_record, prepare_output
 from polmvs.pipeline.stage_table import written_names
 from polmvs.pipeline.stages.images import ImagesResult
@@ -33,7 +34,11 @@ from polmvs.pipeline.stages.images import ImagesResult
 def finished_run(root: Path) -> RunFolder:
     """An output folder with one file of each kind."""
     run_folder = RunFolder(root)
-    for folder, name in (("images", "a.png"), ("sparse", "cameras.bin"), ("maps", "a.npy")):
+    for folder, name in (
+        ("images", "a.png"),
+        ("sparse", "cameras.bin"),
+        ("maps", "a.png.region.npy"),
+    ):
         (root / folder).mkdir(parents=True)
         (root / folder / name).write_bytes(b"x")
     for model in AngleModel:
@@ -75,7 +80,7 @@ def test_record_survives_writing_and_reading(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "{}", '{"stages": 3}', '{"schema_version": 2, "stages": []}', "\0"]
+    "text", ["", "[]", "{}", '{"stages": 3}', '{"schema_version": 3, "stages": []}', "\0"]
 )
 def test_damaged_record_is_one_clear_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
@@ -98,16 +103,16 @@ def test_run_of_the_version_before_is_refused_by_name_and_version(tmp_path: Path
     run_folder.run_file.write_text(json.dumps(content))
     message = (
         rf"{tmp_path}: holds a run of polmvs 0\.1\.0, whose run\.json has schema version 1; this "
-        r"is polmvs .*, which reads version 2 .*Give another OUT, or begin anew there: .*with "
+        r"is polmvs .*, which reads version 3 .*Give another OUT, or begin anew there: .*with "
         r"`run\.overwrite` delete that run"
     )
     with pytest.raises(DataError, match=message):
         prepare_output(run_folder, overwrite=False, resume=True)
     with pytest.raises(DataError, match=message):
         read_options(run_folder)
-    content["schema_version"] = 3
+    content["schema_version"] = 4
     run_folder.run_file.write_text(json.dumps(content))
-    with pytest.raises(DataError, match="has schema version 3"):
+    with pytest.raises(DataError, match="has schema version 4"):
         load_record(run_folder)
     assert prepare_output(run_folder, overwrite=True, resume=False) == Record()
     assert list(tmp_path.iterdir()) == []
@@ -150,7 +155,6 @@ def test_new_and_empty_folders_are_taken(tmp_path: Path) -> None:
         run_folder = RunFolder(root)
         assert not has_content(root)
         assert prepare_output(run_folder, overwrite=False, resume=False) == Record()
-        assert root.is_dir()
 
 
 def test_occupied_folder_is_refused(tmp_path: Path) -> None:
@@ -164,12 +168,18 @@ def test_overwrite_deletes_results_only(tmp_path: Path) -> None:
     run_folder = finished_run(tmp_path)
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "photos").mkdir()
-    (tmp_path / ".sfm.tmp").mkdir()
     assert prepare_output(run_folder, overwrite=True, resume=False) == Record()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.txt", "photos"]
 
 
-@pytest.mark.parametrize("foreign", ["images/mine.png", "sparse/notes.txt", "maps/sub/a.npy"])
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        *("images/mine.png", "sparse/notes.txt", "maps/sub/a.npy"),
+        *("maps/mine.npy", "maps/mine.png.region.npy", "views_ppa/mine.png.range.npy"),
+        *("sparse/mine.bin", "tracks/mine.npy"),
+    ],
+)
 def test_overwrite_deletes_nothing_where_foreign_files_lie(tmp_path: Path, foreign: str) -> None:
     run_folder = finished_run(tmp_path)
     path = tmp_path / foreign
@@ -197,18 +207,16 @@ def test_linked_folder_is_not_emptied(tmp_path: Path) -> None:
     (run_folder.sparse / "cameras.bin").unlink()
     run_folder.sparse.rmdir()
     run_folder.sparse.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(DataError, match="was not written by polmvs"):
-        prepare_output(run_folder, overwrite=True, resume=False)
+    for overwrite in (True, False):
+        with pytest.raises(DataError, match=r"out/sparse: is a link and was not written by polmvs"):
+            prepare_output(run_folder, overwrite=overwrite, resume=not overwrite)
     assert (tmp_path / "elsewhere" / "points3D.bin").exists()
 
 
-def test_resume_keeps_results_and_clears_what_is_half_done(tmp_path: Path) -> None:
+def test_resume_keeps_results(tmp_path: Path) -> None:
     run_folder = finished_run(tmp_path)
-    (tmp_path / ".maps.tmp").mkdir()
-    (tmp_path / ".ppa.12.tmp.ply").write_bytes(b"x")
     record = prepare_output(run_folder, overwrite=False, resume=True)
     assert record.stage("images") is not None
-    assert not list(tmp_path.glob(".*"))
     assert run_folder.cloud(AngleModel.PPA).exists()
 
 
@@ -220,9 +228,11 @@ def test_resume_without_a_run_is_an_error(tmp_path: Path) -> None:
 
 def test_output_that_is_a_file_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
+    with pytest.raises(DataError, match="OUT must be a folder"):
+        prepare_output(RunFolder(tmp_path / "out"), overwrite=True, resume=False)
     for root in (tmp_path / "out", tmp_path / "out" / "deeper"):
-        with pytest.raises(DataError, match=r"OUT must be a folder|cannot be (made|used)"):
-            prepare_output(RunFolder(root), overwrite=True, resume=False)
+        with pytest.raises(DataError, match="cannot be made"), locked(root):
+            pass
 
 
 @pytest.mark.parametrize("place", ["", "raw"])
@@ -237,6 +247,13 @@ def test_input_may_not_lie_where_results_go(tmp_path: Path) -> None:
             require_apart(RunFolder(tmp_path), capture=tmp_path / name, others=())
         with pytest.raises(OptionError, match="lies where OUT's results go"):
             require_apart(RunFolder(tmp_path), capture=tmp_path / "c", others=[tmp_path / name])
+    # By a link, too.
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.png").write_bytes(b"x")
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "a.png").symlink_to(tmp_path / "images" / "a.png")
+    with pytest.raises(OptionError, match="lies where OUT's results go"):
+        require_apart(RunFolder(tmp_path), capture=tmp_path / "c", others=())
     require_apart(RunFolder(tmp_path / "out"), capture=tmp_path, others=[tmp_path / "model"])
     require_apart(RunFolder(tmp_path), capture=tmp_path / "capture", others=())
 
@@ -251,8 +268,12 @@ def test_replacing_a_folder_is_whole_or_not_at_all(tmp_path: Path) -> None:
         raise KeyboardInterrupt
     assert (maps / "a.npy").read_bytes() == b"1"
     with replacing(maps) as folder:
-        (folder / "b.npy").write_bytes(b"3")
-    assert [path.name for path in tmp_path.rglob("*")] == ["maps", "b.npy"]
+        (folder / "a.npy").write_bytes(b"3")
+    assert [path.name for path in tmp_path.rglob("*")] == ["maps", "a.npy"]
+    (maps / "mine.npy").write_bytes(b"4")
+    with pytest.raises(DataError, match=r"mine\.npy: was not written"), replacing(maps) as folder:
+        (folder / "a.npy").write_bytes(b"5")
+    assert (maps / "a.npy").read_bytes() == b"3"
 
 
 def test_nothing_is_discarded_where_a_foreign_file_lies(tmp_path: Path) -> None:
@@ -263,7 +284,7 @@ def test_nothing_is_discarded_where_a_foreign_file_lies(tmp_path: Path) -> None:
         discard(paths)
     assert run_folder.metrics.exists()
     (tmp_path / "maps" / "mine.txt").unlink()
-    discard(paths)
+    discard(paths, {"a.png"})
     assert not any(path.exists() for path in paths)
 
 

@@ -97,12 +97,12 @@ def test_stale_stages_leave_other_models_alone() -> None:
     table = stage_table()
     assert names(with_dependent(["mesh_ppa"], table)) == ["mesh_ppa"]
     assert names(with_dependent(["densify_tilted"], table)) == [
-        *("densify_tilted", "mesh_tilted", "dense_tilted", "evaluation")
+        *("densify_tilted", "trust_tilted", "mesh_tilted", "dense_tilted", "evaluation")
     ]
     stale = names(with_dependent(["normals_ppa"], table))  # which the seeds are chosen by
     assert {"seeds", "sparse_cloud_opa", "densify_opa", "dense_ppa", "evaluation"} <= set(stale)
     assert not {"maps", "normals_opa", "normals_tilted"} & set(stale)
-    assert set(names(with_dependent(["poses"], table))) == set(names(table)) - {"images"}
+    assert set(names(with_dependent(["poses"], table))) == set(names(table)) - {"images", "sfm"}
 
 
 def test_evaluation_of_some_models_does_not_need_the_others() -> None:

@@ -8,6 +8,7 @@ from polmvs.config import Light
 from polmvs.geometry import RigidTransform
 from polmvs.polarization.phase_map import PhaseTolerances, build_phase_map
 from polmvs.polarization.region import Region
+from polmvs.polarization.stokes import Stokes
 from polmvs.scene import View
 
 WIDTH, HEIGHT = 48, 40
@@ -25,10 +26,11 @@ def build(s0, s1, s2, sigma, reliable, **tolerances):
     pose = RigidTransform(np.eye(3), np.zeros(3))
     view = View(name="a", camera=camera, cam_from_world=pose)
     nothing = np.zeros_like(reliable)
-    images = (np.asarray(image, np.float32) for image in (s0, s1, s2, sigma))
+    s0, s1, s2, sigma = (np.asarray(image, np.float32) for image in (s0, s1, s2, sigma))
+    stokes = Stokes(s0=s0, s1=s1, s2=s2, sigma=sigma, valid=reliable)
     region = Region(reliable, reliable, nothing)
     return build_phase_map(
-        view, *images, region, Light.DIFFUSE, tolerances=PhaseTolerances(**tolerances)
+        view, stokes, region, Light.DIFFUSE, tolerances=PhaseTolerances(**tolerances)
     )
 
 

@@ -9,6 +9,7 @@ from polmvs.camera import PinholeCamera
 from polmvs.config import AngleModel, Light
 from polmvs.polarization.phase_map import build_phase_map
 from polmvs.polarization.region import find_region
+from polmvs.polarization.stokes import Stokes
 from polmvs.surface.hollows import SurfaceFaces, find_hollows
 from polmvs.synthetic.captures import Cylinder, Group, Plane, render_view, ring_of_views
 
@@ -64,7 +65,8 @@ def vessel_maps(bore=RADIUS - WALL, offset=0.0, dark=0.02):
         s0, s1, s2 = 0.5 * (i0 + i45 + i90 + i135), i0 - i90, i45 - i135
         region = find_region(s0, s1, s2, s0 > 0.04, min_dolp=0.1, mask=seen.mask)
         sigma = np.full(s0.shape, 2e-3, np.float32)
-        made = build_phase_map(view, s0, s1, s2, sigma, region, Light.SPECULAR)
+        stokes = Stokes(s0=s0, s1=s1, s2=s2, sigma=sigma, valid=s0 > 0.04)
+        made = build_phase_map(view, stokes, region, Light.SPECULAR)
         known = made.samples.copy()
         known[inside] = 0
         maps.append(replace(made, samples=known))

@@ -29,10 +29,12 @@ from polmvs.parallel import Workers
 from polmvs.pipeline.monitor import OnProgress, no_progress
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, replace_folder, scratch
 from polmvs.pipeline.stages.maps import open_maps, posed_views
+from polmvs.pipeline.stages.poses import load_camera_modes
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind, Seeds
+from polmvs.surface.camera_sigma import CameraModes
 from polmvs.surface.consensus import hidden_by
 from polmvs.surface.contour import propagate
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
@@ -78,6 +80,7 @@ def densify(
     model: AngleModel,
     *,
     sparse: Path,
+    camera_modes: Path,
     images: Path,
     maps: Path,
     track_normals: Path,
@@ -101,6 +104,7 @@ def densify(
     ----------
     model : angle model.
     sparse, images : folders of the COLMAP model and of its images.
+    camera_modes : file of what the estimated camera leaves open.
     maps : folder of the phase maps for ``model``.
     track_normals, seeds : files of the model's normals of the sparse points, and of the seeds.
     cloud : PLY to write.
@@ -149,7 +153,11 @@ def densify(
                 workers=workers,
                 on_progress=on_progress,
             )
-        surface = surface_cloud(fused)
+        modes = CameraModes(
+            read_model(sparse).tracks.points_in_world, load_camera_modes(camera_modes)
+        )
+        modes.widen_stored([phase_map.view for phase_map in phase_maps], new_views)
+        surface = surface_cloud(modes.widened(fused))
         surface.scalars["kind"][: len(presumed)][presumed] = PointKind.PRESUMED
         around = _surroundings_cloud(
             sparse, fused, phase_maps, fusion, given, folder / "around", workers=workers
@@ -207,10 +215,10 @@ def _global_surface(
     spacing = fusion.voxel if fusion.voxel is not None else fusion.voxel_px * surface.footprint
     found = surface_points(surface, maps, spacing or FINEST_SPACING_PX * surface.footprint)
     write_mesh(views / SURFACE_MESH, supported_mesh(surface))
-    for number, mesh in enumerate(levels):
+    for name, mesh in zip(SURFACE_LEVELS, levels, strict=False):  # there are fewer
         faces = mesh.faces.astype(np.int32)
         whole = Mesh(vertices=mesh.vertices, normals=mesh.vertex_normals, triangles=faces)
-        write_mesh(views / SURFACE_LEVELS.format(number=number), whole)
+        write_mesh(views / name, whole)
     return found
 
 
@@ -354,10 +362,14 @@ def _surroundings_cloud(
         return surface_cloud(kept_cloud(given, surface.points), PointKind.COLMAP)
     tracks = read_model(sparse).tracks
     if options.surroundings is Surroundings.STEREO:
-        return surface_cloud(
-            stereo_surroundings(tracks, maps, folder, workers=workers), PointKind.STEREO
+        found = stereo_surroundings(tracks, maps, folder, workers=workers)
+        if len(found.points):
+            return surface_cloud(found, PointKind.STEREO)
+        logger.warning(
+            "`fusion.surroundings` stereo finds no points: too few views lie near enough to each "
+            "other to be matched and confirmed. The sparse points are kept; record more views."
         )
-    if options.surroundings is Surroundings.SPARSE:
+    if options.surroundings is not Surroundings.NONE:
         return _sparse_cloud(sparse_surroundings(tracks, maps))
     return surface_cloud(surface[np.zeros(len(surface.points), np.bool_)])
 

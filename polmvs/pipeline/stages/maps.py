@@ -6,6 +6,7 @@ sensor's polarizers and lie in a folder of their own.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +16,9 @@ from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, Light, RegionOptions
 from polmvs.errors import DataError
 from polmvs.io.images import read_mask
+from polmvs.normals.axes_check import check_axes
 from polmvs.normals.light import find_diffuse
+from polmvs.normals.light_check import check_light
 from polmvs.parallel import Workers
 from polmvs.pipeline.monitor import OnProgress, no_progress
 from polmvs.pipeline.run_folder import replacing
@@ -31,6 +34,8 @@ from polmvs.polarization.phase_map import (
 )
 from polmvs.polarization.region import find_region
 from polmvs.scene import Tracks, View
+
+logger = logging.getLogger(__name__)
 
 MIN_VIEWS = 3  # of normals: with two there is nothing left to check them by
 
@@ -103,8 +108,10 @@ def build_maps(
             on_progress(1)
         maps = [open_phase_map(view, folder) for view in views]
         num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
-        if options.light is None and len(tracks.point3D_ids):
-            num_diffuse = _turn_diffuse(tracks, maps, folder)
+        if len(tracks.point3D_ids):
+            _warn_of_settings(capture, options.light, tracks, maps)
+            if options.light is None:
+                num_diffuse = _turn_diffuse(tracks, maps, folder)
     return MapsResult(num_region_px=num_inside, num_diffuse_px=num_diffuse)
 
 
@@ -193,8 +200,19 @@ def _build_map(
     s0, s1, s2 = stokes.s0, stokes.s1, stokes.s2
     region = find_region(s0, s1, s2, stokes.valid, min_dolp=options.min_dolp, mask=mask)
     light = options.light or Light.SPECULAR
-    store_phase_map(build_phase_map(view, s0, s1, s2, stokes.sigma, region, light), folder)
+    store_phase_map(build_phase_map(view, stokes, region, light), folder)
     return int(region.inside.sum())
+
+
+def _warn_of_settings(
+    capture: Capture, light: Light | None, tracks: Tracks, maps: Sequence[PhaseMap]
+) -> None:
+    """Say which setting the planes of incidence of all views contradict."""
+    axes = check_axes(tracks, maps)
+    if axes.change is not None:
+        logger.warning("%s.", axes.message(capture.options, capture.files.kind))
+    elif light is not None and (check := check_light(tracks, maps, light)).contradicted:
+        logger.warning("%s.", check.message)
 
 
 def _turn_diffuse(tracks: Tracks, maps: Sequence[PhaseMap], folder: Path) -> int:

@@ -82,7 +82,7 @@ def load_track_normals(source: Path) -> NormalEstimate:
     DataError
         The file is missing or damaged.
     """
-    stored: NDArray[np.void] = np.array(map_array(source))
+    stored: NDArray[np.void] = np.array(map_array(source, NORMALS_TYPE))
     return NormalEstimate(
         normals=np.ascontiguousarray(stored["normal"]),
         valid=stored["valid"].copy(),

@@ -1,29 +1,21 @@
-"""Stage ``poses``: the COLMAP model of the run, by SfM or from a given model, in its frame."""
+"""Stage ``poses``: the COLMAP model of the run, in the metric frame that is asked for."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from polmvs.colmap.models import match_model_to_capture, read_model, write_model
-from polmvs.colmap.sfm import run_sfm
-from polmvs.config import ReferenceOptions, SfmOptions
-from polmvs.io.clouds import preload
+from polmvs.colmap.models import read_model, write_model
+from polmvs.config import ReferenceOptions
+from polmvs.io.arrays import map_array, save_array
 from polmvs.io.images import read_gray
-from polmvs.pipeline.monitor import OnProgress, no_progress
-from polmvs.pipeline.run_folder import replace_folder, scratch
-from polmvs.pipeline.stages.images import image_names
-from polmvs.polarization.capture import Capture
-from polmvs.poses.metric_frame import metric_frame, transform_model
-from polmvs.scene import SparseModel, short_list
-
-logger = logging.getLogger(__name__)
-
-NUM_SFM_STEPS = 4  # that run_sfm reports
+from polmvs.pipeline.run_folder import CAMERA_MODES, replace_folder, scratch
+from polmvs.poses.metric_frame import Frame, metric_frame, transform_model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,93 +72,62 @@ class PosesResult:
         return f"{self.num_views} of {total} views, {self.num_tracks:,} sparse points"
 
 
-def find_poses(
+def place_model(
+    source: Path,
     images: Path,
-    names: Sequence[str],
+    names: Iterable[str],
     target: Path,
-    options: SfmOptions | None = None,
+    camera: Path,
     reference: ReferenceOptions | None = None,
-    *,
-    on_progress: OnProgress = no_progress,
 ) -> PosesResult:
-    """Run SfM on images, and bring its model into the metric frame that is asked for.
+    """Bring the model of SfM, or a given one, into the metric frame that is asked for.
 
     Parameters
     ----------
-    images : folder of 8-bit intensity images.
+    source : folder of the model in its own frame, with ``CAMERA_MODES``.
+    images : folder of the intensity images, in which markers are looked for.
     names : of the images in it.
     target : folder of the COLMAP model, whole or not at all.
-    options, reference : defaults where None.
+    camera : file for the camera's modes in the same frame.
+    reference : defaults where None.
 
     Raises
     ------
     DataError, OptionError
-        No model comes out, or the options do not fit the images.
+        A source of the frame is unusable; the model of SfM stays.
     """
-
-    def on_step(name: str) -> None:
-        if name == "mapping":  # on one core: the other can load what the next stages need
-            preload()
-        on_progress(1)
-
-    with scratch(target) as folder:
-        model = run_sfm(
-            images, names, folder / "work", folder / "sparse", options or SfmOptions(), on_step
-        )
-        frame = _take_frame(model, images, reference, folder / "sparse")
-        replace_folder(folder / "sparse", target)
-    return _result(model, images, frame)
-
-
-def fit_model(capture: Capture, source: Path) -> SparseModel:
-    """An existing COLMAP model, fitted to the capture's image names and size.
-
-    Raises
-    ------
-    DataError
-        It is missing, damaged or of other images.
-    """
-    names = list(image_names(capture))
-    return match_model_to_capture(
-        read_model(source), names, capture.width, capture.height, source=source
-    )
-
-
-def take_poses(
-    model: SparseModel,
-    source: Path,
-    images: Path,
-    target: Path,
-    reference: ReferenceOptions | None = None,
-) -> PosesResult:
-    """Write an existing model that was fitted to the capture; the original is not touched.
-
-    Parameters
-    ----------
-    model : from :func:`fit_model`.
-    source : where it was read, for messages.
-    images : folder of the intensity images, in which markers are looked for.
-    target : folder of the COLMAP model, whole or not at all.
-    reference : defaults where None.
-    """
-    with scratch(target) as folder:
-        write_model(model, folder / "sparse")
-        frame = _take_frame(model, images, reference, folder / "sparse")
-        replace_folder(folder / "sparse", target)
-    return _result(model, source, frame)
-
-
-def _take_frame(
-    model: SparseModel, images: Path, options: ReferenceOptions | None, target: Path
-) -> MetricFrameResult | None:
-    """Rewrite a model in the metric frame that the options give; without one it stays."""
+    model = read_model(source)
+    modes = np.asarray(map_array(source / CAMERA_MODES), np.float64)
     frame = metric_frame(
-        model, options or ReferenceOptions(), lambda name: read_gray(images / name)
+        model, reference or ReferenceOptions(), lambda name: read_gray(images / name)
     )
-    if frame is None:
-        return None
+    if frame is not None:
+        similarity = frame.metric_from_world
+        model = transform_model(model, similarity)
+        modes = similarity.scale * modes @ np.asarray(similarity.rotation).T
+    with scratch(target) as folder:
+        if frame is None:  # bit for bit what SfM wrote
+            shutil.copytree(source, folder / "sparse", ignore=shutil.ignore_patterns(CAMERA_MODES))
+        else:
+            write_model(model, folder / "sparse")
+        replace_folder(folder / "sparse", target)
+    camera.parent.mkdir(exist_ok=True)
+    save_array(camera, modes)
+    return PosesResult(
+        num_views=len(model.views),
+        unregistered=tuple(sorted(set(names) - {view.name for view in model.views})),
+        num_tracks=len(model.tracks.point3D_ids),
+        frame=None if frame is None else _frame_result(frame),
+    )
+
+
+def load_camera_modes(source: Path) -> NDArray[np.float64]:
+    """The camera's modes (K, T, 3) at the sparse points, as :func:`place_model` stored them."""
+    return np.asarray(map_array(source), np.float64)
+
+
+def _frame_result(frame: Frame) -> MetricFrameResult:
     similarity = frame.metric_from_world
-    write_model(transform_model(model, similarity), target)
     rows = np.asarray(similarity.rotation, np.float64).tolist()
     x, y, z = map(float, similarity.translation)
     return MetricFrameResult(
@@ -179,22 +140,4 @@ def _take_frame(
         checked_by=dict(frame.checked_by),
         rotation=tuple((a, b, c) for a, b, c in rows),
         translation=(x, y, z),
-    )
-
-
-def _result(model: SparseModel, source: Path, frame: MetricFrameResult | None) -> PosesResult:
-    num_views, num_missing = len(model.views), len(model.unregistered)
-    if num_missing >= num_views:
-        logger.warning(
-            "%s: only %d of %d views have a pose; without one are %s.",
-            source,
-            num_views,
-            num_views + num_missing,
-            short_list(model.unregistered),
-        )
-    return PosesResult(
-        num_views=num_views,
-        unregistered=model.unregistered,
-        num_tracks=len(model.tracks.point3D_ids),
-        frame=frame,
     )

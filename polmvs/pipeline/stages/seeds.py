@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, NormalOptions
+from polmvs.errors import DataError
 from polmvs.io.arrays import map_array, save_array
 from polmvs.normals.tracks import select_seeds
 from polmvs.parallel import Workers
@@ -128,12 +129,14 @@ def load_seeds(model: AngleModel, source: Path, track_normals: Path) -> Seeds:
     DataError
         A file is missing or damaged.
     """
-    stored: NDArray[np.void] = np.array(map_array(source))
+    stored: NDArray[np.void] = np.array(map_array(source, SEEDS_TYPE))
     normals = np.array(stored["normal"])
     on_track = stored["track"] != NO_TRACK
+    solved = load_track_normals(track_normals).normals
+    _require_tracks(source, stored["track"], len(solved))
     if model is not AngleModel.PPA:
         normals[~on_track] = np.nan  # each model solves its own
-    normals[on_track] = load_track_normals(track_normals).normals[stored["track"][on_track]]
+    normals[on_track] = solved[stored["track"][on_track]]
     return Seeds(np.array(stored["point"]), normals, np.array(stored["sigma"]))
 
 
@@ -145,7 +148,8 @@ def seed_tracks(source: Path, num_tracks: int) -> NDArray[np.bool_]:
     DataError
         The file is missing or damaged.
     """
-    track = np.asarray(map_array(source)["track"])
+    track = np.asarray(map_array(source, SEEDS_TYPE)["track"])
+    _require_tracks(source, track, num_tracks)
     is_seed = np.zeros(num_tracks, np.bool_)
     is_seed[track[track != NO_TRACK]] = True
     return is_seed
@@ -168,6 +172,12 @@ def _warn_of_doubts(parts: Sequence[PartReport]) -> None:
     )
     for part in others:
         logger.info("%s: so does one of %d px: %s.", part.view, part.num_px, part.doubt)
+
+
+def _require_tracks(source: Path, track: NDArray[np.int64], num_tracks: int) -> None:
+    """Refuse seeds of other sparse points."""
+    if len(track) and not (track.min() >= NO_TRACK and track.max() < num_tracks):
+        raise DataError(source, "is not of these sparse points; run again with `run.overwrite`.")
 
 
 def _rows(seeds: Seeds, track: NDArray[np.int64]) -> NDArray[np.void]:

@@ -1,0 +1,89 @@
+"""Why SfM found no model, by its database: no texture, no overlap, or a camera that is none."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from polmvs.config import SfmOptions
+from polmvs.scene import short_list
+
+
+@dataclass(frozen=True, kw_only=True)
+class FailureTolerances:
+    """What SfM needs to begin.
+
+    Attributes
+    ----------
+    min_features : of an image. Guess; images that make a model have thousands.
+    min_inliers : matches of a pair that one geometry explains; what COLMAP's mapper asks of the
+        pair that it begins with (100) and of an image that it adds (30), the latter.
+    min_start : the former.
+    """
+
+    min_features: int = 100
+    min_inliers: int = 30
+    min_start: int = 100
+
+
+def why_no_model(
+    database: Path,
+    options: SfmOptions,
+    *,
+    tolerances: FailureTolerances = FailureTolerances(),
+) -> str:
+    """One or two sentences: what is missing, and which setting or change of the capture helps.
+
+    Parameters
+    ----------
+    database : COLMAP's, with features and matches.
+    options : of the run that failed.
+    """
+    t = tolerances
+    with closing(pycolmap.Database.open(database)) as content:
+        images = {image.image_id: str(image.name) for image in content.read_all_images()}
+        features = {i: int(content.num_keypoints_for_image(i)) for i in images}
+        pairs, inliers = content.read_two_view_geometry_num_inliers()
+        ids = [pycolmap.pair_id_to_image_pair(pair) for pair in pairs]
+    if np.median(list(features.values())) < t.min_features:
+        poor = [images[i] for i, num in features.items() if num < t.min_features]
+        return (
+            f"the images show too little texture: under {t.min_features} features in "
+            f"{len(poor)} of {len(images)} ({short_list(poor)}). SfM lives on the surroundings of "
+            "the part: put a printed pattern about it, expose more, or give poses with "
+            "`sfm.sparse`."
+        )
+    best = dict.fromkeys(images, 0)
+    for (first, second), num in zip(ids, inliers, strict=True):
+        best[first], best[second] = max(best[first], int(num)), max(best[second], int(num))
+    if max(best.values(), default=0) < t.min_start:
+        lonely = [images[i] for i, num in best.items() if num < t.min_inliers]
+        return (
+            f"the images overlap too little: the two most alike share {max(best.values())} "
+            f"features, and {len(lonely)} of {len(images)} share under {t.min_inliers} with any "
+            "other. Record views in between, 20 degrees apart at most, of surroundings that stay "
+            "in place, or give poses with `sfm.sparse`."
+        )
+    return (
+        f"the images have texture and overlap (up to {max(best.values())} shared features), but "
+        f"no camera explains them. {_camera_remedy(options)}"
+    )
+
+
+def _camera_remedy(options: SfmOptions) -> str:
+    if options.intrinsics is not None or options.camera is not None:
+        name = "intrinsics" if options.intrinsics is not None else "camera"
+        return f"Check `sfm.{name}`, or leave it out, so that the camera is estimated."
+    if options.camera_model != SfmOptions().camera_model:
+        return (
+            f"Check `sfm.camera_model` {options.camera_model}; a normal lens has "
+            f"{SfmOptions().camera_model}. Or give `sfm.intrinsics`."
+        )
+    return (
+        "Give `sfm.intrinsics`, or for a very wide lens `sfm.camera_model` OPENCV_FISHEYE. Views "
+        "that differ by a turn of the camera alone have no depth: move it."
+    )

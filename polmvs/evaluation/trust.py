@@ -1,0 +1,237 @@
+"""What a reconstruction says about itself: a few figures, each with the range that is normal.
+
+No truth is needed. What can be derived is; the rest was measured on reconstructions that are right:
+see :class:`NormalRanges`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import depth_buffer, sample_image
+from polmvs.config import AngleModel, PropagationOptions
+from polmvs.evaluation.consistency import (
+    CELL_PX,
+    MAX_RELATIVE_EXCESS,
+    measure_consistency,
+    phase_residuals_deg,
+)
+from polmvs.io.clouds import Cloud
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import PointKind
+
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+MAX_POINTS = 20_000  # of a cloud, evenly spread, that single views are asked about; costs time only
+OUTLINE_MARGIN_PX = 3  # a region's border is that uncertain: marks and smoothing; a guess
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormalRanges:
+    """Where the figures of right reconstructions lie, as (least, most).
+
+    Attributes
+    ----------
+    residual_sigmas : derived: 0.67 where the stated deviations hold all that errs. Those of a phase
+        map hold more than noise; what an angle model leaves out comes on top. Right ones had 0.05
+        to 0.9, OPA's 6.
+    residual_deg : measured, 0.04 to 1.1; OPA's 7. Noise adds to it, so that the end is a guess.
+    agreement : measured, 0.95 to 1; 0.70 of the views one by one of ``step``, whose faces they
+        bridge (24 % within a millimetre).
+    inside : measured, 0.95 to 1; marks in a region and its uncertain border cost the rest.
+    determined : measured, 0.79 to 1 where every part has marks; parts without any lower it rightly,
+        so that the end is a guess.
+    sigma_share : measured, 0.0003 to 0.0019. The end is derived: twice the bending that the
+        camera's model is allowed (`propagation.bending`).
+
+    Measured on right reconstructions: five rendered captures (``board``, ``dome``, ``demo``,
+    ``mug``, ``step``) by one or both methods, ``board`` with six views, and analytic boards and
+    balls of 6 and 12 views, sensors that obey PPA and tilted ones, noise of 0.2 and 1 % of full
+    scale.
+    """
+
+    residual_sigmas: tuple[float, float] = (0.0, 2.5)
+    residual_deg: tuple[float, float] = (0.0, 3.0)
+    agreement: tuple[float, float] = (0.8, 1.0)
+    inside: tuple[float, float] = (0.9, 1.0)
+    determined: tuple[float, float] = (0.7, 1.0)
+    sigma_share: tuple[float, float] = (0.0, 2 * PropagationOptions.bending)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrustFigure:
+    """One figure and what is normal.
+
+    Attributes
+    ----------
+    name : what it is, with its unit.
+    value : None where there is nothing to tell it from.
+    least, most : normal range.
+    remedy : what to check where it lies outside.
+    """
+
+    name: str
+    value: float | None
+    least: float
+    most: float
+    remedy: str
+
+    @property
+    def is_normal(self) -> bool:
+        """Whether it is known and within its range."""
+        return self.value is not None and self.least <= self.value <= self.most
+
+    def __str__(self) -> str:
+        value = "unknown" if self.value is None else f"{self.value:.3g}"
+        text = f"{self.name}: {value} (normal {self.least:g} to {self.most:g})"
+        return text if self.is_normal else text + f"; check {self.remedy}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trust:
+    """How far a cloud of one angle model is to be trusted.
+
+    Attributes
+    ----------
+    residual_deg : median angle between measured phases and those that the cloud's normals predict.
+    residual_sigmas : the same in the deviations that the phase maps state.
+    agreement : share of the views that see a point that agree with it in place and normal.
+    inside : share of the points that views see, nothing before them, that lie in the views'
+        polarised regions: what lies outside contradicts their silhouettes.
+    determined : share of the regions, over all views, that show a point.
+    sigma_share : median stated deviation of a place along its normal, share of its distance from
+        the nearest camera.
+    """
+
+    residual_deg: float
+    residual_sigmas: float
+    agreement: float
+    inside: float
+    determined: float
+    sigma_share: float
+
+    def __str__(self) -> str:
+        figures = self.figures()
+        normal = sum(figure.is_normal for figure in figures)
+        return f"{normal} of {len(figures)} figures are normal"
+
+    def figures(self, ranges: NormalRanges = NormalRanges()) -> tuple[TrustFigure, ...]:
+        """The figures with their normal ranges, for people."""
+        light = "`region.light`, `capture.pattern`, `capture.gamma`"
+        rows = (
+            ("phase residual, median, deg", self.residual_deg, ranges.residual_deg, 1.0, light),
+            (
+                "phase residual, median, stated deviations",
+                self.residual_sigmas,
+                ranges.residual_sigmas,
+                1.0,
+                light,
+            ),
+            (
+                "views that agree with a point they see, %",
+                self.agreement,
+                ranges.agreement,
+                100.0,
+                "poses: `sfm.intrinsics`, `sfm.sparse`",
+            ),
+            (
+                "points within the silhouettes of the views, %",
+                self.inside,
+                ranges.inside,
+                100.0,
+                "`region.mask`, poses",
+            ),
+            (
+                "part of the polarised regions determined, %",
+                self.determined,
+                ranges.determined,
+                100.0,
+                "marks on the part; more views",
+            ),
+            (
+                "stated deviation of the places, median, % of the distance",
+                self.sigma_share,
+                ranges.sigma_share,
+                100.0,
+                "`sfm.intrinsics`; more views",
+            ),
+        )
+        return tuple(
+            TrustFigure(
+                name=name,
+                value=scale * value if np.isfinite(value) else None,
+                least=scale * low,
+                most=scale * high,
+                remedy=remedy,
+            )
+            for name, value, (low, high), scale, remedy in rows
+        )
+
+    def doubts(self) -> tuple[str, ...]:
+        """A line for each figure that is not normal."""
+        return tuple(str(figure) for figure in self.figures() if not figure.is_normal)
+
+
+def measure_trust(
+    angle_model: AngleModel, cloud: Cloud, tracks: Cloud, maps: Sequence[PhaseMap]
+) -> Trust:
+    """Measure a cloud against the capture that it was made from.
+
+    Parameters
+    ----------
+    angle_model : of the cloud.
+    cloud : dense, with ``kind``, ``num_views`` and ``sigma``.
+    tracks : sparse points, as :func:`polmvs.evaluation.consistency.measure_consistency` takes them.
+    maps : of all views, for the model.
+    """
+    consistency = measure_consistency(angle_model, cloud, tracks, maps)
+    surface = cloud.only(cloud.scalars["kind"] == PointKind.SURFACE)
+    nothing = np.zeros((0, 3))
+    points, normals = surface.points, nothing if surface.normals is None else surface.normals
+    step = -(-len(points) // MAX_POINTS) or 1
+    chosen = np.zeros(len(points), np.bool_)
+    chosen[::step] = True
+    in_sigmas, num_seen, num_inside = [np.zeros(0)], 0, 0
+    nearest = np.full(len(points), np.inf)
+    for phase_map in maps if len(points) else ():
+        nearest = np.minimum(nearest, phase_map.view.ranges(points))
+        seen = _in_sight(points, normals, phase_map) & chosen
+        xy = phase_map.view.project(points[seen])
+        size = 2 * OUTLINE_MARGIN_PX + 1
+        region = cv2.dilate(phase_map.region.inside.astype(np.float32), np.ones((size, size)))
+        inside = sample_image(np.asarray(region, np.float32), xy, nearest=True) > 0
+        num_seen, num_inside = num_seen + len(inside), num_inside + int(inside.sum())
+        residuals = phase_residuals_deg(angle_model, points[seen], normals[seen], phase_map)
+        precision = sample_image(np.ascontiguousarray(phase_map.samples[..., 2]), xy)
+        known = (precision > 0) & np.isfinite(residuals)
+        in_sigmas.append(np.radians(residuals[known]) * np.sqrt(precision[known]))
+    ratios = np.abs(np.concatenate(in_sigmas))
+    sigma = surface.scalars.get("sigma", np.full(len(points), np.nan)) / nearest
+    return Trust(
+        residual_deg=consistency.phase_residual.median_deg,
+        residual_sigmas=float(np.median(ratios)) if len(ratios) else float("nan"),
+        agreement=min(consistency.agreement, 1.0),
+        inside=num_inside / num_seen if num_seen else float("nan"),
+        determined=consistency.coverage,
+        sigma_share=float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else float("nan"),
+    )
+
+
+def _in_sight(points: Floats, normals: Floats, phase_map: PhaseMap) -> Mask:
+    """Points that face a view, lie in its image, and have none clearly nearer in their cell."""
+    view, (height, width) = phase_map.view, phase_map.region.inside.shape
+    xy, distance = view.project(points), view.ranges(points)
+    with np.errstate(invalid="ignore"):
+        within = ((xy > 0) & (xy < [width, height])).all(axis=-1)
+    facing = view.faces(points, normals) & within
+    seen = np.zeros(len(points), np.bool_)
+    if facing.any():
+        _, nearest = depth_buffer(xy[facing], distance[facing], width, height, cell_px=CELL_PX)
+        seen[facing] = distance[facing] <= (1 + MAX_RELATIVE_EXCESS) * nearest
+    return seen

@@ -1,0 +1,43 @@
+"""Names of unfinished files and folders: each carries a token that only this process knows.
+
+Whoever must clean up after a process that was killed removes what has its token in the name, and
+nothing else: no file of a user's can look like it by chance.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import secrets
+import shutil
+from pathlib import Path
+
+TOKEN = secrets.token_hex(8)
+PREFIX = ".polmvs-"
+SHOWN = (
+    24  # characters of the final name that a temporary one ends in, so that it never is too long
+)
+
+_numbers = itertools.count()
+
+
+def temporary_path(target: Path) -> Path:
+    """A new name beside ``target``, of the same suffix, for what will take its place."""
+    number = f"{os.getpid()}-{next(_numbers)}"
+    return target.with_name(f"{PREFIX}{TOKEN}-{number}-{target.name[-SHOWN:]}")
+
+
+def is_temporary(path: Path, token: str) -> bool:
+    """Whether a name is one that the process with this token gave."""
+    return path.name.startswith(f"{PREFIX}{token}-")
+
+
+def remove_temporary(path: Path) -> None:
+    """Remove a file or folder that may not exist, without hiding the error that led here."""
+    try:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+    except OSError:
+        return

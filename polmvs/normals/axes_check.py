@@ -1,0 +1,183 @@
+"""Whether angles of polarization are counted as the planes of incidence of many views say.
+
+A wrong order of the polarizers that still pairs perpendicular ones, angles counted clockwise, or
+from another direction, mirrors all phases or turns them by 45 degrees: the sums of the samples
+cannot tell, and one view cannot. Many can: under wrong angles their planes of incidence do not meet
+in one normal. (A turn by 90 degrees is that of the other kind of light.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.config import AngleModel, CaptureKind, CaptureOptions, NormalOptions
+from polmvs.normals.estimator import NormalEstimate
+from polmvs.normals.tracks import inside_shares, normals_from_windows, window_map
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import Tracks, some_tracks
+
+Array = NDArray[np.float64]
+# How (cos 2a, sin 2a) become those of the right angles: rows of the signs and places of both.
+Change = tuple[tuple[int, int], tuple[int, int]]
+
+GIVEN: Change = ((1, 0), (0, 1))
+MIRRORED: Change = ((1, 0), (0, -1))
+TURNED: Change = ((0, 1), (-1, 0))  # by 45 degrees
+TURNED_MIRRORED: Change = ((0, 1), (1, 0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxesTolerances:
+    """When other angles are said to be the right ones.
+
+    Attributes
+    ----------
+    min_rows : of a point that votes. Derived: three rows fix a normal and leave one to tell.
+    min_votes : points. Guess.
+    min_share : of them, that speak for the other angles. Guess.
+    min_z : mean vote over its standard error. Guess: points on one surface see the same light, so
+        that their votes are worth fewer than their number.
+    min_gain : mean vote, log-likelihood of a row. Guess: noise alone gives a few hundredths.
+    max_row_cost : of one row. Guess, as of the choice between specular and diffuse light.
+    """
+
+    min_rows: int = 4
+    min_votes: int = 8
+    min_share: float = 0.8
+    min_z: float = 6.0
+    min_gain: float = 0.2
+    max_row_cost: float = 4.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxesCheck:
+    """Which angles the planes of incidence show.
+
+    Attributes
+    ----------
+    num_votes : sparse points that have a say.
+    share : of them that speak for the best of the other ways to count.
+    change : that way; None where the given one is right or nothing tells.
+    """
+
+    num_votes: int
+    share: float
+    change: Change | None
+
+    def message(self, options: CaptureOptions, kind: CaptureKind) -> str:
+        """One line for the user.
+
+        Parameters
+        ----------
+        options : that the capture was opened with.
+        kind : of its files.
+        """
+        begin = (
+            f"under other angles the planes of incidence of all views meet better for "
+            f"{100 * self.share:.0f} % of the {self.num_votes} sparse points on the part"
+        )
+        assert self.change is not None
+        if kind is CaptureKind.MOSAIC:
+            given = ",".join(map(str, options.pattern))
+            likely = ",".join(map(str, changed_pattern(options.pattern, self.change)))
+            return (
+                f"`capture.pattern` {given} does not fit: {begin}. Give `capture.pattern` {likely}"
+            )
+        mirrored = self.change in (MIRRORED, TURNED_MIRRORED)
+        name = "clockwise" if mirrored else "zero_deg"
+        hint = "the other way round" if mirrored else "45 degrees more or less"
+        return f"`capture.{name}` does not fit: {begin}. Give `capture.{name}` {hint}"
+
+
+def check_axes(
+    tracks: Tracks, maps: Sequence[PhaseMap], *, tolerances: AxesTolerances = AxesTolerances()
+) -> AxesCheck:
+    """Have the sparse points vote on the angles of polarization.
+
+    Parameters
+    ----------
+    tracks : sparse points; ``obs_view`` counts in ``maps``.
+    maps : phase maps built under either kind of light, one for all.
+    """
+    t, options = tolerances, NormalOptions()
+    on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
+    windows = [window_map(phase_map, options.window_px) for phase_map in maps]
+
+    def cost_of(change: Change) -> Array:
+        """Of each point (N,): mean cost of a row, under the better kind of light."""
+        costs = [
+            _row_cost(
+                normals_from_windows(
+                    AngleModel.PPA,
+                    on_parts,
+                    [_changed(window, change, sign) for window in windows],
+                    options.estimator,
+                ),
+                t,
+            )
+            for sign in (1, -1)
+        ]
+        return np.minimum(*costs)
+
+    given = cost_of(GIVEN)
+    best = AxesCheck(num_votes=int(np.isfinite(given).sum()), share=0.0, change=None)
+    if best.num_votes < t.min_votes:
+        return best
+    most = t.min_gain
+    for change in (MIRRORED, TURNED, TURNED_MIRRORED):
+        votes = given - cost_of(change)
+        votes = votes[np.isfinite(votes)]
+        if len(votes) < t.min_votes:
+            continue
+        mean, error = float(votes.mean()), float(votes.std(ddof=1)) / np.sqrt(len(votes))
+        share = float(np.mean(votes > 0))
+        if mean > most and mean > t.min_z * error and share > t.min_share:
+            best, most = AxesCheck(num_votes=len(votes), share=share, change=change), mean
+    return best
+
+
+def changed_pattern(
+    pattern: tuple[int, int, int, int], change: Change
+) -> tuple[int, int, int, int]:
+    """The order of polarizers under which the Stokes parameters are the changed ones.
+
+    Of the two that differ by a quarter turn of all angles, which light cannot tell apart, the
+    sensors' usual one, if it is one of them, else the one that keeps more of the given places.
+    """
+    (a, b), (c, d) = change
+    # The place of the polarizer at angle x measures s0 + cos 2x s1 + sin 2x s2 in the given Stokes
+    # parameters, and the same in the right ones.
+    found = []
+    for sign in (1, -1):
+        places = []
+        for angle in pattern:
+            x, y = round(np.cos(2 * np.radians(angle))), round(np.sin(2 * np.radians(angle)))
+            new = sign * (a * x + b * y), sign * (c * x + d * y)
+            places.append(int(np.degrees(np.arctan2(new[1], new[0])) / 2 % 180))
+        found.append((places[0], places[1], places[2], places[3]))
+    usual = CaptureOptions().pattern
+    if usual in found:
+        return usual
+    return max(found, key=lambda p: sum(x == y for x, y in zip(p, pattern, strict=True)))
+
+
+def _changed(window: PhaseMap, change: Change, sign: int) -> PhaseMap:
+    matrix = np.array(change, np.float32) * np.float32(sign)
+    axial = window.samples[..., :2] @ matrix.T
+    return replace(
+        window, samples=np.dstack([axial, window.samples[..., 2]]).astype(np.float32), folder=None
+    )
+
+
+def _row_cost(estimate: NormalEstimate, t: AxesTolerances) -> Array:
+    """Mean Cauchy cost of a point's rows (N,); NaN where too few are given."""
+    weights = estimate.row_weights
+    given = weights > 0
+    costs = np.minimum(-np.log(np.maximum(weights, 1e-6)), t.max_row_cost)
+    count = given.sum(axis=0)
+    mean = np.where(given, costs, 0).sum(axis=0) / np.maximum(count, 1)
+    return np.where(count >= t.min_rows, mean, np.nan)

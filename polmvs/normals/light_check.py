@@ -1,0 +1,76 @@
+"""Whether the light that a user states is the one that the planes of incidence show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from polmvs.config import AngleModel, Light, NormalOptions
+from polmvs.normals.light import specular_votes
+from polmvs.normals.tracks import inside_shares, normals_from_windows, window_map
+from polmvs.polarization.phase_map import PhaseMap, turned
+from polmvs.scene import Tracks, some_tracks
+
+MIN_VOTES = 8  # sparse points; a guess
+# Mean vote over its standard error: by chance once in 30,000 captures. Points near each other see
+# the same light, so that their votes are worth fewer; a guess allows for it.
+MIN_Z = 4.0
+MIN_SHARE = 0.7  # of the points, that vote for the other light; a guess
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightCheck:
+    """How the sparse points on the polarised surfaces vote on their light.
+
+    Attributes
+    ----------
+    given : by the user.
+    num_votes : sparse points that have a say.
+    share : of them that speak for the other light.
+    contradicted : whether they clearly do.
+    """
+
+    given: Light
+    num_votes: int
+    share: float
+    contradicted: bool
+
+    @property
+    def message(self) -> str:
+        """One line for the user, of what is contradicted."""
+        other = Light.DIFFUSE if self.given is Light.SPECULAR else Light.SPECULAR
+        return (
+            f"`region.light` {self.given} does not fit: under {other} light the planes of "
+            f"incidence of all views meet better for {100 * self.share:.0f} % of the "
+            f"{self.num_votes} sparse points on the part. Give `region.light` {other}, or leave it "
+            "out"
+        )
+
+
+def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> LightCheck:
+    """Have the sparse points vote on the light that a user gave.
+
+    Parameters
+    ----------
+    tracks : sparse points; ``obs_view`` counts in ``maps``.
+    maps : phase maps built under the given light.
+    """
+    options = NormalOptions()
+    on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
+    windows = [window_map(phase_map, options.window_px) for phase_map in maps]
+    opposite = [turned(m, np.ones(m.region.inside.shape, np.bool_)) for m in windows]
+    as_given, as_other = (
+        normals_from_windows(AngleModel.PPA, on_parts, each, options.estimator)
+        for each in (windows, opposite)
+    )
+    votes, voting = specular_votes(as_given, as_other)  # for the first over the second
+    votes = votes[voting]
+    num = len(votes)
+    if num < MIN_VOTES:
+        return LightCheck(given=given, num_votes=num, share=0.0, contradicted=False)
+    share = float(np.mean(votes < 0))
+    error = float(votes.std(ddof=1)) / np.sqrt(num)
+    contradicted = share > MIN_SHARE and float(votes.mean()) < -MIN_Z * error
+    return LightCheck(given=given, num_votes=num, share=share, contradicted=bool(contradicted))

@@ -1,0 +1,173 @@
+"""One run at a time in a run folder, and what a killed one left half done.
+
+The lock is the system's on an open file in the run folder: it ends with its process, however that
+ends. The file lists the tokens of the runs whose temporary names may still lie there (see
+:mod:`polmvs.io.temporary`): a run adds its own before it makes anything, and removes what carries
+that of an earlier one. Nothing else is ever taken for half done. A run that comes to its end,
+good or bad, leaves no such file.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from polmvs.errors import DataError
+from polmvs.io.temporary import TOKEN, is_temporary, remove_temporary
+from polmvs.pipeline.run_folder import HERE
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+logger = logging.getLogger(__name__)
+
+LOCK_FILE = ".polmvs-lock"
+MAX_BYTES = 1 << 16
+_LINE = re.compile(r"([0-9a-f]{16}) (\d{1,10})")  # token and number of a process
+_PLACES = (Path(), HERE.seeds.parent)  # folders in which a run gives temporary names
+_HELD_ELSEWHERE = (errno.EWOULDBLOCK, errno.EACCES)
+
+
+@contextmanager
+def locked(root: Path) -> Iterator[None]:
+    """Keep other runs out of a run folder, which is made if need be, and clean up after dead ones.
+
+    Raises
+    ------
+    DataError
+        Another run is at work in it, or it cannot be written.
+    """
+    path = root / LOCK_FILE
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(root, f"cannot be made: {error.strerror or error}.") from error
+    descriptor = _open_locked(path)
+    try:
+        tokens = {TOKEN: os.getpid(), **_read(path)}
+        _write(descriptor, path, tokens)
+        try:
+            _remove_left_over(root, set(tokens) - {TOKEN})
+            yield
+        finally:
+            # Once more: a worker may have outlived its run by a moment.
+            left = _remove_left_over(root, set(tokens))
+            if left:
+                _write(descriptor, path, {token: tokens[token] for token in left})
+            else:
+                with suppress(OSError):
+                    path.unlink()
+    finally:
+        os.close(descriptor)
+
+
+def left_over_names(root: Path) -> frozenset[str]:
+    """Names in a run folder of the lock and of what a killed run left; no results, no user's."""
+    path = root / LOCK_FILE
+    if not path.is_file() or path.is_symlink():
+        return frozenset()
+    tokens = _read(path)
+    found = [entry.name for entry in root.iterdir() if any(is_temporary(entry, t) for t in tokens)]
+    return frozenset((LOCK_FILE, *found))
+
+
+def _open_locked(path: Path) -> int:
+    """Descriptor of the lock's file, which is locked."""
+    while True:
+        try:
+            flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+            descriptor = os.open(path, flags, 0o666)
+        except OSError as error:
+            raise DataError(path, f"cannot be written: {error.strerror or error}.") from error
+        try:
+            _lock(descriptor)
+        except OSError as error:
+            os.close(descriptor)
+            if error.errno not in _HELD_ELSEWHERE:
+                raise DataError(path, f"cannot be locked: {error.strerror or error}.") from error
+            numbers = [str(number) for number in _read(path).values()]
+            who = f" (process {numbers[0]})" if numbers else ""
+            raise DataError(
+                path.parent,
+                f"another run is at work in it{who}. Wait for its end, or give another OUT.",
+            ) from error
+        # The run that held it may have removed the file since it was opened here.
+        with suppress(OSError):
+            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                return descriptor
+        os.close(descriptor)
+
+
+def _lock(descriptor: int) -> None:
+    """Lock a file at once; OSError where another process has."""
+    if sys.platform == "win32":
+        # Far beyond the content, which others may read all the same.
+        os.lseek(descriptor, MAX_BYTES, os.SEEK_SET)
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP):
+            raise
+        logger.warning(
+            "OUT lies on a file system without locks: a second run in it would not be noticed."
+        )
+
+
+def _read(path: Path) -> dict[str, int]:
+    """Process by token.
+
+    Raises
+    ------
+    DataError
+        The file is not one that a run wrote.
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES).decode("ascii")
+    except OSError as error:
+        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+    except ValueError as error:
+        raise DataError(path, "was not written by polmvs. Move it out of the way.") from error
+    found = [_LINE.fullmatch(line) for line in text.splitlines()]
+    if text and not any(found):
+        raise DataError(path, "was not written by polmvs. Move it out of the way.")
+    # A line that was cut when its writer was killed names nothing: nothing was made by then.
+    return {match[1]: int(match[2]) for match in found if match is not None}
+
+
+def _write(descriptor: int, path: Path, tokens: dict[str, int]) -> None:
+    """Put the list in the place of the old one; killed on the way, it names too much at worst."""
+    data = "".join(f"{token} {number}\n" for token, number in tokens.items()).encode()
+    try:
+        os.lseek(descriptor, 0, os.SEEK_SET)
+        if os.write(descriptor, data) != len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        os.ftruncate(descriptor, len(data))
+    except OSError as error:
+        raise DataError(path, f"cannot be written: {error.strerror or error}.") from error
+
+
+def _remove_left_over(root: Path, tokens: set[str]) -> set[str]:
+    """Remove what carries one of these tokens; the tokens of what could not be removed."""
+    left = set()
+    for place in _PLACES:
+        folder = root / place
+        if folder.is_symlink() and place != Path():
+            continue
+        for path in list(folder.iterdir()) if folder.is_dir() else []:
+            token = next((token for token in tokens if is_temporary(path, token)), None)
+            if token is not None:
+                remove_temporary(path)
+                if os.path.lexists(path):
+                    left.add(token)
+    return left

@@ -1,0 +1,224 @@
+"""Stage ``sfm``: the COLMAP model of the run in its own frame, by SfM or from a given model."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from polmvs.colmap.camera_uncertainty import camera_uncertainty
+from polmvs.colmap.models import match_model_to_capture, read_model, write_model
+from polmvs.colmap.sfm import NoModelError, run_sfm
+from polmvs.colmap.sfm_failure import why_no_model
+from polmvs.config import PropagationOptions, SfmOptions
+from polmvs.errors import DataError
+from polmvs.io.arrays import save_array
+from polmvs.io.clouds import preload
+from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.pipeline.run_folder import CAMERA_MODES, replace_folder, scratch
+from polmvs.pipeline.stages.images import image_names
+from polmvs.polarization.capture import Capture
+from polmvs.scene import SparseModel, short_list
+from polmvs.separate import CrashError, run_separately
+
+logger = logging.getLogger(__name__)
+
+# Of SQLite and of the system, in the last words of a process of COLMAP's.
+FULL_DISK = re.compile("disk I/O error|database or disk is full|No space left|readonly database")
+CANNOT_WRITE = "cannot be written: is the disk full?"
+MAX_SAID = 120  # characters of COLMAP's words
+NUM_SFM_STEPS = 4  # that run_sfm reports
+# Of views: under it most points of a surface are seen by two or three views, of which none can be
+# told to be wrong.
+FEW_VIEWS = 5
+# Of the distance. The surfaces allow their shape to bend by that much by errors of the camera.
+LARGE_BENDING = PropagationOptions.bending
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmResult:
+    """What the stage found.
+
+    Attributes
+    ----------
+    num_views : images with a pose.
+    num_points : sparse ones.
+    focal_sigma : standard deviation of the estimated focal length as a share of it; None where the
+        camera was given, or that is not known.
+    bending : median deviation of the sparse points by what the estimated camera leaves open, as a
+        share of their distance; likewise.
+    """
+
+    num_views: int
+    num_points: int
+    focal_sigma: float | None = None
+    bending: float | None = None
+
+    def __str__(self) -> str:
+        text = f"{self.num_views} views, {self.num_points:,} sparse points"
+        if self.focal_sigma is None:
+            return text
+        return text + f", focal length +-{100 * self.focal_sigma:.2g} %"
+
+
+def find_model(
+    images: Path,
+    names: Sequence[str],
+    target: Path,
+    options: SfmOptions | None = None,
+    *,
+    on_progress: OnProgress = no_progress,
+) -> SfmResult:
+    """Run SfM on images.
+
+    Parameters
+    ----------
+    images : folder of 8-bit intensity images.
+    names : of the images in it.
+    target : folder of the COLMAP model, whole or not at all; with it goes ``CAMERA_MODES``, which
+        :func:`polmvs.colmap.camera_uncertainty.camera_uncertainty` explains.
+    options : defaults where None.
+
+    Raises
+    ------
+    DataError, OptionError
+        No model comes out, or the options do not fit the images.
+    """
+    options = options or SfmOptions()
+
+    def on_step(name: str) -> None:
+        if name == "mapping":  # on one core: the other can load what the next stages need
+            preload()
+        on_progress(1)
+
+    with scratch(target) as folder:
+        work, new = folder / "work", folder / "sparse"
+        try:
+            # Where its database cannot be written COLMAP ends the process.
+            model = run_separately(_run_sfm, images, names, work, new, options, on_message=on_step)
+        except CrashError as error:
+            if not FULL_DISK.search(error.said):
+                raise
+            raise DataError(target.parent, CANNOT_WRITE) from error
+        except NoModelError as error:
+            reason = why_no_model(work / "database.db", options)
+            raise DataError(images, f"SfM finds no model: {reason}") from error
+        found = None
+        if options.intrinsics is None and options.camera is None:
+            found = camera_uncertainty(new)
+        modes = np.zeros((0, len(model.tracks.point3D_ids), 3)) if found is None else found.modes
+        save_array(new / CAMERA_MODES, modes)
+        replace_folder(new, target)
+    _warn_of_missing(model, images)
+    _warn_of_few(len(model.views))
+    if found is None:
+        return _result(model)
+    bending = _bending(model, modes)
+    if not bending < LARGE_BENDING:
+        logger.warning(
+            "the %d views do not fix the camera: its focal length is known to %.2g %%, which moves "
+            "the surface by %.2g %% of its distance while all images fit. The stated deviations "
+            "hold it. Give `sfm.intrinsics` or `sfm.camera`, or record more views, some of them "
+            "turned by 90 degrees.",
+            len(model.views),
+            100 * found.focal,
+            100 * bending,
+        )
+    return _result(model, focal_sigma=found.focal, bending=bending)
+
+
+def _run_sfm(
+    images: Path,
+    names: Sequence[str],
+    work: Path,
+    new: Path,
+    options: SfmOptions,
+    on_step: Callable[[str], None],
+) -> SparseModel:
+    """SfM, where what COLMAP says of a folder that it cannot work in is an error of that folder."""
+    try:
+        return run_sfm(images, names, work, new, options, on_step)
+    except RuntimeError as error:
+        said = " ".join(str(error).split())[:MAX_SAID]
+        raise DataError(new.parent.parent, f"{CANNOT_WRITE} COLMAP says: {said}") from error
+
+
+def fit_model(capture: Capture, source: Path) -> SparseModel:
+    """An existing COLMAP model, fitted to the capture's image names and size.
+
+    Raises
+    ------
+    DataError
+        It is missing, damaged or of other images.
+    """
+    names = list(image_names(capture))
+    return match_model_to_capture(
+        read_model(source), names, capture.width, capture.height, source=source
+    )
+
+
+def take_model(model: SparseModel, source: Path, target: Path) -> SfmResult:
+    """Write an existing model that was fitted to the capture; the original is not touched.
+
+    Parameters
+    ----------
+    model : from :func:`fit_model`.
+    source : where it was read, for messages.
+    target : folder of the COLMAP model, whole or not at all.
+    """
+    with scratch(target) as folder:
+        write_model(model, folder / "sparse")
+        modes = np.zeros((0, len(model.tracks.point3D_ids), 3))
+        save_array(folder / "sparse" / CAMERA_MODES, modes)
+        replace_folder(folder / "sparse", target)
+    _warn_of_missing(model, source)
+    _warn_of_few(len(model.views))
+    return _result(model)
+
+
+def _bending(model: SparseModel, modes: np.ndarray) -> float:
+    """Median over the sparse points of how far the modes move them, share of their distance."""
+    if modes.size == 0:
+        return 0.0
+    moved = np.sqrt(np.square(modes).sum(axis=(0, 2)))
+    points = model.tracks.points_in_world
+    distance = np.min([view.ranges(points) for view in model.views], axis=0)
+    return float(np.median(moved / distance))
+
+
+def _result(
+    model: SparseModel, *, focal_sigma: float | None = None, bending: float | None = None
+) -> SfmResult:
+    return SfmResult(
+        num_views=len(model.views),
+        num_points=len(model.tracks.point3D_ids),
+        focal_sigma=focal_sigma,
+        bending=bending,
+    )
+
+
+def _warn_of_missing(model: SparseModel, source: Path) -> None:
+    num_views, num_missing = len(model.views), len(model.unregistered)
+    if num_missing >= num_views:
+        logger.warning(
+            "%s: only %d of %d views have a pose; without one are %s.",
+            source,
+            num_views,
+            num_views + num_missing,
+            short_list(model.unregistered),
+        )
+
+
+def _warn_of_few(num_views: int) -> None:
+    if num_views < FEW_VIEWS:
+        logger.warning(
+            "%d views carry little: a normal takes two planes of incidence and has %s to check "
+            "it, a reflection in one view passes unnoticed, and parts without sparse points can "
+            "hardly be placed. Record ten or more, from all around.",
+            num_views,
+            "one more" if num_views == 3 else "two more" if num_views == 4 else "none",
+        )

@@ -1,0 +1,215 @@
+"""Which encoding gamma the samples of a mosaic have, told by polarised light itself.
+
+Behind an analyzer at ``a`` stands ``I = s0 / 2 (1 + q cos 2a + u sin 2a)``. Whatever gains, angles
+and extinction ratios the four analyzers have, and however oblique rays tilt them, the redundancy
+``r = (I0 + I90 - I45 - I135) / s0`` is *linear* in ``q, u`` at each place of the image. An encoding
+``I ** p`` adds to it ``(p - 1) / (2 p) (q^2 - u^2)``, to second order, with q and u as they are
+measured. The two are told apart by regression, and the exponent follows without any knowledge of
+the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.polarization.mosaic import clipped_cells, split_mosaic
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearityTolerances:
+    """What the estimate of an encoding is made from, and when it contradicts the one given.
+
+    Attributes
+    ----------
+    patch_px : side of the squares over which samples are averaged. Guess: cells that see
+        texture differ, their mean does not.
+    min_level : of a patch's mean, share of full scale. Guess: where samples near nought are cut
+        off, darker ones look encoded.
+    max_contrast : deviation of the intensity within a patch over its mean. Guess.
+    min_patches : Guess.
+    max_patches : evenly spread; costs time only.
+    min_quadratic : deviation of ``q^2 - u^2`` over the patches, for them to tell anything. Guess:
+        that of light polarised by 7 % in all directions.
+    num_rounds : of weights and exponents; the exponent converges quadratically.
+    scale_of_loss : Cauchy's, in deviations of the residual; 95 % as efficient as least squares
+        for normal noise.
+    num_groups : of patches, neighbours together, each of which is left out once (jackknife).
+    min_z : of the logarithm of the two gammas' ratio, in its standard deviations. Derived: by
+        chance once in 16,000 captures.
+    min_ratio : of the two gammas, whatever the certainty. Guess: the degree of polarisation is off
+        by as much. Real sensors are linear to some percent.
+    max_log_sigma : of the gamma's logarithm, for an estimate to be named. Guess.
+    """
+
+    patch_px: int = 8
+    min_level: float = 0.02
+    max_contrast: float = 0.1
+    min_patches: int = 200
+    max_patches: int = 6000
+    min_quadratic: float = 0.0035
+    num_rounds: int = 4
+    scale_of_loss: float = 2.385
+    num_groups: int = 8
+    min_z: float = 4.0
+    min_ratio: float = 1.25
+    max_log_sigma: float = 0.15
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearityCheck:
+    """The encoding gamma that the samples show.
+
+    Attributes
+    ----------
+    given : gamma that the samples are decoded with.
+    found : that they show; None where too little polarised light tells.
+    log_sigma : standard deviation of its logarithm.
+    fits : whether the two agree; None where nothing tells.
+    """
+
+    given: float
+    found: float | None
+    log_sigma: float
+    fits: bool | None
+
+    @property
+    def message(self) -> str:
+        """One line for the user."""
+        if self.fits is None or self.found is None:
+            return f"too little polarised light to check `capture.gamma` {self.given:g}"
+        if self.fits:
+            return f"`capture.gamma` {self.given:g} fits"
+        likely = _round_gamma(self.found, self.log_sigma)
+        return (
+            f"`capture.gamma` {self.given:g} does not fit: the sums of perpendicular samples show "
+            f"an encoding gamma of {self.found:.2f} +- {self.found * self.log_sigma:.1g}. Give "
+            f"`capture.gamma` {likely:g}"
+        )
+
+
+def check_linearity(
+    mosaics: Sequence[NDArray[Any]],
+    pattern: tuple[int, int, int, int],
+    clip: float,
+    gamma: float,
+    *,
+    tolerances: LinearityTolerances = LinearityTolerances(),
+) -> LinearityCheck:
+    """Compare the gamma that mosaics are to be decoded with and the one that they show.
+
+    Parameters
+    ----------
+    mosaics : (H, W), samples as they are stored, shares of full scale.
+    pattern : polarizer angles of a cell, row by row, degrees.
+    clip : share from which a sample is clipped.
+    gamma : that the user gave: linear = sample ** (1 / gamma).
+    """
+    t = tolerances
+    unknown = LinearityCheck(given=gamma, found=None, log_sigma=np.inf, fits=None)
+    log_gamma, sigma = 0.0, np.inf
+    for _ in range(t.num_rounds):
+        decoded = [_patches(raw, pattern, clip, np.exp(-log_gamma), t) for raw in mosaics]
+        if not decoded or sum(len(rows) for rows, _ in decoded) < t.min_patches:
+            return unknown
+        slope, sigma = _quadratic_part(decoded, t)
+        # slope = (p - 1) / (2 p); far from p = 1 the step is cut short, the next rounds go on.
+        step = -np.log(1.0 - 2.0 * min(slope, 0.3))
+        log_gamma += float(step)
+        sigma *= 2.0
+        if abs(step) < 0.1 * sigma:
+            break
+    if not sigma < t.max_log_sigma or not abs(log_gamma) < np.log(10.0):
+        return unknown
+    apart = abs(log_gamma - np.log(gamma))
+    fits = bool(apart < max(t.min_z * sigma, np.log(t.min_ratio)))
+    return LinearityCheck(
+        given=gamma, found=float(np.exp(log_gamma)), log_sigma=float(sigma), fits=fits
+    )
+
+
+def _patches(
+    raw: NDArray[Any],
+    pattern: tuple[int, int, int, int],
+    clip: float,
+    exponent: float,
+    t: LinearityTolerances,
+) -> tuple[Array, NDArray[np.int64]]:
+    """Rows ``(N, 6)`` of smooth patches: s0, q, u, r, and place x, y; and their groups ``(N,)``."""
+    images = split_mosaic(raw, pattern)
+    usable = (~clipped_cells(raw, clip)).astype(np.float32)
+    intensity = 0.25 * images.sum(axis=0)
+    spread = _means(np.square(intensity), t.patch_px) - np.square(_means(intensity, t.patch_px))
+    level = np.maximum(_means(intensity, t.patch_px), 1e-6)
+    good = (_means(usable, t.patch_px) > 0.999) & (spread < np.square(t.max_contrast * level))
+    # By the sum of all four: a choice by single ones would depend on the angle.
+    good &= level > t.min_level
+    if exponent != 1.0:
+        images = np.power(np.maximum(images, 0), np.float32(exponent))
+    i0, i45, i90, i135 = (_means(image, t.patch_px) for image in images)
+    s0 = np.maximum(0.5 * (i0 + i45 + i90 + i135), 1e-9)
+    rows, cols = np.indices(s0.shape)
+    x, y = cols / s0.shape[1] - 0.5, (rows - 0.5 * s0.shape[0]) / s0.shape[1]
+    stack = np.stack([s0, (i0 - i90) / s0, (i45 - i135) / s0, (i0 + i90 - i45 - i135) / s0, x, y])
+    group = (rows * 8 // s0.shape[0] * 3 + cols * 8 // s0.shape[1]) % t.num_groups
+    step = max(1, -(-int(np.count_nonzero(good)) // t.max_patches))
+    return np.asarray(stack[:, good].T[::step], np.float64), group[good][::step]
+
+
+def _means(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Means of squares of an image, the rest at its far sides left out."""
+    rows, cols = image.shape[0] // size, image.shape[1] // size
+    if not rows or not cols:
+        return np.zeros((0, 0), np.float32)
+    whole = np.ascontiguousarray(image[: rows * size, : cols * size], np.float32)
+    return np.asarray(cv2.resize(whole, (cols, rows), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _quadratic_part(
+    parts: Sequence[tuple[Array, NDArray[np.int64]]], t: LinearityTolerances
+) -> tuple[float, float]:
+    """Slope of r over ``q^2 - u^2`` beside all that is linear in q and u, and its deviation."""
+    s0, q, u, r, x, y = np.concatenate([rows for rows, _ in parts]).T
+    group = np.concatenate([groups for _, groups in parts])
+    place = (np.ones_like(x), x, y, x * x, x * y, y * y)
+    if not np.std(q * q - u * u) > t.min_quadratic:
+        return 0.0, np.inf
+    columns = [q * q - u * u, *(a * b for a in place for b in (np.ones_like(q), q, u))]
+    # r is relative: the fewer photons, the less it says.
+    weight = np.sqrt(s0 / s0.max())
+    design, right = np.stack(columns, axis=1) * weight[:, None], r * weight
+    loss = np.ones_like(r)
+    solution = np.zeros(design.shape[1])
+    for _ in range(t.num_rounds):
+        solution = _solve(design, right, loss)
+        residual = right - design @ solution
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
+        loss = 1.0 / (1.0 + np.square(residual / (t.scale_of_loss * scale)))
+    left_out = [
+        _solve(design[group != k], right[group != k], loss[group != k])[0]
+        for k in range(t.num_groups)
+    ]
+    num = t.num_groups
+    deviation = np.sqrt((num - 1) / num * np.square(np.subtract(left_out, np.mean(left_out))).sum())
+    return float(solution[0]), float(deviation)
+
+
+def _solve(design: Array, right: Array, loss: Array) -> Array:
+    weighted = design * loss[:, None]
+    ridge = 1e-9 * np.trace(weighted.T @ design) * np.eye(design.shape[1])
+    return np.asarray(np.linalg.solve(weighted.T @ design + ridge, weighted.T @ right), np.float64)
+
+
+def _round_gamma(found: float, log_sigma: float) -> float:
+    """The usual gamma that is meant, if one is near; else the one found."""
+    usual = (1 / 2.2, 0.5, 1.0, 2.0, 2.2)
+    nearest = min(usual, key=lambda value: abs(np.log(value / found)))
+    near = abs(np.log(nearest / found)) < max(3 * log_sigma, 0.1)
+    return round(nearest if near else found, 2)

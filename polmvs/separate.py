@@ -1,0 +1,152 @@
+"""A function in a process of its own, for libraries that end the process when they fail.
+
+COLMAP aborts where its database cannot be written, and hears no Ctrl-C while it works. Here such an
+end is an error, and an interrupt ends the work at once. Not by `multiprocessing`, which imports a
+script once more that asks for it: the function must be one of an importable module.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from typing import IO, Any, TypeVar
+
+from polmvs.errors import PolmvsError
+
+T = TypeVar("T")
+
+SHOWN_BYTES = 2000  # of what a library said at its end, for the log
+CODE = "from polmvs.separate import work; work()"
+
+logger = logging.getLogger(__name__)
+package_logger = logging.getLogger("polmvs")
+
+
+class CrashError(PolmvsError):
+    """The process of a function ended before the function did.
+
+    Parameters
+    ----------
+    status : of the process; the negative number of a signal.
+    said : the last words on its standard error.
+    """
+
+    def __init__(self, status: int, said: str) -> None:
+        number = f"signal {-status}" if status < 0 else f"status {status}"
+        super().__init__(f"a library crashed ({number}); its last words are in the log.")
+        self.status = status
+        self.said = said
+
+
+def run_separately(
+    function: Callable[..., T], *arguments: Any, on_message: Callable[[str], None]
+) -> T:
+    """What a function returns that is called in a process of its own.
+
+    Its log records and errors arrive here as its own.
+
+    Parameters
+    ----------
+    function : of a module; called with the arguments and, after them, a function that takes texts.
+    arguments : picklable.
+    on_message : is called here with each text.
+
+    Raises
+    ------
+    CrashError
+        The process ended before.
+    """
+    with (
+        tempfile.TemporaryFile() as complaints,
+        subprocess.Popen(
+            [sys.executable, "-c", CODE],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=complaints,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        ) as process,
+    ):
+        try:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            task = (function, arguments, package_logger.getEffectiveLevel())
+            _send(process.stdin, task)
+            result: T = _result(process.stdout, on_message)
+            return result
+        except (EOFError, pickle.UnpicklingError, BrokenPipeError):
+            status = process.wait()
+            complaints.seek(0, os.SEEK_END)
+            complaints.seek(max(complaints.tell() - SHOWN_BYTES, 0))
+            said = complaints.read().decode(errors="replace")
+            logger.error("last words: %s", said, extra={"file_only": True})
+            raise CrashError(status, said) from None
+        finally:
+            process.kill()
+
+
+def _send(stream: IO[bytes], content: Any) -> None:
+    pickle.dump(content, stream)
+    stream.flush()
+
+
+def _result(stream: IO[bytes], on_message: Callable[[str], None]) -> Any:
+    """What comes at the end; messages and log records are passed on until then."""
+    while True:
+        kind, content = pickle.load(stream)
+        match kind:
+            case "message":
+                on_message(content)
+            case "log":
+                logging.getLogger(content.name).handle(content)
+            case "error":
+                raise content
+            case _:
+                return content
+
+
+# In the process
+
+
+class _Sender(logging.Handler):
+    """Sends log records to the parent."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        super().__init__()
+        self.stream = stream
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send the text, as arguments and tracebacks may not pickle."""
+        record.msg, record.args, record.exc_info = record.getMessage(), None, None
+        _send(self.stream, ("log", record))
+
+
+def work() -> None:
+    """Do the task that comes on standard input; the way of its result is standard output."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    results = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print is no result
+    function, arguments, level = pickle.load(sys.stdin.buffer)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    package_logger.addHandler(_Sender(results))
+    package_logger.setLevel(level)
+    package_logger.propagate = False
+    try:
+        content = function(*arguments, lambda text: _send(results, ("message", text)))
+        _send(results, ("result", content))
+    except Exception as error:
+        _send(results, ("error", error))
+    # Without the destructors of libraries, which may crash once more.
+    os._exit(0)
+
+
+def _end_with_parent() -> None:
+    """A killed parent closes its end, and what is done here is for nobody."""
+    sys.stdin.buffer.read()
+    os._exit(1)

@@ -1,0 +1,45 @@
+"""The light that a user states, against what the planes of incidence show."""
+
+import numpy as np
+import pytest
+from scenes import Scene, board_scene, phase_map_of, tracks_at
+
+from polmvs.config import Light
+from polmvs.normals.light_check import check_light
+from polmvs.polarization.phase_map import turned
+from polmvs.synthetic.captures import Sphere, render_view
+
+OTHER = {Light.SPECULAR: Light.DIFFUSE, Light.DIFFUSE: Light.SPECULAR}
+
+
+def ball_scene(light: Light, sensor: str) -> Scene:
+    """A ball, whose light is polarised all round its rim under either kind of reflection."""
+    views, ball = board_scene(6).views, Sphere(center=np.zeros(3), radius=0.2)
+    rendered = [
+        render_view(v, ball, light=light.value, sensor=sensor, s0=0.3, background=0.9)
+        for v in views
+    ]
+    return Scene(ball, views, rendered, [phase_map_of(r, light) for r in rendered])
+
+
+@pytest.mark.parametrize("light", list(Light))
+@pytest.mark.parametrize("sensor", ["ppa", "tilted"])
+def test_only_the_wrong_light_is_contradicted(light, sensor):
+    scene = ball_scene(light, sensor)
+    tracks = tracks_at(scene, scene.surface_points(40)[0])
+    right = [phase_map_of(rendered, light) for rendered in scene.rendered]
+    assert not check_light(tracks, right, light).contradicted
+    wrong = [turned(m, np.ones(m.region.inside.shape, bool)) for m in right]
+    found = check_light(tracks, wrong, OTHER[light])
+    assert found.contradicted
+    assert f"`region.light` {OTHER[light]} does not fit: under {light} light" in found.message
+    assert f"Give `region.light` {light}, or leave it out" in found.message
+
+
+def test_few_points_say_nothing():
+    scene = board_scene(6)
+    tracks = tracks_at(scene, scene.surface_points(5)[0])
+    wrong = [turned(m, np.ones(m.region.inside.shape, bool)) for m in scene.maps]
+    assert not check_light(tracks, wrong, Light.DIFFUSE).contradicted
+    nothing = tracks_at(scene, np.zeros((0, 3)))
+    assert check_light(nothing, wrong, Light.DIFFUSE).num_votes == 0
