@@ -98,6 +98,21 @@ class Selection(StrEnum):
     ANGLE = "angle"
 
 
+class PairChoice(StrEnum):
+    """Which images SfM matches with which, where no list says so."""
+
+    EXHAUSTIVE = "exhaustive"
+    RETRIEVAL = "retrieval"
+    SEQUENTIAL = "sequential"
+
+
+class Mapper(StrEnum):
+    """How SfM makes a model of matched images."""
+
+    INCREMENTAL = "incremental"
+    GLOBAL = "global"
+
+
 class Packing(StrEnum):
     """How a dump without a header holds its samples."""
 
@@ -383,13 +398,45 @@ class SfmOptions(OptionGroup, group="sfm"):
     )
     sparse: Path | None = option(None, "existing COLMAP model to use instead of running SfM")
     single_camera: bool = option(True, "all images share one camera")
+    pairs: str | None = option(
+        None,
+        "which images are matched: 'exhaustive', all with all; 'retrieval', each with those most "
+        "similar to it, and with its neighbours where names count up; 'sequential', each with "
+        "those after it by name; or a text file with two names on each line; by default all of up "
+        "to 40, retrieval of more",
+        metavar="exhaustive|retrieval|sequential|FILE",
+    )
+    database: Path | None = option(
+        None,
+        "COLMAP database of the same images at the size of the polarization images: its features, "
+        "and where it has any its matches, are used instead of new ones, and its cameras unless "
+        "`sfm.intrinsics` or `sfm.camera` are given; it is not changed",
+    )
+    mapper: Mapper = option(
+        Mapper.INCREMENTAL,
+        "'incremental': images one after the other; 'global': all at once, in less time where they "
+        "are many",
+    )
     seed: int = option(0, "random seed of SfM")
 
     def check(self) -> None:
-        """Four positive numbers, or a file."""
+        """Four positive numbers, or a file; nothing for an SfM that is not run."""
         _require_intrinsics(self, self.intrinsics)
         once = self.intrinsics is None or self.camera is None
         self.require(once, "camera", "and `sfm.intrinsics` exclude each other")
+        if self.sparse is not None:
+            reason = "is for SfM, in whose place a COLMAP model is given with `sfm.sparse`"
+            self.require(self.pairs is None, "pairs", reason)
+            self.require(self.database is None, "database", reason)
+            self.require(self.mapper is Mapper.INCREMENTAL, "mapper", reason)
+        if self.pairs_file is not None:  # a run may go on from another folder
+            object.__setattr__(self, "pairs", str(self.pairs_file.absolute()))
+
+    @property
+    def pairs_file(self) -> Path | None:
+        """The list of pairs, if ``pairs`` names one."""
+        is_file = self.pairs is not None and self.pairs not in set(PairChoice)
+        return Path(self.pairs or "") if is_file else None
 
 
 def _require_intrinsics(options: OptionGroup, given: tuple[float, ...] | None) -> None:
@@ -592,6 +639,13 @@ class RunOptions(OptionGroup, group="run", in_files=False):
     overwrite: bool = option(False, "delete an earlier run's results in OUT first")
     resume: bool = option(False, "go on with the run in OUT at its first unfinished stage")
     workers: int = option(default_num_workers(), "processes to share the views among", least=1)
+    scheduler: str | None = option(
+        None,
+        "address of a dask.distributed scheduler, such as tcp://10.0.0.1:8786, whose workers share "
+        "the views instead of processes here; they must have the same versions, and CAPTURE and "
+        "OUT on storage that they see under the same path",
+        metavar="ADDRESS",
+    )
 
     def check(self) -> None:
         """Not both."""
@@ -784,6 +838,15 @@ def plain_options(options: Options, paths: Iterable[str]) -> dict[str, Any]:
     whole = {name: option_paths(cls) for name, cls in groups.items()}
     every = [path for given in paths for path in whole.get(given, (given,))]
     return {path: to_plain(get_option(options, path)) for path in every}
+
+
+def with_absolute_paths(options: Options) -> Options:
+    """The same files and folders, named so that another process finds them."""
+    for path in option_paths():
+        value = get_option(options, path)
+        if isinstance(value, Path):
+            options = replace_option(options, path, value.absolute())
+    return options
 
 
 def _split(path: str) -> tuple[str, str]:

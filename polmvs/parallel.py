@@ -1,8 +1,12 @@
-"""Parallel work over views on all cores.
+"""One interface to parallel work over views, with three backends of the same results.
 
-Processes rather than threads: the sparse solver and many small array operations hold Python's
-lock. They are spawned, not forked, because forking after OpenCV, OpenBLAS and COLMAP have started
-threads may hang.
+This process itself; processes on this machine; and a ``dask.distributed`` cluster
+(:mod:`polmvs.cluster`). What is given to :meth:`Workers.map` depends on its arguments alone and
+writes its files whole, so that it may be done anywhere, and again.
+
+On one machine processes rather than threads: the sparse solver and many small array operations
+hold Python's lock. They are spawned, not forked, because forking after OpenCV, OpenBLAS and COLMAP
+have started threads may hang.
 """
 
 from __future__ import annotations
@@ -10,12 +14,15 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
+from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import cv2
 
@@ -25,29 +32,56 @@ HELD_BACK = (signal.SIGINT, signal.SIGTERM)
 POSIX = hasattr(signal, "pthread_sigmask")
 
 
+class Backend(Protocol):
+    """Where work is done."""
+
+    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
+        """As :meth:`Workers.outcomes`."""
+
+    def close(self, *, cancel: bool) -> None:
+        """End what is under way, with ``cancel`` before its end; a later map begins anew."""
+
+
 class Workers:
-    """A pool of processes, started at the first use; one worker means this process itself.
+    """Who does parallel work.
 
     Functions and arguments given to :meth:`map` must be picklable. As with any spawned process, a
     script that asks for more than one worker needs ``if __name__ == "__main__":``.
+
+    Parameters
+    ----------
+    num : processes, started at the first use; one means this process itself.
+    backend : something else that does the work, ``num`` tasks at a time.
     """
 
-    def __init__(self, num: int = 1) -> None:
+    def __init__(self, num: int = 1, backend: Backend | None = None) -> None:
         if num < 1:
             raise ValueError(f"{num=} but expected at least one worker.")
         self.num = num
-        self._pool: ProcessPoolExecutor | None = None
+        self._backend = backend or (_ThisProcess() if num == 1 else _Processes(num))
+
+    @classmethod
+    def of_cluster(
+        cls, address: str, storage: Sequence[Path] = (), sources: Sequence[Path] = ()
+    ) -> Workers:
+        """The workers of a Dask scheduler; see :class:`polmvs.cluster.Cluster`."""
+        from polmvs.cluster import Cluster
+
+        cluster = Cluster(address, storage, sources)
+        return cls(cluster.num_threads, cluster)
 
     def map(self, function: Callable[..., T], *iterables: Any) -> Iterator[T]:
-        """Results in order, as ``map`` gives them."""
-        if self.num == 1:
-            return map(function, *iterables)
-        if self._pool is None:
-            self._pool = ProcessPoolExecutor(
-                self.num, mp_context=get_context("spawn"), initializer=_start_worker
-            )
-        with _signals_held_back():
-            return self._pool.map(function, *iterables)
+        """Results in order, as ``map`` gives them; the first error ends it."""
+        outcomes = self._backend.outcomes(function, *iterables)
+        return (outcome() for outcome in outcomes)
+
+    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
+        """Of each task, in order, what gives its result or raises its error, to be called once.
+
+        The error of one stops no other. A task whose worker is lost is done again; that which
+        loses every worker raises ``BrokenProcessPool`` or a ``DataError``.
+        """
+        return self._backend.outcomes(function, *iterables)
 
     @contextmanager
     def stopped_on_error(self) -> Iterator[None]:
@@ -55,13 +89,8 @@ class Workers:
         try:
             yield
         except BaseException:
-            self._stop(cancel=True)
+            self._backend.close(cancel=True)
             raise
-
-    def _stop(self, *, cancel: bool) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=cancel)
-            self._pool = None
 
     def __enter__(self) -> Workers:
         return self
@@ -72,7 +101,77 @@ class Workers:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._stop(cancel=kind is not None)
+        self._backend.close(cancel=kind is not None)
+
+
+class _ThisProcess:
+    """No other one."""
+
+    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
+        """Tasks are done when they are asked for."""
+        return map(partial(partial, function), *iterables)
+
+    def close(self, *, cancel: bool) -> None:
+        """Do nothing."""
+
+
+class _Processes:
+    """A pool of processes on this machine, started at the first use."""
+
+    def __init__(self, num: int) -> None:
+        self.num = num
+        self._pool: ProcessPoolExecutor | None = None
+
+    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
+        """All tasks are handed over at once."""
+        tasks = list(zip(*iterables, strict=False))
+        futures = [self._submit(function, task) for task in tasks]
+        ask = partial(self._result, function, tasks, futures)
+        return (partial(ask, index) for index in range(len(tasks)))
+
+    def _result(
+        self,
+        function: Callable[..., T],
+        tasks: list[tuple[Any, ...]],
+        futures: list[Future[T]],
+        index: int,
+    ) -> T:
+        """Result of a task. One that was lost with its worker is done again while no other is.
+
+        A killed worker takes all tasks with it, and which one killed it is not known.
+        """
+        task, future = tasks[index], futures[index]
+        tasks[index], futures[index] = (), Future()  # nothing of it is held for those to come
+        try:
+            return future.result()
+        except BrokenProcessPool:
+            self.close(cancel=True)
+            try:
+                return self._submit(function, task).result()
+            finally:
+                for later in range(index + 1, len(tasks)):
+                    done = futures[later].done() and not futures[later].cancelled()
+                    if not done or isinstance(futures[later].exception(), BrokenProcessPool):
+                        futures[later] = self._submit(function, tasks[later])
+
+    def _submit(self, function: Callable[..., T], task: tuple[Any, ...]) -> Future[T]:
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(
+                self.num, mp_context=get_context("spawn"), initializer=_start_worker
+            )
+        with _signals_held_back():
+            try:
+                return self._pool.submit(function, *task)
+            except BrokenProcessPool as error:  # by one of the tasks before, as is told of them
+                lost: Future[T] = Future()
+                lost.set_exception(error)
+                return lost
+
+    def close(self, *, cancel: bool) -> None:
+        """End the processes."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=cancel)
+            self._pool = None
 
 
 @contextmanager

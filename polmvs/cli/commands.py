@@ -83,6 +83,21 @@ class ReportChoice(OptionGroup, group="report", in_files=False):
 
 
 @dataclass(frozen=True, kw_only=True)
+class BatchArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    list_file: Path = option(
+        MISSING,
+        "TOML or CSV file of captures: 'capture' is a folder, 'name' that of its results, 'model' "
+        "as the flag; options as tables in TOML ([[captures]], [captures.sfm]), as columns in CSV "
+        "(sfm.intrinsics); flags are for what it leaves open",
+        positional=True,
+        metavar="LIST",
+    )
+    out: Path = option(MISSING, "folder of the results, OUT/NAME for each capture", positional=True)
+
+
+@dataclass(frozen=True, kw_only=True)
 class FolderArguments(OptionGroup, group="arguments", in_files=False):
     """Arguments."""
 
@@ -257,6 +272,12 @@ COMMANDS = (
         "that tell them apart",
         run="polmvs.cli.jobs:compare",
         groups=(JobArguments, ComparedModels, *TO_CLOUD, EvaluationOptions, *SHOWN, *HOW),
+    ),
+    Command(
+        name="batch",
+        help_text="'reconstruct' for many captures side by side, and one table of what came out",
+        run="polmvs.cli.batch:batch",
+        groups=(BatchArguments, ModelChoice, *TO_CLOUD, ExportOptions, *HOW),
     ),
     Command(
         name="evaluate",

@@ -21,12 +21,23 @@ import pycolmap
 
 from polmvs.camera import PinholeCamera
 from polmvs.colmap.cameras import camera_to_colmap, quiet_colmap
+from polmvs.colmap.database import (
+    GivenDatabase,
+    check_database,
+    copy_database,
+    image_numbers,
+    match_pairs,
+    opened,
+    read_descriptors,
+    replace_cameras,
+)
 from polmvs.colmap.models import (
     model_from_reconstruction,
     reconstruction_of_views,
     write_reconstruction,
 )
-from polmvs.config import SfmOptions
+from polmvs.colmap.pairs import choose_pairs, read_pairs
+from polmvs.config import Mapper, SfmOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.images import read_gray
 from polmvs.io.intrinsics import Intrinsics, read_intrinsics
@@ -60,12 +71,13 @@ class SfmTolerances:
     min_tri_angle_deg : of a point that is kept; COLMAP's own.
     loss_scale_px : of the last adjustment's Cauchy loss; measured, about twice the error of a good
         keypoint.
+    max_cost_change : relative, of the sum of squares in an adjustment's step, at which it ends.
+        Measured: COLMAP's own 0 goes on to its last allowed step, for no digit of the cameras.
+    model_growth : factor in images or points at which the incremental mapper adjusts all anew;
+        measured: at COLMAP's own 1.1 it takes most of the mapper's time.
     min_views_principal_point : from which the principal point is freed; measured: of three views
         two captures of three got worse, of four none.
     max_principal_point_shift : of the image's width; a guess, more is an estimate gone astray.
-    max_exhaustive_images : that are matched in all pairs; a guess, 20,000 pairs take some minutes
-        on two cores.
-    sequential_overlap : neighbours that each image of more is matched with; a guess.
     max_images_two_view_tracks : up to which tracks of two views count; a guess: with few images
         most tracks have two views only, with more those are mostly mismatches.
     focal_range : focal lengths that are believed, in widths of the image: 136 to 6 degrees.
@@ -76,10 +88,10 @@ class SfmTolerances:
     max_reproj_error_px: float = 2.0
     min_tri_angle_deg: float = 1.5
     loss_scale_px: float = 0.5
+    max_cost_change: float = 1e-6
+    model_growth: float = 1.3
     min_views_principal_point: int = 4
     max_principal_point_shift: float = 0.1
-    max_exhaustive_images: int = 200
-    sequential_overlap: int = 20
     max_images_two_view_tracks: int = 5
     focal_range: tuple[float, float] = (0.2, 10.0)
     corner_tolerance: float = 0.15
@@ -103,7 +115,8 @@ def run_sfm(
     ----------
     image_folder : 8-bit intensity images, one size.
     image_names : names of the images in it.
-    work_folder : gets COLMAP's database; what an earlier run left there is replaced.
+    work_folder : gets COLMAP's database, if one is given its copy; what an earlier run left there
+        is replaced.
     sparse_folder : gets the model as COLMAP binary, whole or not at all.
     options : see :class:`polmvs.config.SfmOptions`; ``sparse`` is not used here.
     on_progress : called with the name of each stage when it starts.
@@ -111,13 +124,19 @@ def run_sfm(
     Raises
     ------
     OptionError
-        The intrinsics do not fit the images, or the camera model is unknown.
+        The intrinsics do not fit the images, or the camera model or the mapper is unknown.
     DataError
-        An image is missing, or no model comes out.
+        An image is missing, the list of pairs or the database is unusable, or no model comes out.
     """
     names = sorted(image_names)
     width, height = _image_size(image_folder, names)
     reader = _reader_options(options, width, height, tolerances)
+    given = None
+    if options.database is not None:
+        given = check_database(options.database, names, width, height)
+    to_match = names if given is None else list(given.ids)
+    if options.pairs_file is not None:  # before the features, which take longer
+        read_pairs(options.pairs_file, to_match)
     work_folder.mkdir(parents=True, exist_ok=True)
     database = work_folder / "database.db"
     for left_over in work_folder.glob("database.db*"):
@@ -125,18 +144,24 @@ def run_sfm(
     pycolmap.set_random_seed(options.seed)
     with quiet_colmap():
         on_progress("features")
-        _extract_features(database, image_folder, names, reader, options)
+        if given is None:
+            _extract_features(database, image_folder, names, reader, options)
+        else:
+            _take_database(given, database, reader, width, height, options)
         on_progress("matching")
-        _match(database, len(names), options.seed, tolerances)
+        if given is None or not given.has_matches or options.pairs is not None:
+            _match(database, to_match, options)
         on_progress("mapping")
-        mapper = _mapper_options(len(names), options, tolerances)
-        reconstruction = _map(database, image_folder, names, work_folder / "models", mapper)
+        reconstruction = _map(
+            database, image_folder, work_folder / "models", to_match, options, tolerances
+        )
         on_progress("bundle adjustment")
+        single = options.single_camera if given is None else given.num_cameras == 1
         reconstruction = _refine(
             reconstruction,
             tolerances,
             free_intrinsics=options.intrinsics is None and options.camera is None,
-            single_camera=options.single_camera,
+            single_camera=single,
         )
     write_reconstruction(reconstruction, sparse_folder)
     sparse_model = model_from_reconstruction(reconstruction, names)
@@ -185,10 +210,10 @@ def triangulate_views(
     pycolmap.set_random_seed(seed)
     with quiet_colmap():
         _extract_features(database, image_folder, names, reader, options)
-        _match(database, len(names), seed, tolerances)
+        _match(database, names, options)
         # Images were imported in the order of names, so their ids are those of the views here.
         known = reconstruction_of_views(ordered, single_camera=single)
-        mapper = _mapper_options(len(names), options, tolerances)
+        mapper = _mapper_options(names, options, tolerances)
         output = work_folder / "triangulated"
         output.mkdir(exist_ok=True)
         found = pycolmap.triangulate_points(known, database, image_folder, output, options=mapper)
@@ -312,33 +337,46 @@ def _extract_features(
     )
 
 
-def _match(database: Path, num_images: int, seed: int, tolerances: SfmTolerances) -> None:
-    """Match all pairs, or neighbours in the order of names where there are too many."""
+def _take_database(
+    given: GivenDatabase,
+    database: Path,
+    reader: pycolmap.ImageReaderOptions,
+    width: int,
+    height: int,
+    options: SfmOptions,
+) -> None:
+    """Copy a given database, with the given camera if there is one."""
+    copy_database(given, database)
+    if options.intrinsics is not None or options.camera is not None:
+        params = [float(value) for value in reader.camera_params.split(",")]
+        replace_cameras(
+            database,
+            pycolmap.Camera(model=reader.camera_model, width=width, height=height, params=params),
+        )
+
+
+def _match(database: Path, names: Sequence[str], options: SfmOptions) -> None:
+    """Match the pairs of images that are asked for, or that are likely to show the same."""
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    cpu = pycolmap.Device.cpu
-    if num_images <= tolerances.max_exhaustive_images:
-        logger.info("SfM: %d images, all pairs are matched.", num_images)
-        pycolmap.match_exhaustive(database, verification_options=verification, device=cpu)
-        return
-    logger.warning(
-        "SfM: %d images are too many for all pairs: each is matched with its %d neighbours. "
-        "Their names must be in the order of recording.",
-        num_images,
-        tolerances.sequential_overlap,
-    )
-    pairing = pycolmap.SequentialPairingOptions()
-    pairing.overlap = tolerances.sequential_overlap
-    pycolmap.match_sequential(
-        database, pairing_options=pairing, verification_options=verification, device=cpu
-    )
+    verification.ransac.random_seed = options.seed
+    numbers = image_numbers(database)
+    with opened(database) as content:
+        pairs = choose_pairs(
+            sorted(names),
+            options.pairs,
+            lambda name: read_descriptors(content, numbers[name]),
+            seed=options.seed,
+        )
+    match_pairs(database, pairs, verification)
 
 
 def _mapper_options(
-    num_images: int, options: SfmOptions, tolerances: SfmTolerances
+    names: Sequence[str], options: SfmOptions, tolerances: SfmTolerances
 ) -> pycolmap.IncrementalPipelineOptions:
     """Options of the incremental mapper."""
+    num_images = len(names)
     pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.image_names = list(names)  # a given database may have more
     pipeline.min_model_size = min(3, num_images)
     pipeline.random_seed = options.seed
     pipeline.mapper.random_seed = options.seed
@@ -347,6 +385,9 @@ def _mapper_options(
     # ten views either way. Extraction and matching are the larger part and use all cores.
     pipeline.num_threads = 1
     pipeline.mapper.num_threads = 1
+    pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = tolerances.model_growth
+    pipeline.ba_global_function_tolerance = tolerances.max_cost_change
+    pipeline.ba_local_function_tolerance = tolerances.max_cost_change
     two_view_tracks = num_images <= tolerances.max_images_two_view_tracks
     pipeline.triangulation.ignore_two_view_tracks = not two_view_tracks
     if options.intrinsics is not None or options.camera is not None:
@@ -362,17 +403,62 @@ def _mapper_options(
     return pipeline
 
 
+def _global_options(
+    names: Sequence[str], options: SfmOptions, tolerances: SfmTolerances
+) -> pycolmap.GlobalPipelineOptions:
+    """Options of the global mapper.
+
+    Raises
+    ------
+    OptionError
+        This version of pycolmap has none.
+    """
+    if not hasattr(pycolmap, "global_mapping"):
+        raise OptionError(
+            f"global needs pycolmap 4.1 or newer; this is {pycolmap.__version__}.",
+            field="sfm.mapper",
+        )
+    pipeline = pycolmap.GlobalPipelineOptions()
+    pipeline.image_names = list(names)
+    pipeline.min_model_size = min(3, len(names))
+    pipeline.num_threads = pipeline.mapper.num_threads = 1  # as of the incremental mapper
+    mapper = pipeline.mapper
+    for seeded in (
+        pipeline,
+        mapper,
+        mapper.rotation_averaging,
+        mapper.global_positioning,
+        mapper.retriangulation,
+    ):
+        seeded.random_seed = options.seed
+    solver = mapper.bundle_adjustment.ceres.solver_options
+    solver.num_threads = 1
+    solver.function_tolerance = tolerances.max_cost_change
+    if options.intrinsics is not None or options.camera is not None:
+        mapper.bundle_adjustment.refine_focal_length = False
+        mapper.bundle_adjustment.refine_extra_params = False
+        error_px = tolerances.max_reproj_error_px
+        mapper.retriangulation.complete_max_reproj_error = error_px
+        mapper.retriangulation.merge_max_reproj_error = error_px
+    return pipeline
+
+
 def _map(
     database: Path,
     image_folder: Path,
-    names: Sequence[str],
     models: Path,
-    options: pycolmap.IncrementalPipelineOptions,
+    names: Sequence[str],
+    options: SfmOptions,
+    tolerances: SfmTolerances,
 ) -> pycolmap.Reconstruction:
-    """The largest model that the incremental mapper makes."""
+    """The largest model of the images that the mapper makes."""
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir()
-    found = pycolmap.incremental_mapping(database, image_folder, models, options)
+    paths = (database, image_folder, models)
+    if options.mapper is Mapper.GLOBAL:
+        found = pycolmap.global_mapping(*paths, _global_options(names, options, tolerances))
+    else:
+        found = pycolmap.incremental_mapping(*paths, _mapper_options(names, options, tolerances))
     shutil.rmtree(models)
     if not found:
         raise NoModelError(image_folder, f"SfM finds no model of these images. {NO_MODEL_REMEDY}")
@@ -433,6 +519,7 @@ def _adjust(
     bundle.print_summary = False
     bundle.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     bundle.ceres.loss_function_scale = tolerances.loss_scale_px
+    bundle.ceres.solver_options.function_tolerance = tolerances.max_cost_change
     bundle.ceres.solver_options.num_threads = 1  # sums over threads depend on their timing
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in reconstruction.reg_image_ids():

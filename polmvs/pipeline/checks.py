@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from polmvs.camera import PinholeCamera
+from polmvs.colmap.database import check_database
 from polmvs.colmap.dense_workspace import open_dense_workspace, require_same_frame
+from polmvs.colmap.pairs import read_pairs
 from polmvs.colmap.sfm import check_camera, check_intrinsics
 from polmvs.config import Options, ReferenceOptions, SfmOptions
 from polmvs.errors import DataError, OptionError
@@ -37,6 +39,8 @@ def inputs_of(options: Options) -> list[Path]:
     paths = (
         options.sfm.sparse,
         options.sfm.camera,
+        options.sfm.database,
+        options.sfm.pairs_file,
         options.capture.calibration,
         options.reference.reference,
         options.region.mask,
@@ -159,6 +163,12 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
         check_intrinsics(options.sfm.intrinsics, capture.width, capture.height)
     if options.sfm.camera is not None:
         check_camera(options.sfm.camera, capture.width, capture.height)
+    names = list(image_names(capture))
+    if options.sfm.database is not None:
+        given = check_database(options.sfm.database, names, capture.width, capture.height)
+        names = list(given.ids)
+    if options.sfm.pairs_file is not None:
+        read_pairs(options.sfm.pairs_file, names)
     return None
 
 

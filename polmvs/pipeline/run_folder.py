@@ -20,10 +20,9 @@ from polmvs.io.temporary import remove_temporary, temporary_path
 RUN_FILE = "run.json"
 LOG_FILE = "polmvs.log"
 SURFACE_MESH = "surface.ply"  # among dense views: the mesh that they are rendered from
-# and those on its way: its hull, then after each level
-SURFACE_LEVELS = tuple(f"surface_{number}.ply" for number in range(10))
 NOT_OURS = "was not written by polmvs. Move it out of the way."
 CAMERA_MODES = "camera_modes.npy"  # beside the model of SfM: what its camera leaves open
+SURFACE_LEVELS = "surface_{number}.ply"  # and those on its way: its hull, then after each level
 DENSE_MARKER = "polmvs-files.txt"  # in a COLMAP workspace: the files that were written with it
 
 
@@ -120,6 +119,7 @@ class RunFolder:
 HERE = RunFolder(Path())  # its paths are those within any run folder
 
 _MODEL_FILES = {f"{name}.bin" for name in ("cameras", "images", "points3D", "rigs", "frames")}
+_SURFACES = {SURFACE_MESH, *(SURFACE_LEVELS.format(number=number) for number in range(10))}
 # What a run writes in its folders, by folder.
 FOLDER_FILES = {
     HERE.sfm.name: {*_MODEL_FILES, CAMERA_MODES},
@@ -129,7 +129,7 @@ FOLDER_FILES = {
         HERE.camera_modes.name,
         *(HERE.track_normals(model).name for model in AngleModel),
     },
-    **{HERE.views(model).name: {SURFACE_MESH, *SURFACE_LEVELS} for model in AngleModel},
+    **{HERE.views(model).name: _SURFACES for model in AngleModel},
 }
 # In these, files named IMAGE.part.npy as well; images are known by name from the record.
 FOLDERS_BY_IMAGE = frozenset(

@@ -18,7 +18,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from polmvs.colmap.cameras import quiet_colmap
-from polmvs.config import Options, RunOptions, plain_options, show_value, to_plain
+from polmvs.config import (
+    Options,
+    RunOptions,
+    plain_options,
+    show_value,
+    to_plain,
+    with_absolute_paths,
+)
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.folders import require_unicode
@@ -270,6 +277,9 @@ def open_run(
         The input is unusable, or the run folder is, or another run is at work in it.
     """
     monitor = monitor if monitor is not None else NoMonitor()
+    if run_options.scheduler is not None:  # whose workers have other working folders
+        capture_folder, out = capture_folder.absolute(), out.absolute()
+        options = with_absolute_paths(options)
     run_folder, others = RunFolder(out), inputs_of(options)
     for path in (capture_folder, out, *others):
         require_unicode(path)
@@ -284,7 +294,11 @@ def open_run(
             load_record(run_folder)
         require_usable(run_folder, overwrite=overwrite, resume=resume)
     # Workers end before the lock: what they were at may be cleared away then.
-    with quiet_colmap(), locked(out), Workers(run_options.workers) as workers:
+    with (
+        quiet_colmap(),
+        locked(out),
+        _workers(run_options, capture_folder, out, options) as workers,
+    ):
         record = prepare_output(run_folder, overwrite=overwrite, resume=resume)
         identity = identity_of(capture)
         require_same_capture(record, identity, run_folder)
@@ -311,6 +325,15 @@ def open_run(
             with suppress(PolmvsError):  # the first error is the one to report
                 run.save()
             raise
+
+
+def _workers(run_options: RunOptions, capture_folder: Path, out: Path, options: Options) -> Workers:
+    """Processes here, or those of a cluster that sees what they need."""
+    if run_options.scheduler is None:
+        return Workers(run_options.workers)
+    existing = next(folder for folder in (out, *out.parents) if folder.is_dir())
+    sources = [path for path in (capture_folder, *inputs_of(options)) if path.exists()]
+    return Workers.of_cluster(run_options.scheduler, [existing], sources)
 
 
 def load_record(run_folder: RunFolder) -> Record:

@@ -247,9 +247,10 @@ def _models(record: Record) -> tuple[AngleModel, ...]:
 
 def _levels(views: Path) -> Iterator[Mesh]:
     """The hull and the levels that a run left, in their order."""
-    for name in SURFACE_LEVELS:
-        if (views / name).is_file():
-            yield read_mesh(views / name)
+    number = 0
+    while (path := views / SURFACE_LEVELS.format(number=number)).is_file():
+        yield read_mesh(path)
+        number += 1
 
 
 def _principal_point(camera: Camera) -> tuple[Sequence[float], Sequence[float]]:

@@ -61,7 +61,9 @@ def run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "run"
     shutil.copytree(demo_run, folder)
     views = RunFolder(folder).views("ppa")
-    for number, name in enumerate([*SURFACE_LEVELS[:3], SURFACE_MESH]):
+    for number, name in enumerate(
+        [*(SURFACE_LEVELS.format(number=n) for n in range(3)), SURFACE_MESH]
+    ):
         vertices = TETRAHEDRON / (1 + number)
         write_mesh(views / name, Mesh(vertices=vertices, normals=TETRAHEDRON, triangles=FACES))
     return folder

@@ -215,10 +215,10 @@ def _global_surface(
     spacing = fusion.voxel if fusion.voxel is not None else fusion.voxel_px * surface.footprint
     found = surface_points(surface, maps, spacing or FINEST_SPACING_PX * surface.footprint)
     write_mesh(views / SURFACE_MESH, supported_mesh(surface))
-    for name, mesh in zip(SURFACE_LEVELS, levels, strict=False):  # there are fewer
+    for number, mesh in enumerate(levels):
         faces = mesh.faces.astype(np.int32)
         whole = Mesh(vertices=mesh.vertices, normals=mesh.vertex_normals, triangles=faces)
-        write_mesh(views / name, whole)
+        write_mesh(views / SURFACE_LEVELS.format(number=number), whole)
     return found
 
 

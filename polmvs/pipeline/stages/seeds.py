@@ -155,6 +155,12 @@ def seed_tracks(source: Path, num_tracks: int) -> NDArray[np.bool_]:
     return is_seed
 
 
+def _require_tracks(source: Path, track: NDArray[np.int64], num_tracks: int) -> None:
+    """Refuse seeds of other sparse points."""
+    if len(track) and not (track.min() >= NO_TRACK and track.max() < num_tracks):
+        raise DataError(source, "is not of these sparse points; run again with `run.overwrite`.")
+
+
 def _warn_of_doubts(parts: Sequence[PartReport]) -> None:
     """One line for all parts without a place, by the largest of them; the log has the others."""
     if not parts:
@@ -172,12 +178,6 @@ def _warn_of_doubts(parts: Sequence[PartReport]) -> None:
     )
     for part in others:
         logger.info("%s: so does one of %d px: %s.", part.view, part.num_px, part.doubt)
-
-
-def _require_tracks(source: Path, track: NDArray[np.int64], num_tracks: int) -> None:
-    """Refuse seeds of other sparse points."""
-    if len(track) and not (track.min() >= NO_TRACK and track.max() < num_tracks):
-        raise DataError(source, "is not of these sparse points; run again with `run.overwrite`.")
 
 
 def _rows(seeds: Seeds, track: NDArray[np.int64]) -> NDArray[np.void]:

@@ -1,0 +1,306 @@
+"""Work on a ``dask.distributed`` cluster behind the interface of an executor.
+
+The cluster is the user's: a scheduler and its workers, on any machines, that see the same storage
+under the same paths and run the same versions. All of that is checked before work starts. Lost
+workers are Dask's to replace; what a lost scheduler has forgotten is submitted again to the one
+that follows it at the same address. Tasks are safe to repeat: each depends on its arguments alone
+and writes its files whole.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from importlib.metadata import PackageNotFoundError, version
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from polmvs._version import __version__
+from polmvs.errors import DataError, OptionError
+
+PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pycolmap")
+SCATTERED_BYTES = 100_000  # of arguments, from which they do not pass through the scheduler's graph
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClusterPatience:
+    """Seconds and repetitions that a cluster is given.
+
+    Attributes
+    ----------
+    connect_s : for the scheduler to answer. A guess.
+    workers_s : for the first worker to come. A guess.
+    return_s : for a lost scheduler to be there again. A guess: longer than a restart by hand.
+    max_losses : of the scheduler during one map; a guess.
+    """
+
+    connect_s: float = 10.0
+    workers_s: float = 30.0
+    return_s: float = 120.0
+    max_losses: int = 5
+
+
+class Cluster:
+    """A connection to a scheduler.
+
+    Parameters
+    ----------
+    address : of the scheduler, such as ``tcp://10.0.0.1:8786``.
+    storage : folders that every worker must see under the same path; written to for a moment.
+    sources : files and folders that every worker must be able to read.
+    patience : see there.
+
+    Raises
+    ------
+    OptionError
+        ``dask.distributed`` is not installed.
+    DataError
+        The scheduler does not answer or has no workers, or a worker runs other versions or does
+        not see the storage.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        storage: Sequence[Path] = (),
+        sources: Sequence[Path] = (),
+        *,
+        patience: ClusterPatience = ClusterPatience(),
+    ) -> None:
+        self.address = address
+        self.patience = patience
+        self._client = _connect(address, patience)
+        try:
+            self._check_workers()
+            for folder in storage:
+                self._check_storage(folder)
+            self._check_sources(sources)
+        except BaseException:
+            self._client.close()
+            raise
+        self._pending: set[Any] = set()
+
+    @property
+    def num_threads(self) -> int:
+        """Tasks that the workers of now do at a time."""
+        return sum(self._client.nthreads().values())
+
+    def outcomes(
+        self, function: Callable[..., Any], *iterables: Any
+    ) -> Iterator[Callable[[], Any]]:
+        """As :meth:`polmvs.parallel.Workers.outcomes`; all tasks are submitted at once."""
+        tasks = list(zip(*iterables, strict=False))
+        futures = [self._submit(function, task) for task in tasks]
+        ask = partial(self._result, function, tasks, futures)
+        return (partial(ask, index) for index in range(len(tasks)))
+
+    def _result(
+        self,
+        function: Callable[..., Any],
+        tasks: list[tuple[Any, ...]],
+        futures: list[Any],
+        index: int,
+    ) -> Any:
+        """Result of a task.
+
+        Raises
+        ------
+        DataError
+            The task cost several workers their lives, or the scheduler does not come back.
+        """
+        from distributed import KilledWorker
+
+        for losses in count(1):
+            try:
+                result = futures[index].result()
+                break
+            except KilledWorker as error:
+                raise DataError(
+                    self.address,
+                    f"{error.allowed_failures + 1} workers were lost on the same task: out of "
+                    "memory? Give each worker more memory or fewer threads.",
+                ) from error
+            except (CancelledError, OSError, TimeoutError) as error:
+                of_task = futures[index].status == "error"
+                if of_task or losses > self.patience.max_losses:
+                    raise
+                self._await_return(error)
+                for later in range(index, len(tasks)):
+                    if futures[later].status != "finished":
+                        futures[later] = self._submit(function, tasks[later])
+        self._pending.discard(futures[index])
+        futures[index].release()
+        tasks[index] = ()  # nothing of it is held for those to come
+        return result
+
+    def close(self, *, cancel: bool) -> None:
+        """End the connection; the cluster stays."""
+        if cancel and self._pending and self._client.status == "running":
+            self._client.cancel(list(self._pending), force=True)
+        self._pending.clear()
+        self._client.close()
+
+    def _submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Any:
+        """One task; large arguments go to the workers past the scheduler's graph."""
+        import cloudpickle  # comes with Dask; a script's own functions travel whole
+
+        packed = cloudpickle.dumps((function, task))
+        payload: Any = packed
+        if len(packed) > SCATTERED_BYTES:
+            payload = self._client.scatter(packed, hash=False)
+        future = self._client.submit(_work, own_versions(), payload, pure=False)
+        self._pending.add(future)
+        return future
+
+    def _await_return(self, error: BaseException) -> None:
+        """Wait for a scheduler at the address; connect anew."""
+        end = time.monotonic() + self.patience.return_s
+        while True:
+            try:
+                if self._client.status != "running":
+                    self._client.close(timeout=1)
+                    self._client = _connect(self.address, self.patience)
+                self._client.wait_for_workers(1, timeout=self.patience.workers_s)
+                return
+            except (DataError, OSError, TimeoutError):
+                if time.monotonic() > end:
+                    raise DataError(
+                        self.address,
+                        "the scheduler or all of its workers were lost and did not come back. "
+                        "Start them again and go on with `run.resume`.",
+                    ) from error
+                time.sleep(1)
+
+    def _check_workers(self) -> None:
+        """Every worker has this package, in these versions."""
+        try:
+            self._client.wait_for_workers(1, timeout=self.patience.workers_s)
+        except (TimeoutError, OSError) as error:
+            raise DataError(
+                self.address, f"has no workers. Start some: dask worker {self.address}"
+            ) from error
+        mine = own_versions()
+        for worker, found in self._on_all(_try_versions).items():
+            for package, wanted in mine.items():
+                if found.get(package) != wanted:
+                    raise DataError(
+                        worker,
+                        f"the worker has {package} {found.get(package, 'missing')}, this program "
+                        f"{wanted}. Install the same versions there.",
+                    )
+
+    def _check_storage(self, folder: Path) -> None:
+        """Every worker reads what is written here, and writes what is read here."""
+        token = secrets.token_hex(8)
+        probe = folder / f".polmvs-probe-{token}.tmp"
+        answers: dict[str, Path] = {}
+        try:
+            probe.write_text(token, encoding="ascii")
+            found = self._on_all(_try_storage, str(folder), token)
+            answers = {worker: folder / name for worker, name in found.items() if name}
+            for worker in found:
+                if worker not in answers or not answers[worker].is_file():
+                    raise DataError(
+                        worker,
+                        f"the worker does not share {folder} with this program. Give a folder on "
+                        "storage that all workers read and write under the same path.",
+                    )
+        except OSError as error:
+            raise DataError(folder, f"cannot be written: {error.strerror or error}.") from error
+        finally:
+            for path in (probe, *answers.values()):
+                path.unlink(missing_ok=True)
+
+    def _check_sources(self, sources: Sequence[Path]) -> None:
+        names = [str(path.absolute()) for path in sources]
+        for worker, missing in self._on_all(_missing, names).items():
+            if missing:
+                raise DataError(
+                    missing[0],
+                    f"the worker {worker} does not see it. Put it on storage that all workers "
+                    "share under the same path.",
+                )
+
+    def _on_all(self, function: Callable[..., Any], *arguments: Any) -> Mapping[str, Any]:
+        """What each worker answers, by its address."""
+        try:
+            return dict(self._client.run(function, *arguments, on_error="raise"))
+        except Exception as error:  # whatever the worker could not load
+            text = " ".join(str(error).split()) or type(error).__name__
+            raise DataError(
+                self.address,
+                f"a worker cannot run polmvs {__version__} ({text}). Install it there.",
+            ) from error
+
+
+@lru_cache(maxsize=1)
+def own_versions() -> dict[str, str]:
+    """Versions that decide a task's result."""
+    found = {"polmvs": __version__}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "unknown"
+    return found
+
+
+def _connect(address: str, patience: ClusterPatience) -> Any:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise OptionError(
+            "needs dask.distributed: pip install 'polmvs[dask]'.", field="run.scheduler"
+        ) from error
+    try:
+        return Client(address, timeout=patience.connect_s, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise DataError(
+            address,
+            "no Dask scheduler answers there. Start one ('dask scheduler'), or give its address "
+            "as it prints it, such as tcp://10.0.0.1:8786.",
+        ) from error
+
+
+# On the workers
+
+
+def _work(versions: dict[str, str], packed: bytes) -> Any:
+    """Do a task; a worker that came later is checked as the first ones were."""
+    import cloudpickle
+
+    if versions != own_versions():
+        raise DataError(
+            "dask worker", f"has other versions ({own_versions()}) than the program ({versions})."
+        )
+    cv2.setNumThreads(1)  # a worker's thread is one core
+    function, task = cloudpickle.loads(packed)
+    return function(*task)
+
+
+def _try_versions() -> dict[str, str]:
+    return own_versions()
+
+
+def _try_storage(folder: str, token: str) -> str:
+    """Name of a file written beside the probe; empty where that is not seen."""
+    probe = Path(folder) / f".polmvs-probe-{token}.tmp"
+    answer = probe.with_name(f".polmvs-probe-{token}-{secrets.token_hex(8)}.tmp")
+    try:
+        if probe.read_text(encoding="ascii") != token:
+            return ""
+        answer.write_text(token, encoding="ascii")
+    except OSError:
+        return ""
+    return answer.name
+
+
+def _missing(paths: Sequence[str]) -> list[str]:
+    return [path for path in paths if not Path(path).exists()]

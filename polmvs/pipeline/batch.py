@@ -1,0 +1,409 @@
+"""Many captures, one after the other or side by side: a list of them, a folder each, one table.
+
+A capture is one task (:mod:`polmvs.parallel`): on this machine each has a process of its own, on a
+cluster a worker. One that fails stops no other.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+import os
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import partial
+from multiprocessing import active_children
+from pathlib import Path
+from typing import Any
+
+from polmvs.config import (
+    AngleModel,
+    FieldInfo,
+    Options,
+    PairChoice,
+    RunOptions,
+    describe_fields,
+    groups_of,
+    in_table,
+    require_table,
+    values_from_plain,
+    with_absolute_paths,
+)
+from polmvs.errors import DataError, OptionError, PolmvsError
+from polmvs.evaluation.tables import format_table, number
+from polmvs.io.images import write_bytes
+from polmvs.io.typed_json import write_json
+from polmvs.parallel import Workers
+from polmvs.pipeline.jobs import Job, JobOutcome, reconstruct
+from polmvs.pipeline.monitor import NoMonitor
+from polmvs.pipeline.run_folder import RunFolder, has_content
+from polmvs.pipeline.stages.densify import DensifyResult
+from polmvs.pipeline.stages.poses import PosesResult
+
+logger = logging.getLogger(__name__)
+
+TABLE_FILE, JSON_FILE = "batch.md", "batch.json"
+LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+LOST = "its worker was lost: out of memory? Give `run.workers` 1, or workers more memory."
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchEntry:
+    """One capture of a list.
+
+    Attributes
+    ----------
+    name : of its folder in OUT.
+    capture : folder.
+    angle_model : of its reconstruction.
+    options : of all stages.
+    """
+
+    name: str
+    capture: Path
+    angle_model: AngleModel
+    options: Options
+
+
+class State(StrEnum):
+    """What has become of a capture."""
+
+    FINISHED = "finished"
+    EMPTY = "empty"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchRow:
+    """What has become of one capture of a list.
+
+    Attributes
+    ----------
+    name, capture : as in the list.
+    state : ``empty`` is a finished run whose cloud has no points.
+    num_images, num_views : of the capture, and those with a pose.
+    num_tracks, num_points : sparse and dense points.
+    seconds : of all calls.
+    peak_rss_mb : the largest of its stages.
+    message : why there is no cloud, or none with points.
+    """
+
+    name: str
+    capture: Path
+    state: State
+    num_images: int = 0
+    num_views: int = 0
+    num_tracks: int = 0
+    num_points: int = 0
+    seconds: float = 0.0
+    peak_rss_mb: float = 0.0
+    message: str = ""
+
+
+def read_batch(
+    path: Path, options: Options, angle_model: AngleModel = AngleModel.PPA
+) -> tuple[BatchEntry, ...]:
+    """Captures of a list, a TOML or CSV file; paths in it are relative to its folder.
+
+    TOML: a table ``[[captures]]`` for each, with ``capture``, the folder, ``name``, by default
+    that of the folder, ``model``, and tables of options by group. CSV: a line for each under a
+    header with ``capture`` and as needed ``name``, ``model`` and options as ``group.name``; an
+    empty cell is one that is not there.
+
+    Parameters
+    ----------
+    path : of the list.
+    options, angle_model : of what the list leaves open.
+
+    Raises
+    ------
+    DataError
+        The list cannot be read or is empty, or a capture's folder is missing.
+    OptionError
+        A key or value is unusable, or a name is there twice.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8"
+        raise DataError(path, f"is no readable list of captures ({reason}).") from error
+    suffix = path.suffix.lower()
+    if suffix not in (".toml", ".csv"):
+        raise DataError(path, "is no list of captures: its name must end in .toml or .csv.")
+    tables = _toml_tables(path, text) if suffix == ".toml" else _csv_tables(path, text)
+    if not tables:
+        raise DataError(path, "lists no captures.")
+    entries = [
+        _entry(table, f"{path}: {where}", path.absolute().parent, options, angle_model)
+        for where, table in tables
+    ]
+    seen: dict[str, str] = {}
+    for entry in entries:
+        if entry.name.casefold() in seen:  # some systems do not tell them apart
+            raise OptionError(f"{path}: two captures are named {entry.name!r}; give `name`s.")
+        seen[entry.name.casefold()] = entry.name
+    for entry in entries:
+        if not entry.capture.is_dir():
+            raise DataError(entry.capture, f"no such folder; {path} lists it as {entry.name!r}.")
+    return tuple(entries)
+
+
+def run_batch(
+    entries: Sequence[BatchEntry],
+    out: Path,
+    run_options: RunOptions,
+    on_done: Callable[[BatchRow], None] = lambda row: None,
+) -> list[BatchRow]:
+    """Reconstruct captures, each into ``OUT/NAME``; ``OUT/batch.md`` and ``.json`` grow with them.
+
+    Parameters
+    ----------
+    entries : from :func:`read_batch`.
+    out : folder of all runs.
+    run_options : ``workers`` processes are shared among the captures, of each of which at least
+        one; with ``scheduler`` each capture is one task of the cluster.
+    on_done : told of each capture, in the list's order.
+
+    Raises
+    ------
+    OptionError
+        A capture's folder in OUT holds something, and neither ``overwrite`` nor ``resume`` is
+        given.
+    DataError
+        OUT cannot be made, or the cluster is unusable.
+    """
+    out = out.absolute()
+    for entry in entries:
+        folder = out / entry.name
+        if has_content(folder) and not (run_options.overwrite or run_options.resume):
+            raise OptionError(
+                f"{folder}: exists and is not empty. Give `run.overwrite` to delete earlier runs "
+                "in it, `run.resume` to go on with them, or another OUT."
+            )
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(out, f"cannot be made: {error.strerror or error}.") from error
+    each = replace(run_options, workers=1, scheduler=None)
+    if run_options.scheduler is not None:
+        captures = [entry.capture for entry in entries]
+        workers = Workers.of_cluster(run_options.scheduler, [out], captures)
+    else:
+        num_beside = min(run_options.workers, len(entries))
+        each = replace(each, workers=run_options.workers // num_beside)
+        workers = Workers(num_beside)
+    rows: list[BatchRow] = []
+    with workers:
+        outcomes = workers.outcomes(partial(_run_one, out, each), entries)
+        try:
+            for entry, outcome in zip(entries, outcomes, strict=True):
+                rows.append(_row_of(entry, outcome))
+                write_json(out / JSON_FILE, rows)
+                write_bytes(out / TABLE_FILE, f"{batch_table(rows)}\n".encode())
+                on_done(rows[-1])
+        except BaseException:  # Ctrl-C: captures take long, and go on with `run.resume`
+            for child in active_children():
+                child.terminate()
+            raise
+    return rows
+
+
+def batch_table(rows: Sequence[BatchRow]) -> str:
+    """One table of all captures."""
+    header = ["capture", "state", "views", "sparse", "points", "s", "peak MB", "why"]
+    cells = [
+        [
+            row.name,
+            row.state,
+            f"{row.num_views} of {row.num_images}",
+            f"{row.num_tracks:,}",
+            f"{row.num_points:,}",
+            number(row.seconds, digits=1),
+            number(row.peak_rss_mb, digits=0),
+            row.message.replace("|", "\\|"),
+        ]
+        for row in rows
+    ]
+    return format_table(header, cells)
+
+
+class _LogMonitor(NoMonitor):
+    """Writes what happens into the run's log."""
+
+    def __init__(self) -> None:
+        self.handler: logging.Handler | None = None
+
+    def opened(self, run_folder: RunFolder) -> None:
+        """Begin."""
+        self.handler = logging.FileHandler(run_folder.log, encoding="utf-8")
+        self.handler.setFormatter(logging.Formatter(LOG_FORMAT))
+        logging.getLogger("polmvs").addHandler(self.handler)
+
+    def close(self) -> None:
+        """End."""
+        if self.handler is not None:
+            logging.getLogger("polmvs").removeHandler(self.handler)
+            self.handler.close()
+
+
+def _run_one(out: Path, run_options: RunOptions, entry: BatchEntry) -> BatchRow:
+    """Reconstruct one capture; what goes wrong is told, not raised."""
+    package = logging.getLogger("polmvs")
+    if package.getEffectiveLevel() > logging.INFO:  # a worker's, which no terminal has set
+        package.setLevel(logging.INFO)
+    monitor = _LogMonitor()
+    job = Job(
+        capture=entry.capture,
+        out=out / entry.name,
+        options=entry.options,
+        run_options=run_options,
+        monitor=monitor,
+        command_line=("polmvs", "batch", entry.name),
+    )
+    try:
+        return _finished(entry, reconstruct(job, entry.angle_model))
+    except PolmvsError as error:
+        logger.error("%s", error)
+        return _failed(entry, str(error))
+    except Exception as error:
+        logger.exception("internal error")
+        return _failed(entry, f"internal error: {type(error).__name__}: {error}")
+    finally:
+        monitor.close()
+
+
+def _row_of(entry: BatchEntry, outcome: Callable[[], BatchRow]) -> BatchRow:
+    try:
+        return outcome()
+    except BrokenProcessPool:
+        return _failed(entry, LOST)
+    except (PolmvsError, OSError) as error:
+        return _failed(entry, str(error))
+
+
+def _finished(entry: BatchEntry, outcome: JobOutcome) -> BatchRow:
+    poses = outcome.result(PosesResult)
+    return BatchRow(
+        name=entry.name,
+        capture=entry.capture,
+        state=State.FINISHED if outcome.empty is None else State.EMPTY,
+        num_images=len(outcome.record.images),
+        num_views=poses.num_views,
+        num_tracks=poses.num_tracks,
+        num_points=outcome.result(DensifyResult, entry.angle_model).num_points,
+        seconds=outcome.record.wall_s,
+        peak_rss_mb=max(stage.peak_rss_mb for stage in outcome.record.stages),
+        message=outcome.empty or "",
+    )
+
+
+def _failed(entry: BatchEntry, message: str) -> BatchRow:
+    return BatchRow(
+        name=entry.name,
+        capture=entry.capture,
+        state=State.FAILED,
+        message=" ".join(message.split()),
+    )
+
+
+# Lists
+
+
+def _toml_tables(path: Path, text: str) -> list[tuple[str, dict[str, Any]]]:
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise DataError(path, f"is no TOML file ({error}).") from error
+    listed = content.pop("captures", [])
+    if content or not isinstance(listed, list) or not all(isinstance(t, dict) for t in listed):
+        found = next(iter(content), "captures")
+        raise OptionError(f"{path}: {found!r} is none of its tables, which are [[captures]].")
+    return [(f"capture {number}", table) for number, table in enumerate(listed, start=1)]
+
+
+def _csv_tables(path: Path, text: str) -> list[tuple[str, dict[str, Any]]]:
+    reader = csv.DictReader(text.splitlines(), restkey="", skipinitialspace=True)
+    infos = {
+        info.path: info for cls in groups_of(Options).values() for info in describe_fields(cls)
+    }
+    known = {"capture", "name", "model", *infos}
+    for column in reader.fieldnames or ():
+        if column not in known:
+            raise OptionError(
+                f"{path}: unknown column {column!r}; columns are capture, name, model, and options "
+                "as group.name such as sfm.intrinsics."
+            )
+    tables = []
+    for row in reader:
+        where = f"line {reader.line_num}"
+        if "" in row:
+            raise OptionError(f"{path}: {where}: has more cells than the header.")
+        table: dict[str, Any] = {}
+        for column, cell in row.items():
+            if not cell:
+                continue
+            group, _, name = column.partition(".")
+            if not name:
+                table[column] = cell
+            else:
+                value = _value_of(infos[column], cell, f"{path}: {where}")
+                table.setdefault(group, {})[name] = value
+        tables.append((where, table))
+    return tables
+
+
+def _value_of(info: FieldInfo, cell: str, where: str) -> Any:
+    """A cell as TOML would have it."""
+    try:
+        if info.kind is bool:
+            return {"yes": True, "no": False, "true": True, "false": False}[cell.lower()]
+        if info.kind in (int, float):
+            return info.kind(cell)
+        if getattr(info.kind, "__origin__", None) is tuple:
+            kinds = info.kind.__args__
+            return [
+                (kinds[0] if Ellipsis in kinds else kind)(part.strip())
+                for part, kind in zip(cell.split(","), kinds * len(cell), strict=False)
+            ]
+    except (KeyError, ValueError, TypeError) as error:
+        raise OptionError(f"{where}: {info.path} cannot be {cell!r}.") from error
+    return cell
+
+
+def _entry(
+    table: Mapping[str, Any], where: str, base: Path, options: Options, angle_model: AngleModel
+) -> BatchEntry:
+    """A capture of a list from its table."""
+    table = dict(table)
+    capture, name, model = (table.pop(key, None) for key in ("capture", "name", "model"))
+    if not isinstance(capture, str):
+        raise OptionError(f"{where}: needs a 'capture', the folder of one.")
+    folder = Path(os.path.normpath(base / capture))
+    name = folder.name if name is None else name
+    if not isinstance(name, str) or Path(name).name != name or name in ("", ".", ".."):
+        raise OptionError(f"{where}: the name {name!r} cannot be that of a folder.")
+    if model is not None and model not in set(AngleModel):
+        raise OptionError(f"{where}: model must be one of {', '.join(AngleModel)}, not {model!r}.")
+    groups = groups_of(Options)
+    made: dict[str, Any] = {}
+    for group, values in table.items():
+        require_table(group, values, groups, where)
+        given = values_from_plain(groups[group], values, where)
+        for key, value in given.items():
+            if isinstance(value, Path):
+                given[key] = base / value
+            elif (group, key) == ("sfm", "pairs") and value not in set(PairChoice):
+                given[key] = str(base / value)
+        try:
+            made[group] = replace(getattr(options, group), **given)
+        except OptionError as error:
+            raise in_table(error, where) from error
+    return BatchEntry(
+        name=name,
+        capture=folder,
+        angle_model=AngleModel(model or angle_model),
+        options=with_absolute_paths(replace(options, **made)),
+    )

@@ -1,0 +1,201 @@
+"""Captures with printed texture, cheap enough for hundreds of views: SfM finds their poses.
+
+A dark glossy part lies in printed surroundings. Light from the print is unpolarised and the same
+from every side, that from the part polarised as Fresnel's equations say; labels on the part are
+printed too, so that sparse points lie on it. Every ray has a closed form, as in
+:mod:`polmvs.synthetic.captures`; the print is sampled at the resolution that a pixel covers, so
+that features are found again from other distances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from polmvs.camera import Camera, sample_image
+from polmvs.geometry import RigidTransform
+from polmvs.scene import View
+from polmvs.synthetic.captures import SyntheticView, look_at, render_mosaic, render_view
+from polmvs.synthetic.surfaces import Group, Surface
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+DARKEST, BRIGHTEST = 0.15, 0.85  # of a print, s0 in full scales
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PrintedScene:
+    """A glossy part among printed surfaces, which lie nearly along the x-y plane.
+
+    Attributes
+    ----------
+    part : polarises the light.
+    surroundings : what is printed, by x and y.
+    labels : (L, 3), centres of round printed labels on the part, world.
+    label_radius : of each label.
+    texel : side of a texel of the print in the scene's unit; on labels a quarter of it.
+    seed : of the print.
+    part_s0 : ``I0 + I90`` of the part beside its labels, full scales.
+    """
+
+    part: Surface
+    surroundings: Surface
+    labels: ArrayLike
+    label_radius: float
+    texel: float
+    seed: int = 0
+    part_s0: float = 0.2
+
+    @cached_property
+    def print_levels(self) -> list[NDArray[np.float32]]:
+        """The print, and its means over 2, 4, 8, ... texels a side."""
+        return _pyramid(_random_print(1024, np.random.default_rng(self.seed)))
+
+    @cached_property
+    def all_surfaces(self) -> Group:
+        """Part and surroundings, which occlude each other."""
+        return Group((self.part, self.surroundings))
+
+
+def render_printed_mosaic(
+    view: View, scene: PrintedScene, *, sensor: str = "tilted", ior: float = 1.5
+) -> Array:
+    """Render a raw mosaic ``(2 H, 2 W)`` of the view's half-size image, share of full scale.
+
+    Parameters
+    ----------
+    view : camera of the half-size image, and pose.
+    scene : what is seen.
+    sensor, ior : as in :func:`polmvs.synthetic.captures.render_view`.
+    """
+    mosaic = render_mosaic(view, scene.part, sensor=sensor, ior=ior, s0=scene.part_s0)
+    camera = view.camera
+    # Samples of the mosaic lie half a half-size pixel apart.
+    cols, rows = np.arange(2 * camera.width), np.arange(2 * camera.height)
+    xy = 0.5 * np.stack(np.meshgrid(cols + 0.5, rows + 0.5), axis=-1)
+    printed, brightness = _print_seen(view, scene, xy)
+    mosaic[printed] = 0.5 * brightness[printed]  # behind any polarizer half of the light is left
+    return mosaic
+
+
+def render_printed_truth(view: View, scene: PrintedScene) -> tuple[SyntheticView, Array]:
+    """The part alone as :func:`render_view` gives it, and the depth (H, W) of all that is seen."""
+    part = render_view(view, scene.part, s0=scene.part_s0)
+    everything = render_view(view, scene.all_surfaces)
+    return part, everything.depth
+
+
+def orbit_views(
+    num_views: int,
+    camera: Camera,
+    *,
+    target: ArrayLike = (0.0, 0.0, 0.0),
+    distance: float = 0.6,
+    elevations_deg: tuple[float, float] = (30.0, 65.0),
+    seed: int = 0,
+    ordered: bool = False,
+) -> list[View]:
+    """Views from all around, as a hand would take them; their names' order tells nothing.
+
+    Azimuths advance by the golden angle, so that any number of views surrounds the target; places,
+    directions and rolls vary by a few percent and degrees.
+
+    Parameters
+    ----------
+    num_views, camera, target, distance : of how many, with which, at what, how far off.
+    elevations_deg : range of the elevations over the x-y plane.
+    seed : of the variations and of the order of the names.
+    ordered : name the views by their azimuth instead.
+
+    Returns
+    -------
+    Views named ``000.png`` on, sorted by name.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = np.radians(elevations_deg)
+    azimuths = np.mod(np.arange(num_views) * np.pi * (3 - np.sqrt(5)), 2 * np.pi)
+    ranks = np.argsort(np.argsort(azimuths)) if ordered else rng.permutation(num_views)
+    views = []
+    for rank, azimuth in zip(ranks, azimuths, strict=True):
+        elevation = rng.uniform(low, high)
+        across = np.cos(elevation)
+        direction = [across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)]
+        center = np.asarray(target) + distance * rng.uniform(0.9, 1.1) * np.array(direction)
+        pose = look_at(center, np.asarray(target) + distance * rng.normal(scale=0.02, size=3))
+        cos, sin = np.cos(roll := rng.normal(scale=0.2)), np.sin(roll)
+        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        name = f"{rank:0{max(3, len(str(num_views - 1)))}d}.png"
+        turned = RigidTransform(turn @ pose.rotation, turn @ pose.translation)
+        views.append(View(name=name, camera=camera, cam_from_world=turned))
+    return sorted(views, key=lambda view: view.name)
+
+
+def _print_seen(view: View, scene: PrintedScene, xy: Array) -> tuple[Mask, Array]:
+    """Which image coordinates (H, W, 2) show a print, and how bright it is there."""
+    rays = view.camera.rays(xy) @ view.cam_from_world.rotation
+    center = view.center_in_world
+    on_part, _ = scene.part.intersect(center, rays)
+    on_print, normals = scene.surroundings.intersect(center, rays)
+    is_part = on_part < on_print
+    distance = np.minimum(on_part, on_print)
+    points = center + np.where(np.isfinite(distance), distance, 0)[..., None] * rays
+    labelled = np.zeros(is_part.shape, bool)
+    for label in np.asarray(scene.labels, np.float64).reshape(-1, 3):
+        labelled |= ((points - label) ** 2).sum(axis=-1) < scene.label_radius**2
+    labelled &= is_part
+    printed = np.isfinite(distance) & (labelled | ~is_part)
+    # Sides of a pixel on the surface, the geometric mean of the long and the short one.
+    facing = np.abs((np.nan_to_num(normals) * rays).sum(axis=-1))
+    footprint = distance / view.camera.mean_focal_px / np.sqrt(np.maximum(facing, 0.05))
+    scale = np.where(labelled, 4.0, 1.0) / scene.texel
+    place = points[..., :2] * scale[..., None]
+    level = np.log2(np.maximum(np.where(printed, footprint * scale, 1.0), 1e-3))
+    return printed, _sample_levels(scene.print_levels, place, level)
+
+
+def _sample_levels(levels: Sequence[NDArray[np.float32]], place: Array, level: Array) -> Array:
+    """A periodic print at places (..., 2), texels, blended between two levels of its pyramid."""
+    level = np.clip(level, 0, len(levels) - 1.001)
+    lower = level.astype(int)
+    sampled = np.zeros(level.shape)
+    for index in np.unique(lower):
+        here = lower == index
+        share = level[here] - index
+        fine, coarse = (_sample_periodic(levels[i], place[here] / 2**i) for i in (index, index + 1))
+        sampled[here] = (1 - share) * fine + share * coarse
+    return sampled
+
+
+def _sample_periodic(image: NDArray[np.float32], xy: Array) -> NDArray[np.float32]:
+    side = image.shape[0]
+    padded = np.pad(image, 1, mode="wrap")
+    return sample_image(padded, np.mod(xy, side) + 1)
+
+
+def _pyramid(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    levels = [image]
+    while levels[-1].shape[0] > 4:
+        side = levels[-1].shape[0] // 2
+        levels.append(levels[-1].reshape(side, 2, side, 2).mean(axis=(1, 3)))
+    return levels
+
+
+def _random_print(side: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Blocks of random brightness of every size from 4 to 64 texels, smoothed at their own."""
+    total = np.zeros((side, side))
+    for exponent in range(2, 7):
+        size = 2**exponent
+        blocks = rng.uniform(-1, 1, (side // size, side // size))
+        layer = np.kron(blocks, np.ones((size, size)))
+        for axis in (0, 1):  # a box of its own size leaves no edges that lie on a lattice
+            shifted = [np.roll(layer, shift, axis) for shift in range(-size // 2, size // 2)]
+            layer = np.mean(shifted, axis=0)
+        total += layer
+    low, high = np.percentile(total, [2, 98])
+    share = np.clip((total - low) / (high - low), 0, 1)
+    return np.asarray(DARKEST + (BRIGHTEST - DARKEST) * share, np.float32)
