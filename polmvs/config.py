@@ -485,7 +485,7 @@ class PropagationOptions(OptionGroup, group="propagation"):
     """How ranges spread from the seeds over the polarised region."""
 
     method: Method = option(
-        Method.INTEGRATE,
+        Method.SURFACE,
         "'surface': one mesh that all views agree on, from their silhouettes and phases; "
         "'integrate': multi-view normals over the region's pixels, coarse to fine; 'contour': "
         "along phase contours, as in the paper",
