@@ -99,11 +99,12 @@ def build_maps(
     views = posed_views(sparse)
     names = image_names(capture)
     tracks = read_model(sparse).tracks
-    with replacing(target) as folder:
+    workers = workers or Workers()
+    with replacing(target) as folder, workers.stopped_on_error():
         build = partial(_build_map, capture, options, folder)
         num_inside = 0
         raw_names = [names[view.name] for view in views]
-        for count in (workers or Workers()).map(build, views, raw_names):
+        for count in workers.map(build, views, raw_names):
             num_inside += count
             on_progress(1)
         maps = [open_phase_map(view, folder) for view in views]
@@ -131,8 +132,9 @@ def tilt_maps(
     target : folder of the corrected maps, whole or not at all.
     """
     stored = open_maps(sparse, maps)
-    with replacing(target) as folder:
-        for _ in (workers or Workers()).map(partial(_tilt_map, folder), stored):
+    workers = workers or Workers()
+    with replacing(target) as folder, workers.stopped_on_error():
+        for _ in workers.map(partial(_tilt_map, folder), stored):
             on_progress(1)
     return TiltedMapsResult(num_maps=len(stored))
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from polmvs.colmap.models import read_model, write_model
 from polmvs.config import ReferenceOptions
 from polmvs.io.arrays import map_array, save_array
-from polmvs.io.images import read_gray, write_bytes
+from polmvs.io.images import read_bytes, read_gray, write_bytes
 from polmvs.pipeline.run_folder import CAMERA_MODES, replace_folder, scratch
 from polmvs.poses.metric_frame import Frame, metric_frame, transform_model
 
@@ -107,9 +107,8 @@ def place_model(
     with scratch(target) as folder:
         if frame is None:  # bit for bit what SfM wrote
             (folder / "sparse").mkdir()
-            for file in source.iterdir():
-                if file.name != CAMERA_MODES:
-                    write_bytes(folder / "sparse" / file.name, file.read_bytes())
+            for file in source.glob("*.bin"):
+                write_bytes(folder / "sparse" / file.name, read_bytes(file))
         else:
             write_model(model, folder / "sparse")
         replace_folder(folder / "sparse", target)
