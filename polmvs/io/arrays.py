@@ -57,7 +57,8 @@ def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:
     return array
 
 
-@lru_cache(maxsize=256)
+# Those of the views that are being looked at: what is mapped and read counts as resident memory.
+@lru_cache(maxsize=32)
 def _map_array(path: Path, stamp: int) -> NDArray[Any]:
     # A plain array over the map: OpenCV takes it without a copy.
     return np.asarray(np.lib.format.open_memmap(path, mode="r"))

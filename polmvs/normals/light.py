@@ -11,8 +11,9 @@ diffuse light of a smooth dielectric hardly over 0.4).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,8 +23,14 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel, NormalOptions
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
-from polmvs.normals.tracks import inside_shares, normals_from_windows, window_map
-from polmvs.polarization.phase_map import PhaseMap, turned
+from polmvs.normals.tracks import (
+    MAX_ROWS,
+    WindowMaps,
+    in_tiles,
+    inside_shares,
+    normals_from_windows,
+)
+from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
 
 Array = NDArray[np.float64]
@@ -43,6 +50,8 @@ class LightTolerances:
     diffuse_dolp : largest DoLP of diffuse light. Derived: smooth dielectric of ior 1.5, seen at a
         grazing angle.
     dolp_votes : log-likelihood that twice that DoLP is worth. Guess.
+    max_pixel_views : views, evenly spread over all, that a part's own pixels are looked up in.
+        Guess; more cost time only.
     num_pixels : of a part that vote where it has no points. Guess; costs time only.
     num_ranges : distances that these are tried at. Guess; normals hardly depend on them.
     widening : of the distances beyond those of the scene's points, factor. Guess.
@@ -52,133 +61,190 @@ class LightTolerances:
     max_row_cost: float = 4.0
     diffuse_dolp: float = 0.4
     dolp_votes: float = 20.0
+    max_pixel_views: int = 60
     num_pixels: int = 64
     num_ranges: int = 7
     widening: float = 1.3
 
 
 def find_diffuse(
-    tracks: Tracks, maps: Sequence[PhaseMap], tolerances: LightTolerances | None = None
-) -> list[Mask]:
-    """Pixels of each view whose light is diffuse-dominant.
+    tracks: Tracks,
+    maps: Sequence[PhaseMap],
+    tolerances: LightTolerances | None = None,
+    *,
+    max_rows: int = MAX_ROWS,
+) -> Iterator[Mask]:
+    """Pixels of each view whose light is diffuse-dominant, view by view.
 
     Every connected part of a view's region is decided as a whole: by the points that project into
-    it, else by its own pixels, else with the majority of the capture.
+    it, else by its own pixels, else with the majority of the capture. One map is held at a time.
 
     Parameters
     ----------
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps built under the assumption of specular light.
     tolerances : see there.
+    max_rows : of points and views together, that are solved at a time.
 
     Returns
     -------
-    One ``(H, W)`` bool mask for each map.
+    One ``(H, W)`` bool mask for each map; all is decided before the first.
     """
     t = tolerances or LightTolerances()
-    options = NormalOptions()
+    window_px = NormalOptions().window_px
+    windows = WindowMaps(maps, window_px), WindowMaps(maps, window_px, opposite=True)
     on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
-    windows = [window_map(phase_map, options.window_px) for phase_map in maps]
-    opposite = [turned(m, np.ones(m.region.inside.shape, bool)) for m in windows]
-    specular = normals_from_windows(AngleModel.PPA, on_parts, windows, options.estimator)
-    diffuse = normals_from_windows(AngleModel.PPA, on_parts, opposite, options.estimator)
-    votes, voting = specular_votes(specular, diffuse, t)
-    parts = [
-        _find_parts(m, on_parts.points_in_world[voting], votes[voting], t.min_rows) for m in maps
+    votes, voting = _track_votes(on_parts, windows, t, max_rows)
+    of_points = [
+        _part_votes(m, on_parts.points_in_world[voting], votes[voting], t.min_rows) for m in maps
     ]
+    of_pixels = _pixel_votes(of_points, windows, tracks.points_in_world, t, max_rows)
     overall = float(votes[voting].sum()) + _dolp_votes(maps, t)
-    for k, found in enumerate(parts):
-        dense = _pixel_votes(found, k, windows, opposite, tracks.points_in_world, t)
-        undecided = ~np.isfinite(found.votes)
-        found.votes[undecided] = dense[undecided]
+    decided = []
+    for known, dense in zip(of_points, of_pixels, strict=True):
+        undecided = ~np.isfinite(known)
+        decided.append(np.where(undecided, dense, known))
         overall += float(np.nansum(dense[undecided]))
     # Without any evidence light is specular: what polarises most.
     tie = overall if overall != 0 else 1.0
-    masks = []
-    for phase_map, found in zip(maps, parts, strict=True):
-        verdict = np.where(np.isfinite(found.votes), found.votes, overall)
-        verdict = np.where(verdict == 0, tie, verdict)
-        masks.append(np.asarray((verdict < 0)[found.labels] & phase_map.region.inside))
-    return masks
+    return (_diffuse_pixels(*pair, overall, tie) for pair in zip(maps, decided, strict=True))
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """Connected parts of a view's region.
-
-    Attributes
-    ----------
-    labels : (H, W), number of each pixel's part; 0 outside of the region.
-    votes : (P,), log-likelihood of specular over diffuse light; NaN where nothing has voted.
-    """
-
-    labels: NDArray[np.int32]
-    votes: Array
+def _diffuse_pixels(phase_map: PhaseMap, votes: Array, overall: float, tie: float) -> Mask:
+    """The pixels (H, W) of a view's parts whose votes (P,) say diffuse."""
+    verdict = np.where(np.isfinite(votes), votes, overall)
+    verdict = np.where(verdict == 0, tie, verdict)
+    return np.asarray((verdict < 0)[_parts_of(phase_map)] & phase_map.region.inside)
 
 
-def _find_parts(phase_map: PhaseMap, points: Array, votes: Array, min_points: int) -> _Parts:
-    """Parts with the votes (N,) of the points (N, 3) that project into them; NaN for too few."""
-    inside = phase_map.region.inside
-    num, labels = cv2.connectedComponents(inside.astype(np.uint8), connectivity=4)
+def _track_votes(
+    tracks: Tracks, windows: tuple[WindowMaps, WindowMaps], t: LightTolerances, max_rows: int
+) -> tuple[Array, Mask]:
+    """As :func:`specular_votes` of all tracks, many at a time."""
+    votes, voting = [], []
+    estimator = NormalOptions().estimator
+    for some in in_tiles(tracks, len(windows[0]), max_rows):
+        specular, diffuse = (
+            normals_from_windows(AngleModel.PPA, some, maps, estimator) for maps in windows
+        )
+        of_some = specular_votes(specular, diffuse, t)
+        votes.append(of_some[0])
+        voting.append(of_some[1])
+    return np.concatenate(votes), np.concatenate(voting)
+
+
+def _parts_of(phase_map: PhaseMap) -> NDArray[np.int32]:
+    """Number (H, W) of each pixel's connected part of the region; 0 outside of it."""
+    inside = phase_map.region.inside.astype(np.uint8)
+    return np.asarray(cv2.connectedComponents(inside, connectivity=4)[1], np.int32)
+
+
+def _part_votes(phase_map: PhaseMap, points: Array, votes: Array, min_points: int) -> Array:
+    """Votes (P,) of each part: those (N,) of the points (N, 3) in it; NaN for too few."""
+    labels = _parts_of(phase_map)
+    num = int(labels.max(initial=0)) + 1
     xy = phase_map.view.project(points)
     owner = sample_image(labels.astype(np.float32), xy, nearest=True).astype(np.int64)
     total = np.bincount(owner, votes, minlength=num)
     count = np.bincount(owner, minlength=num)
-    return _Parts(np.asarray(labels, np.int32), np.where(count >= min_points, total, np.nan))
+    return np.where(count >= min_points, total, np.nan)
 
 
 def _pixel_votes(
-    parts: _Parts,
-    k: int,
-    windows: Sequence[PhaseMap],
-    opposite: Sequence[PhaseMap],
+    of_points: Sequence[Array],
+    windows: tuple[WindowMaps, WindowMaps],
     points: Array,
     t: LightTolerances,
-) -> Array:
-    """Votes (P,) of the pixels of view k's undecided parts; NaN where no view sees enough.
+    max_rows: int,
+) -> list[Array]:
+    """Votes (P,) of the pixels of each view's undecided parts; NaN where no view sees enough.
 
     Parameters
     ----------
-    windows, opposite : averaged maps of all views under specular and diffuse light.
+    of_points : votes (P,) of the sparse points for each view's parts; NaN where undecided.
+    windows : averaged maps of all views under specular and diffuse light.
     points : (T, 3), of the scene, which say how far off a part may be.
     """
-    votes = np.full(len(parts.votes), np.nan)
-    phase_map = windows[k]
-    view, center = phase_map.view, phase_map.view.center_in_world
-    undecided = [int(i) for i in np.flatnonzero(~np.isfinite(parts.votes)) if i > 0]
-    in_cam = view.cam_from_world * points
-    ahead = in_cam[in_cam[:, 2] > 0]
-    if not undecided or not len(ahead):
-        return votes
-    pixels, owners = [], []
-    for index in undecided:
-        rows, cols = np.nonzero((parts.labels == index) & phase_map.region.reliable)
-        step = max(1, len(rows) // t.num_pixels)
-        pixels.append(np.stack([cols[::step], rows[::step]], axis=-1) + 0.5)
-        owners.append(np.full(len(pixels[-1]), index))
-    owner, num = np.concatenate(owners), len(votes)
-    rays = view.rays_in_world(np.concatenate(pixels))
-    distances = np.linalg.norm(ahead, axis=-1)
-    nearest, farthest = np.percentile(distances, [2, 98]) * [1 / t.widening, t.widening]
-    # Of each part, per kind of light, the least cost of a row at any of the distances.
-    least, rows_there = np.full((2, num), np.inf), np.zeros(num)
-    for distance in np.geomspace(nearest, farthest, t.num_ranges):
-        placed = center + distance * rays
+    maps = windows[0].maps
+    # A slot is a part of a view at one of the distances.
+    num_slots, first, placed, slots = 0, [], [np.zeros((0, 3))], [np.zeros(0, np.int64)]
+    for phase_map, votes in zip(maps, of_points, strict=True):
+        first.append(num_slots)
+        num_slots += t.num_ranges * len(votes)
+        found = _undecided_pixels(phase_map, votes, points, t)
+        if found is not None:
+            rays, owner, distances = found
+            for index, distance in enumerate(distances):
+                placed.append(phase_map.view.center_in_world + distance * rays)
+                slots.append(first[-1] + index * len(votes) + owner)
+    all_placed, slot = np.concatenate(placed), np.concatenate(slots)
+    seen_by = np.linspace(0, len(maps) - 1, min(len(maps), t.max_pixel_views)).round().astype(int)
+    some = [_Chosen(of_light, seen_by) for of_light in windows]
+    total, sums = np.zeros(num_slots), np.zeros((2, num_slots))
+    step = max(1, max_rows // max(len(seen_by), 1))
+    for start in range(0, len(slot), step):
+        tile, here = all_placed[start : start + step], slot[start : start + step]
         specular, diffuse = (
             solve_normals(rows.rows, rows.rays, rows.sigma)
-            for rows in (gather_rows(AngleModel.PPA, placed, maps) for maps in (windows, opposite))
+            for rows in (gather_rows(AngleModel.PPA, tile, of_light) for of_light in some)
         )
         costs, compared = _row_costs(specular, diffuse, t.max_row_cost)
         counts = compared.sum(axis=0) * (compared.sum(axis=0) >= t.min_rows)
-        total = np.bincount(owner, counts, num)
+        total += np.bincount(here, counts, num_slots)
         for which, cost in enumerate(costs):
-            sums = np.bincount(owner, (cost * compared).sum(axis=0) * (counts > 0), num)
-            mean = np.divide(sums, total, out=np.full(num, np.inf), where=total > 0)
-            least[which] = np.minimum(least[which], mean)
-        rows_there = np.maximum(rows_there, total)
-    known = np.isfinite(least).all(axis=0)
-    votes[known] = (least[1, known] - least[0, known]) * rows_there[known]
-    return votes
+            weighted = (cost * compared).sum(axis=0) * (counts > 0)
+            sums[which] += np.bincount(here, weighted, num_slots)
+    mean = np.divide(sums, total, out=np.full((2, num_slots), np.inf), where=total > 0)
+    dense = []
+    for begin, votes in zip(first, of_points, strict=True):
+        # Of each part, per kind of light, the least cost of a row at any of the distances.
+        own = np.s_[begin : begin + t.num_ranges * len(votes)]
+        least = mean[:, own].reshape(2, t.num_ranges, len(votes)).min(axis=1)
+        rows_there = total[own].reshape(t.num_ranges, len(votes)).max(axis=0)
+        known = np.isfinite(least).all(axis=0)
+        of_view = np.full(len(votes), np.nan)
+        of_view[known] = (least[1, known] - least[0, known]) * rows_there[known]
+        dense.append(of_view)
+    return dense
+
+
+class _Chosen(Sequence[PhaseMap]):
+    """Some of the maps, each when it is asked for."""
+
+    def __init__(self, maps: WindowMaps, chosen: NDArray[np.intp]) -> None:
+        self.maps, self.chosen = maps, chosen
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.maps[int(self.chosen[index])]
+
+
+def _undecided_pixels(
+    phase_map: PhaseMap, votes: Array, points: Array, t: LightTolerances
+) -> tuple[Array, NDArray[np.int64], Array] | None:
+    """Rays (N, 3) in the world of some pixels of undecided parts, the parts, and distances."""
+    view = phase_map.view
+    undecided = [int(i) for i in np.flatnonzero(~np.isfinite(votes)) if i > 0]
+    in_cam = view.cam_from_world * points
+    ahead = in_cam[in_cam[:, 2] > 0]
+    if not undecided or not len(ahead):
+        return None
+    labels, reliable = _parts_of(phase_map), phase_map.region.reliable
+    pixels, owners = [], []
+    for index in undecided:
+        rows, cols = np.nonzero((labels == index) & reliable)
+        step = max(1, len(rows) // t.num_pixels)
+        pixels.append(np.stack([cols[::step], rows[::step]], axis=-1) + 0.5)
+        owners.append(np.full(len(pixels[-1]), index))
+    distances = np.linalg.norm(ahead, axis=-1)
+    nearest, farthest = np.percentile(distances, [2, 98]) * [1 / t.widening, t.widening]
+    return (
+        view.rays_in_world(np.concatenate(pixels)),
+        np.concatenate(owners),
+        np.geomspace(nearest, farthest, t.num_ranges),
+    )
 
 
 def _row_costs(

@@ -7,8 +7,9 @@ projected point, in every view that sees it, not only in the views that matched 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import overload
 
 import cv2
 import numpy as np
@@ -18,12 +19,13 @@ from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, Estimator, NormalOptions
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
-from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import MIN_FACING_COSINE, Seeds, Tracks, point_sigmas
+from polmvs.polarization.phase_map import PhaseMap, turned
+from polmvs.scene import MIN_FACING_COSINE, Seeds, Tracks, point_sigmas, some_tracks
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+MAX_ROWS = 4_000_000  # of points and views, at a time: some 0.6 GB while they are solved
 BORDER_MARGIN_PX = 7  # points nearer to the region's border may lie on the background
 
 
@@ -59,13 +61,48 @@ def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
     mean = mean / np.maximum(share, 1e-9)[..., None]
     # The window's own precision where it is full, less where few of its pixels count.
     samples = np.dstack([mean, np.where(phase_map.region.inside, share, 0)])
-    return replace(phase_map, samples=samples.astype(np.float32))
+    return phase_map.changed(samples=samples.astype(np.float32))
+
+
+class WindowMaps(Sequence[PhaseMap]):
+    """Phase maps averaged over windows, each when it is asked for: none is held.
+
+    Parameters
+    ----------
+    maps, window_px : as in :func:`window_map`.
+    opposite : under the other kind of light everywhere.
+    """
+
+    def __init__(self, maps: Sequence[PhaseMap], window_px: int, *, opposite: bool = False) -> None:
+        self.maps, self.window_px, self.opposite = maps, window_px, opposite
+
+    def __len__(self) -> int:
+        return len(self.maps)
+
+    @overload
+    def __getitem__(self, index: int) -> PhaseMap: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> WindowMaps: ...
+
+    def __getitem__(self, index: int | slice) -> PhaseMap | WindowMaps:
+        if isinstance(index, slice):
+            return WindowMaps(self.maps[index], self.window_px, opposite=self.opposite)
+        averaged = window_map(self.maps[index], self.window_px)
+        if not self.opposite:
+            return averaged
+        return turned(averaged, np.ones(averaged.samples.shape[:2], bool))
 
 
 def track_normals(
-    angle_model: AngleModel, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
+    angle_model: AngleModel,
+    tracks: Tracks,
+    maps: Sequence[PhaseMap],
+    options: NormalOptions,
+    *,
+    max_rows: int = MAX_ROWS,
 ) -> NormalEstimate:
-    """Normals of all tracks in one batch (paper, eq. coeff_2).
+    """Normals of all tracks (paper, eq. coeff_2), many at a time; one map is held at a time.
 
     Parameters
     ----------
@@ -73,11 +110,42 @@ def track_normals(
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps of the views.
     options : window, estimator and weights.
+    max_rows : of tracks and views together, that are solved at a time.
     """
-    windows = [window_map(phase_map, options.window_px) for phase_map in maps]
-    return normals_from_windows(
-        angle_model, tracks, windows, options.estimator, tilt_aware=options.tilt_aware_weights
+    # A track that no view of its own sees in its region has no normal; one stands for all others.
+    own = np.zeros(len(tracks.points_in_world), bool)
+    for k, phase_map in enumerate(maps):
+        here = tracks.obs_view == k
+        inside = sample_image(phase_map.region.inside.astype(np.float32), tracks.obs_xy[here])
+        own[tracks.obs_track[here][inside > 0]] = True
+    solved = own.copy()
+    solved[np.flatnonzero(~own)[:1]] = True
+    source = np.cumsum(solved) - 1
+    source[~own] = source[np.flatnonzero(~own)[:1]]
+    windows = WindowMaps(maps, options.window_px)
+    estimates = [
+        normals_from_windows(
+            angle_model, some, windows, options.estimator, tilt_aware=options.tilt_aware_weights
+        )
+        for some in in_tiles(some_tracks(tracks, solved), len(maps), max_rows)
+    ]
+    joined = {
+        field.name: np.concatenate([getattr(one, field.name) for one in estimates], axis=axis)
+        for field in fields(NormalEstimate)
+        for axis in [1 if field.name == "row_weights" else 0]  # it has views before tracks
+    }
+    weights = joined.pop("row_weights")[:, source]
+    return NormalEstimate(
+        **{name: values[source] for name, values in joined.items()}, row_weights=weights
     )
+
+
+def in_tiles(tracks: Tracks, num_views: int, max_rows: int) -> Iterator[Tracks]:
+    """The tracks in order, so many at a time that their rows in all views are ``max_rows``."""
+    num = max(1, max_rows // max(num_views, 1))
+    index = np.arange(len(tracks.points_in_world))
+    for start in range(0, max(len(index), 1), num):
+        yield some_tracks(tracks, (index >= start) & (index < start + num))
 
 
 def normals_from_windows(
@@ -88,7 +156,7 @@ def normals_from_windows(
     *,
     tilt_aware: bool = True,
 ) -> NormalEstimate:
-    """As :func:`track_normals`, from phase maps that are averaged already (:func:`window_map`).
+    """Normals of tracks in one batch, from phase maps that are averaged (:func:`window_map`).
 
     First from the views that matched the point, which surely see it, then from every view that
     faces it.

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -82,12 +81,88 @@ class PhaseMap:
         """Whether the pixels at image coordinates ``(..., 2)`` belong to the region."""
         return sample_image(self.region.inside.astype(np.float32), xy, nearest=True) > 0
 
+    def changed(self, **changes: Any) -> PhaseMap:
+        """The map with other arrays, not stored."""
+        now = {field.name: getattr(self, field.name) for field in fields(PhaseMap)}
+        return PhaseMap(**{**now, "folder": None, **changes})
+
+
+class StoredPhaseMap(PhaseMap):
+    """A phase map on disk. Its arrays are mapped into memory when they are asked for, not held.
+
+    So the maps of a capture take no memory but for those that are being looked at. It is pickled
+    as its place.
+    """
+
+    def __init__(self, view: View, folder: Path, tilted: bool) -> None:
+        for name, value in (("view", view), ("folder", folder), ("tilted", tilted)):
+            object.__setattr__(self, name, value)
+
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle a stored map as its place."""
-        if self.folder is not None:
-            return partial(open_phase_map, tilted=self.tilted), (self.view, self.folder)
-        arrays = (self.samples, self.intensity, self.diffuse, self.lowest_dolp)
-        return PhaseMap, (self.view, self.region, *arrays, None, self.tilted)
+        assert self.folder is not None
+        return StoredPhaseMap, (self.view, self.folder, self.tilted)
+
+    def _array(self, name: str, kind: type[np.generic]) -> NDArray[Any]:
+        assert self.folder is not None
+        return map_array(self.folder / name, kind)
+
+    @property
+    def flags(self) -> NDArray[np.uint8]:
+        """Region and light of each pixel (H, W), a bit each."""
+        return self._array(f"{self.view.name}.region.npy", np.unsignedinteger)
+
+    @property
+    def samples(self) -> Image:
+        """See :class:`PhaseMap`."""
+        return self._array(_samples_name(self.view.name, self.tilted), np.floating)
+
+    @property
+    def intensity(self) -> Image:
+        """See :class:`PhaseMap`."""
+        return self._array(f"{self.view.name}.intensity.npy", np.floating)
+
+    @property
+    def lowest_dolp(self) -> NDArray[np.uint8]:
+        """See :class:`PhaseMap`."""
+        return self._array(f"{self.view.name}.dolp.npy", np.unsignedinteger)
+
+    @property
+    def region(self) -> Region:
+        """See :class:`PhaseMap`."""
+        return _StoredRegion(self.flags)
+
+    @property
+    def diffuse(self) -> Mask:
+        """See :class:`PhaseMap`."""
+        return np.asarray((self.flags & 8) > 0)
+
+
+class _StoredRegion(Region):
+    """A region as its flags on disk, of which one mask at a time is made."""
+
+    def __init__(self, flags: NDArray[np.uint8]) -> None:
+        object.__setattr__(self, "flags", flags)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Region, (self.inside, self.reliable, self.edges)
+
+    def _mask(self, bit: int) -> Mask:
+        return np.asarray((vars(self)["flags"] & bit) > 0)
+
+    @property
+    def inside(self) -> Mask:
+        """See :class:`Region`."""
+        return self._mask(1)
+
+    @property
+    def reliable(self) -> Mask:
+        """See :class:`Region`."""
+        return self._mask(2)
+
+    @property
+    def edges(self) -> Mask:
+        """See :class:`Region`."""
+        return self._mask(4)
 
 
 def build_phase_map(
@@ -168,7 +243,7 @@ def as_tilted(phase_map: PhaseMap) -> PhaseMap:
     precision = precision / np.square(corrected.sigma)
     samples = np.dstack([scale * corrected.s1, scale * corrected.s2, precision])
     clean = np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
-    return replace(phase_map, samples=clean, folder=None, tilted=True)
+    return phase_map.changed(samples=clean, tilted=True)
 
 
 def turned(phase_map: PhaseMap, where: Mask) -> PhaseMap:
@@ -176,7 +251,7 @@ def turned(phase_map: PhaseMap, where: Mask) -> PhaseMap:
     sign = np.where(where, -1, 1).astype(np.float32)[..., None]
     axial, precision = phase_map.samples[..., :2], phase_map.samples[..., 2:]
     samples = np.concatenate([sign * axial, precision], axis=-1)
-    return replace(phase_map, samples=samples, diffuse=phase_map.diffuse ^ where, folder=None)
+    return phase_map.changed(samples=samples, diffuse=phase_map.diffuse ^ where)
 
 
 def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:
@@ -198,25 +273,22 @@ def _samples_name(name: str, tilted: bool) -> str:
 
 
 def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMap:
-    """Open a stored phase map; its images stay on disk until they are read.
+    """Open a stored phase map; its images stay on disk until they are asked for.
 
     Raises
     ------
     DataError
         If a file is missing, damaged, or of another size than the view's camera.
     """
-    samples = map_array(folder / _samples_name(view.name, tilted), np.floating)
-    intensity = map_array(folder / f"{view.name}.intensity.npy", np.floating)
-    flags = map_array(folder / f"{view.name}.region.npy", np.unsignedinteger)
-    lowest_dolp = map_array(folder / f"{view.name}.dolp.npy", np.unsignedinteger)
+    stored = StoredPhaseMap(view, folder, tilted)
+    samples = stored.samples
     size = (view.camera.height, view.camera.width)
-    shapes = (samples.shape[:2], intensity.shape, flags.shape, lowest_dolp.shape)
-    if any(shape != size for shape in shapes) or samples.shape[2:] != (3,):
+    shapes = (samples.shape[:2], stored.intensity.shape, stored.flags.shape)
+    fits = all(shape == size for shape in (*shapes, stored.lowest_dolp.shape))
+    if not fits or samples.shape[2:] != (3,):
         reason = "has another size than its camera; give `run.overwrite`."
         raise DataError(folder / view.name, reason)
-    region = Region((flags & 1) > 0, (flags & 2) > 0, (flags & 4) > 0)
-    diffuse = (flags & 8) > 0
-    return PhaseMap(view, region, samples, intensity, diffuse, lowest_dolp, folder, tilted)
+    return stored
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ def floor_scene(light: Light, sensor: str = "tilted") -> Scene:
 
 
 def diffuse_share(scene, tracks):
-    masks = find_diffuse(tracks, scene.maps)
+    masks = list(find_diffuse(tracks, scene.maps))
     inside = sum(int(m.region.inside.sum()) for m in scene.maps)
     return sum(int(mask.sum()) for mask in masks) / inside
 
@@ -75,7 +75,7 @@ def test_a_part_without_points_is_told_by_its_own_phases(light):
     assert max(np.linalg.norm(m.samples[..., :2], axis=-1).max() for m in weak) < 0.4
     corners = np.array([[x, y, -0.2] for x in (-0.3, 0.3) for y in (-0.3, 0.3)])
     about = tracks_at(scene, corners)  # on the ground beside it
-    masks = find_diffuse(about, weak)
+    masks = list(find_diffuse(about, weak))
     share = sum(int(m.sum()) for m in masks) / sum(int(m.region.inside.sum()) for m in weak)
     assert share == pytest.approx(1.0 if light == "diffuse" else 0.0, abs=0.05)
 
