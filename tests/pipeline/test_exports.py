@@ -166,7 +166,7 @@ def test_no_mesh_and_no_colmap(go_on: Continue) -> None:
     assert (out / "ppa.ply").is_file()
     assert not (out / "ppa_mesh.ply").exists()
     assert not (out / "dense").exists()
-    assert stages_of(out)[-1] == "densify_ppa"
+    assert stages_of(out)[-1] == "trust_ppa"
 
 
 def test_export_alone(go_on: Continue, run: Path, demo_capture: Path, cli) -> None:
