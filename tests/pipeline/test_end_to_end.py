@@ -58,7 +58,7 @@ def test_run_record(demo_run: Path) -> None:
     assert [stage["name"] for stage in record["stages"]] == STAGES
     for stage in record["stages"]:
         assert stage["seconds"] > 0
-        assert stage["peak_rss_mb"] > 50
+        assert 50 < stage["peak_rss_mb"] < 2500
     assert record["wall_s"] >= 0.99 * sum(stage["seconds"] for stage in record["stages"])
     assert record["options"]["sfm"]["intrinsics"][0] == pytest.approx(333.75)
     assert record["options"]["fusion"]["min_views"] == 2
@@ -148,10 +148,7 @@ def test_library_and_one_worker_give_the_same_cloud(
     before_cloud = ["images", "sfm", "poses", "maps", "normals_ppa", "seeds", "sparse_cloud_ppa"]
     assert stages_of(tmp_path / "out") == [
         *before_cloud,
-        "densify_ppa",
-        "trust_ppa",
-        "mesh_ppa",
-        "dense_ppa",
+        *("densify_ppa", "trust_ppa", "mesh_ppa", "dense_ppa"),
     ]
 
 
@@ -218,7 +215,7 @@ def test_killed_run_goes_on_to_the_same_result(demo_run: Path, tmp_path: Path, c
     time.sleep(0.5)
     kill(process)
     assert not (out / "sparse").exists()
-    assert stages_of(out) in (["images"], ["images", "sfm"])
+    assert stages_of(out) == ["images"]
 
     process = start(out, "--resume")
     wait_until(lambda: unfinished(out, "views_opa"), process)
