@@ -34,7 +34,10 @@ myst_heading_anchors = 3
 
 # Every reference to something of polmvs must have a target; those of other packages have none here.
 nitpicky = True
-nitpick_ignore_regex = [(r"py:.*", r"(?!polmvs\.).*")]
+nitpick_ignore_regex = [
+    (r"py:.*", r"(?!polmvs\.).*"),
+    (r"py:class", r"polmvs\.config\.T"),  # a type variable
+]
 numpydoc_show_class_members = False
 autosummary_generate = False  # which numpydoc brings
 autodoc_member_order = "bysource"

@@ -82,6 +82,7 @@ class Page:
     facts : name and value of what counts most.
     warnings : of the run, each with its remedy.
     tables : of the models' figures, if there are any: those to begin with, and all.
+    trust : figures of the result about itself, with what is normal.
     views, plots : in order.
     scene : of the 3D view; None where no cloud has a point.
     thinned : points above which the clouds on the page are thinned; 0 if none is.
@@ -94,6 +95,7 @@ class Page:
     facts: Sequence[tuple[str, str]]
     warnings: Sequence[str]
     tables: Sequence[Table]
+    trust: Table | None
     views: Sequence[ViewPage]
     plots: Sequence[Plot]
     scene: Scene3D | None

@@ -15,6 +15,7 @@ from polmvs.config import AngleModel, Options, options_from_plain, to_plain
 from polmvs.errors import DataError, PolmvsError
 from polmvs.evaluation.comparison import Comparison, named_as_truth, read_comparison
 from polmvs.evaluation.tables import comparison_rows, number
+from polmvs.evaluation.trust import Trust
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.clouds import Cloud, read_cloud, read_mesh
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
@@ -111,6 +112,7 @@ def write_report(
             facts=_facts(given),
             warnings=tuple(w for stage in given.record.stages for w in stage.warnings),
             tables=_tables(given),
+            trust=_trust(given),
             views=views,
             plots=_plots(given, samples),
             scene=_scene(given, layers, channels),
@@ -394,6 +396,24 @@ def _tables(given: _Given) -> tuple[Table, ...]:
     header, rows = comparison_rows(given.comparison)
     first = [row for row in rows if row[0] in HEADLINE]
     return Table(header=header, rows=first), Table(header=header, rows=rows)
+
+
+def _trust(given: _Given) -> Table | None:
+    """What the main result says about itself, with what is normal."""
+    main = next(m for m in MAIN if m in given.models)
+    found = given.record.find(Trust, main)
+    if found is None:
+        return None
+    rows = [
+        [
+            figure.name,
+            number(figure.value, 1, 2),
+            f"{figure.least:g} to {figure.most:g}",
+            "" if figure.is_normal else f"check {figure.remedy.replace('`', '')}",
+        ]
+        for figure in found.figures()
+    ]
+    return Table(header=[plots.LABELS[main], "value", "normal", ""], rows=rows)
 
 
 def _plots(given: _Given, samples: Mapping[AngleModel, ErrorSamples]) -> list[Plot]:
