@@ -9,8 +9,8 @@ With ``--capture`` that capture is run first, into the only OUT. ``--estimators`
 estimators beside a plain NumPy baseline, ``--ingest`` the way from a mosaic of 5 megapixels to
 Stokes images with their noise beside OpenCV's and, where it is installed, polanalyser's.
 ``--growth`` makes captures of printed texture in WORK and measures all stages after SfM, on true
-poses, with the number of views, and the per-view stages with that of workers: threads, processes and
-Dask's. With ``--write DIR`` its table and plot become ``DIR/growth.md`` and
+poses, with the number of views, and the per-view stages with that of workers: threads, processes
+and Dask's. With ``--write DIR`` its table and plot become ``DIR/growth.md`` and
 ``DIR/images/growth.png``.
 """
 
