@@ -29,6 +29,7 @@ from polmvs.pipeline.stage_table import (
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.evaluation import evaluate_models
 from polmvs.pipeline.stages.maps import MIN_VIEWS, MapsResult
+from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
 from polmvs.polarization.capture import open_capture
 
@@ -44,6 +45,10 @@ NO_SEEDS = (
     "no seeds: no sparse point lies on the polarised surface with a normal that fits its light, "
     "and no part could be placed by its outline. Put a few printed marks or labels on the part, "
     "check `region.light`, or give the part with `region.mask`."
+)
+TOO_MANY_VIEWS = (
+    "no points: `fusion.min_views` asks for more views to confirm a point than have a pose. Give "
+    "less, or better poses."
 )
 NO_POINTS = (
     "no points: the views agree on none. Check `sfm.intrinsics` or `sfm.sparse` and "
@@ -272,4 +277,6 @@ def _close(run: Run, models: Sequence[AngleModel]) -> JobOutcome:
             empty = NO_SEEDS
         if record.result(MapsResult).num_region_px == 0:
             empty = NO_REGION
+        elif run.options.fusion.min_views > record.result(PosesResult).num_views:
+            empty = TOO_MANY_VIEWS
     return JobOutcome(run_folder=run.run_folder, record=record, empty=empty)

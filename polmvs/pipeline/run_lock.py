@@ -46,6 +46,7 @@ def locked(root: Path) -> Iterator[None]:
         Another run is at work in it, or it cannot be written.
     """
     path = root / LOCK_FILE
+    is_new = not root.exists()
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -65,6 +66,8 @@ def locked(root: Path) -> Iterator[None]:
             else:
                 with suppress(OSError):
                     path.unlink()
+                    if is_new:  # and nothing came of it
+                        root.rmdir()
     finally:
         os.close(descriptor)
 

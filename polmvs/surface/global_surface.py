@@ -19,6 +19,7 @@ from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds, View
+from polmvs.surface.creases import corner_normals, sharpened, sided_normals
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
 from polmvs.surface.hollows import Hollow, SurfaceFaces, find_hollows
@@ -66,8 +67,9 @@ class GlobalSurface:
     mesh : all of it, closed, parts that no view bears out included.
     supported : (F,) bool, faces that the views bear out.
     evidence : of the faces.
-    normals : (V, 3) unit, from the phases at the vertices.
-    sigma_deg : (V,) standard deviation of the normal, degrees; inf where unknown.
+    normals : (F, 3, 3) unit, from the phases, of each corner of the faces: two sides of an edge
+        have their own.
+    sigma_deg : (F,) standard deviation of the normal, degrees; inf where unknown.
     sigma : (V,) standard deviation of the place along the normal, world units; inf where unknown.
     footprint : length that a pixel covers at the surface, world units.
     contradictions : with the data.
@@ -184,14 +186,16 @@ def reconstruct_surface(
         return Undetermined("the surface vanishes under the phases of the views")
     row_error, median = median_residual(mesh, views, rows)
     row_sigma = max(row_error, tolerances.row_sigma)
+    fitted = fit_normals(mesh, views, rows, row_sigma=row_sigma, row_error=row_error)
+    normals = sided_normals(mesh, fitted.normals, fitted.is_fitted)
+    mesh = sharpened(mesh, normals)
+    report(1)
     evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
     supported = supported_faces(mesh, evidence, min_views=min_views)
     seen = evidence.num_views >= min_views
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     presumed = seen & ~supported & _lie_on(mesh, [hollow.values for hollow in hollows])
     supported |= presumed
-    report(1)
-    normals = fit_normals(mesh, views, rows, row_sigma=row_sigma, row_error=row_error)
     report(1)
     sigma = _deviations(mesh, views, rows, hull.footprint, known)
     report(1)
@@ -200,8 +204,8 @@ def reconstruct_surface(
         mesh=mesh,
         supported=supported,
         evidence=evidence,
-        normals=normals.normals,
-        sigma_deg=normals.sigma_deg,
+        normals=corner_normals(mesh, normals),
+        sigma_deg=fitted.sigma_deg,
         sigma=sigma,
         footprint=hull.footprint,
         contradictions=contradictions,
@@ -295,9 +299,14 @@ def supported_mesh(surface: GlobalSurface) -> Mesh:
     """What the views bear out of the surface, with the normals of the phases."""
     faces = surface.mesh.faces[surface.supported]
     used, compact = np.unique(faces, return_inverse=True)
+    # A file has one normal for each vertex: on an edge the mean of its sides'.
+    sums = np.zeros_like(surface.mesh.vertices)
+    np.add.at(sums, faces, surface.normals[surface.supported])
+    normals = sums[used]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     return Mesh(
         vertices=surface.mesh.vertices[used],
-        normals=surface.normals[used],
+        normals=normals,
         triangles=compact.reshape(-1, 3).astype(np.int32),
     )
 
@@ -326,14 +335,13 @@ def surface_points(
     points = mesh.points_at(face, barycentric)
     kept = voxel_representatives(points, max(spacing, np.sqrt(area / max_points)))
     face, barycentric, points = face[kept], barycentric[kept], points[kept]
-    normals = _interpolated(surface.normals, mesh, face, barycentric)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    normals = _normals_at(surface, face, barycentric)
     cloud = FusedCloud(
         points=points,
         normals=normals,
         intensity=_intensity(points, normals, maps),
         num_views=surface.evidence.num_views[face].astype(np.int32),
-        sigma_deg=_finite(_interpolated(surface.sigma_deg, mesh, face, barycentric)),
+        sigma_deg=_finite(surface.sigma_deg[face]),
         sigma=_finite(_interpolated(surface.sigma, mesh, face, barycentric)),
     )
     return cloud, surface.presumed[face]
@@ -347,10 +355,15 @@ def _finite(values: Array) -> NDArray[np.float32]:
 def _interpolated(
     values: Array, mesh: TriangleMesh, face: NDArray[np.int64], barycentric: Floats
 ) -> Array:
-    """Values ``(V, ...)`` of vertices at points of faces."""
-    corners = values[mesh.faces[face]]
-    weights = barycentric.reshape(*barycentric.shape, *([1] * (corners.ndim - 2)))
-    return np.asarray((corners * weights).sum(axis=1))
+    """Values ``(V,)`` of vertices at points of faces."""
+    return np.asarray((values[mesh.faces[face]] * barycentric).sum(axis=1))
+
+
+def _normals_at(surface: GlobalSurface, face: NDArray[np.int64], barycentric: Floats) -> Array:
+    """Unit normals ``(N, 3)`` at points of faces."""
+    normals = (surface.normals[face] * barycentric[:, :, None]).sum(axis=1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return np.asarray(normals)
 
 
 def _intensity(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> NDArray[np.float32]:
@@ -395,12 +408,11 @@ def render_view(
     range_map, confidence = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     sigma, sigma_deg = (np.full(shape, np.nan, np.float32) for _ in range(2))
     normal_map = np.full((*shape, 3), np.nan, np.float32)
-    normals = _interpolated(surface.normals, mesh, face, barycentric)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    normals = _normals_at(surface, face, barycentric)
     along = _interpolated(surface.sigma, mesh, face, barycentric) / np.maximum(cosine, 0.1)
     range_map.ravel()[index] = hits.distance[index]
     normal_map.reshape(-1, 3)[index] = normals
     sigma.ravel()[index] = _finite(along)
-    sigma_deg.ravel()[index] = _finite(_interpolated(surface.sigma_deg, mesh, face, barycentric))
+    sigma_deg.ravel()[index] = _finite(surface.sigma_deg[face])
     confidence.ravel()[index] = surface.evidence.agreement[face]
     return DenseView(stride_px, range_map, normal_map, sigma_deg, sigma, confidence)

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-CHUNK = 20_000  # vertices whose normals are solved at a time; bounds memory
+CHUNK = 20_000  # faces whose normals are solved at a time; bounds memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,8 @@ class QualityTolerances:
     max_contradicting_share : of the phases at a face. Guess.
     smoothing_rounds : of the shares over neighbouring faces: single faces are noisy. Guess.
     trusted_deg : by which the normal that the phases give at a place may differ from the mesh's,
-        beside three deviations. Guess.
+        beside three deviations. Guess: a face across a right-angled edge is turned by 45 deg, most
+        by less.
     """
 
     min_cosine: float = 0.1
@@ -52,7 +53,7 @@ class QualityTolerances:
     row_sine: float = 0.2
     max_contradicting_share: float = 0.6
     smoothing_rounds: int = 2
-    trusted_deg: float = 10.0
+    trusted_deg: float = 25.0
 
 
 @dataclass(frozen=True)
@@ -169,19 +170,22 @@ def _smoothed(mesh: TriangleMesh, values: Array, rounds: int) -> Array:
 
 
 @dataclass(frozen=True)
-class VertexNormals:
-    """Normals of a mesh's vertices at their places.
+class FaceNormals:
+    """Normals of a mesh's faces at their places.
 
     Attributes
     ----------
-    normals : (V, 3) unit, world: the phases' where they agree with the mesh, else the mesh's.
-    sigma_deg : (V,) standard deviation, degrees; inf where the phases give none.
-    num_views : (V,) int, views whose phases count.
+    normals : (F, 3) unit, world: the phases' where they agree with the mesh, else the mesh's.
+    sigma_deg : (F,) standard deviation, degrees; inf where the phases give none.
     """
 
     normals: Array
     sigma_deg: Array
-    num_views: NDArray[np.int64]
+
+    @property
+    def is_fitted(self) -> Mask:
+        """(F,), whether a normal is the phases'."""
+        return np.isfinite(self.sigma_deg)
 
 
 def fit_normals(
@@ -192,7 +196,7 @@ def fit_normals(
     row_sigma: float,
     row_error: float,
     tolerances: QualityTolerances | None = None,
-) -> VertexNormals:
+) -> FaceNormals:
     """Normals from the phases of all views at the places of the mesh, which stay.
 
     A mesh's own normals are noisier: they are differences of places.
@@ -203,27 +207,27 @@ def fit_normals(
     row_error : deviation of ``m . n`` that the surface shows. Views share some of it, so that it
         does not average out: half of it is added to the normals' deviations. Guess.
     """
-    tol = tolerances or QualityTolerances()
-    num = len(mesh.vertices)
-    normals, sigma = mesh.vertex_normals.copy(), np.full(num, np.inf)
-    counted = np.zeros(num, np.int64)
-    scene = RayScene(mesh) if num else None
+    tol, rows_tolerances = tolerances or QualityTolerances(), RefinementTolerances()
+    num = len(mesh.faces)
+    normals, sigma = mesh.face_normals.copy(), np.full(num, np.inf)
+    if not num:
+        return FaceNormals(normals, sigma)
+    scene, centers = RayScene(mesh), mesh.centers
     for start in range(0, num, CHUNK):
         part = slice(start, min(start + CHUNK, num))
-        points, own = mesh.vertices[part], mesh.vertex_normals[part]
+        points, own = centers[part], mesh.face_normals[part]
         shape = (len(views), len(points))
         rows = np.full((3, *shape), np.nan, np.float32)
         rays = np.zeros((3, *shape), np.float32)
         turns = np.full(shape, np.inf, np.float32)
         for index, view in enumerate(views):
-            assert scene is not None  # there are vertices
             seen, directions, _ = visible_points(
                 scene,
                 view.center,
                 points,
                 own,
-                tolerance=0.5 * mesh.mean_edge,
-                min_cosine=tol.min_cosine,
+                tolerance=rows_tolerances.visible_slack * mesh.mean_edge,
+                min_cosine=rows_tolerances.min_cosine,
             )
             found = phase_rows(view, angle_model, points[seen])
             known = found.precision > 0
@@ -238,8 +242,7 @@ def fit_normals(
         normals[part][good] = estimate.normals[good]
         shared = np.degrees(0.5 * row_error)
         sigma[part] = np.where(good, np.hypot(estimate.sigma_deg, shared), np.inf)
-        counted[part] = estimate.num_rows
-    return VertexNormals(normals, sigma, counted)
+    return FaceNormals(normals, sigma)
 
 
 @dataclass(frozen=True, kw_only=True)

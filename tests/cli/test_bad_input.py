@@ -442,15 +442,21 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
-@pytest.mark.parametrize("num_stages", [0, 2, 3, 5])
-def test_full_disk(demo_run: Path, demo_capture: Path, tmp_path: Path, num_stages: int) -> None:
+# In SfM COLMAP refuses to begin, or aborts the process that it works in.
+@pytest.mark.parametrize(
+    ("num_stages", "limit"),
+    [(0, 30000), (1, 30000), (1, 200_000), (2, 30000), (3, 30000), (6, 30000)],
+)
+def test_full_disk(
+    demo_run: Path, demo_capture: Path, tmp_path: Path, num_stages: int, limit: int
+) -> None:
     """A limit on the size of files fails as a full disk does, at a stage's first large file."""
     out = tmp_path / "out"
     shutil.copytree(demo_run, out)
     record = json.loads((out / "run.json").read_text())
     record["stages"] = record["stages"][:num_stages]
     (out / "run.json").write_text(json.dumps(record))
-    arguments = ["30000", "demo", str(out), "--resume", "--workers", "1"]
+    arguments = [str(limit), "demo", str(out), "--resume", "--workers", "1"]
     done = subprocess.run(
         [sys.executable, "-c", FULL_DISK, *arguments], capture_output=True, text=True, check=False
     )

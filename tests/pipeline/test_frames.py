@@ -266,6 +266,12 @@ def test_markers_where_there_are_none(take_poses, out: Path) -> None:
     assert "--aruco DICT_4X4_50:0.05: " in err
     assert "marker" in err
     assert not (out / "sparse").exists()
+    # What SfM found is kept: the run goes on without doing it again.
+    assert stages_of(out) == ["images", "sfm"]
+    before = (out / "sfm" / "images.bin").stat().st_mtime_ns
+    assert take_poses("--scale", "000.png", "004.png", 0.25)[0] == 0
+    assert (out / "sfm" / "images.bin").stat().st_mtime_ns == before
+    assert stages_of(out) == ["images", "sfm", "poses"]
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import record_of, refused
+from helpers import record_of, refused, result_of
 
 from polmvs.colmap.models import read_model, write_model
 from polmvs.pipeline.checks import identity_of
 from polmvs.polarization.capture import open_capture
+from polmvs.scene import some_tracks
 
 INTRINSICS = "333.75,333.75,230.6475,196.608"  # of the bundled capture
 
@@ -126,6 +127,24 @@ def test_truth_of_other_names(cli, demo_capture, tmp_path: Path) -> None:
     (gt / "cameras.json").write_text(content.replace('"0', '"x0'))
     err = refused(cli("compare", demo_capture, tmp_path / "out", "--gt", gt))
     assert "knows 0 of the 10 images by name" in err
+
+
+def test_few_views_are_said_to_carry_little(cli, demo_capture, demo_run, tmp_path: Path) -> None:
+    model = read_model(demo_run / "sparse")
+    few = tmp_path / "few"
+    seen = model.tracks.obs_view < 3
+    tracks = replace(
+        model.tracks,
+        obs_track=model.tracks.obs_track[seen],
+        obs_view=model.tracks.obs_view[seen],
+        obs_xy=model.tracks.obs_xy[seen],
+    )
+    counted = np.bincount(tracks.obs_track, minlength=len(tracks.point3D_ids)) > 0
+    write_model(replace(model, views=model.views[:3], tracks=some_tracks(tracks, counted)), few)
+    status, _, err = cli("sfm", demo_capture, tmp_path / "out", "--sparse", few)
+    assert status == 0
+    assert "3 views carry little" in err
+    assert result_of(tmp_path / "out", "sfm")["num_views"] == 3
 
 
 def test_a_gamma_that_does_not_fit_is_warned_of(cli, demo_capture) -> None:
