@@ -646,6 +646,12 @@ class RunOptions(OptionGroup, group="run", in_files=False):
         "OUT on storage that they see under the same path",
         metavar="ADDRESS",
     )
+    memory: float | None = option(
+        None,
+        "GB of memory for this process and those that share the views with it: fewer of them and "
+        "smaller tiles are used where they need more; a stage that takes more is told",
+        above=0,
+    )
 
     def check(self) -> None:
         """Not both."""
