@@ -75,6 +75,7 @@ class GlobalSurface:
     contradictions : with the data.
     presumed : (F,) bool, faces that no phase shows: walls of hollows, presumed as thick inside as
         the rim shows them.
+    tilt_share : as in :class:`polmvs.surface.refinement.Refined`.
     """
 
     mesh: TriangleMesh
@@ -86,6 +87,7 @@ class GlobalSurface:
     footprint: float
     contradictions: Contradictions
     presumed: Mask
+    tilt_share: float
 
 
 @dataclass(frozen=True)
@@ -210,6 +212,7 @@ def reconstruct_surface(
         footprint=hull.footprint,
         contradictions=contradictions,
         presumed=presumed,
+        tilt_share=refined.tilt_share,
     )
 
 

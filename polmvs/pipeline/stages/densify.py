@@ -67,10 +67,15 @@ class DensifyResult:
     ----------
     num_points : of the cloud, on polarised surfaces.
     num_surroundings : of the cloud, beside them.
+    method : by which the points were made: the views one by one where there is no surface from all.
+    tilt_share : of the turn by tilted polarizers that the surface of all views took back; None by
+        the other methods.
     """
 
     num_points: int
     num_surroundings: int
+    method: Method
+    tilt_share: float | None
 
     def __str__(self) -> str:
         return f"{self.num_points:,} points, and {self.num_surroundings:,} of the surroundings"
@@ -126,9 +131,9 @@ def densify(
     with scratch(views) as folder, workers.stopped_on_error():
         new_views = folder / "views"
         new_views.mkdir()
-        fused, presumed = None, np.zeros(0, np.bool_)
-        if propagation.method is Method.SURFACE:
-            fused, presumed = _global_surface(
+        found, method = None, propagation.method
+        if method is Method.SURFACE:
+            found = _global_surface(
                 model,
                 phase_maps,
                 known,
@@ -140,7 +145,11 @@ def densify(
                 masks_given=masks_given,
                 on_progress=on_progress,
             )
-        if fused is None:
+        if found is not None:
+            fused, presumed, tilt_share = found
+        else:
+            method = Method.CONTOUR if method is Method.CONTOUR else Method.INTEGRATE
+            presumed, tilt_share = np.zeros(0, np.bool_), None
             fused = _dense_surface(
                 model,
                 phase_maps,
@@ -164,7 +173,12 @@ def densify(
         )
         replace_folder(new_views, views)
     write_cloud(cloud, _join_clouds(surface, around))
-    return DensifyResult(num_points=len(surface.points), num_surroundings=len(around.points))
+    return DensifyResult(
+        num_points=len(surface.points),
+        num_surroundings=len(around.points),
+        method=method,
+        tilt_share=tilt_share,
+    )
 
 
 def _global_surface(
@@ -179,8 +193,8 @@ def _global_surface(
     tilt_aware: bool,
     masks_given: bool,
     on_progress: OnProgress,
-) -> tuple[FusedCloud | None, NDArray[np.bool_]]:
-    """The surface of all views, and which of its points are presumed.
+) -> tuple[FusedCloud, NDArray[np.bool_], float] | None:
+    """The surface of all views, which of its points are presumed, and its share of the tilt.
 
     Its mesh and its depth in each view go to ``views``. None where silhouettes do not bound the
     objects.
@@ -203,7 +217,7 @@ def _global_surface(
             model,
             surface.reason,
         )
-        return None, np.zeros(0, np.bool_)
+        return None
     for sentence in surface.contradictions.warnings():
         logger.warning("%s: %s.", model, sentence)
     scene = RayScene(surface.mesh)
@@ -213,13 +227,13 @@ def _global_surface(
             store_dense_view(dense, views / phase_map.view.name)
         on_progress(1)
     spacing = fusion.voxel if fusion.voxel is not None else fusion.voxel_px * surface.footprint
-    found = surface_points(surface, maps, spacing or FINEST_SPACING_PX * surface.footprint)
+    points = surface_points(surface, maps, spacing or FINEST_SPACING_PX * surface.footprint)
     write_mesh(views / SURFACE_MESH, supported_mesh(surface))
     for number, mesh in enumerate(levels):
         faces = mesh.faces.astype(np.int32)
         whole = Mesh(vertices=mesh.vertices, normals=mesh.vertex_normals, triangles=faces)
         write_mesh(views / SURFACE_LEVELS.format(number=number), whole)
-    return found
+    return *points, surface.tilt_share
 
 
 def _dense_surface(
