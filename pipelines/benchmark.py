@@ -1,20 +1,35 @@
-"""Print the seconds and memory of the stages of one or more runs, side by side.
+"""Print times and memory: of runs by stage, of single steps beside others' ways, and their growth.
 
     python pipelines/benchmark.py OUT [OUT ...]
     python pipelines/benchmark.py --capture CAPTURE OUT [flags of polmvs compare]
-    OMP_NUM_THREADS=1 python pipelines/benchmark.py --estimators
+    OMP_NUM_THREADS=1 python pipelines/benchmark.py --estimators --ingest
+    python pipelines/benchmark.py --growth WORK --views 25,50,100 --num-workers 1,2,4 --write docs
 
 With ``--capture`` that capture is run first, into the only OUT. ``--estimators`` times the normal
-estimators beside a plain NumPy baseline.
+estimators beside a plain NumPy baseline, ``--ingest`` the way from a mosaic of 5 megapixels to
+Stokes images with their noise beside OpenCV's and, where it is installed, polanalyser's.
+``--growth`` makes captures of printed texture in WORK and measures all stages after SfM, on true
+poses, with the number of views, and the per-view stages with that of workers: threads, processes
+and Dask's. With ``--write DIR`` its table and plot become ``DIR/growth.md`` and
+``DIR/images/growth.png``.
 """
 
 from __future__ import annotations
 
+import os
+import platform
+import shutil
+import tempfile
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,15 +38,31 @@ from polmvs.cli.commands import HOW, TO_CLOUD
 from polmvs.cli.flags import Command
 from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
-from polmvs.config import AngleModel, EvaluationOptions, OptionGroup, RunOptions, option
+from polmvs.colmap.models import write_model
+from polmvs.config import (
+    AngleModel,
+    EvaluationOptions,
+    OptionGroup,
+    Options,
+    RunOptions,
+    default_num_workers,
+    option,
+)
 from polmvs.errors import OptionError
 from polmvs.evaluation.tables import format_table
+from polmvs.io.images import write_bytes
 from polmvs.normals.estimator import EstimatorTolerances, solve_normals
 from polmvs.normals.single_view.plane import plane_normal
-from polmvs.pipeline.jobs import Job, compare
+from polmvs.parallel import Workers
+from polmvs.pipeline.jobs import Job, compare, reconstruct
+from polmvs.pipeline.record import versions
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
 from polmvs.pipeline.runner import load_record, timing_table
+from polmvs.pipeline.stages.images import write_images
+from polmvs.pipeline.stages.maps import build_maps
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
+from polmvs.polarization.capture import open_capture
+from polmvs.synthetic.printed_capture import Part, printed_model, scene_of, write_printed_capture
 
 Array = NDArray[np.float64]
 
@@ -48,11 +79,17 @@ class Arguments(OptionGroup, group="arguments", in_files=False):
     runs: tuple[Path, ...] = option((), "folders of finished runs", positional=True, metavar="OUT")
     capture: Path | None = option(None, "compare the models on this capture first, into OUT")
     estimators: bool = option(False, "time the normal estimators")
+    ingest: bool = option(False, "time the way from a mosaic to Stokes images")
+    growth: Path | None = option(None, "measure the growth, in this folder", metavar="WORK")
+    views: tuple[int, ...] = option((25, 50, 100), "growth: numbers of views", least=4)
+    width: int = option(612, "growth: of the half-size images, px", least=48)
+    num_workers: tuple[int, ...] = option((1, 2, 4), "growth: numbers of workers", least=1)
+    write: Path | None = option(None, "growth: folder of growth.md and images/", metavar="DIR")
 
     def check(self) -> None:
         """There is something to do."""
-        if not self.runs and not self.estimators:
-            raise OptionError("give the folder of a run, or --estimators.")
+        if not (self.runs or self.estimators or self.ingest or self.growth):
+            raise OptionError("give the folder of a run, --estimators, --ingest or --growth.")
         if self.capture is not None and len(self.runs) != 1:
             raise OptionError("--capture goes with one OUT.")
 
@@ -61,6 +98,14 @@ def _benchmark(call: Call, terminal: Terminal) -> int:
     given = call.get(Arguments)
     if given.estimators:
         print(estimator_table())
+    if given.ingest:
+        print(ingest_table())
+    if given.growth is not None:
+        run_options = call.get(RunOptions)
+        page = growth_page(given, call.options(), run_options, terminal)
+        print(page.text)
+        if given.write is not None:
+            page.save(given.write)
     if given.capture is not None:
         job = Job(
             capture=given.capture,
@@ -78,7 +123,7 @@ def _benchmark(call: Call, terminal: Terminal) -> int:
 
 
 COMMAND = Command(
-    help_text="seconds and memory of the stages of one or more runs, side by side",
+    help_text="times and memory of runs by stage, of single steps, and their growth",
     run=_benchmark,
     groups=(Arguments, *TO_CLOUD, EvaluationOptions, *HOW),
 )
@@ -164,6 +209,321 @@ def _tracks(rng: np.random.Generator) -> list[tuple[str, float]]:
         (what + "weighted, robust", _median_seconds(estimate(True))),
         (what + "plain NumPy, robust rounds", _median_seconds(baseline)),
     ]
+
+
+def ingest_table() -> str:
+    """Stokes images from a mosaic of 5 megapixels, three ways; without reading the file."""
+    rng = np.random.default_rng(0)
+    rows, cols = np.mgrid[:2048, :2448]
+    scene = 90 + 60 * np.sin(rows / 37) * np.cos(cols / 53) + rng.normal(0, 2, rows.shape)
+    raw = np.clip(scene, 1, 250).astype(np.uint8)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.pgm"
+        header = b"P5\n%d %d\n255\n" % raw.shape[::-1]
+        for name in ("a.pgm", "b.pgm"):
+            (path.parent / name).write_bytes(header + raw.tobytes())
+        capture = open_capture(path.parent)
+        reading = _median_seconds(lambda: capture._read(path))
+        own = _median_seconds(lambda: capture.load("a.pgm")) - reading
+    ways = [("polmvs: interpolated to the cell's centre, noise, clipped and dark pixels", own)]
+    ways.append(
+        (
+            "OpenCV: slices of the mosaic, Stokes, angle and degree",
+            _median_seconds(partial(_opencv_ingest, raw)),
+        )
+    )
+    try:
+        import polanalyser
+    except ImportError:
+        ways.append(("polanalyser: not installed", np.nan))
+    else:
+        angles = np.deg2rad([0, 45, 90, 135])
+
+        def others() -> object:
+            images = polanalyser.demosaicing(raw, polanalyser.COLOR_PolarMono)
+            stokes = polanalyser.calcStokes(images, angles)
+            return polanalyser.cvtStokesToAoLP(stokes), polanalyser.cvtStokesToDoLP(stokes)
+
+        ways.append(("polanalyser: demosaicing, Stokes, angle and degree", _median_seconds(others)))
+    rows_ = [[name, f"{1e3 * t:.1f}", f"{t / own:.2f}"] for name, t in ways]
+    return format_table(["mosaic of 2448x2048, median of 7", "ms", "of polmvs"], rows_)
+
+
+def _opencv_ingest(raw: NDArray[np.uint8]) -> object:
+    samples = raw.astype(np.float32)
+    i90, i45, i135, i0 = (samples[r::2, c::2] for r, c in ((0, 0), (0, 1), (1, 0), (1, 1)))
+    s0 = 0.5 * (i0 + i45 + i90 + i135)
+    s1, s2 = cv2.subtract(i0, i90), cv2.subtract(i45, i135)
+    length, angle = cv2.cartToPolar(s1, s2)
+    return 0.5 * angle, length / s0
+
+
+# Growth
+
+
+@dataclass(frozen=True, kw_only=True)
+class Growth:
+    """One run of some views.
+
+    Attributes
+    ----------
+    num_views : of it.
+    seconds, peak_mb : of each stage by name.
+    """
+
+    num_views: int
+    seconds: dict[str, float]
+    peak_mb: dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scaling:
+    """The per-view stages with some workers.
+
+    Attributes
+    ----------
+    backend : ``threads``, ``processes`` or ``Dask``.
+    num_workers : of it.
+    seconds : of images and maps, workers started already.
+    """
+
+    backend: str
+    num_workers: int
+    seconds: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class GrowthPage:
+    """Table and plot of the growth.
+
+    Attributes
+    ----------
+    text : Markdown.
+    runs, scalings : what it shows.
+    """
+
+    text: str
+    runs: Sequence[Growth]
+    scalings: Sequence[Scaling]
+
+    def save(self, folder: Path) -> None:
+        """Write ``growth.md`` and ``images/growth.png`` into a folder of documents."""
+        import matplotlib
+
+        matplotlib.use("Agg")
+        from matplotlib import pyplot
+
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        figure, axes = pyplot.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+        views = [run.num_views for run in self.runs]
+        for stage in self.runs[-1].seconds:
+            axes[0].loglog(views, [run.seconds[stage] for run in self.runs], "o-", label=stage)
+            axes[1].semilogx(views, [run.peak_mb[stage] for run in self.runs], "o-", label=stage)
+        for backend in dict.fromkeys(one.backend for one in self.scalings):
+            some = [one for one in self.scalings if one.backend == backend]
+            axes[2].plot(
+                [one.num_workers for one in some],
+                [one.seconds for one in some],
+                "o-",
+                label=backend,
+            )
+        for axis, x, y in zip(
+            axes,
+            ("views", "views", "workers"),
+            ("seconds of a stage", "peak memory of a stage, MB", "images and maps, seconds"),
+            strict=True,
+        ):
+            axis.set(xlabel=x, ylabel=y)
+            axis.set_ylim(bottom=0) if axis is not axes[0] else None
+        axes[0].legend(fontsize=6)
+        axes[2].legend(fontsize=8)
+        figure.savefig(folder / "images" / "growth.png", dpi=120)
+        pyplot.close(figure)
+        picture = (
+            "![Time and memory of the stages with the views, and with workers](images/growth.png)"
+        )
+        write_bytes(folder / "growth.md", f"{self.text}\n\n{picture}\n".encode())
+
+
+def growth_page(
+    given: Arguments, options: Options, run_options: RunOptions, terminal: Terminal
+) -> GrowthPage:
+    """Make the captures, run them, and fit the exponents."""
+    assert given.growth is not None
+    runs = [_run_views(given, num, options, run_options, terminal) for num in sorted(given.views)]
+    scalings = _scalings(given, max(given.views), terminal)
+    stages = list(runs[-1].seconds)
+    header = ["stage", *(f"{run.num_views} views, s" for run in runs), "exponent"]
+    header += [*(f"{run.num_views}, MB" for run in runs), "ratio of time per view"]
+    rows = []
+    for stage in stages:
+        times = [run.seconds[stage] for run in runs]
+        per_view = [t / run.num_views for t, run in zip(times, runs, strict=True)]
+        rows.append(
+            [
+                stage,
+                *(f"{t:.2f}" for t in times),
+                _exponent(runs, times),
+                *(f"{run.peak_mb[stage]:.0f}" for run in runs),
+                f"{per_view[-1] / max(per_view[0], 1e-9):.2f}",
+            ]
+        )
+    one = {s.backend: s.seconds for s in scalings if s.num_workers == min(given.num_workers)}
+    worker_rows = [
+        [
+            f"{s.backend}, {s.num_workers}",
+            f"{s.seconds:.2f}",
+            f"{one[s.backend] / s.seconds:.2f}",
+            f"{one[s.backend] / s.seconds / s.num_workers:.2f}",
+        ]
+        for s in scalings
+    ]
+    sizes = ",".join(map(str, given.views))
+    text = "\n\n".join(
+        [
+            "# Growth with views and workers",
+            f"`python pipelines/benchmark.py --growth WORK --views {sizes} --width {given.width} "
+            f"--num-workers {','.join(map(str, given.num_workers))} --workers "
+            f"{run_options.workers} --write docs`, on {_machine()}.",
+            f"Captures of `pipelines/synthetic.py`, half-size images {given.width} px wide, true "
+            "poses and 2,000 true sparse points in place of SfM's. An exponent of 1 is a time that "
+            "grows with the views; the last column is the time per view of most views over that of "
+            "fewest.",
+            format_table(header, rows),
+            "Stages `images` and `maps` of the largest capture, their workers started before:",
+            format_table(["workers", "s", "speed-up", "efficiency"], worker_rows),
+        ]
+    )
+    return GrowthPage(text=text, runs=runs, scalings=scalings)
+
+
+def _machine() -> str:
+    """What the figures were measured on."""
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+        model = names[0].partition(":")[2].strip() if names else model
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    found = versions()
+    return (
+        f"{os.cpu_count()} cores ({model}), load {load:.1f} at the end, Python {found['python']}, "
+        f"NumPy {found['numpy']}, polmvs {found['polmvs']}"
+    )
+
+
+def _capture(given: Arguments, num_views: int) -> tuple[Path, Path]:
+    """Folders of a capture and of its true model, made where they are missing."""
+    assert given.growth is not None
+    folder = given.growth / f"capture-{num_views}-{given.width}"
+    model = given.growth / f"model-{num_views}-{given.width}"
+    if not folder.exists():
+        with Workers(default_num_workers()) as workers:
+            views = write_printed_capture(folder, num_views, width=given.width, workers=workers)
+        shutil.rmtree(model, ignore_errors=True)
+        write_model(printed_model(scene_of(Part.BOARD), views), model)
+    return folder, model
+
+
+def _run_views(
+    given: Arguments, num_views: int, options: Options, run_options: RunOptions, terminal: Terminal
+) -> Growth:
+    folder, model = _capture(given, num_views)
+    assert given.growth is not None
+    job = Job(
+        capture=folder,
+        out=given.growth / f"run-{num_views}-{given.width}",
+        options=replace(options, sfm=replace(options.sfm, sparse=model)),
+        run_options=replace(run_options, overwrite=True, resume=False),
+        monitor=terminal,
+    )
+    record = reconstruct(job).record
+    return Growth(
+        num_views=num_views,
+        seconds={stage.name: stage.seconds for stage in record.stages},
+        peak_mb={stage.name: stage.peak_rss_mb for stage in record.stages},
+    )
+
+
+def _exponent(runs: Sequence[Growth], times: Sequence[float]) -> str:
+    """Slope of the logarithms; none for what takes no time."""
+    if min(times) < 0.05 or len(runs) < 2:
+        return "-"
+    views = np.log([run.num_views for run in runs])
+    return f"{np.polyfit(views, np.log(times), 1)[0]:.2f}"
+
+
+class _Threads:
+    """Threads of this process, as a backend to compare with."""
+
+    def __init__(self, num: int) -> None:
+        self.pool = ThreadPoolExecutor(num)
+
+    def outcomes(
+        self, function: Callable[..., Any], *iterables: Any
+    ) -> Iterator[Callable[[], Any]]:
+        """As :meth:`polmvs.parallel.Workers.outcomes`."""
+        tasks: list[Future[Any]] = [
+            self.pool.submit(function, *task) for task in zip(*iterables, strict=False)
+        ]
+        return iter([task.result for task in tasks])
+
+    def close(self, *, cancel: bool) -> None:
+        """End the threads."""
+        self.pool.shutdown(cancel_futures=cancel)
+
+
+@contextmanager
+def _workers_of(backend: str, num: int) -> Iterator[Workers | None]:
+    """Some workers, started; None where Dask is not installed."""
+    if backend == "threads":
+        with Workers(num, _Threads(num)) as workers:
+            yield workers
+    elif backend == "processes":
+        with Workers(num) as workers:
+            yield workers
+    else:
+        try:
+            from distributed import LocalCluster
+        except ImportError:
+            yield None
+            return
+        with (
+            LocalCluster(n_workers=num, threads_per_worker=1, dashboard_address=":0") as cluster,
+            Workers.of_cluster(cluster.scheduler_address) as workers,
+        ):
+            yield workers
+
+
+def _scalings(given: Arguments, num_views: int, terminal: Terminal) -> list[Scaling]:
+    folder, model = _capture(given, num_views)
+    capture = open_capture(folder.absolute())
+    found = []
+    for backend in ("threads", "processes", "Dask"):
+        for num in given.num_workers:
+            with (
+                _workers_of(backend, num) as workers,
+                tempfile.TemporaryDirectory(dir=folder.parent.absolute()) as scratch,
+            ):
+                if workers is None:
+                    continue
+                target = Path(scratch)
+                list(workers.map(_warm_up, range(4 * num)))
+                start = time.perf_counter()
+                write_images(capture, target / "images", workers=workers)
+                build_maps(capture, model.absolute(), target / "maps", workers=workers)
+                seconds = time.perf_counter() - start
+            found.append(Scaling(backend=backend, num_workers=num, seconds=seconds))
+            terminal.finished(f"{backend}, {num}", seconds, "")
+    return found
+
+
+def _warm_up(index: int) -> int:
+    """Have a worker import what the stages need."""
+    import polmvs.pipeline.stages.maps  # noqa: F401
+
+    time.sleep(0.1)
+    return index
 
 
 def _median_seconds(work: Callable[[], object]) -> float:

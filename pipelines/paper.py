@@ -32,8 +32,9 @@ from polmvs.errors import OptionError
 from polmvs.experiments.data import open_experiment, require_apart
 from polmvs.experiments.output import NAMES, Report, write_files, write_report
 from polmvs.experiments.report import check_options, num_steps, run_experiment
+from polmvs.memory import PeakMemory
 from polmvs.parallel import Workers
-from polmvs.pipeline.record import peak_rss_mb, versions
+from polmvs.pipeline.record import versions
 from polmvs.pipeline.run_folder import has_content
 
 
@@ -69,6 +70,7 @@ def _paper(call: Call, terminal: Terminal) -> int:
         scenes.append(scene)
     reports: dict[str, list[Report]] = {}
     seconds: dict[str, dict[str, float]] = {}
+    memory = PeakMemory()
     with Workers(how.workers) as workers:
         for capture, scene in zip(names, scenes, strict=True):
             reports[capture], seconds[capture] = [], {}
@@ -78,11 +80,11 @@ def _paper(call: Call, terminal: Terminal) -> int:
                     reports[capture].append(run_experiment(name, scene, options, workers, report))
                 seconds[capture][name] = round(time.perf_counter() - start, 2)
                 terminal.finished(f"{capture} {name}", seconds[capture][name], "")
-        memory = round(peak_rss_mb())
+        peak_mb = round(memory.mb())
     for capture in names:
         for made in reports[capture]:
             write_report(given.out / capture, made)
-    write_files(given.out, _page(reports, seconds, memory, how.workers))
+    write_files(given.out, _page(reports, seconds, peak_mb, how.workers))
     terminal.show(str(given.out / "paper.md"), {"page": given.out / "paper.md"})
     return 0
 
@@ -110,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _page(
     reports: dict[str, list[Report]],
     seconds: dict[str, dict[str, float]],
-    memory: int,
+    peak_mb: int,
     workers: int,
 ) -> dict[str, bytes]:
     """The page and its numbers, by file name."""
@@ -118,7 +120,7 @@ def _page(
     lines = [
         "# The paper's experiments\n",
         "OPA, PPA and tilted, the paper's estimators and ours, in one run. "
-        f"{total:.0f} s with {workers} processes, at most {memory} MB.\n",
+        f"{total:.0f} s with {workers} processes, at most {peak_mb} MB.\n",
     ]
     for capture, own in reports.items():
         lines.append(f"## {capture}\n")
@@ -130,7 +132,7 @@ def _page(
         },
         "seconds": seconds,
         "workers": workers,
-        "peak_rss_mb": memory,
+        "peak_rss_mb": peak_mb,
         "versions": versions(),
     }
     text = json.dumps(to_plain(content), indent=1, allow_nan=False) + "\n"

@@ -44,6 +44,7 @@ if TYPE_CHECKING:  # heavy
     import pycolmap
 
     from polmvs.evaluation.comparison import Comparison, ModelFigures
+    from polmvs.evaluation.trust import Trust
     from polmvs.normals.single_view.plane import PlaneEstimate
     from polmvs.pipeline.monitor import Monitor
     from polmvs.pipeline.record import Record
@@ -295,6 +296,13 @@ class Reconstruction:
         from polmvs.pipeline.stages.poses import PosesResult
 
         return self.record.result(PosesResult).is_metric
+
+    @property
+    def trust(self) -> Trust | None:
+        """What the result says about itself without any truth; None where no stage measured it."""
+        from polmvs.evaluation.trust import Trust
+
+        return self.record.find(Trust, self.angle_model)
 
     @cached_property
     def record(self) -> Record:

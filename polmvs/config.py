@@ -485,7 +485,7 @@ class PropagationOptions(OptionGroup, group="propagation"):
     """How ranges spread from the seeds over the polarised region."""
 
     method: Method = option(
-        Method.INTEGRATE,
+        Method.SURFACE,
         "'surface': one mesh that all views agree on, from their silhouettes and phases; "
         "'integrate': multi-view normals over the region's pixels, coarse to fine; 'contour': "
         "along phase contours, as in the paper",
@@ -645,6 +645,12 @@ class RunOptions(OptionGroup, group="run", in_files=False):
         "the views instead of processes here; they must have the same versions, and CAPTURE and "
         "OUT on storage that they see under the same path",
         metavar="ADDRESS",
+    )
+    memory: float | None = option(
+        None,
+        "GB of memory for this process and those that share the views with it: fewer of them and "
+        "smaller tiles are used where they need more; a stage that takes more is told",
+        above=0,
     )
 
     def check(self) -> None:

@@ -22,7 +22,7 @@ from polmvs.errors import PolmvsError
 
 T = TypeVar("T")
 
-SHOWN_BYTES = 2000  # of what a library said at its end, for the log
+SHOWN_BYTES = 20_000  # of what a library said at its end, for the log; a trace of calls may follow
 CODE = "from polmvs.separate import work; work()"
 
 logger = logging.getLogger(__name__)

@@ -4,11 +4,15 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 
 import pytest
 
+from polmvs.errors import DataError
 from polmvs.parallel import Workers
+from polmvs.pipeline.run_folder import scratch
 
 SLEEPERS = """
 import os, time
@@ -72,3 +76,35 @@ def test_one_worker_is_this_process() -> None:
     next(outcomes)()
     assert asked == [0]
     assert list(Workers().map(pow, [2, 3], [3, 2])) == [8, 9]
+
+
+def fail_or_write(folder, diary, index):
+    if index == 0:
+        raise DataError("a", "is bad.")
+    (folder / f"begun {index}").touch()
+    time.sleep(1)
+    with diary.open("a") as file:
+        file.write(f"done {index}, folder there: {folder.is_dir()}\n")
+
+
+def test_a_failing_worker_stops_the_others_before_their_files_go(tmp_path) -> None:
+    """What is under way ends in the folder that it works in, and nothing begins after that."""
+    diary = tmp_path / "diary"
+    diary.touch()
+    with Workers(3) as workers:
+        with (
+            suppress(DataError),
+            scratch(tmp_path / "views") as folder,
+            workers.stopped_on_error(),
+        ):
+            tasks = workers.outcomes(fail_or_write, [folder] * 20, [diary] * 20, range(20))
+            first = next(tasks)
+            while len(list(folder.iterdir())) < 2:
+                time.sleep(0.01)
+            first()
+        lines = diary.read_text().splitlines()
+        assert 2 <= len(lines) < 19
+        assert all(line.endswith("folder there: True") for line in lines)
+        assert [path.name for path in tmp_path.iterdir()] == ["diary"]
+        time.sleep(1.2)
+        assert diary.read_text().splitlines() == lines

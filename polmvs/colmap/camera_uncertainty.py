@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_reconstruction
 from polmvs.geometry import align_points
+from polmvs.scene import KEYPOINT_SIGMA_PX
 
 Array = NDArray[np.float64]
 
@@ -34,16 +35,17 @@ class CameraTolerances:
     ----------
     principal_point_sigma : of a lens, from the image's centre, share of the image's width: what is
         known of it where it is not estimated. Guess; sensors are mounted to about 1 %.
-    min_residual_px : of a keypoint's coordinate, larger than the residual: features near each
-        other err alike. Measured: focal lengths and principal points of five captures, from five
-        views each, err by 1.8 times what residuals of 0.17 px say (RMS of 12).
+    min_residual_px : of a keypoint's coordinate, where the residual is less: that which the points'
+        own deviations are made of. Features near each other err alike, which residuals hide.
+        Measured: cameras of five captures err by 1.8 times what residuals of 0.17 px say (RMS of 12
+        parameters, from five views each), of ``demo`` with ten views by 4 times.
     loss_scale_px : of the adjustment's Cauchy loss, as that of SfM's last one.
     max_views : of a model that is looked at: each mode costs an adjustment, and the camera of so
         many views is known. Guess.
     """
 
     principal_point_sigma: float = 0.01
-    min_residual_px: float = 0.3
+    min_residual_px: float = KEYPOINT_SIGMA_PX
     loss_scale_px: float = 0.5
     max_views: int = 40
 

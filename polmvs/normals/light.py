@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
 
 import cv2
 import numpy as np
@@ -25,12 +25,13 @@ from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import (
     MAX_ROWS,
-    WindowMaps,
+    DerivedMaps,
     in_tiles,
     inside_shares,
     normals_from_windows,
+    window_map,
 )
-from polmvs.polarization.phase_map import PhaseMap
+from polmvs.polarization.phase_map import PhaseMap, turned
 from polmvs.scene import Tracks, some_tracks
 
 Array = NDArray[np.float64]
@@ -91,14 +92,12 @@ def find_diffuse(
     One ``(H, W)`` bool mask for each map; all is decided before the first.
     """
     t = tolerances or LightTolerances()
-    window_px = NormalOptions().window_px
-    windows = WindowMaps(maps, window_px), WindowMaps(maps, window_px, opposite=True)
     on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
-    votes, voting = _track_votes(on_parts, windows, t, max_rows)
+    votes, voting = _track_votes(on_parts, maps, t, max_rows)
     of_points = [
         _part_votes(m, on_parts.points_in_world[voting], votes[voting], t.min_rows) for m in maps
     ]
-    of_pixels = _pixel_votes(of_points, windows, tracks.points_in_world, t, max_rows)
+    of_pixels = _pixel_votes(of_points, maps, tracks.points_in_world, t, max_rows)
     overall = float(votes[voting].sum()) + _dolp_votes(maps, t)
     decided = []
     for known, dense in zip(of_points, of_pixels, strict=True):
@@ -117,15 +116,27 @@ def _diffuse_pixels(phase_map: PhaseMap, votes: Array, overall: float, tie: floa
     return np.asarray((verdict < 0)[_parts_of(phase_map)] & phase_map.region.inside)
 
 
+def _windows(maps: Sequence[PhaseMap]) -> tuple[DerivedMaps, DerivedMaps]:
+    """Averaged maps under specular and under diffuse light."""
+    windows = DerivedMaps(maps, partial(window_map, window_px=NormalOptions().window_px))
+    return windows, DerivedMaps(windows, _opposite)
+
+
+def _opposite(phase_map: PhaseMap) -> PhaseMap:
+    """The map under the other kind of light."""
+    return turned(phase_map, np.ones(phase_map.samples.shape[:2], bool))
+
+
 def _track_votes(
-    tracks: Tracks, windows: tuple[WindowMaps, WindowMaps], t: LightTolerances, max_rows: int
+    tracks: Tracks, maps: Sequence[PhaseMap], t: LightTolerances, max_rows: int
 ) -> tuple[Array, Mask]:
     """As :func:`specular_votes` of all tracks, many at a time."""
     votes, voting = [], []
     estimator = NormalOptions().estimator
-    for some in in_tiles(tracks, len(windows[0]), max_rows):
+    for some in in_tiles(tracks, len(maps), max_rows):
         specular, diffuse = (
-            normals_from_windows(AngleModel.PPA, some, maps, estimator) for maps in windows
+            normals_from_windows(AngleModel.PPA, some, windows, estimator)
+            for windows in _windows(maps)
         )
         of_some = specular_votes(specular, diffuse, t)
         votes.append(of_some[0])
@@ -152,7 +163,7 @@ def _part_votes(phase_map: PhaseMap, points: Array, votes: Array, min_points: in
 
 def _pixel_votes(
     of_points: Sequence[Array],
-    windows: tuple[WindowMaps, WindowMaps],
+    maps: Sequence[PhaseMap],
     points: Array,
     t: LightTolerances,
     max_rows: int,
@@ -162,10 +173,9 @@ def _pixel_votes(
     Parameters
     ----------
     of_points : votes (P,) of the sparse points for each view's parts; NaN where undecided.
-    windows : averaged maps of all views under specular and diffuse light.
+    maps : of all views, under the assumption of specular light.
     points : (T, 3), of the scene, which say how far off a part may be.
     """
-    maps = windows[0].maps
     # A slot is a part of a view at one of the distances.
     num_slots, first, placed, slots = 0, [], [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for phase_map, votes in zip(maps, of_points, strict=True):
@@ -179,14 +189,14 @@ def _pixel_votes(
                 slots.append(first[-1] + index * len(votes) + owner)
     all_placed, slot = np.concatenate(placed), np.concatenate(slots)
     seen_by = np.linspace(0, len(maps) - 1, min(len(maps), t.max_pixel_views)).round().astype(int)
-    some = [_Chosen(of_light, seen_by) for of_light in windows]
+    both = _windows([maps[k] for k in seen_by])
     total, sums = np.zeros(num_slots), np.zeros((2, num_slots))
     step = max(1, max_rows // max(len(seen_by), 1))
     for start in range(0, len(slot), step):
         tile, here = all_placed[start : start + step], slot[start : start + step]
         specular, diffuse = (
             solve_normals(rows.rows, rows.rays, rows.sigma)
-            for rows in (gather_rows(AngleModel.PPA, tile, of_light) for of_light in some)
+            for rows in (gather_rows(AngleModel.PPA, tile, windows) for windows in both)
         )
         costs, compared = _row_costs(specular, diffuse, t.max_row_cost)
         counts = compared.sum(axis=0) * (compared.sum(axis=0) >= t.min_rows)
@@ -206,19 +216,6 @@ def _pixel_votes(
         of_view[known] = (least[1, known] - least[0, known]) * rows_there[known]
         dense.append(of_view)
     return dense
-
-
-class _Chosen(Sequence[PhaseMap]):
-    """Some of the maps, each when it is asked for."""
-
-    def __init__(self, maps: WindowMaps, chosen: NDArray[np.intp]) -> None:
-        self.maps, self.chosen = maps, chosen
-
-    def __len__(self) -> int:
-        return len(self.chosen)
-
-    def __getitem__(self, index: Any) -> Any:
-        return self.maps[int(self.chosen[index])]
 
 
 def _undecided_pixels(

@@ -7,8 +7,9 @@ projected point, in every view that sees it, not only in the views that matched 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import overload
 
 import cv2
@@ -17,15 +18,16 @@ from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, Estimator, NormalOptions
+from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
-from polmvs.polarization.phase_map import PhaseMap, turned
+from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds, Tracks, point_sigmas, some_tracks
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-MAX_ROWS = 4_000_000  # of points and views, at a time: some 0.6 GB while they are solved
+MAX_ROWS = MemoryNeeds.max_rows  # of points and views together, at a time, without a budget
 BORDER_MARGIN_PX = 7  # points nearer to the region's border may lie on the background
 
 
@@ -64,17 +66,17 @@ def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
     return phase_map.changed(samples=samples.astype(np.float32))
 
 
-class WindowMaps(Sequence[PhaseMap]):
-    """Phase maps averaged over windows, each when it is asked for: none is held.
+class DerivedMaps(Sequence[PhaseMap]):
+    """Phase maps made of others, each when it is asked for: none is held.
 
     Parameters
     ----------
-    maps, window_px : as in :func:`window_map`.
-    opposite : under the other kind of light everywhere.
+    maps : of the views.
+    derive : makes one of them.
     """
 
-    def __init__(self, maps: Sequence[PhaseMap], window_px: int, *, opposite: bool = False) -> None:
-        self.maps, self.window_px, self.opposite = maps, window_px, opposite
+    def __init__(self, maps: Sequence[PhaseMap], derive: Callable[[PhaseMap], PhaseMap]) -> None:
+        self.maps, self.derive = maps, derive
 
     def __len__(self) -> int:
         return len(self.maps)
@@ -83,15 +85,12 @@ class WindowMaps(Sequence[PhaseMap]):
     def __getitem__(self, index: int) -> PhaseMap: ...
 
     @overload
-    def __getitem__(self, index: slice) -> WindowMaps: ...
+    def __getitem__(self, index: slice) -> DerivedMaps: ...
 
-    def __getitem__(self, index: int | slice) -> PhaseMap | WindowMaps:
+    def __getitem__(self, index: int | slice) -> PhaseMap | DerivedMaps:
         if isinstance(index, slice):
-            return WindowMaps(self.maps[index], self.window_px, opposite=self.opposite)
-        averaged = window_map(self.maps[index], self.window_px)
-        if not self.opposite:
-            return averaged
-        return turned(averaged, np.ones(averaged.samples.shape[:2], bool))
+            return DerivedMaps(self.maps[index], self.derive)
+        return self.derive(self.maps[index])
 
 
 def track_normals(
@@ -112,17 +111,18 @@ def track_normals(
     options : window, estimator and weights.
     max_rows : of tracks and views together, that are solved at a time.
     """
-    # A track that no view of its own sees in its region has no normal; one stands for all others.
+    # A track on no region of its own views has no normal; one stands for all others.
     own = np.zeros(len(tracks.points_in_world), bool)
     for k, phase_map in enumerate(maps):
         here = tracks.obs_view == k
-        inside = sample_image(phase_map.region.inside.astype(np.float32), tracks.obs_xy[here])
-        own[tracks.obs_track[here][inside > 0]] = True
+        seen = tracks.obs_track[here]
+        xy = phase_map.view.project(tracks.points_in_world[seen])
+        own[seen[sample_image(phase_map.region.inside.astype(np.float32), xy) > 0]] = True
     solved = own.copy()
     solved[np.flatnonzero(~own)[:1]] = True
     source = np.cumsum(solved) - 1
     source[~own] = source[np.flatnonzero(~own)[:1]]
-    windows = WindowMaps(maps, options.window_px)
+    windows = DerivedMaps(maps, partial(window_map, window_px=options.window_px))
     estimates = [
         normals_from_windows(
             angle_model, some, windows, options.estimator, tilt_aware=options.tilt_aware_weights

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import platform
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from multiprocessing import active_children
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,11 +14,6 @@ from polmvs.config import AngleModel
 from polmvs.errors import DataError
 from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
 
 R = TypeVar("R")
 
@@ -43,7 +35,8 @@ class StageRecord:
     reads : what it was made from, paths in the run folder.
     options : values of the options that decided its result, by path, in terms of JSON.
     seconds : wall time.
-    peak_rss_mb : largest memory so far of the run's processes together.
+    peak_rss_mb : largest resident memory of the run's processes together during it, see
+        :class:`polmvs.memory.PeakMemory`; not of a cluster's.
     warnings : what it warned of.
     result : what it found, of the type that the stage table says.
     """
@@ -252,41 +245,3 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "unknown"
     return found
-
-
-def peak_rss_mb() -> float:
-    """Largest resident memory so far of this process and of those that it started, MB.
-
-    Those that live are summed; of those that have ended the largest counts, if it is more.
-
-    An upper bound: the processes need not have had their peaks at the same time, and what they
-    share counts for each.
-    """
-    children = [_peak_of(child.pid) for child in active_children() if child.pid is not None]
-    ended = 0.0 if resource is None else _in_mb(resource.getrusage(resource.RUSAGE_CHILDREN))
-    return _own_peak() + max(sum(children), ended)
-
-
-def _own_peak() -> float:
-    # getrusage starts from the peak of the process that started this one: the second choice.
-    peak = _peak_of(os.getpid())
-    if peak or resource is None:
-        return peak
-    return _in_mb(resource.getrusage(resource.RUSAGE_SELF))
-
-
-def _in_mb(usage: Any) -> float:
-    """The peak that the system states, in bytes or in kilobytes."""
-    return float(usage.ru_maxrss) / (1e6 if sys.platform == "darwin" else 1e3)
-
-
-def _peak_of(pid: int) -> float:
-    """High-water mark of another process, MB; 0 where the system does not tell."""
-    try:
-        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace")
-    except OSError:
-        return 0.0
-    for line in status.splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) / 1e3
-    return 0.0

@@ -29,6 +29,7 @@ from polmvs.config import (
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.folders import require_unicode
+from polmvs.memory import MemoryNeeds, MemoryPlan, PeakMemory, plan_memory
 from polmvs.parallel import Workers
 from polmvs.pipeline.checks import (
     check_input,
@@ -41,7 +42,6 @@ from polmvs.pipeline.monitor import Monitor, NoMonitor, OnProgress, no_progress
 from polmvs.pipeline.record import (
     Record,
     StageRecord,
-    peak_rss_mb,
     read_image_names,
     read_record,
     versions,
@@ -83,6 +83,8 @@ class Run:
     table : all stages, in order.
     given_model : the sparse model of the options, fitted to the capture.
     record : what is finished, as in ``run.json``.
+    max_rows : of points and views that normals are solved from at a time.
+    budget_gb : of memory, that stages are held to; None: none.
     """
 
     run_folder: RunFolder
@@ -93,6 +95,8 @@ class Run:
     table: Sequence[StageSpec]
     given_model: SparseModel | None
     record: Record
+    max_rows: int = MemoryNeeds().max_rows
+    budget_gb: float | None = None
     _started: float = field(default_factory=time.perf_counter)
 
     def is_finished(self, spec: StageSpec) -> bool:
@@ -126,12 +130,21 @@ class Run:
     def _carry_out(self, spec: StageSpec) -> None:
         """Do a stage whose input is there, and record it."""
         logger.info("%s: begins", spec.name)
-        start = time.perf_counter()
+        start, memory = time.perf_counter(), PeakMemory()
         with (
             self.monitor.stage(spec.name, spec.num_steps(self._input())) as on_progress,
             _collected_warnings() as warned,
         ):
             result = spec.work(self._input(on_progress))
+            peak_mb = memory.mb()
+            if self.budget_gb is not None and peak_mb > 1e3 * self.budget_gb:
+                logger.warning(
+                    "%s took %.2f GB, more than the %g GB of `run.memory`: not all that it holds "
+                    "depends on the number of workers.",
+                    spec.name,
+                    peak_mb / 1e3,
+                    self.budget_gb,
+                )
         seconds = round(time.perf_counter() - start, 3)
         logger.info("%s: %.1f s, %s", spec.name, seconds, result, extra=FILE_ONLY)
         finished = StageRecord(
@@ -140,7 +153,7 @@ class Run:
             reads=_names(spec.reads),
             options=plain_options(self.options, spec.decides),
             seconds=seconds,
-            peak_rss_mb=round(peak_rss_mb(), 1),
+            peak_rss_mb=round(peak_mb, 1),
             warnings=tuple(dict.fromkeys(warned)),
             result=result,
         )
@@ -154,6 +167,7 @@ class Run:
             capture=self.capture,
             options=self.options,
             workers=self.workers,
+            max_rows=self.max_rows,
             given_model=self.given_model,
             record=self.record,
             on_progress=on_progress,
@@ -289,6 +303,7 @@ def open_run(
         capture = open_capture(capture_folder, options.capture)
         if run_folder.run_file.is_file() and (run_options.resume or continues):
             require_same_capture(load_record(run_folder), identity_of(capture), run_folder)
+        plan = plan_memory(run_options.memory, run_options.workers, capture.width * capture.height)
         given_model = check_input(capture, options, min_images)
         if continues:
             load_record(run_folder)
@@ -297,7 +312,7 @@ def open_run(
     with (
         quiet_colmap(),
         locked(out),
-        _workers(run_options, capture_folder, out, options) as workers,
+        _workers(run_options, plan, capture_folder, out, options) as workers,
     ):
         record = prepare_output(run_folder, overwrite=overwrite, resume=resume)
         identity = identity_of(capture)
@@ -311,6 +326,8 @@ def open_run(
             table=table,
             given_model=given_model,
             record=record,
+            max_rows=plan.max_rows,
+            budget_gb=run_options.memory,
         )
         run.require_same_options(taken_over)
         record.capture, record.images = identity, tuple(image_names(capture))
@@ -327,10 +344,12 @@ def open_run(
             raise
 
 
-def _workers(run_options: RunOptions, capture_folder: Path, out: Path, options: Options) -> Workers:
+def _workers(
+    run_options: RunOptions, plan: MemoryPlan, capture_folder: Path, out: Path, options: Options
+) -> Workers:
     """Processes here, or those of a cluster that sees what they need."""
     if run_options.scheduler is None:
-        return Workers(run_options.workers)
+        return Workers(plan.num_workers)
     existing = next(folder for folder in (out, *out.parents) if folder.is_dir())
     sources = [path for path in (capture_folder, *inputs_of(options)) if path.exists()]
     return Workers.of_cluster(run_options.scheduler, [existing], sources)

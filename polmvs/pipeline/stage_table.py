@@ -52,6 +52,7 @@ class StageInput:
     Attributes
     ----------
     run_folder, capture, options, workers : what the run works with.
+    max_rows : of points and views that normals are solved from at a time.
     given_model : the sparse model of the options, fitted to the capture.
     record : of the stages that are finished.
     on_progress : is told of the stage's steps.
@@ -61,6 +62,7 @@ class StageInput:
     capture: Capture
     options: Options
     workers: Workers
+    max_rows: int
     given_model: SparseModel | None
     record: Record
     on_progress: OnProgress
@@ -139,6 +141,7 @@ def _build_maps(run: StageInput) -> maps.MapsResult:
         run.run_folder.sparse,
         run.run_folder.maps(AngleModel.PPA),
         run.options.region,
+        max_rows=run.max_rows,
         workers=run.workers,
         on_progress=run.on_progress,
     )
@@ -158,7 +161,12 @@ def _tilt_maps(run: StageInput) -> maps.TiltedMapsResult:
 def _solve_normals(model: AngleModel, run: StageInput) -> normals.NormalsResult:
     folder = run.run_folder
     return normals.solve_track_normals(
-        model, folder.sparse, folder.maps(model), folder.track_normals(model), run.options.normals
+        model,
+        folder.sparse,
+        folder.maps(model),
+        folder.track_normals(model),
+        run.options.normals,
+        max_rows=run.max_rows,
     )
 
 

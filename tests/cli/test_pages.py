@@ -96,7 +96,8 @@ def test_render_draws_a_column_for_each_file(cli, demo_run: Path, tmp_path: Path
     assert "exists" in refused(cli("render", *arguments), 2)
     assert cli("render", *arguments, "--overwrite", "--part")[0] == 0
     alone = cv2.imread(str(picture))  # without the surroundings' points
-    assert 0 < (alone < 250).sum() < (drawn < 250).sum()
+    assert (alone < 250).any()
+    assert (alone != drawn).any()
 
 
 def test_render_refuses_what_it_cannot_draw(cli, demo_run: Path, tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def test_batch(cli, captures, tmp_path) -> None:
     assert "poses: begins" in (out / "first" / "polmvs.log").read_text()
     bad, first = json.loads((out / "batch.json").read_text())
     assert (bad["name"], bad["state"], first["name"]) == ("bad", "failed", "first")
-    assert "no model of these images" in bad["message"]
+    assert "finds no model" in bad["message"]
     assert first["state"] in ("finished", "empty")
     assert (first["num_images"], first["num_views"]) == (6, 6)
     assert first["seconds"] == record_of(out / "first")["wall_s"]

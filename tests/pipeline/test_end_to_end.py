@@ -146,7 +146,10 @@ def test_library_and_one_worker_give_the_same_cloud(
     # The model is written anew from its views and tracks: the last digits differ.
     assert len(again.points) == pytest.approx(len(first.points), rel=0.01)
     before_cloud = ["images", "sfm", "poses", "maps", "normals_ppa", "seeds", "sparse_cloud_ppa"]
-    assert stages_of(tmp_path / "out") == [*before_cloud, "densify_ppa", "mesh_ppa", "dense_ppa"]
+    assert stages_of(tmp_path / "out") == [
+        *before_cloud,
+        *("densify_ppa", "trust_ppa", "mesh_ppa", "dense_ppa"),
+    ]
 
 
 def test_16_bit_tiff_with_own_poses_and_names(

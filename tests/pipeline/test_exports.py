@@ -98,7 +98,7 @@ def heights(points: np.ndarray) -> np.ndarray:
 def test_files_and_their_record(run: Path) -> None:
     names = {path.name for path in run.iterdir()}
     assert {"ppa.ply", "ppa_mesh.ply", "dense", "normals.ply", "run.json"} <= names
-    assert stages_of(run)[-3:] == ["densify_ppa", "mesh_ppa", "dense_ppa"]
+    assert stages_of(run)[-3:] == ["trust_ppa", "mesh_ppa", "dense_ppa"]
     assert Path(result_of(run, "dense_ppa")["folder"]) == run / "dense"
     assert result_of(run, "mesh_ppa")["num_triangles"] == len(
         read_mesh(run / "ppa_mesh.ply").triangles
@@ -166,7 +166,7 @@ def test_no_mesh_and_no_colmap(go_on: Continue) -> None:
     assert (out / "ppa.ply").is_file()
     assert not (out / "ppa_mesh.ply").exists()
     assert not (out / "dense").exists()
-    assert stages_of(out)[-1] == "densify_ppa"
+    assert stages_of(out)[-1] == "trust_ppa"
 
 
 def test_export_alone(go_on: Continue, run: Path, demo_capture: Path, cli) -> None:

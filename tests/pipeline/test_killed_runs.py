@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -20,8 +21,9 @@ from helpers import content_of, stages_of
 
 from polmvs.camera import PinholeCamera
 from polmvs.colmap.models import write_model
-from polmvs.config import Options, RunOptions, SfmOptions
+from polmvs.config import Method, Options, PropagationOptions, RunOptions, SfmOptions
 from polmvs.errors import DataError
+from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import Job, reconstruct
 from polmvs.pipeline.monitor import NoMonitor
 from polmvs.pipeline.run_lock import locked
@@ -196,3 +198,43 @@ def test_an_input_that_vanishes_on_the_way_is_named(given, tmp_path: Path) -> No
         reconstruct(job)
     assert stages_of(out) == ["images", "sfm", "poses"]
     assert [path.name for path in out.rglob(".*")] == []
+
+
+@pytest.mark.parametrize(
+    ("work", "unfinished"),
+    [
+        ("images._write_image", "images"),
+        ("maps._build_map", "maps"),
+        ("densify._dense_surface", "views_ppa"),
+    ],
+)
+def test_stages_stop_their_workers_before_their_files_go(
+    given, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, work: str, unfinished: str
+) -> None:
+    out, there = tmp_path / "out", []
+
+    def fail(*arguments, **options):
+        raise DataError("a", "is bad.")
+
+    @contextmanager
+    def stopped_on_error(self):
+        try:
+            yield
+        except DataError:
+            there.extend(path.name.rpartition("-")[2] for path in out.glob(".polmvs-*-*-*"))
+            raise
+
+    monkeypatch.setattr(f"polmvs.pipeline.stages.{work}", fail)
+    monkeypatch.setattr(Workers, "stopped_on_error", stopped_on_error)
+    job = Job(
+        capture=given[0],
+        out=out,
+        options=Options(
+            sfm=SfmOptions(sparse=given[2]), propagation=PropagationOptions(method=Method.INTEGRATE)
+        ),
+        run_options=RunOptions(workers=1),
+    )
+    with pytest.raises(DataError, match="a: is bad"):
+        reconstruct(job)
+    assert there == [unfinished]
+    assert not list(out.glob(".*"))

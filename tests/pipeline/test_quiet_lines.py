@@ -64,7 +64,14 @@ def test_several_models_are_said_only_where_images_are_left_out(
     monkeypatch.setattr(sfm.pycolmap, "incremental_mapping", lambda *arguments: found)
     names = [f"{number}.png" for number in range(5)]
     with caplog.at_level(logging.WARNING, logger="polmvs"):
-        largest = sfm._map(tmp_path / "db", tmp_path, names, tmp_path / "models", None)
+        largest = sfm._map(
+            tmp_path / "db",
+            tmp_path,
+            tmp_path / "models",
+            names,
+            sfm.SfmOptions(),
+            sfm.SfmTolerances(),
+        )
     assert largest.num_reg_images() == registered
     assert [record.getMessage() for record in caplog.records] == (
         ["SfM: the images fall into 2 models; the largest is used and has 4 of 5 images."] * warns

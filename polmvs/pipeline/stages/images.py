@@ -49,9 +49,10 @@ def write_images(
     """
     names = image_names(capture)
     white = capture.exposure()
-    with replacing(target) as folder:
+    workers = workers or Workers()
+    with replacing(target) as folder, workers.stopped_on_error():
         write = partial(_write_image, capture, white, folder)
-        for _ in (workers or Workers()).map(write, names.values(), names):
+        for _ in workers.map(write, names.values(), names):
             on_progress(1)
     return ImagesResult(num_images=len(names))
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, Light, RegionOptions
@@ -19,6 +21,7 @@ from polmvs.io.images import read_mask
 from polmvs.normals.axes_check import check_axes
 from polmvs.normals.light import find_diffuse
 from polmvs.normals.light_check import check_light
+from polmvs.normals.tracks import MAX_ROWS
 from polmvs.parallel import Workers
 from polmvs.pipeline.monitor import OnProgress, no_progress
 from polmvs.pipeline.run_folder import replacing
@@ -37,6 +40,7 @@ from polmvs.scene import Tracks, View
 
 logger = logging.getLogger(__name__)
 
+MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are held together
 MIN_VIEWS = 3  # of normals: with two there is nothing left to check them by
 
 
@@ -78,6 +82,7 @@ def build_maps(
     target: Path,
     options: RegionOptions | None = None,
     *,
+    max_rows: int = MAX_ROWS,
     workers: Workers | None = None,
     on_progress: OnProgress = no_progress,
 ) -> MapsResult:
@@ -89,6 +94,7 @@ def build_maps(
     sparse : folder of the COLMAP model.
     target : folder of the maps, whole or not at all.
     options : defaults where None.
+    max_rows : of points and views together, that normals are solved from at a time.
 
     Raises
     ------
@@ -99,11 +105,12 @@ def build_maps(
     views = posed_views(sparse)
     names = image_names(capture)
     tracks = read_model(sparse).tracks
-    with replacing(target) as folder:
+    workers = workers or Workers()
+    with replacing(target) as folder, workers.stopped_on_error():
         build = partial(_build_map, capture, options, folder)
         num_inside = 0
         raw_names = [names[view.name] for view in views]
-        for count in (workers or Workers()).map(build, views, raw_names):
+        for count in workers.map(build, views, raw_names):
             num_inside += count
             on_progress(1)
         maps = [open_phase_map(view, folder) for view in views]
@@ -111,7 +118,7 @@ def build_maps(
         if len(tracks.point3D_ids):
             _warn_of_settings(capture, options.light, tracks, maps)
             if options.light is None:
-                num_diffuse = _turn_diffuse(tracks, maps, folder)
+                num_diffuse = _turn_diffuse(tracks, maps, folder, max_rows)
     return MapsResult(num_region_px=num_inside, num_diffuse_px=num_diffuse)
 
 
@@ -131,8 +138,9 @@ def tilt_maps(
     target : folder of the corrected maps, whole or not at all.
     """
     stored = open_maps(sparse, maps)
-    with replacing(target) as folder:
-        for _ in (workers or Workers()).map(partial(_tilt_map, folder), stored):
+    workers = workers or Workers()
+    with replacing(target) as folder, workers.stopped_on_error():
+        for _ in workers.map(partial(_tilt_map, folder), stored):
             on_progress(1)
     return TiltedMapsResult(num_maps=len(stored))
 
@@ -208,6 +216,7 @@ def _warn_of_settings(
     capture: Capture, light: Light | None, tracks: Tracks, maps: Sequence[PhaseMap]
 ) -> None:
     """Say which setting the planes of incidence of all views contradict."""
+    tracks, maps = _some_views(tracks, maps)
     axes = check_axes(tracks, maps)
     if axes.change is not None:
         logger.warning("%s.", axes.message(capture.options, capture.files.kind))
@@ -215,10 +224,25 @@ def _warn_of_settings(
         logger.warning("%s.", check.message)
 
 
-def _turn_diffuse(tracks: Tracks, maps: Sequence[PhaseMap], folder: Path) -> int:
+def _some_views(tracks: Tracks, maps: Sequence[PhaseMap]) -> tuple[Tracks, list[PhaseMap]]:
+    """Evenly spread views, so many as a check may hold at a time, and what these observe."""
+    chosen = np.linspace(0, len(maps) - 1, min(len(maps), MAX_CHECKED_VIEWS)).round().astype(int)
+    index = np.full(len(maps), -1)
+    index[chosen] = np.arange(len(chosen))
+    kept = index[tracks.obs_view] >= 0
+    observed = replace(
+        tracks,
+        obs_track=tracks.obs_track[kept],
+        obs_view=index[tracks.obs_view[kept]],
+        obs_xy=tracks.obs_xy[kept],
+    )
+    return observed, [maps[k] for k in chosen]
+
+
+def _turn_diffuse(tracks: Tracks, maps: Sequence[PhaseMap], folder: Path, max_rows: int) -> int:
     """Turn the phase where the light is diffuse; returns the number of these pixels."""
     num_diffuse = 0
-    for phase_map, where in zip(maps, find_diffuse(tracks, maps), strict=True):
+    for phase_map, where in zip(maps, find_diffuse(tracks, maps, max_rows=max_rows), strict=True):
         if where.any():
             store_phase_map(turned(phase_map, where), folder)
             num_diffuse += int(where.sum())

@@ -12,7 +12,7 @@ from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, NormalOptions
 from polmvs.io.arrays import map_array, save_array
 from polmvs.normals.estimator import NormalEstimate
-from polmvs.normals.tracks import track_normals
+from polmvs.normals.tracks import MAX_ROWS, track_normals
 from polmvs.pipeline.stages.maps import open_maps
 
 # Columns of the stored normals, a row for each track; see NormalEstimate.
@@ -51,6 +51,8 @@ def solve_track_normals(
     maps: Path,
     target: Path,
     options: NormalOptions | None = None,
+    *,
+    max_rows: int = MAX_ROWS,
 ) -> NormalsResult:
     """Normals of the sparse points from the phases of all views that see them.
 
@@ -60,12 +62,15 @@ def solve_track_normals(
     sparse, maps : folders of the COLMAP model and of the phase maps for ``model``.
     target : file of the normals, ``.npy`` with rows of ``NORMALS_TYPE``, one for each track.
     options : defaults where None.
+    max_rows : of points and views together, that are solved at a time.
     """
     tracks = read_model(sparse).tracks
     phase_maps = open_maps(sparse, maps, model)
     stored = np.zeros(len(tracks.point3D_ids), NORMALS_TYPE)
     if len(stored):
-        estimate = track_normals(model, tracks, phase_maps, options or NormalOptions())
+        estimate = track_normals(
+            model, tracks, phase_maps, options or NormalOptions(), max_rows=max_rows
+        )
         stored["normal"], stored["valid"] = estimate.normals, estimate.valid
         stored["conditioning"], stored["sigma_deg"] = estimate.conditioning, estimate.sigma_deg
         stored["residual"], stored["num_rows"] = estimate.residual, estimate.num_rows

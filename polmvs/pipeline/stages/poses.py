@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from polmvs.colmap.models import read_model, write_model
 from polmvs.config import ReferenceOptions
 from polmvs.io.arrays import map_array, save_array
-from polmvs.io.images import read_gray
+from polmvs.io.images import read_bytes, read_gray, write_bytes
 from polmvs.pipeline.run_folder import CAMERA_MODES, replace_folder, scratch
 from polmvs.poses.metric_frame import Frame, metric_frame, transform_model
 
@@ -107,7 +106,9 @@ def place_model(
         modes = similarity.scale * modes @ np.asarray(similarity.rotation).T
     with scratch(target) as folder:
         if frame is None:  # bit for bit what SfM wrote
-            shutil.copytree(source, folder / "sparse", ignore=shutil.ignore_patterns(CAMERA_MODES))
+            (folder / "sparse").mkdir()
+            for file in source.glob("*.bin"):
+                write_bytes(folder / "sparse" / file.name, read_bytes(file))
         else:
             write_model(model, folder / "sparse")
         replace_folder(folder / "sparse", target)

@@ -1,0 +1,147 @@
+"""Resident memory: what a run's processes took, and what a budget allows.
+
+The kernel keeps the largest resident memory of each process (``VmHWM``), which can be set back, so
+that the peak of one stage is told from that of those before. Only Linux tells it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from multiprocessing import active_children
+from pathlib import Path
+
+from polmvs.errors import OptionError
+
+RESET_PEAK = "5"  # see proc(5), clear_refs
+
+
+@dataclass(frozen=True, kw_only=True)
+class MemoryNeeds:
+    """What a process of a run takes.
+
+    Attributes
+    ----------
+    process_mb : with its libraries. Measured on Linux with Open3D not loaded.
+    bytes_per_px : of the polarization image that a process is at work on, all its Stokes images,
+        masks and smoothed copies. Measured with 0.3 and 1.3 million pixels.
+    bytes_per_row : of points and views that normals are solved from. Derived: rows and rays of
+        two kinds of light, in single precision, and as much again in the solver.
+    max_rows : that are solved at a time where the budget leaves more; more hardly saves time.
+    """
+
+    process_mb: float = 170.0
+    bytes_per_px: float = 250.0
+    bytes_per_row: float = 150.0
+    max_rows: int = 4_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class MemoryPlan:
+    """What fits into a budget.
+
+    Attributes
+    ----------
+    num_workers : processes that share the views; one: the run's own does all.
+    max_rows : of points and views that normals are solved from at a time.
+    """
+
+    num_workers: int
+    max_rows: int
+
+
+def plan_memory(
+    budget_gb: float | None, num_workers: int, num_px: int, needs: MemoryNeeds = MemoryNeeds()
+) -> MemoryPlan:
+    """Workers and tiles for a budget.
+
+    Parameters
+    ----------
+    budget_gb : of all processes of the run together, GB; None: no budget.
+    num_workers : that are wanted.
+    num_px : of one polarization image.
+
+    Raises
+    ------
+    OptionError
+        The budget does not hold one view.
+    """
+    if budget_gb is None:
+        return MemoryPlan(num_workers=num_workers, max_rows=needs.max_rows)
+    view_mb = num_px * needs.bytes_per_px / 1e6
+    least_mb = needs.process_mb + view_mb
+    left_mb = 1e3 * budget_gb - least_mb
+    if left_mb < 0:
+        raise OptionError(
+            f"{budget_gb:g} GB hold no view of {num_px / 1e6:.1f} million pixels, which takes "
+            f"{least_mb / 1e3:.2f} GB. Give more, or smaller images (`capture.resolution` half).",
+            field="run.memory",
+        )
+    # With workers the run's own process waits, and solves when they are done.
+    fitting = int(left_mb / least_mb)
+    max_rows = int((left_mb + view_mb) * 1e6 / needs.bytes_per_row)
+    return MemoryPlan(
+        num_workers=min(num_workers, fitting) if fitting >= 2 else 1,
+        max_rows=max(1, min(needs.max_rows, max_rows)),
+    )
+
+
+class PeakMemory:
+    """Largest resident memory of a run's processes from now on, summed.
+
+    An upper bound: the processes need not have had their peaks at the same time, and what they
+    share counts for each. Where the system cannot set a peak back it is that since the start.
+    """
+
+    def __init__(self) -> None:
+        self._ended = _largest_ended_mb()
+        for pid in _living():
+            try:
+                Path(f"/proc/{pid}/clear_refs").write_text(RESET_PEAK, encoding="ascii")
+            except OSError:  # not Linux, or the process has ended
+                continue
+
+    def mb(self) -> float:
+        """The sum so far, MB; a process that has ended counts if it is the largest of all such."""
+        total = _own_peak_mb() + sum(_peak_mb(pid) for pid in _living() if pid != os.getpid())
+        ended = _largest_ended_mb()
+        return total + (ended if ended > self._ended else 0.0)
+
+
+def _living() -> Iterable[int]:
+    """The run's own process and its workers."""
+    return [os.getpid(), *(child.pid for child in active_children() if child.pid is not None)]
+
+
+def _own_peak_mb() -> float:
+    # getrusage starts from the peak of the process that started this one: the second choice.
+    peak = _peak_mb(os.getpid())
+    return peak or _rusage_mb("RUSAGE_SELF")
+
+
+def _largest_ended_mb() -> float:
+    """Of the processes that this one has started and seen end, the largest."""
+    return _rusage_mb("RUSAGE_CHILDREN")
+
+
+def _rusage_mb(who: str) -> float:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0.0
+    largest = resource.getrusage(getattr(resource, who)).ru_maxrss
+    return largest / 1e6 if sys.platform == "darwin" else largest / 1e3
+
+
+def _peak_mb(pid: int) -> float:
+    """High-water mark of a process, MB; 0 where the system does not tell."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return 0.0
+    for line in status.splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) / 1e3
+    return 0.0

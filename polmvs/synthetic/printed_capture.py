@@ -1,0 +1,191 @@
+"""Whole captures of printed scenes, with true cameras and a true sparse model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import PinholeCamera, in_image
+from polmvs.io.folders import new_folder
+from polmvs.io.ground_truth import DEPTH_UNIT_M
+from polmvs.io.images import write_bytes, write_png
+from polmvs.parallel import Workers
+from polmvs.scene import SparseModel, Tracks, View
+from polmvs.synthetic.captures import add_noise, quantize
+from polmvs.synthetic.printed import (
+    PrintedScene,
+    orbit_views,
+    render_printed_mosaic,
+    render_printed_truth,
+)
+from polmvs.synthetic.surfaces import Group, Plane, Sphere
+
+Array = NDArray[np.float64]
+
+SAME_PLACE = 1e-4  # relative: of a point and of what its view sees there
+
+
+class Part(StrEnum):
+    """Shape of the part."""
+
+    BOARD = "board"
+    DOME = "dome"
+
+
+def scene_of(part: Part, seed: int = 0) -> PrintedScene:
+    """A board of 240 x 200 mm, or a dome of 180 mm across, labelled, on a printed bumpy table."""
+    corners = [(x, y) for x in (-0.24, 0.24) for y in (-0.22, 0.22)]
+    bumps = [Sphere((x, y, -0.06), 0.12) for x, y in corners]
+    surroundings = Group((Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), *bumps))
+    if part is Part.BOARD:
+        top = 0.01
+        shape: Plane | Sphere = Plane((0.0, 0.0, top), (0.0, 0.0, 1.0), (0.12, 0.10))
+        labels = np.array([(x, y, top) for x in (-0.08, 0.0, 0.08) for y in (-0.06, 0.06)])
+    else:
+        radius, sunk = 0.12, 0.08
+        shape = Sphere((0.0, 0.0, -sunk), radius)
+        tilts = np.radians([0, 18, 18, 18, 34, 34, 34])
+        turns = np.radians([0, 0, 120, 240, 60, 180, 300])
+        labels = radius * np.stack(
+            [np.sin(tilts) * np.cos(turns), np.sin(tilts) * np.sin(turns), np.cos(tilts)], axis=-1
+        ) - [0, 0, sunk]
+    return PrintedScene(
+        part=shape,
+        surroundings=surroundings,
+        labels=labels,
+        label_radius=0.012,
+        texel=0.0025,
+        seed=seed,
+    )
+
+
+def camera_of(width: int) -> PinholeCamera:
+    """A lens of 69 degrees across, its principal point half a percent off the centre."""
+    height = round(width * 5 / 12) * 2
+    focal = 0.727 * width
+    return PinholeCamera(
+        width=width, height=height, fx=focal, fy=focal, cx=0.5025 * width, cy=0.507 * height
+    )
+
+
+def write_printed_capture(
+    target: Path,
+    num_views: int,
+    *,
+    part: Part = Part.BOARD,
+    width: int = 612,
+    ordered: bool = False,
+    maps: bool = False,
+    seed: int = 0,
+    workers: Workers | None = None,
+    on_progress: Callable[[int], None] = lambda count: None,
+) -> list[View]:
+    """Write raw mosaics of 8 bits with photon noise, and ``gt/`` as :mod:`polmvs.io.ground_truth`.
+
+    Parameters
+    ----------
+    target : folder, whole or not at all.
+    num_views : on an orbit, see :func:`polmvs.synthetic.printed.orbit_views`.
+    part : shape of the part.
+    width : of the half-size images, px; their height is 5/6 of it.
+    ordered : names follow the orbit.
+    maps : write depth, normals and masks as well.
+    seed : of print, places, names and noise.
+
+    Returns
+    -------
+    The true views, by name, metres.
+
+    Raises
+    ------
+    DataError
+        The folder exists and is not empty, or the system refuses.
+    """
+    camera = camera_of(width)
+    views = orbit_views(num_views, camera, seed=seed, ordered=ordered)
+    with new_folder(target) as folder:
+        (folder / "raw").mkdir()
+        (folder / "gt").mkdir()
+        write_bytes(folder / "gt" / "cameras.json", _cameras(camera, views).encode())
+        work = partial(_write_view, folder, scene_of(part, seed), maps)
+        for _ in (workers or Workers()).map(work, views, range(seed, seed + num_views)):
+            on_progress(1)
+    return views
+
+
+def printed_model(
+    scene: PrintedScene, views: Sequence[View], num_points: int = 2000
+) -> SparseModel:
+    """The true cameras, and points on labels and surroundings as all views see them.
+
+    In place of SfM's, where what comes after is measured alone.
+    """
+    rng = np.random.default_rng(scene.seed)
+    labels = np.asarray(scene.labels, np.float64).reshape(-1, 3)
+    spread = np.concatenate(
+        [
+            labels[rng.integers(len(labels), size=num_points // 2)]
+            + rng.uniform(-0.6, 0.6, (num_points // 2, 3)) * scene.label_radius,
+            rng.uniform(-0.3, 0.3, (num_points - num_points // 2, 3)),
+        ]
+    )
+    above = np.column_stack([spread[:, :2], np.ones(len(spread))])
+    down = np.broadcast_to([0.0, 0.0, -1.0], above.shape)
+    points = above + scene.all_surfaces.intersect(above, down)[0][:, None] * down
+    obs_track, obs_view, obs_xy = [], [], []
+    for index, view in enumerate(views):
+        xy = view.project(points)
+        rays = points - view.center_in_world
+        distance = np.linalg.norm(rays, axis=-1)
+        seen_at, _ = scene.all_surfaces.intersect(view.center_in_world, rays / distance[:, None])
+        seen = in_image(view.camera, xy) & (np.abs(seen_at / distance - 1) < SAME_PLACE)
+        obs_track.append(np.flatnonzero(seen))
+        obs_view.append(np.full(seen.sum(), index))
+        obs_xy.append(xy[seen])
+    tracks = Tracks(
+        point3D_ids=np.arange(1, len(points) + 1),
+        points_in_world=points,
+        colors=np.full((len(points), 3), 128, np.uint8),
+        errors=np.full(len(points), 0.3),
+        obs_track=np.concatenate(obs_track),
+        obs_view=np.concatenate(obs_view),
+        obs_xy=np.concatenate(obs_xy),
+    )
+    return SparseModel(views=tuple(views), tracks=tracks, unregistered=())
+
+
+def _cameras(camera: PinholeCamera, views: Sequence[View]) -> str:
+    """The content of ``cameras.json``."""
+    matrix = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
+    images = {
+        view.name: {
+            "K": matrix,
+            "cam_from_world": np.column_stack(
+                [view.cam_from_world.rotation, view.cam_from_world.translation]
+            ).tolist(),
+        }
+        for view in views
+    }
+    return json.dumps({"width": camera.width, "height": camera.height, "images": images}, indent=1)
+
+
+def _write_view(folder: Path, scene: PrintedScene, maps: bool, view: View, seed: int) -> None:
+    mosaic = render_printed_mosaic(view, scene)
+    noisy = add_noise(mosaic, rng=np.random.default_rng(seed))
+    write_png(folder / "raw" / view.name, quantize(noisy))
+    if not maps:
+        return
+    part, depth = render_printed_truth(view, scene)
+    seen = part.mask & (part.depth <= depth + 1e-9)
+    stem = folder / "gt" / Path(view.name).stem
+    encoded = np.rint(np.nan_to_num(depth, posinf=0) / DEPTH_UNIT_M)
+    write_png(f"{stem}_depth.png", encoded.astype(np.uint16))
+    write_png(f"{stem}_mask.png", np.where(seen, 255, 0).astype(np.uint8))
+    normals = np.rint((np.where(seen[..., None], part.normals_in_cam, 0) + 1) * 32767.5)
+    write_png(f"{stem}_normal.png", normals.astype(np.uint16)[..., ::-1].copy())

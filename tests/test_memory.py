@@ -1,0 +1,59 @@
+"""Memory: peaks of stages, and what a budget allows."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from polmvs.errors import OptionError
+from polmvs.memory import MemoryNeeds, PeakMemory, plan_memory
+from polmvs.parallel import Workers
+
+NEEDS = MemoryNeeds(process_mb=100, bytes_per_px=200, bytes_per_row=100, max_rows=5_000_000)
+
+
+def fill(megabytes):
+    return int(np.ones(megabytes * 125_000).sum())
+
+
+def test_without_a_budget_all_is_as_wanted() -> None:
+    plan = plan_memory(None, 8, 1_000_000, NEEDS)
+    assert (plan.num_workers, plan.max_rows) == (8, 5_000_000)
+
+
+@pytest.mark.parametrize(
+    ("budget_gb", "num_workers", "max_rows"),
+    [
+        # A view takes 0.3 GB: the process itself, then pairs of it and workers.
+        (0.3, 1, 2_000_000),
+        (0.8, 1, 5_000_000),
+        (0.95, 2, 5_000_000),
+        (1.25, 3, 5_000_000),
+        (10.0, 8, 5_000_000),
+    ],
+)
+def test_workers_and_tiles_fit_the_budget(budget_gb, num_workers, max_rows) -> None:
+    plan = plan_memory(budget_gb, 8, 1_000_000, NEEDS)
+    assert (plan.num_workers, plan.max_rows) == (num_workers, max_rows)
+
+
+def test_too_small_for_one_view() -> None:
+    message = r"`run\.memory` 0\.2 GB hold no view of 1\.0 million pixels, which takes 0\.30 GB"
+    with pytest.raises(OptionError, match=message):
+        plan_memory(0.2, 8, 1_000_000, NEEDS)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="peaks are set back on Linux only")
+def test_peaks_are_of_their_time() -> None:
+    """A large array is seen in its own stage, a worker's too, and not in the next."""
+    before = PeakMemory().mb()
+    first = PeakMemory()
+    fill(200)
+    assert 190 < first.mb() - before < 260
+    assert PeakMemory().mb() - before < 100
+    with Workers(2) as workers:
+        list(workers.map(fill, [1, 1]))
+        idle = PeakMemory().mb()
+        second = PeakMemory()
+        list(workers.map(fill, [150]))
+        assert 120 < second.mb() - idle < 220
