@@ -15,6 +15,7 @@ import dataclasses
 import functools
 import math
 import os
+import sys
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -214,7 +215,7 @@ class Range:
     def __contains__(self, value: float) -> bool:
         """Whether a number is one of these."""
         return (
-            math.isfinite(value)
+            abs(value) <= sys.float_info.max  # not NaN, and no integer beyond all floats
             and (self.least is None or value >= self.least)
             and (self.most is None or value <= self.most)
             and (self.above is None or value > self.above)

@@ -146,7 +146,11 @@ def read_batch(
             raise OptionError(f"{path}: two captures are named {entry.name!r}; give `name`s.")
         seen[entry.name.casefold()] = entry.name
     for entry in entries:
-        if not entry.capture.is_dir():
+        try:
+            there = entry.capture.is_dir()
+        except OSError as error:  # a name longer than the system has
+            raise DataError(path, f"lists a folder that cannot be: {error.strerror}.") from error
+        if not there:
             raise DataError(entry.capture, f"no such folder; {path} lists it as {entry.name!r}.")
     return tuple(entries)
 
@@ -315,7 +319,9 @@ def _failed(entry: BatchEntry, message: str) -> BatchRow:
 def _toml_tables(path: Path, text: str) -> list[tuple[str, dict[str, Any]]]:
     try:
         content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError as error:
+        raise DataError(path, "is no TOML file (it is nested too deeply).") from error
+    except ValueError as error:  # of the parser, or an integer of thousands of digits
         raise DataError(path, f"is no TOML file ({error}).") from error
     listed = content.pop("captures", [])
     if content or not isinstance(listed, list) or not all(isinstance(t, dict) for t in listed):

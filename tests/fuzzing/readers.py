@@ -22,6 +22,7 @@ from polmvs.camera import PinholeCamera
 from polmvs.cli.call import read_config
 from polmvs.colmap.dense_workspace import open_dense_workspace
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
+from polmvs.colmap.pairs import read_pairs
 from polmvs.config import (
     AngleModel,
     CaptureOptions,
@@ -49,6 +50,7 @@ from polmvs.io.intrinsics import read_intrinsics
 from polmvs.io.layouts import read_author_truth, read_dmb, write_dmb
 from polmvs.io.raw_formats import probe_raw, read_raw
 from polmvs.neighbors import nearest_points, voxel_representatives
+from polmvs.pipeline.batch import read_batch
 from polmvs.pipeline.record import Record, read_image_names, read_options
 from polmvs.pipeline.run_folder import RunFolder, mark_own_workspace, require_own
 from polmvs.pipeline.run_lock import locked
@@ -407,6 +409,17 @@ SET_WRITERS = (
     data_set_writer.nersp,
     data_set_writer.mvas,
 )
+PAIRS = '# pairs\na.png d.png\n"b c.png" a.png\n'
+
+
+def batch(name: str, content: str) -> Kind:
+    def write(folder: Path) -> None:
+        (folder / "c").mkdir()
+        (folder / name).write_text(content)
+
+    return Kind(write, lambda folder: read_batch(folder / name, Options()))
+
+
 GROUPS = tuple(groups_of(Options).values())
 KINDS: dict[str, Kind] = {
     **{f"capture, {n}": capture(n) for n in capture_writer.FORMATS if "turned" not in n},
@@ -450,6 +463,9 @@ KINDS: dict[str, Kind] = {
     "camera line": text("cameras.txt", COLMAP_LINE, read_intrinsics),
     "centers": text("a.json", CENTERS, read_centers),
     "center lines": text("a.txt", "a.png 0 1 2\nb c.png 1 2 3\n", read_centers),
+    "pairs": text("p.txt", PAIRS, lambda path: read_pairs(path, ["a.png", "b c.png", "d.png"])),
+    "batch in toml": batch("b.toml", '[[captures]]\ncapture = "c"\n[captures.sfm]\nseed = 3\n'),
+    "batch in csv": batch("b.csv", "capture,name,sfm.seed\nc,one,3\nc,two,\n"),
     "config": text("a.toml", CONFIG, lambda path: read_config(path, GROUPS)),
     "metrics": text("metrics.json", comparison_json(), read_comparison),
 }  # fmt: skip
