@@ -42,6 +42,7 @@ from polmvs.colmap.models import write_model
 from polmvs.config import (
     AngleModel,
     EvaluationOptions,
+    ExportOptions,
     OptionGroup,
     Options,
     RunOptions,
@@ -125,7 +126,7 @@ def _benchmark(call: Call, terminal: Terminal) -> int:
 COMMAND = Command(
     help_text="times and memory of runs by stage, of single steps, and their growth",
     run=_benchmark,
-    groups=(Arguments, *TO_CLOUD, EvaluationOptions, *HOW),
+    groups=(Arguments, *TO_CLOUD, ExportOptions, EvaluationOptions, *HOW),
 )
 
 
