@@ -254,7 +254,7 @@ def test_no_polarised_region(cli, demo_run: Path, demo_capture: Path, tmp_path: 
 
 def test_no_seeds(cli, demo_run: Path, demo_capture: Path, tmp_path: Path) -> None:
     model, out = without_points(demo_run / "sparse", tmp_path / "model"), tmp_path / "out"
-    flags = ("--sparse", model, "--gt", demo_capture)
+    flags = ("--sparse", model, "--gt", demo_capture, "--method", "integrate")
     status, text, err = cli("compare", demo_capture, out, *flags)
     assert status == 3
     assert "| F-score at 1 mm, %" in text

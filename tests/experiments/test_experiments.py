@@ -32,7 +32,7 @@ from polmvs.experiments.data import Scene, load_view, open_experiment, open_scen
 from polmvs.experiments.phase import ErrorTally, measure_phase, phase_images
 from polmvs.experiments.plane import measure_plane
 from polmvs.experiments.tracks import check_k, measure_tracks, order_at_random, order_by_angle
-from polmvs.io.clouds import _open3d
+from polmvs.io.open3d_import import import_open3d
 from polmvs.io.images import write_png
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import open_capture
@@ -216,7 +216,7 @@ def test_line_sets_open_in_open3d(tmp_path):
     lines = Lines(points=points, curve=curve, heights=np.zeros(10))
     path = tmp_path / "lines.ply"
     path.write_bytes(line_set_bytes([lines, lines], stride=1))
-    loaded = _open3d().io.read_line_set(str(path))
+    loaded = import_open3d().io.read_line_set(str(path))
     np.testing.assert_allclose(np.asarray(loaded.points), np.concatenate([points, points]))
     edges = np.asarray(loaded.lines)
     assert len(edges) == 2 * (5 + 3)

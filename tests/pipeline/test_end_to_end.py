@@ -81,9 +81,9 @@ def test_ppa_reconstructs_the_board_and_opa_does_not(demo_run: Path) -> None:
     assert ppa["cloud"]["normal_mean_deg"] < 1
     assert ppa["tracks"]["errors"]["mean_deg"] < 1
     assert ppa["cloud"]["off_surface_share"] < 0.02
-    # Several times worse.
-    assert opa["cloud"]["f_score"][0] < 0.6 * ppa["cloud"]["f_score"][0]
-    assert opa["cloud"]["chamfer_m"] > 4 * ppa["cloud"]["chamfer_m"]
+    # OPA's surface keeps to silhouettes and sparse points, but its normals are several times worse.
+    assert 1 - opa["cloud"]["f_score"][0] > 4 * (1 - ppa["cloud"]["f_score"][0])
+    assert opa["cloud"]["normal_mean_deg"] > 4 * ppa["cloud"]["normal_mean_deg"]
     assert opa["tracks"]["errors"]["mean_deg"] > 4 * ppa["tracks"]["errors"]["mean_deg"]
 
 
@@ -211,7 +211,7 @@ def test_killed_run_goes_on_to_the_same_result(demo_run: Path, tmp_path: Path, c
     """Killed twice, in SfM and while it densifies; each time the finished stages stay."""
     out = tmp_path / "out"
     process = start(out)
-    wait_until(lambda: unfinished(out, "sparse"), process)
+    wait_until(lambda: unfinished(out, "sfm"), process)
     time.sleep(0.5)
     kill(process)
     assert not (out / "sparse").exists()
@@ -274,7 +274,7 @@ def test_stage_alone_is_done_again_only_with_overwrite(
     status, _, err = cli("densify", demo_capture, out)
     assert status == 2
     assert "is finished. Give --overwrite" in err
-    status, _, err = cli("densify", demo_capture, out, "--stride-px", 4, "--overwrite")
+    status, _, err = cli("densify", demo_capture, out, "--voxel-px", 2, "--overwrite")
     assert (status, err) == (0, "")
     assert len(read_cloud(out / "ppa.ply").points) < 0.5 * len(
         read_cloud(demo_run / "ppa.ply").points
@@ -314,4 +314,4 @@ def test_paper_contours_work_too(demo_run: Path, demo_capture: Path, tmp_path: P
     assert status == 0
     assert json.loads(text)["cloud"]["f_score"][1] > 0.9
     assert PropagationOptions().contour == "tangent"
-    assert PropagationOptions().method == "integrate"
+    assert PropagationOptions().method == "surface"

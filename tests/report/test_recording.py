@@ -61,6 +61,9 @@ def run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "run"
     shutil.copytree(demo_run, folder)
     views = RunFolder(folder).views("ppa")
+    for model in ("opa", "ppa", "tilted"):
+        for path in RunFolder(folder).views(model).glob("surface*.ply"):
+            path.unlink()
     for number, name in enumerate(
         [*(SURFACE_LEVELS.format(number=n) for n in range(3)), SURFACE_MESH]
     ):
