@@ -23,7 +23,7 @@ from polmvs.evaluation.tables import best_fit_lines
 from polmvs.evaluation.trust import Trust
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.pipeline import jobs as pipeline
-from polmvs.pipeline.record import read_options
+from polmvs.pipeline.record import is_finished, read_options
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.dense_workspace import DenseWorkspaceResult
 from polmvs.pipeline.stages.densify import DensifyResult
@@ -138,7 +138,12 @@ def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeli
     arguments, run_options = call.get(JobArguments), call.get(RunOptions)
     recorded = None
     if run_options.resume or continues:
-        recorded = read_options(RunFolder(arguments.out))
+        run_folder = RunFolder(arguments.out)
+        recorded = read_options(run_folder)
+        # A reference that failed gives way to the one that is given in its stead.
+        named = any(option.startswith("reference.") for option in call.given)
+        if named and not is_finished(run_folder, "poses"):
+            recorded = {name: group for name, group in recorded.items() if name != "reference"}
     return pipeline.Job(
         capture=arguments.capture,
         out=arguments.out,

@@ -182,6 +182,14 @@ def read_options(run_folder: RunFolder) -> Mapping[str, Any]:
     return options if content["stages"] else {}
 
 
+def is_finished(run_folder: RunFolder, stage: str) -> bool:
+    """Whether a run's record lists a stage as finished."""
+    if not run_folder.run_file.is_file():
+        return False
+    stages = _read_current(run_folder)["stages"]
+    return any(isinstance(one, dict) and one.get("name") == stage for one in stages)
+
+
 def read_image_names(run_folder: RunFolder) -> frozenset[str]:
     """Names of the files in ``images/``, from a record of any version.
 

@@ -94,7 +94,7 @@ def test_render_draws_a_column_for_each_file(cli, demo_run: Path, tmp_path: Path
     assert (drawn[:, :200] < 250).any()
     assert (drawn[:, 200:] < 250).any()
     assert "exists" in refused(cli("render", *arguments), 2)
-    assert cli("render", *arguments, "--overwrite", "--part")[0] == 0
+    assert cli("render", *arguments, "--size", "200,120", "--overwrite", "--part")[0] == 0
     alone = cv2.imread(str(picture))  # without the surroundings' points
     assert (alone < 250).any()
     assert (alone != drawn).any()

@@ -32,8 +32,8 @@ from polmvs.experiments.data import Scene, load_view, open_experiment, open_scen
 from polmvs.experiments.phase import ErrorTally, measure_phase, phase_images
 from polmvs.experiments.plane import measure_plane
 from polmvs.experiments.tracks import check_k, measure_tracks, order_at_random, order_by_angle
-from polmvs.io.open3d_import import import_open3d
 from polmvs.io.images import write_png
+from polmvs.io.open3d_import import import_open3d
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import open_capture
 from polmvs.synthetic.captures import Plane, quantize, render_mosaic, render_view, ring_of_views
