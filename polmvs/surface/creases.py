@@ -71,8 +71,7 @@ def sided_normals(
     (F, 3) unit.
     """
     tol = tolerances or CreaseTolerances()
-    incidence = _incidence(mesh)
-    one, other = (incidence @ incidence.T).tocoo().coords
+    one, other = (mesh.incidence @ mesh.incidence.T).tocoo().coords
     centers = mesh.centers
     width = tol.reach_edges * mesh.mean_edge
     near = np.exp(-0.5 * ((centers[one] - centers[other]) ** 2).sum(axis=1) / width**2)
@@ -127,19 +126,11 @@ def corner_normals(
     ones, corner_vertex = np.ones(3 * num), mesh.faces.ravel()
     shape = (3 * num, len(mesh.vertices))
     at_vertex = sparse.coo_array((ones, (np.arange(3 * num), corner_vertex)), shape=shape).tocsr()
-    corner, face = (at_vertex @ _incidence(mesh).T).tocoo().coords
+    corner, face = (at_vertex @ mesh.incidence.T).tocoo().coords
     alike = (normals[corner // 3] * normals[face]).sum(axis=1) > np.cos(np.radians(tol.crease_deg))
     weight = mesh.face_areas[face] * alike
     mean = _sums(corner, weight[:, None] * normals[face], 3 * num)
     return _unit(mean).reshape(num, 3, 3)
-
-
-def _incidence(mesh: TriangleMesh) -> sparse.csr_array:
-    """Which faces hold which vertices, ``(F, V)``."""
-    num = len(mesh.faces)
-    indices = (np.repeat(np.arange(num), 3), mesh.faces.ravel())
-    shape = (num, len(mesh.vertices))
-    return sparse.coo_array((np.ones(3 * num), indices), shape=shape).tocsr()
 
 
 def _sums(index: NDArray[np.int64], values: Array, num: int) -> Array:

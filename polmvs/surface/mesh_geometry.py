@@ -113,6 +113,14 @@ class TriangleMesh:
         return float(np.linalg.norm(ends, axis=-1).mean()) if len(self.faces) else 0.0
 
     @cached_property
+    def incidence(self) -> sparse.csr_array:
+        """Which faces hold which vertices, ``(F, V)``."""
+        num = len(self.faces)
+        indices = (np.repeat(np.arange(num), 3), self.faces.ravel())
+        shape = (num, len(self.vertices))
+        return sparse.coo_array((np.ones(3 * num), indices), shape=shape).tocsr()
+
+    @cached_property
     def face_components(self) -> NDArray[np.int64]:
         """Label ``(F,)`` of the connected piece of each face, from 0."""
         labels = connected_components(self.adjacency, directed=False)[1]

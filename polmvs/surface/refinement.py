@@ -261,9 +261,8 @@ def face_rows(
     angle_model: AngleModel,
     row_sigma: float,
     tolerances: RefinementTolerances,
-    other_light: Mask | None = None,
 ) -> FaceRows:
-    """Rows of one view at the faces that it sees; ``other_light`` (F,) as in `phase_rows`."""
+    """Rows of one view at the faces that it sees."""
     face, rays, cosine = visible_points(
         scene,
         view.center,
@@ -272,8 +271,7 @@ def face_rows(
         tolerance=tolerances.visible_slack * mesh.mean_edge,
         min_cosine=tolerances.min_cosine,
     )
-    other = None if other_light is None else other_light[face]
-    found = phase_rows(view, angle_model, mesh.centers[face], other)
+    found = phase_rows(view, angle_model, mesh.centers[face])
     known = found.precision > 0
     face, cosine, rows = face[known], cosine[known], found.rows[known]
     turn, precision = found.turn[known], found.precision[known]

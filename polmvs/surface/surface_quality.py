@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
@@ -159,10 +158,7 @@ def supported_faces(
 
 def _smoothed(mesh: TriangleMesh, values: Array, rounds: int) -> Array:
     """Means ``(F, C)`` of values ``(F, C)`` over faces that share a vertex, in rounds."""
-    num_faces, num = len(mesh.faces), len(mesh.vertices)
-    ones = np.ones(3 * num_faces)
-    indices = (mesh.faces.ravel(), np.repeat(np.arange(num_faces), 3))
-    incidence = sparse.coo_array((ones, indices), shape=(num, num_faces)).tocsr()
+    incidence = mesh.incidence.T.tocsr()
     degree = np.maximum(np.asarray(incidence.sum(axis=1)).ravel(), 1)[:, None]
     for _ in range(rounds):
         values = np.asarray(incidence.T @ ((incidence @ values) / degree)) / 3

@@ -148,7 +148,8 @@ def densify(
         if found is not None:
             fused, presumed, tilt_share = found
         else:
-            method = Method.CONTOUR if method is Method.CONTOUR else Method.INTEGRATE
+            if method is Method.SURFACE:
+                method = Method.INTEGRATE
             presumed, tilt_share = np.zeros(0, np.bool_), None
             fused = _dense_surface(
                 model,
