@@ -2,23 +2,26 @@
 
 CAPTURE has ``gt/`` and mosaics of 8 bits, whose steps are filled with noise that finer formats
 show. Each format is written to a folder of WORK, with the truth turned where the format turns the
-images, and run as ``polmvs compare CAPTURE OUT --gt GT --method integrate``, with the poses of the
-first (``--sparse``) unless it is turned: a grain of noise moves those of SfM by more than a format
-does. Formats that give the same Stokes images to the last bit share a run. Figures stay in WORK, so
-that a later call goes on where one ended. Prints a table, and which figures of a format differ by
-more than 5 % from those of floats.
+images, and run as ``polmvs compare CAPTURE OUT --gt GT --method integrate`` with the poses of the
+first (``--sparse``): a grain of noise moves those of SfM by more than a format does. Formats that
+give the same Stokes images to the last bit share a run. Figures stay in WORK, so that a later call
+goes on where one ended. Prints a table, and which figures of a format differ by more than 5 % from
+those of floats.
 """
 
 import hashlib
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from capture_writer import FORMATS, Mosaics, Written, rounded, tolerance, turn
 
+from polmvs.camera import PinholeCamera
+from polmvs.colmap.models import read_model, write_model
 from polmvs.config import (
     CaptureOptions,
     EvaluationOptions,
@@ -29,6 +32,7 @@ from polmvs.config import (
     SfmOptions,
 )
 from polmvs.evaluation.tables import format_table
+from polmvs.geometry import RigidTransform
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.raw_formats import read_raw
 from polmvs.pipeline.jobs import AngleModel, Job, compare
@@ -65,6 +69,10 @@ def exposures(folder: Path, mosaics: Mosaics) -> Written:
 ALL = {**FORMATS, "jpeg, quality 98": jpeg, "two exposures": exposures}
 
 
+def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    return np.dstack([turn(plane, orientation) for plane in cv2.split(pixels)]).squeeze()
+
+
 def turned_truth(source: Path, folder: Path, orientation: int) -> tuple[float, ...]:
     """Write the truth of the turned images; their intrinsics.
 
@@ -81,19 +89,48 @@ def turned_truth(source: Path, folder: Path, orientation: int) -> tuple[float, .
         center = axes[:2, :2] @ (matrix[:2, 2] - size / 2) + turned_size / 2
         focal = np.abs(axes[:2, :2]) @ np.diag(matrix)[:2]
         image["K"] = [[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]]
-        image["cam_from_world"] = np.column_stack(
-            [axes @ pose[:, :3] @ world, axes @ pose[:, 3]]
-        ).tolist()
+        pose = np.column_stack([axes @ pose[:, :3] @ world, axes @ pose[:, 3]])
+        image["cam_from_world"] = pose.tolist()
     cameras["width"], cameras["height"] = map(int, turned_size)
     folder.mkdir(exist_ok=True)
     (folder / "cameras.json").write_text(json.dumps(cameras))
     for path in source.glob("*.png"):
         pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if path.stem.endswith("_normal"):
-            around = pixels[..., ::-1].astype(float) / 32767.5 - 1
-            pixels = np.rint((around @ axes.T + 1) * 32767.5).astype(np.uint16)[..., ::-1]
-        cv2.imwrite(str(folder / path.name), np.ascontiguousarray(turn(pixels, orientation)))
+            normals = (pixels[..., ::-1] / 32767.5 - 1) @ axes.T
+            pixels = np.rint((normals + 1) * 32767.5).astype(np.uint16)[..., ::-1]
+        assert cv2.imwrite(str(folder / path.name), turned(pixels, orientation))
     return (*focal, *center)
+
+
+def turned_model(source: Path, folder: Path, orientation: int, intrinsics: tuple[float, ...]):
+    """Write a model's views and points as the turned images see them."""
+    model = read_model(source)
+    axes = np.eye(3)
+    axes[:2, :2] = AXES[orientation]
+    world = np.diag([np.linalg.det(axes), 1, 1])
+    old = model.views[0].camera
+    size = np.array([old.width, old.height])
+    turned_size = np.abs(axes[:2, :2]) @ size
+    numbers = (*map(int, turned_size), *intrinsics)
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    camera = PinholeCamera(**dict(zip(names, numbers, strict=True)))
+    views = tuple(
+        replace(
+            view,
+            camera=camera,
+            cam_from_world=RigidTransform(
+                axes @ view.cam_from_world.rotation @ world, axes @ view.cam_from_world.translation
+            ),
+        )
+        for view in model.views
+    )
+    tracks = replace(
+        model.tracks,
+        points_in_world=model.tracks.points_in_world @ world,
+        obs_xy=(model.tracks.obs_xy - size / 2) @ axes[:2, :2].T + turned_size / 2,
+    )
+    write_model(replace(model, views=views, tracks=tracks), folder)
 
 
 def digest(capture: Path, written: Written) -> str:
@@ -113,10 +150,13 @@ def run(capture: Path, truth: Path, written: Written, work: Path) -> dict:
     if not (work / "metrics.json").exists():
         intrinsics = turned_truth(truth, work / "gt", written.turn)
         model = work.parent / "sparse"
-        shared = model.exists() and written.turn == 1
+        sfm = SfmOptions(intrinsics=intrinsics)
+        if model.exists():
+            turned_model(model, work / "sparse", written.turn, intrinsics)
+            sfm = SfmOptions(sparse=work / "sparse")
         options = Options(
             capture=written.options,
-            sfm=SfmOptions(sparse=model) if shared else SfmOptions(intrinsics=intrinsics),
+            sfm=sfm,
             propagation=PropagationOptions(method=Method.INTEGRATE),
             evaluation=EvaluationOptions(gt=work / "gt"),
         )
