@@ -34,7 +34,7 @@ def inspect(call: Call, terminal: Terminal) -> int:
         inspection = inspect_capture(capture, on_progress=report)
     lines = list(inspection.lines)
     if arguments.sheet is not None:
-        write_contact_sheet(arguments.sheet, capture)
+        write_contact_sheet(arguments.sheet, capture, in_flags)
         lines.append(f"{arguments.sheet}: contact sheet")
     content = {
         "notes": capture.notes,

@@ -58,11 +58,18 @@ def check_database(path: Path, names: Sequence[str], width: int, height: int) ->
     """
     if not path.is_file():
         raise DataError(path, "no such file. `sfm.database` takes a COLMAP database.")
+    with sound(path), closing(_open_read_only(path)) as connection:
+        return _checked(connection, path, names, width, height)
+
+
+@contextmanager
+def sound(path: Path) -> Iterator[None]:
+    """Faults that SQLite and COLMAP find in a database meanwhile are errors that name it."""
     try:
-        with closing(_open_read_only(path)) as connection:
-            return _checked(connection, path, names, width, height)
-    except sqlite3.Error as error:
-        raise DataError(path, f"is no sound COLMAP database ({error}). {REMEDY}") from error
+        yield
+    except (sqlite3.Error, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise DataError(path, f"is no sound COLMAP database ({reason}). {REMEDY}") from error
 
 
 def copy_database(given: GivenDatabase, target: Path) -> None:
@@ -70,10 +77,13 @@ def copy_database(given: GivenDatabase, target: Path) -> None:
 
     Images that are none of the capture's stay in it, named by their numbers.
     """
-    with closing(_open_read_only(given.path)) as source, closing(sqlite3.connect(target)) as copy:
-        source.backup(copy)
-    with _renamed(target, {number: name for name, number in given.ids.items()}, keep=True):
-        pass
+    with sound(given.path):
+        with closing(_open_read_only(given.path)) as source, closing(sqlite3.connect(target)) as to:
+            source.backup(to)
+        with _renamed(target, {number: name for name, number in given.ids.items()}, keep=True):
+            pass
+        with opened(target):
+            pass
 
 
 def match_pairs(

@@ -14,6 +14,7 @@ import copy
 import logging
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from polmvs.colmap.database import (
     opened,
     read_descriptors,
     replace_cameras,
+    sound,
 )
 from polmvs.colmap.models import (
     model_from_reconstruction,
@@ -142,7 +144,7 @@ def run_sfm(
     for left_over in work_folder.glob("database.db*"):
         left_over.unlink()
     pycolmap.set_random_seed(options.seed)
-    with quiet_colmap():
+    with quiet_colmap(), nullcontext() if given is None else sound(given.path):
         on_progress("features")
         if given is None:
             _extract_features(database, image_folder, names, reader, options)

@@ -156,12 +156,15 @@ def inspect_capture(
     return Inspection(capture=opened, white=white, views=tuple(figures), warnings=tuple(warnings))
 
 
-def contact_sheet(capture: Capture, names: Sequence[str] | None = None) -> Picture:
+def contact_sheet(
+    capture: Capture, names: Sequence[str] | None = None, worded: Callable[[str], str] = str
+) -> Picture:
     """Pictures of some views: intensity, AoLP, DoLP, one view a row, in two columns of rows.
 
     Parameters
     ----------
     names : of the views; None for eight, evenly spread.
+    worded : what is shown of a line that names options by their paths.
 
     Returns
     -------
@@ -184,18 +187,18 @@ def contact_sheet(capture: Capture, names: Sequence[str] | None = None) -> Pictu
         tiles.append(np.zeros_like(tiles[0]))
     rows = [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
     body = np.vstack(rows)
-    return np.vstack([_header(capture, body.shape[1]), body])
+    return np.vstack([_header(capture, body.shape[1], worded), body])
 
 
-def write_contact_sheet(path: Path, capture: Capture) -> None:
-    """Write the contact sheet as PNG, whole or not at all.
+def write_contact_sheet(path: Path, capture: Capture, worded: Callable[[str], str] = str) -> None:
+    """Write the contact sheet as PNG, whole or not at all; see :func:`contact_sheet`.
 
     Raises
     ------
     DataError
         The system refuses, or a view cannot be read.
     """
-    write_png(path, contact_sheet(capture))
+    write_png(path, contact_sheet(capture, worded=worded))
 
 
 def intensity_picture(stokes: Stokes, white: float) -> Picture:
@@ -245,7 +248,7 @@ def _tile(picture: Picture, caption: str) -> Picture:
     return tile
 
 
-def _header(capture: Capture, width: int) -> Picture:
+def _header(capture: Capture, width: int, worded: Callable[[str], str]) -> Picture:
     """The wheel and what the capture is."""
     wheel = _wheel(HEADER_PX - 12)
     left = wheel.shape[1] + 14
@@ -253,7 +256,7 @@ def _header(capture: Capture, width: int) -> Picture:
     lines = [(str(capture.folder), WHITE)]
     for note in capture.notes:  # whole: what a warning says to do stands at its end
         colour = ORANGE if note in capture.warnings else GRAY
-        lines += [(line, colour) for line in textwrap.wrap(note, room)]
+        lines += [(line, colour) for line in textwrap.wrap(worded(note), room)]
     height = max(HEADER_PX, LINE_PX * len(lines) + 8)
     header = np.zeros((height, width, 3), np.uint8)
     header[6 : 6 + wheel.shape[0], 6 : 6 + wheel.shape[1]] = wheel

@@ -9,6 +9,7 @@ from boards import CHECKER, pictures
 
 from polmvs.camera import PinholeCamera
 from polmvs.io.intrinsics import read_intrinsics
+from polmvs.polarization import inspection
 from polmvs.polarization.calibration import read_calibration
 from polmvs.synthetic.captures import Plane, render_mosaic, ring_of_views
 from polmvs.synthetic.sensor import faulty_sensor
@@ -16,7 +17,9 @@ from polmvs.synthetic.sensor import faulty_sensor
 SHAPE = (96, 128)
 
 
-def test_inspect_says_what_a_capture_is(cli, demo_capture, tmp_path):
+def test_inspect_says_what_a_capture_is(cli, demo_capture, tmp_path, monkeypatch):
+    written = []
+    monkeypatch.setattr(inspection, "_write", lambda picture, text, *where: written.append(text))
     status, out, _ = cli("inspect", demo_capture, "--sheet", tmp_path / "sheet.png")
     assert status == 0
     assert "10 views, raw mosaics; files of 918x768 px, uint8" in out
@@ -24,6 +27,7 @@ def test_inspect_says_what_a_capture_is(cli, demo_capture, tmp_path):
     assert "is clipped in 001.png, 002.png" in out
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
     assert sheet.shape[1] == 6 * 326
+    assert "--pattern 90,45,135,0 fits, or a turned or mirrored one" in written
     status, out, _ = cli("inspect", demo_capture, "--json")
     content = json.loads(out)
     assert len(content["views"]) == 10

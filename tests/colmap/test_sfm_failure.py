@@ -1,14 +1,19 @@
 """Why SfM found no model is told apart, from the database that it leaves."""
 
+import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
+from fuzzing.readers import write_database
 
+from polmvs.colmap.sfm import run_sfm
 from polmvs.colmap.sfm_failure import why_no_model
 from polmvs.config import SfmOptions
+from polmvs.errors import DataError
 
 
 def database_of(folder: Path, num_features: int, shared: dict[tuple[int, int], int]) -> Path:
@@ -55,3 +60,24 @@ def test_a_camera_that_explains_nothing(tmp_path: Path, options: SfmOptions, rem
     found = why_no_model(database_of(tmp_path, 900, shared), options)
     assert "have texture and overlap (up to 400 shared features)" in found
     assert remedy in found
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE cameras SET model = 999",
+        "UPDATE cameras SET params = x'00'",
+        "UPDATE two_view_geometries SET rows = 1000",
+        "UPDATE two_view_geometries SET F = x'00'",
+    ],
+)
+def test_a_database_that_colmap_refuses_is_named(tmp_path: Path, damage: str) -> None:
+    """What SQLite finds sound and COLMAP does not."""
+    write_database(tmp_path)
+    with closing(sqlite3.connect(tmp_path / "a.db")) as connection, connection:
+        connection.execute(damage)
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((16, 24), np.uint8))
+    options = SfmOptions(database=tmp_path / "a.db", pairs="exhaustive")
+    with pytest.raises(DataError, match=r"a\.db: is no sound COLMAP database"):
+        run_sfm(tmp_path, ["a.png", "b.png"], tmp_path / "w", tmp_path / "sparse", options)

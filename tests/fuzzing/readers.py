@@ -20,6 +20,7 @@ from scenes import phase_map_of
 
 from polmvs.camera import PinholeCamera
 from polmvs.cli.call import read_config
+from polmvs.colmap.database import check_database, copy_database, opened, read_descriptors, sound
 from polmvs.colmap.dense_workspace import open_dense_workspace
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.pairs import read_pairs
@@ -215,6 +216,39 @@ def model(camera, *, five: bool, as_text: bool = False) -> Kind:
                 (folder / "sparse" / f"{name}{suffix}").unlink(missing_ok=True)
 
     return Kind(write, lambda folder: use_model(folder / "sparse"))
+
+
+def write_database(folder: Path) -> None:
+    """Two views with features, matches and a verified pair."""
+    pycolmap.Database.open(folder / "a.db").close()
+    with opened(folder / "a.db") as content:
+        camera = pycolmap.Camera(model="PINHOLE", width=24, height=16, params=[18, 18, 12, 8])
+        number = content.write_camera(camera)
+        same = np.tile(np.arange(20, dtype=np.uint32)[:, None], (1, 2))
+        for name in ("a.png", "b.png"):
+            image = content.write_image(pycolmap.Image(name=name, camera_id=number))
+            content.write_keypoints(image, RNG.uniform(0, 16, (20, 4)).astype(np.float32))
+            descriptors = pycolmap.FeatureDescriptors(
+                pycolmap.FeatureExtractorType.SIFT, RNG.integers(0, 255, (20, 128), np.uint8)
+            )
+            content.write_descriptors(image, descriptors)
+        content.write_matches(1, 2, same)
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.inlier_matches = same
+        content.write_two_view_geometry(1, 2, geometry)
+
+
+def use_database(folder: Path) -> None:
+    """What SfM does with a given database; COLMAP's mapper reads it into its cache."""
+    given = check_database(folder / "a.db", ["a.png", "b.png"], 24, 16)
+    copy = folder / "copy.db"
+    copy_database(given, copy)
+    with sound(folder / "a.db"), opened(copy) as content:
+        for number in given.ids.values():
+            read_descriptors(content, number)
+        options = pycolmap.DatabaseCacheOptions()
+        options.image_names = set(given.ids)
+        pycolmap.DatabaseCache.create(content, options)
 
 
 def use_workspace(path: Path) -> None:
@@ -438,6 +472,7 @@ KINDS: dict[str, Kind] = {
     "old model": model(OPENCV, five=False),
     "text model": model(OPENCV, five=True, as_text=True),
     "old text model": model(PINHOLE, five=False, as_text=True),
+    "database": Kind(write_database, use_database),
     "workspace": Kind(
         lambda folder: board_scene(SMALL, 3).write(folder / "w"),
         lambda folder: use_workspace(folder / "w"),

@@ -101,9 +101,11 @@ def find_model(
             # Where its database cannot be written COLMAP ends the process.
             model = run_separately(_run_sfm, images, names, work, new, options, on_message=on_step)
         except CrashError as error:
-            if not FULL_DISK.search(error.said):
-                raise
-            raise DataError(target.parent, CANNOT_WRITE) from error
+            if FULL_DISK.search(error.said):
+                raise DataError(target.parent, CANNOT_WRITE) from error
+            if options.database is not None:
+                raise DataError(options.database, f"is not usable: {error}") from error
+            raise
         except NoModelError as error:
             reason = why_no_model(work / "database.db", options)
             raise DataError(images, f"SfM finds no model: {reason}") from error
