@@ -460,14 +460,19 @@ class _Threads:
     def __init__(self, num: int) -> None:
         self.pool = ThreadPoolExecutor(num)
 
-    def outcomes(
-        self, function: Callable[..., Any], *iterables: Any
-    ) -> Iterator[Callable[[], Any]]:
-        """As :meth:`polmvs.parallel.Workers.outcomes`."""
-        tasks: list[Future[Any]] = [
-            self.pool.submit(function, *task) for task in zip(*iterables, strict=False)
-        ]
-        return iter([task.result for task in tasks])
+    def submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Future[Any]:
+        """Queue a task."""
+        return self.pool.submit(function, *task)
+
+    def result(
+        self,
+        function: Callable[..., Any],
+        tasks: list[tuple[Any, ...]],
+        futures: list[Future[Any]],
+        index: int,
+    ) -> Any:
+        """Result of a task."""
+        return futures[index].result()
 
     def close(self, *, cancel: bool) -> None:
         """End the threads."""
