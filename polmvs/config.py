@@ -469,7 +469,6 @@ class NormalOptions(OptionGroup, group="normals"):
 
     estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
     window_px: int = option(17, "side of the window of rows about a track's point, px", least=1)
-    unseeded: bool = option(True, "place parts without a sparse point by their outlines")
     tilt_aware_weights: bool = option(
         True,
         "rows of oblique rays count less, by what the model leaves out: OPA the perspective, OPA "

@@ -91,7 +91,7 @@ def normals(call: Call, terminal: Terminal) -> int:
     found, seeds = outcome.result(NormalsResult, model), outcome.result(SeedsResult)
     text = (
         f"{outcome.run_folder.sparse_cloud(model)}: {found.num_normals:,} of "
-        f"{found.num_tracks:,} sparse points have a normal, {seeds.num_track_seeds:,} are seeds"
+        f"{found.num_tracks:,} sparse points have a normal, {seeds.num_seeds:,} are seeds"
     )
     terminal.show(text, _content(outcome, terminal))
     return 0

@@ -46,7 +46,6 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 PANDORA_SIZE = (2448, 2048)  # of its dumps, px
-IMAGE_SUFFIXES = (".png", ".jpg", ".npy", ".raw", ".hdr", ".exr")
 MAX_NPZ_BYTES = 1 << 28
 
 

@@ -272,8 +272,7 @@ def _close(run: Run, models: Sequence[AngleModel]) -> JobOutcome:
     record, empty = run.record, None
     if any(record.result(DensifyResult, model).num_points == 0 for model in models):
         empty = NO_POINTS
-        seeds = record.result(SeedsResult)
-        if seeds.num_track_seeds == 0 and seeds.num_part_seeds == 0:
+        if record.result(SeedsResult).num_seeds == 0:
             empty = NO_SEEDS
         if record.result(MapsResult).num_region_px == 0:
             empty = NO_REGION

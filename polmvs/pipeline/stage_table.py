@@ -177,10 +177,6 @@ def _find_seeds(run: StageInput) -> seeds.SeedsResult:
         folder.maps(AngleModel.PPA),
         folder.track_normals(AngleModel.PPA),
         folder.seeds,
-        options=run.options.normals,
-        max_neighbors=run.options.propagation.max_neighbors,
-        workers=run.workers,
-        on_progress=run.on_progress,
     )
 
 
@@ -257,7 +253,7 @@ def sparse_figures(record: Record) -> SparseFigures:
         num_views=found.num_views,
         unregistered=found.unregistered,
         num_tracks=found.num_tracks,
-        num_seeds=chosen.num_track_seeds,
+        num_seeds=chosen.num_seeds,
     )
 
 
@@ -331,10 +327,8 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             command=NORMALS,
             reads=(HERE.sparse, HERE.maps(ppa), HERE.track_normals(ppa)),
             writes=(HERE.seeds,),
-            decides=("normals.unseeded", TILT_AWARE, "propagation.max_neighbors"),
             work=_find_seeds,
             result=seeds.SeedsResult,
-            num_steps=lambda run: run.num_views if run.options.normals.unseeded else None,
         ),
         StageSpec(
             name="evaluation",

@@ -28,7 +28,6 @@ FRUSTUM_SHARE = 0.08  # depth of a drawn camera, of the distance from the target
 EYE_DISTANCE = 3.2  # from the target, in radii of the part: all of it in a field of view of 40 deg
 EYE_ELEVATION_DEG = 35.0
 SPACING_SAMPLES = 2000  # points whose nearest neighbour is looked up; their median errs by 1 %
-NORMAL_NOTE = "red and green: sideways, blue: up; grey: no normal"
 KIND_COLORS = ("#0072b2", "#999999", "#e69f00", "#009e73", "#cc79a7")  # by PointKind
 
 

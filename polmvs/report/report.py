@@ -373,7 +373,7 @@ def _facts(given: _Given) -> list[tuple[str, str]]:
     facts = [
         ("views with a pose", f"{poses.num_views} of {total}"),
         ("sparse points", f"{poses.num_tracks:,}"),
-        ("seeds on the part", f"{seeds.num_track_seeds + seeds.num_part_seeds:,}"),
+        ("seeds on the part", f"{seeds.num_seeds:,}"),
         (
             f"points, {plots.LABELS[main]}",
             f"{given.record.result(DensifyResult, main).num_points:,}",

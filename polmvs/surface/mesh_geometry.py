@@ -83,12 +83,6 @@ class TriangleMesh:
         return np.asarray(total / np.maximum(length, 1e-300))
 
     @cached_property
-    def vertex_areas(self) -> Array:
-        """Area ``(V,)``, a third of the faces' at each vertex."""
-        third = np.repeat(self.face_areas / 3, 3)
-        return np.asarray(np.bincount(self.faces.ravel(), third, len(self.vertices)), np.float64)
-
-    @cached_property
     def adjacency(self) -> sparse.csr_array:
         """Symmetric ``(V, V)`` matrix with ones at the edges."""
         tail = self.faces[:, [0, 1, 2]].ravel()

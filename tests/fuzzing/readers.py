@@ -24,7 +24,6 @@ from polmvs.colmap.dense_workspace import open_dense_workspace
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.pairs import read_pairs
 from polmvs.config import (
-    AngleModel,
     CaptureOptions,
     Options,
     groups_of,
@@ -325,7 +324,7 @@ def use_stage_files(folder: Path) -> None:
     found = find_dense_view(folder / view.name)
     assert found is not None
     found.known.sum()
-    load_seeds(AngleModel.OPA, folder / "seeds.npy", folder / "normals.npy")
+    load_seeds(folder / "seeds.npy", folder / "normals.npy")
     seed_tracks(folder / "seeds.npy", 4)
 
 

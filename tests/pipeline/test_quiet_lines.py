@@ -8,49 +8,6 @@ import pytest
 from polmvs.colmap import sfm
 from polmvs.config import AngleModel
 from polmvs.evaluation.tables import best_fit_lines
-from polmvs.pipeline.stages.seeds import _warn_of_doubts
-from polmvs.surface.parts import PartReport
-
-
-def part(name: str, num_px: int) -> PartReport:
-    return PartReport(
-        view=name,
-        num_px=num_px,
-        num_views=3,
-        num_agreeing=0,
-        doubt="no outline",
-        range=1.0,
-        sigma=0.1,
-        outline_px=1.0,
-        phase_deg=1.0,
-    )
-
-
-@pytest.mark.parametrize(
-    ("parts", "expected"),
-    [
-        ([], []),
-        (
-            [part("a.png", 777)],
-            ["a.png: a part of 777 px without a sparse point stays undetermined: no outline."],
-        ),
-        (
-            [part("a.png", 777), part("b.png", 9000), part("c.png", 60)],
-            [
-                "b.png: a part of 9000 px without a sparse point stays undetermined: no outline "
-                "(and 2 smaller parts; see the log)."
-            ],
-        ),
-    ],
-)
-def test_parts_without_a_place_are_one_warning(caplog, parts, expected) -> None:
-    with caplog.at_level(logging.INFO, logger="polmvs"):
-        _warn_of_doubts(parts)
-    by_level = {logging.WARNING: [], logging.INFO: []}
-    for record in caplog.records:
-        by_level[record.levelno].append(record.getMessage())
-    assert by_level[logging.WARNING] == expected
-    assert len(by_level[logging.INFO]) == max(0, len(parts) - 1)
 
 
 @pytest.mark.parametrize(("registered", "warns"), [(5, False), (4, True)])

@@ -23,6 +23,7 @@ from polmvs.config import (
 )
 from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud
+from polmvs.normals.tracks import select_seeds
 from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import Job, compare, reconstruct
 from polmvs.pipeline.monitor import NoMonitor
@@ -203,29 +204,34 @@ def copy_of(demo_run: Path, tmp_path: Path):
     return copy
 
 
-def test_resume_with_other_neighbours_does_not_take_over_the_seeds(
+def test_resume_with_other_neighbours_does_not_take_over_the_surface(
     copy_of, demo_capture: Path, cli
 ) -> None:
-    out = copy_of("sparse_cloud_tilted")
+    out = copy_of("densify_tilted")
     err = refused(cli("compare", demo_capture, out, "--resume", "--max-neighbors", 8), 2)
-    assert "is 8 but the finished stage 'seeds'" in err
+    assert "is 8 but the finished stage 'densify_opa'" in err
     assert "used 15" in err
 
 
-def test_flags_of_seeds_are_those_of_the_last_word(
+def test_all_models_clouds_flag_the_same_seeds(
     copy_of, demo_capture: Path, cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Tracks that the outlines contradict are seeds in no model's cloud."""
+    def only_ten(tracks, normals, maps):
+        seeds, is_seed = select_seeds(tracks, normals, maps)
+        ten = replace(
+            seeds,
+            points_in_world=seeds.points_in_world[:10],
+            normals_in_world=seeds.normals_in_world[:10],
+            sigma=seeds.sigma[:10],
+        )
+        return ten, is_seed & (np.cumsum(is_seed) <= 10)
 
-    def all_but_ten(seeds, part_seeds):
-        return np.arange(len(seeds.sigma)) >= 10
-
-    monkeypatch.setattr("polmvs.pipeline.stages.seeds.contradicted", all_but_ten)
+    monkeypatch.setattr("polmvs.pipeline.stages.seeds.select_seeds", only_ten)
     out = copy_of("maps_tilted")
     for model in AngleModel:
         flags = ("--model", model, "--workers", 1, "--resume")
         assert cli("normals", demo_capture, out, *flags)[0] == 0
-    assert result_of(out, "seeds")["num_track_seeds"] == 10
+    assert result_of(out, "seeds")["num_seeds"] == 10
     clouds = [read_cloud(RunFolder(out).sparse_cloud(model)) for model in AngleModel]
     for cloud in clouds:
         assert cloud.scalars["seed"].sum() == 10

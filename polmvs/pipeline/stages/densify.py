@@ -126,7 +126,7 @@ def densify(
     propagation, fusion = propagation or PropagationOptions(), fusion or FusionOptions()
     workers = workers or Workers()
     phase_maps = open_maps(sparse, maps, model)
-    known = load_seeds(model, seeds, track_normals)
+    known = load_seeds(seeds, track_normals)
     given = _open_given(fusion, sparse, images)
     with scratch(views) as folder, workers.stopped_on_error():
         new_views = folder / "views"
