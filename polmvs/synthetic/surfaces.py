@@ -124,7 +124,7 @@ class Group:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    return np.einsum("...i,...i", a, b)
+    return np.asarray(np.einsum("...i,...i", a, b))
 
 
 def _quadratic(
