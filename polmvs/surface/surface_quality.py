@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-MAX_ROWS = 500_000  # of faces and views that normals are solved from at a time; bounds memory
+CHUNK, MAX_ROWS = 20_000, 500_000  # faces, and those times views, at a time; bounds memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,7 +209,7 @@ def fit_normals(
     if not num:
         return FaceNormals(normals, sigma)
     scene, centers = RayScene(mesh), mesh.centers
-    at_a_time = max(1, MAX_ROWS // len(views))
+    at_a_time = max(1, min(CHUNK, MAX_ROWS // len(views)))
     for start in range(0, num, at_a_time):
         part = slice(start, min(start + at_a_time, num))
         points, own = centers[part], mesh.face_normals[part]
