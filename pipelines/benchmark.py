@@ -73,6 +73,7 @@ NUM_TRACKS, NUM_VIEWS = 10_000, 10
 PHASE_SIGMA = 0.02  # rad
 REPEATS = 7
 TRIALS = 3
+SHOWN_SHARE = 0.005  # of a run's time, from which on a stage is drawn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,28 +319,30 @@ class GrowthPage:
         from matplotlib import pyplot
 
         (folder / "images").mkdir(parents=True, exist_ok=True)
-        figure, axes = pyplot.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+        figure, axes = pyplot.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
         views = [run.num_views for run in self.runs]
-        for stage in self.runs[-1].seconds:
+        last = self.runs[-1].seconds
+        shown = [stage for stage in last if last[stage] > SHOWN_SHARE * sum(last.values())]
+        for stage in sorted(shown, key=last.__getitem__, reverse=True):
             axes[0].loglog(views, [run.seconds[stage] for run in self.runs], "o-", label=stage)
             axes[1].semilogx(views, [run.peak_mb[stage] for run in self.runs], "o-", label=stage)
         for backend in dict.fromkeys(one.backend for one in self.scalings):
             some = [one for one in self.scalings if one.backend == backend]
-            axes[2].plot(
-                [one.num_workers for one in some],
-                [one.seconds for one in some],
-                "o-",
-                label=backend,
-            )
-        for axis, x, y in zip(
-            axes,
-            ("views", "views", "workers"),
-            ("CPU seconds of a stage", "peak memory of a stage, MB", "images and maps, seconds"),
-            strict=True,
+            nums, seconds = [one.num_workers for one in some], [one.seconds for one in some]
+            axes[2].semilogx(nums, seconds, "o-", label=backend)
+        workers = sorted({one.num_workers for one in self.scalings})
+        for axis, ticks, x, y in (
+            (axes[0], views, "views", "CPU seconds of a stage"),
+            (axes[1], views, "views", "peak memory of a stage, MB"),
+            (axes[2], workers, "workers", "images and maps, seconds"),
         ):
             axis.set(xlabel=x, ylabel=y)
-            axis.set_ylim(bottom=0) if axis is not axes[0] else None
-        axes[0].legend(fontsize=6)
+            axis.set_xticks(ticks, [str(tick) for tick in ticks])
+            axis.minorticks_off()
+            axis.grid(alpha=0.3)
+            if axis is not axes[0]:
+                axis.set_ylim(bottom=0)
+        axes[1].legend(fontsize=8)
         axes[2].legend(fontsize=8)
         figure.savefig(folder / "images" / "growth.png", dpi=120)
         pyplot.close(figure)
