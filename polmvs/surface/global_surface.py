@@ -40,6 +40,7 @@ from polmvs.surface.surface_quality import (
     face_evidence,
     find_contradictions,
     fit_normals,
+    point_offset,
     supported_faces,
 )
 from polmvs.surface.surface_view import SurfaceView, surface_view
@@ -210,7 +211,12 @@ def reconstruct_surface(
     report(1)
     sigma = _deviations(mesh, views, rows, hull.footprint, known)
     report(1)
-    contradictions = find_contradictions(mesh, evidence, supported, views, median)
+    offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, hull.footprint)
+    contradictions = replace(
+        find_contradictions(mesh, evidence, supported, views, median),
+        point_offset_px=offset_px,
+        point_offset_sigmas=offset_sigmas,
+    )
     return GlobalSurface(
         mesh=mesh,
         supported=supported,

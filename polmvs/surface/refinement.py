@@ -26,8 +26,6 @@ from polmvs.surface.surface_view import SurfaceView, phase_rows
 
 logger = logging.getLogger(__name__)
 
-NO_BIAS_PX = 0.02  # of outlines that carry the scale alone
-
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -74,11 +72,10 @@ class RefinementTolerances:
     rim_sigma_px : least deviation of an outline; its residuals may show a larger one. Measured:
         0.3; 0.7 costs 30 % on general shapes.
     rim_length_px : of an outline along which its errors are alike. Guess.
-    outline_bias_px : by which all silhouettes together may be too wide or too narrow. Measured on
-        the true outlines of four captures: -0.35 to 0.04. What errors the phases share bends the
-        surface as far as this lets it: Chamfer distance of `mug` 0.59 mm with 0.3, 0.38 with 0.1.
-    min_known : known points on the surface from which on that bias is sought; without them
-        nothing tells it from the scale. Measured on exact scenes: 0.7 to 1.3 px off.
+    outline_bias_px : deviation of an error of all silhouettes together, too wide or too narrow.
+        Measured on the true outlines of four captures: -0.35 to 0.04. It is part of the stated
+        deviations and not solved for: what a mesh rounds at sharp edges would pass for it, by half
+        a pixel on `board`, whose normals then err by 0.62 deg instead of 0.28.
     point_sigma_px : least deviation of a known point, in footprints. Guess.
     smoothness : deviation of the scale-free curvature from its surroundings' mean. Measured: 0.02
         to 0.04 alike.
@@ -105,7 +102,6 @@ class RefinementTolerances:
     rim_sigma_px: float = 0.3
     rim_length_px: float = 10.0
     outline_bias_px: float = 0.1
-    min_known: int = 10
     point_sigma_px: float = 0.3
     smoothness: float = 0.04
     smoothness_memory: float = 0.8
@@ -381,7 +377,7 @@ class _System:
     Attributes
     ----------
     equations : of the views and the known points.
-    bias : of all silhouettes, px.
+    outline_slope : (V,), change of the gradient by an error of all silhouettes, per px.
     tilt : share of the polarizers' tilt that is still to be taken back.
     smooth, pull : matrix ``(V, V)`` and gradient ``(V,)`` of the smoothness, and the matrix
         ``(V, V)`` whose product with its own transpose is the former.
@@ -390,7 +386,7 @@ class _System:
     """
 
     equations: _Equations
-    bias: _SharedError
+    outline_slope: Array
     tilt: _SharedError
     smooth: sparse.csr_array
     pull: Array
@@ -431,16 +427,13 @@ def _system(
         tol,
         with_slope=not rims,
     )
-    num_known = 0
     if known is not None and len(known.points) and seen.any():
-        num_known = _add_points(equations, mesh, seen, known, footprint, level, tol)
-    bias_px = tol.outline_bias_px if num_known >= tol.min_known else NO_BIAS_PX
-    bias = _SharedError(len(mesh.vertices), tol.phase_correlation / bias_px**2)
-    _add_rims(equations, bias, rims, level, tol)
+        _add_points(equations, mesh, seen, known, footprint, level, tol)
+    outline_slope = _add_rims(equations, rims, level, tol)
     smooth, pull, factor = _smoothness(mesh, edge, tol)
     free = np.zeros(len(mesh.vertices), np.bool_)
     free[mesh.faces[seen]] = True
-    return _System(equations, bias, tilt, smooth, pull, factor, free, error)
+    return _System(equations, outline_slope, tilt, smooth, pull, factor, free, error)
 
 
 def _step(
@@ -448,10 +441,8 @@ def _step(
 ) -> tuple[TriangleMesh, Array]:
     """One Gauss-Newton step: the new mesh and the displacements ``(V,)``."""
     matrix = system.equations.matrix() + system.smooth
-    errors = (system.bias, system.tilt)
-    shared = np.stack([error.column() for error in errors])
-    gradient = system.equations.gradient + system.pull
-    gradient -= np.array([error.offset() for error in errors]) @ shared
+    shared = system.tilt.column()
+    gradient = system.equations.gradient + system.pull - system.tilt.offset() * shared
     damping = np.where(system.free, tol.damping, tol.unseen_damping) * edge
     displacement = -solve(matrix, gradient, 1 / damping**2, shared)
     displacement = np.clip(np.nan_to_num(displacement), -edge, edge)
@@ -492,18 +483,23 @@ def place_deviations(
     matrix = system.equations.matrix() + system.smooth
     # Nothing but the energy holds the surface here; what no view sees is not asked for.
     loose = np.where(system.free, 100.0, tol.unseen_damping) * edge
-    none = np.zeros((0, num))
-    responses = []
-    for error in (system.bias, system.tilt):
-        response = solve(matrix, error.slope, 1 / loose**2, none)
-        responses.append(response * error.deviation(response))
+    none = np.zeros(num)
+    by_tilt = solve(matrix, system.tilt.slope, 1 / loose**2, none)
+    by_outlines = solve(matrix, system.outline_slope, 1 / loose**2, none)
+    # The outlines' error is not one that more views average out.
+    shared = np.stack(
+        [
+            by_tilt * system.tilt.deviation(by_tilt),
+            by_outlines * tol.outline_bias_px / np.sqrt(tol.phase_correlation),
+        ]
+    )
     total = np.zeros(num)
     for _ in range(num_samples):
         noise = system.equations.noise(rng)
         noise += system.smooth_factor @ rng.standard_normal(num)
         # What outlines and rows share, as if it were known: its own sample comes on top.
         sample = solve(matrix, noise, 1 / loose**2, none)
-        total += (sample + rng.standard_normal(len(responses)) @ np.stack(responses)) ** 2
+        total += (sample + rng.standard_normal(len(shared)) @ shared) ** 2
     sigma = np.sqrt(tol.phase_correlation * total / num_samples)
     return np.where(system.free, sigma, np.inf)
 
@@ -533,7 +529,9 @@ def median_residual(
 
 
 def solve(matrix: sparse.csr_array, right: Array, damping: Array, shared: Array) -> Array:
-    """Solution of ``(matrix + diag(damping) - sharedT shared) x = right`` by conjugate gradients.
+    """Solution of ``(matrix + diag(damping) - s sT) x = right`` by conjugate gradients.
+
+    s is ``shared`` (V,), see :class:`_SharedError`.
 
     Conditions are good: the damping bounds the smallest eigenvalue, and low frequencies were
     solved on coarser meshes.
@@ -543,7 +541,7 @@ def solve(matrix: sparse.csr_array, right: Array, damping: Array, shared: Array)
     inverse = 1 / damped.diagonal()
     precondition = LinearOperator((num, num), matvec=lambda x: inverse * x.ravel())
     reduced = LinearOperator(
-        (num, num), matvec=lambda x: damped @ x.ravel() - (shared @ x.ravel()) @ shared
+        (num, num), matvec=lambda x: damped @ x.ravel() - (shared @ x.ravel()) * shared
     )
     return np.asarray(cg(reduced, right, rtol=1e-3, maxiter=300, M=precondition)[0])
 
@@ -748,22 +746,27 @@ def _rim_rows(
 
 def _add_rims(
     equations: _Equations,
-    bias: _SharedError,
     rims: Sequence[_RimRows],
     level: Level,
     tol: RefinementTolerances,
-) -> None:
-    """Add the outlines of all views, as certain as their residuals show them to be."""
+) -> Array:
+    """Add the outlines of all views, as certain as their residuals show them to be.
+
+    Returns how the gradient (V,) changes with an error of all of them, per px.
+    """
+    slope = np.zeros(equations.num)
     residuals = np.concatenate([np.zeros(0), *(rim.residual for rim in rims)])
     if not len(residuals):
-        return
+        return slope
     sigma = max(tol.rim_sigma_px, robust_deviation(residuals - np.median(residuals)))
     scale = max(3 * tol.rim_sigma_px, 0.5 * level.rim_gate_px) ** 2
     for rim in rims:
         weight = rim.length_px * (scale / (scale + rim.residual**2)) ** 2
         weight *= tol.phase_correlation / (tol.rim_length_px * sigma**2)
         equations.add(rim.vertices, rim.jacobian, rim.residual, weight)
-        bias.add(rim.vertices, rim.jacobian, rim.residual, weight)
+        change = (weight[:, None] * rim.jacobian).ravel()
+        slope += np.bincount(rim.vertices.ravel(), change, equations.num)
+    return slope
 
 
 def _add_points(
@@ -774,11 +777,8 @@ def _add_points(
     footprint: float,
     level: Level,
     tol: RefinementTolerances,
-) -> int:
-    """Draw the faces that are ``seen`` (F,), not those behind them, to the known points near them.
-
-    Returns how many these are.
-    """
+) -> None:
+    """Draw the faces that are ``seen`` (F,), not those behind them, to known points near them."""
     visible = TriangleMesh(mesh.vertices, mesh.faces[seen])
     place, face, barycentric = RayScene(visible).closest(known.points)
     face = np.flatnonzero(seen)[face]
@@ -792,7 +792,6 @@ def _add_points(
     scale = np.maximum(4 * sigma, 0.1 * level.rim_gate_px * footprint) ** 2
     weight = tol.phase_correlation * (scale / (scale + residual**2)) ** 2 / sigma**2
     equations.add(mesh.faces[face], jacobian, residual, weight)
-    return int(near.sum())
 
 
 def _smoothness(

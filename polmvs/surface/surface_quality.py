@@ -14,15 +14,19 @@ from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
+from polmvs.fitting import robust_deviation
 from polmvs.normals.estimator import solve_normals
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
-from polmvs.surface.refinement import RefinementTolerances, face_rows
+from polmvs.surface.refinement import KnownPoints, RefinementTolerances, face_rows
 from polmvs.surface.surface_view import SurfaceView, phase_rows
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
+MAX_SIGMAS = 3.0  # of one figure, before it is called a contradiction
+MIN_POINTS = 10  # on the surface, for their median to be one
+POINT_REACH_PX = 4.0  # of the surface; what lies farther is not on it
 CHUNK, MAX_ROWS = 20_000, 500_000  # faces, and those times views, at a time; bounds memory
 
 
@@ -253,12 +257,17 @@ class Contradictions:
     denied_share : of that area, which silhouettes deny.
     uncovered_share : mean over the views of the share of the silhouette that the surface leaves
         uncovered.
+    point_offset_px : by which the surface lies outside of the known points on it, in the median
+        and in footprints of a pixel.
+    point_offset_sigmas : the same in standard deviations of it.
     """
 
     phase_sine: float
     contradicted_share: float
     denied_share: float
     uncovered_share: float
+    point_offset_px: float = 0.0
+    point_offset_sigmas: float = 0.0
 
     def warnings(self) -> list[str]:
         """Sentences for what a user should know; none if the surface fits its data."""
@@ -277,6 +286,13 @@ class Contradictions:
             found.append(
                 f"{self.uncovered_share:.0%} of the polarised regions are not covered by the "
                 "surface: views contradict each other, or a part is missing"
+            )
+        if abs(self.point_offset_sigmas) > MAX_SIGMAS:
+            side = "outside" if self.point_offset_px > 0 else "inside"
+            found.append(
+                f"the surface lies {abs(self.point_offset_px):.1f} px {side} of the sparse points "
+                "on it, which its stated deviation does not explain: outlines are too wide or too "
+                "narrow (masks, blur), or the points are not on it"
             )
         return found
 
@@ -316,6 +332,38 @@ def find_contradictions(
         denied_share=float(area[denied].sum()) / total,
         uncovered_share=float(np.mean(known)) if known else 0.0,
     )
+
+
+def point_offset(
+    mesh: TriangleMesh, supported: Mask, sigma: Array, known: KnownPoints, footprint: float
+) -> tuple[float, float]:
+    """By how much a surface lies outside of the known points on it.
+
+    Parameters
+    ----------
+    mesh, supported : the surface, with V vertices and F faces; (F,) those that are kept.
+    sigma : (V,) its stated deviation, world units.
+    known : points of the surface.
+    footprint : length that a pixel covers, world units.
+
+    Returns
+    -------
+    The median, in footprints, and the same in standard deviations; 0 where few points are near.
+    """
+    if len(known.points) < MIN_POINTS or not supported.any():
+        return 0.0, 0.0
+    mesh = TriangleMesh(mesh.vertices, mesh.faces[supported])
+    place, face, _ = RayScene(mesh).closest(known.points)
+    offset = ((place - known.points) * mesh.face_normals[face]).sum(axis=1)
+    stated = np.median(sigma[mesh.faces[face]], axis=1)
+    near = np.isfinite(stated) & (np.abs(offset) < POINT_REACH_PX * footprint)
+    if near.sum() < MIN_POINTS:
+        return 0.0, 0.0
+    offset, middle = offset[near], float(np.median(offset[near]))
+    # A median of normal errors is known to 1.25 deviations over the root of their number.
+    own = max(robust_deviation(offset - middle), float(np.median(known.sigma[near])))
+    noise = np.hypot(1.25 * own / np.sqrt(len(offset)), np.median(stated[near]))
+    return middle / footprint, middle / max(float(noise), 1e-300)
 
 
 def _uncovered_share(mesh: TriangleMesh, view: SurfaceView, stride_px: int) -> float:

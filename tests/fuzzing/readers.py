@@ -314,7 +314,7 @@ def write_stage_files(folder: Path) -> None:
     )
     np.save(folder / "normals.npy", np.zeros(4, NORMALS_TYPE))
     seeds = np.zeros(3, SEEDS_TYPE)
-    seeds["track"] = (-1, 0, 3)
+    seeds["track"] = (1, 0, 3)
     np.save(folder / "seeds.npy", seeds)
 
 

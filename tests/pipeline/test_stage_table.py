@@ -88,11 +88,6 @@ def test_every_option_decides_a_stage() -> None:
         plain_options(Options(), ["propagation.soup"])
 
 
-def test_seeds_are_decided_by_the_neighbours_that_they_are_placed_with() -> None:
-    seeds = next(spec for spec in stage_table() if spec.name == "seeds")
-    assert "propagation.max_neighbors" in plain_options(Options(), seeds.decides)
-
-
 def test_stale_stages_leave_other_models_alone() -> None:
     table = stage_table()
     assert names(with_dependent(["mesh_ppa"], table)) == ["mesh_ppa"]
@@ -128,7 +123,7 @@ def test_names_of_all_results() -> None:
 
 def test_option_groups_of_commands() -> None:
     assert option_groups("sfm") == ("capture", "sfm", "reference")
-    assert {"region", "normals", "propagation"} <= set(option_groups("normals"))
+    assert option_groups("normals") == ("capture", "sfm", "reference", "region", "normals")
     assert "evaluation" not in option_groups("export")
     assert set(option_groups("compare")) == {f.name for f in fields(Options)} - {"export"}
 

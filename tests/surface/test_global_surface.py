@@ -159,3 +159,6 @@ def test_contradictions_are_put_in_words():
     assert fine.warnings() == []
     bad = replace(fine, contradicted_share=0.4, denied_share=0.2, uncovered_share=0.5)
     assert [w.split()[0] for w in bad.warnings()] == ["on", "20%", "50%"]
+    assert replace(fine, point_offset_px=1.2, point_offset_sigmas=2.0).warnings() == []
+    (shifted,) = replace(fine, point_offset_px=-1.2, point_offset_sigmas=-4.0).warnings()
+    assert "1.2 px inside of the sparse points" in shifted

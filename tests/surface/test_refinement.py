@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from analytic_objects import box, phase_maps_of, ring_of_views, sphere, torus
@@ -23,6 +24,7 @@ from polmvs.surface.refinement import (
     shared_edges,
     solve,
 )
+from polmvs.surface.surface_quality import point_offset
 from polmvs.surface.surface_view import Silhouette, phase_rows, surface_view
 from polmvs.surface.visual_hull import visual_hull
 
@@ -180,26 +182,28 @@ def test_faces_of_a_box_become_flat():
     assert abs(np.mean(top[:, 2]) - 0.5) < 1.0 * FOOTPRINT
 
 
-def test_known_points_place_what_outlines_misplace(ball):
-    """All silhouettes are a pixel too wide; the phases of a sphere hardly see its scale."""
-    import cv2
-
+def test_outlines_that_known_points_contradict_are_told(ball):
+    """All silhouettes are two pixels too wide; the phases of a sphere hardly see its scale."""
     wide = []
     for view in ball:
-        mask = cv2.dilate(view.silhouette.certain.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        mask = cv2.dilate(view.silhouette.certain.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         wide.append(replace(view, silhouette=Silhouette(mask, mask)))
     rng = np.random.default_rng(0)
     points = rng.standard_normal((80, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     known = KnownPoints(points, np.full(80, 0.3 * FOOTPRINT))
-    hull = visual_hull(wide, num_wrong=0)
-    alone, helped = (
-        refine(hull.mesh, wide, PPA, hull.footprint, known=k, tolerances=QUICK).mesh
-        for k in (None, known)
-    )
-    error = [np.mean(np.linalg.norm(m.vertices, axis=1) - 1) / FOOTPRINT for m in (alone, helped)]
-    assert error[0] > 0.6
-    assert abs(error[1]) < 0.6 * error[0]
+    found = []
+    for views in (ball, wide):
+        hull = visual_hull(views, num_wrong=0)
+        refined = refine(hull.mesh, views, PPA, hull.footprint, known=known, tolerances=QUICK)
+        sigma = place_deviations(refined.mesh, views, PPA, hull.footprint, known=known)
+        all_faces = np.ones(len(refined.mesh.faces), np.bool_)
+        found.append(point_offset(refined.mesh, all_faces, sigma, known, hull.footprint))
+    (fine_px, fine_sigmas), (wide_px, wide_sigmas) = found
+    assert abs(fine_sigmas) < 3
+    assert abs(fine_px) < 0.3
+    assert 1.5 < wide_px < 2.6
+    assert wide_sigmas > 3
 
 
 def test_outliers_among_known_points_lose(ball):
