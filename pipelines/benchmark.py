@@ -9,9 +9,9 @@ With ``--capture`` that capture is run first, into the only OUT. ``--estimators`
 estimators beside a plain NumPy baseline, ``--ingest`` the way from a mosaic of 5 megapixels to
 Stokes images with their noise beside OpenCV's and, where it is installed, polanalyser's.
 ``--growth`` makes captures of printed texture in WORK and measures all stages after SfM, on true
-poses, with the number of views, and the per-view stages with that of workers: threads, processes
-and Dask's. With ``--write DIR`` its table and plot become ``DIR/growth.md`` and
-``DIR/images/growth.png``.
+poses, with the number of views, each in a process of its own, and the per-view stages with that of
+workers: threads, processes and Dask's. With ``--write DIR`` its table and plot become
+``DIR/growth.md`` and ``DIR/images/growth.png``.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ from polmvs.pipeline.runner import load_record, timing_table
 from polmvs.pipeline.stages.images import write_images
 from polmvs.pipeline.stages.maps import build_maps
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
-from polmvs.polarization.capture import open_capture
+from polmvs.polarization.capture import Capture, open_capture
 from polmvs.synthetic.printed_capture import Part, printed_model, scene_of, write_printed_capture
 
 Array = NDArray[np.float64]
@@ -71,6 +72,8 @@ NUM_PIXELS = 250_000
 NUM_TRACKS, NUM_VIEWS = 10_000, 10
 PHASE_SIGMA = 0.02  # rad
 REPEATS = 7
+TRIALS = 3
+SHOWN_SHARE = 0.005  # of a run's time, from which on a stage is drawn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,7 +148,7 @@ def estimator_table() -> str:
     rng = np.random.default_rng(0)
     rows = [*_planes(rng), *_tracks(rng)]
     table = [[name, f"{1e3 * seconds:.1f}"] for name, seconds in rows]
-    return format_table(["median of 7 runs", "ms"], table)
+    return format_table(["median of 7 runs", "CPU ms"], table)
 
 
 def _planes(rng: np.random.Generator) -> list[tuple[str, float]]:
@@ -214,6 +217,7 @@ def _tracks(rng: np.random.Generator) -> list[tuple[str, float]]:
 
 def ingest_table() -> str:
     """Stokes images from a mosaic of 5 megapixels, three ways; without reading the file."""
+    cv2.setNumThreads(1)
     rng = np.random.default_rng(0)
     rows, cols = np.mgrid[:2048, :2448]
     scene = 90 + 60 * np.sin(rows / 37) * np.cos(cols / 53) + rng.normal(0, 2, rows.shape)
@@ -247,7 +251,7 @@ def ingest_table() -> str:
 
         ways.append(("polanalyser: demosaicing, Stokes, angle and degree", _median_seconds(others)))
     rows_ = [[name, f"{1e3 * t:.1f}", f"{t / own:.2f}"] for name, t in ways]
-    return format_table(["mosaic of 2448x2048, median of 7", "ms", "of polmvs"], rows_)
+    return format_table(["mosaic of 2448x2048, median of 7", "CPU ms", "of polmvs"], rows_)
 
 
 def _opencv_ingest(raw: NDArray[np.uint8]) -> object:
@@ -269,7 +273,7 @@ class Growth:
     Attributes
     ----------
     num_views : of it.
-    seconds, peak_mb : of each stage by name.
+    seconds, peak_mb : of the processor and of memory, of each stage by name.
     """
 
     num_views: int
@@ -285,7 +289,7 @@ class Scaling:
     ----------
     backend : ``threads``, ``processes`` or ``Dask``.
     num_workers : of it.
-    seconds : of images and maps, workers started already.
+    seconds : of images and maps, workers started already; the least of some trials.
     """
 
     backend: str
@@ -315,28 +319,30 @@ class GrowthPage:
         from matplotlib import pyplot
 
         (folder / "images").mkdir(parents=True, exist_ok=True)
-        figure, axes = pyplot.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+        figure, axes = pyplot.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
         views = [run.num_views for run in self.runs]
-        for stage in self.runs[-1].seconds:
+        last = self.runs[-1].seconds
+        shown = [stage for stage in last if last[stage] > SHOWN_SHARE * sum(last.values())]
+        for stage in sorted(shown, key=last.__getitem__, reverse=True):
             axes[0].loglog(views, [run.seconds[stage] for run in self.runs], "o-", label=stage)
             axes[1].semilogx(views, [run.peak_mb[stage] for run in self.runs], "o-", label=stage)
         for backend in dict.fromkeys(one.backend for one in self.scalings):
             some = [one for one in self.scalings if one.backend == backend]
-            axes[2].plot(
-                [one.num_workers for one in some],
-                [one.seconds for one in some],
-                "o-",
-                label=backend,
-            )
-        for axis, x, y in zip(
-            axes,
-            ("views", "views", "workers"),
-            ("seconds of a stage", "peak memory of a stage, MB", "images and maps, seconds"),
-            strict=True,
+            nums, seconds = [one.num_workers for one in some], [one.seconds for one in some]
+            axes[2].semilogx(nums, seconds, "o-", label=backend)
+        workers = sorted({one.num_workers for one in self.scalings})
+        for axis, ticks, x, y in (
+            (axes[0], views, "views", "CPU seconds of a stage"),
+            (axes[1], views, "views", "peak memory of a stage, MB"),
+            (axes[2], workers, "workers", "images and maps, seconds"),
         ):
             axis.set(xlabel=x, ylabel=y)
-            axis.set_ylim(bottom=0) if axis is not axes[0] else None
-        axes[0].legend(fontsize=6)
+            axis.set_xticks(ticks, [str(tick) for tick in ticks])
+            axis.minorticks_off()
+            axis.grid(alpha=0.3)
+            if axis is not axes[0]:
+                axis.set_ylim(bottom=0)
+        axes[1].legend(fontsize=8)
         axes[2].legend(fontsize=8)
         figure.savefig(folder / "images" / "growth.png", dpi=120)
         pyplot.close(figure)
@@ -351,10 +357,11 @@ def growth_page(
 ) -> GrowthPage:
     """Make the captures, run them, and fit the exponents."""
     assert given.growth is not None
+    run_options = replace(run_options, workers=1, scheduler=None, overwrite=True, resume=False)
     runs = [_run_views(given, num, options, run_options, terminal) for num in sorted(given.views)]
     scalings = _scalings(given, max(given.views), terminal)
     stages = list(runs[-1].seconds)
-    header = ["stage", *(f"{run.num_views} views, s" for run in runs), "exponent"]
+    header = ["stage", *(f"{run.num_views} views, CPU s" for run in runs), "exponent"]
     header += [*(f"{run.num_views}, MB" for run in runs), "ratio of time per view"]
     rows = []
     for stage in stages:
@@ -384,14 +391,15 @@ def growth_page(
         [
             "# Growth with views and workers",
             f"`python pipelines/benchmark.py --growth WORK --views {sizes} --width {given.width} "
-            f"--num-workers {','.join(map(str, given.num_workers))} --workers "
-            f"{run_options.workers} --write docs`, on {_machine()}.",
+            f"--num-workers {','.join(map(str, given.num_workers))} --write docs`, on "
+            f"{_machine()}.",
             f"Captures of `pipelines/synthetic.py`, half-size images {given.width} px wide, true "
-            "poses and 2,000 true sparse points in place of SfM's. An exponent of 1 is a time that "
-            "grows with the views; the last column is the time per view of most views over that of "
-            "fewest.",
+            "poses and 2,000 true sparse points in place of SfM's, one process. An exponent of 1 "
+            "is a time that grows with the views; the last column is the time per view of most "
+            "views over that of fewest.",
             format_table(header, rows),
-            "Stages `images` and `maps` of the largest capture, their workers started before:",
+            "Stages `images` and `maps` of the largest capture, their workers started before, by "
+            f"the clock, the least of {TRIALS} trials:",
             format_table(["workers", "s", "speed-up", "efficiency"], worker_rows),
         ]
     )
@@ -435,13 +443,16 @@ def _run_views(
         capture=folder,
         out=given.growth / f"run-{num_views}-{given.width}",
         options=replace(options, sfm=replace(options.sfm, sparse=model)),
-        run_options=replace(run_options, overwrite=True, resume=False),
-        monitor=terminal,
+        run_options=run_options,
     )
-    record = reconstruct(job).record
+    start = time.perf_counter()
+    # What one run has loaded is no memory of the next.
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        record = pool.submit(reconstruct, job).result().record
+    terminal.finished(f"{num_views} views", time.perf_counter() - start, "")
     return Growth(
         num_views=num_views,
-        seconds={stage.name: stage.seconds for stage in record.stages},
+        seconds={stage.name: stage.cpu_s or 0.0 for stage in record.stages},
         peak_mb={stage.name: stage.peak_rss_mb for stage in record.stages},
     )
 
@@ -460,14 +471,19 @@ class _Threads:
     def __init__(self, num: int) -> None:
         self.pool = ThreadPoolExecutor(num)
 
-    def outcomes(
-        self, function: Callable[..., Any], *iterables: Any
-    ) -> Iterator[Callable[[], Any]]:
-        """As :meth:`polmvs.parallel.Workers.outcomes`."""
-        tasks: list[Future[Any]] = [
-            self.pool.submit(function, *task) for task in zip(*iterables, strict=False)
-        ]
-        return iter([task.result for task in tasks])
+    def submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Future[Any]:
+        """Queue a task."""
+        return self.pool.submit(function, *task)
+
+    def result(
+        self,
+        function: Callable[..., Any],
+        tasks: list[tuple[Any, ...]],
+        futures: list[Future[Any]],
+        index: int,
+    ) -> Any:
+        """Result of a task."""
+        return futures[index].result()
 
     def close(self, *, cancel: bool) -> None:
         """End the threads."""
@@ -502,21 +518,25 @@ def _scalings(given: Arguments, num_views: int, terminal: Terminal) -> list[Scal
     found = []
     for backend in ("threads", "processes", "Dask"):
         for num in given.num_workers:
-            with (
-                _workers_of(backend, num) as workers,
-                tempfile.TemporaryDirectory(dir=folder.parent.absolute()) as scratch,
-            ):
+            with _workers_of(backend, num) as workers:
                 if workers is None:
                     continue
-                target = Path(scratch)
                 list(workers.map(_warm_up, range(4 * num)))
-                start = time.perf_counter()
-                write_images(capture, target / "images", workers=workers)
-                build_maps(capture, model.absolute(), target / "maps", workers=workers)
-                seconds = time.perf_counter() - start
+                trials = [_per_view(capture, model.absolute(), workers) for _ in range(TRIALS)]
+                seconds = min(trials)
             found.append(Scaling(backend=backend, num_workers=num, seconds=seconds))
             terminal.finished(f"{backend}, {num}", seconds, "")
     return found
+
+
+def _per_view(capture: Capture, model: Path, workers: Workers) -> float:
+    """Seconds that the images and maps of a capture take."""
+    with tempfile.TemporaryDirectory(dir=capture.folder.parent) as scratch:
+        target = Path(scratch)
+        start = time.perf_counter()
+        write_images(capture, target / "images", workers=workers)
+        build_maps(capture, model, target / "maps", workers=workers)
+        return time.perf_counter() - start
 
 
 def _warm_up(index: int) -> int:
@@ -528,12 +548,13 @@ def _warm_up(index: int) -> int:
 
 
 def _median_seconds(work: Callable[[], object]) -> float:
+    """Of the processor, so that other work on the machine does not count."""
     work()
     seconds = []
     for _ in range(REPEATS):
-        start = time.perf_counter()
+        start = time.process_time()
         work()
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.process_time() - start)
     return float(np.median(seconds))
 
 

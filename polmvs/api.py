@@ -478,6 +478,7 @@ def reconstruct(
     overwrite: bool = False,
     resume: bool = False,
     workers: int | None = None,
+    scheduler: str | None = None,
     monitor: Monitor | None = None,
     **changes: Any,
 ) -> Reconstruction:
@@ -492,6 +493,7 @@ def reconstruct(
     overwrite, resume : delete an earlier run in ``out`` first, or go on with it.
     workers : processes; one for each core where None. With more than one a script needs
         ``if __name__ == "__main__":``.
+    scheduler : address of a Dask scheduler, whose workers do the per-view work instead.
     monitor : who follows the run, if anybody.
     **changes : single options by name, such as ``intrinsics=(fx, fy, cx, cy)``.
 
@@ -503,7 +505,7 @@ def reconstruct(
     from polmvs.pipeline import jobs
 
     angle_model = _choice(AngleModel, model, "model")
-    job = _job(capture, out, options, changes, overwrite, resume, workers, monitor)
+    job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
     outcome = jobs.reconstruct(job, angle_model)
     _warn_if_empty(outcome.empty)
     return Reconstruction(folder=outcome.run_folder.root, angle_model=angle_model)
@@ -518,6 +520,7 @@ def compare(
     overwrite: bool = False,
     resume: bool = False,
     workers: int | None = None,
+    scheduler: str | None = None,
     monitor: Monitor | None = None,
     **changes: Any,
 ) -> RunResult:
@@ -526,7 +529,7 @@ def compare(
     Parameters
     ----------
     models : angle models.
-    capture, out, options, overwrite, resume, workers, monitor, **changes : see
+    capture, out, options, overwrite, resume, workers, scheduler, monitor, **changes : see
         :func:`reconstruct`; ``gt`` is the folder of the ground truth.
 
     Raises
@@ -537,7 +540,7 @@ def compare(
     from polmvs.pipeline import jobs
 
     chosen = tuple(dict.fromkeys(_choice(AngleModel, model, "models") for model in models))
-    job = _job(capture, out, options, changes, overwrite, resume, workers, monitor)
+    job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
     outcome = jobs.compare(job, chosen)
     _warn_if_empty(outcome.empty)
     return _run_result(outcome.run_folder.root, chosen)
@@ -583,6 +586,7 @@ def _job(
     overwrite: bool,
     resume: bool,
     workers: int | None,
+    scheduler: str | None,
     monitor: Monitor | None,
 ) -> Any:
     from polmvs.pipeline.jobs import Job
@@ -591,7 +595,7 @@ def _job(
 
     if resume and options is None:  # those of the run, as the command line does
         options = options_from_plain(read_options(RunFolder(Path(out))), str(out))
-    run_options = RunOptions(overwrite=overwrite, resume=resume)
+    run_options = RunOptions(overwrite=overwrite, resume=resume, scheduler=scheduler)
     if workers is not None:
         run_options = replace(run_options, workers=workers)
     return Job(

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
@@ -92,23 +92,14 @@ class Cluster:
         """Tasks that the workers of now do at a time."""
         return sum(self._client.nthreads().values())
 
-    def outcomes(
-        self, function: Callable[..., Any], *iterables: Any
-    ) -> Iterator[Callable[[], Any]]:
-        """As :meth:`polmvs.parallel.Workers.outcomes`; all tasks are submitted at once."""
-        tasks = list(zip(*iterables, strict=False))
-        futures = [self._submit(function, task) for task in tasks]
-        ask = partial(self._result, function, tasks, futures)
-        return (partial(ask, index) for index in range(len(tasks)))
-
-    def _result(
+    def result(
         self,
         function: Callable[..., Any],
         tasks: list[tuple[Any, ...]],
         futures: list[Any],
         index: int,
     ) -> Any:
-        """Result of a task.
+        """Result of a task, as the workers' interface asks for it.
 
         Raises
         ------
@@ -134,7 +125,7 @@ class Cluster:
                 self._await_return(error)
                 for later in range(index, len(tasks)):
                     if futures[later].status != "finished":
-                        futures[later] = self._submit(function, tasks[later])
+                        futures[later] = self.submit(function, tasks[later])
         self._pending.discard(futures[index])
         futures[index].release()
         tasks[index] = ()  # nothing of it is held for those to come
@@ -147,7 +138,7 @@ class Cluster:
         self._pending.clear()
         self._client.close()
 
-    def _submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Any:
+    def submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Any:
         """One task; large arguments go to the workers past the scheduler's graph."""
         import cloudpickle  # comes with Dask; a script's own functions travel whole
 

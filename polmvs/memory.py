@@ -1,4 +1,4 @@
-"""Resident memory: what a run's processes took, and what a budget allows.
+"""Memory and processor time: what a run's processes took, and what a budget allows.
 
 The kernel keeps the largest resident memory of each process (``VmHWM``), which can be set back, so
 that the peak of one stage is told from that of those before. Only Linux tells it.
@@ -108,6 +108,23 @@ class PeakMemory:
         total = _own_peak_mb() + sum(_peak_mb(pid) for pid in _living() if pid != os.getpid())
         ended = _largest_ended_mb()
         return total + (ended if ended > self._ended else 0.0)
+
+
+def cpu_seconds() -> float:
+    """Processor time so far of this process, its workers, and children that have ended.
+
+    Of living workers only Linux tells it. Seconds, of all cores together.
+    """
+    total = sum(os.times()[:4])
+    for pid in _living():
+        if pid != os.getpid():
+            try:
+                status = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
+            except OSError:  # not Linux, or the process has ended
+                continue
+            ticks = status.rpartition(")")[2].split()[11:15]  # see proc(5)
+            total += sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
+    return total
 
 
 def _living() -> Iterable[int]:

@@ -33,10 +33,19 @@ POSIX = hasattr(signal, "pthread_sigmask")
 
 
 class Backend(Protocol):
-    """Where work is done."""
+    """Where work is done that is handed over."""
 
-    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
-        """As :meth:`Workers.outcomes`."""
+    def submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Any:
+        """Hand over a task; what stands for its result."""
+
+    def result(
+        self,
+        function: Callable[..., Any],
+        tasks: list[tuple[Any, ...]],
+        futures: list[Any],
+        index: int,
+    ) -> Any:
+        """Result of a task, of all that were submitted in order; lost ones are submitted again."""
 
     def close(self, *, cancel: bool) -> None:
         """End what is under way, with ``cancel`` before its end; a later map begins anew."""
@@ -58,7 +67,7 @@ class Workers:
         if num < 1:
             raise ValueError(f"{num=} but expected at least one worker.")
         self.num = num
-        self._backend = backend or (_ThisProcess() if num == 1 else _Processes(num))
+        self._backend = backend or (None if num == 1 else _Processes(num))
 
     @classmethod
     def of_cluster(
@@ -72,8 +81,7 @@ class Workers:
 
     def map(self, function: Callable[..., T], *iterables: Any) -> Iterator[T]:
         """Results in order, as ``map`` gives them; the first error ends it."""
-        outcomes = self._backend.outcomes(function, *iterables)
-        return (outcome() for outcome in outcomes)
+        return (outcome() for outcome in self.outcomes(function, *iterables))
 
     def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
         """Of each task, in order, what gives its result or raises its error, to be called once.
@@ -81,7 +89,12 @@ class Workers:
         The error of one stops no other. A task whose worker is lost is done again; that which
         loses every worker raises ``BrokenProcessPool`` or a ``DataError``.
         """
-        return self._backend.outcomes(function, *iterables)
+        if self._backend is None:  # done here, when it is asked for
+            return map(partial(partial, function), *iterables)
+        tasks = list(zip(*iterables, strict=False))
+        futures = [self._backend.submit(function, task) for task in tasks]
+        ask = partial(self._backend.result, function, tasks, futures)
+        return (partial(ask, index) for index in range(len(tasks)))
 
     @contextmanager
     def stopped_on_error(self) -> Iterator[None]:
@@ -89,7 +102,7 @@ class Workers:
         try:
             yield
         except BaseException:
-            self._backend.close(cancel=True)
+            self._close(cancel=True)
             raise
 
     def __enter__(self) -> Workers:
@@ -101,18 +114,11 @@ class Workers:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._backend.close(cancel=kind is not None)
+        self._close(cancel=kind is not None)
 
-
-class _ThisProcess:
-    """No other one."""
-
-    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
-        """Tasks are done when they are asked for."""
-        return map(partial(partial, function), *iterables)
-
-    def close(self, *, cancel: bool) -> None:
-        """Do nothing."""
+    def _close(self, *, cancel: bool) -> None:
+        if self._backend is not None:
+            self._backend.close(cancel=cancel)
 
 
 class _Processes:
@@ -122,21 +128,14 @@ class _Processes:
         self.num = num
         self._pool: ProcessPoolExecutor | None = None
 
-    def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
-        """All tasks are handed over at once."""
-        tasks = list(zip(*iterables, strict=False))
-        futures = [self._submit(function, task) for task in tasks]
-        ask = partial(self._result, function, tasks, futures)
-        return (partial(ask, index) for index in range(len(tasks)))
-
-    def _result(
+    def result(
         self,
         function: Callable[..., T],
         tasks: list[tuple[Any, ...]],
         futures: list[Future[T]],
         index: int,
     ) -> T:
-        """Result of a task. One that was lost with its worker is done again while no other is.
+        """Result of a task; one that was lost with its worker is done again while no other is.
 
         A killed worker takes all tasks with it, and which one killed it is not known.
         """
@@ -147,14 +146,15 @@ class _Processes:
         except BrokenProcessPool:
             self.close(cancel=True)
             try:
-                return self._submit(function, task).result()
+                return self.submit(function, task).result()
             finally:
                 for later in range(index + 1, len(tasks)):
                     done = futures[later].done() and not futures[later].cancelled()
                     if not done or isinstance(futures[later].exception(), BrokenProcessPool):
-                        futures[later] = self._submit(function, tasks[later])
+                        futures[later] = self.submit(function, tasks[later])
 
-    def _submit(self, function: Callable[..., T], task: tuple[Any, ...]) -> Future[T]:
+    def submit(self, function: Callable[..., T], task: tuple[Any, ...]) -> Future[T]:
+        """Start the processes, if there are none, and queue a task."""
         if self._pool is None:
             self._pool = ProcessPoolExecutor(
                 self.num, mp_context=get_context("spawn"), initializer=_start_worker

@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from helpers import content_of
 
+import polmvs
 import polmvs.cluster
 from polmvs.cluster import Cluster, ClusterPatience
+from polmvs.colmap.models import write_model
 from polmvs.errors import DataError, OptionError
 from polmvs.parallel import Workers
 from polmvs.pipeline.stages.images import write_images
 from polmvs.polarization.capture import open_capture
+from polmvs.synthetic.printed_capture import Part, printed_model, scene_of, write_printed_capture
 
 distributed = pytest.importorskip("distributed")
 
@@ -158,6 +161,27 @@ def test_without_dask(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(OptionError, match=r"`run\.scheduler` needs .*polmvs\[dask\]"):
         Cluster("tcp://127.0.0.1:9")
+
+
+def test_commands_on_a_cluster(cli, address, tmp_path) -> None:
+    views = write_printed_capture(tmp_path / "capture", 4, width=96)
+    write_model(printed_model(scene_of(Part.BOARD), views, num_points=400), tmp_path / "model")
+    content = []
+    for name, where in (("here", ()), ("there", ("--scheduler", address))):
+        out = tmp_path / name
+        first = cli("sfm", tmp_path / "capture", out, "--sparse", tmp_path / "model", *where)
+        second = cli("normals", tmp_path / "capture", out, "--resume", *where)
+        assert (first[0], second[0]) == (0, 0), first[2] + second[2]
+        content.append(content_of(out / "images") | content_of(out / "maps"))
+    assert len(content[0]) == 4 * 5
+    assert content[0] == content[1]
+
+
+def test_python_takes_the_address(demo_capture, tmp_path) -> None:
+    for call in (polmvs.reconstruct, polmvs.compare):
+        with pytest.raises(DataError, match="nonsense://x: no Dask scheduler answers"):
+            call(demo_capture, tmp_path / "out", scheduler="nonsense://x")
+    assert not (tmp_path / "out").exists()
 
 
 # Last, as the workers may not be back at once

@@ -1,12 +1,13 @@
 """Memory: peaks of stages, and what a budget allows."""
 
 import sys
+import time
 
 import numpy as np
 import pytest
 
 from polmvs.errors import OptionError
-from polmvs.memory import MemoryNeeds, PeakMemory, plan_memory
+from polmvs.memory import MemoryNeeds, PeakMemory, cpu_seconds, plan_memory
 from polmvs.parallel import Workers
 
 NEEDS = MemoryNeeds(process_mb=100, bytes_per_px=200, bytes_per_row=100, max_rows=5_000_000)
@@ -14,6 +15,12 @@ NEEDS = MemoryNeeds(process_mb=100, bytes_per_px=200, bytes_per_row=100, max_row
 
 def fill(megabytes):
     return int(np.ones(megabytes * 125_000).sum())
+
+
+def spin(seconds):
+    end = time.process_time() + seconds
+    while time.process_time() < end:
+        pass
 
 
 def test_without_a_budget_all_is_as_wanted() -> None:
@@ -57,3 +64,14 @@ def test_peaks_are_of_their_time() -> None:
         second = PeakMemory()
         list(workers.map(fill, [150]))
         assert 120 < second.mb() - idle < 220
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="times of living workers are known on Linux")
+def test_processor_time_of_workers_counts_once() -> None:
+    with Workers(2) as workers:
+        list(workers.map(spin, [0.0, 0.0]))
+        before = cpu_seconds()
+        list(workers.map(spin, [0.3, 0.3]))
+        alive = cpu_seconds() - before
+    assert 0.58 < alive < 0.9
+    assert alive - 0.05 < cpu_seconds() - before < alive + 0.5  # their end takes some

@@ -7,6 +7,7 @@ worker costs nothing.
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,19 @@ from polmvs.io.images import write_bytes
 MAX_REASON = 120  # characters of NumPy's words
 
 
+@dataclass(frozen=True)
+class StoredArray:
+    """An array on disk, which ``np.asarray`` maps into memory, read only."""
+
+    path: Path
+
+    def __array__(
+        self, dtype: npt.DTypeLike | None = None, copy: bool | None = None
+    ) -> NDArray[Any]:
+        """See :func:`map_array`."""
+        return np.asarray(map_array(self.path), dtype)
+
+
 def save_array(path: Path, array: NDArray[Any]) -> None:
     """Write an ``.npy`` file whole or not at all, into a folder that there is.
 
@@ -29,6 +43,14 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
     buffer = io.BytesIO()
     np.save(buffer, array)
     write_bytes(path, buffer.getvalue())
+
+
+def kept_array(array: NDArray[Any], path: Path | None) -> NDArray[Any] | StoredArray:
+    """The array itself, or where a path is given, what finds it there."""
+    if path is None:
+        return array
+    save_array(path, array)
+    return StoredArray(path)
 
 
 def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:

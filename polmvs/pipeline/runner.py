@@ -29,7 +29,7 @@ from polmvs.config import (
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.folders import require_unicode
-from polmvs.memory import MemoryNeeds, MemoryPlan, PeakMemory, plan_memory
+from polmvs.memory import MemoryNeeds, MemoryPlan, PeakMemory, cpu_seconds, plan_memory
 from polmvs.parallel import Workers
 from polmvs.pipeline.checks import (
     check_input,
@@ -130,7 +130,7 @@ class Run:
     def _carry_out(self, spec: StageSpec) -> None:
         """Do a stage whose input is there, and record it."""
         logger.info("%s: begins", spec.name)
-        start, memory = time.perf_counter(), PeakMemory()
+        start, cpu_start, memory = time.perf_counter(), cpu_seconds(), PeakMemory()
         with (
             self.monitor.stage(spec.name, spec.num_steps(self._input())) as on_progress,
             _collected_warnings() as warned,
@@ -153,6 +153,7 @@ class Run:
             reads=_names(spec.reads),
             options=plain_options(self.options, spec.decides),
             seconds=seconds,
+            cpu_s=round(cpu_seconds() - cpu_start, 3),
             peak_rss_mb=round(peak_mb, 1),
             warnings=tuple(dict.fromkeys(warned)),
             result=result,
@@ -445,26 +446,33 @@ def _names(paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def timing_table(records: Mapping[str, Record]) -> str:
-    """Seconds and memory of the stages of one or more runs, one column pair each."""
+    """Seconds, those of the processor, and memory of the stages of one or more runs."""
     names = list(dict.fromkeys(stage.name for run in records.values() for stage in run.stages))
     header = ["stage"]
     for run in records:
-        header += [f"{run}, s", "peak MB"]
+        header += [f"{run}, s", "CPU s", "peak MB"]
     rows = [[name, *_stage_cells(name, records)] for name in names]
     total, rest, wall = ["all stages"], ["all but poses"], ["wall clock"]
     for record in records.values():
         seconds = {stage.name: stage.seconds for stage in record.stages}
         peak = max((stage.peak_rss_mb for stage in record.stages), default=None)
-        total += [number(sum(seconds.values())), number(peak, 1, 0)]
-        rest += [number(sum(t for name, t in seconds.items() if name not in ("sfm", "poses"))), ""]
-        wall += [number(record.wall_s), ""]
+        cpu = {stage.name: stage.cpu_s or 0.0 for stage in record.stages}
+        total += [number(sum(seconds.values())), number(sum(cpu.values())), number(peak, 1, 0)]
+        rest += [number(_without_poses(times)) for times in (seconds, cpu)] + [""]
+        wall += [number(record.wall_s), "", ""]
     return format_table(header, [*rows, total, rest, wall])
+
+
+def _without_poses(times: Mapping[str, float]) -> float:
+    return sum(time for name, time in times.items() if name not in ("sfm", "poses"))
 
 
 def _stage_cells(name: str, records: Mapping[str, Record]) -> list[str]:
     cells = []
     for record in records.values():
         stage = record.stage(name)
-        found = (stage.seconds, stage.peak_rss_mb) if stage is not None else (None, None)
-        cells += [number(found[0]), number(found[1], 1, 0)]
+        if stage is None:
+            cells += [number(None)] * 3
+        else:
+            cells += [number(stage.seconds), number(stage.cpu_s), number(stage.peak_rss_mb, 1, 0)]
     return cells

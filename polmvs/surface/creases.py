@@ -33,22 +33,24 @@ class CreaseTolerances:
         fitted normals (1 to 3 deg) and the curvature of a face, below the edges of parts. Measured
         on five captures: with 0.4 for 0.2 the F-score at 1 mm falls by 0.2 to 1.4 points.
     fitting_sine : deviation of a face's own normal from the given one at which its vertices are
-        free to move. Guess: half of ``like_sine``.
+        free to move. Half of ``like_sine``.
     reach_edges : deviation of the distance of faces that are averaged, in edges. Guess.
     unfitted_weight : of a normal that is the mesh's own. Guess.
-    normal_rounds : of the average. Guess: an edge is two faces wide.
-    vertex_rounds : of the vertices' move. Sun et al.: 10 to 30.
-    max_move : of a vertex, in edges: what rounding takes.
+    normal_rounds : of the average. Measured, 6, 12, 20: normals of `step` err by 2.61, 2.47, 2.40
+        deg, of `mug` by 1.84, 1.97, 2.12.
+    vertex_rounds : of the vertices' move: until it ends. Measured: 30 fall short, F at 1 mm of
+        `step` 97.1 and not 97.2.
+    max_move : of a vertex, in edges: what rounding takes. 0.5 and 1 alike.
     crease_deg : between faces that do not share the normal of a corner. Guess: three ``like_sine``.
     """
 
     like_sine: float = 0.2
-    fitting_sine: float = 0.2
+    fitting_sine: float = 0.1
     reach_edges: float = 1.0
     unfitted_weight: float = 0.2
-    normal_rounds: int = 6
-    vertex_rounds: int = 20
-    max_move: float = 0.5
+    normal_rounds: int = 12
+    vertex_rounds: int = 60
+    max_move: float = 1.0
     crease_deg: float = 30.0
 
 

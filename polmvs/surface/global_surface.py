@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ from polmvs.surface.refinement import (
     place_deviations,
     refine,
 )
-from polmvs.surface.silhouettes import find_silhouettes
+from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.surface_quality import (
     Contradictions,
     FaceEvidence,
@@ -121,6 +122,7 @@ def reconstruct_surface(
     tolerances: RefinementTolerances | None = None,
     on_progress: OnProgress | None = None,
     on_mesh: Callable[[TriangleMesh], None] | None = None,
+    folder: Path | None = None,
 ) -> GlobalSurface | Undetermined:
     """The surface on which all views agree.
 
@@ -136,12 +138,18 @@ def reconstruct_surface(
     tolerances : of the refinement.
     on_progress : called with 1 after each step.
     on_mesh : called with the hull, and with the mesh after each level of its refinement.
+    folder : where what is made of each view is kept meanwhile; None: in memory.
     """
     report = on_progress if on_progress is not None else lambda count: None
-    silhouettes = find_silhouettes(maps, masks_given=masks_given)
     views = [
-        surface_view(phase_map, silhouette, angle_model, tilt_aware=tilt_aware)
-        for phase_map, silhouette in zip(maps, silhouettes, strict=True)
+        surface_view(
+            phase_map,
+            find_silhouette(phase_map, mask_given=masks_given),
+            angle_model,
+            tilt_aware=tilt_aware,
+            folder=folder,
+        )
+        for phase_map in maps
     ]
     if reason := _no_hull(views):
         return Undetermined(reason)
@@ -158,6 +166,7 @@ def reconstruct_surface(
         tilt_aware=tilt_aware,
         signed_distance=RayScene(hull.mesh).signed_distance,
         first_hit=_first_hit(hull.mesh),
+        folder=folder,
     )
     if steps:
         logger.info("%d groups of faces that silhouettes do not tell apart.", len(steps))
@@ -180,7 +189,7 @@ def reconstruct_surface(
     )
     mesh = refined.mesh
     views = [replace(view, tilt_share=refined.tilt_share) for view in views]
-    hollows = _hollows((mesh, hull.mesh), hull.footprint, maps, angle_model, tilt_aware)
+    hollows = _hollows((mesh, hull.mesh), hull.footprint, maps, angle_model, tilt_aware, folder)
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
     if carvings and len(mesh.faces):
@@ -228,6 +237,7 @@ def _hollows(
     maps: Sequence[PhaseMap],
     angle_model: AngleModel,
     tilt_aware: bool,
+    folder: Path | None,
 ) -> tuple[Hollow, ...]:
     """Hollows of the first of some meshes that has any: a refined outer wall places the inner."""
     for mesh in meshes:
@@ -240,7 +250,7 @@ def _hollows(
             RayScene(mesh).signed_distance,
             footprint,
         )
-        found = find_hollows(faces, maps, angle_model, tilt_aware=tilt_aware)
+        found = find_hollows(faces, maps, angle_model, tilt_aware=tilt_aware, folder=folder)
         if found:
             return tuple(found)
     return ()

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -170,6 +171,7 @@ def find_hollows(
     tilt_aware: bool = True,
     tolerances: HollowTolerances | None = None,
     offset_tolerances: OffsetTolerances | None = None,
+    folder: Path | None = None,
 ) -> tuple[Hollow, ...]:
     """Mouths that a surface closes with a cap, and the hollows presumed behind them.
 
@@ -179,11 +181,12 @@ def find_hollows(
     maps : phase maps of the views.
     angle_model, tilt_aware : of the rows, as in :func:`polmvs.normals.rows.gather_rows`.
     tolerances, offset_tolerances : numbers of the search, and of the borders.
+    folder : as of :func:`polmvs.surface.offsets.face_scene`.
     """
     tol, face_tol = tolerances or HollowTolerances(), offset_tolerances or OffsetTolerances()
     if not len(surface.centers) or len(maps) < tol.min_views:
         return ()
-    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=face_tol)
+    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=face_tol, folder=folder)
     found: list[Hollow] = []
     for flat in _flat_pieces(surface, tol, face_tol):
         rim = _rim(surface, flat, scene, tol, face_tol)

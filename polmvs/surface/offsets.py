@@ -15,17 +15,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
+from polmvs.io.arrays import kept_array
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
@@ -351,6 +353,7 @@ def stepped_faces(
     signed_distance: SignedDistance | None = None,
     first_hit: FirstHit | None = None,
     tolerances: OffsetTolerances | None = None,
+    folder: Path | None = None,
 ) -> tuple[SteppedFaces, ...]:
     """Groups of faces of like normal that a first surface does not explain, with their extents.
 
@@ -365,11 +368,12 @@ def stepped_faces(
     first_hit : distance and normal where rays from ``(N, 3)`` along ``(3,)`` first meet the first
         surface (inf where they do not): it keeps the places that it explains better.
     tolerances : numbers of the search.
+    folder : as of :func:`face_scene`.
     """
     tol = tolerances or OffsetTolerances()
     if not faces:
         return ()
-    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=tol)
+    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=tol, folder=folder)
     found = []
     for group in _grouped(faces, tol):
         points = seeds.points_in_world[np.concatenate([face.members for face in group])]
@@ -461,16 +465,25 @@ def _grid_over(
 
 @dataclass(frozen=True)
 class FaceScene:
-    """Phase maps, which rows they have, and the images (H, W, 4) whose steps show borders."""
+    """Phase maps, which rows they have, and the images (H, W, 4) whose steps show borders.
+
+    The images may be on disk: ``np.asarray`` makes arrays of them.
+    """
 
     maps: Sequence[PhaseMap]
     angle_model: AngleModel
     tilt_aware: bool
-    features: Sequence[Image]
+    features: Sequence[ArrayLike]
 
-    def rows(self, points: Array) -> Rows:
-        """Rows of points ``(N, 3)``."""
-        return gather_rows(self.angle_model, points, self.maps, tilt_aware=self.tilt_aware)
+    def rows(self, points: Array, maps: Sequence[PhaseMap] | None = None) -> Rows:
+        """Rows of points ``(N, 3)``, of all views or of some."""
+        chosen = self.maps if maps is None else maps
+        return gather_rows(self.angle_model, points, chosen, tilt_aware=self.tilt_aware)
+
+    def losses(self, points: Array, normals: Floats, tol: OffsetTolerances) -> Image:
+        """Loss (K, N) of the rows of points, as :func:`row_losses`, with one view's rows held."""
+        each = [row_losses(self.rows(points, [one]), normals, tol)[0] for one in self.maps]
+        return np.concatenate(each)
 
 
 def face_scene(
@@ -479,10 +492,14 @@ def face_scene(
     *,
     tilt_aware: bool = True,
     tolerances: OffsetTolerances | None = None,
+    folder: Path | None = None,
 ) -> FaceScene:
-    """What is asked about faces, from the views' phase maps."""
+    """What is asked about faces, from the views' phase maps; kept in a folder or in memory."""
     tol = tolerances or OffsetTolerances()
-    features = [_features(phase_map, tol) for phase_map in maps]
+    features = [
+        kept_array(_features(one, tol), folder and folder / f"{one.view.name}.features.npy")
+        for one in maps
+    ]
     return FaceScene(maps, angle_model, tilt_aware, features)
 
 
@@ -648,7 +665,7 @@ def face_evidence(
     tol : numbers.
     """
     shape = places.shape[:2]
-    losses = row_losses(scene.rows(places.reshape(-1, 3)), face.normal[:, None], tol)[0]
+    losses = scene.losses(places.reshape(-1, 3), face.normal[:, None], tol)
     losses = losses.reshape(-1, *shape)
     jumps = np.full(losses.shape, np.nan, np.float32)
     inside, num_seen, num_marks = np.zeros((3, *shape))
@@ -695,9 +712,11 @@ def _seen(
     return xy.astype(np.float32), np.asarray(seen & (cosine > tol.min_cosine))
 
 
-def _line_steps(images: Image, xy: Image, shown: Mask, tol: OffsetTolerances) -> tuple[Image, Mask]:
+def _line_steps(
+    images: ArrayLike, xy: Image, shown: Mask, tol: OffsetTolerances
+) -> tuple[Image, Mask]:
     """Steps (H, W) of one view's images, NaN where it shows nothing, and where it shows a mark."""
-    values = sample_image(images, xy)
+    values = sample_image(np.asarray(images), xy)
     steps = np.where(shown, _steps(values[..., :3], shown, tol), np.nan)
     return steps.astype(np.float32), np.asarray(shown & (values[..., 3] < 1))
 
@@ -750,7 +769,7 @@ def _surface_cost(
     distance, normals = first_hit(start.reshape(-1, 3), -grid.axis)
     hit = np.isfinite(distance)
     points = start.reshape(-1, 3)[hit] - np.asarray(distance, np.float64)[hit, None] * grid.axis
-    losses = row_losses(scene.rows(points), np.asarray(normals)[hit].T, tol)[0]
+    losses = scene.losses(points, np.asarray(normals)[hit].T, tol)
     flat = cost.reshape(-1)
     flat[hit] = median_loss(losses[:, None])[0]
     return cost

@@ -8,7 +8,6 @@ check one another: what a view alone claims, or alone denies, is unknown as well
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -63,24 +62,17 @@ class SilhouetteTolerances:
 REFERENCE_FOCAL_PX = 445.0
 
 
-def find_silhouettes(
-    maps: Sequence[PhaseMap],
-    *,
-    masks_given: bool,
-    tolerances: SilhouetteTolerances | None = None,
-) -> list[Silhouette]:
-    """Silhouette of each view from its region and intensity.
+def find_silhouette(
+    phase_map: PhaseMap, *, mask_given: bool, tolerances: SilhouetteTolerances | None = None
+) -> Silhouette:
+    """Silhouette of a view from its region and intensity.
 
     Parameters
     ----------
-    maps : phase maps of the views.
-    masks_given : the regions are the user's masks; they are certain.
+    phase_map : of the view.
+    mask_given : the region is the user's mask; it is certain.
     """
     tol = tolerances or SilhouetteTolerances()
-    return [_silhouette(phase_map, masks_given, tol) for phase_map in maps]
-
-
-def _silhouette(phase_map: PhaseMap, mask_given: bool, tol: SilhouetteTolerances) -> Silhouette:
     inside = np.asarray(phase_map.region.inside, np.bool_)
     if mask_given or not inside.any():
         return Silhouette(inside, inside)

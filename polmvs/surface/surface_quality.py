@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 MAX_SIGMAS = 3.0  # of one figure, before it is called a contradiction
 MIN_POINTS = 10  # on the surface, for their median to be one
 POINT_REACH_PX = 4.0  # of the surface; what lies farther is not on it
-CHUNK = 20_000  # faces whose normals are solved at a time; bounds memory
+CHUNK, MAX_ROWS = 20_000, 500_000  # faces, and those times views, at a time; bounds memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +120,7 @@ def face_evidence(
         seen, xy = seen[inside], xy[inside]
         counts[0, seen] += 1
         if view.has_outline:
-            beyond = sample_image(view.silhouette.outer[..., 0], xy) > tol.outside_px
+            beyond = sample_image(view.silhouette.outer, xy)[:, 0] > tol.outside_px
             counts[1, seen[beyond]] += 1
         rows = face_rows(mesh, scene, view, angle_model, row_sigma, rows_tolerances)
         residual = np.abs(rows.residual)
@@ -213,8 +213,9 @@ def fit_normals(
     if not num:
         return FaceNormals(normals, sigma)
     scene, centers = RayScene(mesh), mesh.centers
-    for start in range(0, num, CHUNK):
-        part = slice(start, min(start + CHUNK, num))
+    at_a_time = max(1, min(CHUNK, MAX_ROWS // len(views)))
+    for start in range(0, num, at_a_time):
+        part = slice(start, min(start + at_a_time, num))
         points, own = centers[part], mesh.face_normals[part]
         shape = (len(views), len(points))
         rows = np.full((3, *shape), np.nan, np.float32)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
+from polmvs.io.arrays import kept_array
 from polmvs.polarization.angle_models import rows_from_axial, tilt_turn
 from polmvs.polarization.phase_map import PhaseMap, view_rays
 from polmvs.scene import View
@@ -57,6 +59,20 @@ class Silhouette:
         return bool((self.certain == self.possible).all())
 
 
+class _StoredSilhouette(Silhouette):
+    """A silhouette whose arrays are on disk and mapped when they are asked for."""
+
+    def __init__(self, made: Silhouette, folder: Path, name: str) -> None:
+        names = ("certain", "possible", "inner") + (() if made.is_sharp else ("outer",))
+        arrays = {n: kept_array(getattr(made, n), folder / f"{name}.{n}.npy") for n in names}
+        vars(self).update(is_sharp=made.is_sharp, arrays=arrays)
+
+    certain = property(lambda self: np.asarray(self.arrays["certain"]))
+    possible = property(lambda self: np.asarray(self.arrays["possible"]))
+    inner = property(lambda self: np.asarray(self.arrays["inner"]))
+    outer = property(lambda self: np.asarray(self.arrays["inner" if self.is_sharp else "outer"]))
+
+
 def signed_distance_px(mask: Mask) -> Image:
     """Distance (H, W) to the border of a mask, px, negative inside."""
     pixels = mask.astype(np.uint8)
@@ -87,22 +103,24 @@ class SurfaceView:
 
     Attributes
     ----------
-    view : name, camera and pose.
-    samples : (H, W, 4) float32, ``dolp cos 2 phase``, ``dolp sin 2 phase``, the inverse variance
-        of the phase (1 / rad^2; 0: no phase here), of a phase map, and by how much tilted
-        polarizers would have turned the phase (rad; 0 where that is not asked).
-    intensity : (H, W) float32, s0.
+    phase_map : its phase; looked at anew each time, as it may be on disk.
     silhouette : of the objects.
+    tilt : (H, W) float32, by how much tilted polarizers would have turned the phase, rad; None
+        where that is not asked.
     has_outline : whether the silhouette may carve and pull: some pixels on it and some off it.
     tilt_share : of that turn that is taken back: 0 for a sensor that obeys the angle model.
     """
 
-    view: View
-    samples: Image
-    intensity: Image
+    phase_map: PhaseMap
     silhouette: Silhouette
+    tilt: ArrayLike | None = None
     has_outline: bool = True
     tilt_share: float = 0.0
+
+    @property
+    def view(self) -> View:
+        """Name, camera and pose."""
+        return self.phase_map.view
 
     @property
     def width(self) -> int:
@@ -172,9 +190,12 @@ def phase_rows(
     in_cam = view.to_camera(points)
     xy = view.view.camera.project(in_cam)
     rays = in_cam / np.maximum(np.linalg.norm(in_cam, axis=1, keepdims=True), 1e-300)
-    cos2, sin2, precision, tilt = (
-        np.asarray(column, np.float64) for column in sample_image(view.samples, xy).T
+    cos2, sin2, precision = (
+        np.asarray(column, np.float64) for column in sample_image(view.phase_map.samples, xy).T
     )
+    tilt = np.zeros(len(xy))
+    if view.tilt is not None:
+        tilt = sample_image(np.asarray(view.tilt), xy).astype(np.float64)
     if view.tilt_share:
         cos, sin = np.cos(2 * view.tilt_share * tilt), np.sin(2 * view.tilt_share * tilt)
         cos2, sin2 = cos2 * cos - sin2 * sin, sin2 * cos + cos2 * sin
@@ -196,6 +217,7 @@ def surface_view(
     angle_model: AngleModel,
     *,
     tilt_aware: bool = True,
+    folder: Path | None = None,
 ) -> SurfaceView:
     """The record of a view from its phase map and silhouette.
 
@@ -206,18 +228,20 @@ def surface_view(
     angle_model : whose rows the phase will give.
     tilt_aware : keep by how much tilted polarizers would have turned the phases, which OPA and PPA
         leave out, so that the share of it that all views agree on can be taken back.
+    folder : where what is made here is kept; None: in memory, some 30 bytes a pixel.
     """
-    samples = np.zeros((*phase_map.samples.shape[:2], 4), np.float32)
-    samples[..., :3] = phase_map.samples
+    name, tilt = phase_map.view.name, None
     if tilt_aware and angle_model is not AngleModel.TILTED:
+        samples = np.asarray(phase_map.samples)
         known = samples[..., 2] > 0
         diffuse = np.asarray(phase_map.diffuse)[known]
         cos2, sin2 = samples[known, :2].T
-        samples[known, 3] = tilt_turn(cos2, sin2, view_rays(phase_map.view)[known], diffuse=diffuse)
+        turn = np.zeros(known.shape, np.float32)
+        turn[known] = tilt_turn(cos2, sin2, view_rays(phase_map.view)[known], diffuse=diffuse)
+        tilt = kept_array(turn, folder and folder / f"{name}.tilt.npy")
     return SurfaceView(
-        view=phase_map.view,
-        samples=samples,
-        intensity=np.asarray(phase_map.intensity, np.float32),
-        silhouette=silhouette,
+        phase_map=phase_map,
+        silhouette=silhouette if folder is None else _StoredSilhouette(silhouette, folder, name),
+        tilt=tilt,
         has_outline=bool(silhouette.certain.any() and not silhouette.possible.all()),
     )

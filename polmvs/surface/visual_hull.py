@@ -24,7 +24,7 @@ Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 OUTSIDE = np.float32(1e6)
-CHUNK = 400_000  # points at a time
+MAX_VALUES = 8_000_000  # of points and views at a time; bounds memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,19 +225,15 @@ def hull_values(
 ) -> NDArray[np.float32]:
     """Signed distance ``(N,)`` to the hull's cones at points ``(N, 3)``, negative inside."""
     tol = tolerances or HullTolerances()
-    largest = np.full((num_wrong + 1, len(points)), -OUTSIDE, np.float32)
+    of_views = np.empty((len(views), len(points)), np.float32)
     num_seen = np.zeros(len(points), np.int32)
-    for view in views:
+    for index, view in enumerate(views):
         xy, z = view.project(points)
         seen = view.in_image(xy, 1.0) & (z > 0)
-        pixels = sample_image(view.silhouette.outer[..., 0], xy)
-        value = np.where(seen, pixels * (z / view.view.camera.mean_focal_px), -OUTSIDE)
-        value = value.astype(np.float32)
+        pixels = sample_image(view.silhouette.outer, xy)[:, 0]
+        of_views[index] = np.where(seen, pixels * (z / view.view.camera.mean_focal_px), -OUTSIDE)
         num_seen += seen
-        for rank in range(num_wrong + 1):
-            greater = np.maximum(largest[rank], value)
-            value = np.minimum(largest[rank], value)
-            largest[rank] = greater
+    largest = np.sort(of_views, axis=0)[::-1]
     # Of few views that see a point, fewer may be wrong.
     chosen = np.minimum((tol.wrong_share * num_seen + 0.5).astype(np.int64), num_wrong)
     values = largest[chosen, np.arange(len(points))]
@@ -271,8 +267,9 @@ def _values_on_grid(
         values = np.zeros(shape, np.float32)
     flat = values.reshape(-1)
     chosen = np.arange(flat.size) if where is None else np.flatnonzero(where)
-    for start in range(0, len(chosen), CHUNK):
-        some = chosen[start : start + CHUNK]
+    num = max(1, MAX_VALUES // len(views))
+    for start in range(0, len(chosen), num):
+        some = chosen[start : start + num]
         points = low + step * np.stack(np.unravel_index(some, shape), axis=1)
         flat[some] = hull_values(views, points, num_wrong, plane, tol)
     return values

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from polmvs.camera import Camera, sample_image
 from polmvs.geometry import RigidTransform
@@ -26,6 +27,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 DARKEST, BRIGHTEST = 0.15, 0.85  # of a print, s0 in full scales
+STRIP = 32  # rows of a mosaic that are rendered at a time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,11 +54,6 @@ class PrintedScene:
     part_s0: float = 0.2
 
     @cached_property
-    def print_levels(self) -> list[NDArray[np.float32]]:
-        """The print, and its means over 2, 4, 8, ... texels a side."""
-        return _pyramid(_random_print(1024, np.random.default_rng(self.seed)))
-
-    @cached_property
     def all_surfaces(self) -> Group:
         """Part and surroundings, which occlude each other."""
         return Group((self.part, self.surroundings))
@@ -74,12 +71,14 @@ def render_printed_mosaic(
     sensor, ior : as in :func:`polmvs.synthetic.captures.render_view`.
     """
     mosaic = render_mosaic(view, scene.part, sensor=sensor, ior=ior, s0=scene.part_s0)
-    camera = view.camera
-    # Samples of the mosaic lie half a half-size pixel apart.
-    cols, rows = np.arange(2 * camera.width), np.arange(2 * camera.height)
-    xy = 0.5 * np.stack(np.meshgrid(cols + 0.5, rows + 0.5), axis=-1)
-    printed, brightness = _print_seen(view, scene, xy)
-    mosaic[printed] = 0.5 * brightness[printed]  # behind any polarizer half of the light is left
+    num_rows, num_cols = mosaic.shape
+    for start in range(0, num_rows, STRIP):  # which the processor's cache holds
+        strip = mosaic[start : start + STRIP]
+        # Samples of the mosaic lie half a half-size pixel apart.
+        rows = np.arange(start, start + len(strip))
+        xy = 0.5 * np.stack(np.meshgrid(np.arange(num_cols) + 0.5, rows + 0.5), axis=-1)
+        printed, brightness = _print_seen(view, scene, xy)
+        strip[printed] = 0.5 * brightness[printed]  # behind any polarizer half of it is left
     return mosaic
 
 
@@ -144,18 +143,19 @@ def _print_seen(view: View, scene: PrintedScene, xy: Array) -> tuple[Mask, Array
     is_part = on_part < on_print
     distance = np.minimum(on_part, on_print)
     points = center + np.where(np.isfinite(distance), distance, 0)[..., None] * rays
-    labelled = np.zeros(is_part.shape, bool)
-    for label in np.asarray(scene.labels, np.float64).reshape(-1, 3):
-        labelled |= ((points - label) ** 2).sum(axis=-1) < scene.label_radius**2
-    labelled &= is_part
+    labelled = np.zeros(is_part.shape, np.bool_)
+    tree = cKDTree(np.asarray(scene.labels, np.float64).reshape(-1, 3))
+    labelled[is_part] = np.isfinite(
+        tree.query(points[is_part], distance_upper_bound=scene.label_radius)[0]
+    )
     printed = np.isfinite(distance) & (labelled | ~is_part)
     # Sides of a pixel on the surface, the geometric mean of the long and the short one.
-    facing = np.abs((np.nan_to_num(normals) * rays).sum(axis=-1))
+    facing = np.abs(np.einsum("...i,...i", np.nan_to_num(normals), rays))
     footprint = distance / view.camera.mean_focal_px / np.sqrt(np.maximum(facing, 0.05))
     scale = np.where(labelled, 4.0, 1.0) / scene.texel
     place = points[..., :2] * scale[..., None]
     level = np.log2(np.maximum(np.where(printed, footprint * scale, 1.0), 1e-3))
-    return printed, _sample_levels(scene.print_levels, place, level)
+    return printed, _sample_levels(_print_levels(scene.seed), place, level)
 
 
 def _sample_levels(levels: Sequence[NDArray[np.float32]], place: Array, level: Array) -> Array:
@@ -177,8 +177,10 @@ def _sample_periodic(image: NDArray[np.float32], xy: Array) -> NDArray[np.float3
     return sample_image(padded, np.mod(xy, side) + 1)
 
 
-def _pyramid(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    levels = [image]
+@lru_cache(maxsize=2)  # of a process: a scene comes anew with each view
+def _print_levels(seed: int) -> list[NDArray[np.float32]]:
+    """The print, and its means over 2, 4, 8, ... texels a side."""
+    levels = [_random_print(1024, np.random.default_rng(seed))]
     while levels[-1].shape[0] > 4:
         side = levels[-1].shape[0] // 2
         levels.append(levels[-1].reshape(side, 2, side, 2).mean(axis=(1, 3)))

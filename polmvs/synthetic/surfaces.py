@@ -124,7 +124,7 @@ class Group:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    return np.asarray((a * b).sum(axis=-1))
+    return np.asarray(np.einsum("...i,...i", a, b))
 
 
 def _quadratic(
@@ -148,6 +148,6 @@ def _quadratic(
 def _finish(
     distance: Array, hit: NDArray[np.bool_], normals: Array, rays: Array
 ) -> tuple[Array, Array]:
-    """Misses to infinity and NaN; normals unit and towards the camera."""
+    """Misses to infinity and NaN; unit normals towards the camera."""
     facing = np.where(_dot(normals, rays)[..., None] > 0, -normals, normals)
-    return np.where(hit, distance, np.inf), np.where(hit[..., None], unit(facing), np.nan)
+    return np.where(hit, distance, np.inf), np.where(hit[..., None], facing, np.nan)

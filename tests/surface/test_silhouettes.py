@@ -5,7 +5,7 @@ import pytest
 from analytic_objects import looking_at, phase_map_of, sphere
 
 from polmvs.polarization.region import Region
-from polmvs.surface.silhouettes import find_silhouettes
+from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.surface_view import FAR_PX, Silhouette, signed_distance_px
 
 VIEW = looking_at((5.0, 0, 2.0))
@@ -20,9 +20,8 @@ def with_region(phase_map, inside):
     return replace(phase_map, region=Region(inside, inside, np.zeros_like(inside)))
 
 
-def only_silhouette(phase_map, *, masks_given=False):
-    (found,) = find_silhouettes([phase_map], masks_given=masks_given)
-    return found
+def found_silhouette(phase_map, *, mask_given=False):
+    return find_silhouette(phase_map, mask_given=mask_given)
 
 
 def test_the_border_of_a_mask_runs_between_its_pixels():
@@ -40,7 +39,7 @@ def test_a_mask_without_border_is_far(full, sign):
 
 
 def test_gradient_of_a_silhouette_points_outwards(ball):
-    silhouette = only_silhouette(ball)
+    silhouette = found_silhouette(ball)
     distance, dx, dy = np.moveaxis(silhouette.inner, -1, 0)
     ring = np.abs(distance) < 3
     rows, cols = np.nonzero(ring)
@@ -52,23 +51,23 @@ def test_gradient_of_a_silhouette_points_outwards(ball):
 def test_user_masks_are_certain(ball):
     inside = ball.region.inside.copy()
     inside[50:54, 60:64] = False  # a hole as small as a mark stays if the user drew it
-    silhouette = only_silhouette(with_region(ball, inside), masks_given=True)
+    silhouette = found_silhouette(with_region(ball, inside), mask_given=True)
     assert (silhouette.certain == inside).all()
     assert silhouette.is_sharp
 
 
 def test_specks_gaps_and_marks_are_cleaned(ball):
     inside = ball.region.inside.copy()
-    clean = only_silhouette(ball).certain
+    clean = found_silhouette(ball).certain
     inside[2, 2] = True
     inside[50:52, 60:63] = False
-    assert (only_silhouette(with_region(ball, inside)).certain == clean).all()
+    assert (found_silhouette(with_region(ball, inside)).certain == clean).all()
 
 
 def test_a_large_hole_stays(ball):
     inside = ball.region.inside.copy()
     inside[48:62, 60:72] = False
-    silhouette = only_silhouette(with_region(replace(ball, intensity=_bright_hole(ball)), inside))
+    silhouette = found_silhouette(with_region(replace(ball, intensity=_bright_hole(ball)), inside))
     assert not silhouette.possible[52:58, 64:68].any()
 
 
@@ -82,7 +81,7 @@ def test_dark_pixels_that_go_on_are_unknown(ball):
     inside = ball.region.inside
     left = inside.copy()
     left[:, 86:] = False  # unpolarised there, as dark as the rest
-    silhouette = only_silhouette(with_region(ball, left))
+    silhouette = found_silhouette(with_region(ball, left))
     missing = inside & ~left
     assert (silhouette.possible & missing).sum() > 0.4 * missing.sum()  # up to the blurred edge
     assert not (silhouette.certain & missing)[:, 89:].any()
@@ -97,13 +96,13 @@ def test_outlines_follow_the_step_of_intensity(ball):
     true = signed_distance_px(ball.region.inside)
     ring = np.abs(true) < 0.6
     before = signed_distance_px(grown)[ring]
-    after = only_silhouette(with_region(ball, grown)).inner[..., 0][ring]
+    after = found_silhouette(with_region(ball, grown)).inner[..., 0][ring]
     assert np.median(before) < -1.4
     assert abs(np.median(after)) < 0.5
 
 
 def test_nothing_polarised_gives_an_empty_silhouette(ball):
-    silhouette = only_silhouette(with_region(ball, np.zeros_like(ball.region.inside)))
+    silhouette = found_silhouette(with_region(ball, np.zeros_like(ball.region.inside)))
     assert not silhouette.possible.any()
 
 

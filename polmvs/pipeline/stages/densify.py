@@ -141,6 +141,7 @@ def densify(
                 propagation,
                 fusion,
                 new_views,
+                folder / "kept",
                 tilt_aware=tilt_aware,
                 masks_given=masks_given,
                 on_progress=on_progress,
@@ -190,6 +191,7 @@ def _global_surface(
     propagation: PropagationOptions,
     fusion: FusionOptions,
     views: Path,
+    kept: Path,
     *,
     tilt_aware: bool,
     masks_given: bool,
@@ -197,10 +199,12 @@ def _global_surface(
 ) -> tuple[FusedCloud, NDArray[np.bool_], float] | None:
     """The surface of all views, which of its points are presumed, and its share of the tilt.
 
-    Its mesh and its depth in each view go to ``views``. None where silhouettes do not bound the
+    Its mesh and its depth in each view go to ``views``, what it is made from meanwhile to ``kept``,
+    a new folder. None where silhouettes do not bound the
     objects.
     """
     levels: list[TriangleMesh] = []
+    kept.mkdir()
     surface = reconstruct_surface(
         model,
         maps,
@@ -211,6 +215,7 @@ def _global_surface(
         min_views=fusion.min_views,
         on_progress=on_progress,
         on_mesh=levels.append,
+        folder=kept,
     )
     if isinstance(surface, Undetermined):
         logger.warning(
