@@ -29,7 +29,8 @@ def test_report_says_what_came_out(demo_run: Path) -> None:
     text = (demo_run / "report.html").read_text()
     metrics = json.loads((demo_run / "metrics.json").read_text())
     score = metrics["models"]["ppa"]["truth"]["cloud"]["f_score"][0]
-    assert f"PPA has an F-score of {100 * score:.1f} % at 1 mm" in text
+    angle = metrics["models"]["ppa"]["truth"]["cloud"]["normal_mean_deg"]
+    assert f"PPA has an F-score of {100 * score:.1f} % at 1 mm and normals {angle:.1f} deg" in text
     for name in ("000.png", "009.png"):
         assert f"<summary>{name}</summary>" in text
 
