@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from polmvs.report.recording import num_recorded_steps, require_rerun, write_rec
 from polmvs.report.rendering import Viewpoint, contact_sheet
 from polmvs.report.report import write_report
 from polmvs.scene import PointKind
+from polmvs.separate import CrashError, run_separately
 
 
 def report(call: Call, terminal: Terminal) -> int:
@@ -72,18 +74,32 @@ def view(call: Call, terminal: Terminal) -> int:
     ]
     if not files:
         raise DataError(folder.root, "has no cloud to show. Run 'polmvs densify' first.")
-    if sys.platform == "linux" and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
-        page = folder.report if folder.report.is_file() else make_report(folder, terminal)
-        terminal.show(
-            f"there is no display here to open a window on; {page} shows the same in a browser",
-            {"report": page},
-        )
+    if _shown(files):
+        terminal.show("\n".join(map(str, files)), {"shown": files})
         return 0
-    show_in_viewer(files)
-    terminal.show("\n".join(map(str, files)), {"shown": files})
+    page = folder.report if folder.report.is_file() else make_report(folder, terminal)
+    terminal.show(
+        f"there is no display here to open a window on; {page} shows the same in a browser",
+        {"report": page},
+    )
     return 0
+
+
+def _shown(files: Sequence[Path]) -> bool:
+    """Show files in the viewer until its window is closed; False where none opens."""
+    displays = ("DISPLAY", "WAYLAND_DISPLAY")
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in displays):
+        return False
+    try:
+        # Where the display does not answer Open3D ends the process.
+        run_separately(_show, files, on_message=lambda text: None)
+    except CrashError:
+        return False
+    return True
+
+
+def _show(files: Sequence[Path], report: Callable[[str], None]) -> None:
+    show_in_viewer(files)
 
 
 def render(call: Call, terminal: Terminal) -> int:

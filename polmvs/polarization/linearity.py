@@ -41,7 +41,8 @@ class LinearityTolerances:
     num_rounds : of weights and exponents; the exponent converges quadratically.
     scale_of_loss : Cauchy's, in deviations of the residual; 95 % as efficient as least squares
         for normal noise.
-    num_groups : of patches, neighbours together, each of which is left out once (jackknife).
+    num_groups : of patches, neighbours together, each of which is left out once (jackknife), as is
+        each image.
     min_z : of the logarithm of the two gammas' ratio, in its standard deviations. Derived: by
         chance once in 16,000 captures.
     min_ratio : of the two gammas, whatever the certainty. Guess: the degree of polarisation is off
@@ -84,7 +85,10 @@ class LinearityCheck:
     def message(self) -> str:
         """One line for the user."""
         if self.fits is None or self.found is None:
-            return f"too little polarised light to check `capture.gamma` {self.given:g}"
+            return (
+                "too little polarised light, or images that show different things, to check "
+                f"`capture.gamma` {self.given:g}"
+            )
         if self.fits:
             return f"`capture.gamma` {self.given:g} fits"
         likely = _round_gamma(self.found, self.log_sigma)
@@ -192,13 +196,17 @@ def _quadratic_part(
         residual = right - design @ solution
         scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
         loss = 1.0 / (1.0 + np.square(residual / (t.scale_of_loss * scale)))
-    left_out = [
-        _solve(design[group != k], right[group != k], loss[group != k])[0]
-        for k in range(t.num_groups)
-    ]
-    num = t.num_groups
-    deviation = np.sqrt((num - 1) / num * np.square(np.subtract(left_out, np.mean(left_out))).sum())
-    return float(solution[0]), float(deviation)
+    image = np.repeat(np.arange(len(parts)), [len(rows) for rows, _ in parts])
+    deviations = []
+    for index, num in ((group, t.num_groups), (image, len(parts))):
+        left_out = [
+            _solve(design[index != k], right[index != k], loss[index != k])[0]
+            for k in range(num if num > 1 else 0)
+        ]
+        spread = np.square(np.subtract(left_out, np.mean(left_out or 0.0))).sum()
+        deviations.append(np.sqrt((num - 1) / num * spread))
+    # Images of different scenes may each show something else: all together say little then.
+    return float(solution[0]), float(max(deviations))
 
 
 def _solve(design: Array, right: Array, loss: Array) -> Array:

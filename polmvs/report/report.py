@@ -14,6 +14,7 @@ from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, Options, options_from_plain, to_plain
 from polmvs.errors import DataError, PolmvsError
 from polmvs.evaluation.comparison import Comparison, named_as_truth, read_comparison
+from polmvs.evaluation.metrics import angular_errors_deg
 from polmvs.evaluation.tables import comparison_rows, number
 from polmvs.evaluation.trust import Trust
 from polmvs.geometry import SimilarityTransform
@@ -32,7 +33,7 @@ from polmvs.pipeline.stages.seeds import SeedsResult
 from polmvs.polarization.capture import Capture, open_capture
 from polmvs.poses.alignment import align_views
 from polmvs.report import pictures, plots
-from polmvs.report.contents import ErrorSamples, ViewInput, view_page
+from polmvs.report.contents import MAX_NORMAL_ERROR_DEG, ErrorSamples, ViewInput, view_page
 from polmvs.report.layers import KIND, Channel, Layer, Scene3D, pack_scene, thinned
 from polmvs.report.page import Page, Plot, Table, ViewPage, page_text
 from polmvs.scene import PointKind, SparseModel, View
@@ -251,6 +252,12 @@ def _layers(given: _Given) -> tuple[list[Layer], dict[str, Channel]]:
             high=1e3 * MAX_ERROR_M,
             colors=pictures.ERROR,
         )
+        channels["normal_error"] = Channel(
+            label="angle to the true normal, on the part",
+            unit="deg",
+            high=MAX_NORMAL_ERROR_DEG,
+            colors=pictures.ERROR,
+        )
     layers = [
         _cloud_layer(given, model, cloud, factor)
         for model, cloud in given.clouds.items()
@@ -294,14 +301,17 @@ def _cloud_layer(given: _Given, model: AngleModel, cloud: Cloud, factor: float) 
     if given.truth is None:
         return layer
     truth, truth_from_world = given.truth
-    distance, _ = nearest_points(
-        truth.surface_points().points, truth_from_world * layer.points, far=MAX_ERROR_M
+    true = truth.surface_points()
+    distance, nearest = nearest_points(
+        true.points, truth_from_world * layer.points, far=MAX_ERROR_M
     )
+    normals = layer.normals @ truth_from_world.rotation.T
+    off = np.nan_to_num(angular_errors_deg(normals, true.normals[nearest]))
     return Layer(
         label=layer.label,
         points=layer.points,
         normals=layer.normals,
-        values={**layer.values, "error": 1e3 * distance},
+        values={**layer.values, "error": 1e3 * distance, "normal_error": off},
     )
 
 
@@ -352,11 +362,12 @@ def _sentence(given: _Given) -> str:
     name = plots.LABELS[main]
     if first is not None and second is not None:
         near = first.cloud.thresholds_m[0]
+        scores = [number(truth.cloud.f_score[0], 100, 1) for truth in (second, first)]
+        angles = [number(truth.cloud.normal_mean_deg, 1, 1) for truth in (second, first)]
         return (
-            f"{name} has an F-score of {number(second.cloud.f_score[0], 100, 1)} % at "
-            f"{1e3 * near:g} mm, OPA {number(first.cloud.f_score[0], 100, 1)} %: oblique rays "
-            "turn the phase of a surface, which OPA, for which all rays are parallel, takes for "
-            "shape."
+            f"{name} has an F-score of {scores[0]} % at {1e3 * near:g} mm and normals "
+            f"{angles[0]} deg off, OPA {scores[1]} % and {angles[1]} deg: oblique rays turn the "
+            "phase of a surface, which OPA, for which all rays are parallel, takes for shape."
         )
     before = figures[opa].consistency.phase_residual.median_deg
     after = figures[main].consistency.phase_residual.median_deg

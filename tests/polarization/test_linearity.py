@@ -54,6 +54,14 @@ def test_unpolarised_light_tells_nothing():
         assert "too little polarised light" in check.message
 
 
+def test_images_that_contradict_each_other_tell_nothing():
+    """As of different scenes, in one of which the polarisation itself follows the intensity."""
+    raws = mosaics()
+    check = check_linearity([raws[0], raws[1], raws[2] ** 0.4545], PATTERN, 0.98, 1.0)
+    assert check.fits is None
+    assert "images that show different things" in check.message
+
+
 def test_a_curved_surface():
     sphere = Sphere(center=np.zeros(3), radius=0.12)
     raws = mosaics("tilted", sphere, gain=0.02)

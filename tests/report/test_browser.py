@@ -164,15 +164,15 @@ def test_keys_turn_and_zoom(opened: Opened, key: str) -> None:
 
 def test_colours_frusta_and_layout_can_be_chosen(opened: Opened) -> None:
     page = opened.page
-    assert page.locator("[data-control=color]").input_value() == "error"  # there is a truth
+    assert page.locator("[data-control=color]").input_value() == "normal_error"  # there is a truth
     page.select_option("[data-control=color]", "normal")
     start = opened.drawing()
     seen = {start}
-    for name in ("intensity", "kind", "sigma", "error"):
+    for name in ("intensity", "kind", "sigma", "error", "normal_error"):
         page.select_option("[data-control=color]", name)
         seen.add(opened.drawing())
         assert page.locator(".legend").inner_text().strip() or name == "intensity"
-    assert len(seen) == 5
+    assert len(seen) == 6
     page.select_option("[data-control=color]", "normal")
     page.check("[data-control=frusta]")
     assert opened.drawing() != start

@@ -211,7 +211,7 @@ class View {
     this.built = new Map();
     this.textures = new Map();
     this.blank = paletteTexture(["#888888"]);
-    this.color = "error" in this.description.channels ? "error" : "normal";
+    this.color = "normal_error" in this.description.channels ? "normal_error" : "normal";
     this.pointScale = 1;
     this.camera = new PerspectiveCamera(FIELD_DEG, 1, 0.01 * this.description.radius, 100 * this.description.radius);
     this.frusta = new LineSegments(
