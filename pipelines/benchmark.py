@@ -452,7 +452,7 @@ def _run_views(
     terminal.finished(f"{num_views} views", time.perf_counter() - start, "")
     return Growth(
         num_views=num_views,
-        seconds={stage.name: stage.cpu_s or 0.0 for stage in record.stages},
+        seconds={stage.name: stage.cpu_s for stage in record.stages},
         peak_mb={stage.name: stage.peak_rss_mb for stage in record.stages},
     )
 
