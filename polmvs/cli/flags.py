@@ -356,6 +356,8 @@ def _message(error: CycloptsError) -> str:
         name = error.argument.name
         if not name.startswith("-"):
             return f"{name} is missing"
+        if str(error).rstrip(".").endswith("requires an argument"):
+            return f"{name} needs a value"
     error.verbose = False
     text = " ".join(str(error).split())
     name = error.argument.name if error.argument is not None else ""
