@@ -229,6 +229,27 @@ class _SharedError:
 
 
 @dataclass(frozen=True)
+class RowSigma:
+    """Deviation of ``m . n`` that noise does not explain.
+
+    Attributes
+    ----------
+    direct : of light from elsewhere.
+    mirrored : of light that comes from the object itself and is polarised already, where the view's
+        mirror ray meets it.
+    """
+
+    direct: float
+    mirrored: float
+
+    @classmethod
+    def shown_by(cls, residuals: Array, is_mirrored: Mask, least: float) -> RowSigma:
+        """What residuals ``(K,)`` show of it, at ``least`` a value."""
+        found = (robust_deviation(residuals[kind]) for kind in (~is_mirrored, is_mirrored))
+        return cls(*(max(least, np.nan_to_num(sigma)) for sigma in found))
+
+
+@dataclass(frozen=True)
 class FaceRows:
     """Phase rows of a view at the faces of a mesh that it sees.
 
@@ -240,6 +261,7 @@ class FaceRows:
     rows : (K, 3) unit, world.
     cosine : (K,) between normal and direction to the camera.
     tilt : (K,) by how much the residual would change, were the polarizers' tilt taken back.
+    is_mirrored : (K,) bool, whether the mirror ray of the view meets the mesh.
     """
 
     face: Indices
@@ -248,6 +270,7 @@ class FaceRows:
     rows: Array
     cosine: Array
     tilt: Array
+    is_mirrored: Mask
 
 
 def face_rows(
@@ -255,7 +278,7 @@ def face_rows(
     scene: RayScene,
     view: SurfaceView,
     angle_model: AngleModel,
-    row_sigma: float,
+    row_sigma: RowSigma,
     tolerances: RefinementTolerances,
 ) -> FaceRows:
     """Rows of one view at the faces that it sees."""
@@ -271,11 +294,16 @@ def face_rows(
     known = found.precision > 0
     face, cosine, rows = face[known], cosine[known], found.rows[known]
     turn, precision = found.turn[known], found.precision[known]
-    residual = (rows * mesh.face_normals[face]).sum(axis=1)
-    variance = (1 - cosine**2) * turn**2 / precision + row_sigma**2
+    rays, normals = rays[known], mesh.face_normals[face]
+    residual = (rows * normals).sum(axis=1)
+    mirrored = rays + 2 * cosine[:, None] * normals
+    start = mesh.centers[face] + mesh.mean_edge * normals
+    is_mirrored = np.isfinite(scene.cast(start, mirrored).distance)
+    unexplained = np.where(is_mirrored, row_sigma.mirrored, row_sigma.direct)
+    variance = (1 - cosine**2) * turn**2 / precision + unexplained**2
     # A greater phase turns the row against the sense of the ray.
-    aside = (np.cross(rays[known], rows) * mesh.face_normals[face]).sum(axis=1)
-    return FaceRows(face, residual, variance, rows, cosine, -found.tilt[known] * aside)
+    tilt = -found.tilt[known] * (np.cross(rays, rows) * normals).sum(axis=1)
+    return FaceRows(face, residual, variance, rows, cosine, tilt, is_mirrored)
 
 
 @dataclass(frozen=True)
@@ -300,7 +328,6 @@ def refine(
     footprint: float,
     *,
     known: KnownPoints | None = None,
-    row_sigma: float = 0.0,
     tolerances: RefinementTolerances | None = None,
     on_progress: Callable[[int], None] | None = None,
     on_level: Callable[[TriangleMesh], None] | None = None,
@@ -318,13 +345,12 @@ def refine(
     angle_model : OPA or PPA; PPA for samples corrected for tilted polarizers.
     footprint : length that a pixel covers at the surface, world units.
     known : points of the surface.
-    row_sigma : deviation of ``m . n`` that noise does not explain, if a coarser mesh has shown it.
     tolerances : numbers of the energy, with the levels to do.
     on_progress : called with the number of steps done.
     on_level : called with the mesh after each level.
     """
     tol = tolerances or RefinementTolerances()
-    row_sigma = max(tol.row_sigma, row_sigma)
+    row_sigma = RowSigma(tol.row_sigma, tol.row_sigma)
     tilt_share = 0.0
     for number, level in enumerate(tol.levels):
         edge = level.edge_px * footprint
@@ -364,7 +390,7 @@ def refine(
                 break
         # A model that leaves something out (OPA the perspective) errs by more than its phases'
         # noise; held against that, most of its rows were outliers. Every model is treated alike.
-        row_sigma = max(tol.row_sigma, system.row_error)
+        row_sigma = system.row_sigma
         if on_level is not None:
             on_level(mesh)
     return Refined(mesh, tilt_share)
@@ -382,7 +408,7 @@ class _System:
     smooth, pull : matrix ``(V, V)`` and gradient ``(V,)`` of the smoothness, and the matrix
         ``(V, V)`` whose product with its own transpose is the former.
     free : (V,) bool, vertices of faces that some view sees.
-    row_error : robust deviation of the phase rows' residuals.
+    row_sigma : what the phase rows' residuals show of it.
     """
 
     equations: _Equations
@@ -392,7 +418,7 @@ class _System:
     pull: Array
     smooth_factor: sparse.csr_array
     free: Mask
-    row_error: float
+    row_sigma: RowSigma
 
 
 def _system(
@@ -403,7 +429,7 @@ def _system(
     edge: float,
     level: Level,
     known: KnownPoints | None,
-    row_sigma: float,
+    row_sigma: RowSigma,
     tol: RefinementTolerances,
 ) -> _System:
     scene = RayScene(mesh)
@@ -414,7 +440,7 @@ def _system(
     # as what else the rows share.
     taken_back = views[0].tilt_share if views else 0.0
     tilt = _SharedError(len(mesh.vertices), prior=tol.phase_correlation, expected=-taken_back)
-    seen, error = _add_phases(
+    seen, shown = _add_phases(
         equations,
         tilt,
         mesh,
@@ -433,7 +459,7 @@ def _system(
     smooth, pull, factor = _smoothness(mesh, edge, tol)
     free = np.zeros(len(mesh.vertices), np.bool_)
     free[mesh.faces[seen]] = True
-    return _System(equations, outline_slope, tilt, smooth, pull, factor, free, error)
+    return _System(equations, outline_slope, tilt, smooth, pull, factor, free, shown)
 
 
 def _step(
@@ -476,9 +502,9 @@ def place_deviations(
     num, rng = len(mesh.vertices), np.random.default_rng(seed)
     if not num:
         return np.zeros(0)
-    edge = mesh.mean_edge
+    edge, row_sigma = mesh.mean_edge, RowSigma(tol.row_sigma, tol.row_sigma)
     system = _system(
-        mesh, views, angle_model, footprint, edge, tol.levels[-1], known, tol.row_sigma, tol
+        mesh, views, angle_model, footprint, edge, tol.levels[-1], known, row_sigma, tol
     )
     matrix = system.equations.matrix() + system.smooth
     # Nothing but the energy holds the surface here; what no view sees is not asked for.
@@ -509,23 +535,22 @@ def median_residual(
     views: Sequence[SurfaceView],
     angle_model: AngleModel,
     tolerances: RefinementTolerances | None = None,
-) -> tuple[float, float]:
+) -> tuple[RowSigma, float]:
     """What the phases show of the angle model's own error on a refined mesh.
 
     Returns
     -------
-    error : robust deviation of ``m . n``.
+    row_sigma : robust deviations of ``m . n``.
     median : of the absolute residuals; 0 without any.
     """
     tol = tolerances or RefinementTolerances()
-    scene = RayScene(mesh)
-    residuals = np.concatenate(
-        [np.zeros(0)]
-        + [face_rows(mesh, scene, v, angle_model, tol.row_sigma, tol).residual for v in views]
-    )
+    scene, equal = RayScene(mesh), RowSigma(tol.row_sigma, tol.row_sigma)
+    rows = [face_rows(mesh, scene, view, angle_model, equal, tol) for view in views]
+    residuals = np.concatenate([np.zeros(0), *(row.residual for row in rows)])
+    is_mirrored = np.concatenate([np.zeros(0, np.bool_), *(row.is_mirrored for row in rows)])
     if not len(residuals):
-        return 0.0, 0.0
-    return robust_deviation(residuals), float(np.median(np.abs(residuals)))
+        return RowSigma(0.0, 0.0), 0.0
+    return RowSigma.shown_by(residuals, is_mirrored, 0.0), float(np.median(np.abs(residuals)))
 
 
 def solve(matrix: sparse.csr_array, right: Array, damping: Array, shared: Array) -> Array:
@@ -566,11 +591,11 @@ def _add_phases(
     angle_model: AngleModel,
     footprint: float,
     level: Level,
-    row_sigma: float,
+    row_sigma: RowSigma,
     tol: RefinementTolerances,
     *,
     with_slope: bool,
-) -> tuple[Mask, float]:
+) -> tuple[Mask, RowSigma]:
     """Add the rows of all views.
 
     How a row changes as the place moves through the phase image (``with_slope``) places a surface
@@ -580,7 +605,7 @@ def _add_phases(
     Returns
     -------
     is_seen : (F,) faces that some view sees.
-    error : robust deviation of the rows' residuals.
+    row_sigma : what the rows' residuals show of it.
     """
     num_faces = len(mesh.faces)
     blocks, gradient = np.zeros((num_faces, 3, 3)), np.zeros((num_faces, 3))
@@ -590,7 +615,7 @@ def _add_phases(
     share = np.minimum(mesh.face_areas / (tol.independent_px * footprint**2), 1.0)
     reach = min(0.5 * mesh.mean_edge, 1.5 * footprint)
     steepest = 0.5 / footprint
-    residuals = [np.zeros(0)]
+    residuals, mirrored = [np.zeros(0)], [np.zeros(0, np.bool_)]
     for view in views:
         seen = face_rows(mesh, scene, view, angle_model, row_sigma, tol)
         face = seen.face
@@ -609,9 +634,10 @@ def _add_phases(
         gradient[face] += (weight * residual)[:, None] * jacobian
         tilt.add(mesh.faces[face], jacobian, residual, weight, -seen.tilt)
         residuals.append(residual)
+        mirrored.append(seen.is_mirrored)
     equations.add_blocks(mesh.faces, blocks, gradient)
-    everything = np.concatenate(residuals)
-    return is_seen, robust_deviation(everything) if len(everything) else 0.0
+    everything, is_mirrored = np.concatenate(residuals), np.concatenate(mirrored)
+    return is_seen, RowSigma.shown_by(everything, is_mirrored, tol.row_sigma)
 
 
 def _row_slope(

@@ -17,7 +17,7 @@ from polmvs.config import AngleModel
 from polmvs.fitting import robust_deviation
 from polmvs.normals.estimator import solve_normals
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
-from polmvs.surface.refinement import KnownPoints, RefinementTolerances, face_rows
+from polmvs.surface.refinement import KnownPoints, RefinementTolerances, RowSigma, face_rows
 from polmvs.surface.surface_view import SurfaceView, phase_rows
 
 Array = NDArray[np.float64]
@@ -122,7 +122,9 @@ def face_evidence(
         if view.has_outline:
             beyond = sample_image(view.silhouette.outer, xy)[:, 0] > tol.outside_px
             counts[1, seen[beyond]] += 1
-        rows = face_rows(mesh, scene, view, angle_model, row_sigma, rows_tolerances)
+        # A place that mirrors the object is not excused: it may be wrong, and mirror it therefore.
+        equal = RowSigma(row_sigma, row_sigma)
+        rows = face_rows(mesh, scene, view, angle_model, equal, rows_tolerances)
         residual = np.abs(rows.residual)
         wrong = residual > np.maximum(tol.row_sigmas * np.sqrt(rows.variance), tol.row_sine)
         counts[2, rows.face] += 1
@@ -203,7 +205,8 @@ def fit_normals(
 
     Parameters
     ----------
-    mesh, views, angle_model, row_sigma : as in :func:`face_evidence`.
+    mesh, views, angle_model : as in :func:`face_evidence`.
+    row_sigma : deviation of ``m . n`` that noise does not explain.
     row_error : deviation of ``m . n`` that the surface shows. Views share some of it, so that it
         does not average out: half of it is added to the normals' deviations. Guess.
     """

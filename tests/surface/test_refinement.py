@@ -14,6 +14,7 @@ from polmvs.surface.refinement import (
     KnownPoints,
     Level,
     RefinementTolerances,
+    RowSigma,
     _Equations,
     _SharedError,
     face_rows,
@@ -56,12 +57,34 @@ def test_rows_of_exact_phases_are_tangents(ball):
     exact = TriangleMesh(
         mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True), mesh.faces
     )
-    rows = face_rows(exact, RayScene(exact), ball[0], PPA, 0.03, RefinementTolerances())
+    rows = face_rows(
+        exact, RayScene(exact), ball[0], PPA, RowSigma(0.03, 0.03), RefinementTolerances()
+    )
     # A cap of 0.3 of a sphere is seen from a distance of 5 by less than 75 deg.
     assert len(rows.face) > 0.28 * len(exact.faces)
     inner = rows.cosine > 0.4
     assert np.median(np.abs(rows.residual[inner])) < 0.01
     assert (rows.variance >= 0.03**2).all()
+
+
+def test_places_that_mirror_the_object_itself_are_told(ball):
+    equal = RowSigma(0.03, 0.03)
+    convex = extracted(sphere(), step=0.05)
+    alone = face_rows(convex, RayScene(convex), ball[0], PPA, equal, RefinementTolerances())
+    assert not alone.is_mirrored[alone.cosine > 0.4].any()
+    ring = extracted(torus(), step=0.05)
+    view = views_of(torus(), ring_of_views(1, elevations=(45.0,)))[0]
+    rows = face_rows(ring, RayScene(ring), view, PPA, equal, RefinementTolerances())
+    across = np.linalg.norm(ring.centers[rows.face, :2], axis=1)
+    middle = 0.5 * (across.min() + across.max())
+    mirrored = rows.is_mirrored & (rows.cosine > 0.4)
+    assert mirrored.sum() > 50
+    assert (across[mirrored] < middle).all()  # the side towards the hole
+    doubted = face_rows(
+        ring, RayScene(ring), view, PPA, RowSigma(0.03, 0.3), RefinementTolerances()
+    )
+    more = doubted.variance - rows.variance
+    np.testing.assert_allclose(more, np.where(rows.is_mirrored, 0.3**2 - 0.03**2, 0), atol=1e-9)
 
 
 def test_rows_of_the_other_light_are_across(ball):
