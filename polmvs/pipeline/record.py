@@ -35,8 +35,7 @@ class StageRecord:
     reads : what it was made from, paths in the run folder.
     options : values of the options that decided its result, by path, in terms of JSON.
     seconds : wall time.
-    cpu_s : processor time, see :func:`polmvs.memory.cpu_seconds`; not of a cluster's. None where
-        an earlier program wrote the record.
+    cpu_s : processor time, see :func:`polmvs.memory.cpu_seconds`; not of a cluster's.
     peak_rss_mb : largest resident memory of the run's processes together during it, see
         :class:`polmvs.memory.PeakMemory`; not of a cluster's.
     warnings : what it warned of.
@@ -48,7 +47,7 @@ class StageRecord:
     reads: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
     seconds: float
-    cpu_s: float | None = None
+    cpu_s: float
     peak_rss_mb: float
     warnings: tuple[str, ...] = ()
     result: Any = None

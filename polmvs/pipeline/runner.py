@@ -456,7 +456,7 @@ def timing_table(records: Mapping[str, Record]) -> str:
     for record in records.values():
         seconds = {stage.name: stage.seconds for stage in record.stages}
         peak = max((stage.peak_rss_mb for stage in record.stages), default=None)
-        cpu = {stage.name: stage.cpu_s or 0.0 for stage in record.stages}
+        cpu = {stage.name: stage.cpu_s for stage in record.stages}
         total += [number(sum(seconds.values())), number(sum(cpu.values())), number(peak, 1, 0)]
         rest += [number(_without_poses(times)) for times in (seconds, cpu)] + [""]
         wall += [number(record.wall_s), "", ""]

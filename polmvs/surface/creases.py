@@ -48,7 +48,7 @@ class CreaseTolerances:
     fitting_sine: float = 0.1
     reach_edges: float = 1.0
     unfitted_weight: float = 0.2
-    normal_rounds: int = 12
+    normal_rounds: int = 10
     vertex_rounds: int = 60
     max_move: float = 1.0
     crease_deg: float = 30.0

@@ -335,13 +335,9 @@ def _mouth(
     mouth = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
     if mouth.sum() < np.pi * tol.min_radius**2:
         return np.zeros(grid.shape, np.bool_)
-    snapped = snapped_border(
-        np.where(mouth, 0, NO_FACE),
-        0,
-        evidence.jump.astype(np.float64),
-        face_tol,
-        band_cells=tol.snap_cells,
-    )
+    labels = np.where(mouth, 0, NO_FACE)
+    near = replace(face_tol, snap_cells=tol.snap_cells)
+    snapped = snapped_border(labels, 0, evidence.jump.astype(np.float64), near)
     return np.asarray(snapped == 0)
 
 

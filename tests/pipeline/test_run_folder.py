@@ -51,6 +51,7 @@ def finished_run(root: Path) -> RunFolder:
         name="images",
         options={"capture.gamma": 1.0},
         seconds=1.0,
+        cpu_s=1.5,
         peak_rss_mb=2.0,
         result=ImagesResult(num_images=1),
     )

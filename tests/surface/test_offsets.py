@@ -9,7 +9,7 @@ from scenes import phase_map_of
 from polmvs.camera import PinholeCamera
 from polmvs.config import AngleModel
 from polmvs.scene import Seeds
-from polmvs.surface.offsets import find_faces, stepped_faces
+from polmvs.surface.offsets import OffsetTolerances, find_faces, snapped_border, stepped_faces
 from polmvs.synthetic.captures import Group, Plane, Sphere, render_view, ring_of_views
 
 CAMERA = PinholeCamera(width=320, height=256, fx=270.0, fy=270.0, cx=160.0, cy=128.0)
@@ -190,3 +190,19 @@ def test_points_of_a_curved_surface_or_too_few_make_no_large_face():
     unknown = Seeds(0.05 * normals, np.full((60, 3), np.nan), np.full(60, SIGMA))
     assert find_faces(unknown) == ()
     assert stepped_faces((), few, [], AngleModel.PPA) == ()
+
+
+def test_a_border_follows_its_lines_around_corners():
+    """A turned square, drawn too small and without its corners; noise stands for texture."""
+    rows, cols = np.indices((160, 160))
+    turn = np.radians(35.0)
+    u = np.cos(turn) * (cols - 80) + np.sin(turn) * (rows - 80)
+    v = -np.sin(turn) * (cols - 80) + np.cos(turn) * (rows - 80)
+    beside = np.maximum(np.abs(u), np.abs(v)) - 40  # distance to the square, negative inside
+    jump = 10 * np.exp(-0.5 * beside**2) + np.abs(np.random.default_rng(0).standard_normal(u.shape))
+    octagon = np.maximum(beside + 4, (np.abs(u) + np.abs(v)) / np.sqrt(2) - 44)
+    found = snapped_border(np.where(octagon < 0, 1, 0), 1, jump, OffsetTolerances()) == 1
+    wrong = found != (beside < 0)
+    assert np.abs(beside[wrong]).max() < 1.5
+    corners = (np.abs(u) > 33) & (np.abs(v) > 33) & (beside < -1.5)
+    assert found[corners].all()
