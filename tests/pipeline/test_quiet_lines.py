@@ -6,8 +6,10 @@ from types import SimpleNamespace
 import pytest
 
 from polmvs.colmap import sfm
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, FusionOptions, Surroundings
 from polmvs.evaluation.tables import best_fit_lines
+from polmvs.parallel import Workers
+from polmvs.pipeline.stages import densify
 
 
 @pytest.mark.parametrize(("registered", "warns"), [(5, False), (4, True)])
@@ -43,3 +45,21 @@ def test_one_model_fits_best_of_none() -> None:
         best_fit=AngleModel.PPA, models={AngleModel.OPA: figures, AngleModel.PPA: figures}
     )
     assert best_fit_lines(two)[-1] == "The phases fit PPA best: 0.50 deg at the seeds."
+
+
+def test_stereo_that_finds_nothing_says_so_and_keeps_the_sparse_points(
+    caplog, tmp_path, monkeypatch
+) -> None:
+    kept = object()
+    monkeypatch.setattr(densify, "read_model", lambda folder: SimpleNamespace(tracks=None))
+    nothing = SimpleNamespace(points=[])
+    monkeypatch.setattr(densify, "stereo_surroundings", lambda *given, **others: nothing)
+    monkeypatch.setattr(densify, "sparse_surroundings", lambda tracks, maps: kept)
+    monkeypatch.setattr(densify, "_sparse_cloud", lambda found: found)
+    options = FusionOptions(surroundings=Surroundings.STEREO)
+    cloud = densify._surroundings_cloud(
+        tmp_path, None, [], options, None, tmp_path, workers=Workers(1)
+    )
+    assert cloud is kept
+    assert "`fusion.surroundings` stereo finds no points: too few views" in caplog.text
+    assert "record more views" in caplog.text
