@@ -72,7 +72,7 @@ NUM_PIXELS = 250_000
 NUM_TRACKS, NUM_VIEWS = 10_000, 10
 PHASE_SIGMA = 0.02  # rad
 REPEATS = 7
-TRIALS = 5
+TRIALS = 3
 SHOWN_SHARE = 0.005  # of a run's time, from which on a stage is drawn
 
 
