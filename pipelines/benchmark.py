@@ -72,7 +72,7 @@ NUM_PIXELS = 250_000
 NUM_TRACKS, NUM_VIEWS = 10_000, 10
 PHASE_SIGMA = 0.02  # rad
 REPEATS = 7
-TRIALS = 5
+TRIALS = 3
 SHOWN_SHARE = 0.005  # of a run's time, from which on a stage is drawn
 
 
@@ -342,7 +342,7 @@ class GrowthPage:
             axis.grid(alpha=0.3)
             if axis is not axes[0]:
                 axis.set_ylim(bottom=0)
-        axes[1].legend(fontsize=8)
+        axes[1].legend(fontsize=7, ncols=3, loc="lower center")  # under the least memory
         axes[2].legend(fontsize=8)
         figure.savefig(folder / "images" / "growth.png", dpi=120)
         pyplot.close(figure)
