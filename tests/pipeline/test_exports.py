@@ -28,6 +28,7 @@ from polmvs.pipeline.run_folder import DENSE_MARKER
 from polmvs.poses.metric_frame import transform_model
 from polmvs.scene import PointKind
 from polmvs.surface.kept_depth import kept_cloud
+from polmvs.surface.map_export import WarpTolerances
 
 BOARD_HEIGHT_M = 0.012  # of the true plane z = const, in the capture's gt/scene.json
 # A pixel is 1.3 mm on the board; SfM's poses bend and shift it by some tenths of that.
@@ -93,10 +94,13 @@ def heights(points: np.ndarray) -> np.ndarray:
     return np.abs(points[:, 2] - BOARD_HEIGHT_M)
 
 
-def assert_on_board(distances: np.ndarray) -> None:
-    """Points of the top to a pixel, and of its sides, which silhouettes place, to two."""
+def assert_on_board(distances: np.ndarray, outline_px: float = 0.0) -> None:
+    """Points of the top to a pixel, and of its sides, which silhouettes place, to two.
+
+    ``outline_px`` is by how much outlines may have grown, in pixels of 1.7 mm.
+    """
     assert np.quantile(distances, 0.95) < TOLERANCE_M
-    assert np.quantile(distances, 0.99) < 2 * TOLERANCE_M
+    assert np.quantile(distances, 0.99) < 2 * TOLERANCE_M + 1.7e-3 * outline_px
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +161,8 @@ def test_colmap_fuses_the_workspace(
     assert reconstruction.num_reg_images() == 10
     cloud = fuse(tmp_path / "dense", min_num_pixels=3)
     assert len(cloud.points) > 10_000
-    assert_on_board(off_board(cloud.points))
+    # A map's pixel takes the plane of the nearest point of the lattice, of two pixels.
+    assert_on_board(off_board(cloud.points), 2 * WarpTolerances().reach)
     assert cloud.normals is not None
     assert np.median(cloud.normals[:, 2]) > np.cos(np.radians(1))
     # The whole board: hardly a point of the truth is far from the fused cloud.
