@@ -43,8 +43,8 @@ NO_REGION = (
 )
 NO_SEEDS = (
     "no seeds: no sparse point lies on the polarised surface with a normal that fits its light, "
-    "and no part could be placed by its outline. Put a few printed marks or labels on the part, "
-    "check `region.light`, or give the part with `region.mask`."
+    "and silhouettes place no surface. Put a few printed marks or labels on the part, check "
+    "`region.light`, or give the part with `region.mask`."
 )
 TOO_MANY_VIEWS = (
     "no points: `fusion.min_views` asks for more views to confirm a point than have a pose. Give "

@@ -198,10 +198,12 @@ def _quadratic_part(
         loss = 1.0 / (1.0 + np.square(residual / (t.scale_of_loss * scale)))
     image = np.repeat(np.arange(len(parts)), [len(rows) for rows, _ in parts])
     deviations = []
-    for index, num in ((group, t.num_groups), (image, len(parts))):
+    for index in (group, image):
+        present = np.unique(index)
+        num = len(present)
         left_out = [
             _solve(design[index != k], right[index != k], loss[index != k])[0]
-            for k in range(num if num > 1 else 0)
+            for k in (present if num > 1 else ())
         ]
         spread = np.square(np.subtract(left_out, np.mean(left_out or 0.0))).sum()
         deviations.append(np.sqrt((num - 1) / num * spread))

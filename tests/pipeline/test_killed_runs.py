@@ -41,8 +41,6 @@ FLAGS = (
     "--quiet",
     "--no-report",
     "--no-mesh",
-    "--method",
-    "integrate",
     "--stride-px",
     "3",
 )
