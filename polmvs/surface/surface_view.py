@@ -185,9 +185,7 @@ class PhaseRows:
     tilt: Array
 
 
-def phase_rows(
-    view: SurfaceView, angle_model: AngleModel, points: Floats, other_light: Mask | None = None
-) -> PhaseRows:
+def phase_rows(view: SurfaceView, angle_model: AngleModel, points: Floats) -> PhaseRows:
     """Rows ``m`` with ``m . n = 0`` of one view at points of space.
 
     Parameters
@@ -195,8 +193,6 @@ def phase_rows(
     view : with its phase.
     angle_model : OPA, or PPA; the samples of a tilted map are those of PPA.
     points : (N, 3), world.
-    other_light : (N,) bool, points whose light is of the other kind than the phase map presumes
-        (diffuse instead of specular or the reverse): their phase is turned by pi/2.
     """
     in_cam = view.to_camera(points)
     xy = view.view.camera.project(in_cam)
@@ -210,9 +206,6 @@ def phase_rows(
     if view.tilt_share:
         cos, sin = np.cos(2 * view.tilt_share * tilt), np.sin(2 * view.tilt_share * tilt)
         cos2, sin2 = cos2 * cos - sin2 * sin, sin2 * cos + cos2 * sin
-    if other_light is not None:
-        sign = np.where(other_light, -1.0, 1.0)
-        cos2, sin2 = sign * cos2, sign * sin2
     rows = np.asarray(rows_from_axial(angle_model, cos2, sin2, rays), np.float64)
     known = (precision > 0) & np.isfinite(rows).all(axis=1) & (rays[:, 2] > 0)
     rows = np.where(known[:, None], rows, 0.0)

@@ -26,7 +26,7 @@ from polmvs.surface.refinement import (
     solve,
 )
 from polmvs.surface.surface_quality import point_offset
-from polmvs.surface.surface_view import Silhouette, phase_rows, surface_view
+from polmvs.surface.surface_view import Silhouette, surface_view
 from polmvs.surface.visual_hull import visual_hull
 
 PPA = AngleModel.PPA
@@ -85,13 +85,6 @@ def test_places_that_mirror_the_object_itself_are_told(ball):
     )
     more = doubted.variance - rows.variance
     np.testing.assert_allclose(more, np.where(rows.is_mirrored, 0.3**2 - 0.03**2, 0), atol=1e-9)
-
-
-def test_rows_of_the_other_light_are_across(ball):
-    points = ball[0].center + 4.0 * ball[0].view.rays_in_world(np.array([[70.0, 50.0]]))
-    own = phase_rows(ball[0], PPA, points)
-    other = phase_rows(ball[0], PPA, points, np.array([True]))
-    assert abs((own.rows * other.rows).sum()) < 0.1
 
 
 def test_the_change_of_normals_is_their_derivative():
