@@ -193,7 +193,13 @@ def reconstruct_surface(
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
     if carvings and len(mesh.faces):
-        mesh = remeshed(mesh, mesh.mean_edge / REMESHED_EDGE, free=carvings, smoothing=0)
+        mesh = remeshed(
+            mesh,
+            mesh.mean_edge / REMESHED_EDGE,
+            solid=[_within(group.solid, hull.mesh) for group in steps],
+            free=carvings,
+            smoothing=0,
+        )
     if not len(mesh.faces):
         return Undetermined("the surface vanishes under the phases of the views")
     row_error, median = median_residual(mesh, views, rows)
@@ -265,6 +271,21 @@ def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Flo
         return hits.distance, mesh.face_normals[hits.face]
 
     return first_hit
+
+
+def _within(solid: Callable[[Array], Array], mesh: TriangleMesh) -> Callable[[Array], Array]:
+    """Signed distances to what is solid and enclosed by a mesh."""
+    scene = RayScene(mesh)
+
+    def distances(points: Array) -> Array:
+        found = solid(points)
+        near = np.flatnonzero(np.isfinite(found))
+        if not len(near):
+            return found
+        found[near] = np.maximum(found[near], scene.signed_distance(points[near], num_rays=1))
+        return found
+
+    return distances
 
 
 def _lie_on(mesh: TriangleMesh, carvings: Sequence[Callable[[Array], Floats]]) -> Mask:

@@ -348,6 +348,7 @@ def remeshed(
     mesh: TriangleMesh,
     step: float,
     *,
+    solid: Sequence[Callable[[Array], Floats]] = (),
     free: Sequence[Callable[[Array], Floats]] = (),
     smoothing: float = 0.5,
     min_cells: int = 30,
@@ -361,6 +362,8 @@ def remeshed(
     ----------
     mesh : closed.
     step : of the grid, world units.
+    solid : functions of points ``(N, 3)`` that give signed distances ``(N,)``, negative where
+        something is: it is added.
     free : functions of points ``(N, 3)`` that give signed distances ``(N,)``, positive where space
         is free: it is carved out, its borders unsmoothed.
     smoothing : width of a Gaussian on the distances, in steps.
@@ -404,6 +407,14 @@ def remeshed(
         values[(negative > 0.5 * total)[pieces] & (pieces > 0)] = -limit
     if smoothing > 0:
         values = ndimage.gaussian_filter(values, smoothing)
+    if solid:
+        rest = np.stack(np.meshgrid(*map(np.arange, shape[1:]), indexing="ij"), axis=-1)
+        for number, slab in enumerate(values):  # what bounds the memory
+            cells = np.concatenate([np.full((*shape[1:], 1), number), rest], axis=-1)
+            points = origin + step * cells.reshape(-1, 3)
+            for function in solid:
+                distances = np.clip(function(points), -limit, limit).reshape(slab.shape)
+                np.minimum(slab, distances, out=slab)
     if free:
         inner = values < limit
         points = origin + step * np.argwhere(inner)

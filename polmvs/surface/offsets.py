@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
 
@@ -222,6 +223,33 @@ class SteppedFaces:
                 across = self._interpolated(self._beside(under), cells)
                 solid = np.minimum(solid, np.maximum(across, face.height(points)))
         return solid
+
+    def solid(self, points: Floats) -> Array:
+        """Signed distance ``(N,)`` of points to what stands on the lowest face: negative in it.
+
+        What a face shows reaches down to the lowest one, for all that the faces say; inf farther
+        than two cells aside of it.
+        """
+        points = np.asarray(points, np.float64)
+        found = np.full(len(points), np.inf)
+        cells = np.moveaxis(self.grid.cells(points), -1, 0)
+        nearest = np.clip(np.rint(cells), 0, np.array(self.labels.shape)[:, None] - 1).astype(int)
+        lowest, *standing = self._by_height
+        for face, beside in standing:
+            near = np.flatnonzero(beside[tuple(nearest)] < 2 * self.grid.step)
+            across = self._interpolated(beside, cells[:, near])
+            above, under = face.height(points[near]), lowest[0].height(points[near])
+            found[near] = np.minimum(found[near], np.maximum(across, np.maximum(above, -under)))
+        return found
+
+    @cached_property
+    def _by_height(self) -> list[tuple[Face, Image]]:
+        """The faces, the lowest first, with the distance to the cells of each."""
+        rise = [float(np.median(self._rise(face))) for face in self.faces]
+        return [
+            (self.faces[number], self._beside(self.labels == number))
+            for number in np.argsort(rise, kind="stable")
+        ]
 
     def _rise(self, face: Face) -> Array:
         return np.asarray((self.grid.points(face) - self.grid.origin) @ self.grid.axis)

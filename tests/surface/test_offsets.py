@@ -206,3 +206,14 @@ def test_a_border_follows_its_lines_around_corners():
     assert np.abs(beside[wrong]).max() < 1.5
     corners = (np.abs(u) > 33) & (np.abs(v) > 33) & (beside < -1.5)
     assert found[corners].all()
+
+
+def test_what_stands_on_the_lowest_face_is_solid():
+    scene = step_scene(0.03, 0.0)
+    faces = find_faces(scene.seeds)
+    (group,) = stepped_faces(faces, scene.seeds, scene.maps, AngleModel.PPA)
+    points = column_points()
+    inside = (np.abs(points[:, :2]) < BOX).all(axis=1) & (points[:, 2] > 0) & (points[:, 2] < 0.03)
+    clear = np.minimum(np.abs(points[:, 2]), np.abs(points[:, 2] - 0.03)) > 1e-3
+    assert np.mean((group.solid(points) < 0)[clear] == inside[clear]) > 0.99
+    assert np.isinf(group.solid(np.array([[0.9 * PLATE, 0.0, 0.01]]))).all()
