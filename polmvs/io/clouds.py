@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import tempfile
 import threading
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,8 @@ from polmvs.io.ply import read_ply, read_ply_header, write_ply
 from polmvs.scene import MAX_COORDINATE
 
 Array = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
 
 NORMALS = ("nx", "ny", "nz")
 COLORS = ("red", "green", "blue")
@@ -229,11 +234,28 @@ def solve_poisson(
     o3d = import_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.normals = o3d.utility.Vector3dVector(normals)
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+    quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
+    with quiet, _unprinted():
         mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
             cloud, depth=depth, scale=scale, n_threads=1
         )
     return np.array(mesh.vertices, np.float64), np.array(mesh.triangles, np.int32)
+
+
+@contextmanager
+def _unprinted() -> Iterator[None]:
+    """Keep what a library writes on stderr by itself for the log: it alarms and helps no one."""
+    with tempfile.TemporaryFile() as said:
+        own = os.dup(2)
+        os.dup2(said.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(own, 2)
+            os.close(own)
+            said.seek(0)
+            if text := said.read().decode(errors="replace").strip():
+                logger.debug("Open3D: %s", text)
 
 
 def write_mesh(path: str | Path, mesh: Mesh) -> None:
