@@ -610,8 +610,8 @@ def snapped_border(
     node[band] = np.arange(num)
     steps = [_steps_between(jump, *direction) for direction in (*BESIDE, *ACROSS)]
     tails, heads, between = (np.concatenate(part) for part in zip(*steps, strict=True))
-    is_across = np.arange(len(between)) >= sum(len(step[0]) for step in steps[: len(BESIDE)])
-    length = np.where(is_across, np.sqrt(0.5), 1.0)
+    of_direction = [1.0] * len(BESIDE) + [np.sqrt(0.5)] * len(ACROSS)
+    length = np.repeat(of_direction, [len(step[0]) for step in steps])
     ends = node.ravel()[np.stack([tails, heads])]
     inner = ends[0] != ends[1]
     # It falls so slowly that the middle of a wide line still counts for more than a short cut.

@@ -200,8 +200,7 @@ def _global_surface(
     """The surface of all views, which of its points are presumed, and its share of the tilt.
 
     Its mesh and its depth in each view go to ``views``, what it is made from meanwhile to ``kept``,
-    a new folder. None where silhouettes do not bound the
-    objects.
+    a new folder. None where silhouettes do not bound the objects.
     """
     levels: list[TriangleMesh] = []
     kept.mkdir()
