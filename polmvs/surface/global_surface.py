@@ -204,7 +204,7 @@ def reconstruct_surface(
         return Undetermined("the surface vanishes under the phases of the views")
     row_error, median = median_residual(mesh, views, rows)
     row_sigma = max(row_error.direct, tolerances.row_sigma)
-    fitted = fit_normals(mesh, views, rows, row_sigma=row_sigma, row_error=row_error.direct)
+    fitted = fit_normals(mesh, views, rows, row_sigma=row_sigma)
     normals = sided_normals(mesh, fitted.normals, fitted.is_fitted)
     mesh = sharpened(mesh, normals)
     report(1)

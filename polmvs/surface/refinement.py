@@ -26,6 +26,8 @@ from polmvs.surface.surface_view import SurfaceView, phase_rows
 
 logger = logging.getLogger(__name__)
 
+SETTLING_STEPS = 2  # until a mesh made anew, which shrinks by some tenths of a pixel, is at rest
+
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -367,13 +369,14 @@ def refine(
             if not len(mesh.faces):
                 return Refined(mesh, tilt_share)
             turned = [replace(view, tilt_share=tilt_share) for view in views]
-            system = _system(
+            energy = _energy(
                 mesh, turned, angle_model, footprint, edge, level, known, row_sigma, tol
             )
-            mesh, displacement = _step(mesh, system, edge, tol)
-            tilt_share = float(np.clip(tilt_share + system.tilt.solved(displacement), 0, 1))
+            mesh, displacement = _step(mesh, energy, edge, tol)
+            tilt_share += energy.views.tilt.solved(displacement)
+            tilt_share = float(np.clip(tilt_share, 0, 1))
             moved = moved + displacement
-            free = displacement[system.free]
+            free = displacement[energy.free]
             change = float(np.sqrt(np.mean(free**2))) if len(free) else 0.0
             logger.info(
                 "edges of %.1f px, %d vertices: moved by %.3f px; %.2f of the polarizers' tilt.",
@@ -390,38 +393,67 @@ def refine(
                 break
         # A model that leaves something out (OPA the perspective) errs by more than its phases'
         # noise; held against that, most of its rows were outliers. Every model is treated alike.
-        row_sigma = system.row_sigma
+        row_sigma = energy.views.row_sigma
         if on_level is not None:
             on_level(mesh)
     return Refined(mesh, tilt_share)
 
 
 @dataclass(frozen=True)
-class _System:
-    """Normal equations of one mesh.
+class _Evidence:
+    """What some views say of the displacements of one mesh.
 
     Attributes
     ----------
-    equations : of the views and the known points.
+    equations : of their phases and outlines.
     outline_slope : (V,), change of the gradient by an error of all silhouettes, per px.
     tilt : share of the polarizers' tilt that is still to be taken back.
-    smooth, pull : matrix ``(V, V)`` and gradient ``(V,)`` of the smoothness, and the matrix
-        ``(V, V)`` whose product with its own transpose is the former.
-    free : (V,) bool, vertices of faces that some view sees.
+    is_seen : (F,) bool, faces that some view sees.
     row_sigma : what the phase rows' residuals show of it.
     """
 
     equations: _Equations
     outline_slope: Array
     tilt: _SharedError
+    is_seen: Mask
+    row_sigma: RowSigma
+
+
+@dataclass(frozen=True)
+class _Energy:
+    """The energy about one mesh, as the parts of its normal equations.
+
+    Attributes
+    ----------
+    views : what all of them say.
+    of_views : the same of some of them, by their indices.
+    points : equations of the known points.
+    smooth, pull : matrix ``(V, V)`` and gradient ``(V,)`` of the smoothness, and the matrix
+        ``(V, V)`` whose product with its own transpose is the former.
+    free : (V,) bool, vertices of faces that some view sees.
+    """
+
+    views: _Evidence
+    of_views: Callable[[Sequence[int]], _Evidence]
+    points: _Equations
     smooth: sparse.csr_array
     pull: Array
     smooth_factor: sparse.csr_array
     free: Mask
-    row_sigma: RowSigma
+
+    def matrix(self) -> sparse.csr_array:
+        """Of all parts ``(V, V)``, without damping."""
+        sums = self.views.equations.matrix() + self.points.matrix() + self.smooth
+        return sparse.csr_array(sums)
+
+    def gradient(self) -> Array:
+        """Of all parts ``(V,)``."""
+        tilt = self.views.tilt
+        sums = self.views.equations.gradient + self.points.gradient + self.pull
+        return np.asarray(sums - tilt.offset() * tilt.column())
 
 
-def _system(
+def _energy(
     mesh: TriangleMesh,
     views: Sequence[SurfaceView],
     angle_model: AngleModel,
@@ -431,46 +463,54 @@ def _system(
     known: KnownPoints | None,
     row_sigma: RowSigma,
     tol: RefinementTolerances,
-) -> _System:
-    scene = RayScene(mesh)
-    equations = _Equations(len(mesh.vertices))
-    edges = shared_edges(mesh)
-    rims = [_rim_rows(mesh, scene, view, edges, level) for view in views if view.has_outline]
-    # Anything between a sensor of the angle model and a tilted polarizer may be, as little known
-    # as what else the rows share.
-    taken_back = views[0].tilt_share if views else 0.0
-    tilt = _SharedError(len(mesh.vertices), prior=tol.phase_correlation, expected=-taken_back)
-    seen, shown = _add_phases(
-        equations,
-        tilt,
-        mesh,
-        scene,
-        views,
-        angle_model,
-        footprint,
-        level,
-        row_sigma,
-        tol,
-        with_slope=not rims,
-    )
-    if known is not None and len(known.points) and seen.any():
-        _add_points(equations, mesh, seen, known, footprint, level, tol)
-    outline_slope = _add_rims(equations, rims, level, tol)
+) -> _Energy:
+    scene, edges = RayScene(mesh), shared_edges(mesh)
+    rims = [
+        _rim_rows(mesh, scene, view, edges, level) if view.has_outline else None for view in views
+    ]
+    residuals = [np.zeros(0), *(rim.residual for rim in rims if rim is not None)]
+    rim_sigma = _rim_sigma(np.concatenate(residuals), tol)
+
+    def of_views(chosen: Sequence[int]) -> _Evidence:
+        equations = _Equations(len(mesh.vertices))
+        # Anything between a sensor of the angle model and a tilted polarizer may be, as little
+        # known as what else the rows share.
+        taken_back = views[0].tilt_share if views else 0.0
+        tilt = _SharedError(len(mesh.vertices), prior=tol.phase_correlation, expected=-taken_back)
+        is_seen, shown = _add_phases(
+            equations,
+            tilt,
+            mesh,
+            scene,
+            [views[index] for index in chosen],
+            angle_model,
+            footprint,
+            level,
+            row_sigma,
+            tol,
+            with_slope=not any(rims),
+        )
+        own = [rim for rim in (rims[index] for index in chosen) if rim is not None]
+        outline_slope = _add_rims(equations, own, rim_sigma, level, tol)
+        return _Evidence(equations, outline_slope, tilt, is_seen, shown)
+
+    everything = of_views(range(len(views)))
+    points = _Equations(len(mesh.vertices))
+    if known is not None and len(known.points) and everything.is_seen.any():
+        _add_points(points, mesh, everything.is_seen, known, footprint, level, tol)
     smooth, pull, factor = _smoothness(mesh, edge, tol)
     free = np.zeros(len(mesh.vertices), np.bool_)
-    free[mesh.faces[seen]] = True
-    return _System(equations, outline_slope, tilt, smooth, pull, factor, free, shown)
+    free[mesh.faces[everything.is_seen]] = True
+    return _Energy(everything, of_views, points, smooth, pull, factor, free)
 
 
 def _step(
-    mesh: TriangleMesh, system: _System, edge: float, tol: RefinementTolerances
+    mesh: TriangleMesh, energy: _Energy, edge: float, tol: RefinementTolerances
 ) -> tuple[TriangleMesh, Array]:
     """One Gauss-Newton step: the new mesh and the displacements ``(V,)``."""
-    matrix = system.equations.matrix() + system.smooth
-    shared = system.tilt.column()
-    gradient = system.equations.gradient + system.pull - system.tilt.offset() * shared
-    damping = np.where(system.free, tol.damping, tol.unseen_damping) * edge
-    displacement = -solve(matrix, gradient, 1 / damping**2, shared)
+    damping = np.where(energy.free, tol.damping, tol.unseen_damping) * edge
+    shared = energy.views.tilt.column()
+    displacement = -solve(energy.matrix(), energy.gradient(), 1 / damping**2, shared)
     displacement = np.clip(np.nan_to_num(displacement), -edge, edge)
     return mesh.moved(displacement[:, None] * mesh.vertex_normals), displacement
 
@@ -483,18 +523,23 @@ def place_deviations(
     *,
     known: KnownPoints | None = None,
     tolerances: RefinementTolerances | None = None,
-    num_samples: int = 24,
+    max_groups: int = 24,
+    num_samples: int = 12,
     seed: int = 0,
 ) -> Array:
     """Standard deviation ``(V,)`` of the place along the normal of each vertex of a refined mesh.
 
-    From samples of the energy's normal distribution: the solution for residuals with random
-    errors of the size that their weights state. Errors of the phases that faces share and the
-    bias of the outlines are part of it. Large where only smoothness carries a vertex.
+    What the views contribute is taken from the views: the jackknife (Tukey 1958), how far the
+    surface moves when one of them, or one of some groups of them, is left out. Whatever a view's
+    phases and outline have in common (light, pose, blur) is in it, without a guess of what. What
+    all views share is not: the share of the polarizers' tilt and the bias of the outlines are
+    added, and samples of the errors of points and smoothness, and of the views' stated noise, below
+    which few views agree by chance. Large where only smoothness carries a vertex.
 
     Parameters
     ----------
     mesh, views, angle_model, footprint, known : as in :func:`refine`.
+    max_groups : of views, to leave out.
     num_samples : the deviation of a deviation is one over the root of twice as many.
     seed : of the random numbers.
     """
@@ -503,31 +548,37 @@ def place_deviations(
     if not num:
         return np.zeros(0)
     edge, row_sigma = mesh.mean_edge, RowSigma(tol.row_sigma, tol.row_sigma)
-    system = _system(
-        mesh, views, angle_model, footprint, edge, tol.levels[-1], known, row_sigma, tol
-    )
-    matrix = system.equations.matrix() + system.smooth
+
+    def energy_of(mesh: TriangleMesh) -> _Energy:
+        level = tol.levels[-1]
+        return _energy(mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol)
+
+    energy = energy_of(mesh)
+    for _ in range(SETTLING_STEPS):
+        mesh, _ = _step(mesh, energy, edge, tol)
+        energy = energy_of(mesh)
+    matrix = energy.matrix()
     # Nothing but the energy holds the surface here; what no view sees is not asked for.
-    loose = np.where(system.free, 100.0, tol.unseen_damping) * edge
+    loose = 1 / (np.where(energy.free, 100.0, tol.unseen_damping) * edge) ** 2
     none = np.zeros(num)
-    by_tilt = solve(matrix, system.tilt.slope, 1 / loose**2, none)
-    by_outlines = solve(matrix, system.outline_slope, 1 / loose**2, none)
-    # The outlines' error is not one that more views average out.
-    shared = np.stack(
-        [
-            by_tilt * system.tilt.deviation(by_tilt),
-            by_outlines * tol.outline_bias_px / np.sqrt(tol.phase_correlation),
-        ]
-    )
-    total = np.zeros(num)
+    rest = -solve(matrix, energy.gradient(), loose, none)
+    by_tilt = solve(matrix, energy.views.tilt.slope, loose, none)
+    # What rows share is as uncertain as their own errors would be, were they not weighted down.
+    by_tilt *= energy.views.tilt.deviation(by_tilt) * np.sqrt(tol.phase_correlation)
+    by_outlines = solve(matrix, energy.views.outline_slope, loose, none) * tol.outline_bias_px
+    variance = by_tilt**2 + by_outlines**2
     for _ in range(num_samples):
-        noise = system.equations.noise(rng)
-        noise += system.smooth_factor @ rng.standard_normal(num)
-        # What outlines and rows share, as if it were known: its own sample comes on top.
-        sample = solve(matrix, noise, 1 / loose**2, none)
-        total += (sample + rng.standard_normal(len(shared)) @ shared) ** 2
-    sigma = np.sqrt(tol.phase_correlation * total / num_samples)
-    return np.where(system.free, sigma, np.inf)
+        noise = energy.views.equations.noise(rng) + energy.smooth_factor @ rng.standard_normal(num)
+        noise += np.sqrt(tol.phase_correlation) * energy.points.noise(rng)
+        variance += solve(matrix, noise, loose, none) ** 2 / num_samples
+    num_groups = min(len(views), max_groups)
+    for first in range(num_groups):
+        # Neighbours by name are likely to see the same: each goes to a group of its own.
+        left_out = energy.of_views(range(first, len(views), num_groups)).equations
+        own = left_out.matrix()
+        change = solve(sparse.csr_array(matrix - own), left_out.gradient + own @ rest, loose, none)
+        variance += (num_groups - 1) / num_groups * change**2
+    return np.where(energy.free, np.sqrt(variance), np.inf)
 
 
 def median_residual(
@@ -770,21 +821,25 @@ def _rim_rows(
     return _RimRows(vertices, np.nan_to_num(jacobian), residual, rim.length_px[near])
 
 
+def _rim_sigma(residuals: Array, tol: RefinementTolerances) -> float:
+    """Deviation of the outlines that the residuals ``(K,)`` of all views show, px."""
+    if not len(residuals):
+        return tol.rim_sigma_px
+    return max(tol.rim_sigma_px, robust_deviation(residuals - np.median(residuals)))
+
+
 def _add_rims(
     equations: _Equations,
     rims: Sequence[_RimRows],
+    sigma: float,
     level: Level,
     tol: RefinementTolerances,
 ) -> Array:
-    """Add the outlines of all views, as certain as their residuals show them to be.
+    """Add the outlines of some views, of deviation ``sigma``, px.
 
     Returns how the gradient (V,) changes with an error of all of them, per px.
     """
     slope = np.zeros(equations.num)
-    residuals = np.concatenate([np.zeros(0), *(rim.residual for rim in rims)])
-    if not len(residuals):
-        return slope
-    sigma = max(tol.rim_sigma_px, robust_deviation(residuals - np.median(residuals)))
     scale = max(3 * tol.rim_sigma_px, 0.5 * level.rim_gate_px) ** 2
     for rim in rims:
         weight = rim.length_px * (scale / (scale + rim.residual**2)) ** 2

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.fitting import robust_deviation
-from polmvs.normals.estimator import solve_normals
+from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
 from polmvs.surface.refinement import KnownPoints, RefinementTolerances, RowSigma, face_rows
 from polmvs.surface.surface_view import SurfaceView, phase_rows
@@ -196,23 +196,23 @@ def fit_normals(
     angle_model: AngleModel,
     *,
     row_sigma: float,
-    row_error: float,
     tolerances: QualityTolerances | None = None,
 ) -> FaceNormals:
     """Normals from the phases of all views at the places of the mesh, which stay.
 
-    A mesh's own normals are noisier: they are differences of places.
+    A mesh's own normals are noisier: they are differences of places. Their deviations are those
+    that the phases' noise states, times the root of by how much the rows about a face miss it
+    (Birge 1932): light that is not the model's errs more than noise.
 
     Parameters
     ----------
     mesh, views, angle_model : as in :func:`face_evidence`.
     row_sigma : deviation of ``m . n`` that noise does not explain.
-    row_error : deviation of ``m . n`` that the surface shows. Views share some of it, so that it
-        does not average out: half of it is added to the normals' deviations. Guess.
     """
     tol, rows_tolerances = tolerances or QualityTolerances(), RefinementTolerances()
     num = len(mesh.faces)
     normals, sigma = mesh.face_normals.copy(), np.full(num, np.inf)
+    misfit = np.zeros((num, 2))  # chi squared and degrees of freedom
     if not num:
         return FaceNormals(normals, sigma)
     scene, centers = RayScene(mesh), mesh.centers
@@ -244,9 +244,29 @@ def fit_normals(
         good = estimate.valid & (apart < tol.trusted_deg + 3 * estimate.sigma_deg)
         good &= estimate.residual < 3 * row_sigma
         normals[part][good] = estimate.normals[good]
-        shared = np.degrees(0.5 * row_error)
-        sigma[part] = np.where(good, np.hypot(estimate.sigma_deg, shared), np.inf)
-    return FaceNormals(normals, sigma)
+        sigma[part][good] = estimate.sigma_deg[good]
+        misfit[part][good, 0] = _chi_squared(rows, rays, turns, estimate)[good]
+        misfit[part][good, 1] = np.maximum(estimate.num_rows[good] - 2, 0)
+    return FaceNormals(normals, sigma * np.sqrt(_misfit_ratio(mesh, misfit, tol)))
+
+
+def _chi_squared(rows: Floats, rays: Floats, turns: Floats, estimate: NormalEstimate) -> Array:
+    """Weighted sum (N,) of squares of ``m . n`` in the variances that the turns' state."""
+    along, across = (np.einsum("ikn,ni->kn", a, estimate.normals) for a in (rays, rows))
+    squares = across**2 / (turns**2 * (1 - along**2))
+    return np.asarray(np.nansum(estimate.row_weights * squares, axis=0))
+
+
+def _misfit_ratio(mesh: TriangleMesh, misfit: Array, tol: QualityTolerances) -> Array:
+    """Chi squared over degrees of freedom (F,), at least 1, from both (F, 2) about each face.
+
+    A face has few degrees of freedom: those of its surroundings are counted with them, and as many
+    as one row's of the whole surface.
+    """
+    whole = misfit.sum(axis=0)
+    expected = whole[0] / whole[1] if whole[1] else 1.0
+    about = _smoothed(mesh, misfit, tol.smoothing_rounds)
+    return np.maximum((about[:, 0] + expected) / (about[:, 1] + 1), 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)

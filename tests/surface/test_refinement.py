@@ -245,13 +245,26 @@ def test_an_empty_mesh_stays_empty(ball):
     assert len(refine(empty, ball, PPA, FOOTPRINT).mesh.faces) == 0
 
 
+def test_views_that_disagree_widen_the_deviations(ball):
+    """By what they disagree: nothing else tells of a pose or a mask that is slightly wrong."""
+    mesh = extracted(sphere(), step=0.12)
+    alike = place_deviations(mesh, ball, PPA, FOOTPRINT)
+    views = list(ball)
+    for index in (0, 5):
+        mask = views[index].silhouette.certain.astype(np.uint8)
+        wide = cv2.dilate(mask, np.ones((5, 5), np.uint8)) > 0
+        views[index] = replace(views[index], silhouette=Silhouette(wide, wide))
+    assert np.median(place_deviations(mesh, views, PPA, FOOTPRINT) / alike) > 1.3
+
+
 def test_deviations_are_larger_where_less_is_known(ball):
     mesh = extracted(sphere(), step=0.12)
     sigma = place_deviations(mesh, ball, PPA, FOOTPRINT, num_samples=16)
     assert np.isfinite(sigma).all()
     blurred = [replace(view, has_outline=False) for view in ball]
-    without = place_deviations(mesh, blurred, PPA, FOOTPRINT, num_samples=16)
-    assert np.median(without) > 1.05 * np.median(sigma)
+    many = place_deviations(mesh, blurred, PPA, FOOTPRINT, num_samples=16)
+    few = place_deviations(mesh, blurred[::3], PPA, FOOTPRINT, num_samples=16)
+    assert np.median(few / many) > 1.3
     one_side = [view for view in ball if view.center[0] > 0][:2]
     few = place_deviations(mesh, one_side, PPA, FOOTPRINT, num_samples=16)
     behind = mesh.vertices[:, 0] < -0.5
