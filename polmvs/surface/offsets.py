@@ -86,7 +86,8 @@ class OffsetTolerances:
     snap_cells : width of the band in which a border is moved to the lines. As ``min_radius_cells``:
         every face has a core. Measured on `step`: 8, 12 and 20 give the same corners.
     seed_weight : chance that a walk ends on a point that it passes, over that of a step. Guess.
-    min_claim : chance of a place for its likeliest face, under which it has none. Guess.
+    min_total : chance that a walk from a place ends on any face's points at all. Guess: one in a
+        hundred gets through where the phases contradict.
     min_share : of the seen views in whose region a place must lie. Guess: one view in six wrong.
     min_cosine : between a face's normal and the direction to a view that counts.
     min_views : that see a place.
@@ -124,7 +125,7 @@ class OffsetTolerances:
     leak: float = 0.1
     snap_cells: float = 12.0
     seed_weight: float = 0.2
-    min_claim: float = 0.25
+    min_total: float = 0.01
     min_share: float = 0.84
     min_cosine: float = 0.1
     min_views: int = 2
@@ -197,11 +198,13 @@ class SteppedFaces:
     faces : by number.
     grid : of the labels.
     labels : (H, W) int64, number of the face, ``NO_FACE`` where none is shown.
+    shown : (H, W) bool, where the views show the face; beside, its label is carried on.
     """
 
     faces: tuple[Face, ...]
     grid: FaceGrid
     labels: NDArray[np.int64]
+    shown: Mask
 
     def values(self, points: Floats) -> Array:
         """Signed distance ``(N,)`` of points to what the faces leave: positive in free space.
@@ -244,10 +247,10 @@ class SteppedFaces:
 
     @cached_property
     def _by_height(self) -> list[tuple[Face, Image]]:
-        """The faces, the lowest first, with the distance to the cells of each."""
+        """The faces, the lowest first, with the distance to the cells that show each."""
         rise = [float(np.median(self._rise(face))) for face in self.faces]
         return [
-            (self.faces[number], self._beside(self.labels == number))
+            (self.faces[number], self._beside(self.shown & (self.labels == number)))
             for number in np.argsort(rise, kind="stable")
         ]
 
@@ -416,9 +419,9 @@ def stepped_faces(
         grid = _grid_over(group, points, maps, footprint, tol)
         if grid is None:
             continue
-        labels = _labels(group, seeds, grid, scene, first_hit, tol)
+        labels, shown = _labels(group, seeds, grid, scene, first_hit, tol)
         if (labels != NO_FACE).any():
-            found.append(SteppedFaces(tuple(group), grid, labels))
+            found.append(SteppedFaces(tuple(group), grid, labels, shown))
     return tuple(found)
 
 
@@ -555,16 +558,15 @@ def _labels(
     scene: FaceScene,
     first_hit: FirstHit | None,
     tol: OffsetTolerances,
-) -> NDArray[np.int64]:
-    """Number of the face at each cell, ``NO_FACE`` where the views show none."""
+) -> tuple[NDArray[np.int64], Mask]:
+    """Number of the face at each cell, ``NO_FACE`` where there is none, and where it is shown."""
     places = [grid.points(face) for face in group]
     rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
     surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit, tol)
-    labels = np.full(grid.shape, NO_FACE)
+    labels, shown = np.full(grid.shape, NO_FACE), np.zeros(grid.shape, np.bool_)
     for round_index in range(tol.num_rounds):
         claims, jumps = np.zeros((2, len(group), *grid.shape))
-        taken = np.zeros(grid.shape, np.bool_)  # by something that the faces do not explain
-        explained = np.zeros(grid.shape, np.bool_)
+        possible, fits = np.zeros((2, len(group), *grid.shape), np.bool_)
         for number, face in enumerate(group):
             hidden = None
             if round_index > 0:
@@ -572,20 +574,27 @@ def _labels(
             on_grid = grid.cells(seeds.points_in_world[face.members])
             near = _distance_to(on_grid, grid.shape) < 0.5 * tol.mark_px
             evidence = face_evidence(places[number], face, scene, near, hidden, tol)
-            fits = (evidence.cost < tol.max_cost) & (evidence.cost < surface_cost + tol.better_by)
-            taken |= evidence.possible & ~fits
-            explained |= evidence.possible & fits
-            possible = evidence.possible & (evidence.cost < surface_cost + tol.better_by)
-            claims[number] = _claim(number, group, seeds, grid, evidence, possible, tol)
+            possible[number] = evidence.possible
+            better = evidence.possible & (evidence.cost < surface_cost + tol.better_by)
+            fits[number] = better & (evidence.cost < tol.max_cost)
+            claims[number] = _claim(number, group, seeds, grid, evidence, better, tol)
             jumps[number] = evidence.jump
-        labels = np.where(claims.max(axis=0) > tol.min_claim, claims.argmax(axis=0), NO_FACE)
+        # What walks a long way to its few points has a small chance of reaching them, and is the
+        # face's all the same if no other face can be there.
+        total = claims.sum(axis=0)
+        claimed = (total > tol.min_total) & (claims.max(axis=0) > 0.5 * total)
+        labels = np.where(claimed, claims.argmax(axis=0), NO_FACE)
         labels = _without_small(labels, len(group), tol)
         # The lowest ends where others stand on it, and where they do their own borders count.
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1))[1:]:
             labels = snapped_border(labels, int(number), jumps[number], tol)
-        taken = ndimage.binary_opening(taken & ~explained, iterations=2)
-        labels = _continued(np.where(taken, NO_FACE, labels), taken, tol)
-    return np.asarray(labels, np.int64)
+        # By something that the faces do not explain.
+        taken = possible.any(axis=0) & ~fits.any(axis=0)
+        taken = ndimage.binary_opening(taken, iterations=2)
+        labels = np.where(taken, NO_FACE, labels)
+        shown = labels != NO_FACE
+        labels = _continued(labels, fits | ~possible.any(axis=0), taken, tol)
+    return np.asarray(labels, np.int64), np.asarray(shown, np.bool_)
 
 
 def snapped_border(
@@ -632,8 +641,10 @@ def snapped_border(
     return np.where(inside, number, np.where(own, given_back, labels))
 
 
-def _continued(labels: NDArray[np.int64], taken: Mask, tol: OffsetTolerances) -> NDArray[np.int64]:
-    """Labels carried on to cells near them that nothing else takes.
+def _continued(
+    labels: NDArray[np.int64], allowed: Mask, taken: Mask, tol: OffsetTolerances
+) -> NDArray[np.int64]:
+    """Labels carried on to cells near them where they are ``allowed`` (G, H, W) and none is taken.
 
     Beside a face, where the views show no part, there is nothing that a label could wrongly carve;
     but the first surface may stand there in a rim as wide as the silhouettes are unsure.
@@ -642,7 +653,8 @@ def _continued(labels: NDArray[np.int64], taken: Mask, tol: OffsetTolerances) ->
         return labels
     distance, nearest = ndimage.distance_transform_edt(labels == NO_FACE, return_indices=True)
     carried = labels[tuple(nearest)]
-    return np.where((distance <= tol.min_radius_cells) & ~taken, carried, labels)
+    free = np.take_along_axis(allowed, carried[None], axis=0)[0] & ~taken
+    return np.where((distance <= tol.min_radius_cells) & free, carried, labels)
 
 
 def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
