@@ -45,7 +45,12 @@ from polmvs.surface.surface_quality import (
     supported_faces,
 )
 from polmvs.surface.surface_view import SurfaceView, surface_view
-from polmvs.surface.visual_hull import HullTolerances, Plane, supporting_plane, visual_hull
+from polmvs.surface.visual_hull import (
+    HullTolerances,
+    Plane,
+    supporting_plane,
+    visual_hull,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -108,7 +113,8 @@ class Undetermined:
 def num_surface_steps(num_views: int) -> int:
     """How often :func:`reconstruct_surface` and the rendering of its views report at most."""
     tolerances = RefinementTolerances()
-    refinement = sum(level.num_steps for level in tolerances.levels + tolerances.thin_levels)
+    levels = tolerances.levels + tolerances.thin_levels
+    refinement = sum(level.num_steps * (1 + level.with_slope) for level in levels)
     return refinement + 2 * NUM_FINAL_STEPS + num_views
 
 
@@ -232,6 +238,11 @@ def _surface(
     rows = AngleModel.OPA if angle_model is AngleModel.OPA else AngleModel.PPA
     known = KnownPoints(seeds.points_in_world, seeds.sigma)
     meshes.append(hull.mesh)
+    hollows = _hollows(given, hull.mesh, hull.footprint)
+    if hollows:
+        # Phases of what sees only itself would be dug after.
+        still = tuple(replace(level, with_slope=False) for level in tolerances.levels)
+        tolerances = replace(tolerances, levels=still)
     refined = refine(
         hull.mesh,
         given.views,
@@ -244,9 +255,8 @@ def _surface(
     )
     mesh = refined.mesh
     views = [replace(view, tilt_share=refined.tilt_share) for view in given.views]
-    hollows = _hollows(
-        (mesh, hull.mesh), hull.footprint, maps, angle_model, tilt_aware, given.folder
-    )
+    # A refined outer wall places the inner one better than the hull's.
+    hollows = _hollows(given, mesh, hull.footprint) or hollows
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
     if carvings and len(mesh.faces):
@@ -295,29 +305,20 @@ def _surface(
     return surface, meshes
 
 
-def _hollows(
-    meshes: Sequence[TriangleMesh],
-    footprint: float,
-    maps: Sequence[PhaseMap],
-    angle_model: AngleModel,
-    tilt_aware: bool,
-    folder: Path | None,
-) -> tuple[Hollow, ...]:
-    """Hollows of the first of some meshes that has any: a refined outer wall places the inner."""
-    for mesh in meshes:
-        if not len(mesh.faces):
-            continue
-        faces = SurfaceFaces(
-            mesh.centers,
-            mesh.face_normals,
-            mesh.face_areas,
-            RayScene(mesh).signed_distance,
-            footprint,
-        )
-        found = find_hollows(faces, maps, angle_model, tilt_aware=tilt_aware, folder=folder)
-        if found:
-            return tuple(found)
-    return ()
+def _hollows(given: _Given, mesh: TriangleMesh, footprint: float) -> tuple[Hollow, ...]:
+    """Hollows of a mesh that see only themselves."""
+    if not len(mesh.faces):
+        return ()
+    faces = SurfaceFaces(
+        mesh.centers,
+        mesh.face_normals,
+        mesh.face_areas,
+        RayScene(mesh).signed_distance,
+        footprint,
+    )
+    return find_hollows(
+        faces, given.maps, given.angle_model, tilt_aware=given.tilt_aware, folder=given.folder
+    )
 
 
 def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:

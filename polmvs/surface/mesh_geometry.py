@@ -202,6 +202,8 @@ class RayScene:
         points : (N, 3).
         num_rays : odd, up to 3, whose majority decides: one may graze an edge.
         """
+        if not len(points):  # Open3D crashes on none
+            return np.zeros(0, np.float32)
         local = self._local(points)
         distance = np.asarray(self._scene.compute_distance(self._tensor(local)).numpy(), np.float32)
         votes = np.zeros(len(points), np.int64)

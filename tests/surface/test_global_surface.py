@@ -143,7 +143,7 @@ def test_thin_walls_are_found_by_a_finer_mesh():
     x, y = np.meshgrid([-0.4, 0.0, 0.4], [-0.4, 0.0, 0.4])
     inner = np.stack([x, y, 1.3 - np.sqrt(1.53**2 - x**2 - y**2)], axis=-1).reshape(-1, 3)
     place, _, _ = RayScene(found.mesh.only(found.supported)).closest(inner)
-    assert np.linalg.norm(place - inner, axis=1).max() < 1.2 * FOOTPRINT
+    assert np.linalg.norm(place - inner, axis=1).max() < 1.5 * FOOTPRINT
 
 
 def with_regions(maps, inside):

@@ -85,6 +85,7 @@ def test_distances_and_hits_far_from_the_origin():
     scene = RayScene(TriangleMesh(mesh.vertices + far, mesh.faces))
     points = far + np.array([[0.0, 0, 0.5], [0, 0, 2.0]])
     assert scene.signed_distance(points) == pytest.approx([-0.5, 1.0], abs=0.01)
+    assert scene.signed_distance(points[:0]).shape == (0,)  # on which Open3D crashes
     hits = scene.cast(far + np.array([0, 0, 5.0]), np.array([[0, 0, -1.0], [0, 0, 1.0]]))
     assert hits.distance[0] == pytest.approx(4.0, abs=0.01)
     assert hits.face[1] == -1

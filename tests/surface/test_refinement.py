@@ -24,6 +24,7 @@ from polmvs.surface.refinement import (
     refine,
     shared_edges,
     solve,
+    unexplained_share,
 )
 from polmvs.surface.surface_quality import point_offset
 from polmvs.surface.surface_view import Silhouette, surface_view
@@ -231,6 +232,35 @@ def test_outliers_among_known_points_lose(ball):
     hull = visual_hull(ball, num_wrong=0)
     mesh = refine(hull.mesh, ball, PPA, hull.footprint, known=known, tolerances=QUICK).mesh
     assert np.linalg.norm(mesh.vertices, axis=1).min() > 0.95
+
+
+def test_what_explains_the_phases_better_is_less_unexplained(ball):
+    right, low, small = (
+        unexplained_share(extracted(shape, step=0.08), ball, PPA)
+        for shape in (sphere(), sphere(center=(0, 0, -0.3)), sphere(0.8))
+    )
+    assert right < 0.1
+    assert low > 2 * right
+    assert small > 0.3  # uncovered: a third of the disc
+
+
+def test_the_better_of_two_ways_is_taken():
+    """With the slope of the phases the floor of this dent ends ten pixels too high."""
+    dent = sphere(1.2, (0, 0, 1.3))
+
+    def dented(p):
+        body = 0.6 * (np.linalg.norm(p / [1, 1, 0.6], axis=-1) - 1.1)
+        return np.max([body, p[..., 2] - 0.3, -dent(p)], axis=0)
+
+    views = views_of(dented, ring_of_views(14, elevations=(30.0, 55.0)))
+    hull = visual_hull(views)
+    levels = RefinementTolerances().levels[:1]
+    assert levels[0].with_slope
+    tolerances = replace(RefinementTolerances(), levels=levels)
+    mesh = refine(hull.mesh, views, PPA, hull.footprint, tolerances=tolerances).mesh
+    middle = np.linalg.norm(mesh.centers[:, :2], axis=1) < 0.3
+    floor = mesh.centers[middle & (mesh.face_normals[:, 2] > 0.5)]
+    assert np.abs(floor[:, 2] - 0.1).mean() < 4 * FOOTPRINT
 
 
 def test_progress_is_whole(ball):
