@@ -33,7 +33,7 @@ from polmvs.surface.dense_view import DenseView
 
 DenseViews = Sequence[DenseView | None]
 
-SCHEMA_VERSION = 2  # of ``metrics.json``; 1: the first releases, which did not name it
+SCHEMA_VERSION = 3  # of ``metrics.json``; 1: the first releases, which did not name it; 2: 0.2.0
 
 
 @dataclass(frozen=True, kw_only=True)

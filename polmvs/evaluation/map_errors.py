@@ -29,7 +29,6 @@ Mask = NDArray[np.bool_]
 
 # These define the figures; they are no tolerances of an algorithm.
 WITHIN_M = 0.001
-WITHIN_SIGMAS = 2.0
 WHOLE_SHARE = 0.999  # of the pixels about a lattice point; interpolation rounds
 MAX_SLOPE = 20.0  # depth per width of a pixel's footprint: a surface seen under 3 deg, or a step
 
@@ -52,7 +51,8 @@ class MapErrors:
     normals : angles between normals and truth.
     sigma_ratio_median : median of the range's absolute error over its standard deviation; 0.67
         where errors are normal and the deviations true.
-    within_two_sigma : share of the errors below two standard deviations; 0.95 likewise.
+    within_one_sigma, within_two_sigma : shares of the errors below one and two standard
+        deviations; 0.68 and 0.95 likewise.
     """
 
     num_pixels: int
@@ -65,6 +65,7 @@ class MapErrors:
     depth_within_1mm: float
     normals: AngleStats
     sigma_ratio_median: float
+    within_one_sigma: float
     within_two_sigma: float
 
 
@@ -230,7 +231,8 @@ def _summary(views: Sequence[LatticeErrors]) -> MapErrors:
         depth_within_1mm=_mean(size < WITHIN_M),
         normals=AngleStats.from_degrees(pooled(lambda one: one.normal_deg)),
         sigma_ratio_median=float(np.median(ratio)) if len(ratio) else float("nan"),
-        within_two_sigma=_mean(ratio < WITHIN_SIGMAS),
+        within_one_sigma=_mean(ratio < 1),
+        within_two_sigma=_mean(ratio < 2),
     )
 
 

@@ -12,6 +12,7 @@ from polmvs.evaluation.metrics import AngleStats, CloudMetrics
 
 if TYPE_CHECKING:
     from polmvs.evaluation.comparison import Comparison, ModelFigures, PhaseFigures, TruthFigures
+    from polmvs.evaluation.map_errors import MapErrors
 
 NONE = "-"
 
@@ -120,6 +121,10 @@ def _truth_rows(
             *[number(m.depth_within_1mm if m else None, 100, 1) for m in maps],
         ],
         [
+            "depth errors within one / two stated deviations, %",
+            *[_within_sigmas(m) if m else number(None) for m in maps],
+        ],
+        [
             "normal maps, mean / median error, deg",
             *[mean_and_median(m.normals if m else None) for m in maps],
         ],
@@ -127,6 +132,11 @@ def _truth_rows(
     for same in zip(*(cloud_rows(f.cloud) for f in figures), strict=True):
         rows.append([same[0][0], *[row[1] for row in same]])
     return rows
+
+
+def _within_sigmas(errors: MapErrors) -> str:
+    shares = (errors.within_one_sigma, errors.within_two_sigma)
+    return " / ".join(number(share, 100, 0) for share in shares)
 
 
 def cloud_rows(cloud: CloudMetrics) -> list[list[str]]:

@@ -35,6 +35,7 @@ from polmvs.surface.refinement import (
 )
 from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.surface_quality import (
+    MAX_SHARE,
     Contradictions,
     FaceEvidence,
     face_evidence,
@@ -44,7 +45,7 @@ from polmvs.surface.surface_quality import (
     supported_faces,
 )
 from polmvs.surface.surface_view import SurfaceView, surface_view
-from polmvs.surface.visual_hull import supporting_plane, visual_hull
+from polmvs.surface.visual_hull import HullTolerances, Plane, supporting_plane, visual_hull
 
 logger = logging.getLogger(__name__)
 
@@ -106,8 +107,9 @@ class Undetermined:
 
 def num_surface_steps(num_views: int) -> int:
     """How often :func:`reconstruct_surface` and the rendering of its views report at most."""
-    refinement = sum(level.num_steps for level in RefinementTolerances().levels)
-    return refinement + NUM_FINAL_STEPS + num_views
+    tolerances = RefinementTolerances()
+    refinement = sum(level.num_steps for level in tolerances.levels + tolerances.thin_levels)
+    return refinement + 2 * NUM_FINAL_STEPS + num_views
 
 
 def reconstruct_surface(
@@ -137,10 +139,9 @@ def reconstruct_surface(
     min_views : that must bear out a part.
     tolerances : of the refinement.
     on_progress : called with 1 after each step.
-    on_mesh : called with the hull, and with the mesh after each level of its refinement.
+    on_mesh : called at the end with the hull, and with the mesh after each level of its refinement.
     folder : where what is made of each view is kept meanwhile; None: in memory.
     """
-    report = on_progress if on_progress is not None else lambda count: None
     views = [
         surface_view(
             phase_map,
@@ -153,10 +154,66 @@ def reconstruct_surface(
     ]
     if reason := _no_hull(views):
         return Undetermined(reason)
-    plane = supporting_plane(surroundings, np.array([view.center for view in views]))
-    hull = visual_hull(views, plane)
+    given = _Given(
+        angle_model=angle_model,
+        tilt_aware=tilt_aware,
+        maps=maps,
+        views=views,
+        seeds=seeds,
+        plane=supporting_plane(surroundings, np.array([view.center for view in views])),
+        min_views=min_views,
+        folder=folder,
+        report=on_progress if on_progress is not None else lambda count: None,
+    )
+    tolerances, hull_tolerances = tolerances or RefinementTolerances(), HullTolerances()
+    found, meshes = _surface(given, hull_tolerances, tolerances)
+    if tolerances.thin_levels and _unexplained_share(found) > MAX_SHARE:
+        logger.info("much of the silhouettes stays uncovered; walls may be thin: once more, finer.")
+        fine = replace(hull_tolerances, step_px=0.5 * hull_tolerances.step_px)
+        thin = replace(tolerances, levels=tolerances.thin_levels)
+        again, fine_meshes = _surface(given, fine, thin)
+        if _unexplained_share(again) < _unexplained_share(found):
+            found, meshes = again, fine_meshes
+    if on_mesh is not None:
+        for mesh in meshes:
+            on_mesh(mesh)
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Given:
+    """What a surface is made from; the names are those of :func:`reconstruct_surface`."""
+
+    angle_model: AngleModel
+    tilt_aware: bool
+    maps: Sequence[PhaseMap]
+    views: Sequence[SurfaceView]
+    seeds: Seeds
+    plane: Plane | None
+    min_views: int
+    folder: Path | None
+    report: OnProgress
+
+
+def _unexplained_share(found: GlobalSurface | Undetermined) -> float:
+    """Mean share of the silhouettes that a surface does not cover; 1 without one."""
+    return 1.0 if isinstance(found, Undetermined) else found.contradictions.uncovered_share
+
+
+def _surface(
+    given: _Given, hull_tolerances: HullTolerances, tolerances: RefinementTolerances
+) -> tuple[GlobalSurface | Undetermined, list[TriangleMesh]]:
+    """The surface, with the hull and the mesh after each level of its refinement."""
+    maps, seeds, angle_model, tilt_aware = (
+        given.maps,
+        given.seeds,
+        given.angle_model,
+        given.tilt_aware,
+    )
+    meshes: list[TriangleMesh] = []
+    hull = visual_hull(given.views, given.plane, tolerances=hull_tolerances)
     if not len(hull.mesh.faces):
-        return Undetermined("the polarised regions of the views have no common object")
+        return Undetermined("the polarised regions of the views have no common object"), meshes
     logger.info("visual hull: %d vertices.", len(hull.mesh.vertices))
     steps = stepped_faces(
         find_faces(seeds),
@@ -166,7 +223,7 @@ def reconstruct_surface(
         tilt_aware=tilt_aware,
         signed_distance=RayScene(hull.mesh).signed_distance,
         first_hit=_first_hit(hull.mesh),
-        folder=folder,
+        folder=given.folder,
     )
     if steps:
         logger.info("%d groups of faces that silhouettes do not tell apart.", len(steps))
@@ -174,22 +231,22 @@ def reconstruct_surface(
     # Rows of a tilted map are those of PPA: its samples are corrected.
     rows = AngleModel.OPA if angle_model is AngleModel.OPA else AngleModel.PPA
     known = KnownPoints(seeds.points_in_world, seeds.sigma)
-    tolerances = tolerances or RefinementTolerances()
-    if on_mesh is not None:
-        on_mesh(hull.mesh)
+    meshes.append(hull.mesh)
     refined = refine(
         hull.mesh,
-        views,
+        given.views,
         rows,
         hull.footprint,
         known=known,
         tolerances=tolerances,
-        on_progress=on_progress,
-        on_level=on_mesh,
+        on_progress=given.report,
+        on_level=meshes.append,
     )
     mesh = refined.mesh
-    views = [replace(view, tilt_share=refined.tilt_share) for view in views]
-    hollows = _hollows((mesh, hull.mesh), hull.footprint, maps, angle_model, tilt_aware, folder)
+    views = [replace(view, tilt_share=refined.tilt_share) for view in given.views]
+    hollows = _hollows(
+        (mesh, hull.mesh), hull.footprint, maps, angle_model, tilt_aware, given.folder
+    )
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
     if carvings and len(mesh.faces):
@@ -201,29 +258,29 @@ def reconstruct_surface(
             smoothing=0,
         )
     if not len(mesh.faces):
-        return Undetermined("the surface vanishes under the phases of the views")
+        return Undetermined("the surface vanishes under the phases of the views"), meshes
     row_error, median = median_residual(mesh, views, rows)
     row_sigma = max(row_error.direct, tolerances.row_sigma)
     fitted = fit_normals(mesh, views, rows, row_sigma=row_sigma)
     normals = sided_normals(mesh, fitted.normals, fitted.is_fitted)
     mesh = sharpened(mesh, normals)
-    report(1)
+    given.report(1)
     evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
-    supported = supported_faces(mesh, evidence, min_views=min_views)
-    seen = evidence.num_views >= min_views
+    supported = supported_faces(mesh, evidence, min_views=given.min_views)
+    seen = evidence.num_views >= given.min_views
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     presumed = seen & ~supported & _lie_on(mesh, [hollow.values for hollow in hollows])
     supported |= presumed
-    report(1)
+    given.report(1)
     sigma = _deviations(mesh, views, rows, hull.footprint, known)
-    report(1)
+    given.report(1)
     offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, hull.footprint)
     contradictions = replace(
         find_contradictions(mesh, evidence, supported, views, median),
         point_offset_px=offset_px,
         point_offset_sigmas=offset_sigmas,
     )
-    return GlobalSurface(
+    surface = GlobalSurface(
         mesh=mesh,
         supported=supported,
         evidence=evidence,
@@ -235,6 +292,7 @@ def reconstruct_surface(
         presumed=presumed,
         tilt_share=refined.tilt_share,
     )
+    return surface, meshes
 
 
 def _hollows(

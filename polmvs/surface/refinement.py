@@ -60,6 +60,9 @@ class RefinementTolerances:
     ----------
     levels : coarse to fine. The third, of 2 px, is for edges: F at 1 mm of `board` 99.5 -> 99.9, of
         `step` 95.3 -> 96.3, for half as much time again.
+    thin_levels : instead, where walls are thinner than the coarse edges, so that the mesh loses
+        them: one of half as long edges, with as many steps as the same way takes and half as many
+        again. Measured: a bowl with walls of 3 px, F at 1 mm 2 -> 91 %.
     row_sigma : deviation of ``m . n`` that noise does not explain (interreflection, mixed light,
         facets). Measured: 0.03.
     independent_px : area over which phases err alike, px^2; smaller faces count by their area.
@@ -96,6 +99,10 @@ class RefinementTolerances:
         Level(edge_px=6.0, num_steps=18, loss_scale=12.0, rim_gate_px=25.0),
         Level(edge_px=3.0, num_steps=4, loss_scale=6.0, rim_gate_px=8.0),
         Level(edge_px=2.0, num_steps=3, loss_scale=4.0, rim_gate_px=4.0),
+    )
+    thin_levels: tuple[Level, ...] = (
+        Level(edge_px=3.0, num_steps=60, loss_scale=12.0, rim_gate_px=25.0),
+        Level(edge_px=2.0, num_steps=5, loss_scale=4.0, rim_gate_px=4.0),
     )
     row_sigma: float = 0.03
     independent_px: float = 4.0

@@ -25,6 +25,7 @@ Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 MAX_SIGMAS = 3.0  # of one figure, before it is called a contradiction
+MAX_SHARE = 0.1  # of a surface or its silhouettes in contradiction. Guess
 MIN_POINTS = 10  # on the surface, for their median to be one
 POINT_REACH_PX = 4.0  # of the surface; what lies farther is not on it
 CHUNK, MAX_ROWS = 20_000, 500_000  # faces, and those times views, at a time; bounds memory
@@ -295,17 +296,17 @@ class Contradictions:
     def warnings(self) -> list[str]:
         """Sentences for what a user should know; none if the surface fits its data."""
         found = []
-        if self.contradicted_share > 0.1:
+        if self.contradicted_share > MAX_SHARE:
             found.append(
                 f"on {self.contradicted_share:.0%} of the surface most phases contradict it; "
                 "these parts are left out"
             )
-        if self.denied_share > 0.1:
+        if self.denied_share > MAX_SHARE:
             found.append(
                 f"{self.denied_share:.0%} of the surface lies outside of the silhouettes of views "
                 "that see it; these parts are left out"
             )
-        if self.uncovered_share > 0.1:
+        if self.uncovered_share > MAX_SHARE:
             found.append(
                 f"{self.uncovered_share:.0%} of the polarised regions are not covered by the "
                 "surface: views contradict each other, or a part is missing"

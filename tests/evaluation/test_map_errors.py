@@ -109,6 +109,7 @@ def test_an_offset_of_the_range_in_units_of_its_sigma(plane: ExactTruth, offset_
 
     errors = map_errors(scrambled(scale), changed(scale, change), plane)
     assert errors.sigma_ratio_median == pytest.approx(abs(offset_m) / sigma_m, rel=1e-3)
+    assert errors.within_one_sigma == (1 if abs(offset_m) < sigma_m else 0)
     assert errors.within_two_sigma == (1 if abs(offset_m) < 2 * sigma_m else 0)
     # Depth errs by z / range of it: 0.78 at the corners of the image.
     assert 0.78 * abs(offset_m) < abs(errors.depth_bias_m) < abs(offset_m)
@@ -180,7 +181,7 @@ def test_views_without_a_map_count_against_coverage(plane: ExactTruth) -> None:
     none = map_errors(scrambled(1.0), [None] * 6, plane)
     assert (none.coverage, none.num_pixels, none.normals.count) == (0, 0, 0)
     figures = (none.outside, none.depth_rmse_m, none.depth_median_m, none.depth_within_1mm)
-    assert np.isnan([*figures, none.sigma_ratio_median, none.within_two_sigma]).all()
+    assert np.isnan([*figures, none.sigma_ratio_median, none.within_one_sigma]).all()
 
 
 def test_values_beside_the_part(plane: ExactTruth) -> None:
@@ -242,6 +243,7 @@ def test_comparison_tells_of_the_maps(demo_run: Path) -> None:
     for name in (
         "depth maps, RMSE, mm",
         "depth maps within 1 mm, %",
+        "depth errors within one / two stated deviations, %",
         "normal maps, mean / median error, deg",
     ):
         assert any(digit in rows[name] for digit in "0123456789")

@@ -117,6 +117,35 @@ def test_several_objects():
     assert np.median(np.abs(pair(found.mesh.vertices))) < FOOTPRINT
 
 
+def dish(radius=1.6, wall=0.07, rim=0.2):
+    """A part of a ball's shell, its lowest point 0.3 below the origin; walls of two pixels."""
+
+    def distance(p):
+        shell = np.linalg.norm(p - [0, 0, radius - 0.3], axis=-1) - radius + wall / 2
+        return np.maximum(np.abs(shell) - wall / 2, p[..., 2] - rim)
+
+    return distance
+
+
+def test_thin_walls_are_found_by_a_finer_mesh():
+    """Edges of 6 px jump over a wall of two; what stays uncovered tells, and it is made again."""
+    maps = phase_maps_of(dish(), ring_of_views(16, elevations=(25.0, 50.0)))
+    once = reconstruct_surface(
+        PPA, maps, NO_SEEDS, NOTHING, tolerances=RefinementTolerances(thin_levels=())
+    )
+    assert not isinstance(once, Undetermined)
+    assert once.contradictions.uncovered_share > 0.5
+    steps = []
+    found = reconstruct_surface(PPA, maps, NO_SEEDS, NOTHING, on_progress=steps.append)
+    assert not isinstance(found, Undetermined)
+    assert found.contradictions.uncovered_share < 0.1
+    assert sum(steps) <= num_surface_steps(len(maps))
+    x, y = np.meshgrid([-0.4, 0.0, 0.4], [-0.4, 0.0, 0.4])
+    inner = np.stack([x, y, 1.3 - np.sqrt(1.53**2 - x**2 - y**2)], axis=-1).reshape(-1, 3)
+    place, _, _ = RayScene(found.mesh.only(found.supported)).closest(inner)
+    assert np.linalg.norm(place - inner, axis=1).max() < 1.2 * FOOTPRINT
+
+
 def with_regions(maps, inside):
     none = np.zeros(inside.shape, bool)
     return [replace(m, region=Region(inside, inside, none)) for m in maps]
