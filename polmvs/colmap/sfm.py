@@ -39,6 +39,7 @@ from polmvs.colmap.models import (
     write_reconstruction,
 )
 from polmvs.colmap.pairs import choose_pairs, read_pairs
+from polmvs.colmap.thinning import thin_database
 from polmvs.config import Mapper, SfmOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.images import read_gray
@@ -84,6 +85,8 @@ class SfmTolerances:
     min_views_principal_point : from which the principal point is freed; measured: of three views
         two captures of three got worse, of four none.
     max_principal_point_shift : of the image's width; a guess, more is an estimate gone astray.
+    min_pair_matches : that each pair keeps where the mapper is given fewer; twice what COLMAP asks
+        of the pair that it begins with. Measured: docs/scale.md.
     max_images_two_view_tracks : up to which tracks of two views count; a guess: with few images
         most tracks have two views only, with more those are mostly mismatches.
     focal_range : focal lengths that are believed, in widths of the image: 136 to 6 degrees.
@@ -99,6 +102,7 @@ class SfmTolerances:
     model_growth: float = 1.3
     min_views_principal_point: int = 4
     max_principal_point_shift: float = 0.1
+    min_pair_matches: int = 200
     max_images_two_view_tracks: int = 5
     focal_range: tuple[float, float] = (0.2, 10.0)
     corner_tolerance: float = 0.15
@@ -159,9 +163,7 @@ def run_sfm(
         if given is None or not given.has_matches or options.pairs is not None:
             _match(database, to_match, options)
         on_progress("mapping")
-        reconstruction = _map(
-            database, image_folder, work_folder / "models", to_match, options, tolerances
-        )
+        reconstruction = _map(database, image_folder, work_folder, to_match, options, tolerances)
         on_progress("bundle adjustment")
         single = options.single_camera if given is None else given.num_cameras == 1
         reconstruction = _refine(
@@ -455,25 +457,33 @@ def _global_options(
 def _map(
     database: Path,
     image_folder: Path,
-    models: Path,
+    work_folder: Path,
     names: Sequence[str],
     options: SfmOptions,
     tolerances: SfmTolerances,
 ) -> pycolmap.Reconstruction:
-    """The largest model of the images that the mapper makes."""
-    shutil.rmtree(models, ignore_errors=True)
-    models.mkdir()
-    paths = (database, image_folder, models)
-    if options.mapper is Mapper.GLOBAL:
-        found = pycolmap.global_mapping(*paths, _global_options(names, options, tolerances))
-    else:
-        found = pycolmap.incremental_mapping(*paths, _mapper_options(names, options, tolerances))
-    shutil.rmtree(models)
+    """The largest model of the images that the mapper makes.
+
+    Where matches abound it finds the poses from a part of them, if that registers every image.
+    """
+    thinned = work_folder / "mapping.db"
+    thinned.unlink(missing_ok=True)
+    models = work_folder / "models"
+    if thin_database(database, thinned, tolerances.min_pair_matches, seed=options.seed):
+        found = _models(thinned, image_folder, models, names, options, tolerances)
+        thinned.unlink()
+        if found and found[0].num_reg_images() == len(names):
+            models.mkdir()
+            mapper = _mapper_options(names, options, tolerances)
+            whole = pycolmap.triangulate_points(
+                found[0], database, image_folder, models, options=mapper
+            )
+            shutil.rmtree(models)
+            return whole
+    found = _models(database, image_folder, models, names, options, tolerances)
     if not found:
         raise NoModelError(image_folder, f"SfM finds no model of these images. {NO_MODEL_REMEDY}")
-    largest: pycolmap.Reconstruction = max(
-        found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D())
-    )
+    largest = found[0]
     if largest.num_reg_images() < 2:
         raise NoModelError(image_folder, f"SfM registers one image only. {NO_MODEL_REMEDY}")
     if len(found) > 1 and largest.num_reg_images() < len(names):
@@ -484,6 +494,28 @@ def _map(
             len(names),
         )
     return largest
+
+
+def _models(
+    database: Path,
+    image_folder: Path,
+    models: Path,
+    names: Sequence[str],
+    options: SfmOptions,
+    tolerances: SfmTolerances,
+) -> list[pycolmap.Reconstruction]:
+    """What the mapper makes of a database, the largest model first."""
+    shutil.rmtree(models, ignore_errors=True)
+    models.mkdir()
+    paths = (database, image_folder, models)
+    if options.mapper is Mapper.GLOBAL:
+        found = pycolmap.global_mapping(*paths, _global_options(names, options, tolerances))
+    else:
+        found = pycolmap.incremental_mapping(*paths, _mapper_options(names, options, tolerances))
+    shutil.rmtree(models)
+    return sorted(
+        found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), reverse=True
+    )
 
 
 def _refine(

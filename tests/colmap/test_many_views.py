@@ -10,7 +10,7 @@ import pytest
 from printed_images import CAMERA, INTRINSICS, write_printed_images
 
 from polmvs.colmap.database import check_database
-from polmvs.colmap.sfm import run_sfm
+from polmvs.colmap.sfm import SfmTolerances, run_sfm
 from polmvs.config import SfmOptions
 from polmvs.errors import DataError
 from polmvs.geometry import align_points
@@ -34,11 +34,12 @@ def retrieved(capture, tmp_path_factory):
     return model, work / "database.db"
 
 
-def sfm(capture, work, **options):
+def sfm(capture, work, *, min_pair_matches=200, **options):
     folder, views = capture
     names = [view.name for view in views]
     given = SfmOptions(**{"intrinsics": INTRINSICS, **options})
-    return run_sfm(folder, names, work / "work", work / "sparse", given)
+    tolerances = SfmTolerances(min_pair_matches=min_pair_matches)
+    return run_sfm(folder, names, work / "work", work / "sparse", given, tolerances=tolerances)
 
 
 def change(database, *statements):
@@ -112,12 +113,29 @@ def test_database_without_matches_or_with_more_pairs(capture, retrieved, tmp_pat
 
 
 def test_global_mapper(capture, retrieved, tmp_path):
-    """As exact as the incremental one, and the same twice."""
+    """As exact as the incremental one of fewer matches too, and the same twice."""
     if not hasattr(pycolmap, "global_mapping"):
         pytest.skip("pycolmap before 4.1")
-    one = sfm(capture, tmp_path / "one", database=retrieved[1], mapper="global")
+    options = {"database": retrieved[1], "mapper": "global", "min_pair_matches": 30}
+    one = sfm(capture, tmp_path / "one", **options)
     assert np.median(center_errors_mm(one, capture[1])) < 1.0
-    assert_same(one, sfm(capture, tmp_path / "two", database=retrieved[1], mapper="global"))
+    assert_same(one, sfm(capture, tmp_path / "two", **options))
+
+
+def test_mapping_of_fewer_matches(capture, retrieved, tmp_path):
+    """All points come back, the cameras are as exact, and twice the same."""
+    options = {"database": retrieved[1], "min_pair_matches": 30}
+    one = sfm(capture, tmp_path / "one", **options)
+    assert np.median(center_errors_mm(one, capture[1])) < 1.0
+    num_points = len(retrieved[0].tracks.point3D_ids)
+    assert len(one.tracks.point3D_ids) == pytest.approx(num_points, rel=0.1)
+    assert_same(one, sfm(capture, tmp_path / "two", **options))
+
+
+def test_too_few_matches_to_map_are_not_all(capture, retrieved, tmp_path):
+    """Where the mapper cannot do with a part of them it gets the rest."""
+    model = sfm(capture, tmp_path, database=retrieved[1], min_pair_matches=2)
+    assert_same(model, retrieved[0])
 
 
 def test_names_with_blanks(capture, tmp_path):
