@@ -1,7 +1,13 @@
 """The bundled capture, one finished run of it, and the command line as a function."""
 
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+
+# Before numpy is imported, here and in what tests start: with a process for each core, threads of
+# linear algebra wait for each other and take twice the time.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 
@@ -21,10 +27,27 @@ def demo_capture() -> Path:
 
 @pytest.fixture(scope="session")
 def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output folder of ``polmvs demo``; tests that change it take a copy."""
+    """Output folder of ``polmvs demo``; tests that change it take a copy.
+
+    Of several processes of pytest-xdist one makes it, and each has a copy.
+    """
     out = tmp_path_factory.mktemp("demo") / "out"
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        make_demo_run(out)
+        return out
+    import fcntl
+
+    shared = tmp_path_factory.getbasetemp().parent / "demo"
+    with shared.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not shared.with_suffix(".done").exists():
+            make_demo_run(shared)
+            shared.with_suffix(".done").touch()
+    return Path(shutil.copytree(shared, out))
+
+
+def make_demo_run(out: Path) -> None:
     assert main(["demo", str(out), "--workers", "2"]) == 0
-    return out
 
 
 @pytest.fixture

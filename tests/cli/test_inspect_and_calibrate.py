@@ -1,6 +1,7 @@
 """``polmvs inspect`` and ``polmvs calibrate`` end to end."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -122,13 +123,16 @@ def test_frames_that_cannot_be_used(cli, tmp_path):
 
 
 def test_calibrate_camera_needs_a_board(cli, demo_capture, tmp_path):
-    out = tmp_path / "camera.txt"
-    status, _, err = cli("calibrate", "camera", demo_capture, out)
+    out, folder = tmp_path / "camera.txt", tmp_path / "capture"
+    folder.mkdir()
+    for path in sorted((demo_capture / "raw").iterdir())[:3]:
+        shutil.copy(path, folder)
+    status, _, err = cli("calibrate", "camera", folder, out)
     assert status == 2
     assert "squares" in err
-    status, _, err = cli("calibrate", "camera", demo_capture, out, "--cols", 9, "--rows", 7)
+    status, _, err = cli("calibrate", "camera", folder, out, "--cols", 9, "--rows", 7)
     assert status == 1
-    assert "0 of 10 pictures" in err
+    assert "0 of 3 pictures" in err
     assert not out.exists()
 
 

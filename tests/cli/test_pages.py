@@ -15,14 +15,20 @@ def run_copy(demo_run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(demo_run, tmp_path / "run"))
 
 
-def test_report_makes_the_page_again(cli, run_copy: Path) -> None:
+def test_report_makes_the_page_again_and_escapes_names(cli, run_copy: Path) -> None:
     page = run_copy / "report.html"
+    record = json.loads((run_copy / "run.json").read_text())
+    record["command_line"] = ["polmvs", "<script>alert(1)</script>"]
+    record["stages"][0]["warnings"] = ["a <b>bold</b> warning"]
+    (run_copy / "run.json").write_text(json.dumps(record))
     assert cli("report", run_copy)[0] == 0  # of the record as it is now
     first = page.read_bytes()
     page.unlink()
     status, text, _ = cli("report", run_copy)
     assert (status, text.strip()) == (0, str(page))
     assert page.read_bytes() == first
+    assert b"<script>alert(1)" not in first
+    assert b"a &lt;b&gt;bold&lt;/b&gt; warning" in first
 
 
 def test_report_says_what_came_out(demo_run: Path) -> None:
@@ -48,17 +54,6 @@ def test_report_without_the_capture_and_the_truth(cli, run_copy: Path) -> None:
     text = (run_copy / "report.html").read_text()
     assert "residual phase" in text
     assert "depth error" not in text
-
-
-def test_names_are_escaped(cli, run_copy: Path) -> None:
-    record = json.loads((run_copy / "run.json").read_text())
-    record["command_line"] = ["polmvs", "<script>alert(1)</script>"]
-    record["stages"][0]["warnings"] = ["a <b>bold</b> warning"]
-    (run_copy / "run.json").write_text(json.dumps(record))
-    assert cli("report", run_copy)[0] == 0
-    text = (run_copy / "report.html").read_text()
-    assert "<script>alert(1)" not in text
-    assert "a &lt;b&gt;bold&lt;/b&gt; warning" in text
 
 
 @pytest.mark.parametrize("command", ["report", "view"])

@@ -17,6 +17,7 @@ from pages import DATA, ROOT, RUN, Block, blocks, pages
 from polmvs.cli import main
 
 RECONSTRUCT = "polmvs reconstruct capture out --intrinsics 333.75,333.75,230.6475,196.608"
+TESTS = "pytest -q -n 2 --dist loadfile"
 # Commands that other tests and .ci/run run as they stand here, and where.
 RUN_ELSEWHERE = {
     "polmvs demo": "tests/conftest.py",
@@ -25,7 +26,7 @@ RUN_ELSEWHERE = {
     "pip install '.[docs]'": "tests/docs/test_site.py",
     "pip install '.[dev]'": ".ci/run",
     "sphinx-build -W -n docs site": "tests/docs/test_site.py",
-    "pytest -q": ".ci/run",
+    TESTS: ".ci/run",
     RECONSTRUCT: "tests/docs/test_blocks.py",
 }
 
@@ -66,6 +67,11 @@ def workplace(
 def test_every_block_is_run_or_says_why_not(page: Path) -> None:
     for block in blocks(page):
         assert block.kind in (*RUN, *DATA), f"{block.kind!r}:\n{block.text}"
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", ".ci/run"])
+def test_the_command_of_the_tests_is_one(page: str) -> None:
+    assert TESTS in (ROOT / page).read_text()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}-{page.stem}")

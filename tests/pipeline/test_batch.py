@@ -15,7 +15,7 @@ from polmvs.config import AngleModel, Light, Options, PropagationOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.pipeline.batch import BatchEntry, _row_of, read_batch
 
-COARSE = ("--stride-px", 8, "--num-rounds", 1, "--no-mesh", "--no-colmap", "--workers", 2)
+COARSE = ("--method", "integrate", "--stride-px", 8, "--no-mesh", "--no-colmap", "--workers", 2)
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from polmvs.colmap.dense_workspace import (
 from polmvs.colmap.maps import DepthNormals, read_depth_map, write_depth_map
 from polmvs.colmap.models import read_model, write_model
 from polmvs.geometry import SimilarityTransform
-from polmvs.io.clouds import read_cloud, read_mesh
+from polmvs.io.clouds import read_cloud, read_mesh, write_cloud
 from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
 from polmvs.pipeline.run_folder import DENSE_MARKER
 from polmvs.poses.metric_frame import transform_model
@@ -33,6 +33,8 @@ from polmvs.surface.map_export import WarpTolerances
 BOARD_HEIGHT_M = 0.012  # of the true plane z = const, in the capture's gt/scene.json
 # A pixel is 1.3 mm on the board; SfM's poses bend and shift it by some tenths of that.
 TOLERANCE_M = 0.001
+# For what is not about the surface: one that is a quarter of the work.
+QUICK = ("--method", "integrate")
 
 # Runs a command on a copy of the finished run that was cut short, and gives the copy.
 Continue = Callable[..., Path]
@@ -129,7 +131,10 @@ def off_board(truth: GroundTruth) -> Callable[[np.ndarray], np.ndarray]:
 def test_files_and_their_record(run: Path) -> None:
     names = {path.name for path in run.iterdir()}
     assert {"ppa.ply", "ppa_mesh.ply", "dense", "normals.ply", "run.json"} <= names
-    assert stages_of(run)[-3:] == ["trust_ppa", "mesh_ppa", "dense_ppa"]
+    assert stages_of(run) == [
+        *("images", "sfm", "poses", "maps", "normals_ppa", "seeds", "sparse_cloud_ppa"),
+        *("densify_ppa", "trust_ppa", "mesh_ppa", "dense_ppa"),
+    ]
     assert Path(result_of(run, "dense_ppa")["folder"]) == run / "dense"
     assert result_of(run, "mesh_ppa")["num_triangles"] == len(
         read_mesh(run / "ppa_mesh.ply").triangles
@@ -237,14 +242,17 @@ def test_users_file_in_the_workspace_is_not_deleted(
 
 def test_mesh_command(run: Path, tmp_path: Path, cli) -> None:
     target = tmp_path / "mesh.ply"
-    status, text, err = cli("mesh", run / "ppa.ply", target)
+    cloud = read_cloud(run / "ppa.ply")
+    every_eighth = np.arange(len(cloud.points)) % 8 == 0
+    write_cloud(tmp_path / "ppa.ply", cloud.only(every_eighth))
+    status, text, err = cli("mesh", tmp_path / "ppa.ply", target)
     assert (status, err) == (0, "")
     assert text.startswith(f"{target}: ")
     assert target.read_bytes() != (run / "ppa_mesh.ply").read_bytes()  # the surface's own
     target.write_text("mine")
-    assert f"{target}: exists" in refused(cli("mesh", run / "ppa.ply", target), 2)
+    assert f"{target}: exists" in refused(cli("mesh", tmp_path / "ppa.ply", target), 2)
     assert target.read_text() == "mine"
-    assert cli("mesh", run / "ppa.ply", target, "--overwrite")[0] == 0
+    assert cli("mesh", tmp_path / "ppa.ply", target, "--overwrite")[0] == 0
     assert len(read_mesh(target).triangles) > 1000
 
 
@@ -258,11 +266,14 @@ def test_mesh_of_what_is_no_cloud(tmp_path: Path, cli) -> None:
 # Options of the cloud
 
 
-def test_voxel_in_metres_thins(go_on: Continue, run: Path, off_board) -> None:
+def test_voxel_in_metres_thins_and_there_are_no_surroundings(
+    go_on: Continue, run: Path, off_board
+) -> None:
     voxel = 0.01
-    points = surface_of(
-        read_cloud(go_on("sparse_cloud_ppa", "densify", "--voxel", voxel) / "ppa.ply")
-    )
+    out = go_on("sparse_cloud_ppa", "densify", "--voxel", voxel, "--surroundings", "none")
+    cloud = read_cloud(out / "ppa.ply")
+    points = surface_of(cloud)
+    assert len(points) == len(cloud.points) == result_of(out, "densify_ppa")["num_points"]
     before = surface_of(read_cloud(run / "ppa.ply"))
     cells = len(np.unique(np.floor(before / voxel), axis=0))
     assert 0.5 * cells < len(points) < 1.5 * cells
@@ -270,19 +281,14 @@ def test_voxel_in_metres_thins(go_on: Continue, run: Path, off_board) -> None:
 
 
 def test_more_views_must_agree(go_on: Continue, run: Path) -> None:
-    cloud = read_cloud(go_on("sparse_cloud_ppa", "densify", "--min-views", 6) / "ppa.ply")
+    out = go_on("sparse_cloud_ppa", "densify", "--min-views", 6, *QUICK)
+    cloud = read_cloud(out / "ppa.ply")
     on_surface = cloud.scalars["kind"] == PointKind.SURFACE
     assert cloud.scalars["num_views"][on_surface].min() >= 6
     before = read_cloud(run / "ppa.ply")
     fewer = before.scalars["num_views"][before.scalars["kind"] == PointKind.SURFACE]
     assert fewer.min() < 6
     assert 0 < on_surface.sum() < len(fewer)
-
-
-def test_no_surroundings(go_on: Continue, run: Path) -> None:
-    cloud = read_cloud(go_on("sparse_cloud_ppa", "densify", "--surroundings", "none") / "ppa.ply")
-    assert set(cloud.scalars["kind"]) == {PointKind.SURFACE}
-    assert len(cloud.points) == result_of(run, "densify_ppa")["num_points"]
 
 
 def test_surroundings_by_stereo(go_on: Continue, run: Path, truth: GroundTruth) -> None:
@@ -408,7 +414,7 @@ def test_in_place_changes_the_workspace_and_keeps_a_backup(
 ) -> None:
     out = shutil.copytree(filled, tmp_path / "out")
     flags = ("--workspace", own, "--workers", 1)
-    assert cli("densify", demo_capture, out, *flags, "--overwrite")[0] == 0
+    assert cli("densify", demo_capture, out, *flags, *QUICK, "--overwrite")[0] == 0
     assert not (out / "dense").exists()
     before = content_of(own)
     status, text, err = cli("export", demo_capture, out, *flags, "--in-place")
@@ -425,7 +431,7 @@ def test_in_place_changes_the_workspace_and_keeps_a_backup(
     assert {name: saved[name] for name in changed} == {name: before[name] for name in changed}
     assert len([name for name in changed if "depth_maps" in name]) == 10
     # A second time the fill cannot be told from COLMAP's own, and the user hears of it.
-    assert cli("densify", demo_capture, out, *flags, "--overwrite")[0] == 0
+    assert cli("densify", demo_capture, out, *flags, *QUICK, "--overwrite")[0] == 0
     warnings = [text for stage in record_of(out)["stages"] for text in stage["warnings"]]
     (warning,) = [text for text in warnings if f"{own}: was filled before" in text]
     assert backup.name in warning

@@ -151,6 +151,7 @@ def test_dragging_turns_both_panes(opened: Opened) -> None:
     assert opened.drawing() == before[0]
 
 
+@pytest.mark.parametrize("opened", [390], indirect=True)
 @pytest.mark.parametrize("key", ["ArrowLeft", "ArrowUp", "+", "-"])
 def test_keys_turn_and_zoom(opened: Opened, key: str) -> None:
     selector = "[data-pane=left] canvas"
@@ -162,6 +163,7 @@ def test_keys_turn_and_zoom(opened: Opened, key: str) -> None:
     assert opened.drawing() == before
 
 
+@pytest.mark.parametrize("opened", [390], indirect=True)
 def test_colours_frusta_and_layout_can_be_chosen(opened: Opened) -> None:
     page = opened.page
     assert page.locator("[data-control=color]").input_value() == "normal_error"  # there is a truth
