@@ -16,6 +16,7 @@ from polmvs.errors import DataError
 from polmvs.geometry import align_points
 
 NUM_VIEWS = 18
+ALL = 100_000  # matches of a pair
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +31,12 @@ def retrieved(capture, tmp_path_factory):
     folder, views = capture
     work = tmp_path_factory.mktemp("work")
     options = SfmOptions(intrinsics=INTRINSICS, pairs="retrieval")
-    model = run_sfm(folder, [view.name for view in views], work, work / "sparse", options)
+    names, whole = [view.name for view in views], SfmTolerances(min_pair_matches=ALL)
+    model = run_sfm(folder, names, work, work / "sparse", options, tolerances=whole)
     return model, work / "database.db"
 
 
-def sfm(capture, work, *, min_pair_matches=200, **options):
+def sfm(capture, work, *, min_pair_matches=ALL, **options):
     folder, views = capture
     names = [view.name for view in views]
     given = SfmOptions(**{"intrinsics": INTRINSICS, **options})
