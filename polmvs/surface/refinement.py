@@ -363,25 +363,21 @@ def refine(
     """
     tol = tolerances or RefinementTolerances()
     state = _State(mesh, 0.0, RowSigma(tol.row_sigma, tol.row_sigma))
-    for level in tol.levels:
+    for number, level in enumerate(tol.levels):
         edge = level.edge_px * footprint
         expected = 1.2 * state.mesh.face_areas.sum() / edge**2
-        if level is not tol.levels[0] and expected > tol.max_vertices:
+        if number and expected > tol.max_vertices:
             edge = float(np.sqrt(1.2 * state.mesh.face_areas.sum() / tol.max_vertices))
-
-        def refined(way: Level, start: _State = state, edge: float = edge) -> _State:
-            return _refined_at(
-                start, views, angle_model, footprint, edge, way, known, tol, on_progress
-            )
-
         ways = [level, replace(level, with_slope=False)] if level.with_slope else [level]
-        if len(ways) == 1:
-            state = refined(level)
-        else:
-            found = [refined(way) for way in ways]
+        found = [
+            _refined_at(state, views, angle_model, footprint, edge, way, known, tol, on_progress)
+            for way in ways
+        ]
+        if len(found) > 1:
             shares = [unexplained_share(one.mesh, views, angle_model, tol) for one in found]
             logger.info("unexplained with the slope of the phases %.3f, without %.3f.", *shares)
-            state = found[int(np.argmin(shares))]
+            found = [found[int(np.argmin(shares))]]
+        state = found[0]
         if not len(state.mesh.faces):
             break
         if on_level is not None:
