@@ -81,7 +81,8 @@ class AxesCheck:
             f"{100 * self.share:.0f} % of the {self.num_votes} sparse points on the part"
         )
         assert self.change is not None
-        if kind is CaptureKind.MOSAIC:
+        # Of two settings that can be wrong, the one that was changed is the likely one.
+        if kind is CaptureKind.MOSAIC and not (options.clockwise or options.zero_deg):
             given = ",".join(map(str, options.pattern))
             likely = ",".join(map(str, changed_pattern(options.pattern, self.change)))
             return (

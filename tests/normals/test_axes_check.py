@@ -87,3 +87,5 @@ def test_the_message_names_the_setting():
     assert text.startswith("`capture.pattern` 90,135,45,0 does not fit")
     assert text.endswith("Give `capture.pattern` 90,45,135,0")
     assert "Give `capture.clockwise`" in found.message(CaptureOptions(), CaptureKind.AOLP)
+    mirrored = CaptureOptions(clockwise=True)
+    assert "Give `capture.clockwise`" in found.message(mirrored, CaptureKind.MOSAIC)
