@@ -60,7 +60,8 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from test_separate import wait
 from polmvs.separate import run_separately
-signal.signal(signal.SIGTERM, signal.default_int_handler)
+for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background ignores the first
+    signal.signal(number, signal.default_int_handler)
 try:
     run_separately(wait, Path(sys.argv[2]), on_message=print)
 except KeyboardInterrupt:

@@ -37,14 +37,15 @@ def thin_database(database: Path, target: Path, num_kept: int, *, seed: int = 0)
         Whether it was written.
     """
     with closing(sqlite3.connect(database)) as source:
-        rows = source.execute(  # damaged ones are left to COLMAP
-            "SELECT pair_id, data FROM two_view_geometries WHERE length(data) = ? * rows",
-            (PAIR_BYTES,),
-        )
-        numbers, matches = [], []
-        for number, data in rows:
-            numbers.append(number)
-            matches.append(np.frombuffer(data, np.uint32).reshape(-1, 2))
+        try:
+            rows = source.execute(
+                "SELECT pair_id, data FROM two_view_geometries WHERE length(data) = ? * rows",
+                (PAIR_BYTES,),
+            ).fetchall()
+        except sqlite3.DatabaseError:  # a damaged one is left to COLMAP
+            return False
+        numbers = [number for number, _ in rows]
+        matches = [np.frombuffer(data, np.uint32).reshape(-1, 2) for _, data in rows]
         pairs = [pycolmap.pair_id_to_image_pair(number) for number in numbers]
         kept = sample_tracks(pairs, matches, num_kept, seed=seed)
         if 2 * sum(map(np.count_nonzero, kept)) >= sum(map(len, kept)):

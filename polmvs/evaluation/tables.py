@@ -121,7 +121,7 @@ def _truth_rows(
             *[number(m.depth_within_1mm if m else None, 100, 1) for m in maps],
         ],
         [
-            "depth errors within one / two stated deviations, %",
+            "depths within one / two stated deviations, %",
             *[_within_sigmas(m) if m else number(None) for m in maps],
         ],
         [

@@ -111,11 +111,13 @@ class Undetermined:
 
 
 def num_surface_steps(num_views: int) -> int:
-    """How often :func:`reconstruct_surface` and the rendering of its views report at most."""
+    """How many steps :func:`reconstruct_surface` and the rendering of its views report.
+
+    A surface that is made once more reports none of its steps.
+    """
     tolerances = RefinementTolerances()
-    levels = tolerances.levels + tolerances.thin_levels
-    refinement = sum(level.num_steps * (1 + level.with_slope) for level in levels)
-    return refinement + 2 * NUM_FINAL_STEPS + num_views
+    refinement = sum(level.num_steps * (1 + level.with_slope) for level in tolerances.levels)
+    return refinement + NUM_FINAL_STEPS + num_views
 
 
 def reconstruct_surface(
@@ -160,6 +162,14 @@ def reconstruct_surface(
     ]
     if reason := _no_hull(views):
         return Undetermined(reason)
+    done = 0
+
+    def report(count: int) -> None:
+        nonlocal done
+        done += count
+        if on_progress is not None:
+            on_progress(count)
+
     given = _Given(
         angle_model=angle_model,
         tilt_aware=tilt_aware,
@@ -169,7 +179,7 @@ def reconstruct_surface(
         plane=supporting_plane(surroundings, np.array([view.center for view in views])),
         min_views=min_views,
         folder=folder,
-        report=on_progress if on_progress is not None else lambda count: None,
+        report=report,
     )
     tolerances, hull_tolerances = tolerances or RefinementTolerances(), HullTolerances()
     found, meshes = _surface(given, hull_tolerances, tolerances)
@@ -177,9 +187,11 @@ def reconstruct_surface(
         logger.info("much of the silhouettes stays uncovered; walls may be thin: once more, finer.")
         fine = replace(hull_tolerances, step_px=0.5 * hull_tolerances.step_px)
         thin = replace(tolerances, levels=tolerances.thin_levels)
-        again, fine_meshes = _surface(given, fine, thin)
+        unheard = replace(given, report=lambda count: None)
+        again, fine_meshes = _surface(unheard, fine, thin)
         if _unexplained_share(again) < _unexplained_share(found):
             found, meshes = again, fine_meshes
+    report(max(num_surface_steps(0) - done, 0))
     if on_mesh is not None:
         for mesh in meshes:
             on_mesh(mesh)

@@ -243,7 +243,7 @@ def test_comparison_tells_of_the_maps(demo_run: Path) -> None:
     for name in (
         "depth maps, RMSE, mm",
         "depth maps within 1 mm, %",
-        "depth errors within one / two stated deviations, %",
+        "depths within one / two stated deviations, %",
         "normal maps, mean / median error, deg",
     ):
         assert any(digit in rows[name] for digit in "0123456789")

@@ -26,7 +26,7 @@ def test_several_models_are_said_only_where_images_are_left_out(
         largest = sfm._map(
             tmp_path / "db",
             tmp_path,
-            tmp_path / "models",
+            tmp_path,
             names,
             sfm.SfmOptions(),
             sfm.SfmTolerances(),
