@@ -183,13 +183,13 @@ def reconstruct_surface(
     )
     tolerances, hull_tolerances = tolerances or RefinementTolerances(), HullTolerances()
     found, meshes = _surface(given, hull_tolerances, tolerances)
-    if tolerances.thin_levels and _unexplained_share(found) > MAX_SHARE:
+    if tolerances.thin_levels and _uncovered_share(found) > MAX_SHARE:
         logger.info("much of the silhouettes stays uncovered; walls may be thin: once more, finer.")
         fine = replace(hull_tolerances, step_px=0.5 * hull_tolerances.step_px)
         thin = replace(tolerances, levels=tolerances.thin_levels)
         unheard = replace(given, report=lambda count: None)
         again, fine_meshes = _surface(unheard, fine, thin)
-        if _unexplained_share(again) < _unexplained_share(found):
+        if _uncovered_share(again) < _uncovered_share(found):
             found, meshes = again, fine_meshes
     report(max(num_surface_steps(0) - done, 0))
     if on_mesh is not None:
@@ -213,7 +213,7 @@ class _Given:
     report: OnProgress
 
 
-def _unexplained_share(found: GlobalSurface | Undetermined) -> float:
+def _uncovered_share(found: GlobalSurface | Undetermined) -> float:
     """Mean share of the silhouettes that a surface does not cover; 1 without one."""
     return 1.0 if isinstance(found, Undetermined) else found.contradictions.uncovered_share
 

@@ -443,6 +443,14 @@ def _refined_at(
     return _State(mesh, tilt_share, shown)
 
 
+def certain_rays(view: SurfaceView, stride_px: int) -> Array:
+    """Unit rays ``(N, 3)``, world, of every so many-th pixel of a view's certain silhouette."""
+    half = stride_px // 2
+    rows, cols = np.nonzero(view.silhouette.certain[half::stride_px, half::stride_px])
+    xy = np.stack([cols, rows], axis=1) * stride_px + half + 0.5
+    return view.view.rays_in_world(xy)
+
+
 def unexplained_share(
     mesh: TriangleMesh,
     views: Sequence[SurfaceView],
@@ -456,17 +464,15 @@ def unexplained_share(
     1 where it shows nothing, or a normal that the phase contradicts by far; 0 where both agree.
     """
     tol = tolerances or RefinementTolerances()
-    scene, half, losses = RayScene(mesh), stride_px // 2, [np.zeros(0)]
+    scene, losses = RayScene(mesh), [np.zeros(0)]
     for view in views:
-        rows, cols = np.nonzero(view.silhouette.certain[half::stride_px, half::stride_px])
-        xy = np.stack([cols, rows], axis=1) * stride_px + half + 0.5
-        rays = view.view.rays_in_world(xy)
+        rays = certain_rays(view, stride_px)
         hits = scene.cast(view.center, rays)
         hit = hits.face >= 0
         points = view.center + hits.distance[hit, None] * rays[hit]
         found = phase_rows(view, angle_model, points)
         square = ((found.rows * mesh.face_normals[hits.face[hit]]).sum(axis=1) / tol.row_sigma) ** 2
-        loss = np.ones(len(xy))
+        loss = np.ones(len(rays))
         known = found.precision > 0
         loss[np.flatnonzero(hit)[known]] = (square / (square + CAUCHY_SCALE**2))[known]
         kept = ~hit

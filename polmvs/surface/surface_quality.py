@@ -17,7 +17,13 @@ from polmvs.config import AngleModel
 from polmvs.fitting import robust_deviation
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
-from polmvs.surface.refinement import KnownPoints, RefinementTolerances, RowSigma, face_rows
+from polmvs.surface.refinement import (
+    KnownPoints,
+    RefinementTolerances,
+    RowSigma,
+    certain_rays,
+    face_rows,
+)
 from polmvs.surface.surface_view import SurfaceView, phase_rows
 
 Array = NDArray[np.float64]
@@ -392,12 +398,10 @@ def point_offset(
 
 def _uncovered_share(mesh: TriangleMesh, view: SurfaceView, stride_px: int) -> float:
     """Share of the certain silhouette where no surface is; NaN without one."""
-    half = stride_px // 2
-    rows, cols = np.nonzero(view.silhouette.certain[half::stride_px, half::stride_px])
-    if not len(rows):
+    rays = certain_rays(view, stride_px)
+    if not len(rays):
         return float("nan")
     if not len(mesh.faces):
         return 1.0
-    xy = np.stack([cols, rows], axis=1) * stride_px + half + 0.5
-    hits = RayScene(mesh).cast(view.center, view.view.rays_in_world(xy))
+    hits = RayScene(mesh).cast(view.center, rays)
     return float(np.mean(hits.face < 0))
