@@ -73,16 +73,16 @@ def sided_normals(
     (F, 3) unit.
     """
     tol = tolerances or CreaseTolerances()
-    one, other = (mesh.incidence @ mesh.incidence.T).tocoo().coords
-    centers = mesh.centers
+    average = sparse.csr_array(mesh.incidence @ mesh.incidence.T)
+    one, other = average.tocoo().coords
     width = tol.reach_edges * mesh.mean_edge
-    near = np.exp(-0.5 * ((centers[one] - centers[other]) ** 2).sum(axis=1) / width**2)
+    near = np.exp(-0.5 * _squared_distance(mesh.centers, one, other) / width**2)
     certain = mesh.face_areas * np.where(is_fitted, 1.0, tol.unfitted_weight)
     near *= certain[other]
     for _ in range(tol.normal_rounds):
-        apart = ((normals[one] - normals[other]) ** 2).sum(axis=1)
-        weight = near * np.exp(-0.5 * apart / tol.like_sine**2)
-        normals = _unit(_sums(one, weight[:, None] * normals[other], len(normals)))
+        apart = _squared_distance(normals, one, other)
+        average.data = near * np.exp(-0.5 * apart / tol.like_sine**2)
+        normals = _unit(average @ normals)
     return normals
 
 
@@ -93,21 +93,30 @@ def sharpened(
     tol = tolerances or CreaseTolerances()
     if not len(mesh.faces):
         return mesh
-    index = mesh.faces.ravel()
-    area = np.repeat(mesh.face_areas, 3)
-    total = np.maximum(np.bincount(index, area, len(mesh.vertices)), 1e-300)[:, None]
-    moved = np.zeros_like(mesh.vertices)
-    limit = tol.max_move * mesh.mean_edge
+    num, area = len(mesh.vertices), mesh.face_areas
+    total = np.maximum(mesh.incidence.T @ area, 1e-300)[:, None]
     # Places that fit stay: what a rounded edge lacks is not to be taken from the face beside it.
     off = ((mesh.face_normals - normals) ** 2).sum(axis=1)
-    off_at_vertex = np.bincount(index, area * np.repeat(off, 3), len(moved))[:, None] / total
-    mobility = 1 - np.exp(-0.5 * off_at_vertex / tol.fitting_sine**2)
+    mobility = 1 - np.exp(
+        -0.5 * (mesh.incidence.T @ (area * off))[:, None] / total / tol.fitting_sine**2
+    )
+    # All steps are one linear map: the mean height of a face's corners along its normal less each
+    # corner's own, times the area, summed at the corners.
+    columns = (3 * mesh.faces[:, :, None] + np.arange(3)).reshape(-1)
+    indptr = 9 * np.arange(len(area) + 1)
+    along = sparse.csr_array(
+        (np.tile(normals, (1, 3)).ravel(), columns, indptr), (len(area), 3 * num)
+    )
+    spread = sparse.csr_array(along.T @ sparse.diags_array(area))
+    squares = (area[:, None, None] * normals[:, :, None] * normals[:, None, :]).reshape(-1, 9)
+    own = (mesh.incidence.T @ squares).reshape(-1, 3, 3)
+    start, limit = mesh.vertices - mesh.vertices.mean(axis=0), tol.max_move * mesh.mean_edge
+    moved = np.zeros_like(start)
     for _ in range(tol.vertex_rounds):
-        corners = (mesh.vertices + moved)[mesh.faces]
-        from_plane = corners.mean(axis=1, keepdims=True) - corners
-        height = (from_plane * normals[:, None]).sum(axis=-1, keepdims=True)
-        step = (height * normals[:, None]).reshape(-1, 3) * area[:, None]
-        moved += mobility * _sums(index, step, len(moved)) / total
+        vertices = start + moved
+        height = along @ vertices.ravel() / 3
+        step = (spread @ height).reshape(-1, 3) - (own @ vertices[:, :, None])[..., 0]
+        moved += mobility * step / total
         length = np.linalg.norm(moved, axis=1, keepdims=True)
         moved *= np.minimum(1.0, limit / np.maximum(length, 1e-300))
     return mesh.moved(moved)
@@ -131,13 +140,14 @@ def corner_normals(
     corner, face = (at_vertex @ mesh.incidence.T).tocoo().coords
     alike = (normals[corner // 3] * normals[face]).sum(axis=1) > np.cos(np.radians(tol.crease_deg))
     weight = mesh.face_areas[face] * alike
-    mean = _sums(corner, weight[:, None] * normals[face], 3 * num)
+    mean = sparse.coo_array((weight, (corner, face)), shape=(3 * num, num)).tocsr() @ normals
     return _unit(mean).reshape(num, 3, 3)
 
 
-def _sums(index: NDArray[np.int64], values: Array, num: int) -> Array:
-    """Sums ``(num, 3)`` of rows ``(N, 3)`` by index."""
-    return np.stack([np.bincount(index, column, num) for column in values.T], axis=1)
+def _squared_distance(places: Array, one: NDArray[np.integer], other: NDArray[np.integer]) -> Array:
+    """Of pairs ``(N,)`` of places ``(P, 3)``."""
+    squares = [(column[one] - column[other]) ** 2 for column in np.ascontiguousarray(places.T)]
+    return np.asarray(sum(squares))
 
 
 def _unit(vectors: Array) -> Array:

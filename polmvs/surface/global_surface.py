@@ -325,7 +325,7 @@ def _hollows(given: _Given, mesh: TriangleMesh, footprint: float) -> tuple[Hollo
         mesh.centers,
         mesh.face_normals,
         mesh.face_areas,
-        RayScene(mesh).signed_distance,
+        RayScene(mesh).inside_along,
         footprint,
     )
     return find_hollows(

@@ -12,7 +12,7 @@ walls should be labelled accordingly. Where the rim's width varies nothing is pr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,7 +31,6 @@ from polmvs.surface.offsets import (
     FaceGrid,
     FaceScene,
     OffsetTolerances,
-    SignedDistance,
     cells_beside,
     face_evidence,
     face_lines,
@@ -80,7 +79,7 @@ class HollowTolerances:
         one footprint is always allowed. Guess.
     growth : of a hollow's half width per depth. A bottle's shoulders are not presumed. Guess.
     above : height of a cap's bulge over the rim that is cut off. Guess.
-    layer_cells : distance of the layers, and of the cells at which the surface is asked.
+    layer_cells : distance of the layers.
     max_cells : of the grid of a hollow.
     """
 
@@ -152,14 +151,15 @@ class SurfaceFaces:
     ----------
     centers, normals : (F, 3), world; unit normals outwards.
     areas : (F,).
-    signed_distance : of points ``(N, 3)`` to the surface, negative inside.
+    inside_along : which places ``(D, N)`` lie inside, on rays from origins ``(N, 3)`` along one
+        direction ``(3,)``, at ascending distances ``(D,)``.
     footprint : length that a pixel covers at the surface, world units.
     """
 
     centers: Array
     normals: Array
     areas: Array
-    signed_distance: SignedDistance
+    inside_along: Callable[[Array, Array, Array], Mask]
     footprint: float
 
 
@@ -375,40 +375,32 @@ def _hollow(
 ) -> Hollow | None:
     """The hollow under a mouth, its wall as thick as at the rim; None where that varies."""
     border = mouth & ~ndimage.binary_erosion(mouth)
-    spacing = tol.layer_cells
-    rim_places = grid.points(rim)[::spacing, ::spacing]
+    spacing, most = tol.layer_cells, tol.max_cells // mouth.size
+    depths = np.array([tol.wall_depth, *(spacing * np.arange(1, most))], np.float64)
+    order = np.argsort(depths)
+    insides = np.empty((len(depths), *grid.shape), np.bool_)
+    insides[order] = surface.inside_along(
+        grid.points(rim).reshape(-1, 3), -rim.normal, depths[order] * grid.step
+    ).reshape(insides.shape)
 
-    def outside_of(depth: float) -> tuple[Array, bool]:
-        """Distance (H, W) in cells to the outer wall, negative inside, and whether any is.
-
-        The surface is asked on every third cell: between them its distance is about linear.
-        """
-        points = rim_places - depth * grid.step * rim.normal
-        coarse = np.asarray(surface.signed_distance(points.reshape(-1, 3)), np.float64)
-        index = np.indices(grid.shape) / spacing
-        fine = ndimage.map_coordinates(
-            coarse.reshape(points.shape[:2]), index, order=1, mode="nearest"
-        )
+    def outside_of(inside: Mask) -> Array:
+        """Distance (H, W) in cells to the outer wall, negative inside."""
         # What the silhouettes left open inside of the wall is no wall.
-        inside = np.asarray(ndimage.binary_fill_holes(fine < 0), np.bool_)
-        return cells_beside(inside), bool(inside.any())
+        return cells_beside(np.asarray(ndimage.binary_fill_holes(inside), np.bool_))
 
-    wall = -outside_of(tol.wall_depth)[0][border] - 0.5
+    wall = -outside_of(insides[0])[border] - 0.5
     thickness = float(np.median(wall))
     sigma = 1.4826 * float(np.median(np.abs(wall - thickness)))
     if thickness <= 1 or sigma > max(tol.thickness_spread * thickness, 1.0):
         return None
     free = -cells_beside(mouth)
     layers = [free]
-    most = tol.max_cells // mouth.size
-    while len(layers) < most:
-        depth = spacing * len(layers)
-        away, any_inside = outside_of(depth)
-        if not any_inside:
+    for depth, inside in zip(depths[1:], insides[1:], strict=True):
+        if not inside.any():
             break
         # At the rim its line is known; below it the wall's thickness takes over.
         known = min(depth / tol.wall_depth, 1.0)
-        presumed = known * (-away - thickness) + (1 - known) * layers[0]
+        presumed = known * (-outside_of(inside) - thickness) + (1 - known) * layers[0]
         free = np.minimum(presumed, layers[-1] + tol.growth * spacing)
         pieces = ndimage.label(free > 0)[0]
         linked = np.unique(pieces[(layers[-1] > 0) & (pieces > 0)])

@@ -211,15 +211,38 @@ class RayScene:
             votes += self._windings(local, direction) > 0
         return np.where(2 * votes > num_rays, -distance, distance)
 
+    def inside_along(self, origins: Floats, direction: Array, distances: Array) -> Mask:
+        """Which places ``(D, N)`` on parallel rays lie inside.
+
+        Parameters
+        ----------
+        origins : (N, 3).
+        direction : (3,) unit.
+        distances : (D,) of the places from the origins, ascending.
+        """
+        ray, leaves, length = self._crossings(self._local(origins), direction)
+        # What a place's ray leaves beyond it, more often than it enters.
+        last = np.searchsorted(distances, length)
+        shape = (len(distances) + 1, len(origins))
+        count = np.bincount(np.ravel_multi_index((last, ray), shape), leaves, shape[0] * shape[1])
+        beyond = np.cumsum(count.reshape(shape)[::-1], axis=0)[::-1]
+        return np.asarray(np.rint(beyond[1:]) > 0)
+
     def _windings(self, local: NDArray[np.float32], direction: Array) -> NDArray[np.int64]:
         """How often ``(N,)`` more a ray leaves the mesh than it enters it."""
+        ray, leaves, _ = self._crossings(local, direction)
+        return np.rint(np.bincount(ray, leaves, len(local))).astype(np.int64)
+
+    def _crossings(
+        self, local: NDArray[np.float32], direction: Array
+    ) -> tuple[NDArray[np.int64], Array, NDArray[np.float32]]:
+        """Ray, 1 where it leaves and -1 where it enters, and length of every crossing ``(C,)``."""
         rays = np.empty((len(local), 6), np.float32)
         rays[:, :3], rays[:, 3:] = local, direction
         hits = self._scene.list_intersections(self._tensor(rays))
         face = hits["primitive_ids"].numpy().astype(np.int64)
         leaves = np.sign(self._face_normals[face] @ direction)
-        count = np.bincount(hits["ray_ids"].numpy().astype(np.int64), leaves, len(local))
-        return np.rint(count).astype(np.int64)
+        return hits["ray_ids"].numpy().astype(np.int64), leaves, hits["t_hit"].numpy()
 
 
 def visible_points(

@@ -354,7 +354,9 @@ def find_contradictions(
         evidence.num_rows, 1
     )
     denied = evidence.num_outside > np.maximum(tol.max_outside_share * evidence.num_views, 1.5)
-    uncovered = [_uncovered_share(mesh.only(supported), view, stride_px) for view in views]
+    kept = mesh.only(supported)
+    scene = RayScene(kept) if len(kept.faces) else None
+    uncovered = [_uncovered_share(scene, view, stride_px) for view in views]
     known = [share for share in uncovered if np.isfinite(share)]
     return Contradictions(
         phase_sine=phase_sine,
@@ -396,12 +398,9 @@ def point_offset(
     return middle / footprint, middle / max(float(noise), 1e-300)
 
 
-def _uncovered_share(mesh: TriangleMesh, view: SurfaceView, stride_px: int) -> float:
+def _uncovered_share(scene: RayScene | None, view: SurfaceView, stride_px: int) -> float:
     """Share of the certain silhouette where no surface is; NaN without one."""
     rays = certain_rays(view, stride_px)
     if not len(rays):
         return float("nan")
-    if not len(mesh.faces):
-        return 1.0
-    hits = RayScene(mesh).cast(view.center, rays)
-    return float(np.mean(hits.face < 0))
+    return 1.0 if scene is None else float(np.mean(scene.cast(view.center, rays).face < 0))

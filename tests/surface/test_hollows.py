@@ -87,14 +87,13 @@ def closed_cylinder():
     centers = np.concatenate([side, top])
     normals = np.concatenate([out, np.tile([0.0, 0.0, 1.0], (len(top), 1))])
 
-    def signed_distance(points):
-        across = np.hypot(points[:, 0], points[:, 1]) - RADIUS
-        along = np.maximum(points[:, 2] - HEIGHT, -points[:, 2])
-        outside = np.hypot(np.maximum(across, 0), np.maximum(along, 0))
-        return np.where((across < 0) & (along < 0), np.maximum(across, along), outside)
+    def inside_along(origins, direction, distances):
+        points = origins + distances[:, None, None] * direction
+        across = np.hypot(points[..., 0], points[..., 1])
+        return (across < RADIUS) & (points[..., 2] > 0) & (points[..., 2] < HEIGHT)
 
     areas = np.full(len(centers), step**2)
-    return SurfaceFaces(centers, normals, areas, signed_distance, FOOTPRINT)
+    return SurfaceFaces(centers, normals, areas, inside_along, FOOTPRINT)
 
 
 def test_a_dark_mouth_with_a_rim_of_one_width_opens_into_a_hollow():

@@ -20,6 +20,15 @@ def extracted(distance, half=1.6, step=0.08) -> TriangleMesh:
     return mesh_from_grid(values, np.full(3, -half), step)
 
 
+def side_by_side(*parts: TriangleMesh) -> TriangleMesh:
+    """One mesh of several that may overlap."""
+    offsets = np.cumsum([0] + [len(m.vertices) for m in parts[:-1]])
+    return TriangleMesh(
+        np.concatenate([m.vertices for m in parts]),
+        np.concatenate([m.faces + o for m, o in zip(parts, offsets, strict=True)]),
+    )
+
+
 def euler_number(mesh: TriangleMesh) -> int:
     return len(mesh.vertices) - mesh.adjacency.nnz // 2 + len(mesh.faces)
 
@@ -68,13 +77,7 @@ def test_remeshing_joins_pieces_that_met_and_drops_specks():
     first = extracted(sphere(0.6, (-0.4, 0, 0)))
     second = extracted(sphere(0.6, (0.4, 0, 0)))
     speck = extracted(sphere(0.09, (0, 0, 1.4)))
-    parts = [first, second, speck]
-    offsets = np.cumsum([0] + [len(m.vertices) for m in parts[:-1]])
-    crossing = TriangleMesh(
-        np.concatenate([m.vertices for m in parts]),
-        np.concatenate([m.faces + o for m, o in zip(parts, offsets, strict=True)]),
-    )
-    mesh = remeshed(crossing, 0.08)
+    mesh = remeshed(side_by_side(first, second, speck), 0.08)
     assert euler_number(mesh) == 2
     assert mesh.vertices[:, 2].max() < 1.0
 
@@ -89,6 +92,26 @@ def test_distances_and_hits_far_from_the_origin():
     hits = scene.cast(far + np.array([0, 0, 5.0]), np.array([[0, 0, -1.0], [0, 0, 1.0]]))
     assert hits.distance[0] == pytest.approx(4.0, abs=0.01)
     assert hits.face[1] == -1
+
+
+def test_what_lies_inside_along_rays_is_what_their_crossings_enclose():
+    # Two balls behind each other, the second overlapping a third.
+    mesh = side_by_side(
+        extracted(sphere(0.3, (0, 0, 1.0))),
+        extracted(sphere(0.3, (0, 0, -1.0))),
+        extracted(sphere(0.3, (0, 0, -1.2))),
+    )
+    origins = np.array([[0.01, 0.02, 5.0], [0.29, 0, 5.0], [2.0, 0, 5.0]])
+    distances = np.linspace(3, 7, 41)
+    inside = RayScene(mesh).inside_along(origins, np.array([0.0, 0, -1]), distances)
+    points = origins + distances[:, None, None] * np.array([0.0, 0, -1])
+    depth = np.min(
+        [np.linalg.norm(points - [0, 0, z], axis=-1) - 0.3 for z in (1.0, -1.0, -1.2)], axis=0
+    )
+    clear = np.abs(depth) > 0.02
+    assert (inside == (depth < 0))[clear].all()
+    assert inside[:, 0].sum() > 10
+    assert not inside[:, 2].any()
 
 
 def test_a_camera_sees_the_near_side_only():
