@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, default_num_workers
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.polarization.phase_map import PhaseMap
@@ -150,16 +151,16 @@ def reconstruct_surface(
     on_mesh : called at the end with the hull, and with the mesh after each level of its refinement.
     folder : where what is made of each view is kept meanwhile; None: in memory.
     """
-    views = [
-        surface_view(
-            phase_map,
-            find_silhouette(phase_map, mask_given=masks_given),
-            angle_model,
-            tilt_aware=tilt_aware,
-            folder=folder,
+
+    def look_at(phase_map: PhaseMap) -> SurfaceView:
+        silhouette = find_silhouette(phase_map, mask_given=masks_given)
+        return surface_view(
+            phase_map, silhouette, angle_model, tilt_aware=tilt_aware, folder=folder
         )
-        for phase_map in maps
-    ]
+
+    # Threads, for nearly all of it is OpenCV's; each view's depends on itself alone.
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        views = list(pool.map(look_at, maps))
     if reason := _no_hull(views):
         return Undetermined(reason)
     done = 0
