@@ -185,7 +185,12 @@ def reconstruct_surface(
     tolerances, hull_tolerances = tolerances or RefinementTolerances(), HullTolerances()
     found, meshes = _surface(given, hull_tolerances, tolerances)
     if tolerances.thin_levels and _uncovered_share(found) > MAX_SHARE:
-        logger.info("much of the silhouettes stays uncovered; walls may be thin: once more, finer.")
+        logger.warning(
+            "%s: %.0f %% of the polarised regions stay uncovered, walls may be thin: the surface is "
+            "made once more with a finer mesh, which may take minutes.",
+            angle_model,
+            100 * _uncovered_share(found),
+        )
         fine = replace(hull_tolerances, step_px=0.5 * hull_tolerances.step_px)
         thin = replace(tolerances, levels=tolerances.thin_levels)
         unheard = replace(given, report=lambda count: None)
