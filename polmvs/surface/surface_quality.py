@@ -16,6 +16,7 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.fitting import robust_deviation
 from polmvs.normals.estimator import NormalEstimate, solve_normals
+from polmvs.scene import MIN_FACING_COSINE
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
 from polmvs.surface.refinement import (
     KnownPoints,
@@ -33,8 +34,8 @@ Mask = NDArray[np.bool_]
 MAX_SIGMAS = 3.0  # of one figure, before it is called a contradiction
 MAX_SHARE = 0.1  # of a surface or its silhouettes in contradiction. Guess
 MIN_POINTS = 10  # on the surface, for their median to be one
+MAX_ROWS = 500_000  # faces times views at a time; bounds memory
 POINT_REACH_PX = 4.0  # of the surface; what lies farther is not on it
-CHUNK, MAX_ROWS = 20_000, 500_000  # faces, and those times views, at a time; bounds memory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,6 @@ class QualityTolerances:
 
     Attributes
     ----------
-    min_cosine : between normal and viewing direction, for a view to see a face.
     outside_px : by which a face must lie beyond a silhouette to be denied by it. Guess: twice the
         deviation of an outline with its bias.
     max_outside_share : of the views that see a face, to deny it. Guess: two of six.
@@ -56,7 +56,6 @@ class QualityTolerances:
         by less.
     """
 
-    min_cosine: float = 0.1
     outside_px: float = 1.5
     max_outside_share: float = 0.34
     row_sigmas: float = 5.0
@@ -112,7 +111,7 @@ def face_evidence(
     if not len(mesh.faces):
         return FaceEvidence(*counts)
     scene = RayScene(mesh)
-    rows_tolerances = RefinementTolerances(min_cosine=tol.min_cosine)
+    rows_tolerances = RefinementTolerances(min_cosine=MIN_FACING_COSINE)
     for view in views:
         seen, _, _ = visible_points(
             scene,
@@ -120,7 +119,7 @@ def face_evidence(
             mesh.centers,
             mesh.face_normals,
             tolerance=rows_tolerances.visible_slack * mesh.mean_edge,
-            min_cosine=tol.min_cosine,
+            min_cosine=MIN_FACING_COSINE,
         )
         xy, _ = view.project(mesh.centers[seen])
         inside = view.in_image(xy, 2.0)
@@ -223,7 +222,7 @@ def fit_normals(
     if not num:
         return FaceNormals(normals, sigma)
     scene, centers = RayScene(mesh), mesh.centers
-    at_a_time = max(1, min(CHUNK, MAX_ROWS // len(views)))
+    at_a_time = max(1, MAX_ROWS // len(views))
     for start in range(0, num, at_a_time):
         part = slice(start, min(start + at_a_time, num))
         points, own = centers[part], mesh.face_normals[part]

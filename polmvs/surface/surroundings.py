@@ -27,7 +27,14 @@ from polmvs.config import FusionOptions
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map
-from polmvs.scene import KEYPOINT_SIGMA_PX, Tracks, View, point_sigmas, some_tracks
+from polmvs.scene import (
+    KEYPOINT_SIGMA_PX,
+    MIN_FACING_COSINE,
+    Tracks,
+    View,
+    point_sigmas,
+    some_tracks,
+)
 from polmvs.surface.dense_view import DenseView, lattice_xy, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse
 
@@ -77,8 +84,6 @@ class SurroundingsTolerances:
     min_points : in a view, for the range to search. Guess.
     window : lattice points along a side of the planes that are fitted. Guess.
     min_window_share : of a window's lattice points that are known. Guess.
-    min_cosine : between a plane's normal and the ray; steeper ones are steps of the range.
-        Guess.
     """
 
     min_observations: int = 3
@@ -101,7 +106,6 @@ class SurroundingsTolerances:
     min_points: int = 10
     window: int = 5
     min_window_share: float = 0.6
-    min_cosine: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -657,7 +661,7 @@ def _on_planes(
         fitted = 1 / (slope * rays).sum(axis=-1)
         cosine = 1 / (fitted * length)
         good = (np.abs(fitted / ranges - 1) < 2 * sigma) & (deviation < 2 * sigma)
-        good &= cosine > tolerances.min_cosine
+        good &= cosine > MIN_FACING_COSINE  # steeper ones are steps of the range
         # The normal of a plane through errors of the window's points, seen under this angle.
         spread = tolerances.window * stride_px / np.sqrt(12) / view.camera.mean_focal_px
         turn = deviation / (tolerances.window * spread) * cosine**2

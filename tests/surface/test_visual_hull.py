@@ -74,7 +74,7 @@ def test_unknown_pixels_do_not_carve(ball):
 
 def test_the_supporting_plane_bounds_the_hull(ball):
     plane = Plane(np.array([0.0, 0, 1.0]), -0.3)
-    mesh = visual_hull(ball, plane, tolerances=HullTolerances(depth_px=3.0)).mesh
+    mesh = visual_hull(ball, plane, tolerances=HullTolerances(step_px=1.0)).mesh
     assert mesh.vertices[:, 2].min() == pytest.approx(-0.3 - 3 * 5 / 150, abs=0.06)
 
 
