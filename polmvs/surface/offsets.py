@@ -31,8 +31,10 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.io.arrays import kept_array
 from polmvs.normals.rows import Rows, gather_rows
+from polmvs.normals.tracks import SeedTolerances
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
+from polmvs.surface.surface_view import REFERENCE_FOCAL_PX
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -42,7 +44,6 @@ SignedDistance: TypeAlias = Callable[[Array], Floats]
 FirstHit: TypeAlias = Callable[[Array, Array], tuple[Floats, Floats]]
 
 NO_FACE = -1
-REFERENCE_FOCAL_PX = 445.0
 BESIDE, ACROSS = ((0, 1), (1, 0)), ((1, 1), (1, -1))  # neighbours of a cell: down, right
 CUT_UNIT = 10_000  # of the weights of a cut, which are whole numbers
 MAX_COST = 0.5  # median loss beyond which phases contradict a face: that of ``sigmas`` deviations
@@ -73,11 +74,12 @@ class OffsetTolerances:
     line_steps : of noise, from which a step hampers the walk. Guess.
     mark_px : greatest width of a printed mark, at a focal length of 445 px. Guess.
     mark_contrast : of a mark's intensity to what is about it. As for the region's marks.
-    mark_dolp_share : of the DoLP about a mark in its own, at most. As for the seeds.
     mark_share : of the views that show a place, which must show a mark there. Guess: a wall of a
         convex part is seen by half of them.
     mark_margin_px : square about a pixel of a mark that is left out: its smoothed outline.
-    seed_cells : radius about a sparse point that belongs to its face. Guess: its uncertainty.
+    seed_cells : radius about a sparse point that belongs to its face, and distance of a face's
+        points to the given surface from which it does not explain them; a cell is a footprint.
+        Guess: a point's uncertainty, and the size of a first surface's cells.
     phase_floor : residual that noise does not explain, sine. Prototype: 0.03 on curved meshes; a
         plane has no faults of its own.
     leak : conductance to nowhere of a place that contradicts its face. Guess.
@@ -85,12 +87,9 @@ class OffsetTolerances:
     min_total : chance that a walk from a place ends on any face's points at all. Guess: one in a
         hundred gets through where the phases contradict.
     min_share : of the seen views in whose region a place must lie. Guess: one view in six wrong.
-    min_views : that see a place.
     min_radius_cells : of a face's area: smaller ones are tangent planes of curved surfaces. Guess.
         A border is moved to the lines in a band of this width: every face has a core. Measured on
         `step`: bands of 8, 12 and 20 give the same corners.
-    off_footprints : distance of a face's points to the given surface, in footprints of a pixel,
-        from which the surface does not explain them. Guess: a first surface's cells are 2 wide.
     better_by : median loss by which the given surface must explain the views better than a face
         to keep its place. Guess.
     num_rounds : of labels and visibility; a third changes nothing on step.
@@ -111,7 +110,6 @@ class OffsetTolerances:
     line_steps: float = 4.0
     mark_px: float = 20.0
     mark_contrast: float = 1.5
-    mark_dolp_share: float = 0.85
     mark_share: float = 0.6
     mark_margin_px: int = 5
     seed_cells: float = 2.0
@@ -120,9 +118,7 @@ class OffsetTolerances:
     seed_weight: float = 0.2
     min_total: float = 0.01
     min_share: float = 0.84
-    min_views: int = 2
     min_radius_cells: float = 12.0
-    off_footprints: float = 2.0
     better_by: float = 0.3
     num_rounds: int = 2
 
@@ -405,7 +401,7 @@ def stepped_faces(
         points = seeds.points_in_world[np.concatenate([face.members for face in group])]
         footprint = _footprint(points, maps)
         if signed_distance is not None and not any(
-            _is_off(face, seeds, signed_distance, tol.off_footprints * footprint) for face in group
+            _is_off(face, seeds, signed_distance, tol.seed_cells * footprint) for face in group
         ):
             continue
         grid = _grid_over(group, points, maps, footprint, tol)
@@ -474,7 +470,7 @@ def _grid_over(
             local = origin + distance[hit, None] * rays[hit] - center
             place = np.stack([local @ first, local @ second], axis=1)
             low[k], high[k] = place.min(axis=0), place.max(axis=0)
-    if np.isfinite(low).all(axis=1).sum() < tol.min_views:
+    if np.isfinite(low).all(axis=1).sum() < 2:
         return None
     # A region may run to the horizon in one view: what half of the views show is enough.
     own = np.stack([(points - center) @ first, (points - center) @ second], axis=1)
@@ -663,7 +659,7 @@ def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
         cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)),
     )
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
-    dull = phase_map.lowest_dolp < 255 * tol.mark_dolp_share * dolp
+    dull = phase_map.lowest_dolp < 255 * SeedTolerances.max_dolp_share * dolp
     mark = dull & (intensity > tol.mark_contrast * about + tol.dark)
     kernel = np.ones((tol.mark_margin_px,) * 2, np.uint8)
     on_mark = cv2.dilate(mark.astype(np.uint8), kernel)
@@ -731,7 +727,7 @@ def face_evidence(
     # not at the same place.
     printed = near_points & (num_marks > tol.mark_share * inside)
     jumps[:, printed] = np.nan
-    possible = (num_seen >= tol.min_views) & (inside >= tol.min_share * num_seen)
+    possible = (num_seen >= 2) & (inside >= tol.min_share * num_seen)
     return FaceEvidence(_shared_lines(jumps, tol.view_share), median_loss(losses), possible)
 
 

@@ -92,7 +92,6 @@ class RefinementTolerances:
     unseen_damping : of a vertex that no view sees, in edges; smoothness alone would melt it.
     converged : root mean square of displacements of what is seen that ends a level, in edges.
         Guess.
-    visible_slack : by which the mesh may hide a face's centre, in edges. Guess.
     max_vertices : of a mesh; finer levels are left out. From the time allowed.
     """
 
@@ -117,7 +116,6 @@ class RefinementTolerances:
     remesh_after: float = 2.0
     unseen_damping: float = 0.02
     converged: float = 0.03
-    visible_slack: float = 0.5
     max_vertices: int = 120_000
 
 
@@ -295,7 +293,6 @@ def face_rows(
         view.center,
         mesh.centers,
         mesh.face_normals,
-        tolerance=tolerances.visible_slack * mesh.mean_edge,
         min_cosine=tolerances.min_cosine,
     )
     found = phase_rows(view, angle_model, mesh.centers[face])

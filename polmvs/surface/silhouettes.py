@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from polmvs.camera import sample_image
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.surface.surface_view import Silhouette, signed_distance_px
+from polmvs.surface.surface_view import REFERENCE_FOCAL_PX, Silhouette, signed_distance_px
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -57,9 +57,6 @@ class SilhouetteTolerances:
     edge_prior_px: float = 2.5
     edge_contrast: float = 0.15
     edge_smoothing_px: float = 1.5
-
-
-REFERENCE_FOCAL_PX = 445.0
 
 
 def find_silhouette(

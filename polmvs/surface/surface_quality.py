@@ -114,12 +114,7 @@ def face_evidence(
     rows_tolerances = RefinementTolerances(min_cosine=MIN_FACING_COSINE)
     for view in views:
         seen, _, _ = visible_points(
-            scene,
-            view.center,
-            mesh.centers,
-            mesh.face_normals,
-            tolerance=rows_tolerances.visible_slack * mesh.mean_edge,
-            min_cosine=MIN_FACING_COSINE,
+            scene, view.center, mesh.centers, mesh.face_normals, min_cosine=MIN_FACING_COSINE
         )
         xy, _ = view.project(mesh.centers[seen])
         inside = view.in_image(xy, 2.0)
@@ -215,7 +210,7 @@ def fit_normals(
     mesh, views, angle_model : as in :func:`face_evidence`.
     row_sigma : deviation of ``m . n`` that noise does not explain.
     """
-    tol, rows_tolerances = tolerances or QualityTolerances(), RefinementTolerances()
+    tol = tolerances or QualityTolerances()
     num = len(mesh.faces)
     normals, sigma = mesh.face_normals.copy(), np.full(num, np.inf)
     misfit = np.zeros((num, 2))  # chi squared and degrees of freedom
@@ -232,12 +227,7 @@ def fit_normals(
         turns = np.full(shape, np.inf, np.float32)
         for index, view in enumerate(views):
             seen, directions, _ = visible_points(
-                scene,
-                view.center,
-                points,
-                own,
-                tolerance=rows_tolerances.visible_slack * mesh.mean_edge,
-                min_cosine=rows_tolerances.min_cosine,
+                scene, view.center, points, own, min_cosine=RefinementTolerances.min_cosine
             )
             found = phase_rows(view, angle_model, points[seen])
             known = found.precision > 0
