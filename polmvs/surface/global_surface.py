@@ -45,7 +45,7 @@ from polmvs.surface.surface_quality import (
     point_offset,
     supported_faces,
 )
-from polmvs.surface.surface_view import SurfaceView, surface_view
+from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, surface_view
 from polmvs.surface.visual_hull import (
     HullTolerances,
     Plane,
@@ -60,7 +60,6 @@ Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 OnProgress = Callable[[int], None]
 
-MIN_VIEWS = 3  # with an outline: the hull of two cones is no shape
 MAX_FILLED_SHARE = 0.35  # of the image's border on the objects, where a silhouette bounds little
 REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured on spheres
 NUM_FINAL_STEPS = 3  # of the progress: evidence, normals, deviations

@@ -44,6 +44,7 @@ from polmvs.surface.offsets import (
 )
 from polmvs.surface.refinement import RefinementTolerances
 from polmvs.surface.surface_quality import QualityTolerances
+from polmvs.surface.surface_view import MIN_VIEWS
 from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]
@@ -64,7 +65,6 @@ class HollowTolerances:
     min_part : share of a plane's faces that is rim, and that is mouth, at least. Guess.
     min_sectors : of eight about what has no phase, in which there must be some that has. Guess:
         one may be hidden.
-    min_views : that a normal, and a comparison of brightness, need.
     min_radius : of a mouth, as a disc. Guess.
     max_gap : of the rim, half its length (a mark, a reflection). Guess. The cells that the closed
         rim encloses may be off the mouth's border by as much.
@@ -83,7 +83,6 @@ class HollowTolerances:
     surface_sigma: float = 0.5
     min_part: float = 0.15
     min_sectors: int = 7
-    min_views: int = 3
     min_radius: float = 8.0
     max_gap: float = 4.0
     max_brightness: float = 0.3
@@ -169,7 +168,7 @@ def find_hollows(
     folder : as of :func:`polmvs.surface.offsets.face_scene`.
     """
     tol, face_tol = tolerances or HollowTolerances(), offset_tolerances or OffsetTolerances()
-    if not len(surface.centers) or len(maps) < tol.min_views:
+    if not len(surface.centers) or len(maps) < MIN_VIEWS:
         return ()
     scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=face_tol, folder=folder)
     found: list[Hollow] = []
@@ -229,7 +228,7 @@ def _rim(
     start = np.repeat(flat.normal[:, None], len(flat.members), axis=1)
     estimate = solve_normals(rows.rows, rows.rays, sigma, initial_normals=start)
     turned = np.nan_to_num(estimate.normals) @ flat.normal
-    agree = estimate.valid & (estimate.num_rows >= tol.min_views)
+    agree = estimate.valid & (estimate.num_rows >= MIN_VIEWS)
     agree &= turned > np.cos(np.radians(QualityTolerances.trusted_deg))
     if agree.sum() < 10:
         return None
@@ -341,7 +340,7 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: HollowTol
                 medians.append(float(np.median(sample_image(intensity, xy[shown]))))
         if len(medians) == 2:
             ratios.append(medians[0] / max(medians[1], 1e-9))
-    return len(ratios) >= tol.min_views and float(np.median(ratios)) < tol.max_brightness
+    return len(ratios) >= MIN_VIEWS and float(np.median(ratios)) < tol.max_brightness
 
 
 def _ring_about(mouth: Mask, tol: HollowTolerances) -> Mask:

@@ -34,6 +34,7 @@ from polmvs.normals.rows import Rows, gather_rows
 from polmvs.normals.tracks import SeedTolerances
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
+from polmvs.surface.refinement import RefinementTolerances
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX
 
 Array = NDArray[np.float64]
@@ -76,12 +77,9 @@ class OffsetTolerances:
     mark_contrast : of a mark's intensity to what is about it. As for the region's marks.
     mark_share : of the views that show a place, which must show a mark there. Guess: a wall of a
         convex part is seen by half of them.
-    mark_margin_px : square about a pixel of a mark that is left out: its smoothed outline.
     seed_cells : radius about a sparse point that belongs to its face, and distance of a face's
         points to the given surface from which it does not explain them; a cell is a footprint.
         Guess: a point's uncertainty, and the size of a first surface's cells.
-    phase_floor : residual that noise does not explain, sine. Prototype: 0.03 on curved meshes; a
-        plane has no faults of its own.
     leak : conductance to nowhere of a place that contradicts its face. Guess.
     seed_weight : chance that a walk ends on a point that it passes, over that of a step. Guess.
     min_total : chance that a walk from a place ends on any face's points at all. Guess: one in a
@@ -111,9 +109,7 @@ class OffsetTolerances:
     mark_px: float = 20.0
     mark_contrast: float = 1.5
     mark_share: float = 0.6
-    mark_margin_px: int = 5
     seed_cells: float = 2.0
-    phase_floor: float = 0.015
     leak: float = 0.1
     seed_weight: float = 0.2
     min_total: float = 0.01
@@ -661,7 +657,7 @@ def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
     dull = phase_map.lowest_dolp < 255 * SeedTolerances.max_dolp_share * dolp
     mark = dull & (intensity > tol.mark_contrast * about + tol.dark)
-    kernel = np.ones((tol.mark_margin_px,) * 2, np.uint8)
+    kernel = np.ones((2 * round(2 * tol.smoothing_px) + 1,) * 2, np.uint8)  # its smoothed outline
     on_mark = cv2.dilate(mark.astype(np.uint8), kernel)
     # The root has the same photon noise everywhere; smoothed after it, a step keeps its place.
     root = cv2.GaussianBlur(np.sqrt(np.maximum(intensity, 0)), (0, 0), tol.smoothing_px)
@@ -683,7 +679,9 @@ def row_losses(
     cosine = -(rows.rays * normals[:, None]).sum(axis=0)
     residual = (rows.rows * normals[:, None]).sum(axis=0)
     with np.errstate(invalid="ignore"):
-        variance = (1 - cosine**2) * np.square(rows.sigma) + np.float32(tol.phase_floor**2)
+        # Half of what a curved mesh leaves unexplained: a plane has no faults of its own.
+        floor = np.float32((0.5 * RefinementTolerances.row_sigma) ** 2)
+        variance = (1 - cosine**2) * np.square(rows.sigma) + floor
         z2 = np.square(residual) / (variance * np.float32(tol.sigmas**2))
         loss = z2 / (1 + z2)
     counts = np.isfinite(rows.sigma) & (cosine > MIN_FACING_COSINE)

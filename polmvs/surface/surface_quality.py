@@ -17,6 +17,7 @@ from polmvs.config import AngleModel
 from polmvs.fitting import robust_deviation
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.scene import MIN_FACING_COSINE
+from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
 from polmvs.surface.refinement import (
     KnownPoints,
@@ -47,8 +48,8 @@ class QualityTolerances:
     outside_px : by which a face must lie beyond a silhouette to be denied by it. Guess: twice the
         deviation of an outline with its bias.
     max_outside_share : of the views that see a face, to deny it. Guess: two of six.
-    row_sigmas, row_sine : a phase contradicts a normal from this many deviations and this sine on.
-        Guess: 5, and 12 deg, beyond what mixed light and facets explain.
+    row_sigmas : a phase contradicts a normal from this many deviations on, and from the sine that
+        tells the sides of a crease apart: 12 deg, beyond what mixed light and facets explain.
     max_contradicting_share : of the phases at a face. Guess.
     smoothing_rounds : of the shares over neighbouring faces: single faces are noisy. Guess.
     trusted_deg : by which the normal that the phases give at a place may differ from the mesh's,
@@ -59,7 +60,6 @@ class QualityTolerances:
     outside_px: float = 1.5
     max_outside_share: float = 0.34
     row_sigmas: float = 5.0
-    row_sine: float = 0.2
     max_contradicting_share: float = 0.6
     smoothing_rounds: int = 2
     trusted_deg: float = 25.0
@@ -127,7 +127,9 @@ def face_evidence(
         equal = RowSigma(row_sigma, row_sigma)
         rows = face_rows(mesh, scene, view, angle_model, equal, rows_tolerances)
         residual = np.abs(rows.residual)
-        wrong = residual > np.maximum(tol.row_sigmas * np.sqrt(rows.variance), tol.row_sine)
+        wrong = residual > np.maximum(
+            tol.row_sigmas * np.sqrt(rows.variance), CreaseTolerances.like_sine
+        )
         counts[2, rows.face] += 1
         counts[3, rows.face[wrong]] += 1
     return FaceEvidence(*counts)
