@@ -25,6 +25,7 @@ from polmvs.config import AngleModel
 from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
+from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.mesh_geometry import MAX_CELLS
 from polmvs.surface.offsets import (
     MAX_COST,
@@ -43,7 +44,6 @@ from polmvs.surface.offsets import (
     snapped_border,
 )
 from polmvs.surface.refinement import RefinementTolerances
-from polmvs.surface.surface_quality import QualityTolerances
 from polmvs.surface.surface_view import MIN_VIEWS
 from polmvs.surface.visual_hull import HullTolerances
 
@@ -65,17 +65,16 @@ class HollowTolerances:
     min_part : share of a plane's faces that is rim, and that is mouth, at least. Guess.
     min_sectors : of eight about what has no phase, in which there must be some that has. Guess:
         one may be hidden.
-    min_radius : of a mouth, as a disc. Guess.
     max_gap : of the rim, half its length (a mark, a reflection). Guess. The cells that the closed
         rim encloses may be off the mouth's border by as much.
     max_brightness : of the mouth over the rim, median over the views. A second reflection on
         glass of ior 1.5 leaves a tenth to a half of the light of the first at 45 to 75 deg. Guess.
-    rounding : of the surface beside the rim; below it the wall's thickness is measured, and over
-        it the rim's brightness is taken. Guess: three of the surface's cells.
+    rounding : of the surface beside the rim; below it the wall's thickness is measured, over half
+        of it the rim's brightness is taken, and what is no wider is no mouth. Guess: three of the
+        surface's cells.
     thickness_spread : robust deviation of the wall's thickness around the rim, as a share of it;
         one footprint is always allowed. Guess.
     growth : of a hollow's half width per depth. A bottle's shoulders are not presumed. Guess.
-    layer_cells : distance of the layers.
     """
 
     max_samples: int = 3000
@@ -83,13 +82,11 @@ class HollowTolerances:
     surface_sigma: float = 0.5
     min_part: float = 0.15
     min_sectors: int = 7
-    min_radius: float = 8.0
     max_gap: float = 4.0
     max_brightness: float = 0.3
     rounding: float = 6.0
     thickness_spread: float = 0.15
     growth: float = 0.5
-    layer_cells: int = 3
 
 
 @dataclass(frozen=True)
@@ -199,12 +196,12 @@ def _flat_pieces(
     chosen = np.sort(rng.choice(len(share), num, replace=False, p=share))
     sigma = np.full(num, tol.surface_sigma * surface.footprint)
     seeds = Seeds(surface.centers[chosen], surface.normals[chosen], sigma)
-    least = np.pi * (tol.min_radius * surface.footprint) ** 2 / surface.areas.sum()
+    least = np.pi * (tol.rounding * surface.footprint) ** 2 / surface.areas.sum()
     search = replace(
         face_tol,
         min_points=max(int(least * num), 10),
-        normal_deg=QualityTolerances.trusted_deg,
-        min_normal_sigma_deg=QualityTolerances.trusted_deg,
+        normal_deg=CreaseTolerances.crease_deg,
+        min_normal_sigma_deg=CreaseTolerances.crease_deg,
     )
     faces = find_faces(seeds, search, max_faces=tol.max_planes)
     return tuple(replace(face, members=chosen[face.members]) for face in faces)
@@ -229,7 +226,7 @@ def _rim(
     estimate = solve_normals(rows.rows, rows.rays, sigma, initial_normals=start)
     turned = np.nan_to_num(estimate.normals) @ flat.normal
     agree = estimate.valid & (estimate.num_rows >= MIN_VIEWS)
-    agree &= turned > np.cos(np.radians(QualityTolerances.trusted_deg))
+    agree &= turned > np.cos(np.radians(CreaseTolerances.crease_deg))
     if agree.sum() < 10:
         return None
     normal = np.median(estimate.normals[agree], axis=0)
@@ -317,7 +314,7 @@ def _mouth(
     if num == 0:
         return enclosed
     mouth = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
-    if mouth.sum() < np.pi * tol.min_radius**2:
+    if mouth.sum() < np.pi * tol.rounding**2:
         return np.zeros(grid.shape, np.bool_)
     labels = np.where(mouth, 0, NO_FACE)
     jump = evidence.jump.astype(np.float64)
@@ -359,7 +356,7 @@ def _hollow(
 ) -> Hollow | None:
     """The hollow under a mouth, its wall as thick as at the rim; None where that varies."""
     border = mouth & ~ndimage.binary_erosion(mouth)
-    spacing, most = tol.layer_cells, MAX_CELLS // mouth.size
+    spacing, most = 0.5 * tol.rounding, MAX_CELLS // mouth.size
     depths = np.array([tol.rounding, *(spacing * np.arange(1, most))], np.float64)
     order = np.argsort(depths)
     insides = np.empty((len(depths), *grid.shape), np.bool_)
@@ -395,7 +392,7 @@ def _hollow(
     depths = spacing * np.arange(len(layers), dtype=np.float64)
     # The bottom is as thick as the wall, at least.
     floor = spacing * len(layers) - thickness - depths
-    if floor[0] <= tol.min_radius:
+    if floor[0] <= tol.rounding:
         return None
     # A cap bulges over the rim by no more than it is rounded.
     above = int(np.ceil(2 * tol.rounding / spacing))

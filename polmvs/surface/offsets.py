@@ -34,6 +34,7 @@ from polmvs.normals.rows import Rows, gather_rows
 from polmvs.normals.tracks import SeedTolerances
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
+from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.refinement import RefinementTolerances
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX
 
@@ -64,24 +65,21 @@ class OffsetTolerances:
     normal_deg : largest angle between a point's normal and its face. Guess: several deviations.
     min_normal_sigma_deg : deviation of the mean of the points' normals (sensor and model, alike
         for all points). Measured on board: 0.2.
-    same_group_deg : faces whose normals differ less share a grid.
     num_near : neighbours that tell whether points of a face lie among those of another. Guess.
     max_cells : of a grid. Memory and time: one solution takes 7 us a cell.
     smoothing_px : of the intensity before its steps are measured.
-    dark : intensity by which a mark must at least be brighter, full scales: one count of 8 bits.
-    min_scale : least step of noise per cell, of roots of full scales: synthetic images have none.
+    dark : intensity by which a mark must at least be brighter, full scales, and least step of noise
+        per cell: one count of 8 bits; synthetic images have less.
     view_share : share of the views that see a place, which must show a line there. A wall of a
         convex part is seen by about half of the views around it. Guess: half of these.
     line_steps : of noise, from which a step hampers the walk. Guess.
     mark_px : greatest width of a printed mark, at a focal length of 445 px. Guess.
     mark_contrast : of a mark's intensity to what is about it. As for the region's marks.
-    mark_share : of the views that show a place, which must show a mark there. Guess: a wall of a
-        convex part is seen by half of them.
     seed_cells : radius about a sparse point that belongs to its face, and distance of a face's
         points to the given surface from which it does not explain them; a cell is a footprint.
         Guess: a point's uncertainty, and the size of a first surface's cells.
-    leak : conductance to nowhere of a place that contradicts its face. Guess.
-    seed_weight : chance that a walk ends on a point that it passes, over that of a step. Guess.
+    seed_weight : chance that a walk ends on a point that it passes, or goes astray where phases
+        contradict the face, over that of a step. Guess.
     min_total : chance that a walk from a place ends on any face's points at all. Guess: one in a
         hundred gets through where the phases contradict.
     min_share : of the seen views in whose region a place must lie. Guess: one view in six wrong.
@@ -90,7 +88,6 @@ class OffsetTolerances:
         `step`: bands of 8, 12 and 20 give the same corners.
     better_by : median loss by which the given surface must explain the views better than a face
         to keep its place. Guess.
-    num_rounds : of labels and visibility; a third changes nothing on step.
     """
 
     min_points: int = 4
@@ -98,25 +95,20 @@ class OffsetTolerances:
     sigmas: float = 3.0
     normal_deg: float = 4.0
     min_normal_sigma_deg: float = 0.2
-    same_group_deg: float = 30.0
     num_near: int = 5
     max_cells: int = 160_000
     smoothing_px: float = 1.0
     dark: float = 1 / 255
-    min_scale: float = 0.003
     view_share: float = 0.25
     line_steps: float = 4.0
     mark_px: float = 20.0
     mark_contrast: float = 1.5
-    mark_share: float = 0.6
     seed_cells: float = 2.0
-    leak: float = 0.1
     seed_weight: float = 0.2
     min_total: float = 0.01
     min_share: float = 0.84
     min_radius_cells: float = 12.0
     better_by: float = 0.3
-    num_rounds: int = 2
 
 
 @dataclass(frozen=True)
@@ -346,7 +338,7 @@ def _without_interlopers(faces: Sequence[Face], points: Array, tol: OffsetTolera
         alike = [
             other
             for other in kept
-            if face.normal @ other.normal > np.cos(np.radians(tol.same_group_deg))
+            if face.normal @ other.normal > np.cos(np.radians(CreaseTolerances.crease_deg))
         ]
         if alike:
             tangents = np.linalg.svd(face.normal[None])[2][1:]
@@ -393,7 +385,7 @@ def stepped_faces(
         return ()
     scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=tol, folder=folder)
     found = []
-    for group in _grouped(faces, tol):
+    for group in _grouped(faces):
         points = seeds.points_in_world[np.concatenate([face.members for face in group])]
         footprint = _footprint(points, maps)
         if signed_distance is not None and not any(
@@ -409,11 +401,11 @@ def stepped_faces(
     return tuple(found)
 
 
-def _grouped(faces: Sequence[Face], tol: OffsetTolerances) -> list[list[Face]]:
+def _grouped(faces: Sequence[Face]) -> list[list[Face]]:
     groups: list[list[Face]] = []
     for face in faces:
         for group in groups:
-            if face.normal @ group[0].normal > np.cos(np.radians(tol.same_group_deg)):
+            if face.normal @ group[0].normal > np.cos(np.radians(CreaseTolerances.crease_deg)):
                 group.append(face)
                 break
         else:
@@ -548,12 +540,13 @@ def _labels(
     rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
     surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit, tol)
     labels, shown = np.full(grid.shape, NO_FACE), np.zeros(grid.shape, np.bool_)
-    for round_index in range(tol.num_rounds):
+    # Which face hides which shows in labels alone: a second time with those of the first.
+    for is_labelled in (False, True):
         claims, jumps = np.zeros((2, len(group), *grid.shape))
         possible, fits = np.zeros((2, len(group), *grid.shape), np.bool_)
         for number, face in enumerate(group):
             hidden = None
-            if round_index > 0:
+            if is_labelled:
                 hidden = _hidden(number, group, places[number], grid, labels, scene.maps)
             on_grid = grid.cells(seeds.points_in_world[face.members])
             near = _distance_to(on_grid, grid.shape) < 0.5 * tol.mark_px
@@ -722,8 +715,8 @@ def face_evidence(
         jumps[k], marks = _line_steps(scene.features[k], xy, shown, tol)
         num_marks += marks
     # What is printed on the face is a mark in all views, what is printed on a wall beside it is
-    # not at the same place.
-    printed = near_points & (num_marks > tol.mark_share * inside)
+    # not at the same place, and half of them see such a wall at most.
+    printed = near_points & (num_marks > 0.5 * inside)
     jumps[:, printed] = np.nan
     possible = (num_seen >= 2) & (inside >= tol.min_share * num_seen)
     return FaceEvidence(_shared_lines(jumps, tol.view_share), median_loss(losses), possible)
@@ -784,7 +777,7 @@ def _steps(values: Image, shown: Mask, tol: OffsetTolerances) -> Image:
         return total
     for channel in np.moveaxis(values, -1, 0):
         step = np.hypot(*np.gradient(channel))
-        scale = max(1.4826 * float(np.median(step[well])), tol.min_scale)
+        scale = max(1.4826 * float(np.median(step[well])), tol.dark)
         total = np.maximum(total, np.where(well, step / scale, 0)).astype(np.float32)
     return total
 
@@ -867,7 +860,7 @@ def _claim(
     adjacency, degree = _walk(evidence.jump.astype(np.float64), tol)
     # A walk may end on any point it passes, so that a single false one does not decide.
     ending = tol.seed_weight * (starts | ends).ravel()
-    leak = tol.leak * np.clip(evidence.cost.astype(np.float64).ravel() / MAX_COST - 1, 0, 1)
+    leak = tol.seed_weight * np.clip(evidence.cost.astype(np.float64).ravel() / MAX_COST - 1, 0, 1)
     free = np.flatnonzero(possible)
     right = tol.seed_weight * starts.ravel()[free].astype(np.float64)
     claim = np.zeros(starts.size)

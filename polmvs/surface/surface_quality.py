@@ -48,21 +48,12 @@ class QualityTolerances:
     outside_px : by which a face must lie beyond a silhouette to be denied by it. Guess: twice the
         deviation of an outline with its bias.
     max_outside_share : of the views that see a face, to deny it. Guess: two of six.
-    row_sigmas : a phase contradicts a normal from this many deviations on, and from the sine that
-        tells the sides of a crease apart: 12 deg, beyond what mixed light and facets explain.
     max_contradicting_share : of the phases at a face. Guess.
-    smoothing_rounds : of the shares over neighbouring faces: single faces are noisy. Guess.
-    trusted_deg : by which the normal that the phases give at a place may differ from the mesh's,
-        beside three deviations. Guess: a face across a right-angled edge is turned by 45 deg, most
-        by less.
     """
 
     outside_px: float = 1.5
     max_outside_share: float = 0.34
-    row_sigmas: float = 5.0
     max_contradicting_share: float = 0.6
-    smoothing_rounds: int = 2
-    trusted_deg: float = 25.0
 
 
 @dataclass(frozen=True)
@@ -127,8 +118,9 @@ def face_evidence(
         equal = RowSigma(row_sigma, row_sigma)
         rows = face_rows(mesh, scene, view, angle_model, equal, rows_tolerances)
         residual = np.abs(rows.residual)
+        # Beyond what mixed light and facets explain, too: what tells the sides of a crease apart.
         wrong = residual > np.maximum(
-            tol.row_sigmas * np.sqrt(rows.variance), CreaseTolerances.like_sine
+            MAX_SIGMAS * np.sqrt(rows.variance), CreaseTolerances.like_sine
         )
         counts[2, rows.face] += 1
         counts[3, rows.face[wrong]] += 1
@@ -156,7 +148,7 @@ def supported_faces(
     counts = np.stack(
         [evidence.num_views, evidence.num_outside, evidence.num_rows, evidence.num_contradicting]
     )
-    smooth = _smoothed(mesh, counts.astype(np.float64).T, tol.smoothing_rounds).T
+    smooth = _smoothed(mesh, counts.astype(np.float64).T).T
     views, outside, rows, contradicting = smooth
     denied = outside > np.maximum(tol.max_outside_share * views, 1.5)
     contradicted = contradicting > tol.max_contradicting_share * rows
@@ -165,13 +157,11 @@ def supported_faces(
     )
 
 
-def _smoothed(mesh: TriangleMesh, values: Array, rounds: int) -> Array:
-    """Means ``(F, C)`` of values ``(F, C)`` over faces that share a vertex, in rounds."""
+def _smoothed(mesh: TriangleMesh, values: Array) -> Array:
+    """Means ``(F, C)`` of values ``(F, C)`` over faces that share a vertex: one is noisy."""
     incidence = mesh.incidence.T.tocsr()
     degree = np.maximum(np.asarray(incidence.sum(axis=1)).ravel(), 1)[:, None]
-    for _ in range(rounds):
-        values = np.asarray(incidence.T @ ((incidence @ values) / degree)) / 3
-    return values
+    return np.asarray(incidence.T @ ((incidence @ values) / degree)) / 3
 
 
 @dataclass(frozen=True)
@@ -199,7 +189,6 @@ def fit_normals(
     angle_model: AngleModel,
     *,
     row_sigma: float,
-    tolerances: QualityTolerances | None = None,
 ) -> FaceNormals:
     """Normals from the phases of all views at the places of the mesh, which stay.
 
@@ -212,7 +201,6 @@ def fit_normals(
     mesh, views, angle_model : as in :func:`face_evidence`.
     row_sigma : deviation of ``m . n`` that noise does not explain.
     """
-    tol = tolerances or QualityTolerances()
     num = len(mesh.faces)
     normals, sigma = mesh.face_normals.copy(), np.full(num, np.inf)
     misfit = np.zeros((num, 2))  # chi squared and degrees of freedom
@@ -239,13 +227,14 @@ def fit_normals(
         estimate = solve_normals(rows, rays, turns, initial_normals=own.T)
         cosine = np.clip((estimate.normals * own).sum(axis=1), -1, 1)
         apart = np.degrees(np.arccos(cosine))
-        good = estimate.valid & (apart < tol.trusted_deg + 3 * estimate.sigma_deg)
+        # A mesh rounds a right-angled edge: a face there is turned by 45 deg, most by less.
+        good = estimate.valid & (apart < CreaseTolerances.crease_deg + 3 * estimate.sigma_deg)
         good &= estimate.residual < 3 * row_sigma
         normals[part][good] = estimate.normals[good]
         sigma[part][good] = estimate.sigma_deg[good]
         misfit[part][good, 0] = _chi_squared(rows, rays, turns, estimate)[good]
         misfit[part][good, 1] = np.maximum(estimate.num_rows[good] - 2, 0)
-    return FaceNormals(normals, sigma * np.sqrt(_misfit_ratio(mesh, misfit, tol)))
+    return FaceNormals(normals, sigma * np.sqrt(_misfit_ratio(mesh, misfit)))
 
 
 def _chi_squared(rows: Floats, rays: Floats, turns: Floats, estimate: NormalEstimate) -> Array:
@@ -255,7 +244,7 @@ def _chi_squared(rows: Floats, rays: Floats, turns: Floats, estimate: NormalEsti
     return np.asarray(np.nansum(estimate.row_weights * squares, axis=0))
 
 
-def _misfit_ratio(mesh: TriangleMesh, misfit: Array, tol: QualityTolerances) -> Array:
+def _misfit_ratio(mesh: TriangleMesh, misfit: Array) -> Array:
     """Chi squared over degrees of freedom (F,), at least 1, from both (F, 2) about each face.
 
     A face has few degrees of freedom: those of its surroundings are counted with them, and as many
@@ -263,7 +252,7 @@ def _misfit_ratio(mesh: TriangleMesh, misfit: Array, tol: QualityTolerances) -> 
     """
     whole = misfit.sum(axis=0)
     expected = whole[0] / whole[1] if whole[1] else 1.0
-    about = _smoothed(mesh, misfit, tol.smoothing_rounds)
+    about = _smoothed(mesh, misfit)
     return np.maximum((about[:, 0] + expected) / (about[:, 1] + 1), 1.0)
 
 

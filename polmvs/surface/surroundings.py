@@ -41,8 +41,6 @@ from polmvs.surface.fusion import FusedCloud, fuse
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-REGION_MARGIN_PX = 3  # a keypoint this near a part's outline may owe its place to the outline
-
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 
@@ -71,7 +69,8 @@ class SurroundingsTolerances:
         Guess.
     min_shared_points : of two views, for their angle to be known, the range to search, and their
         overlap to be worth it. Guess.
-    block_px : side of the patches that are compared. Guess.
+    block_px : side of the patches that are compared, and of the planes that are fitted, in points
+        of the lattice. Guess.
     min_texture : standard deviation, grey levels. Derived: noise of a full well of 10,000
         electrons makes 0.6.
     min_ray_z : rays more than 60 deg from the rectified axis would be stretched fourfold.
@@ -79,8 +78,7 @@ class SurroundingsTolerances:
     range_percentiles : of the sparse points' distances; few of them are wrong. Guess.
     range_margin : of the disparities beyond those of the sparse points. Guess.
     max_disparities : searched; more means that the sparse points are no guide. Guess.
-    window : lattice points along a side of the planes that are fitted. Guess.
-    min_window_share : of a window's lattice points that are known. Guess.
+    min_window_share : of a plane's lattice points that are known. Guess.
     """
 
     min_observations: int = 3
@@ -97,7 +95,6 @@ class SurroundingsTolerances:
     range_percentiles: tuple[float, float] = (1.0, 99.0)
     range_margin: float = 0.15
     max_disparities: int = 512
-    window: int = 5
     min_window_share: float = 0.6
 
     @property
@@ -138,7 +135,8 @@ def sparse_surroundings(
     maps : phase maps of the views.
     tolerances : of this step.
     """
-    part_share = part_shares(tracks, maps)
+    # A keypoint this near a part's outline may owe its place to the outline.
+    part_share = part_shares(tracks, maps, tolerances.border_px)
     num_views = np.bincount(tracks.obs_track, minlength=len(part_share))
     sigma = relative_sigmas(tracks, [phase_map.view for phase_map in maps])
     kept = (
@@ -154,13 +152,13 @@ def sparse_surroundings(
     )
 
 
-def part_shares(tracks: Tracks, maps: Sequence[PhaseMap]) -> Array:
+def part_shares(tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int) -> Array:
     """Share ``(T,)`` of each track's observations in or beside a region; 1 without any."""
     num_tracks = len(tracks.points_in_world)
     on_part = np.zeros(len(tracks.obs_track), bool)
     for k, phase_map in enumerate(maps):
         here = tracks.obs_view == k
-        grown = grow_mask(phase_map.region.inside, REGION_MARGIN_PX).astype(np.float32)
+        grown = grow_mask(phase_map.region.inside, margin_px).astype(np.float32)
         on_part[here] = sample_image(grown, tracks.obs_xy[here], nearest=True) > 0
     count = np.bincount(tracks.obs_track, minlength=num_tracks)
     hits = np.bincount(tracks.obs_track, on_part, num_tracks)
@@ -568,9 +566,9 @@ def fit_planes(
     columns = [outer, v * u[..., None], (u * u)[..., None], known[..., None].astype(np.float64)]
     moments, border = np.concatenate(columns, axis=-1), cv2.BORDER_CONSTANT
     sums = cv2.boxFilter(
-        moments, -1, (tolerances.window, tolerances.window), normalize=False, borderType=border
+        moments, -1, (tolerances.block_px, tolerances.block_px), normalize=False, borderType=border
     )
-    used = known & (sums[..., 13] >= tolerances.min_window_share * tolerances.window**2 - 0.5)
+    used = known & (sums[..., 13] >= tolerances.min_window_share * tolerances.block_px**2 - 0.5)
     matrix, right = sums[used, :9].reshape(-1, 3, 3), sums[used, 9:12]
     solved = np.linalg.solve(matrix, right[..., None])[..., 0]
     residual = sums[used, 12] - (solved * right).sum(axis=-1)
@@ -642,8 +640,8 @@ def _on_planes(
         good = (np.abs(fitted / ranges - 1) < 2 * sigma) & (deviation < 2 * sigma)
         good &= cosine > MIN_FACING_COSINE  # steeper ones are steps of the range
         # The normal of a plane through errors of the window's points, seen under this angle.
-        spread = tolerances.window * stride_px / np.sqrt(12) / view.camera.mean_focal_px
-        turn = deviation / (tolerances.window * spread) * cosine**2
+        spread = tolerances.block_px * stride_px / np.sqrt(12) / view.camera.mean_focal_px
+        turn = deviation / (tolerances.block_px * spread) * cosine**2
     normals = np.where(good[..., None], -slope / length[..., None], np.nan)
     return DenseView(
         stride_px=stride_px,

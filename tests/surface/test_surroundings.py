@@ -108,7 +108,7 @@ def test_no_tracks_and_tracks_without_observations():
     assert sparse_surroundings(none, maps).points.shape == (0, 3)
     assert choose_partners(none, [m.view for m in maps]) == [[], []]
     unseen = tracks_of(np.ones((1, 3)), [m.view for m in maps], seen=[()])
-    np.testing.assert_array_equal(part_shares(unseen, maps), [1.0])
+    np.testing.assert_array_equal(part_shares(unseen, maps, 3), [1.0])
     assert np.isinf(relative_sigmas(unseen, [m.view for m in maps])).all()
     assert not sparse_surroundings(unseen, maps).is_kept.any()
 
