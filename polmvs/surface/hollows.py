@@ -24,7 +24,7 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Seeds
+from polmvs.scene import KEYPOINT_SIGMA_PX, Seeds
 from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.mesh_geometry import MAX_CELLS
 from polmvs.surface.offsets import (
@@ -59,9 +59,7 @@ class HollowTolerances:
 
     Attributes
     ----------
-    max_samples : faces of the surface among which planes are sought.
     max_planes : of the surface that are looked at, largest first. Guess: a box has six.
-    surface_sigma : deviation of the surface from its planes. Guess: cells are two wide.
     min_part : share of a plane's faces that is rim, and that is mouth, at least. Guess.
     min_sectors : of eight about what has no phase, in which there must be some that has. Guess:
         one may be hidden.
@@ -77,9 +75,7 @@ class HollowTolerances:
     growth : of a hollow's half width per depth. A bottle's shoulders are not presumed. Guess.
     """
 
-    max_samples: int = 3000
     max_planes: int = 8
-    surface_sigma: float = 0.5
     min_part: float = 0.15
     min_sectors: int = 7
     max_gap: float = 4.0
@@ -192,9 +188,9 @@ def _flat_pieces(
     """The largest planes of a surface, with the faces (of all) that lie in them."""
     rng = np.random.default_rng(0)
     share = surface.areas / surface.areas.sum()
-    num = min(tol.max_samples, len(share))
+    num = min(face_tol.num_trials, len(share))
     chosen = np.sort(rng.choice(len(share), num, replace=False, p=share))
-    sigma = np.full(num, tol.surface_sigma * surface.footprint)
+    sigma = np.full(num, KEYPOINT_SIGMA_PX * surface.footprint)
     seeds = Seeds(surface.centers[chosen], surface.normals[chosen], sigma)
     least = np.pi * (tol.rounding * surface.footprint) ** 2 / surface.areas.sum()
     search = replace(

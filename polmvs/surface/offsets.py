@@ -57,7 +57,8 @@ class OffsetTolerances:
 
     Attributes
     ----------
-    min_points : of a face. Three lie in a plane by chance.
+    min_points : of a face. Three lie in a plane by chance. As many neighbours tell whether a
+        point lies among those of another face.
     num_trials : random triples of points per face; a face of a tenth of the points is then missed
         once in 1000 searches. Derived.
     sigmas : distance of a point to its face, and residual of a phase on it, in deviations: what
@@ -65,7 +66,6 @@ class OffsetTolerances:
     normal_deg : largest angle between a point's normal and its face. Guess: several deviations.
     min_normal_sigma_deg : deviation of the mean of the points' normals (sensor and model, alike
         for all points). Measured on board: 0.2.
-    num_near : neighbours that tell whether points of a face lie among those of another. Guess.
     max_cells : of a grid. Memory and time: one solution takes 7 us a cell.
     smoothing_px : of the intensity before its steps are measured.
     dark : intensity by which a mark must at least be brighter, full scales, and least step of noise
@@ -75,11 +75,15 @@ class OffsetTolerances:
     line_steps : of noise, from which a step hampers the walk. Guess.
     mark_px : greatest width of a printed mark, at a focal length of 445 px. Guess.
     mark_contrast : of a mark's intensity to what is about it. As for the region's marks.
+    mark_share : of the views that show a place, which must show a mark there. A wall of a convex
+        part is seen by half of them. Measured, 0.5: F at 1 mm of an analytic bracket falls by 0.9
+        points.
     seed_cells : radius about a sparse point that belongs to its face, and distance of a face's
         points to the given surface from which it does not explain them; a cell is a footprint.
         Guess: a point's uncertainty, and the size of a first surface's cells.
-    seed_weight : chance that a walk ends on a point that it passes, or goes astray where phases
-        contradict the face, over that of a step. Guess.
+    leak : conductance to nowhere of a place that contradicts its face. Measured, 0.2: F at 1 mm of
+        an analytic bracket falls by 0.2 points.
+    seed_weight : chance that a walk ends on a point that it passes, over that of a step. Guess.
     min_total : chance that a walk from a place ends on any face's points at all. Guess: one in a
         hundred gets through where the phases contradict.
     min_share : of the seen views in whose region a place must lie. Guess: one view in six wrong.
@@ -95,7 +99,6 @@ class OffsetTolerances:
     sigmas: float = 3.0
     normal_deg: float = 4.0
     min_normal_sigma_deg: float = 0.2
-    num_near: int = 5
     max_cells: int = 160_000
     smoothing_px: float = 1.0
     dark: float = 1 / 255
@@ -103,7 +106,9 @@ class OffsetTolerances:
     line_steps: float = 4.0
     mark_px: float = 20.0
     mark_contrast: float = 1.5
+    mark_share: float = 0.6
     seed_cells: float = 2.0
+    leak: float = 0.1
     seed_weight: float = 0.2
     min_total: float = 0.01
     min_share: float = 0.84
@@ -345,7 +350,7 @@ def _without_interlopers(faces: Sequence[Face], points: Array, tol: OffsetTolera
             own = points[face.members] @ tangents.T
             others = np.concatenate([points[other.members] for other in alike]) @ tangents.T
             tree = cKDTree(np.concatenate([own, others]))
-            num = min(tol.num_near + 1, len(own) + len(others))
+            num = min(tol.min_points + 1, len(own) + len(others))
             near = np.atleast_2d(tree.query(own, num)[1])
             if np.mean(near[:, 1:] < len(own)) < 0.5:
                 continue
@@ -715,8 +720,8 @@ def face_evidence(
         jumps[k], marks = _line_steps(scene.features[k], xy, shown, tol)
         num_marks += marks
     # What is printed on the face is a mark in all views, what is printed on a wall beside it is
-    # not at the same place, and half of them see such a wall at most.
-    printed = near_points & (num_marks > 0.5 * inside)
+    # not at the same place.
+    printed = near_points & (num_marks > tol.mark_share * inside)
     jumps[:, printed] = np.nan
     possible = (num_seen >= 2) & (inside >= tol.min_share * num_seen)
     return FaceEvidence(_shared_lines(jumps, tol.view_share), median_loss(losses), possible)
@@ -860,7 +865,7 @@ def _claim(
     adjacency, degree = _walk(evidence.jump.astype(np.float64), tol)
     # A walk may end on any point it passes, so that a single false one does not decide.
     ending = tol.seed_weight * (starts | ends).ravel()
-    leak = tol.seed_weight * np.clip(evidence.cost.astype(np.float64).ravel() / MAX_COST - 1, 0, 1)
+    leak = tol.leak * np.clip(evidence.cost.astype(np.float64).ravel() / MAX_COST - 1, 0, 1)
     free = np.flatnonzero(possible)
     right = tol.seed_weight * starts.ravel()[free].astype(np.float64)
     claim = np.zeros(starts.size)

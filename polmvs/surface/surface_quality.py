@@ -27,6 +27,7 @@ from polmvs.surface.refinement import (
     face_rows,
 )
 from polmvs.surface.surface_view import SurfaceView, phase_rows
+from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -36,7 +37,6 @@ MAX_SIGMAS = 3.0  # of one figure, before it is called a contradiction
 MAX_SHARE = 0.1  # of a surface or its silhouettes in contradiction. Guess
 MIN_POINTS = 10  # on the surface, for their median to be one
 MAX_ROWS = 500_000  # faces times views at a time; bounds memory
-POINT_REACH_PX = 4.0  # of the surface; what lies farther is not on it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -369,7 +369,8 @@ def point_offset(
     place, face, _ = RayScene(mesh).closest(known.points)
     offset = ((place - known.points) * mesh.face_normals[face]).sum(axis=1)
     stated = np.median(sigma[mesh.faces[face]], axis=1)
-    near = np.isfinite(stated) & (np.abs(offset) < POINT_REACH_PX * footprint)
+    # What lies farther than the hull's cells are wide is not on the surface.
+    near = np.isfinite(stated) & (np.abs(offset) < HullTolerances.step_px * footprint)
     if near.sum() < MIN_POINTS:
         return 0.0, 0.0
     offset, middle = offset[near], float(np.median(offset[near]))

@@ -35,6 +35,7 @@ from polmvs.scene import (
     point_sigmas,
     some_tracks,
 )
+from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.dense_view import DenseView, lattice_xy, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse
 
@@ -65,8 +66,6 @@ class SurroundingsTolerances:
         Guess.
     max_axis_angle_deg : between the directions in which two views look, and between their
         baseline and the plane across them: an epipole in the image is no use. Guess.
-    max_normal_difference_deg : of two views; planes of ten pixels' disparities are uncertain.
-        Guess.
     min_shared_points : of two views, for their angle to be known, the range to search, and their
         overlap to be worth it. Guess.
     block_px : side of the patches that are compared, and of the planes that are fitted, in points
@@ -87,7 +86,6 @@ class SurroundingsTolerances:
     min_angle_deg: float = 5.0
     max_angle_deg: float = 25.0
     max_axis_angle_deg: float = 45.0
-    max_normal_difference_deg: float = 30.0
     min_shared_points: int = 20
     block_px: int = 5
     min_texture: float = 2.0
@@ -310,7 +308,7 @@ def stereo_surroundings(
             on_progress(1)
     options = FusionOptions(
         min_views=tolerances.min_observations,
-        max_normal_difference_deg=tolerances.max_normal_difference_deg,
+        max_normal_difference_deg=CreaseTolerances.crease_deg,
         voxel_px=1.0,
     )
     views = [_whole_view(maps[k]) for k in used]
