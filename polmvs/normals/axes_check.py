@@ -9,25 +9,24 @@ in one normal. (A turn by 90 degrees is that of the other kind of light.)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import AngleModel, CaptureKind, CaptureOptions, NormalOptions
 from polmvs.normals.estimator import NormalEstimate
-from polmvs.normals.tracks import inside_shares, normals_from_windows, window_map
+from polmvs.normals.rows import AS_MEASURED, Reading, gather_rows_under
+from polmvs.normals.tracks import DerivedMaps, inside_shares, normals_from_rows, window_map
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
 
 Array = NDArray[np.float64]
-# How (cos 2a, sin 2a) become those of the right angles: rows of the signs and places of both.
-Change = tuple[tuple[int, int], tuple[int, int]]
 
-GIVEN: Change = ((1, 0), (0, 1))
-MIRRORED: Change = ((1, 0), (0, -1))
-TURNED: Change = ((0, 1), (-1, 0))  # by 45 degrees
-TURNED_MIRRORED: Change = ((0, 1), (1, 0))
+MIRRORED: Reading = ((1, 0), (0, -1))
+TURNED: Reading = ((0, 1), (-1, 0))  # by 45 degrees
+TURNED_MIRRORED: Reading = ((0, 1), (1, 0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +65,7 @@ class AxesCheck:
 
     num_votes: int
     share: float
-    change: Change | None
+    change: Reading | None
 
     def message(self, options: CaptureOptions, kind: CaptureKind) -> str:
         """One line for the user.
@@ -106,31 +105,23 @@ def check_axes(
     """
     t, options = tolerances, NormalOptions()
     on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
-    windows = [window_map(phase_map, options.window_px) for phase_map in maps]
-
-    def cost_of(change: Change) -> Array:
-        """Of each point (N,): mean cost of a row, under the better kind of light."""
-        costs = [
-            _row_cost(
-                normals_from_windows(
-                    AngleModel.PPA,
-                    on_parts,
-                    [_changed(window, change, sign) for window in windows],
-                    options.estimator,
-                ),
-                t,
-            )
-            for sign in (1, -1)
-        ]
-        return np.minimum(*costs)
-
-    given = cost_of(GIVEN)
+    windows = DerivedMaps(maps, partial(window_map, window_px=options.window_px))
+    others = (MIRRORED, TURNED, TURNED_MIRRORED)
+    every = [
+        reading for change in (AS_MEASURED, *others) for reading in (change, _other_light(change))
+    ]
+    costs = [
+        _row_cost(normals_from_rows(on_parts, rows, options.estimator), t)
+        for rows in gather_rows_under(every, AngleModel.PPA, on_parts.points_in_world, windows)
+    ]
+    # Of each point (N,): mean cost of a row, under the better kind of light.
+    given, *changed = (np.minimum(*costs[i : i + 2]) for i in range(0, len(costs), 2))
     best = AxesCheck(num_votes=int(np.isfinite(given).sum()), share=0.0, change=None)
     if best.num_votes < t.min_votes:
         return best
     most = t.min_gain
-    for change in (MIRRORED, TURNED, TURNED_MIRRORED):
-        votes = given - cost_of(change)
+    for change, cost in zip(others, changed, strict=True):
+        votes = given - cost
         votes = votes[np.isfinite(votes)]
         if len(votes) < t.min_votes:
             continue
@@ -142,7 +133,7 @@ def check_axes(
 
 
 def changed_pattern(
-    pattern: tuple[int, int, int, int], change: Change
+    pattern: tuple[int, int, int, int], change: Reading
 ) -> tuple[int, int, int, int]:
     """The order of polarizers under which the Stokes parameters are the changed ones.
 
@@ -166,12 +157,9 @@ def changed_pattern(
     return max(found, key=lambda p: sum(x == y for x, y in zip(p, pattern, strict=True)))
 
 
-def _changed(window: PhaseMap, change: Change, sign: int) -> PhaseMap:
-    matrix = np.array(change, np.float32) * np.float32(sign)
-    axial = window.samples[..., :2] @ matrix.T
-    return replace(
-        window, samples=np.dstack([axial, window.samples[..., 2]]).astype(np.float32), folder=None
-    )
+def _other_light(reading: Reading) -> Reading:
+    (a, b), (c, d) = reading
+    return (-a, -b), (-c, -d)
 
 
 def _row_cost(estimate: NormalEstimate, t: AxesTolerances) -> Array:

@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, NormalOptions
 from polmvs.normals.estimator import NormalEstimate, solve_normals
-from polmvs.normals.rows import gather_rows
+from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, Rows, gather_rows_under
 from polmvs.normals.tracks import (
     MAX_ROWS,
     DerivedMaps,
     in_tiles,
     inside_shares,
-    normals_from_windows,
+    normals_from_rows,
     window_map,
 )
-from polmvs.polarization.phase_map import PhaseMap, turned
+from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
 
 Array = NDArray[np.float64]
@@ -116,15 +116,10 @@ def _diffuse_pixels(phase_map: PhaseMap, votes: Array, overall: float, tie: floa
     return np.asarray((verdict < 0)[_parts_of(phase_map)] & phase_map.region.inside)
 
 
-def _windows(maps: Sequence[PhaseMap]) -> tuple[DerivedMaps, DerivedMaps]:
-    """Averaged maps under specular and under diffuse light."""
+def _rows_of_both(points: Array, maps: Sequence[PhaseMap]) -> tuple[Rows, ...]:
+    """Rows of averaged phases under specular and under diffuse light."""
     windows = DerivedMaps(maps, partial(window_map, window_px=NormalOptions().window_px))
-    return windows, DerivedMaps(windows, _opposite)
-
-
-def _opposite(phase_map: PhaseMap) -> PhaseMap:
-    """The map under the other kind of light."""
-    return turned(phase_map, np.ones(phase_map.samples.shape[:2], bool))
+    return gather_rows_under((AS_MEASURED, OTHER_LIGHT), AngleModel.PPA, points, windows)
 
 
 def _track_votes(
@@ -135,8 +130,8 @@ def _track_votes(
     estimator = NormalOptions().estimator
     for some in in_tiles(tracks, len(maps), max_rows):
         specular, diffuse = (
-            normals_from_windows(AngleModel.PPA, some, windows, estimator)
-            for windows in _windows(maps)
+            normals_from_rows(some, rows, estimator)
+            for rows in _rows_of_both(some.points_in_world, maps)
         )
         of_some = specular_votes(specular, diffuse, t)
         votes.append(of_some[0])
@@ -189,14 +184,13 @@ def _pixel_votes(
                 slots.append(first[-1] + index * len(votes) + owner)
     all_placed, slot = np.concatenate(placed), np.concatenate(slots)
     seen_by = np.linspace(0, len(maps) - 1, min(len(maps), t.max_pixel_views)).round().astype(int)
-    both = _windows([maps[k] for k in seen_by])
     total, sums = np.zeros(num_slots), np.zeros((2, num_slots))
     step = max(1, max_rows // max(len(seen_by), 1))
     for start in range(0, len(slot), step):
         tile, here = all_placed[start : start + step], slot[start : start + step]
         specular, diffuse = (
             solve_normals(rows.rows, rows.rays, rows.sigma)
-            for rows in (gather_rows(AngleModel.PPA, tile, windows) for windows in both)
+            for rows in _rows_of_both(tile, [maps[k] for k in seen_by])
         )
         costs, compared = _row_costs(specular, diffuse, t.max_row_cost)
         counts = compared.sum(axis=0) * (compared.sum(axis=0) >= t.min_rows)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from polmvs.config import AngleModel, Light, NormalOptions
 from polmvs.normals.light import specular_votes
-from polmvs.normals.tracks import inside_shares, normals_from_windows, window_map
-from polmvs.polarization.phase_map import PhaseMap, turned
+from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
+from polmvs.normals.tracks import DerivedMaps, inside_shares, normals_from_rows, window_map
+from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
 
 MIN_VOTES = 8  # sparse points; a guess
@@ -59,11 +61,11 @@ def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> Light
     """
     options = NormalOptions()
     on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
-    windows = [window_map(phase_map, options.window_px) for phase_map in maps]
-    opposite = [turned(m, np.ones(m.region.inside.shape, np.bool_)) for m in windows]
+    windows = DerivedMaps(maps, partial(window_map, window_px=options.window_px))
+    readings = (AS_MEASURED, OTHER_LIGHT)
     as_given, as_other = (
-        normals_from_windows(AngleModel.PPA, on_parts, each, options.estimator)
-        for each in (windows, opposite)
+        normals_from_rows(on_parts, rows, options.estimator)
+        for rows in gather_rows_under(readings, AngleModel.PPA, on_parts.points_in_world, windows)
     )
     votes, voting = specular_votes(as_given, as_other)  # for the first over the second
     votes = votes[voting]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,12 @@ class Rows:
     sigma: NDArray[np.float32]
 
 
+# What becomes of (cos 2 phase, sin 2 phase): rows of a matrix.
+Reading: TypeAlias = tuple[tuple[int, int], tuple[int, int]]
+AS_MEASURED: Reading = ((1, 0), (0, 1))
+OTHER_LIGHT: Reading = ((-1, 0), (0, -1))
+
+
 def gather_rows(
     angle_model: AngleModel,
     points_in_world: Floats,
@@ -48,8 +55,35 @@ def gather_rows(
 ) -> Rows:
     """Rows of points from all views that see them (paper, eq. coeff_2, before stacking).
 
+    Parameters are those of :func:`gather_rows_under`.
+    """
+    (rows,) = gather_rows_under(
+        (AS_MEASURED,),
+        angle_model,
+        points_in_world,
+        maps,
+        range_maps,
+        range_tolerance=range_tolerance,
+        tilt_aware=tilt_aware,
+    )
+    return rows
+
+
+def gather_rows_under(
+    readings: Sequence[Reading],
+    angle_model: AngleModel,
+    points_in_world: Floats,
+    maps: Sequence[PhaseMap],
+    range_maps: Sequence[Image | None] | None = None,
+    *,
+    range_tolerance: float = OCCLUSION_TOLERANCE,
+    tilt_aware: bool = True,
+) -> tuple[Rows, ...]:
+    """Rows of points under several readings of the same phases, the maps asked once.
+
     Parameters
     ----------
+    readings : of the phases, one for each result; their weights are the measured ones'.
     angle_model : which rows.
     points_in_world : (N, 3).
     maps : K phase maps.
@@ -63,9 +97,15 @@ def gather_rows(
     tilt_aware = tilt_aware and angle_model is not AngleModel.TILTED
     points = np.asarray(points_in_world, np.float64)  # the origin may be far
     num_views, num_points = len(maps), len(points)
-    rows = np.full((3, num_views, num_points), np.nan, np.float32)
     rays = np.zeros((3, num_views, num_points), np.float32)
-    sigma = np.full((num_views, num_points), np.inf, np.float32)
+    found = [
+        Rows(
+            np.full((3, num_views, num_points), np.nan, np.float32),
+            rays,
+            np.full((num_views, num_points), np.inf, np.float32),
+        )
+        for _ in readings
+    ]
     for k, phase_map in enumerate(maps):
         in_cam = (phase_map.view.cam_from_world * points).astype(np.float32)
         distance = np.linalg.norm(in_cam, axis=-1)
@@ -79,21 +119,24 @@ def gather_rows(
             precision = np.where(
                 (shown > 0) & (distance > (1 + range_tolerance) * shown), 0, precision
             )
-        row, turn = _row_and_turn(angle_model, samples, ray)
         rotation = phase_map.view.cam_from_world.rotation.astype(np.float32)
-        rows[:, k] = (row @ rotation).T
         rays[:, k] = (ray @ rotation).T
         seen = np.flatnonzero(precision > 0)
-        variance = 1 / precision[seen]
+        of_phase = 1 / precision[seen]
         if tilt_aware:
-            variance += np.square(_tilt_turns(phase_map, samples[seen], ray[seen], xy[seen]))
-        variance *= np.square(turn[seen])
-        if tilt_aware and angle_model is AngleModel.OPA:
-            # Both rows are perpendicular to d: v . (z x d) over v_z is the tangent of their angle.
-            aside2 = np.square((row[seen] * ray[seen]).sum(axis=-1))
-            variance += aside2 / (aside2 + ray[seen, 2] ** 2)
-        sigma[k, seen] = np.sqrt(variance)
-    return Rows(rows, rays, sigma)
+            of_phase += np.square(_tilt_turns(phase_map, samples[seen], ray[seen], xy[seen]))
+        for reading, rows in zip(readings, found, strict=True):
+            axial = samples[:, :2] @ np.array(reading, np.float32).T
+            row, turn = _row_and_turn(angle_model, axial, ray)
+            rows.rows[:, k] = (row @ rotation).T
+            variance = of_phase * np.square(turn[seen])
+            if tilt_aware and angle_model is AngleModel.OPA:
+                # Both rows are perpendicular to d: v . (z x d) over v_z is the tangent of their
+                # angle.
+                aside2 = np.square((row[seen] * ray[seen]).sum(axis=-1))
+                variance += aside2 / (aside2 + ray[seen, 2] ** 2)
+            rows.sigma[k, seen] = np.sqrt(variance)
+    return tuple(found)
 
 
 def sample_range(range_map: Image, view: View, xy: Floats) -> NDArray[np.float32]:
@@ -109,9 +152,9 @@ def _tilt_turns(phase_map: PhaseMap, samples: Image, rays: Image, xy: Floats) ->
     return tilt_turn(samples[:, 0], samples[:, 1], rays, diffuse=diffuse)
 
 
-def _row_and_turn(angle_model: AngleModel, samples: Image, rays: Floats) -> tuple[Floats, Floats]:
+def _row_and_turn(angle_model: AngleModel, axial: Image, rays: Floats) -> tuple[Floats, Floats]:
     """Row in the camera frame, and how far it turns about the ray per turn of the phase."""
-    row = rows_from_axial(angle_model, samples[:, 0], samples[:, 1], rays)
+    row = rows_from_axial(angle_model, axial[:, 0], axial[:, 1], rays)
     if angle_model is AngleModel.OPA:
         return row, np.ones(len(row), np.float32)
     # v_z / (1 - (v . d)^2): the length of v x d is v_z over the row's length in the image plane.

@@ -20,7 +20,7 @@ from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, Estimator, NormalOptions
 from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
-from polmvs.normals.rows import gather_rows
+from polmvs.normals.rows import Rows, gather_rows
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds, Tracks, point_sigmas, some_tracks
 
@@ -124,8 +124,12 @@ def track_normals(
     source[~own] = source[np.flatnonzero(~own)[:1]]
     windows = DerivedMaps(maps, partial(window_map, window_px=options.window_px))
     estimates = [
-        normals_from_windows(
-            angle_model, some, windows, options.estimator, tilt_aware=options.tilt_aware_weights
+        normals_from_rows(
+            some,
+            gather_rows(
+                angle_model, some.points_in_world, windows, tilt_aware=options.tilt_aware_weights
+            ),
+            options.estimator,
         )
         for some in in_tiles(some_tracks(tracks, solved), len(maps), max_rows)
     ]
@@ -148,20 +152,12 @@ def in_tiles(tracks: Tracks, num_views: int, max_rows: int) -> Iterator[Tracks]:
         yield some_tracks(tracks, (index >= start) & (index < start + num))
 
 
-def normals_from_windows(
-    angle_model: AngleModel,
-    tracks: Tracks,
-    windows: Sequence[PhaseMap],
-    estimator: Estimator,
-    *,
-    tilt_aware: bool = True,
-) -> NormalEstimate:
-    """Normals of tracks in one batch, from phase maps that are averaged (:func:`window_map`).
+def normals_from_rows(tracks: Tracks, rows: Rows, estimator: Estimator) -> NormalEstimate:
+    """Normals of tracks in one batch, from rows of averaged phases (:func:`window_map`).
 
     First from the views that matched the point, which surely see it, then from every view that
     faces it.
     """
-    rows = gather_rows(angle_model, tracks.points_in_world, windows, tilt_aware=tilt_aware)
     matched = np.zeros(rows.sigma.shape, bool)
     matched[tracks.obs_view, tracks.obs_track] = True
     robust = estimator is Estimator.ROBUST

@@ -184,8 +184,8 @@ def reconstruct_surface(
     found, meshes = _surface(given, hull_tolerances, tolerances)
     if tolerances.thin_levels and _uncovered_share(found) > MAX_SHARE:
         logger.warning(
-            "%s: %.0f %% of the polarised regions stay uncovered, walls may be thin: the surface is "
-            "made once more with a finer mesh, which may take minutes.",
+            "%s: %.0f %% of the polarised regions stay uncovered, walls may be thin: the surface "
+            "is made once more with a finer mesh, which may take minutes.",
             angle_model,
             100 * _uncovered_share(found),
         )

@@ -8,18 +8,23 @@ from scenes import Scene, board_scene, phase_map_of, tracks_at
 
 from polmvs.config import CaptureKind, CaptureOptions, Light
 from polmvs.normals.axes_check import (
-    GIVEN,
     MIRRORED,
     TURNED,
     TURNED_MIRRORED,
-    _changed,
     changed_pattern,
     check_axes,
 )
+from polmvs.normals.rows import AS_MEASURED
 from polmvs.synthetic.captures import Sphere, render_view
 
 STANDARD = (90, 45, 135, 0)
 PAIRED = [p for p in permutations((0, 45, 90, 135)) if abs(p[0] - p[3]) == 90]
+
+
+def read_as(phase_map, change):
+    """The map with all its phases changed."""
+    axial = phase_map.samples[..., :2] @ np.array(change, np.float32).T
+    return phase_map.changed(samples=np.dstack([axial, phase_map.samples[..., 2]]))
 
 
 def ball_scene(light: Light, sensor: str = "ppa") -> Scene:
@@ -47,13 +52,13 @@ def test_wrong_angles_are_told_apart(change, shape):
     scene = board_scene(6) if shape == "board" else ball_scene(Light.SPECULAR)
     # Few of a ball's points are seen by four views.
     tracks = tracks_at(scene, scene.surface_points(60 if shape == "board" else 500)[0])
-    wrong = [_changed(phase_map, change, 1) for phase_map in scene.maps]
+    wrong = [read_as(phase_map, change) for phase_map in scene.maps]
     assert check_axes(tracks, wrong).change == change  # each undoes itself, but for the light
 
 
 def test_few_views_or_points_say_nothing():
     scene = board_scene(6)
-    wrong = [_changed(phase_map, MIRRORED, 1) for phase_map in scene.maps]
+    wrong = [read_as(phase_map, MIRRORED) for phase_map in scene.maps]
     few = tracks_at(scene, scene.surface_points(4)[0])
     assert check_axes(few, wrong).change is None
     three = tracks_at(scene, scene.surface_points(60)[0], range(3))
@@ -66,7 +71,7 @@ def stokes_of(pattern: tuple[int, ...], samples: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("given", PAIRED)
-@pytest.mark.parametrize("change", [GIVEN, MIRRORED, TURNED, TURNED_MIRRORED])
+@pytest.mark.parametrize("change", [AS_MEASURED, MIRRORED, TURNED, TURNED_MIRRORED])
 def test_the_pattern_that_is_named_gives_the_changed_parameters(given, change):
     samples = np.random.default_rng(0).uniform(size=4)
     samples[3] = samples[1] + samples[2] - samples[0]  # perpendicular pairs sum alike
@@ -80,7 +85,7 @@ def test_the_pattern_that_is_named_gives_the_changed_parameters(given, change):
 def test_the_message_names_the_setting():
     scene = board_scene(6)
     tracks = tracks_at(scene, scene.surface_points(60)[0])
-    wrong = [_changed(phase_map, MIRRORED, 1) for phase_map in scene.maps]
+    wrong = [read_as(phase_map, MIRRORED) for phase_map in scene.maps]
     found = check_axes(tracks, wrong)
     options = CaptureOptions(pattern=(90, 135, 45, 0))
     text = found.message(options, CaptureKind.MOSAIC)
