@@ -59,17 +59,17 @@ class HollowTolerances:
 
     Attributes
     ----------
-    max_planes : of the surface that are looked at, largest first. Guess: a box has six.
+    max_planes : of the surface that are looked at, largest first: a box has six. 4 and 16 alike.
     min_part : share of a plane's faces that is rim, and that is mouth, at least. Guess.
     min_sectors : of eight about what has no phase, in which there must be some that has. Guess:
         one may be hidden.
     max_gap : of the rim, half its length (a mark, a reflection). Guess. The cells that the closed
-        rim encloses may be off the mouth's border by as much.
+        rim encloses may be off the mouth's border by as much. 2 and 8 alike.
     max_brightness : of the mouth over the rim, median over the views. A second reflection on
         glass of ior 1.5 leaves a tenth to a half of the light of the first at 45 to 75 deg. Guess.
     rounding : of the surface beside the rim; below it the wall's thickness is measured, over half
-        of it the rim's brightness is taken, and what is no wider is no mouth. Guess: three of the
-        surface's cells.
+        of it the rim's brightness is taken, and what is no wider is no mouth. Three of the
+        surface's cells; 3 and 12 alike.
     thickness_spread : robust deviation of the wall's thickness around the rim, as a share of it;
         one footprint is always allowed. Guess.
     growth : of a hollow's half width per depth. A bottle's shoulders are not presumed. Guess.

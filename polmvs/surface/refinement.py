@@ -86,12 +86,13 @@ class RefinementTolerances:
     smoothness : deviation of the scale-free curvature from its surroundings' mean. Measured: 0.02
         to 0.04 alike.
     smoothness_memory : share of the surroundings' curvature that is not resisted. Measured: 0.8.
-    damping : deviation of a step, in edges. Prototype.
+    damping : deviation of a step, in edges. Measured on `mug` and `step`: 100 and 0.5 alike; it
+        holds what neither outlines nor points place. With the three that follow, half of it costs
+        `mug` 0.4 points of F at 1 mm, twice gains 0.1.
     remesh_after : displacement of a fiftieth of the vertices after which a mesh is made anew, in
-        edges. Guess.
+        edges.
     unseen_damping : of a vertex that no view sees, in edges; smoothness alone would melt it.
     converged : root mean square of displacements of what is seen that ends a level, in edges.
-        Guess.
     max_vertices : of a mesh; finer levels are left out. From the time allowed.
     """
 
