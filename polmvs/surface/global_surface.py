@@ -115,7 +115,8 @@ def num_surface_steps(num_views: int) -> int:
     A surface that is made once more reports none of its steps.
     """
     tolerances = RefinementTolerances()
-    refinement = sum(level.num_steps * (1 + level.with_slope) for level in tolerances.levels)
+    refinement = tolerances.levels[0].num_steps  # the coarsest level goes two ways
+    refinement += sum(level.num_steps for level in tolerances.levels)
     return refinement + NUM_FINAL_STEPS + num_views
 
 

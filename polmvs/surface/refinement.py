@@ -44,15 +44,15 @@ class Level:
     num_steps : Gauss-Newton steps at most.
     loss_scale : of the phase rows' loss, in their standard deviations.
     rim_gate_px : outlines farther from a silhouette than this are not drawn to it.
-    with_slope : count how a row changes as its place moves through the phase image, though
-        outlines are there (see :func:`_add_phases`), if the result explains the phases better.
+    with_slope : count how a row changes as its place moves through the phase image (see
+        :func:`_add_phases`).
     """
 
     edge_px: float
     num_steps: int
     loss_scale: float
     rim_gate_px: float
-    with_slope: bool = False
+    with_slope: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,12 +97,12 @@ class RefinementTolerances:
     """
 
     levels: tuple[Level, ...] = (
-        Level(edge_px=6.0, num_steps=18, loss_scale=12.0, rim_gate_px=25.0, with_slope=True),
+        Level(edge_px=6.0, num_steps=18, loss_scale=12.0, rim_gate_px=25.0),
         Level(edge_px=3.0, num_steps=4, loss_scale=6.0, rim_gate_px=8.0),
         Level(edge_px=2.0, num_steps=3, loss_scale=4.0, rim_gate_px=4.0),
     )
     thin_levels: tuple[Level, ...] = (
-        Level(edge_px=3.0, num_steps=60, loss_scale=12.0, rim_gate_px=25.0, with_slope=True),
+        Level(edge_px=3.0, num_steps=60, loss_scale=12.0, rim_gate_px=25.0),
         Level(edge_px=2.0, num_steps=5, loss_scale=4.0, rim_gate_px=4.0),
     )
     row_sigma: float = 0.03
@@ -362,7 +362,9 @@ def refine(
         expected = 1.2 * state.mesh.face_areas.sum() / edge**2
         if number and expected > tol.max_vertices:
             edge = float(np.sqrt(1.2 * state.mesh.face_areas.sum() / tol.max_vertices))
-        ways = [level, replace(level, with_slope=False)] if level.with_slope else [level]
+        ways = [level]
+        if not number and level.with_slope:  # from far away it may lead to a worse minimum
+            ways.append(replace(level, with_slope=False))
         found = [
             _refined_at(state, views, angle_model, footprint, edge, way, known, tol, on_progress)
             for way in ways
@@ -727,10 +729,10 @@ def _add_phases(
     """Add the rows of all views.
 
     How a row changes as the place moves through the phase image (``with_slope``) places a surface
-    that no outline bounds: all of one without outlines, and hollows. It hardly sees the scale of
-    round objects and shrinks them, so that the last levels leave it out where there are outlines.
-    Measured on a dish without sparse points: its floor is 8 mm too high without, and right with it
-    on the first level; on convex objects it is neutral there, and it may find a worse minimum.
+    that no outline bounds: all of one without outlines, hollows, waves. Measured: the floor of a
+    dish without sparse points is 8 mm too high without it on the first level, and right with it;
+    waves 7 mm high, of 60 mm, lie 0.48 mm off without it on the last levels, 0.25 mm with it; six
+    other objects' Chamfer distances change by -0.01 to 0.02 mm.
 
     Returns
     -------
