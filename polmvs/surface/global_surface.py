@@ -45,7 +45,7 @@ from polmvs.surface.surface_quality import (
     point_offset,
     supported_faces,
 )
-from polmvs.surface.surface_view import SurfaceView, surface_view
+from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, surface_view
 from polmvs.surface.visual_hull import (
     HullTolerances,
     Plane,
@@ -60,10 +60,8 @@ Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 OnProgress = Callable[[int], None]
 
-MIN_VIEWS = 3  # with an outline: the hull of two cones is no shape
 MAX_FILLED_SHARE = 0.35  # of the image's border on the objects, where a silhouette bounds little
 REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured on spheres
-COARSE_EDGE_PX = 6.0  # of the mesh on which deviations are sampled; they are smooth
 NUM_FINAL_STEPS = 3  # of the progress: evidence, normals, deviations
 
 
@@ -399,7 +397,7 @@ def _deviations(
     known: KnownPoints,
 ) -> Array:
     """Deviations of the vertices, sampled on a coarser mesh if that saves time."""
-    coarse = remeshed(mesh, COARSE_EDGE_PX * footprint)
+    coarse = remeshed(mesh, RefinementTolerances.levels[0].edge_px * footprint)
     if not len(coarse.faces):
         coarse = mesh
     sigma = place_deviations(coarse, views, angle_model, footprint, known=known)

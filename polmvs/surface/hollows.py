@@ -24,8 +24,11 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Seeds
+from polmvs.scene import KEYPOINT_SIGMA_PX, Seeds
+from polmvs.surface.creases import CreaseTolerances
+from polmvs.surface.mesh_geometry import MAX_CELLS
 from polmvs.surface.offsets import (
+    MAX_COST,
     NO_FACE,
     Face,
     FaceGrid,
@@ -40,6 +43,9 @@ from polmvs.surface.offsets import (
     row_losses,
     snapped_border,
 )
+from polmvs.surface.refinement import RefinementTolerances
+from polmvs.surface.surface_view import MIN_VIEWS
+from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -53,59 +59,30 @@ class HollowTolerances:
 
     Attributes
     ----------
-    max_samples : faces of the surface among which planes are sought.
-    max_planes : of the surface that are looked at, largest first. Guess: a box has six.
-    num_trials : random triples per plane; one of a twentieth of the surface is missed once in
-        ten searches.
-    surface_sigma : deviation of the surface from its planes. Guess: cells are two wide.
-    surface_normal_deg : of its normals from theirs. Guess: those of a carved hull are rough.
+    max_planes : of the surface that are looked at, largest first: a box has six. 4 and 16 alike.
     min_part : share of a plane's faces that is rim, and that is mouth, at least. Guess.
     min_sectors : of eight about what has no phase, in which there must be some that has. Guess:
         one may be hidden.
-    min_cosine : between a face's normal and the direction to a view that is asked. Guess.
-    min_views : that a normal, and a comparison of brightness, need.
-    min_phase_share : of the views that must have a phase at a face of the rim. Guess.
-    min_radius : of a mouth, as a disc. Guess.
-    focus_range : of the sweep of the rim's offset. Guess: what a hull may be off.
-    focus_share : of the views, which must show a line at one place to make it count there. Guess.
-    max_gap : of the rim, half its length (a mark, a reflection). Guess.
+    max_gap : of the rim, half its length (a mark, a reflection). Guess. The cells that the closed
+        rim encloses may be off the mouth's border by as much. 2 and 8 alike.
     max_brightness : of the mouth over the rim, median over the views. A second reflection on
         glass of ior 1.5 leaves a tenth to a half of the light of the first at 45 to 75 deg. Guess.
-    rim_width : over which the rim's brightness is taken. Guess.
-    snap_cells : by which the enclosed cells may be off the mouth's border. Guess.
-    wall_depth : under the rim at which the wall's thickness is measured: below the rounding that
-        the surface has there. Guess: three of its cells.
+    rounding : of the surface beside the rim; below it the wall's thickness is measured, over half
+        of it the rim's brightness is taken, and what is no wider is no mouth. Three of the
+        surface's cells; 3 and 12 alike.
     thickness_spread : robust deviation of the wall's thickness around the rim, as a share of it;
         one footprint is always allowed. Guess.
     growth : of a hollow's half width per depth. A bottle's shoulders are not presumed. Guess.
-    above : height of a cap's bulge over the rim that is cut off. Guess.
-    layer_cells : distance of the layers.
-    max_cells : of the grid of a hollow.
     """
 
-    max_samples: int = 3000
     max_planes: int = 8
-    num_trials: int = 1000
-    surface_sigma: float = 1.0
-    surface_normal_deg: float = 25.0
     min_part: float = 0.15
     min_sectors: int = 7
-    min_cosine: float = 0.3
-    min_views: int = 3
-    min_phase_share: float = 0.5
-    min_radius: float = 8.0
-    focus_range: float = 4.0
-    focus_share: float = 0.75
     max_gap: float = 4.0
     max_brightness: float = 0.3
-    rim_width: float = 6.0
-    snap_cells: float = 5.0
-    wall_depth: float = 6.0
+    rounding: float = 6.0
     thickness_spread: float = 0.15
     growth: float = 0.5
-    above: float = 12.0
-    layer_cells: int = 3
-    max_cells: int = 6_000_000
 
 
 @dataclass(frozen=True)
@@ -184,7 +161,7 @@ def find_hollows(
     folder : as of :func:`polmvs.surface.offsets.face_scene`.
     """
     tol, face_tol = tolerances or HollowTolerances(), offset_tolerances or OffsetTolerances()
-    if not len(surface.centers) or len(maps) < tol.min_views:
+    if not len(surface.centers) or len(maps) < MIN_VIEWS:
         return ()
     scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=face_tol, folder=folder)
     found: list[Hollow] = []
@@ -211,18 +188,16 @@ def _flat_pieces(
     """The largest planes of a surface, with the faces (of all) that lie in them."""
     rng = np.random.default_rng(0)
     share = surface.areas / surface.areas.sum()
-    num = min(tol.max_samples, len(share))
+    num = min(face_tol.num_trials, len(share))
     chosen = np.sort(rng.choice(len(share), num, replace=False, p=share))
-    sigma = np.full(num, tol.surface_sigma * surface.footprint)
+    sigma = np.full(num, KEYPOINT_SIGMA_PX * surface.footprint)
     seeds = Seeds(surface.centers[chosen], surface.normals[chosen], sigma)
-    least = np.pi * (tol.min_radius * surface.footprint) ** 2 / surface.areas.sum()
+    least = np.pi * (tol.rounding * surface.footprint) ** 2 / surface.areas.sum()
     search = replace(
         face_tol,
         min_points=max(int(least * num), 10),
-        normal_deg=tol.surface_normal_deg,
-        min_normal_sigma_deg=tol.surface_normal_deg,
-        plane_sigmas=1.5,
-        num_trials=tol.num_trials,
+        normal_deg=CreaseTolerances.crease_deg,
+        min_normal_sigma_deg=CreaseTolerances.crease_deg,
     )
     faces = find_faces(seeds, search, max_faces=tol.max_planes)
     return tuple(replace(face, members=chosen[face.members]) for face in faces)
@@ -241,21 +216,21 @@ def _rim(
     contradict.
     """
     rows = scene.rows(surface.centers[flat.members])
-    facing = -np.einsum("ikn,i->kn", rows.rays, flat.normal) > tol.min_cosine
+    facing = -np.einsum("ikn,i->kn", rows.rays, flat.normal) > RefinementTolerances.min_cosine
     sigma = np.where(facing, rows.sigma, np.inf)
     start = np.repeat(flat.normal[:, None], len(flat.members), axis=1)
     estimate = solve_normals(rows.rows, rows.rays, sigma, initial_normals=start)
     turned = np.nan_to_num(estimate.normals) @ flat.normal
-    agree = estimate.valid & (estimate.num_rows >= tol.min_views)
-    agree &= turned > np.cos(np.radians(tol.surface_normal_deg))
+    agree = estimate.valid & (estimate.num_rows >= MIN_VIEWS)
+    agree &= turned > np.cos(np.radians(CreaseTolerances.crease_deg))
     if agree.sum() < 10:
         return None
     normal = np.median(estimate.normals[agree], axis=0)
     normal /= np.linalg.norm(normal)
     losses = row_losses(rows, normal[:, None], face_tol)[0]
     losses = np.where(facing, losses, np.nan)
-    has_phase = np.isfinite(losses).sum(axis=0) >= tol.min_phase_share * facing.sum(axis=0)
-    supported = has_phase & (median_loss(losses[:, None])[0] < face_tol.max_cost)
+    has_phase = np.isfinite(losses).sum(axis=0) >= 0.5 * facing.sum(axis=0)
+    supported = has_phase & (median_loss(losses[:, None])[0] < MAX_COST)
     share = float(supported.mean())
     if not tol.min_part <= share <= 1 - tol.min_part:
         return None
@@ -304,9 +279,11 @@ def _in_focus(
 
     def strength(shift: float) -> float:
         face = replace(rim, offset=rim.offset + shift * footprint)
-        return float(face_lines(grid.points(face), face, scene, face_tol, tol.focus_share).sum())
+        return float(
+            face_lines(grid.points(face), face, scene, face_tol, 1 - face_tol.view_share).sum()
+        )
 
-    shifts = np.arange(-tol.focus_range, tol.focus_range + 0.5)
+    shifts = np.arange(-HullTolerances.step_px, HullTolerances.step_px + 0.5)  # a cell of the hull
     sums = np.array([strength(shift) for shift in shifts])
     best = int(np.clip(sums.argmax(), 1, len(sums) - 2))
     below, here, above = sums[best - 1 : best + 2]
@@ -325,7 +302,7 @@ def _mouth(
     """Cells (H, W) that the supported cells of the rim enclose, up to the rim's inner line."""
     nothing_near = np.zeros(grid.shape, np.bool_)
     evidence = face_evidence(grid.points(rim), rim, scene, nothing_near, None, face_tol)
-    supported = evidence.possible & (evidence.cost < face_tol.max_cost)
+    supported = evidence.possible & (evidence.cost < MAX_COST)
     closed = ndimage.binary_closing(supported, iterations=round(tol.max_gap))
     enclosed = np.asarray(ndimage.binary_fill_holes(closed), np.bool_) & ~closed
     enclosed = np.asarray(ndimage.binary_opening(enclosed, iterations=2), np.bool_)
@@ -333,11 +310,11 @@ def _mouth(
     if num == 0:
         return enclosed
     mouth = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
-    if mouth.sum() < np.pi * tol.min_radius**2:
+    if mouth.sum() < np.pi * tol.rounding**2:
         return np.zeros(grid.shape, np.bool_)
     labels = np.where(mouth, 0, NO_FACE)
-    near = replace(face_tol, snap_cells=tol.snap_cells)
-    snapped = snapped_border(labels, 0, evidence.jump.astype(np.float64), near)
+    jump = evidence.jump.astype(np.float64)
+    snapped = snapped_border(labels, 0, jump, tol.max_gap, face_tol.line_steps)
     return np.asarray(snapped == 0)
 
 
@@ -356,13 +333,13 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: HollowTol
                 medians.append(float(np.median(sample_image(intensity, xy[shown]))))
         if len(medians) == 2:
             ratios.append(medians[0] / max(medians[1], 1e-9))
-    return len(ratios) >= tol.min_views and float(np.median(ratios)) < tol.max_brightness
+    return len(ratios) >= MIN_VIEWS and float(np.median(ratios)) < tol.max_brightness
 
 
 def _ring_about(mouth: Mask, tol: HollowTolerances) -> Mask:
     """Cells (H, W) of the rim about a mouth, off the line between them."""
     line = ndimage.binary_dilation(mouth, iterations=2)
-    ring = ndimage.binary_dilation(line, iterations=max(round(0.5 * tol.rim_width), 1))
+    ring = ndimage.binary_dilation(line, iterations=max(round(0.5 * tol.rounding), 1))
     return np.asarray(ring & ~line, np.bool_)
 
 
@@ -375,8 +352,8 @@ def _hollow(
 ) -> Hollow | None:
     """The hollow under a mouth, its wall as thick as at the rim; None where that varies."""
     border = mouth & ~ndimage.binary_erosion(mouth)
-    spacing, most = tol.layer_cells, tol.max_cells // mouth.size
-    depths = np.array([tol.wall_depth, *(spacing * np.arange(1, most))], np.float64)
+    spacing, most = 0.5 * tol.rounding, MAX_CELLS // mouth.size
+    depths = np.array([tol.rounding, *(spacing * np.arange(1, most))], np.float64)
     order = np.argsort(depths)
     insides = np.empty((len(depths), *grid.shape), np.bool_)
     insides[order] = surface.inside_along(
@@ -399,7 +376,7 @@ def _hollow(
         if not inside.any():
             break
         # At the rim its line is known; below it the wall's thickness takes over.
-        known = min(depth / tol.wall_depth, 1.0)
+        known = min(depth / tol.rounding, 1.0)
         presumed = known * (-outside_of(inside) - thickness) + (1 - known) * layers[0]
         free = np.minimum(presumed, layers[-1] + tol.growth * spacing)
         pieces = ndimage.label(free > 0)[0]
@@ -411,9 +388,10 @@ def _hollow(
     depths = spacing * np.arange(len(layers), dtype=np.float64)
     # The bottom is as thick as the wall, at least.
     floor = spacing * len(layers) - thickness - depths
-    if floor[0] <= tol.min_radius:
+    if floor[0] <= tol.rounding:
         return None
-    above = int(np.ceil(tol.above / spacing))
+    # A cap bulges over the rim by no more than it is rounded.
+    above = int(np.ceil(2 * tol.rounding / spacing))
     field = np.minimum(np.stack(layers), floor[:, None, None])
     field = np.concatenate([np.repeat(field[:1], above, axis=0), field])
     field = ndimage.gaussian_filter(field, (0.5, 1.0, 1.0), mode="nearest") * grid.step

@@ -28,6 +28,7 @@ SIGN_DIRECTIONS = (
     np.array([-0.70, 0.10, 0.71]),
     np.array([0.25, -0.83, -0.50]),
 )
+MAX_CELLS = 6_000_000  # of a grid: 4 bytes each for a few arrays. From the memory allowed
 BAND_CELLS = 3  # half width of the band about a mesh in which distances are computed
 
 
@@ -153,14 +154,14 @@ class RayHits:
 
 
 class RayScene:
-    """A mesh to cast rays on and to measure distances to."""
+    """A ``mesh`` to cast rays on and to measure distances to."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
         o3d = import_open3d()
         # Open3D computes in float32: coordinates are taken from the mesh's centre.
         self._origin = mesh.vertices.mean(axis=0) if len(mesh.vertices) else np.zeros(3)
         self._tensor = o3d.core.Tensor
-        self._face_normals = mesh.face_normals
+        self.mesh = mesh
         self._scene: Any = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
             self._tensor(self._local(mesh.vertices)),
@@ -241,7 +242,7 @@ class RayScene:
         rays[:, :3], rays[:, 3:] = local, direction
         hits = self._scene.list_intersections(self._tensor(rays))
         face = hits["primitive_ids"].numpy().astype(np.int64)
-        leaves = np.sign(self._face_normals[face] @ direction)
+        leaves = np.sign(self.mesh.face_normals[face] @ direction)
         return hits["ray_ids"].numpy().astype(np.int64), leaves, hits["t_hit"].numpy()
 
 
@@ -251,20 +252,16 @@ def visible_points(
     points: Floats,
     normals: Floats,
     *,
-    tolerance: float,
     min_cosine: float,
-    candidates: Mask | None = None,
 ) -> tuple[NDArray[np.int64], Array, Array]:
     """Which points of the surface a camera sees.
 
     Parameters
     ----------
-    scene : the mesh that may hide them.
+    scene : the mesh that may hide them; by less than half an edge it does not.
     center : (3,), of the camera.
     points, normals : (N, 3).
-    tolerance : distance by which the mesh may lie in front of a point.
     min_cosine : between normal and direction to the camera.
-    candidates : (N,) bool, points worth asking for.
 
     Returns
     -------
@@ -276,11 +273,10 @@ def visible_points(
     distance = np.linalg.norm(away, axis=1)
     rays = away / np.maximum(distance, 1e-300)[:, None]
     cosine = -(rays * normals).sum(axis=1)
-    facing = cosine > min_cosine
-    index = np.flatnonzero(facing if candidates is None else facing & candidates)
+    index = np.flatnonzero(cosine > min_cosine)
     if len(index):
         hit = scene.cast(center, rays[index]).distance
-        index = index[hit > distance[index] - tolerance]
+        index = index[hit > distance[index] - 0.5 * scene.mesh.mean_edge]
     return index, rays[index], cosine[index]
 
 

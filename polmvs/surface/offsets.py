@@ -31,8 +31,12 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.io.arrays import kept_array
 from polmvs.normals.rows import Rows, gather_rows
+from polmvs.normals.tracks import SeedTolerances
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Seeds
+from polmvs.scene import MIN_FACING_COSINE, Seeds
+from polmvs.surface.creases import CreaseTolerances
+from polmvs.surface.refinement import RefinementTolerances
+from polmvs.surface.surface_view import REFERENCE_FOCAL_PX
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -42,9 +46,9 @@ SignedDistance: TypeAlias = Callable[[Array], Floats]
 FirstHit: TypeAlias = Callable[[Array, Array], tuple[Floats, Floats]]
 
 NO_FACE = -1
-REFERENCE_FOCAL_PX = 445.0
 BESIDE, ACROSS = ((0, 1), (1, 0)), ((1, 1), (1, -1))  # neighbours of a cell: down, right
 CUT_UNIT = 10_000  # of the weights of a cut, which are whole numbers
+MAX_COST = 0.5  # median loss beyond which phases contradict a face: that of ``sigmas`` deviations
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,86 +57,63 @@ class OffsetTolerances:
 
     Attributes
     ----------
-    min_points : of a face. Three lie in a plane by chance.
+    min_points : of a face. Three lie in a plane by chance. As many neighbours tell whether a
+        point lies among those of another face.
     num_trials : random triples of points per face; a face of a tenth of the points is then missed
         once in 1000 searches. Derived.
-    plane_sigmas : distance of a point to its face over its standard deviation. Derived (99.7 %).
+    sigmas : distance of a point to its face, and residual of a phase on it, in deviations: what
+        lies beyond is not of the face. Derived (99.7 %).
     normal_deg : largest angle between a point's normal and its face. Guess: several deviations.
     min_normal_sigma_deg : deviation of the mean of the points' normals (sensor and model, alike
         for all points). Measured on board: 0.2.
-    same_group_deg : faces whose normals differ less share a grid.
-    num_near : neighbours that tell whether points of a face lie among those of another. Guess.
     max_cells : of a grid. Memory and time: one solution takes 7 us a cell.
     smoothing_px : of the intensity before its steps are measured.
-    dark : intensity by which a mark must at least be brighter, full scales: one count of 8 bits.
-    min_scale : least step of noise per cell, of roots of full scales: synthetic images have none.
+    dark : intensity by which a mark must at least be brighter, full scales, and least step of noise
+        per cell: one count of 8 bits; synthetic images have less.
     view_share : share of the views that see a place, which must show a line there. A wall of a
         convex part is seen by about half of the views around it. Guess: half of these.
     line_steps : of noise, from which a step hampers the walk. Guess.
-    line_power : of the weights; the greater, the more the walk keeps to borders. Guess.
     mark_px : greatest width of a printed mark, at a focal length of 445 px. Guess.
     mark_contrast : of a mark's intensity to what is about it. As for the region's marks.
-    mark_dolp_share : of the DoLP about a mark in its own, at most. As for the seeds.
-    mark_share : of the views that show a place, which must show a mark there. Guess: a wall of a
-        convex part is seen by half of them.
-    mark_margin_px : square about a pixel of a mark that is left out: its smoothed outline.
-    seed_cells : radius about a sparse point that belongs to its face. Guess: its uncertainty.
-    phase_floor : residual that noise does not explain, sine. Prototype: 0.03 on curved meshes; a
-        plane has no faults of its own.
-    cost_sigmas : of the robust loss of a residual. Guess.
-    max_cost : median loss over the views above which the phases contradict a face: as many
-        deviations as ``cost_sigmas``. Derived.
-    leak : conductance to nowhere of a place that contradicts its face. Guess.
-    snap_cells : width of the band in which a border is moved to the lines. As ``min_radius_cells``:
-        every face has a core. Measured on `step`: 8, 12 and 20 give the same corners.
+    mark_share : of the views that show a place, which must show a mark there. A wall of a convex
+        part is seen by half of them. Measured, 0.5: F at 1 mm of an analytic bracket falls by 0.9
+        points.
+    seed_cells : radius about a sparse point that belongs to its face, and distance of a face's
+        points to the given surface from which it does not explain them; a cell is a footprint.
+        Guess: a point's uncertainty, and the size of a first surface's cells.
+    leak : conductance to nowhere of a place that contradicts its face. Measured, 0.2: F at 1 mm of
+        an analytic bracket falls by 0.2 points.
     seed_weight : chance that a walk ends on a point that it passes, over that of a step. Guess.
     min_total : chance that a walk from a place ends on any face's points at all. Guess: one in a
         hundred gets through where the phases contradict.
     min_share : of the seen views in whose region a place must lie. Guess: one view in six wrong.
-    min_cosine : between a face's normal and the direction to a view that counts.
-    min_views : that see a place.
     min_radius_cells : of a face's area: smaller ones are tangent planes of curved surfaces. Guess.
-    off_footprints : distance of a face's points to the given surface, in footprints of a pixel,
-        from which the surface does not explain them. Guess: a first surface's cells are 2 wide.
+        A border is moved to the lines in a band of this width: every face has a core. Measured on
+        `step`: bands of 8, 12 and 20 give the same corners.
     better_by : median loss by which the given surface must explain the views better than a face
         to keep its place. Guess.
-    num_rounds : of labels and visibility; a third changes nothing on step.
     """
 
     min_points: int = 4
     num_trials: int = 2000
-    plane_sigmas: float = 3.0
+    sigmas: float = 3.0
     normal_deg: float = 4.0
     min_normal_sigma_deg: float = 0.2
-    same_group_deg: float = 30.0
-    num_near: int = 5
     max_cells: int = 160_000
     smoothing_px: float = 1.0
     dark: float = 1 / 255
-    min_scale: float = 0.003
     view_share: float = 0.25
     line_steps: float = 4.0
-    line_power: float = 2.0
     mark_px: float = 20.0
     mark_contrast: float = 1.5
-    mark_dolp_share: float = 0.85
     mark_share: float = 0.6
-    mark_margin_px: int = 5
     seed_cells: float = 2.0
-    phase_floor: float = 0.015
-    cost_sigmas: float = 3.0
-    max_cost: float = 0.5
     leak: float = 0.1
-    snap_cells: float = 12.0
     seed_weight: float = 0.2
     min_total: float = 0.01
     min_share: float = 0.84
-    min_cosine: float = 0.1
-    min_views: int = 2
     min_radius_cells: float = 12.0
-    off_footprints: float = 2.0
     better_by: float = 0.3
-    num_rounds: int = 2
 
 
 @dataclass(frozen=True)
@@ -312,13 +293,13 @@ def find_faces(
         trial = across / np.maximum(length, 1e-300)[:, None]
         aligned = (trial * mean).sum(axis=1) > agree * np.linalg.norm(mean, axis=1)
         # A plane through three points of one mark turns with their noise.
-        wide = length > (tol.plane_sigmas * sigma[triples].max(axis=1)) ** 2
+        wide = length > (tol.sigmas * sigma[triples].max(axis=1)) ** 2
         usable = wide & aligned & (length > 0)
         if not usable.any():
             break
         trial, a = trial[usable], a[usable]
         distance = np.abs(points[index] @ trial.T - (a * trial).sum(axis=1))
-        inlier = distance < tol.plane_sigmas * sigma[index, None]
+        inlier = distance < tol.sigmas * sigma[index, None]
         inlier &= normals[index] @ trial.T > agree
         members = index[inlier[:, int(inlier.sum(axis=0).argmax())]]
         face = None
@@ -326,7 +307,7 @@ def find_faces(
             if len(members) < tol.min_points:
                 break
             face = _fitted(seeds, members, tol)
-            near = np.abs(face.height(points[index])) < tol.plane_sigmas * sigma[index]
+            near = np.abs(face.height(points[index])) < tol.sigmas * sigma[index]
             members = index[near & (normals[index] @ face.normal > agree)]
         if face is None or len(members) < tol.min_points:
             break
@@ -362,14 +343,14 @@ def _without_interlopers(faces: Sequence[Face], points: Array, tol: OffsetTolera
         alike = [
             other
             for other in kept
-            if face.normal @ other.normal > np.cos(np.radians(tol.same_group_deg))
+            if face.normal @ other.normal > np.cos(np.radians(CreaseTolerances.crease_deg))
         ]
         if alike:
             tangents = np.linalg.svd(face.normal[None])[2][1:]
             own = points[face.members] @ tangents.T
             others = np.concatenate([points[other.members] for other in alike]) @ tangents.T
             tree = cKDTree(np.concatenate([own, others]))
-            num = min(tol.num_near + 1, len(own) + len(others))
+            num = min(tol.min_points + 1, len(own) + len(others))
             near = np.atleast_2d(tree.query(own, num)[1])
             if np.mean(near[:, 1:] < len(own)) < 0.5:
                 continue
@@ -409,11 +390,11 @@ def stepped_faces(
         return ()
     scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=tol, folder=folder)
     found = []
-    for group in _grouped(faces, tol):
+    for group in _grouped(faces):
         points = seeds.points_in_world[np.concatenate([face.members for face in group])]
         footprint = _footprint(points, maps)
         if signed_distance is not None and not any(
-            _is_off(face, seeds, signed_distance, tol.off_footprints * footprint) for face in group
+            _is_off(face, seeds, signed_distance, tol.seed_cells * footprint) for face in group
         ):
             continue
         grid = _grid_over(group, points, maps, footprint, tol)
@@ -425,11 +406,11 @@ def stepped_faces(
     return tuple(found)
 
 
-def _grouped(faces: Sequence[Face], tol: OffsetTolerances) -> list[list[Face]]:
+def _grouped(faces: Sequence[Face]) -> list[list[Face]]:
     groups: list[list[Face]] = []
     for face in faces:
         for group in groups:
-            if face.normal @ group[0].normal > np.cos(np.radians(tol.same_group_deg)):
+            if face.normal @ group[0].normal > np.cos(np.radians(CreaseTolerances.crease_deg)):
                 group.append(face)
                 break
         else:
@@ -477,12 +458,12 @@ def _grid_over(
         origin = phase_map.view.center_in_world
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = -face.height(origin) / (rays @ face.normal)
-        hit = np.isfinite(distance) & (distance > 0) & (rays @ face.normal < -tol.min_cosine)
+        hit = np.isfinite(distance) & (distance > 0) & (rays @ face.normal < -MIN_FACING_COSINE)
         if hit.any():
             local = origin + distance[hit, None] * rays[hit] - center
             place = np.stack([local @ first, local @ second], axis=1)
             low[k], high[k] = place.min(axis=0), place.max(axis=0)
-    if np.isfinite(low).all(axis=1).sum() < tol.min_views:
+    if np.isfinite(low).all(axis=1).sum() < 2:
         return None
     # A region may run to the horizon in one view: what half of the views show is enough.
     own = np.stack([(points - center) @ first, (points - center) @ second], axis=1)
@@ -564,19 +545,20 @@ def _labels(
     rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
     surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit, tol)
     labels, shown = np.full(grid.shape, NO_FACE), np.zeros(grid.shape, np.bool_)
-    for round_index in range(tol.num_rounds):
+    # Which face hides which shows in labels alone: a second time with those of the first.
+    for is_labelled in (False, True):
         claims, jumps = np.zeros((2, len(group), *grid.shape))
         possible, fits = np.zeros((2, len(group), *grid.shape), np.bool_)
         for number, face in enumerate(group):
             hidden = None
-            if round_index > 0:
+            if is_labelled:
                 hidden = _hidden(number, group, places[number], grid, labels, scene.maps)
             on_grid = grid.cells(seeds.points_in_world[face.members])
             near = _distance_to(on_grid, grid.shape) < 0.5 * tol.mark_px
             evidence = face_evidence(places[number], face, scene, near, hidden, tol)
             possible[number] = evidence.possible
             better = evidence.possible & (evidence.cost < surface_cost + tol.better_by)
-            fits[number] = better & (evidence.cost < tol.max_cost)
+            fits[number] = better & (evidence.cost < MAX_COST)
             claims[number] = _claim(number, group, seeds, grid, evidence, better, tol)
             jumps[number] = evidence.jump
         # What walks a long way to its few points has a small chance of reaching them, and is the
@@ -587,7 +569,9 @@ def _labels(
         labels = _without_small(labels, len(group), tol)
         # The lowest ends where others stand on it, and where they do their own borders count.
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1))[1:]:
-            labels = snapped_border(labels, int(number), jumps[number], tol)
+            labels = snapped_border(
+                labels, int(number), jumps[number], tol.min_radius_cells, tol.line_steps
+            )
         # By something that the faces do not explain.
         taken = possible.any(axis=0) & ~fits.any(axis=0)
         taken = ndimage.binary_opening(taken, iterations=2)
@@ -598,19 +582,16 @@ def _labels(
 
 
 def snapped_border(
-    labels: NDArray[np.int64],
-    number: int,
-    jump: Array,
-    tol: OffsetTolerances,
+    labels: NDArray[np.int64], number: int, jump: Array, reach: float, line_steps: float
 ) -> NDArray[np.int64]:
     """Labels (H, W), the border of one face moved to the lines near it.
 
-    The cut of least weight in a band of ``snap_cells`` on either side of the border, across which
+    The cut of least weight in a band of ``reach`` cells on either side of the border, across which
     a walk hardly steps. It follows a line around its corners, which a walk rounds off.
     """
     own = labels == number
-    core = ndimage.distance_transform_edt(own) > tol.snap_cells
-    rest = ndimage.distance_transform_edt(~own) > tol.snap_cells
+    core = ndimage.distance_transform_edt(own) > reach
+    rest = ndimage.distance_transform_edt(~own) > reach
     if not core.any() or not rest.any():
         return labels
     band = ~core & ~rest
@@ -624,7 +605,7 @@ def snapped_border(
     ends = node.ravel()[np.stack([tails, heads])]
     inner = ends[0] != ends[1]
     # It falls so slowly that the middle of a wide line still counts for more than a short cut.
-    weight = length / (1 + between / tol.line_steps)
+    weight = length / (1 + between / line_steps)
     capacity = np.rint(CUT_UNIT * weight[inner]).astype(np.int32)  # whole numbers
     pairs = np.concatenate([ends[:, inner], ends[::-1, inner]], axis=1)
     both = np.concatenate([capacity, capacity])
@@ -672,9 +653,9 @@ def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
         cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)),
     )
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
-    dull = phase_map.lowest_dolp < 255 * tol.mark_dolp_share * dolp
+    dull = phase_map.lowest_dolp < 255 * SeedTolerances.max_dolp_share * dolp
     mark = dull & (intensity > tol.mark_contrast * about + tol.dark)
-    kernel = np.ones((tol.mark_margin_px,) * 2, np.uint8)
+    kernel = np.ones((2 * round(2 * tol.smoothing_px) + 1,) * 2, np.uint8)  # its smoothed outline
     on_mark = cv2.dilate(mark.astype(np.uint8), kernel)
     # The root has the same photon noise everywhere; smoothed after it, a step keeps its place.
     root = cv2.GaussianBlur(np.sqrt(np.maximum(intensity, 0)), (0, 0), tol.smoothing_px)
@@ -696,10 +677,12 @@ def row_losses(
     cosine = -(rows.rays * normals[:, None]).sum(axis=0)
     residual = (rows.rows * normals[:, None]).sum(axis=0)
     with np.errstate(invalid="ignore"):
-        variance = (1 - cosine**2) * np.square(rows.sigma) + np.float32(tol.phase_floor**2)
-        z2 = np.square(residual) / (variance * np.float32(tol.cost_sigmas**2))
+        # Half of what a curved mesh leaves unexplained: a plane has no faults of its own.
+        floor = np.float32((0.5 * RefinementTolerances.row_sigma) ** 2)
+        variance = (1 - cosine**2) * np.square(rows.sigma) + floor
+        z2 = np.square(residual) / (variance * np.float32(tol.sigmas**2))
         loss = z2 / (1 + z2)
-    counts = np.isfinite(rows.sigma) & (cosine > tol.min_cosine)
+    counts = np.isfinite(rows.sigma) & (cosine > MIN_FACING_COSINE)
     return np.where(counts, loss, np.nan).astype(np.float32), cosine
 
 
@@ -727,7 +710,7 @@ def face_evidence(
     jumps = np.full(losses.shape, np.nan, np.float32)
     inside, num_seen, num_marks = np.zeros((3, *shape))
     for k, phase_map in enumerate(scene.maps):
-        xy, seen = _seen(places, face, phase_map, tol)
+        xy, seen = _seen(places, face, phase_map)
         if hidden is not None:
             seen &= ~hidden[k]
         shown = seen & phase_map.shows_surface(xy)
@@ -740,7 +723,7 @@ def face_evidence(
     # not at the same place.
     printed = near_points & (num_marks > tol.mark_share * inside)
     jumps[:, printed] = np.nan
-    possible = (num_seen >= tol.min_views) & (inside >= tol.min_share * num_seen)
+    possible = (num_seen >= 2) & (inside >= tol.min_share * num_seen)
     return FaceEvidence(_shared_lines(jumps, tol.view_share), median_loss(losses), possible)
 
 
@@ -750,23 +733,19 @@ def face_lines(
     """Steps (H, W) in units of noise that a share of the views shows at places (H, W, 3)."""
     jumps = np.full((len(scene.maps), *places.shape[:2]), np.nan, np.float32)
     for k, phase_map in enumerate(scene.maps):
-        xy, seen = _seen(places, face, phase_map, tol)
+        xy, seen = _seen(places, face, phase_map)
         jumps[k] = _line_steps(scene.features[k], xy, seen, tol)[0]
     return _shared_lines(jumps, view_share)
 
 
-def _seen(
-    places: Array, face: Face, phase_map: PhaseMap, tol: OffsetTolerances
-) -> tuple[Image, Mask]:
+def _seen(places: Array, face: Face, phase_map: PhaseMap) -> tuple[Image, Mask]:
     """Pixels (H, W, 2) of places on a face, and whether the view can see them."""
     view = phase_map.view
     xy = np.asarray(view.camera.project(view.cam_from_world * places))
     size = np.array([view.camera.width, view.camera.height])
     with np.errstate(invalid="ignore"):
         seen = ((xy >= 1) & (xy <= size - 1)).all(axis=-1)
-    towards = view.center_in_world - places
-    cosine = (towards @ face.normal) / np.maximum(np.linalg.norm(towards, axis=-1), 1e-300)
-    return xy.astype(np.float32), np.asarray(seen & (cosine > tol.min_cosine))
+    return xy.astype(np.float32), np.asarray(seen & view.faces(places, face.normal))
 
 
 def _line_steps(
@@ -803,7 +782,7 @@ def _steps(values: Image, shown: Mask, tol: OffsetTolerances) -> Image:
         return total
     for channel in np.moveaxis(values, -1, 0):
         step = np.hypot(*np.gradient(channel))
-        scale = max(1.4826 * float(np.median(step[well])), tol.min_scale)
+        scale = max(1.4826 * float(np.median(step[well])), tol.dark)
         total = np.maximum(total, np.where(well, step / scale, 0)).astype(np.float32)
     return total
 
@@ -886,7 +865,7 @@ def _claim(
     adjacency, degree = _walk(evidence.jump.astype(np.float64), tol)
     # A walk may end on any point it passes, so that a single false one does not decide.
     ending = tol.seed_weight * (starts | ends).ravel()
-    leak = tol.leak * np.clip(evidence.cost.astype(np.float64).ravel() / tol.max_cost - 1, 0, 1)
+    leak = tol.leak * np.clip(evidence.cost.astype(np.float64).ravel() / MAX_COST - 1, 0, 1)
     free = np.flatnonzero(possible)
     right = tol.seed_weight * starts.ravel()[free].astype(np.float64)
     claim = np.zeros(starts.size)
@@ -910,7 +889,7 @@ def _walk(jump: Array, tol: OffsetTolerances) -> tuple[sparse.csr_array, Array]:
     """Chances of a step between neighbouring cells ``(H W, H W)``, and their sums."""
     steps = [_steps_between(jump, *direction) for direction in BESIDE]
     tails, heads, between = (np.concatenate(part) for part in zip(*steps, strict=True))
-    weight = 1 / (1 + (between / tol.line_steps) ** 2) ** tol.line_power
+    weight = 1 / (1 + (between / tol.line_steps) ** 2) ** 2
     pairs = (np.concatenate([tails, heads]), np.concatenate([heads, tails]))
     both = np.concatenate([weight, weight])
     adjacency = sparse.coo_array((both, pairs), shape=(jump.size, jump.size)).tocsr()

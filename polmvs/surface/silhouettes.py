@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from polmvs.camera import sample_image
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.surface.surface_view import Silhouette, signed_distance_px
+from polmvs.surface.surface_view import REFERENCE_FOCAL_PX, Silhouette, signed_distance_px
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -30,8 +30,8 @@ class SilhouetteTolerances:
 
     Attributes
     ----------
-    min_speck_px : least area of a piece of the region. Guess.
-    min_hole_px : least area of a hole in it, smaller ones are marks. Guess.
+    min_piece_px : least area of a piece of the region, and of a hole in it: smaller ones are marks.
+        Guess.
     closing_px : width of gaps that are closed. Guess.
     near_px : reach of the continuation in pixels that resemble the region a little. Guess.
     far_px : reach in pixels that resemble it much. Guess; the inside of a mug is 60 px across.
@@ -42,24 +42,18 @@ class SilhouetteTolerances:
     edge_prior_px : deviation of that step from the region's border. Guess.
     edge_contrast : least step, as a share of the brighter side. Guess.
     edge_smoothing_px : of the shifts along the outline. Guess.
-    max_unknown_share : of the image; beyond it the cut has run into the surroundings. Guess.
     """
 
-    min_speck_px: int = 30
-    min_hole_px: int = 60
+    min_piece_px: int = 60
     closing_px: int = 5
     near_px: int = 10
     far_px: int = 40
     object_quantile: float = 0.85
     cut_rounds: int = 3
-    max_unknown_share: float = 0.5
     edge_reach_px: float = 4.0
     edge_prior_px: float = 2.5
     edge_contrast: float = 0.15
     edge_smoothing_px: float = 1.5
-
-
-REFERENCE_FOCAL_PX = 445.0
 
 
 def find_silhouette(
@@ -91,10 +85,10 @@ def find_silhouette(
 def _cleaned(mask: Mask, scale: float, tol: SilhouetteTolerances) -> Mask:
     """The mask without specks, gaps and pinholes."""
     area = scale * scale
-    pixels = _without_small(mask, tol.min_speck_px * area, connectivity=8).astype(np.uint8)
+    pixels = _without_small(mask, tol.min_piece_px * area, connectivity=8).astype(np.uint8)
     size = 2 * round(0.5 * (tol.closing_px - 1) * scale) + 1
     holes = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)) == 0
-    return ~_without_small(holes, tol.min_hole_px * area, connectivity=4)
+    return ~_without_small(holes, tol.min_piece_px * area, connectivity=4)
 
 
 def _without_small(mask: Mask, min_area: float, *, connectivity: int) -> Mask:
@@ -155,9 +149,9 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
     pieces = cv2.connectedComponents((opened | certain).astype(np.uint8))[1]
     held = np.unique(pieces[certain])
     found_mask = np.isin(pieces, held[held > 0])
-    found_mask = ~_without_small(~found_mask, tol.min_hole_px * scale**2, connectivity=4)
-    if (found_mask & ~certain).sum() > tol.max_unknown_share * certain.size:
-        return certain
+    found_mask = ~_without_small(~found_mask, tol.min_piece_px * scale**2, connectivity=4)
+    if 2 * (found_mask & ~certain).sum() > certain.size:
+        return certain  # the cut has run into the surroundings
     return np.asarray(found_mask)
 
 

@@ -27,16 +27,20 @@ from polmvs.config import FusionOptions
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map
-from polmvs.scene import KEYPOINT_SIGMA_PX, Tracks, View, point_sigmas, some_tracks
+from polmvs.scene import (
+    KEYPOINT_SIGMA_PX,
+    MIN_FACING_COSINE,
+    Tracks,
+    View,
+    point_sigmas,
+    some_tracks,
+)
+from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.dense_view import DenseView, lattice_xy, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-REGION_MARGIN_PX = 3  # a keypoint this near a part's outline may owe its place to the outline
-MAX_PART_SHARE = 1 / 3  # of a point's observations on parts: of three, none; of four, one
-MAX_RELATIVE_SIGMA = 0.005  # of a point's place, as a share of its distance
 
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
@@ -49,59 +53,52 @@ class SurroundingsTolerances:
     Attributes
     ----------
     min_observations : two rays that meet say nothing about whether they belong together.
-        Derived.
+        Derived. As many views must agree on a point of stereo.
+    max_part_share : points of which a larger share of the observations lies on parts are left
+        out: they are on the part, which has its own cloud, or mirror images behind it. Derived: of
+        three, none; of four, one.
+    max_relative_sigma : points are left out whose place is less certain than this share of their
+        mean distance from the cameras, along the worst axis. Measured on `dome`: twice as much
+        keeps 1.2 times as many.
     min_angle_deg : of triangulation: half a pixel of disparity is 1 % of the distance there.
         Derived.
     max_angle_deg : of triangulation: patches of slanted surfaces look too different beyond.
         Guess.
-    max_axis_angle_deg : between the directions in which two views look. Guess.
-    min_baseline_angle_deg : between baseline and views: an epipole in the image is no use.
-        Guess.
-    part_margin_px : by which a match may leak over a part's outline. Derived: a patch and its
-        neighbours.
-    max_normal_difference_deg : of two views; planes of ten pixels' disparities are uncertain.
-        Guess.
-    min_shared_points : of two views, for their angle to be known and their overlap to be worth
-        it. Guess.
-    block_px : side of the patches that are compared. Guess.
-    border_px : a patch and the filter before it look this far. Derived.
-    texture_px : side of the window in which texture must show. Derived.
+    max_axis_angle_deg : between the directions in which two views look, and between their
+        baseline and the plane across them: an epipole in the image is no use. Guess.
+    min_shared_points : of two views, for their angle to be known, the range to search, and their
+        overlap to be worth it. Guess.
+    block_px : side of the patches that are compared, and of the planes that are fitted, in points
+        of the lattice. Guess.
     min_texture : standard deviation, grey levels. Derived: noise of a full well of 10,000
         electrons makes 0.6.
-    disparity_sigma_px : of a match; half of it the bias towards whole pixels. Guess.
     min_ray_z : rays more than 60 deg from the rectified axis would be stretched fourfold.
         Derived.
     range_percentiles : of the sparse points' distances; few of them are wrong. Guess.
     range_margin : of the disparities beyond those of the sparse points. Guess.
     max_disparities : searched; more means that the sparse points are no guide. Guess.
-    min_points : in a view, for the range to search. Guess.
-    window : lattice points along a side of the planes that are fitted. Guess.
-    min_window_share : of a window's lattice points that are known. Guess.
-    min_cosine : between a plane's normal and the ray; steeper ones are steps of the range.
-        Guess.
+    min_window_share : of a plane's lattice points that are known. Guess.
     """
 
     min_observations: int = 3
+    max_part_share: float = 1 / 3
+    max_relative_sigma: float = 0.005
     min_angle_deg: float = 5.0
     max_angle_deg: float = 25.0
     max_axis_angle_deg: float = 45.0
-    min_baseline_angle_deg: float = 40.0
-    part_margin_px: int = 8
-    max_normal_difference_deg: float = 30.0
     min_shared_points: int = 20
     block_px: int = 5
-    border_px: int = 4
-    texture_px: int = 2 * border_px + 1
     min_texture: float = 2.0
-    disparity_sigma_px: float = 0.5
     min_ray_z: float = 0.5
     range_percentiles: tuple[float, float] = (1.0, 99.0)
     range_margin: float = 0.15
     max_disparities: int = 512
-    min_points: int = 10
-    window: int = 5
     min_window_share: float = 0.6
-    min_cosine: float = 0.1
+
+    @property
+    def border_px(self) -> int:
+        """How far a patch and the filter before it look."""
+        return self.block_px // 2 + 2
 
 
 @dataclass(frozen=True)
@@ -126,9 +123,6 @@ def sparse_surroundings(
     tracks: Tracks,
     maps: Sequence[PhaseMap],
     *,
-    max_part_share: float = MAX_PART_SHARE,
-    max_relative_sigma: float = MAX_RELATIVE_SIGMA,
-    margin_px: int = REGION_MARGIN_PX,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> SparseSurroundings:
     """Sparse points that are certain in place and neither on a polarised part nor mirrored in one.
@@ -137,20 +131,16 @@ def sparse_surroundings(
     ----------
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps of the views.
-    max_part_share : points of which a larger share of the observations lies on parts are left
-        out: they are on the part, which has its own cloud, or mirror images behind it.
-    max_relative_sigma : points are left out whose place is less certain than this share of their
-        mean distance from the cameras, along the worst axis.
-    margin_px : the parts' regions are grown by this, px.
     tolerances : of this step.
     """
-    part_share = part_shares(tracks, maps, margin_px)
+    # A keypoint this near a part's outline may owe its place to the outline.
+    part_share = part_shares(tracks, maps, tolerances.border_px)
     num_views = np.bincount(tracks.obs_track, minlength=len(part_share))
     sigma = relative_sigmas(tracks, [phase_map.view for phase_map in maps])
     kept = (
         (num_views >= tolerances.min_observations)
-        & (part_share <= max_part_share)
-        & (sigma <= max_relative_sigma)
+        & (part_share <= tolerances.max_part_share)
+        & (sigma <= tolerances.max_relative_sigma)
     )
     return SparseSurroundings(
         points=tracks.points_in_world[kept],
@@ -160,9 +150,7 @@ def sparse_surroundings(
     )
 
 
-def part_shares(
-    tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int = REGION_MARGIN_PX
-) -> Array:
+def part_shares(tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int) -> Array:
     """Share ``(T,)`` of each track's observations in or beside a region; 1 without any."""
     num_tracks = len(tracks.points_in_world)
     on_part = np.zeros(len(tracks.obs_track), bool)
@@ -246,11 +234,7 @@ def _fits(view: View, other: View, points: Array, *, tolerances: SurroundingsTol
     if not np.linalg.norm(baseline) > 0 or _angle_deg(*axes) > tolerances.max_axis_angle_deg:
         return False
     to_baseline = float(_angle_deg(baseline, axes[0] + axes[1]))
-    if (
-        not tolerances.min_baseline_angle_deg
-        <= to_baseline
-        <= 180 - tolerances.min_baseline_angle_deg
-    ):
+    if abs(to_baseline - 90) > tolerances.max_axis_angle_deg:
         return False
     angles = _angle_deg(points - view.center_in_world, points - other.center_in_world)
     return bool(tolerances.min_angle_deg <= np.median(angles) <= tolerances.max_angle_deg)
@@ -291,9 +275,6 @@ def stereo_surroundings(
     folder: Path,
     *,
     stride_px: int = 2,
-    max_partners: int = 3,
-    min_views: int = 3,
-    voxel_px: float = 1.0,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
@@ -307,9 +288,6 @@ def stereo_surroundings(
     maps : phase maps of the views.
     folder : where the views' ranges are kept meanwhile; the caller removes it.
     stride_px : distance between matched pixels of a view, px.
-    max_partners : views that each view is matched with.
-    min_views : views that must agree on a point, its own included.
-    voxel_px : edge of the merging voxel, in footprints of a pixel.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done, twice for each view with points.
     tolerances : of this step.
@@ -318,7 +296,7 @@ def stereo_surroundings(
     folder.mkdir(parents=True, exist_ok=True)
     kept = sparse_surroundings(tracks, maps, tolerances=tolerances).is_kept
     certain = some_tracks(tracks, kept)
-    chosen = choose_partners(certain, [m.view for m in maps], max_partners, tolerances=tolerances)
+    chosen = choose_partners(certain, [m.view for m in maps], tolerances=tolerances)
     used = [k for k, partners in enumerate(chosen) if partners]
     task = partial(_match_view, folder, stride_px, tolerances=tolerances)
     groups = [[maps[k], *(maps[j] for j in chosen[k])] for k in used]
@@ -329,9 +307,9 @@ def stereo_surroundings(
         if on_progress is not None:
             on_progress(1)
     options = FusionOptions(
-        min_views=min_views,
-        max_normal_difference_deg=tolerances.max_normal_difference_deg,
-        voxel_px=voxel_px,
+        min_views=tolerances.min_observations,
+        max_normal_difference_deg=CreaseTolerances.crease_deg,
+        voxel_px=1.0,
     )
     views = [_whole_view(maps[k]) for k in used]
     return fuse(views, dense, options, workers=workers, on_progress=on_progress)
@@ -346,7 +324,8 @@ def _match_view(
     tolerances: SurroundingsTolerances,
 ) -> DenseView:
     """Match the first view with the others and store what comes of it."""
-    excluded = grow_mask(maps[0].region.inside, tolerances.part_margin_px)
+    # A match may leak over a part's outline by its patch and a neighbour's.
+    excluded = grow_mask(maps[0].region.inside, 2 * tolerances.border_px)
     dense = stereo_view(maps[0], maps[1:], points, excluded, stride_px, tolerances=tolerances)
     return store_dense_view(dense, folder / f"{maps[0].view.name}.stereo")
 
@@ -407,11 +386,11 @@ def rectify_pair(
     depth = depth[depth > 0]
     boxes = [_plane_box(v, rotation, tolerances=tolerances) for v in (view, other)]
     low, high = np.maximum(boxes[0][0], boxes[1][0]), np.minimum(boxes[0][1], boxes[1][1])
-    if len(depth) < tolerances.min_points or not high[1] > low[1]:
+    if len(depth) < tolerances.min_shared_points or not high[1] > low[1]:
         return None
     focal = view.camera.mean_focal_px
     far, near = focal * length / np.percentile(depth, tolerances.range_percentiles[::-1])
-    margin = tolerances.range_margin * (near - far) + 4 * tolerances.disparity_sigma_px
+    margin = tolerances.range_margin * (near - far) + 4 * KEYPOINT_SIGMA_PX
     lowest = max(far - margin, 0.0)
     num = 16 * int(np.ceil((near + margin - lowest) / 16))
     if num > tolerances.max_disparities:
@@ -495,7 +474,7 @@ def match(
 
 def _is_textured(grey: NDArray[np.uint8], *, tolerances: SurroundingsTolerances) -> Mask:
     """Where an image varies by more than noise; elsewhere a match only continues others."""
-    image, size = grey.astype(np.float32), (tolerances.texture_px, tolerances.texture_px)
+    image, size = grey.astype(np.float32), (2 * tolerances.border_px + 1,) * 2
     variance = cv2.boxFilter(image * image, -1, size) - cv2.boxFilter(image, -1, size) ** 2
     return np.asarray(variance > tolerances.min_texture**2)
 
@@ -526,13 +505,13 @@ def ranges_from_disparity(
     filled = np.where(known, disparity, 0).astype(np.float32)
     moments = np.dstack([known.astype(np.float32), filled, filled * filled])
     share, mean, square = np.moveaxis(sample_image(moments, xy), -1, 0)
-    smooth = square - mean * mean < tolerances.disparity_sigma_px**2
+    smooth = square - mean * mean < KEYPOINT_SIGMA_PX**2
     total = mean + np.float32(pair.offset_px)
     good = (share > 0.999) & smooth & (total > 0)
     total = np.where(good, total, 1)
     depth = pair.left.fx * pair.baseline / total
     distance = np.where(good, depth / np.where(good, rays[..., 2], 1), 0)
-    return distance.astype(np.float32), (tolerances.disparity_sigma_px / total).astype(np.float32)
+    return distance.astype(np.float32), (KEYPOINT_SIGMA_PX / total).astype(np.float32)
 
 
 def combine_ranges(ranges: Image, sigmas: Image) -> tuple[Image, Image]:
@@ -585,9 +564,9 @@ def fit_planes(
     columns = [outer, v * u[..., None], (u * u)[..., None], known[..., None].astype(np.float64)]
     moments, border = np.concatenate(columns, axis=-1), cv2.BORDER_CONSTANT
     sums = cv2.boxFilter(
-        moments, -1, (tolerances.window, tolerances.window), normalize=False, borderType=border
+        moments, -1, (tolerances.block_px, tolerances.block_px), normalize=False, borderType=border
     )
-    used = known & (sums[..., 13] >= tolerances.min_window_share * tolerances.window**2 - 0.5)
+    used = known & (sums[..., 13] >= tolerances.min_window_share * tolerances.block_px**2 - 0.5)
     matrix, right = sums[used, :9].reshape(-1, 3, 3), sums[used, 9:12]
     solved = np.linalg.solve(matrix, right[..., None])[..., 0]
     residual = sums[used, 12] - (solved * right).sum(axis=-1)
@@ -657,10 +636,10 @@ def _on_planes(
         fitted = 1 / (slope * rays).sum(axis=-1)
         cosine = 1 / (fitted * length)
         good = (np.abs(fitted / ranges - 1) < 2 * sigma) & (deviation < 2 * sigma)
-        good &= cosine > tolerances.min_cosine
+        good &= cosine > MIN_FACING_COSINE  # steeper ones are steps of the range
         # The normal of a plane through errors of the window's points, seen under this angle.
-        spread = tolerances.window * stride_px / np.sqrt(12) / view.camera.mean_focal_px
-        turn = deviation / (tolerances.window * spread) * cosine**2
+        spread = tolerances.block_px * stride_px / np.sqrt(12) / view.camera.mean_focal_px
+        turn = deviation / (tolerances.block_px * spread) * cosine**2
     normals = np.where(good[..., None], -slope / length[..., None], np.nan)
     return DenseView(
         stride_px=stride_px,

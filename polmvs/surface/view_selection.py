@@ -13,9 +13,7 @@ from polmvs.surface.pixel_graph import visible_seeds
 MAX_PLACES = 64  # of a view's seeds, spread evenly, that the choice is made for
 
 
-def choose_neighbors(
-    maps: Sequence[PhaseMap], seeds: Seeds, max_neighbors: int, *, max_places: int = MAX_PLACES
-) -> list[list[int]]:
+def choose_neighbors(maps: Sequence[PhaseMap], seeds: Seeds, max_neighbors: int) -> list[list[int]]:
     """For each view, itself first, then others, the most helpful first.
 
     One after the other the view is taken that sees most of the view's seeds under the greatest
@@ -27,7 +25,6 @@ def choose_neighbors(
     maps : phase maps of the views.
     seeds : places on the surface. A view that sees none is helped by those that see any.
     max_neighbors : others per view.
-    max_places : seeds of a view that count.
     """
     seen = np.array([visible_seeds(m, seeds)[0] for m in maps], bool).reshape(len(maps), -1)
     centers = np.array([m.view.center_in_world for m in maps])
@@ -36,7 +33,7 @@ def choose_neighbors(
     neighbors = []
     for k in range(len(maps)):
         places = np.flatnonzero(seen[k] if seen[k].any() else seen.any(axis=0))
-        places = places[:: max(1, len(places) // max_places)]
+        places = places[:: max(1, len(places) // MAX_PLACES)]
         directions, shows = to_camera[:, places], seen[:, places]
         chosen = [k]
         gap = np.full(shows.shape, np.inf)

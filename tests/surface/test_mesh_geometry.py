@@ -118,12 +118,7 @@ def test_a_camera_sees_the_near_side_only():
     mesh = extracted(union(sphere(0.5), sphere(0.5, (-1.05, 0, 0))))
     center = np.array([4.0, 0, 0])
     index, rays, cosine = visible_points(
-        RayScene(mesh),
-        center,
-        mesh.centers,
-        mesh.face_normals,
-        tolerance=0.02,
-        min_cosine=0.1,
+        RayScene(mesh), center, mesh.centers, mesh.face_normals, min_cosine=0.1
     )
     assert (mesh.centers[index, 0] > 0).all()  # the second sphere hides behind the first
     assert (cosine > 0.1).all()

@@ -9,7 +9,7 @@ from scenes import phase_map_of
 from polmvs.camera import PinholeCamera
 from polmvs.config import AngleModel
 from polmvs.scene import Seeds
-from polmvs.surface.offsets import OffsetTolerances, find_faces, snapped_border, stepped_faces
+from polmvs.surface.offsets import find_faces, snapped_border, stepped_faces
 from polmvs.synthetic.captures import Group, Plane, Sphere, render_view, ring_of_views
 
 CAMERA = PinholeCamera(width=320, height=256, fx=270.0, fy=270.0, cx=160.0, cy=128.0)
@@ -201,7 +201,7 @@ def test_a_border_follows_its_lines_around_corners():
     beside = np.maximum(np.abs(u), np.abs(v)) - 40  # distance to the square, negative inside
     jump = 10 * np.exp(-0.5 * beside**2) + np.abs(np.random.default_rng(0).standard_normal(u.shape))
     octagon = np.maximum(beside + 4, (np.abs(u) + np.abs(v)) / np.sqrt(2) - 44)
-    found = snapped_border(np.where(octagon < 0, 1, 0), 1, jump, OffsetTolerances()) == 1
+    found = snapped_border(np.where(octagon < 0, 1, 0), 1, jump, 12.0, 4.0) == 1
     wrong = found != (beside < 0)
     assert np.abs(beside[wrong]).max() < 1.5
     corners = (np.abs(u) > 33) & (np.abs(v) > 33) & (beside < -1.5)

@@ -8,6 +8,7 @@ from test_stereo import DISTANCE, map_of, plane_points, views_of
 from polmvs.polarization.phase_map import store_phase_map
 from polmvs.scene import Tracks
 from polmvs.surface.surroundings import (
+    SurroundingsTolerances,
     _whole_view,
     choose_partners,
     grow_mask,
@@ -80,9 +81,10 @@ def test_uncertain_points_go():
     tracks = tracks_of(points, views, seen=[range(12), (0, 11), range(12)])
     tracks = replace(tracks, errors=np.array([0.3, 0.3, 8.0]))
     np.testing.assert_array_equal(sparse_surroundings(tracks, maps).is_kept, [True, False, False])
+    loose = SurroundingsTolerances(max_relative_sigma=0.02)
     far = tracks_of(np.array([[0.1, 0.0, 0.0], [5.0, 0.0, -30.0]]), views)
     np.testing.assert_array_equal(
-        sparse_surroundings(far, maps, max_relative_sigma=0.02).is_kept, [True, False]
+        sparse_surroundings(far, maps, tolerances=loose).is_kept, [True, False]
     )
 
 
@@ -106,7 +108,7 @@ def test_no_tracks_and_tracks_without_observations():
     assert sparse_surroundings(none, maps).points.shape == (0, 3)
     assert choose_partners(none, [m.view for m in maps]) == [[], []]
     unseen = tracks_of(np.ones((1, 3)), [m.view for m in maps], seen=[()])
-    np.testing.assert_array_equal(part_shares(unseen, maps), [1.0])
+    np.testing.assert_array_equal(part_shares(unseen, maps, 3), [1.0])
     assert np.isinf(relative_sigmas(unseen, [m.view for m in maps])).all()
     assert not sparse_surroundings(unseen, maps).is_kept.any()
 

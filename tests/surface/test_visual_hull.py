@@ -74,8 +74,9 @@ def test_unknown_pixels_do_not_carve(ball):
 
 def test_the_supporting_plane_bounds_the_hull(ball):
     plane = Plane(np.array([0.0, 0, 1.0]), -0.3)
-    mesh = visual_hull(ball, plane, tolerances=HullTolerances(depth_px=3.0)).mesh
-    assert mesh.vertices[:, 2].min() == pytest.approx(-0.3 - 3 * 5 / 150, abs=0.06)
+    mesh = visual_hull(ball, plane).mesh
+    depth = 3 * HullTolerances.step_px * 5 / 150
+    assert mesh.vertices[:, 2].min() == pytest.approx(-0.3 - depth, abs=0.06)
 
 
 def test_free_space_is_carved(ball):
