@@ -749,8 +749,8 @@ def _add_phases(
     How a row changes as the place moves through the phase image (``with_slope``) places a surface
     that no outline bounds: all of one without outlines, hollows, waves. Measured: the floor of a
     dish without sparse points is 8 mm too high without it on the first level, and right with it;
-    waves 7 mm high and 60 mm long lie 0.48 mm off without it on the last levels, 0.25 mm with it.
-    It hardly sees the scale of round objects and the walls of parts: the Chamfer distances of a blob
+    waves 7 mm high and 60 mm long lie 0.48 mm off without it on later levels, 0.25 mm with it. It
+    hardly sees the scale of round objects and the walls of parts: the Chamfer distances of a blob
     and of a bracket would grow by 0.03 mm.
 
     Returns
