@@ -114,9 +114,8 @@ def num_surface_steps(num_views: int) -> int:
 
     A surface that is made once more reports none of its steps.
     """
-    tolerances = RefinementTolerances()
-    refinement = tolerances.levels[0].num_steps  # the coarsest level goes two ways
-    refinement += sum(level.num_steps for level in tolerances.levels)
+    *before, last = RefinementTolerances().levels
+    refinement = 2 * sum(level.num_steps for level in before) + last.num_steps  # they go two ways
     return refinement + NUM_FINAL_STEPS + num_views
 
 

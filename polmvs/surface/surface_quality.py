@@ -49,13 +49,10 @@ class QualityTolerances:
         deviation of an outline with its bias. Measured with the next: halves cost `mug` 0.4 points
         of F at 1 mm, doubles none.
     max_outside_share : of the views that see a face, to deny it: two of six.
-    max_contradicting_share : of the phases at a face. Measured on `mug`, 0.3 and 0.8: F at 1 mm
-        -0.4 and +0.1 points.
     """
 
     outside_px: float = 1.5
     max_outside_share: float = 0.34
-    max_contradicting_share: float = 0.6
 
 
 @dataclass(frozen=True)
@@ -153,7 +150,7 @@ def supported_faces(
     smooth = _smoothed(mesh, counts.astype(np.float64).T).T
     views, outside, rows, contradicting = smooth
     denied = outside > np.maximum(tol.max_outside_share * views, 1.5)
-    contradicted = contradicting > tol.max_contradicting_share * rows
+    contradicted = contradicting > 0.5 * rows  # most of them
     return np.asarray(
         (evidence.num_views >= min_views) & (rows >= min_views - 0.5) & ~denied & ~contradicted
     )
@@ -339,9 +336,7 @@ def find_contradictions(
     tol = tolerances or QualityTolerances()
     area = mesh.face_areas * (evidence.num_views >= 2)
     total = max(float(area.sum()), 1e-300)
-    contradicted = evidence.num_contradicting > tol.max_contradicting_share * np.maximum(
-        evidence.num_rows, 1
-    )
+    contradicted = evidence.num_contradicting > 0.5 * evidence.num_rows
     denied = evidence.num_outside > np.maximum(tol.max_outside_share * evidence.num_views, 1.5)
     kept = mesh.only(supported)
     scene = RayScene(kept) if len(kept.faces) else None

@@ -24,7 +24,7 @@ from polmvs.surface.refinement import (
     refine,
     shared_edges,
     solve,
-    unexplained_share,
+    unexplained_shares,
 )
 from polmvs.surface.surface_quality import point_offset
 from polmvs.surface.surface_view import Silhouette, surface_view
@@ -236,7 +236,7 @@ def test_outliers_among_known_points_lose(ball):
 
 def test_what_explains_the_phases_better_is_less_unexplained(ball):
     right, low, small = (
-        unexplained_share(extracted(shape, step=0.08), ball, PPA)
+        unexplained_shares(extracted(shape, step=0.08), ball, PPA).mean()
         for shape in (sphere(), sphere(center=(0, 0, -0.3)), sphere(0.8))
     )
     assert right < 0.1
