@@ -45,8 +45,8 @@ class Level:
     loss_scale : of the phase rows' loss, in their standard deviations.
     rim_gate_px : outlines farther from a silhouette than this are not drawn to it.
     with_slope : count how a row changes as its place moves through the phase image (see
-        :func:`_add_phases`) if the views are then clearly explained better. Each level goes both
-        ways but the last of several, which goes the way of the one before.
+        :func:`_add_phases`) if the views are then clearly explained better: levels go both ways
+        until one is better without, and the last of several goes the way of the one before.
     """
 
     edge_px: float
@@ -363,16 +363,14 @@ def refine(
         expected = 1.2 * state.mesh.face_areas.sum() / edge**2
         if number and expected > tol.max_vertices:
             edge = float(np.sqrt(1.2 * state.mesh.face_areas.sum() / tol.max_vertices))
-        ways = [replace(level, with_slope=False), level]
-        if not level.with_slope:
-            ways = ways[:1]
-        elif number and number == len(tol.levels) - 1:  # the way of the level before
-            ways = [ways[with_slope]]
+        with_slope &= level.with_slope
+        ways = [replace(level, with_slope=False), level][: 1 + with_slope]
+        if number and number == len(tol.levels) - 1:  # the way of the level before
+            ways = ways[-1:]
         found = [
             _refined_at(state, views, angle_model, footprint, edge, way, known, tol, on_progress)
             for way in ways
         ]
-        with_slope = ways[0].with_slope
         if len(found) > 1:
             shares = [unexplained_shares(one.mesh, views, angle_model, tol) for one in found]
             with_slope = _is_less(shares[1], shares[0])
