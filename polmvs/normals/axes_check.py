@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from polmvs.config import AngleModel, CaptureKind, CaptureOptions, NormalOptions
 from polmvs.normals.estimator import NormalEstimate
 from polmvs.normals.rows import AS_MEASURED, Reading, gather_rows_under
-from polmvs.normals.tracks import DerivedMaps, inside_shares, normals_from_rows, window_map
+from polmvs.normals.tracks import (
+    MAX_ROWS,
+    DerivedMaps,
+    in_tiles,
+    inside_shares,
+    normals_from_rows,
+    window_map,
+)
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
 
@@ -110,12 +117,16 @@ def check_axes(
     every = [
         reading for change in (AS_MEASURED, *others) for reading in (change, _other_light(change))
     ]
-    costs = [
-        _row_cost(normals_from_rows(on_parts, rows, options.estimator), t)
-        for rows in gather_rows_under(every, AngleModel.PPA, on_parts.points_in_world, windows)
+    of_tiles = [
+        [
+            _row_cost(normals_from_rows(some, rows, options.estimator), t)
+            for rows in gather_rows_under(every, AngleModel.PPA, some.points_in_world, windows)
+        ]
+        for some in in_tiles(on_parts, len(maps), MAX_ROWS)
     ]
+    costs = np.concatenate(of_tiles, axis=1)  # (readings, N)
     # Of each point (N,): mean cost of a row, under the better kind of light.
-    given, *changed = (np.minimum(*costs[i : i + 2]) for i in range(0, len(costs), 2))
+    given, *changed = np.minimum(costs[::2], costs[1::2])
     best = AxesCheck(num_votes=int(np.isfinite(given).sum()), share=0.0, change=None)
     if best.num_votes < t.min_votes:
         return best
