@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +19,10 @@ from polmvs.normals.estimator import NormalEstimate
 from polmvs.normals.rows import AS_MEASURED, Reading, gather_rows_under
 from polmvs.normals.tracks import (
     MAX_ROWS,
-    DerivedMaps,
     in_tiles,
     inside_shares,
     normals_from_rows,
-    window_map,
+    window_maps,
 )
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
@@ -112,7 +110,7 @@ def check_axes(
     """
     t, options = tolerances, NormalOptions()
     on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
-    windows = DerivedMaps(maps, partial(window_map, window_px=options.window_px))
+    windows = window_maps(maps, options.window_px)
     others = (MIRRORED, TURNED, TURNED_MIRRORED)
     every = [
         reading for change in (AS_MEASURED, *others) for reading in (change, _other_light(change))

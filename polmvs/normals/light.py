@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
@@ -25,11 +24,10 @@ from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, Rows, gather_rows_under
 from polmvs.normals.tracks import (
     MAX_ROWS,
-    DerivedMaps,
     in_tiles,
     inside_shares,
     normals_from_rows,
-    window_map,
+    window_maps,
 )
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
@@ -118,7 +116,7 @@ def _diffuse_pixels(phase_map: PhaseMap, votes: Array, overall: float, tie: floa
 
 def _rows_of_both(points: Array, maps: Sequence[PhaseMap]) -> tuple[Rows, ...]:
     """Rows of averaged phases under specular and under diffuse light."""
-    windows = DerivedMaps(maps, partial(window_map, window_px=NormalOptions().window_px))
+    windows = window_maps(maps, NormalOptions().window_px)
     return gather_rows_under((AS_MEASURED, OTHER_LIGHT), AngleModel.PPA, points, windows)
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from polmvs.config import AngleModel, Light, NormalOptions
 from polmvs.normals.light import specular_votes
 from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
-from polmvs.normals.tracks import DerivedMaps, inside_shares, normals_from_rows, window_map
+from polmvs.normals.tracks import inside_shares, normals_from_rows, window_maps
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
 
@@ -61,7 +60,7 @@ def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> Light
     """
     options = NormalOptions()
     on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
-    windows = DerivedMaps(maps, partial(window_map, window_px=options.window_px))
+    windows = window_maps(maps, options.window_px)
     readings = (AS_MEASURED, OTHER_LIGHT)
     as_given, as_other = (
         normals_from_rows(on_parts, rows, options.estimator)

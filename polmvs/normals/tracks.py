@@ -93,6 +93,11 @@ class DerivedMaps(Sequence[PhaseMap]):
         return self.derive(self.maps[index])
 
 
+def window_maps(maps: Sequence[PhaseMap], window_px: int) -> DerivedMaps:
+    """Maps averaged by :func:`window_map`, each when it is asked for."""
+    return DerivedMaps(maps, partial(window_map, window_px=window_px))
+
+
 def track_normals(
     angle_model: AngleModel,
     tracks: Tracks,
@@ -122,7 +127,7 @@ def track_normals(
     solved[np.flatnonzero(~own)[:1]] = True
     source = np.cumsum(solved) - 1
     source[~own] = source[np.flatnonzero(~own)[:1]]
-    windows = DerivedMaps(maps, partial(window_map, window_px=options.window_px))
+    windows = window_maps(maps, options.window_px)
     estimates = [
         normals_from_rows(
             some,
