@@ -3,7 +3,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from analytic_objects import box, phase_maps_of, ring_of_views, sphere, torus
+from analytic_objects import box, phase_maps_of, ring_of_views, sphere, torus, union
 from test_mesh_geometry import euler_number, extracted
 
 from polmvs.config import AngleModel
@@ -11,10 +11,12 @@ from polmvs.polarization.angle_models import tilt_turn
 from polmvs.polarization.phase_map import view_rays
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.refinement import (
+    FaceRows,
     KnownPoints,
     Level,
     RefinementTolerances,
     RowSigma,
+    _agreed_weights,
     _Equations,
     _SharedError,
     face_rows,
@@ -320,3 +322,56 @@ def test_waves_are_as_high_as_they_are():
     centers = centers[(np.abs(centers[:, :2]) < [0.7, 0.5]).all(axis=1)]
     # 0.25 px; 0.79 where the last levels leave that change out.
     assert np.median(np.abs(centers[:, 2] - height(centers))) < 0.5 * FOOTPRINT
+
+
+def rows_of(normals, mesh_normal, is_mirrored=False):
+    """Rows of a face by views about it, each of a normal ``(K, 3)`` of its own."""
+    azimuth = np.linspace(0, 2 * np.pi, len(normals), endpoint=False)
+    rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(len(azimuth), -1.0)], axis=1)
+    found = []
+    for ray, normal in zip(rays, normals, strict=True):
+        row = np.cross(ray, normal) / np.linalg.norm(np.cross(ray, normal))
+        one, mirrored = np.ones(1), np.array([is_mirrored])
+        variance, residual = np.array([0.03**2]), np.array([row @ mesh_normal])
+        found.append(FaceRows(np.array([0]), residual, variance, row[None], one, one, mirrored))
+    return found
+
+
+def test_rows_that_agree_on_another_normal_are_no_outliers():
+    up, slanted = np.array([0.0, 0.0, 1.0]), np.array([0.6, 0.0, 0.8])
+    tol = RefinementTolerances()
+
+    def weights(views):
+        return np.concatenate(_agreed_weights(views, 1, tol))
+
+    all_up = np.tile(up, (8, 1))
+    seen = rows_of(all_up, slanted)
+    pull = weights(seen) * np.abs([rows.residual[0] for rows in seen])
+    # As if off by the width of the narrowest loss, and no more; nothing of those that fit anyhow.
+    assert pull.max() == pytest.approx(tol.levels[-1].loss_scale * 0.03, rel=1e-3)
+    assert (weights(seen) > 0.1).all()
+    one_apart = all_up.copy()
+    one_apart[3] = [0.0, 0.8, 0.6]
+    apart = weights(rows_of(one_apart, slanted))
+    assert apart[3] < 0.01 < np.delete(apart, 3).min()
+    # The mesh is right; views that agree on nothing; three of them; what mirrors the object.
+    assert not weights(rows_of(all_up, up)).any()
+    random = np.random.default_rng(0).normal(size=(8, 3))
+    assert not weights(rows_of(random, slanted)).any()
+    assert not weights(rows_of(all_up[:3], slanted)).any()
+    assert not weights(rows_of(all_up, slanted, is_mirrored=True)).any()
+
+
+def test_a_shoulder_on_which_views_agree_becomes_a_ledge():
+    """A box on a plate, whose top no outline bounds where the box stands on it."""
+
+    def stack(p):
+        return union(box((0.85, 0.7, 0.15)), lambda q: box((0.4, 0.3, 0.1))(q - [0, 0, 0.25]))(p)
+
+    views = views_of(stack, ring_of_views(12, elevations=(25.0, 45.0, 60.0)))
+    hull = visual_hull(views)
+    mesh = refine(hull.mesh, views, PPA, hull.footprint, tolerances=QUICK).mesh
+    seen = mesh.only(mesh.centers[:, 2] > -0.05)
+    error = np.abs(stack(seen.centers)) @ seen.face_areas / seen.face_areas.sum()
+    # 0.26 px; 0.97 where rows that agree on another normal than the mesh's are outliers.
+    assert error < 0.5 * FOOTPRINT
