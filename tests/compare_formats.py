@@ -23,6 +23,7 @@ from capture_writer import FORMATS, Mosaics, Written, rounded, tolerance, turn
 from polmvs.camera import PinholeCamera
 from polmvs.colmap.models import read_model, write_model
 from polmvs.config import (
+    BayerOrder,
     CaptureOptions,
     EvaluationOptions,
     Method,
@@ -66,7 +67,23 @@ def exposures(folder: Path, mosaics: Mosaics) -> Written:
     return Written(CaptureOptions(), tolerance(12))
 
 
-ALL = {**FORMATS, "jpeg, quality 98": jpeg, "two exposures": exposures}
+def colour_mosaic(folder: Path, mosaics: Mosaics) -> Written:
+    """A colour sensor (its sides are multiples of 4) before a grey scene, less light in red and
+    blue."""
+    brightness = np.kron([[0.6, 1.0], [1.0, 0.7]], np.ones((2, 2)))
+    for stem, share in mosaics.items():
+        height, width = share.shape
+        cells = np.tile(brightness, (height // 4, width // 4))
+        cv2.imwrite(str(folder / f"{stem}.png"), rounded(share * cells, 12))
+    return Written(CaptureOptions(bayer=BayerOrder.RGGB), tolerance(12))
+
+
+ALL = {
+    **FORMATS,
+    "colour mosaic": colour_mosaic,
+    "jpeg, quality 98": jpeg,
+    "two exposures": exposures,
+}
 
 
 def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:
