@@ -28,7 +28,9 @@ def cauchy_weights(squares: Floats, scale: float | Floats = CAUCHY_SCALE) -> Flo
     return np.asarray(1.0 / (1.0 + squares / np.square(scale)))
 
 
-def annealed_scales(num_rounds: int, *, num_final: int = 3) -> Iterator[float]:
+def annealed_scales(
+    num_rounds: int, *, num_final: int = 3, last: float = CAUCHY_SCALE
+) -> Iterator[float]:
     """Scales of a Cauchy loss for the rounds of a fit: wide first, halved down to the final one.
 
     A wide loss is nearly convex and lets the fit find the place that most data agree on.
@@ -36,10 +38,11 @@ def annealed_scales(num_rounds: int, *, num_final: int = 3) -> Iterator[float]:
     Parameters
     ----------
     num_rounds : scales to give.
-    num_final : how many of them, the last ones, are ``CAUCHY_SCALE``.
+    num_final : how many of them, the last ones, are ``last``.
+    last : deviations.
     """
     for index in range(num_rounds):
-        yield CAUCHY_SCALE * 2.0 ** max(num_rounds - num_final - index, 0)
+        yield last * 2.0 ** max(num_rounds - num_final - index, 0)
 
 
 def robust_deviation(residuals: Floats) -> float:

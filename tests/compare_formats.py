@@ -212,7 +212,13 @@ def main(capture: Path, work: Path, names: list[str]) -> None:
         share[raw == 255] = 1.0
         mosaics[stem] = share
     rows, reference = [], {}
-    for name in dict.fromkeys([REFERENCE, *(names or ALL)]):
+    chosen = list(names or ALL)
+    if "colour mosaic" in chosen and any(
+        side % 4 for share in mosaics.values() for side in share.shape
+    ):
+        print("colour mosaic: left out, sides of the mosaics are no multiples of 4.", flush=True)
+        chosen.remove("colour mosaic")
+    for name in dict.fromkeys([REFERENCE, *chosen]):
         folder = work / "capture"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
