@@ -10,7 +10,13 @@ import numpy as np
 from polmvs.config import AngleModel, Light, NormalOptions
 from polmvs.normals.light import specular_votes
 from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
-from polmvs.normals.tracks import inside_shares, normals_from_rows, window_maps
+from polmvs.normals.tracks import (
+    MAX_ROWS,
+    in_tiles,
+    inside_shares,
+    normals_from_rows,
+    window_maps,
+)
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
 
@@ -62,12 +68,15 @@ def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> Light
     on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
     windows = window_maps(maps, options.window_px)
     readings = (AS_MEASURED, OTHER_LIGHT)
-    as_given, as_other = (
-        normals_from_rows(on_parts, rows, options.estimator)
-        for rows in gather_rows_under(readings, AngleModel.PPA, on_parts.points_in_world, windows)
-    )
-    votes, voting = specular_votes(as_given, as_other)  # for the first over the second
-    votes = votes[voting]
+    of_tiles = []
+    for some in in_tiles(on_parts, len(maps), MAX_ROWS):
+        as_given, as_other = (
+            normals_from_rows(some, rows, options.estimator)
+            for rows in gather_rows_under(readings, AngleModel.PPA, some.points_in_world, windows)
+        )
+        votes, voting = specular_votes(as_given, as_other)  # for the first over the second
+        of_tiles.append(votes[voting])
+    votes = np.concatenate(of_tiles)
     num = len(votes)
     if num < MIN_VOTES:
         return LightCheck(given=given, num_votes=num, share=0.0, contradicted=False)

@@ -5,6 +5,7 @@ import pytest
 from scenes import Scene, board_scene, phase_map_of, tracks_at
 
 from polmvs.config import Light
+from polmvs.normals import light_check
 from polmvs.normals.light_check import check_light
 from polmvs.polarization.phase_map import turned
 from polmvs.synthetic.captures import Sphere, render_view
@@ -43,3 +44,13 @@ def test_few_points_say_nothing():
     assert not check_light(tracks, wrong, Light.DIFFUSE).contradicted
     nothing = tracks_at(scene, np.zeros((0, 3)))
     assert check_light(nothing, wrong, Light.DIFFUSE).num_votes == 0
+
+
+def test_tiles_of_points_change_nothing(monkeypatch):
+    scene = ball_scene(Light.SPECULAR, "ppa")
+    tracks = tracks_at(scene, scene.surface_points(40)[0])
+    wrong = [turned(m, np.ones(m.region.inside.shape, bool)) for m in scene.maps]
+    whole = check_light(tracks, wrong, Light.DIFFUSE)
+    monkeypatch.setattr(light_check, "MAX_ROWS", 7 * len(scene.maps))
+    assert check_light(tracks, wrong, Light.DIFFUSE) == whole
+    assert whole.num_votes > 7
