@@ -4,7 +4,8 @@ The two differ by a quarter turn of the phase, so the wrong choice puts every pl
 at a right angle to the true one. One view cannot tell; three or more can, because wrong planes of
 incidence do not meet in one normal. Every sparse point on a part votes with the likelihoods of
 its two best normals. Where a part has too few of them its pixels vote the same way, placed as far
-off as explains their phases best, for either kind of light: normals hardly depend on that. The
+off as explains their phases best, for either kind of light: normals hardly depend on that. What
+one view says of a thing is doubtful, so that a part is decided by all views that show it. The
 degree of polarisation has a say where phases have none (specular light is polarised up to wholly,
 diffuse light of a smooth dielectric hardly over 0.4).
 """
@@ -49,9 +50,9 @@ class LightTolerances:
     diffuse_dolp : largest DoLP of diffuse light. Derived: smooth dielectric of ior 1.5, seen at a
         grazing angle.
     dolp_votes : log-likelihood that twice that DoLP is worth. Guess.
-    max_pixel_views : views, evenly spread over all, that a part's own pixels are looked up in.
-        Guess; more cost time only.
-    num_pixels : of a part that vote where it has no points. Guess; costs time only.
+    max_pixel_views : views, evenly spread over all, that a part's pixels are looked up in. Guess;
+        more cost time only.
+    num_pixels : of a part that are placed in space. Guess; costs time only.
     num_ranges : distances that these are tried at. Guess; normals hardly depend on them.
     widening : of the distances beyond those of the scene's points, factor. Guess.
     """
@@ -75,8 +76,9 @@ def find_diffuse(
 ) -> Iterator[Mask]:
     """Pixels of each view whose light is diffuse-dominant, view by view.
 
-    Every connected part of a view's region is decided as a whole: by the points that project into
-    it, else by its own pixels, else with the majority of the capture. One map is held at a time.
+    Every connected part of a view's region is decided as a whole: by the votes of its points, else
+    of its pixels, and of the parts of other views that show the same, else with the majority of the
+    capture. One map is held at a time.
 
     Parameters
     ----------
@@ -97,18 +99,19 @@ def find_diffuse(
     ]
     of_pixels = _pixel_votes(of_points, maps, tracks.points_in_world, t, max_rows)
     overall = float(votes[voting].sum()) + _dolp_votes(maps, t)
-    decided = []
+    own = []
     for known, dense in zip(of_points, of_pixels, strict=True):
         undecided = ~np.isfinite(known)
-        decided.append(np.where(undecided, dense, known))
+        own.append(np.where(undecided, dense, known))
         overall += float(np.nansum(dense[undecided]))
+    decided = _pooled_votes(own, maps, tracks.points_in_world, t)
     # Without any evidence light is specular: what polarises most.
     tie = overall if overall != 0 else 1.0
     return (_diffuse_pixels(*pair, overall, tie) for pair in zip(maps, decided, strict=True))
 
 
 def _diffuse_pixels(phase_map: PhaseMap, votes: Array, overall: float, tie: float) -> Mask:
-    """The pixels (H, W) of a view's parts whose votes (P,) say diffuse."""
+    """The pixels (H, W) of a view's parts whose votes (P,) say diffuse; NaN is the majority."""
     verdict = np.where(np.isfinite(votes), votes, overall)
     verdict = np.where(verdict == 0, tie, verdict)
     return np.asarray((verdict < 0)[_parts_of(phase_map)] & phase_map.region.inside)
@@ -169,70 +172,153 @@ def _pixel_votes(
     maps : of all views, under the assumption of specular light.
     points : (T, 3), of the scene, which say how far off a part may be.
     """
-    # A slot is a part of a view at one of the distances.
-    num_slots, first, placed, slots = 0, [], [np.zeros((0, 3))], [np.zeros(0, np.int64)]
-    for phase_map, votes in zip(maps, of_points, strict=True):
-        first.append(num_slots)
-        num_slots += t.num_ranges * len(votes)
-        found = _undecided_pixels(phase_map, votes, points, t)
-        if found is not None:
-            rays, owner, distances = found
-            for index, distance in enumerate(distances):
-                placed.append(phase_map.view.center_in_world + distance * rays)
-                slots.append(first[-1] + index * len(votes) + owner)
-    all_placed, slot = np.concatenate(placed), np.concatenate(slots)
-    seen_by = np.linspace(0, len(maps) - 1, min(len(maps), t.max_pixel_views)).round().astype(int)
-    total, sums = np.zeros(num_slots), np.zeros((2, num_slots))
+    undecided = [np.flatnonzero(~np.isfinite(votes)) for votes in of_points]
+    slots = _place_pixels(maps, undecided, points, t)
+    seen_by = _looked_up(len(maps), t)
+    total, sums = np.zeros(slots.num), np.zeros((2, slots.num))
     step = max(1, max_rows // max(len(seen_by), 1))
-    for start in range(0, len(slot), step):
-        tile, here = all_placed[start : start + step], slot[start : start + step]
+    for start in range(0, len(slots.owner), step):
+        tile, here = slots.points[start : start + step], slots.owner[start : start + step]
         specular, diffuse = (
             solve_normals(rows.rows, rows.rays, rows.sigma)
             for rows in _rows_of_both(tile, [maps[k] for k in seen_by])
         )
         costs, compared = _row_costs(specular, diffuse, t.max_row_cost)
         counts = compared.sum(axis=0) * (compared.sum(axis=0) >= t.min_rows)
-        total += np.bincount(here, counts, num_slots)
+        total += np.bincount(here, counts, slots.num)
         for which, cost in enumerate(costs):
             weighted = (cost * compared).sum(axis=0) * (counts > 0)
-            sums[which] += np.bincount(here, weighted, num_slots)
-    mean = np.divide(sums, total, out=np.full((2, num_slots), np.inf), where=total > 0)
+            sums[which] += np.bincount(here, weighted, slots.num)
+    mean = np.divide(sums, total, out=np.full((2, slots.num), np.inf), where=total > 0)
     dense = []
-    for begin, votes in zip(first, of_points, strict=True):
+    for rows_there, costs_there in zip(slots.by_view(total), slots.by_view(mean), strict=True):
         # Of each part, per kind of light, the least cost of a row at any of the distances.
-        own = np.s_[begin : begin + t.num_ranges * len(votes)]
-        least = mean[:, own].reshape(2, t.num_ranges, len(votes)).min(axis=1)
-        rows_there = total[own].reshape(t.num_ranges, len(votes)).max(axis=0)
+        least, num_rows = costs_there.min(axis=1), rows_there.max(axis=0)
         known = np.isfinite(least).all(axis=0)
-        of_view = np.full(len(votes), np.nan)
-        of_view[known] = (least[1, known] - least[0, known]) * rows_there[known]
+        of_view = np.full(len(num_rows), np.nan)
+        of_view[known] = (least[1, known] - least[0, known]) * num_rows[known]
         dense.append(of_view)
     return dense
 
 
-def _undecided_pixels(
-    phase_map: PhaseMap, votes: Array, points: Array, t: LightTolerances
-) -> tuple[Array, NDArray[np.int64], Array] | None:
-    """Rays (N, 3) in the world of some pixels of undecided parts, the parts, and distances."""
-    view = phase_map.view
-    undecided = [int(i) for i in np.flatnonzero(~np.isfinite(votes)) if i > 0]
-    in_cam = view.cam_from_world * points
-    ahead = in_cam[in_cam[:, 2] > 0]
-    if not undecided or not len(ahead):
-        return None
-    labels, reliable = _parts_of(phase_map), phase_map.region.reliable
-    pixels, owners = [], []
-    for index in undecided:
-        rows, cols = np.nonzero((labels == index) & reliable)
-        step = max(1, len(rows) // t.num_pixels)
-        pixels.append(np.stack([cols[::step], rows[::step]], axis=-1) + 0.5)
-        owners.append(np.full(len(pixels[-1]), index))
-    distances = np.linalg.norm(ahead, axis=-1)
-    nearest, farthest = np.percentile(distances, [2, 98]) * [1 / t.widening, t.widening]
-    return (
-        view.rays_in_world(np.concatenate(pixels)),
-        np.concatenate(owners),
-        np.geomspace(nearest, farthest, t.num_ranges),
+def _pooled_votes(
+    votes: Sequence[Array], maps: Sequence[PhaseMap], points: Array, t: LightTolerances
+) -> list[Array]:
+    """Votes (P,) of each part with those of the parts of other views that show the same.
+
+    A part's pixels, as far off as most views have a part where they fall, pass on the votes of what
+    they fall on. A thing of another light beside it keeps its own.
+
+    Parameters
+    ----------
+    votes : of each view's parts alone (P,); NaN where unknown.
+    points : (T, 3), of the scene, which say how far off a part may be.
+    """
+    slots = _place_pixels(maps, [np.arange(len(of_view)) for of_view in votes], points, t)
+    placed = np.maximum(np.bincount(slots.owner, minlength=slots.num), 1)
+    covered, passed, known = np.zeros(slots.num), np.zeros(slots.num), np.zeros(slots.num)
+    for k in _looked_up(len(maps), t):
+        elsewhere = slots.view != k
+        xy = maps[k].view.project(slots.points[elsewhere])
+        part = sample_image(_parts_of(maps[k]).astype(np.float32), xy, nearest=True).astype(int)
+        there, owner = votes[k][part], slots.owner[elsewhere]
+        covered += np.bincount(owner, part > 0, slots.num)
+        known += np.bincount(owner, (part > 0) & np.isfinite(there), slots.num)
+        given = np.where(part > 0, np.nan_to_num(there), 0)
+        passed += np.bincount(owner, given, slots.num) / placed
+    pooled = []
+    for own, *others in zip(votes, *map(slots.by_view, (covered, passed, known)), strict=True):
+        best = others[0].argmax(axis=0)[None]
+        passed_on, num_known = (np.take_along_axis(x, best, axis=0)[0] for x in others[1:])
+        total = np.nan_to_num(own) + passed_on
+        pooled.append(np.where(np.isfinite(own) | (num_known > 0), total, np.nan))
+    return pooled
+
+
+def _looked_up(num_views: int, t: LightTolerances) -> NDArray[np.int64]:
+    """Views, evenly spread, that pixels placed in space are looked up in."""
+    chosen = np.linspace(0, num_views - 1, min(num_views, t.max_pixel_views))
+    return np.asarray(chosen.round(), np.int64)
+
+
+@dataclass(frozen=True)
+class _Slots:
+    """Some pixels of parts of all views, placed in space at each of several distances.
+
+    A slot is a part of a view at one of the distances.
+
+    Attributes
+    ----------
+    points : (N, 3), world.
+    owner, view : (N,), the slot and the view of each point.
+    num_parts : of each view.
+    num_ranges : distances.
+    """
+
+    points: Array
+    owner: NDArray[np.int64]
+    view: NDArray[np.int64]
+    num_parts: tuple[int, ...]
+    num_ranges: int
+
+    @property
+    def num(self) -> int:
+        """Slots of all views."""
+        return self.num_ranges * sum(self.num_parts)
+
+    def by_view(self, values: Array) -> list[Array]:
+        """Values (..., slots) as arrays (..., distances, parts), one for each view."""
+        ends = self.num_ranges * np.cumsum(self.num_parts)
+        return [
+            of_view.reshape(*of_view.shape[:-1], self.num_ranges, num)
+            for of_view, num in zip(
+                np.split(values, ends[:-1], axis=-1), self.num_parts, strict=True
+            )
+        ]
+
+
+def _place_pixels(
+    maps: Sequence[PhaseMap],
+    parts: Sequence[NDArray[np.int64]],
+    points: Array,
+    t: LightTolerances,
+) -> _Slots:
+    """Place pixels of parts at distances at which the scene's points (T, 3) lie.
+
+    Parameters
+    ----------
+    parts : of each view, those that are asked for; 0, which is none, is passed over.
+    """
+    placed, owner, view = [np.zeros((0, 3))], [], []
+    num_parts: list[int] = []
+    for index, (phase_map, wanted) in enumerate(zip(maps, parts, strict=True)):
+        labels = _parts_of(phase_map)
+        begin = t.num_ranges * sum(num_parts)
+        num_parts.append(int(labels.max(initial=0)) + 1)
+        in_cam = phase_map.view.cam_from_world * points
+        ahead = in_cam[in_cam[:, 2] > 0]
+        if not len(ahead) or not (wanted > 0).any():
+            continue
+        reliable, pixels, of_part = phase_map.region.reliable, [], []
+        for part in wanted[wanted > 0]:
+            rows, cols = np.nonzero((labels == part) & reliable)
+            step = max(1, len(rows) // t.num_pixels)
+            pixels.append(np.stack([cols[::step], rows[::step]], axis=-1) + 0.5)
+            of_part.append(np.full(len(pixels[-1]), part))
+        rays = phase_map.view.rays_in_world(np.concatenate(pixels))
+        distances = np.linalg.norm(ahead, axis=-1)
+        nearest, farthest = np.percentile(distances, [2, 98]) * [1 / t.widening, t.widening]
+        for step, distance in enumerate(np.geomspace(nearest, farthest, t.num_ranges)):
+            placed.append(phase_map.view.center_in_world + distance * rays)
+            owner.append(begin + step * num_parts[-1] + np.concatenate(of_part))
+            view.append(np.full(len(rays), index))
+    none = [np.zeros(0, np.int64)]
+    return _Slots(
+        points=np.concatenate(placed),
+        owner=np.concatenate(none + owner),
+        view=np.concatenate(none + view),
+        num_parts=tuple(num_parts),
+        num_ranges=t.num_ranges,
     )
 
 
