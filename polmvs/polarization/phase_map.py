@@ -31,9 +31,11 @@ class PhaseTolerances:
     Attributes
     ----------
     sharp_smoothing_px : of the lowest DoLP of single pixels. Guess.
-    fine_smoothing_px : of the phase. Guess.
-    coarse_smoothing_px : of the phase where few pixels count: it bridges marks and frontal
-        spots. Guess.
+    fine_smoothing_px : of the phase. Measured, F at 1 mm with 1.5 px, 1 px and 0.7 px: of `step`
+        97.6, 98.0 and 97.8 %, of `mug` 97.6, 98.2 and 98.0 %.
+    coarse_smoothing_px : of the phase where few pixels count: it bridges clipped spots. Guess.
+    alike_sigma : by which ``(s1, s2) / s0`` of pixels next to each other differ beside their noise:
+        those that are noisier count less. Measured, F at 1 mm of a bolt: 92.6 %, 90.2 without.
     model_sigma : rad; error of the phase of strongly polarised light that noise does not
         explain. Measured on the shared captures.
     ridge : of the local linear fits, as a share of the window's variance: bounds their slopes
@@ -43,8 +45,9 @@ class PhaseTolerances:
     """
 
     sharp_smoothing_px: float = 0.7
-    fine_smoothing_px: float = 1.5
+    fine_smoothing_px: float = 1.0
     coarse_smoothing_px: float = 5.0
+    alike_sigma: float = 0.03
     ridge: float = 0.02
     model_sigma: float = 0.014
     mixture_sigma: float = 0.006
@@ -52,7 +55,7 @@ class PhaseTolerances:
 
 @dataclass(frozen=True)
 class PhaseMap:
-    """Phase of one view, smoothed over the reliable pixels of its region.
+    """Phase of one view, smoothed over the valid pixels of its region.
 
     Attributes
     ----------
@@ -173,7 +176,12 @@ def build_phase_map(
     *,
     tolerances: PhaseTolerances = PhaseTolerances(),
 ) -> PhaseMap:
-    """Smooth the Stokes images over the reliable pixels and turn them into phase and precision.
+    """Smooth the polarization of a region's valid pixels and turn it into phase and precision.
+
+    What is smoothed are ``s1 / s0`` and ``s2 / s0``: the Stokes images themselves would carry the
+    phase of a bright face into the dark one beside it. For the same reason printed marks keep their
+    own phase, as weak as it may be, and are not bridged by what is about them: from a view alone
+    they are not told from a wall that turns away from the light.
 
     Parameters
     ----------
@@ -183,33 +191,36 @@ def build_phase_map(
     light : which reflection dominates; specular light turns the phase by pi/2 from the AoLP.
     tolerances : of this step.
     """
-    weight = region.reliable.astype(np.float32)
-    images = np.dstack([stokes.s0, stokes.s1, stokes.s2])
-    lossy = stokes.lossy_sigma**2
-    variances = np.maximum(np.square(stokes.sigma) - np.float32(lossy), 0)
-    fine = _smoothed(images, variances, weight, tolerances.fine_smoothing_px, tolerances.ridge)
-    coarse = _smoothed(images, variances, weight, tolerances.coarse_smoothing_px, tolerances.ridge)
-    use_fine = fine.share > 0.25
-    smoothed = np.where(use_fine[..., None], fine.values, coarse.values)
-    share = np.where(use_fine, fine.share, coarse.share)
-    width_px = np.where(use_fine, tolerances.fine_smoothing_px, tolerances.coarse_smoothing_px)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        lit = np.where(smoothed[..., :1] > 0, smoothed[..., :1], np.nan)
-        axial = phase_sign(light) * smoothed[..., 1:3] / lit
-        dolp = np.minimum(np.linalg.norm(axial, axis=-1), 1.0)
-        noise = np.where(use_fine, fine.variance, coarse.variance)
-        # A Gaussian of width w averages 4 pi w^2 independent pixels.
-        blocks = 4 * np.pi * width_px**2 * share / stokes.lossy_block_px**2
-        noise = (noise + lossy / np.maximum(blocks, 1)) / lit[..., 0] ** 2 + stokes.gain_sigma**2
-        variance = tolerances.model_sigma**2 + (tolerances.mixture_sigma**2 + noise / 4) / dolp**2
+    t = tolerances
+    counted = region.inside & stokes.valid & (stokes.s0 > 0)
+    s0 = np.where(counted, stokes.s0, np.float32(1))
+    axial = np.dstack([np.where(counted, channel / s0, 0) for channel in (stokes.s1, stokes.s2)])
+    axial = np.asarray(phase_sign(light) * axial, np.float32)
+    whole, lossy = np.square(stokes.sigma / s0), np.square(stokes.lossy_sigma / s0)
+    weight = np.where(counted, t.alike_sigma**2 / (t.alike_sigma**2 + whole), 0)
+    variances, weight = np.maximum(whole - lossy, 0), np.asarray(weight, np.float32)
+    widths_px = t.fine_smoothing_px, t.coarse_smoothing_px
+    fine, coarse = (_smoothed(axial, variances, weight, width, t.ridge) for width in widths_px)
+    of_fine, of_coarse = (_window_share(counted, width) for width in widths_px)
+    use_fine = of_fine > 0.25
+    axial = np.where(use_fine[..., None], fine.values, coarse.values)
+    share = np.where(use_fine, of_fine, of_coarse)
+    width_px = np.where(use_fine, *widths_px)
+    dolp = np.linalg.norm(axial, axis=-1)
+    axial = axial / np.maximum(dolp, 1)[..., None]  # beside an outline a fit may go beyond
+    dolp = np.minimum(dolp, 1)
+    # A Gaussian of width w averages 4 pi w^2 independent pixels.
+    blocks = 4 * np.pi * width_px**2 * share / stokes.lossy_block_px**2
+    noise = np.where(use_fine, fine.variance, coarse.variance)
+    noise = noise + lossy / np.maximum(blocks, 1) + stokes.gain_sigma**2
+    with np.errstate(divide="ignore"):
+        variance = t.model_sigma**2 + (t.mixture_sigma**2 + noise / 4) / dolp**2
         precision = np.where(region.inside & (share > 0.02), 1 / variance, 0)
     samples = np.dstack([axial, precision]).astype(np.float32)
-    np.nan_to_num(samples, copy=False, nan=0.0)
     diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
     intensity = np.asarray(stokes.s0, np.float32)
-    return PhaseMap(
-        view, region, samples, intensity, diffuse, _lowest_dolp(images, tolerances=tolerances)
-    )
+    lowest = _lowest_dolp(np.dstack([stokes.s0, stokes.s1, stokes.s2]), tolerances=t)
+    return PhaseMap(view, region, samples, intensity, diffuse, lowest)
 
 
 def _lowest_dolp(stokes: Image, *, tolerances: PhaseTolerances) -> NDArray[np.uint8]:
@@ -295,13 +306,27 @@ def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMa
 class _Smoothed:
     """Images smoothed over the pixels that count.
 
-    ``values`` (H, W, C); ``variance`` (H, W) of each channel from the pixels' noise; ``share``
-    (H, W) of the window that counts.
+    ``values`` (H, W, C); ``variance`` (H, W) of each channel from the pixels' noise.
     """
 
     values: Image
     variance: Image
-    share: Image
+
+
+def _window(sigma_px: float) -> tuple[Image, Image]:
+    """Places (px) of a Gaussian window along an axis, and its values, which sum to one."""
+    reach = int(np.ceil(4 * sigma_px))
+    place = np.arange(-reach, reach + 1, dtype=np.float32)
+    window = np.exp(-0.5 * (place / sigma_px) ** 2)
+    return place, np.asarray(window / window.sum(), np.float32)
+
+
+def _window_share(counted: Mask, sigma_px: float) -> Image:
+    """Share (H, W) of the window that counts."""
+    _, window = _window(sigma_px)
+    pixels = counted.astype(np.float32)
+    share = cv2.sepFilter2D(pixels, -1, window, window, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(share, np.float32)
 
 
 def _smoothed(
@@ -319,14 +344,11 @@ def _smoothed(
     ----------
     images : (H, W, C).
     variances : (H, W), of their noise.
-    weight : (H, W), 1 where a pixel counts, else 0.
+    weight : (H, W), of each pixel; 0 where it does not count.
     sigma_px : of the window.
     ridge : as in `PhaseTolerances`.
     """
-    reach = int(np.ceil(4 * sigma_px))
-    place = np.arange(-reach, reach + 1, dtype=np.float32)
-    window = np.exp(-0.5 * (place / sigma_px) ** 2)
-    window /= window.sum()
+    place, window = _window(sigma_px)
 
     def moment(image: Image, power_x: int, power_y: int, kernel: Image = window) -> Image:
         along_x, along_y = (np.asarray(kernel * place**i, np.float32) for i in (power_x, power_y))
@@ -350,7 +372,7 @@ def _smoothed(
     values -= by_x[..., None] * moment(counted, 1, 0)
     values -= by_y[..., None] * moment(counted, 0, 1)
     # The same weights squared give the noise.
-    noisy, squared = weight * variances, np.asarray(window**2, np.float32)
+    noisy, squared = weight**2 * variances, np.asarray(window**2, np.float32)
     second = {(i, j): moment(noisy, i, j, squared) for i in range(3) for j in range(3 - i)}
     variance = (
         constant**2 * second[0, 0]
@@ -359,7 +381,7 @@ def _smoothed(
         + 2 * by_x * by_y * second[1, 1]
         - 2 * constant * (by_x * second[1, 0] + by_y * second[0, 1])
     )
-    return _Smoothed(values, np.maximum(variance, 0).astype(np.float32), share)
+    return _Smoothed(values, np.maximum(variance, 0).astype(np.float32))
 
 
 def view_rays(view: View) -> NDArray[np.float32]:

@@ -9,11 +9,13 @@ from scenes import CAMERA, Scene, board_scene, phase_map_of, tracks_at
 from polmvs.config import AngleModel, Light, NormalOptions
 from polmvs.evaluation.comparison import Consistency, best_fitting_model
 from polmvs.evaluation.metrics import AngleStats
-from polmvs.normals.light import find_diffuse
+from polmvs.normals import light as light_module
+from polmvs.normals.light import LightTolerances, find_diffuse
 from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import track_normals
 from polmvs.polarization.phase_map import as_tilted, open_phase_map, store_phase_map, turned
 from polmvs.synthetic.captures import Plane, Sphere, render_view, ring_of_views
+from polmvs.synthetic.surfaces import Group
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +80,32 @@ def test_a_part_without_points_is_told_by_its_own_phases(light):
     masks = list(find_diffuse(about, weak))
     share = sum(int(m.sum()) for m in masks) / sum(int(m.region.inside.sum()) for m in weak)
     assert share == pytest.approx(1.0 if light == "diffuse" else 0.0, abs=0.05)
+
+
+def test_what_one_view_says_of_a_thing_yields_to_the_others_that_show_it():
+    """Two balls of different light, one view wrong of either: each is decided by its own views."""
+    places = np.array([[-0.12, 0.0, 0.0], [0.12, 0.0, 0.0]])
+    balls = [Sphere(center=place, radius=0.06) for place in places]
+    views = ring_of_views(8, CAMERA, target=np.zeros(3), distance=0.5, elevation_deg=70)
+    rendered = [render_view(v, Group(balls), sensor="ppa", s0=0.3, background=0.9) for v in views]
+    maps = [phase_map_of(r) for r in rendered]
+    votes, of_balls = [], []
+    for index, phase_map in enumerate(maps):
+        labels = light_module._parts_of(phase_map)
+        xy = phase_map.view.project(places)
+        own = labels[xy[:, 1].astype(int), xy[:, 0].astype(int)]
+        assert (own > 0).all()
+        assert own[0] != own[1]
+        of_view = np.full(labels.max() + 1, np.nan)
+        of_view[own] = (30.0, -30.0) if index != 3 else (-40.0, 40.0)
+        votes.append(of_view)
+        of_balls.append(own)
+    votes[5][of_balls[5]] = np.nan  # which says nothing itself
+    surroundings = np.array([[x, y, -0.06] for x in (-0.2, 0.2) for y in (-0.2, 0.2)])
+    pooled = light_module._pooled_votes(votes, maps, surroundings, LightTolerances())
+    for found, own in zip(pooled, of_balls, strict=True):
+        assert found[own[0]] > 60
+        assert found[own[1]] < -60
 
 
 def test_turning_twice_changes_nothing(board):
