@@ -225,6 +225,25 @@ def test_outlines_that_known_points_contradict_are_told(ball):
     assert wide_sigmas > 3
 
 
+def test_many_views_that_err_alike_do_not_outweigh_known_points(ball):
+    """All silhouettes a pixel too wide: more of such views know no more of where they are."""
+    wide = []
+    for view in ball:
+        mask = cv2.dilate(view.silhouette.certain.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        wide.append(replace(view, silhouette=Silhouette(mask, mask)))
+    points = np.random.default_rng(0).standard_normal((2000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    known = KnownPoints(points, np.full(2000, 0.3 * FOOTPRINT))
+    hull = visual_hull(wide, num_wrong=0)
+    off_px = []
+    for views in (2 * wide, 6 * wide):
+        mesh = refine(hull.mesh, views, PPA, hull.footprint, known=known, tolerances=QUICK).mesh
+        radius = np.linalg.norm(mesh.vertices, axis=1)
+        off_px.append((np.median(radius) - 1) / hull.footprint)
+    few, many = off_px
+    assert many == pytest.approx(few, rel=0.1)  # without the count of views 0.26 and 0.64 px
+
+
 def test_outliers_among_known_points_lose(ball):
     rng = np.random.default_rng(0)
     points = rng.standard_normal((40, 3))
