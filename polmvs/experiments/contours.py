@@ -3,8 +3,7 @@
 Of each view: 20 true points along the edge of the part are the seeds. ``opa``: iso-depth contours
 in the OPA direction. ``ppa_normals``: the same 2D paths, the distance stepped along them with
 normals from two views at the place reached so far (the paper's way). ``ppa_tangent`` and
-``tilted_tangent``: iso-range contours of the view alone. All use the same phase maps, smoothed
-over the reliable pixels.
+``tilted_tangent``: iso-range contours of the view alone. All use the package's phase maps.
 """
 
 from __future__ import annotations

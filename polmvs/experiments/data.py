@@ -146,7 +146,7 @@ class ViewData:
         return np.asarray(cv2.dilate(spoiled, np.ones((size, size), np.uint8)) > 0)
 
     def phase_map(self, angle_model: AngleModel, region: Region) -> PhaseMap:
-        """The package's own phase map: smoothed over the reliable pixels, with precisions."""
+        """The package's own phase map, with precisions."""
         s = self.sharp
         measured = build_phase_map(self.view, s, region, self.light)
         return as_tilted(measured) if angle_model is AngleModel.TILTED else measured

@@ -188,8 +188,8 @@ def _run_tracks(
         f"Angle between multi-view and true normals of {options.num_points} random pixels of the "
         f"part, from K views ({options.select}) that see them with a DoLP above "
         f"{scene.region.min_dolp:g}; a point without so many views is left out. Eigenvector: "
-        f"single pixels, {_blur(scene)}, all alike. Weighted robust: the package's phase maps, "
-        f"smoothed over reliable pixels. {_poses(scene)} {_paper('tracks')}\n\n"
+        f"single pixels, {_blur(scene)}, all alike. Weighted robust: the package's phase maps. "
+        f"{_poses(scene)} {_paper('tracks')}\n\n"
         f"{tracks_table(result)}"
     )
     return Report(

@@ -5,8 +5,8 @@ point when it sees it (by the true depth) and the blurred pixel there is over th
 K of those views are chosen, the same for every estimator, and more views include the fewer.
 
 Rows of ``opa`` and ``ppa_algebraic`` are the blurred pixels themselves, all alike, as in the
-paper. Those of the weighted robust estimators are the package's phase maps, smoothed over the
-reliable pixels only and weighted by their precision.
+paper. Those of the weighted robust estimators are the package's phase maps, weighted by their
+precision.
 """
 
 from __future__ import annotations
