@@ -74,7 +74,8 @@ class Region:
     Attributes
     ----------
     inside : (H, W) bool, the surface to densify, holes (marks, frontal spots) filled.
-    reliable : (H, W) bool, pixels whose own phase counts: polarised, unsaturated, no mark.
+    reliable : (H, W) bool, pixels that averages over windows and votes on the light count:
+        polarised, unsaturated, neither mark nor what passes for one. Phase maps take all.
     edges : (H, W) bool, creases and depth edges; contours stop there.
     """
 
