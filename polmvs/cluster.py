@@ -20,10 +20,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from polmvs._version import __version__
 from polmvs.errors import DataError, OptionError
+from polmvs.threads import keep_to_one_core
 
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pycolmap")
 SCATTERED_BYTES = 100_000  # of arguments, from which they do not pass through the scheduler's graph
@@ -271,7 +270,7 @@ def _work(versions: dict[str, str], packed: bytes) -> Any:
         raise DataError(
             "dask worker", f"has other versions ({own_versions()}) than the program ({versions})."
         )
-    cv2.setNumThreads(1)  # a worker's thread is one core
+    keep_to_one_core()  # a worker's thread is one core
     function, task = cloudpickle.loads(packed)
     return function(*task)
 

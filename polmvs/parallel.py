@@ -24,7 +24,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, TypeVar
 
-import cv2
+from polmvs.threads import keep_to_one_core
 
 T = TypeVar("T")
 
@@ -202,7 +202,7 @@ def _signals_held_back() -> Iterator[None]:
 def _start_worker() -> None:
     """Ctrl-C is the parent's to handle, and one worker is one core."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    cv2.setNumThreads(1)
+    keep_to_one_core()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

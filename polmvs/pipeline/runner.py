@@ -67,6 +67,7 @@ from polmvs.pipeline.stage_table import (
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture, open_capture
 from polmvs.scene import SparseModel
+from polmvs.threads import one_blas_thread
 
 logger = logging.getLogger(__name__)
 
@@ -312,6 +313,7 @@ def open_run(
     # Workers end before the lock: what they were at may be cleared away then.
     with (
         quiet_colmap(),
+        one_blas_thread(),
         locked(out),
         _workers(run_options, plan, capture_folder, out, options) as workers,
     ):
