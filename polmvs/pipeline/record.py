@@ -33,6 +33,7 @@ class StageRecord:
     name : of the stage.
     angle_model : that it is of; None for those of all.
     reads : what it was made from, paths in the run folder.
+    wrote : what it left there, paths in the run folder.
     options : values of the options that decided its result, by path, in terms of JSON.
     seconds : wall time.
     cpu_s : processor time, see :func:`polmvs.memory.cpu_seconds`; not of a cluster's.
@@ -45,6 +46,7 @@ class StageRecord:
     name: str
     angle_model: AngleModel | None = None
     reads: tuple[str, ...] = ()
+    wrote: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
     seconds: float
     cpu_s: float

@@ -12,7 +12,7 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -101,11 +101,19 @@ class Run:
     _started: float = field(default_factory=time.perf_counter)
 
     def is_finished(self, spec: StageSpec) -> bool:
-        """Whether a stage is recorded."""
-        return self.record.stage(spec.name) is not None
+        """Whether a stage is recorded and what it wrote is still there."""
+        finished = self.record.stage(spec.name)
+        return finished is not None and not self._lost(finished)
+
+    def _lost(self, finished: StageRecord) -> list[str]:
+        """What a finished stage wrote and is no longer there."""
+        return [path for path in finished.wrote if not (self.run_folder.root / path).exists()]
 
     def do(self, spec: StageSpec) -> None:
         """Do a stage, unless it is finished, and record it.
+
+        One whose files are gone is done again, and alone: what was made of them stays, for the same
+        options give the same files.
 
         Raises
         ------
@@ -113,15 +121,20 @@ class Run:
             A stage that it reads from is not finished.
         """
         finished = self.record.stage(spec.name)
+        if finished is not None and (lost := self._lost(finished)):
+            logger.warning("%s: %s is gone and is made again.", spec.name, ", ".join(lost))
+            self._take_back([spec])
+            finished = None
         if finished is not None and not (spec.is_redone and self._has_changed(spec, finished)):
             logger.info("%s: finished earlier", spec.name, extra=FILE_ONLY)
             self.monitor.skipped(spec.name)
             return
         for other in needed_by(spec, self.table):
             if not self.is_finished(other):
+                state = "is not finished" if self.record.stage(other.name) is None else "lost files"
                 raise DataError(
                     self.run_folder.root,
-                    f"its stage {other.name!r} is not finished, which {spec.name!r} reads. "
+                    f"its stage {other.name!r} {state}, which {spec.name!r} reads. "
                     f"Run 'polmvs {other.command}' first.",
                 )
         if finished is not None:
@@ -152,6 +165,7 @@ class Run:
             name=spec.name,
             angle_model=spec.angle_model,
             reads=_names(spec.reads),
+            wrote=_names(path for path in spec.writes if (self.run_folder.root / path).exists()),
             options=plain_options(self.options, spec.decides),
             seconds=seconds,
             cpu_s=round(cpu_seconds() - cpu_start, 3),
@@ -159,7 +173,9 @@ class Run:
             warnings=tuple(dict.fromkeys(warned)),
             result=result,
         )
-        self.record.stages = (*self.record.stages, finished)
+        order = [other.name for other in self.table]
+        stages = (*self.record.stages, finished)
+        self.record.stages = tuple(sorted(stages, key=lambda stage: order.index(stage.name)))
         self.save()
         self.monitor.finished(spec.name, seconds, str(result))
 
@@ -188,7 +204,10 @@ class Run:
         DataError
             A folder of theirs holds files that no run wrote; nothing is deleted.
         """
-        stale = with_dependent(names, self.table)
+        self._take_back(with_dependent(names, self.table))
+
+    def _take_back(self, stale: Sequence[StageSpec]) -> None:
+        """Delete the files of stages, and what is recorded of them."""
         paths = [self.run_folder.root / path for spec in stale for path in spec.writes]
         paths.append(self.run_folder.report)  # which shows them
         images = frozenset(self.record.images)
@@ -443,7 +462,7 @@ def _remove_results(run_folder: RunFolder) -> None:
         raise DataError(root, f"cannot be emptied: {error.strerror or error}.") from error
 
 
-def _names(paths: Sequence[Path]) -> tuple[str, ...]:
+def _names(paths: Iterable[Path]) -> tuple[str, ...]:
     return tuple(path.as_posix() for path in paths)
 
 

@@ -581,7 +581,7 @@ def _energy(
     residuals = [np.zeros(0), *(rim.residual for rim in rims if rim is not None)]
     rim_sigma = _rim_sigma(np.concatenate(residuals), tol)
     rows = [face_rows(mesh, scene, view, angle_model, row_sigma, tol) for view in views]
-    agreed = _agreed_weights(rows, len(mesh.faces), tol)
+    agreed = _agreed_weights(rows, views, mesh.centers, 0.5 * edge / footprint, tol)
     with_slope = level.with_slope or not any(rims)
 
     def of_views(chosen: Sequence[int]) -> _Evidence:
@@ -809,27 +809,41 @@ def _loss_weights(residual: Array, square: Array | float) -> Array:
 
 
 def _agreed_weights(
-    seen: Sequence[FaceRows], num_faces: int, tol: RefinementTolerances
+    seen: Sequence[FaceRows],
+    views: Sequence[SurfaceView],
+    centers: Array,
+    reach_px: float,
+    tol: RefinementTolerances,
 ) -> list[Array]:
     """Weights that rows keep however far off the mesh is: where views agree on another normal.
 
     A shoulder between a wall and a floor that the first surface bridges is contradicted by all
     views alike. Under a loss about the mesh's own normal their rows were outliers, and it stayed.
     Its normal is that of the rows themselves, by a loss that narrows; those that agree with it pull
-    the mesh as strongly as if it were off by the loss's width and no more. Places that mirror the
-    object are not asked: views may agree on what they mirror.
+    the mesh as strongly as if it were off by the loss's width and no more.
+
+    Rows of places that mirror the object are not asked: views may agree on what they mirror. Nor
+    are those of faces that an outline crosses, within ``reach_px`` of their centres, half the
+    length of an edge: the pixel may show what is not the face. All views showed the top of a thin
+    sheet on its narrow sides, so that it grew until the outlines drew it down.
     """
-    scale = tol.levels[-1].loss_scale
-    own, count = np.zeros(num_faces), np.zeros(num_faces)
-    for rows in seen:
-        direct = rows.face[~rows.is_mirrored]  # no face twice
-        own[direct] += _loss_weights(rows.residual, scale**2 * rows.variance)[~rows.is_mirrored]
-        count[direct] += 1
+    scale, num_faces = tol.levels[-1].loss_scale, len(centers)
+    weights = [_loss_weights(rows.residual, scale**2 * rows.variance) for rows in seen]
+    doubted = np.zeros(num_faces, np.bool_)
+    for rows, weight in zip(seen, weights, strict=True):
+        doubted[rows.face[weight < tol.agreement]] = True
+    own, count, chosen = np.zeros(num_faces), np.zeros(num_faces), []
+    for rows, view, weight in zip(seen, views, weights, strict=True):
+        some = np.flatnonzero(doubted[rows.face] & ~rows.is_mirrored)
+        some = some[~_near_outline(view, centers[rows.face[some]], reach_px)]
+        own[rows.face[some]] += weight[some]  # no face twice
+        count[rows.face[some]] += 1
+        chosen.append(some)
     asked = (count > MIN_VIEWS) & (own < tol.agreement * count)
     kept = [np.zeros(len(rows.face)) for rows in seen]
     if not asked.any():
         return kept
-    chosen = [asked[rows.face] & ~rows.is_mirrored for rows in seen]
+    chosen = [some[asked[rows.face[some]]] for rows, some in zip(seen, chosen, strict=True)]
     pairs = list(zip(seen, chosen, strict=True))
     place = (np.cumsum(asked) - 1)[np.concatenate([rows.face[some] for rows, some in pairs])]
     variance = np.concatenate([rows.variance[some] for rows, some in pairs])
@@ -838,10 +852,18 @@ def _agreed_weights(
     weight, agree = _agreement(place, all_rows, variance, int(asked.sum()), scale)
     weight[agree[place] < tol.agreement] = 0
     weight *= np.minimum(scale * np.sqrt(variance) / np.maximum(np.abs(residual), 1e-300), 1)
-    ends = np.cumsum([some.sum() for some in chosen])[:-1]
+    ends = np.cumsum([len(some) for some in chosen])[:-1]
     for values, some, found in zip(kept, chosen, np.split(weight, ends), strict=True):
         values[some] = found
     return kept
+
+
+def _near_outline(view: SurfaceView, points: Array, reach_px: float) -> Mask:
+    """Which points ``(N,)`` a view shows within a distance of its silhouette's outlines."""
+    if not view.has_outline or not len(points):
+        return np.zeros(len(points), np.bool_)
+    distance, _ = rim_residuals(view, view.project(points)[0])
+    return np.asarray(np.abs(distance) < reach_px)
 
 
 def _agreement(

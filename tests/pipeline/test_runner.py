@@ -134,6 +134,29 @@ def test_stages_are_recorded_skipped_and_told_of(make_run) -> None:
     assert (monitor.totals, monitor.steps) == ({"b": 1}, {"b": 1})
 
 
+def test_what_was_deleted_is_made_again_and_nothing_else(make_run, caplog) -> None:
+    table = [toy("a", "", "x"), toy("b", "x", "y"), toy("c", "y", "z")]
+    run = make_run(table)
+    for spec in table:
+        run.do(spec)
+    (run.run_folder.root / "x").unlink()
+    monitor = Recorder()
+    again = make_run(table, monitor=monitor)
+    again.forget(["c"])
+    again.forget(["b"])
+    with pytest.raises(DataError, match="its stage 'a' lost files, which 'b' reads"):
+        again.do(table[1])
+    for spec in table:
+        again.do(spec)
+    assert monitor.events == ["a: Text(text='a')", "b: Text(text='ab')", "c: Text(text='abc')"]
+    (run.run_folder.root / "x").unlink()
+    for spec in table:
+        again.do(spec)
+    assert monitor.events[3:] == ["a: Text(text='a')", "b skipped", "c skipped"]
+    assert "x is gone and is made again" in caplog.text
+    assert [stage.name for stage in make_run(table).record.stages] == ["a", "b", "c"]
+
+
 def test_forgetting_takes_all_that_is_made_from_it(make_run) -> None:
     table = [toy("a", "", "x"), toy("b", "x", "y"), toy("c", "", "z")]
     run = make_run(table)

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -356,12 +357,23 @@ def rows_of(normals, mesh_normal, is_mirrored=False):
     return found
 
 
+def outlined_at(distance_px):
+    """A view with an outline so far from everything; None: without one."""
+    field = np.dstack([np.full((3, 3), distance_px or 0.0), np.zeros((3, 3, 2))]).astype(np.float32)
+    return SimpleNamespace(
+        has_outline=distance_px is not None,
+        silhouette=SimpleNamespace(inner=field, outer=field, is_sharp=True),
+        project=lambda points: (np.full((len(points), 2), 1.5), np.ones(len(points))),
+    )
+
+
 def test_rows_that_agree_on_another_normal_are_no_outliers():
     up, slanted = np.array([0.0, 0.0, 1.0]), np.array([0.6, 0.0, 0.8])
     tol = RefinementTolerances()
 
-    def weights(views):
-        return np.concatenate(_agreed_weights(views, 1, tol))
+    def weights(seen, distance_px=None):
+        view = outlined_at(distance_px)
+        return np.concatenate(_agreed_weights(seen, [view] * len(seen), np.zeros((1, 3)), 4.0, tol))
 
     all_up = np.tile(up, (8, 1))
     seen = rows_of(all_up, slanted)
@@ -379,6 +391,9 @@ def test_rows_that_agree_on_another_normal_are_no_outliers():
     assert not weights(rows_of(random, slanted)).any()
     assert not weights(rows_of(all_up[:3], slanted)).any()
     assert not weights(rows_of(all_up, slanted, is_mirrored=True)).any()
+    # Beside an outline the mesh may show what the pixel does not.
+    assert not weights(seen, distance_px=-3.9).any()
+    assert (weights(seen, distance_px=-4.1) > 0.1).all()
 
 
 def test_a_shoulder_on_which_views_agree_becomes_a_ledge():
