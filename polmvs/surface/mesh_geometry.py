@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 
+from polmvs.geometry import dots, lengths
 from polmvs.io.open3d_import import import_open3d
 
 Array = NDArray[np.float64]
@@ -48,12 +49,13 @@ class TriangleMesh:
     @cached_property
     def corners(self) -> Array:
         """Vertices of each face, ``(F, 3, 3)``."""
-        return np.asarray(self.vertices[self.faces])
+        return self.vertices.take(self.faces, axis=0)
 
     @cached_property
     def centers(self) -> Array:
         """Centroids ``(F, 3)``."""
-        return np.asarray(self.corners.mean(axis=1))
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        return np.asarray((a + b + c) / 3)
 
     @cached_property
     def _crosses(self) -> Array:
@@ -63,7 +65,7 @@ class TriangleMesh:
     @cached_property
     def face_areas(self) -> Array:
         """Areas ``(F,)``."""
-        return np.asarray(0.5 * np.linalg.norm(self._crosses, axis=1))
+        return np.asarray(0.5 * lengths(self._crosses))
 
     @cached_property
     def face_normals(self) -> Array:
@@ -73,14 +75,14 @@ class TriangleMesh:
     @cached_property
     def vertex_normals(self) -> Array:
         """Unit normals ``(V, 3)``, means of the faces' weighted by area; 0 without any."""
-        total = np.stack(
+        total: Array = np.stack(
             [
                 np.bincount(self.faces.ravel(), np.repeat(column, 3), len(self.vertices))
                 for column in self._crosses.T
             ],
             axis=-1,
         )
-        length = np.linalg.norm(total, axis=1, keepdims=True)
+        length = lengths(total)[:, None]
         return np.asarray(total / np.maximum(length, 1e-300))
 
     @cached_property
@@ -105,7 +107,7 @@ class TriangleMesh:
     def mean_edge(self) -> float:
         """Mean length of an edge."""
         ends = self.corners - np.roll(self.corners, 1, axis=1)
-        return float(np.linalg.norm(ends, axis=-1).mean()) if len(self.faces) else 0.0
+        return float(lengths(ends).mean()) if len(self.faces) else 0.0
 
     @cached_property
     def incidence(self) -> sparse.csr_array:
@@ -134,7 +136,7 @@ class TriangleMesh:
 
     def points_at(self, face: NDArray[np.int64], barycentric: Floats) -> Array:
         """Points ``(N, 3)`` at barycentric coordinates ``(N, 3)`` of faces ``(N,)``."""
-        return np.asarray((self.corners[face] * barycentric[..., None]).sum(axis=1))
+        return np.asarray(np.einsum("nji,nj->ni", self.corners.take(face, axis=0), barycentric))
 
 
 @dataclass(frozen=True)
@@ -269,15 +271,15 @@ def visible_points(
     rays : (K, 3) unit, from the camera to them.
     cosine : (K,) between normal and direction to the camera.
     """
-    away = points - center
-    distance = np.linalg.norm(away, axis=1)
+    away = np.asarray(points, np.float64) - center
+    distance = lengths(away)
     rays = away / np.maximum(distance, 1e-300)[:, None]
-    cosine = -(rays * normals).sum(axis=1)
+    cosine: Array = -dots(rays, np.asarray(normals, np.float64))
     index = np.flatnonzero(cosine > min_cosine)
     if len(index):
-        hit = scene.cast(center, rays[index]).distance
+        hit = scene.cast(center, rays.take(index, axis=0)).distance
         index = index[hit > distance[index] - 0.5 * scene.mesh.mean_edge]
-    return index, rays[index], cosine[index]
+    return index, rays.take(index, axis=0), cosine[index]
 
 
 def mesh_from_grid(values: NDArray[np.float32], origin: Array, step: float) -> TriangleMesh:
@@ -349,7 +351,7 @@ def mesh_from_grid(values: NDArray[np.float32], origin: Array, step: float) -> T
 def _split_quads(vertices: Array, quads: NDArray[np.int64]) -> Faces:
     """Two triangles for each quad, along its shorter diagonal."""
     a, b, c, d = (vertices[quads[:, i]] for i in range(4))
-    along = np.linalg.norm(a - c, axis=1) <= np.linalg.norm(b - d, axis=1)
+    along = lengths(a - c) <= lengths(b - d)
     first = np.where(along[:, None], quads[:, [0, 1, 2]], quads[:, [1, 2, 3]])
     second = np.where(along[:, None], quads[:, [0, 2, 3]], quads[:, [1, 3, 0]])
     return np.concatenate([first, second])
@@ -360,7 +362,7 @@ def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
     for _ in range(rounds):
         towards = mesh.neighbor_mean @ mesh.vertices - mesh.vertices
         normals = mesh.vertex_normals
-        towards -= (towards * normals).sum(axis=1, keepdims=True) * normals
+        towards -= dots(towards, normals)[:, None] * normals
         mesh = mesh.moved(0.5 * towards)
     return mesh
 

@@ -21,6 +21,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.fitting import CAUCHY_SCALE, annealed_scales, robust_deviation
+from polmvs.geometry import dots, lengths
 from polmvs.normals.estimator import smallest_eigenvectors
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, visible_points
 from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, phase_rows
@@ -312,19 +313,19 @@ def face_rows(
         mesh.face_normals,
         min_cosine=tolerances.min_cosine,
     )
-    found = phase_rows(view, angle_model, mesh.centers[face])
-    known = found.precision > 0
-    face, cosine, rows = face[known], cosine[known], found.rows[known]
+    found = phase_rows(view, angle_model, mesh.centers.take(face, axis=0))
+    known = np.flatnonzero(found.precision > 0)
+    face, cosine, rows = face[known], cosine[known], found.rows.take(known, axis=0)
     turn, precision = found.turn[known], found.precision[known]
-    rays, normals = rays[known], mesh.face_normals[face]
-    residual = (rows * normals).sum(axis=1)
+    rays, normals = rays.take(known, axis=0), mesh.face_normals.take(face, axis=0)
+    residual = dots(rows, normals)
     mirrored = rays + 2 * cosine[:, None] * normals
-    start = mesh.centers[face] + mesh.mean_edge * normals
+    start = mesh.centers.take(face, axis=0) + mesh.mean_edge * normals
     is_mirrored = np.isfinite(scene.cast(start, mirrored).distance)
     unexplained = np.where(is_mirrored, row_sigma.mirrored, row_sigma.direct)
     variance = (1 - cosine**2) * turn**2 / precision + unexplained**2
     # A greater phase turns the row against the sense of the ray.
-    tilt = -found.tilt[known] * (np.cross(rays, rows) * normals).sum(axis=1)
+    tilt = -found.tilt[known] * dots(np.cross(rays, rows), normals)
     return FaceRows(face, residual, variance, rows, cosine, tilt, is_mirrored)
 
 
@@ -498,7 +499,7 @@ def unexplained_shares(
         hit = hits.face >= 0
         points = view.center + hits.distance[hit, None] * rays[hit]
         found = phase_rows(view, angle_model, points)
-        square = ((found.rows * mesh.face_normals[hits.face[hit]]).sum(axis=1) / tol.row_sigma) ** 2
+        square = (dots(found.rows, mesh.face_normals[hits.face[hit]]) / tol.row_sigma) ** 2
         loss = np.ones(len(rays))
         known = found.precision > 0
         loss[np.flatnonzero(hit)[known]] = (square / (square + CAUCHY_SCALE**2))[known]
@@ -741,7 +742,7 @@ def normal_changes(mesh: TriangleMesh) -> Array:
     """
     a, b, c = np.moveaxis(mesh.corners, 1, 0)
     opposite = np.stack([c - b, a - c, b - a], axis=1)
-    crossed = np.cross(opposite, mesh.vertex_normals[mesh.faces])
+    crossed = np.cross(opposite, mesh.vertex_normals.take(mesh.faces, axis=0))
     return np.asarray(crossed / np.maximum(2 * mesh.face_areas, 1e-300)[:, None, None])
 
 
@@ -775,7 +776,7 @@ def _add_phases(
     blocks, gradient = np.zeros((num_faces, 3, 3)), np.zeros((num_faces, 3))
     is_seen = np.zeros(num_faces, np.bool_)
     change = normal_changes(mesh)
-    along = (mesh.vertex_normals[mesh.faces] * mesh.face_normals[:, None]).sum(axis=-1) / 3
+    along = dots(mesh.vertex_normals.take(mesh.faces, axis=0), mesh.face_normals[:, None]) / 3
     share = np.minimum(mesh.face_areas / (tol.independent_px * footprint**2), 1.0)
     reach = min(0.5 * mesh.mean_edge, 1.5 * footprint)
     steepest = 0.5 / footprint
@@ -785,15 +786,16 @@ def _add_phases(
         is_seen[face] = True
         if not len(face):
             continue
-        normals, residual = mesh.face_normals[face], seen.residual
+        normals, residual = mesh.face_normals.take(face, axis=0), seen.residual
         across = seen.rows - residual[:, None] * normals
-        jacobian = (change[face] @ across[:, :, None])[..., 0]
+        jacobian = np.einsum("nij,nj->ni", change.take(face, axis=0), across)
         if with_slope:
-            slope = _row_slope(view, angle_model, mesh.centers[face], normals, seen.rows, reach)
+            centers = mesh.centers.take(face, axis=0)
+            slope = _row_slope(view, angle_model, centers, normals, seen.rows, reach)
             jacobian += along[face] * np.clip(slope, -steepest, steepest)[:, None]
         weight = np.maximum(_loss_weights(residual, level.loss_scale**2 * seen.variance), agreed)
         weight *= share[face] / seen.variance
-        blocks[face] += weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :]
+        blocks[face] += np.einsum("ni,nj->nij", weight[:, None] * jacobian, jacobian)
         gradient[face] += (weight * residual)[:, None] * jacobian
         tilt.add(mesh.faces[face], jacobian, residual, weight, -seen.tilt)
         residuals.append(residual)
@@ -880,7 +882,7 @@ def _agreement(
         sums = np.array([np.bincount(place, weight * product, num) for product in products])
         total = np.maximum(np.bincount(place, weight, num), 1e-300)
         values, normals = smallest_eigenvectors(sums)
-        residual = (rows * normals[:, place].T).sum(axis=1)
+        residual = np.einsum("ni,in->n", rows, normals[:, place])
         weight = _loss_weights(residual, width**2 * variance)
     agree = np.bincount(place, weight, num) / np.bincount(place, minlength=num)
     return weight, np.where(values[1] > scale**2 * total, agree, 0)
@@ -898,8 +900,8 @@ def _row_slope(
     sides = []
     for sign in (1, -1):
         found = phase_rows(view, angle_model, points + sign * reach * normals)
-        same = np.where((found.rows * rows).sum(axis=1) < 0, -1.0, 1.0)
-        value = same * (found.rows * normals).sum(axis=1)
+        same = np.where(dots(found.rows, rows) < 0, -1.0, 1.0)
+        value = same * dots(found.rows, normals)
         sides.append(np.where(found.precision > 0, value, np.nan))
     return np.nan_to_num((sides[0] - sides[1]) / (2 * reach))
 
@@ -949,22 +951,23 @@ class Rim:
 def find_rim(mesh: TriangleMesh, scene: RayScene, view: SurfaceView, edges: SharedEdges) -> Rim:
     """The outline of a mesh in a view: edges between faces to and fro with nothing behind them."""
     towards = view.center - mesh.centers
-    front = (towards * mesh.face_normals).sum(axis=1) > 0
+    front = dots(towards, mesh.face_normals) > 0
     turning = front[edges.faces[:, 0]] != front[edges.faces[:, 1]]
     ends = edges.ends[turning]
     middle = 0.5 * (mesh.vertices[ends[:, 0]] + mesh.vertices[ends[:, 1]])
     xy, z = view.project(middle)
     start, _ = view.project(mesh.vertices[ends[:, 0]])
     stop, _ = view.project(mesh.vertices[ends[:, 1]])
-    length = np.linalg.norm(stop - start, axis=1)
+    length = lengths(stop - start)
     pixel = np.abs(z) / view.view.camera.mean_focal_px
     kept = view.in_image(xy, 3.0) & (z > 0) & np.isfinite(length)
-    ends, middle, xy, length, pixel = (a[kept] for a in (ends, middle, xy, length, pixel))
+    ends = ends[kept]
+    middle, xy, length, pixel = (a[kept] for a in (middle, xy, length, pixel))
     outwards = mesh.vertex_normals[ends].sum(axis=1)
     away = middle - view.center
-    distance = np.linalg.norm(away, axis=1, keepdims=True)
-    outwards -= (outwards * away).sum(axis=1, keepdims=True) / distance**2 * away
-    outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-300)
+    distance = lengths(away)[:, None]
+    outwards -= dots(outwards, away)[:, None] / distance**2 * away
+    outwards /= np.maximum(lengths(outwards)[:, None], 1e-300)
     # A pixel beyond the outline there is nothing, a pixel before it the surface itself.
     beyond = scene.cast(view.center, away + 1.0 * pixel[:, None] * outwards).distance
     before = scene.cast(view.center, away - 1.0 * pixel[:, None] * outwards).distance
@@ -1011,7 +1014,7 @@ def _rim_rows(
         step = reach * mesh.vertex_normals[ends[:, column]]
         ahead, _ = view.project(middle + step)
         behind, _ = view.project(middle - step)
-        jacobian[:, column] = 0.5 * (gradient * (ahead - behind)).sum(axis=1) / (2 * reach)
+        jacobian[:, column] = 0.5 * dots(gradient, ahead - behind) / (2 * reach)
     vertices = np.column_stack([ends, ends[:, 0]])
     return _RimRows(vertices, np.nan_to_num(jacobian), residual, rim.length_px[near])
 
@@ -1061,11 +1064,11 @@ def _add_points(
     place, face, barycentric = RayScene(visible).closest(known.points)
     face = np.flatnonzero(seen)[face]
     normals = mesh.face_normals[face]
-    residual = ((place - known.points) * normals).sum(axis=1)
+    residual = dots(place - known.points, normals)
     sigma = np.hypot(known.sigma, tol.place_sigma_px * footprint)
-    near = np.linalg.norm(place - known.points, axis=1) < level.rim_gate_px * footprint
+    near = lengths(place - known.points) < level.rim_gate_px * footprint
     face, residual, sigma = face[near], residual[near], sigma[near]
-    along = (mesh.vertex_normals[mesh.faces[face]] * normals[near][:, None]).sum(axis=-1)
+    along = dots(mesh.vertex_normals[mesh.faces[face]], normals[near][:, None])
     jacobian = barycentric[near] * along
     scale = np.maximum(4 * sigma, 0.1 * level.rim_gate_px * footprint) ** 2
     weights = weight * _loss_weights(residual, scale) / sigma**2
@@ -1078,11 +1081,11 @@ def _smoothness(
     """Curvature free of scale, drawn to most of its own surroundings' mean."""
     normals = mesh.vertex_normals
     laplacian = sparse.eye_array(len(mesh.vertices)) - mesh.neighbor_mean
-    curvature = ((laplacian @ mesh.vertices) * normals).sum(axis=1) / edge
+    curvature = dots(laplacian @ mesh.vertices, normals) / edge
     target = tol.smoothness_memory * (mesh.neighbor_mean @ (mesh.neighbor_mean @ curvature))
     entries = laplacian.tocoo()
     rows, cols = entries.coords
-    data = entries.data * (normals[rows] * normals[cols]).sum(axis=1) / edge
+    data = entries.data * dots(normals.take(rows, axis=0), normals.take(cols, axis=0)) / edge
     change = sparse.coo_array((data, (rows, cols)), shape=laplacian.shape).tocsr()
     residual = curvature - target
     weight = 1 / (1 + (residual / (5 * tol.smoothness)) ** 2) ** 2 / tol.smoothness**2
