@@ -12,7 +12,7 @@ diffuse light of a smooth dielectric hardly over 0.4).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -67,29 +67,28 @@ class LightTolerances:
     widening: float = 1.3
 
 
-def find_diffuse(
+def find_diffuse_parts(
     tracks: Tracks,
     maps: Sequence[PhaseMap],
     tolerances: LightTolerances | None = None,
     *,
     max_rows: int = MAX_ROWS,
-) -> Iterator[Mask]:
-    """Pixels of each view whose light is diffuse-dominant, view by view.
+) -> list[Mask]:
+    """Connected parts of each view's region whose light is diffuse-dominant.
 
-    Every connected part of a view's region is decided as a whole: by the votes of its points, else
-    of its pixels, and of the parts of other views that show the same, else with the majority of the
-    capture. One map is held at a time.
+    Every part is decided as a whole: by the votes of its points, else of its pixels, and of the
+    parts of other views that show the same, else with the majority of the capture.
 
     Parameters
     ----------
     tracks : sparse points; ``obs_view`` counts in ``maps``.
-    maps : phase maps built under the assumption of specular light.
+    maps : phase maps built under the assumption of specular light; one is held at a time.
     tolerances : see there.
     max_rows : of points and views together, that are solved at a time.
 
     Returns
     -------
-    One ``(H, W)`` bool mask for each map; all is decided before the first.
+    For each map ``(P,)`` bool, of the parts that :func:`diffuse_pixels` takes.
     """
     t = tolerances or LightTolerances()
     on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
@@ -97,24 +96,26 @@ def find_diffuse(
     of_points = [
         _part_votes(m, on_parts.points_in_world[voting], votes[voting], t.min_rows) for m in maps
     ]
-    of_pixels = _pixel_votes(of_points, maps, tracks.points_in_world, t, max_rows)
+    slots = _place_pixels(maps, tracks.points_in_world, t)
+    of_pixels = _pixel_votes(slots, of_points, maps, t, max_rows)
     overall = float(votes[voting].sum()) + _dolp_votes(maps, t)
     own = []
     for known, dense in zip(of_points, of_pixels, strict=True):
         undecided = ~np.isfinite(known)
         own.append(np.where(undecided, dense, known))
         overall += float(np.nansum(dense[undecided]))
-    decided = _pooled_votes(own, maps, tracks.points_in_world, t)
     # Without any evidence light is specular: what polarises most.
     tie = overall if overall != 0 else 1.0
-    return (_diffuse_pixels(*pair, overall, tie) for pair in zip(maps, decided, strict=True))
+    verdicts = (
+        np.where(np.isfinite(pooled), pooled, overall)
+        for pooled in _pooled_votes(slots, own, maps, t)
+    )
+    return [np.where(verdict == 0, tie, verdict) < 0 for verdict in verdicts]
 
 
-def _diffuse_pixels(phase_map: PhaseMap, votes: Array, overall: float, tie: float) -> Mask:
-    """The pixels (H, W) of a view's parts whose votes (P,) say diffuse; NaN is the majority."""
-    verdict = np.where(np.isfinite(votes), votes, overall)
-    verdict = np.where(verdict == 0, tie, verdict)
-    return np.asarray((verdict < 0)[_parts_of(phase_map)] & phase_map.region.inside)
+def diffuse_pixels(phase_map: PhaseMap, parts: Mask) -> Mask:
+    """Pixels ``(H, W)`` of those parts ``(P,)`` of a view; see :func:`find_diffuse_parts`."""
+    return np.asarray(parts[_parts_of(phase_map)] & phase_map.region.inside)
 
 
 def _rows_of_both(points: Array, maps: Sequence[PhaseMap]) -> tuple[Rows, ...]:
@@ -158,9 +159,9 @@ def _part_votes(phase_map: PhaseMap, points: Array, votes: Array, min_points: in
 
 
 def _pixel_votes(
+    slots: _Slots,
     of_points: Sequence[Array],
     maps: Sequence[PhaseMap],
-    points: Array,
     t: LightTolerances,
     max_rows: int,
 ) -> list[Array]:
@@ -168,17 +169,18 @@ def _pixel_votes(
 
     Parameters
     ----------
+    slots : pixels of all parts.
     of_points : votes (P,) of the sparse points for each view's parts; NaN where undecided.
     maps : of all views, under the assumption of specular light.
-    points : (T, 3), of the scene, which say how far off a part may be.
     """
-    undecided = [np.flatnonzero(~np.isfinite(votes)) for votes in of_points]
-    slots = _place_pixels(maps, undecided, points, t)
+    undecided = slots.of_parts([~np.isfinite(votes) for votes in of_points])
+    asked = np.flatnonzero(undecided[slots.owner])
+    points, owner = slots.points[asked], slots.owner[asked]
     seen_by = _looked_up(len(maps), t)
     total, sums = np.zeros(slots.num), np.zeros((2, slots.num))
     step = max(1, max_rows // max(len(seen_by), 1))
-    for start in range(0, len(slots.owner), step):
-        tile, here = slots.points[start : start + step], slots.owner[start : start + step]
+    for start in range(0, len(owner), step):
+        tile, here = points[start : start + step], owner[start : start + step]
         specular, diffuse = (
             solve_normals(rows.rows, rows.rays, rows.sigma)
             for rows in _rows_of_both(tile, [maps[k] for k in seen_by])
@@ -202,7 +204,7 @@ def _pixel_votes(
 
 
 def _pooled_votes(
-    votes: Sequence[Array], maps: Sequence[PhaseMap], points: Array, t: LightTolerances
+    slots: _Slots, votes: Sequence[Array], maps: Sequence[PhaseMap], t: LightTolerances
 ) -> list[Array]:
     """Votes (P,) of each part with those of the parts of other views that show the same.
 
@@ -211,10 +213,9 @@ def _pooled_votes(
 
     Parameters
     ----------
+    slots : pixels of all parts.
     votes : of each view's parts alone (P,); NaN where unknown.
-    points : (T, 3), of the scene, which say how far off a part may be.
     """
-    slots = _place_pixels(maps, [np.arange(len(of_view)) for of_view in votes], points, t)
     placed = np.maximum(np.bincount(slots.owner, minlength=slots.num), 1)
     covered, passed, known = np.zeros(slots.num), np.zeros(slots.num), np.zeros(slots.num)
     for k in _looked_up(len(maps), t):
@@ -266,6 +267,10 @@ class _Slots:
         """Slots of all views."""
         return self.num_ranges * sum(self.num_parts)
 
+    def of_parts(self, values: Sequence[Mask]) -> Mask:
+        """Values (P,) of the parts of each view as those of their slots (slots,)."""
+        return np.concatenate([np.tile(of_view, self.num_ranges) for of_view in values])
+
     def by_view(self, values: Array) -> list[Array]:
         """Values (..., slots) as arrays (..., distances, parts), one for each view."""
         ends = self.num_ranges * np.cumsum(self.num_parts)
@@ -277,30 +282,20 @@ class _Slots:
         ]
 
 
-def _place_pixels(
-    maps: Sequence[PhaseMap],
-    parts: Sequence[NDArray[np.int64]],
-    points: Array,
-    t: LightTolerances,
-) -> _Slots:
-    """Place pixels of parts at distances at which the scene's points (T, 3) lie.
-
-    Parameters
-    ----------
-    parts : of each view, those that are asked for; 0, which is none, is passed over.
-    """
+def _place_pixels(maps: Sequence[PhaseMap], points: Array, t: LightTolerances) -> _Slots:
+    """Place pixels of all parts at distances at which the scene's points (T, 3) lie."""
     placed, owner, view = [np.zeros((0, 3))], [], []
     num_parts: list[int] = []
-    for index, (phase_map, wanted) in enumerate(zip(maps, parts, strict=True)):
+    for index, phase_map in enumerate(maps):
         labels = _parts_of(phase_map)
         begin = t.num_ranges * sum(num_parts)
         num_parts.append(int(labels.max(initial=0)) + 1)
         in_cam = phase_map.view.cam_from_world * points
         ahead = in_cam[in_cam[:, 2] > 0]
-        if not len(ahead) or not (wanted > 0).any():
+        if not len(ahead) or num_parts[-1] < 2:
             continue
         reliable, pixels, of_part = phase_map.region.reliable, [], []
-        for part in wanted[wanted > 0]:
+        for part in range(1, num_parts[-1]):
             rows, cols = np.nonzero((labels == part) & reliable)
             step = max(1, len(rows) // t.num_pixels)
             pixels.append(np.stack([cols[::step], rows[::step]], axis=-1) + 0.5)

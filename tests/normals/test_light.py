@@ -10,7 +10,7 @@ from polmvs.config import AngleModel, Light, NormalOptions
 from polmvs.evaluation.comparison import Consistency, best_fitting_model
 from polmvs.evaluation.metrics import AngleStats
 from polmvs.normals import light as light_module
-from polmvs.normals.light import LightTolerances, find_diffuse
+from polmvs.normals.light import LightTolerances, diffuse_pixels, find_diffuse_parts
 from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import track_normals
 from polmvs.polarization.phase_map import as_tilted, open_phase_map, store_phase_map, turned
@@ -45,8 +45,14 @@ def floor_scene(light: Light, sensor: str = "tilted") -> Scene:
     return Scene(floor, views, rendered, [phase_map_of(r, light) for r in rendered])
 
 
+def diffuse_masks(tracks, maps):
+    return [
+        diffuse_pixels(*pair) for pair in zip(maps, find_diffuse_parts(tracks, maps), strict=True)
+    ]
+
+
 def diffuse_share(scene, tracks):
-    masks = list(find_diffuse(tracks, scene.maps))
+    masks = diffuse_masks(tracks, scene.maps)
     inside = sum(int(m.region.inside.sum()) for m in scene.maps)
     return sum(int(mask.sum()) for mask in masks) / inside
 
@@ -66,7 +72,7 @@ def test_the_light_of_a_curved_thing_is_told(light):
 
 def test_without_points_strong_polarisation_means_specular(board):
     none = tracks_at(board, np.zeros((0, 3)))
-    assert not any(mask.any() for mask in find_diffuse(none, board.maps))
+    assert not any(mask.any() for mask in diffuse_masks(none, board.maps))
 
 
 @pytest.mark.parametrize("light", ["specular", "diffuse"])
@@ -77,7 +83,7 @@ def test_a_part_without_points_is_told_by_its_own_phases(light):
     assert max(np.linalg.norm(m.samples[..., :2], axis=-1).max() for m in weak) < 0.4
     corners = np.array([[x, y, -0.2] for x in (-0.3, 0.3) for y in (-0.3, 0.3)])
     about = tracks_at(scene, corners)  # on the ground beside it
-    masks = list(find_diffuse(about, weak))
+    masks = diffuse_masks(about, weak)
     share = sum(int(m.sum()) for m in masks) / sum(int(m.region.inside.sum()) for m in weak)
     assert share == pytest.approx(1.0 if light == "diffuse" else 0.0, abs=0.05)
 
@@ -102,7 +108,9 @@ def test_what_one_view_says_of_a_thing_yields_to_the_others_that_show_it():
         of_balls.append(own)
     votes[5][of_balls[5]] = np.nan  # which says nothing itself
     surroundings = np.array([[x, y, -0.06] for x in (-0.2, 0.2) for y in (-0.2, 0.2)])
-    pooled = light_module._pooled_votes(votes, maps, surroundings, LightTolerances())
+    tolerances = LightTolerances()
+    slots = light_module._place_pixels(maps, surroundings, tolerances)
+    pooled = light_module._pooled_votes(slots, votes, maps, tolerances)
     for found, own in zip(pooled, of_balls, strict=True):
         assert found[own[0]] > 60
         assert found[own[1]] < -60

@@ -7,19 +7,21 @@ sensor's polarizers and lie in a folder of their own.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, Light, RegionOptions
 from polmvs.errors import DataError
 from polmvs.io.images import read_mask
 from polmvs.normals.axes_check import check_axes
-from polmvs.normals.light import find_diffuse
+from polmvs.normals.light import diffuse_pixels, find_diffuse_parts
 from polmvs.normals.light_check import check_light
 from polmvs.normals.tracks import MAX_ROWS
 from polmvs.parallel import Workers
@@ -102,9 +104,8 @@ def build_maps(
         Fewer than three views have a pose, or a mosaic or mask is unusable.
     """
     options = options or RegionOptions()
-    views = posed_views(sparse)
+    views, tracks = _posed(sparse)
     names = image_names(capture)
-    tracks = read_model(sparse).tracks
     workers = workers or Workers()
     with replacing(target) as folder, workers.stopped_on_error():
         build = partial(_build_map, capture, options, folder)
@@ -116,9 +117,17 @@ def build_maps(
         maps = [open_phase_map(view, folder) for view in views]
         num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
         if len(tracks.point3D_ids):
-            _warn_of_settings(capture, options.light, tracks, maps)
+            # Both ask all views, so that they are tasks of their own.
+            questions: list[Callable[[], Any]] = [
+                partial(_wrong_setting, capture, options.light, tracks, maps)
+            ]
             if options.light is None:
-                num_diffuse = _turn_diffuse(tracks, maps, folder, max_rows)
+                questions.append(partial(find_diffuse_parts, tracks, maps, max_rows=max_rows))
+            wrong, *diffuse = workers.map(_answer, questions)
+            if wrong is not None:
+                logger.warning("%s.", wrong)
+            for of_views in diffuse:  # here: turned twice, should a worker be lost, it were wrong
+                num_diffuse += sum(map(partial(_turn_parts, folder), maps, of_views))
     return MapsResult(num_region_px=num_inside, num_diffuse_px=num_diffuse)
 
 
@@ -170,14 +179,19 @@ def posed_views(sparse: Path) -> tuple[View, ...]:
     DataError
         There are too few for normals.
     """
-    views = read_model(sparse).views
+    return _posed(sparse)[0]
+
+
+def _posed(sparse: Path) -> tuple[tuple[View, ...], Tracks]:
+    model = read_model(sparse)
+    views = model.views
     if len(views) < MIN_VIEWS:
         raise DataError(
             sparse,
             f"{len(views)} views with a pose; normals need {MIN_VIEWS} or more. "
             "Record more views, or give a better model with `sfm.sparse`.",
         )
-    return views
+    return views, model.tracks
 
 
 def find_mask(folder: Path, image: str) -> Path:
@@ -212,16 +226,21 @@ def _build_map(
     return int(region.inside.sum())
 
 
-def _warn_of_settings(
+def _answer(question: Callable[[], Any]) -> Any:
+    return question()
+
+
+def _wrong_setting(
     capture: Capture, light: Light | None, tracks: Tracks, maps: Sequence[PhaseMap]
-) -> None:
-    """Say which setting the planes of incidence of all views contradict."""
+) -> str | None:
+    """Which setting the planes of incidence of all views contradict, without its full stop."""
     tracks, maps = _some_views(tracks, maps)
     axes = check_axes(tracks, maps)
     if axes.change is not None:
-        logger.warning("%s.", axes.message(capture.options, capture.files.kind))
-    elif light is not None and (check := check_light(tracks, maps, light)).contradicted:
-        logger.warning("%s.", check.message)
+        return axes.message(capture.options, capture.files.kind)
+    if light is not None and (check := check_light(tracks, maps, light)).contradicted:
+        return check.message
+    return None
 
 
 def _some_views(tracks: Tracks, maps: Sequence[PhaseMap]) -> tuple[Tracks, list[PhaseMap]]:
@@ -239,14 +258,12 @@ def _some_views(tracks: Tracks, maps: Sequence[PhaseMap]) -> tuple[Tracks, list[
     return observed, [maps[k] for k in chosen]
 
 
-def _turn_diffuse(tracks: Tracks, maps: Sequence[PhaseMap], folder: Path, max_rows: int) -> int:
-    """Turn the phase where the light is diffuse; returns the number of these pixels."""
-    num_diffuse = 0
-    for phase_map, where in zip(maps, find_diffuse(tracks, maps, max_rows=max_rows), strict=True):
-        if where.any():
-            store_phase_map(turned(phase_map, where), folder)
-            num_diffuse += int(where.sum())
-    return num_diffuse
+def _turn_parts(folder: Path, phase_map: PhaseMap, parts: NDArray[np.bool_]) -> int:
+    """Turn the phase of a view's parts whose light is diffuse; the number of their pixels."""
+    where = diffuse_pixels(phase_map, parts) if parts.any() else parts
+    if where.any():
+        store_phase_map(turned(phase_map, where), folder)
+    return int(where.sum())
 
 
 def _tilt_map(folder: Path, phase_map: PhaseMap) -> None:
