@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import Camera
-from polmvs.geometry import RigidTransform
+from polmvs.geometry import RigidTransform, dots, lengths
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -59,7 +59,7 @@ class View:
 
     def ranges(self, points: Floats) -> Array:
         """Distances ``(...)`` of world points from the camera's centre."""
-        return np.asarray(np.linalg.norm(points - self.center_in_world, axis=-1), np.float64)
+        return lengths(np.asarray(points, np.float64) - self.center_in_world)
 
     def points_at(self, xy: Floats, ranges: Floats) -> Array:
         """World points ``(..., 3)`` at distances ``(...)`` along the rays of coordinates."""
@@ -73,8 +73,9 @@ class View:
         ----------
         points, normals : (..., 3), world, normals unit.
         """
-        to_camera = self.center_in_world - points
-        return np.asarray((to_camera * normals).sum(axis=-1) / self.ranges(points), np.float64)
+        to_camera = self.center_in_world - np.asarray(points, np.float64)
+        along = dots(to_camera, np.asarray(normals, np.float64))
+        return np.asarray(along / lengths(to_camera))
 
     def faces(
         self, points: Floats, normals: Floats, *, min_cosine: float = MIN_FACING_COSINE

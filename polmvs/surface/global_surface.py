@@ -25,7 +25,13 @@ from polmvs.surface.creases import corner_normals, sharpened, sided_normals
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
 from polmvs.surface.hollows import Hollow, SurfaceFaces, find_hollows
-from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, sample_surface
+from polmvs.surface.mesh_geometry import (
+    BAND_CELLS,
+    RayScene,
+    TriangleMesh,
+    remeshed,
+    sample_surface,
+)
 from polmvs.surface.offsets import find_faces, stepped_faces
 from polmvs.surface.refinement import (
     KnownPoints,
@@ -279,7 +285,7 @@ def _surface(
         mesh = remeshed(
             mesh,
             mesh.mean_edge / REMESHED_EDGE,
-            solid=[_within(group.solid, hull.mesh) for group in steps],
+            solid=[_within(group.solid, hull.mesh, mesh.mean_edge) for group in steps],
             free=carvings,
             smoothing=0,
         )
@@ -348,13 +354,18 @@ def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Flo
     return first_hit
 
 
-def _within(solid: Callable[[Array], Array], mesh: TriangleMesh) -> Callable[[Array], Array]:
-    """Signed distances to what is solid and enclosed by a mesh."""
+def _within(
+    solid: Callable[[Array], Array], mesh: TriangleMesh, edge: float
+) -> Callable[[Array], Array]:
+    """Signed distances to what is solid and enclosed by a mesh, for a new one of such edges.
+
+    Far off what is solid they are not less than the distance to it, which is enough.
+    """
     scene = RayScene(mesh)
 
     def distances(points: Array) -> Array:
         found = solid(points)
-        near = np.flatnonzero(np.isfinite(found))
+        near = np.flatnonzero(found < (BAND_CELLS + 1) * edge / REMESHED_EDGE)
         if not len(near):
             return found
         found[near] = np.maximum(found[near], scene.signed_distance(points[near], num_rays=1))

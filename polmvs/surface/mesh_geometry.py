@@ -169,6 +169,8 @@ class RayScene:
             self._tensor(self._local(mesh.vertices)),
             self._tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
         )
+        if len(mesh.faces):  # the first question builds the tree, which two threads must not
+            self._scene.cast_rays(self._tensor(np.ones((1, 6), np.float32)))
 
     def _local(self, points: Floats) -> NDArray[np.float32]:
         return np.ascontiguousarray(points - self._origin, np.float32)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, default_num_workers
 from polmvs.fitting import CAUCHY_SCALE, annealed_scales, robust_deviation
 from polmvs.geometry import dots, lengths
 from polmvs.normals.estimator import smallest_eigenvectors
@@ -576,12 +577,17 @@ def _energy(
     tol: RefinementTolerances,
 ) -> _Energy:
     scene, edges = RayScene(mesh), shared_edges(mesh)
-    rims = [
-        _rim_rows(mesh, scene, view, edges, level) if view.has_outline else None for view in views
-    ]
+
+    def look_at(view: SurfaceView) -> tuple[_RimRows | None, FaceRows]:
+        rim = _rim_rows(mesh, scene, view, edges, level) if view.has_outline else None
+        return rim, face_rows(mesh, scene, view, angle_model, row_sigma, tol)
+
+    # Threads, for products of large arrays and the casting of rays let go of Python's lock.
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        found = list(pool.map(look_at, views))
+    rims, rows = [rim for rim, _ in found], [row for _, row in found]
     residuals = [np.zeros(0), *(rim.residual for rim in rims if rim is not None)]
     rim_sigma = _rim_sigma(np.concatenate(residuals), tol)
-    rows = [face_rows(mesh, scene, view, angle_model, row_sigma, tol) for view in views]
     agreed = _agreed_weights(rows, views, mesh.centers, 0.5 * edge / footprint, tol)
     with_slope = level.with_slope or not any(rims)
 
