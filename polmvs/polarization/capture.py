@@ -355,9 +355,11 @@ class Capture:
         )
 
     def _given_stokes(self, s0: Image, s1: Image, s2: Image, quantum: float = 0.0) -> Stokes:
-        """Stokes images of given maps, invalid where dark or not finite."""
+        """Stokes images of given maps, invalid where dark, clipped or not finite."""
         finite = np.isfinite(s0) & np.isfinite(s1) & np.isfinite(s2)
-        valid = finite & (s0 >= 2.0 * self.options.darkness)
+        # What one channel clips does not show; where all do, s0 is the largest of the capture.
+        clipped = s0 >= self.options.saturation * self.levels.clip_level / self.full_scale
+        valid = finite & (s0 >= 2.0 * self.options.darkness) & ~clipped
         clean = [np.where(finite, image, 0).astype(np.float32) for image in (s0, s1, s2)]
         quantum = max(quantum, self._quantum)
         return stokes_from_maps(clean[0], clean[1], clean[2], valid, quantum=quantum)

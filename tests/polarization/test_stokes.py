@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from polmvs.io.raw_formats import read_raw
 from polmvs.polarization.mosaic import clipped_cells, linearize, split_mosaic
@@ -155,6 +156,21 @@ def test_noise_of_n_images_matches_the_simulation(num):
     assert np.sqrt(np.mean(stokes.sigma**2)) == pytest.approx(error.std(), rel=0.15)
     maps = stokes_from_maps(stokes.s0, stokes.s1, stokes.s2, ~clear)
     assert np.sqrt(np.mean(maps.sigma**2)) == pytest.approx(error.std(), rel=0.15)
+
+
+def test_noise_of_stokes_images_is_told_though_neighbours_share_samples():
+    """Interpolated from a mosaic, as other programs do it, over a floor of two brightnesses."""
+    rng = np.random.default_rng(1)
+    true = np.stack([np.full((512, 512), value) for value in (0.8, 0.1, -0.05)])
+    true[:, :200] *= 0.4
+    weights = np.array([0.75, 0.25])
+    noise = rng.normal(0, 0.02, true.shape)
+    for axis in (1, 2):
+        noise = ndimage.convolve1d(noise, weights, axis=axis)
+    s0, s1, s2 = (true + noise).astype(np.float32)
+    stokes = stokes_from_maps(s0, s1, s2, np.ones(s0.shape, bool))
+    # 0.6 of it where neighbours are asked.
+    assert np.median(stokes.sigma) == pytest.approx(noise.std(), rel=0.1)
 
 
 def test_per_pixel_analyzers_equal_shared_ones():
