@@ -36,7 +36,7 @@ myst_heading_anchors = 3
 nitpicky = True
 nitpick_ignore_regex = [
     (r"py:.*", r"(?!polmvs\.).*"),
-    (r"py:class", r"polmvs\.config\.T"),  # a type variable
+    (r"py:class", r"polmvs\.(config\.T|geometry\.Float)"),  # type variables
 ]
 numpydoc_show_class_members = False
 autosummary_generate = False  # which numpydoc brings

@@ -1,5 +1,6 @@
 """The public API as a notebook uses it."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -256,9 +257,10 @@ def test_results_of_an_earlier_run(demo_run: Path, tmp_path: Path) -> None:
         polmvs.open_run(tmp_path)
 
 
-def test_comparison_goes_on_with_a_run(demo_run: Path, demo_capture: Path) -> None:
-    run = polmvs.compare(demo_capture, demo_run, resume=True, workers=1)
-    assert run.table() in (demo_run / "summary.md").read_text()
+def test_comparison_goes_on_with_a_run(demo_run: Path, demo_capture: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(demo_run, tmp_path / "out"))
+    run = polmvs.compare(demo_capture, out, resume=True, workers=1)
+    assert run.table() in (out / "summary.md").read_text()
     assert set(run.models) == {"opa", "ppa", "tilted"}
 
 
