@@ -10,7 +10,7 @@ from polmvs.pipeline.runner import open_run
 from polmvs.threads import one_blas_thread
 
 
-def blas_threads(*_):
+def blas_threads():
     return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
 
