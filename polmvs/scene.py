@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import pairwise
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -147,6 +148,12 @@ class Tracks:
     obs_view: NDArray[np.int64]
     obs_xy: Array
 
+    def of_views(self, num_views: int) -> list[NDArray[np.int64]]:
+        """Indices of the observations of each view, in their order."""
+        order = np.argsort(self.obs_view, kind="stable")
+        starts = np.searchsorted(self.obs_view[order], np.arange(num_views + 1))
+        return [order[a:b] for a, b in pairwise(starts)]
+
 
 def some_tracks(tracks: Tracks, chosen: Mask) -> Tracks:
     """The chosen ``(T,)`` tracks with their observations."""
@@ -166,8 +173,8 @@ def some_tracks(tracks: Tracks, chosen: Mask) -> Tracks:
 def point_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
     """Standard deviation ``(T,)`` of the points along their least certain axis, world units."""
     information = np.zeros((len(tracks.points_in_world), 3, 3))
-    for k, view in enumerate(views):
-        seen = tracks.obs_track[tracks.obs_view == k]
+    for view, own in zip(views, tracks.of_views(len(views)), strict=True):
+        seen = tracks.obs_track[own]
         to_point = tracks.points_in_world[seen] - view.center_in_world
         # A point in the camera itself is no measurement, but it must not make all NaN.
         distance = np.maximum(np.linalg.norm(to_point, axis=-1), MIN_DISTANCE)

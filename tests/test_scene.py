@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from polmvs.camera import PinholeCamera, in_image
+from polmvs.camera import PinholeCamera, in_frame, in_image
 from polmvs.geometry import RigidTransform
-from polmvs.scene import View, find_name, match_names, short_list
+from polmvs.scene import Tracks, View, find_name, match_names, short_list
 
 CAMERA = PinholeCamera(width=40, height=30, fx=50, fy=60, cx=20, cy=15)
 
@@ -44,6 +44,25 @@ def test_a_surface_faces_the_camera_up_to_grazing(view):
 def test_the_image_has_its_upper_left_border_and_not_its_lower_right():
     xy = np.array([[0.0, 0.0], [39.99, 29.99], [40.0, 3.0], [3.0, 30.0], [-0.01, 3.0], [np.nan, 3]])
     np.testing.assert_array_equal(in_image(CAMERA, xy), [1, 1, 0, 0, 0, 0])
+
+
+def test_a_frame_has_its_whole_border_and_a_margin():
+    xy = np.array([[0.0, 0.0], [40, 30], [2, 28], [1.9, 15], [20, 28.1], [np.nan, 5]])
+    np.testing.assert_array_equal(in_frame(xy, 40, 30), [1, 1, 1, 1, 1, 0])
+    np.testing.assert_array_equal(in_frame(xy, 40, 30, 2), [0, 0, 1, 0, 0, 0])
+
+
+def test_observations_of_views_keep_their_order():
+    tracks = Tracks(
+        point3D_ids=np.arange(3),
+        points_in_world=np.zeros((3, 3)),
+        colors=np.zeros((3, 3), np.uint8),
+        errors=np.zeros(3),
+        obs_track=np.array([2, 0, 1, 0, 2]),
+        obs_view=np.array([3, 1, 3, 0, 1]),
+        obs_xy=np.zeros((5, 2)),
+    )
+    assert [own.tolist() for own in tracks.of_views(5)] == [[3], [1, 4], [], [0, 2], []]
 
 
 def test_names_match_exactly_before_they_match_by_stem():

@@ -414,11 +414,12 @@ def _pose_errors_px(
 def _scene_distances(pairs: Sequence[CommonView], workspace: DenseWorkspace) -> Array:
     """Median distance (N,) from each view of the workspace to the points it observes."""
     tracks = workspace.tracks
-    index = {item.view.name: i for i, item in enumerate(workspace.views)}
+    names = [item.view.name for item in workspace.views]
+    own = dict(zip(names, tracks.of_views(len(names)), strict=True))
     centers = np.array([pair.item.view.center_in_world for pair in pairs])
     distances = np.full(len(pairs), np.nan)
     for i, pair in enumerate(pairs):
-        seen = tracks.obs_track[tracks.obs_view == index[pair.item.view.name]]
+        seen = tracks.obs_track[own[pair.item.view.name]]
         if len(seen):
             distances[i] = np.median(pair.item.view.ranges(tracks.points_in_world[seen]))
     # A view without points: as far as the others, or as the cameras are from each other.

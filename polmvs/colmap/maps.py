@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera
 from polmvs.errors import DataError
+from polmvs.geometry import dots, lengths
 from polmvs.io.images import write_bytes
 
 Image = NDArray[np.float32]
@@ -94,9 +95,9 @@ def write_normal_map(path: PathArg, normals: Image) -> None:
     """
     if normals.ndim != 3 or normals.shape[2] != 3:
         raise ValueError(f"{normals.shape=} but expected (H, W, 3).")
-    known = np.isfinite(normals).all(axis=-1, keepdims=True)
-    normals = np.where(known, normals, 0)
-    length = np.linalg.norm(normals, axis=-1)
+    known = np.logical_and.reduce([np.isfinite(normals[..., i]) for i in range(3)])
+    normals = np.where(known[..., None], normals, 0)
+    length = lengths(normals)
     if (np.abs(length - 1)[length > 0] > MAX_LENGTH_ERROR).any():
         raise ValueError("normals are not unit.")
     _write(path, np.moveaxis(normals, -1, 0))
@@ -126,9 +127,9 @@ def read_normal_map(path: PathArg, camera: PinholeCamera) -> Image:
     """
     check_normal_map(path, camera)
     normals = np.ascontiguousarray(np.moveaxis(_read(path), 0, -1))
-    length = np.linalg.norm(normals, axis=-1)
+    length = lengths(normals)
     rays = camera.rays(map_pixel_xy(camera.width, camera.height))
-    odd = (np.abs(length - 1) > MAX_LENGTH_ERROR) | (np.einsum("ijk,ijk->ij", normals, rays) > 0)
+    odd = (np.abs(length - 1) > MAX_LENGTH_ERROR) | (dots(normals, rays) > 0)
     known = length > 0
     if np.count_nonzero(odd & known) > MAX_ODD_NORMALS * np.count_nonzero(known):
         raise DataError(

@@ -15,7 +15,7 @@ import logging
 import mmap
 import re
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
@@ -60,19 +60,49 @@ def read_model(path: PathArg) -> SparseModel:
     """
     folder = find_model(path)
     with _as_data_error(folder):
-        sparse_model = model_from_reconstruction(_open(folder))
-    if not sparse_model.views:
-        raise DataError(
-            folder, "has no registered image. Run COLMAP again or leave out `sfm.sparse`."
+        reconstruction = _open(folder)
+        keypoints = None
+        if _model_suffix(folder) == ".bin":
+            keypoints = _stored_keypoints(folder / "images.bin")
+        images = _registered(reconstruction)
+        sparse_model = SparseModel(
+            views=_views(reconstruction, images),
+            tracks=_tracks(reconstruction, images, keypoints),
+            unregistered=_unregistered(reconstruction, images),
         )
-    if (reason := _unsound(sparse_model)) is not None:
-        raise DataError(folder, f"is no sound COLMAP model ({reason}). Export it again.")
+    _require_sound(folder, sparse_model.views, sparse_model.tracks)
     return sparse_model
 
 
-def _unsound(sparse_model: SparseModel) -> str | None:
-    """What is wrong with the numbers of a model, if anything is."""
-    for view in sparse_model.views:
+def read_views(path: PathArg) -> tuple[View, ...]:
+    """The views of a COLMAP model, sorted by name, without its points.
+
+    Raises
+    ------
+    DataError
+        As :func:`read_model`.
+    """
+    folder = find_model(path)
+    with _as_data_error(folder):
+        reconstruction = _open(folder)
+        views = _views(reconstruction, _registered(reconstruction))
+    _require_sound(folder, views)
+    return views
+
+
+def _require_sound(folder: Path, views: Sequence[View], tracks: Tracks | None = None) -> None:
+    """Refuse a model without views, or whose numbers are absurd."""
+    if not views:
+        raise DataError(
+            folder, "has no registered image. Run COLMAP again or leave out `sfm.sparse`."
+        )
+    if (reason := _unsound_views(views) or (tracks and _unsound_tracks(tracks))) is not None:
+        raise DataError(folder, f"is no sound COLMAP model ({reason}). Export it again.")
+
+
+def _unsound_views(views: Iterable[View]) -> str | None:
+    """What is wrong with the numbers of views, if anything is."""
+    for view in views:
         camera, pose = view.camera, view.cam_from_world
         sides = (camera.width, camera.height)
         if not (min(sides) > 0 and max(sides) <= MAX_SIDE):
@@ -84,7 +114,11 @@ def _unsound(sparse_model: SparseModel) -> str | None:
             return f"the pose of {view.name} is none"
         if not (np.abs(pose.translation) <= MAX_COORDINATE).all():
             return f"the place of {view.name} is not finite or absurd"
-    tracks = sparse_model.tracks
+    return None
+
+
+def _unsound_tracks(tracks: Tracks) -> str | None:
+    """What is wrong with the numbers of sparse points, if anything is."""
     if not (np.abs(tracks.points_in_world) <= MAX_COORDINATE).all():
         return "a point is not finite or absurd"
     if not (np.abs(tracks.obs_xy) <= MAX_SIDE).all():
@@ -167,22 +201,42 @@ def model_from_reconstruction(
     reconstruction : with any rigs and camera models.
     names : of all images that were to be registered, in addition to the reconstruction's own.
     """
-    cameras = {i: camera_from_colmap(c) for i, c in reconstruction.cameras.items()}
+    images = _registered(reconstruction)
+    return SparseModel(
+        views=_views(reconstruction, images),
+        tracks=_tracks(reconstruction, images),
+        unregistered=_unregistered(reconstruction, images, names),
+    )
+
+
+def _registered(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """Images with a pose, sorted by name."""
     images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
-    images.sort(key=lambda image: str(image.name))
-    views = tuple(
+    return sorted(images, key=lambda image: str(image.name))
+
+
+def _unregistered(
+    reconstruction: pycolmap.Reconstruction,
+    registered: Iterable[pycolmap.Image],
+    names: Iterable[str] = (),
+) -> tuple[str, ...]:
+    """Names of the images without a pose, sorted; ``names`` are known beside the model's own."""
+    known = {str(image.name) for image in reconstruction.images.values()} | set(names)
+    return tuple(sorted(known - {str(image.name) for image in registered}))
+
+
+def _views(
+    reconstruction: pycolmap.Reconstruction, images: Iterable[pycolmap.Image]
+) -> tuple[View, ...]:
+    """The posed images as views, in their order."""
+    cameras = {i: camera_from_colmap(c) for i, c in reconstruction.cameras.items()}
+    return tuple(
         View(
             name=str(image.name),
             camera=cameras[image.camera_id],
             cam_from_world=_rigid_transform(image.cam_from_world()),
         )
         for image in images
-    )
-    known = {str(image.name) for image in reconstruction.images.values()} | set(names)
-    return SparseModel(
-        views=views,
-        tracks=_tracks(reconstruction, images),
-        unregistered=tuple(sorted(known - {view.name for view in views})),
     )
 
 
@@ -191,13 +245,23 @@ def _rigid_transform(transform: pycolmap.Rigid3d) -> RigidTransform:
     return RigidTransform(matrix[:, :3].copy(), matrix[:, 3].copy())
 
 
-def _tracks(reconstruction: pycolmap.Reconstruction, images: list[pycolmap.Image]) -> Tracks:
-    """Sparse points by id, and their observations in ``images``, view by view."""
+def _tracks(
+    reconstruction: pycolmap.Reconstruction,
+    images: Sequence[pycolmap.Image],
+    stored: Mapping[int, NDArray[np.void]] | None = None,
+) -> Tracks:
+    """Sparse points by id, and their observations in ``images``, view by view.
+
+    Parameters
+    ----------
+    stored : keypoints of each image that have a point, with rows of ``KEYPOINT``; None: they are
+        taken from pycolmap, which hands them over one by one, 3 microseconds each.
+    """
     points = sorted(reconstruction.points3D.items())
     ids = np.array([i for i, _ in points], np.int64)
-    seen = [image.get_observation_points2D() for image in images]
-    obs_ids = np.array([point.point3D_id for view in seen for point in view], np.int64)
-    obs_xy = np.array([point.xy for view in seen for point in view], np.float64)
+    seen = [_keypoints(i) if stored is None else stored[i.image_id] for i in images]
+    joined = np.concatenate([np.zeros(0, KEYPOINT), *seen])
+    obs_ids = joined["point3D_id"].astype(np.int64)
     if not np.isin(obs_ids, ids).all():
         raise ValueError("keypoints observe points that are missing")
     return Tracks(
@@ -207,8 +271,28 @@ def _tracks(reconstruction: pycolmap.Reconstruction, images: list[pycolmap.Image
         errors=np.array([p.error for _, p in points], np.float64),
         obs_track=np.searchsorted(ids, obs_ids),
         obs_view=np.repeat(np.arange(len(seen)), [len(view) for view in seen]),
-        obs_xy=obs_xy.reshape(-1, 2),
+        obs_xy=joined["xy"].astype(np.float64),
     )
+
+
+def _keypoints(image: pycolmap.Image) -> NDArray[np.void]:
+    """Keypoints of an image that have a point."""
+    seen = image.get_observation_points2D()
+    return np.array([(point.xy, point.point3D_id) for point in seen], KEYPOINT)
+
+
+def _stored_keypoints(path: Path) -> dict[int, NDArray[np.void]]:
+    """Keypoints that have a point of each image by its id, of a file that was checked."""
+    keypoints = {}
+    with _mapped(path) as data:
+        position = COUNT.size
+        for _ in range(COUNT.unpack_from(data)[0]):
+            image_id, start, num_points = _image_keypoints(data, position)
+            stored = np.frombuffer(data, KEYPOINT, num_points, start)
+            keypoints[image_id] = stored[stored["point3D_id"] != NO_POINT].copy()
+            del stored  # or the file could not be closed
+            position = start + num_points * KEYPOINT.itemsize
+    return keypoints
 
 
 def match_model_to_capture(
@@ -375,11 +459,9 @@ def _reconstruction(sparse_model: SparseModel) -> pycolmap.Reconstruction:
         reconstruction.add_camera_with_trivial_rig(colmap_camera)
     tracks = sparse_model.tracks
     # Index of an observation among those of its image.
-    order = np.argsort(tracks.obs_view, kind="stable")
-    starts = np.searchsorted(tracks.obs_view[order], np.arange(len(sparse_model.views) + 1))
-    point2D_idx = np.empty(len(order), np.int64)
-    for index, view in enumerate(sparse_model.views):
-        own = order[starts[index] : starts[index + 1]]
+    observations = tracks.of_views(len(sparse_model.views))
+    point2D_idx = np.empty(len(tracks.obs_view), np.int64)
+    for index, (view, own) in enumerate(zip(sparse_model.views, observations, strict=True)):
         point2D_idx[own] = np.arange(len(own))
         image = pycolmap.Image(
             name=view.name,
@@ -400,16 +482,19 @@ def _add_points(
     """Add all tracks; ``point2D_idx`` is each observation's index in its image."""
     order = np.argsort(tracks.obs_track, kind="stable")
     starts = np.searchsorted(tracks.obs_track[order], np.arange(len(tracks.point3D_ids) + 1))
+    # Plain numbers, handed over one by one, are twice as fast as a list of its elements.
+    image_ids = (tracks.obs_view[order] + 1).tolist()
+    indices = point2D_idx[order].tolist()
     for index, point3D_id in enumerate(tracks.point3D_ids):
-        own = order[starts[index] : starts[index + 1]].tolist()
-        elements = [
-            pycolmap.TrackElement(int(tracks.obs_view[i]) + 1, int(point2D_idx[i])) for i in own
-        ]
+        track = pycolmap.Track()
+        own = slice(starts[index], starts[index + 1])
+        for image_id, point2D_index in zip(image_ids[own], indices[own], strict=True):
+            track.add_element(image_id, point2D_index)
         point = pycolmap.Point3D(
             xyz=tracks.points_in_world[index],
             color=tracks.colors[index],
             error=float(tracks.errors[index]),
-            track=pycolmap.Track(elements),
+            track=track,
         )
         reconstruction.add_point3D_with_id(int(point3D_id), point)
 
@@ -425,7 +510,8 @@ POSE = struct.Struct("<7d")
 FRAME = struct.Struct("<II7dI")  # id, rig, pose, number of data; then the data
 DATUM = struct.Struct("<iiQ")  # sensor, id
 IMAGE = struct.Struct("<I7dI")  # id, pose, camera; then the name, and the keypoints
-KEYPOINT = struct.Struct("<ddQ")  # place, point
+KEYPOINT = np.dtype([("xy", "<f8", 2), ("point3D_id", "<u8")])
+NO_POINT = np.uint64(2**64 - 1)
 POINT = struct.Struct("<Q3d3Bd")  # id, place, colour, error; then the track
 TRACK_ELEMENT = struct.Struct("<II")  # image, keypoint
 
@@ -458,10 +544,7 @@ def check_binary_model(folder: Path) -> None:
 def _check_file(path: Path, record_end: Reader) -> None:
     """Whether the announced records fill the file."""
     try:
-        with (
-            path.open("rb") as file,
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
-        ):
+        with _mapped(path) as data:
             position = COUNT.size
             for _ in range(COUNT.unpack_from(data)[0]):
                 position = record_end(data, position)
@@ -473,6 +556,16 @@ def _check_file(path: Path, record_end: Reader) -> None:
         complete = False
     if not complete:
         raise DataError(path, "is truncated or no file of COLMAP's. Export the model again.")
+
+
+@contextmanager
+def _mapped(path: Path) -> Iterator[mmap.mmap]:
+    """The bytes of a file."""
+    with (
+        path.open("rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
+    ):
+        yield data
 
 
 def _camera_end(data: mmap.mmap, start: int) -> int:
@@ -498,11 +591,18 @@ def _frame_end(data: mmap.mmap, start: int) -> int:
 
 
 def _image_end(data: mmap.mmap, start: int) -> int:
+    _, first, num_points = _image_keypoints(data, start)
+    return int(first + num_points * KEYPOINT.itemsize)
+
+
+def _image_keypoints(data: mmap.mmap, start: int) -> tuple[int, int, int]:
+    """Id of an image, where its keypoints begin, and how many there are."""
+    image_id = IMAGE.unpack_from(data, start)[0]
     name_end = data.find(b"\0", start + IMAGE.size)
     if name_end < 0:
         raise ValueError("name without end")
     (num_points,) = COUNT.unpack_from(data, name_end + 1)
-    return int(name_end + 1 + COUNT.size + num_points * KEYPOINT.size)
+    return image_id, name_end + 1 + COUNT.size, num_points
 
 
 def _point_end(data: mmap.mmap, start: int) -> int:

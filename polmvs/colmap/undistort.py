@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polmvs.camera import Camera, PinholeCamera, pixel_centers, sample_image
+from polmvs.camera import Camera, PinholeCamera, in_frame, pixel_centers, sample_image
 from polmvs.colmap.cameras import camera_from_colmap, camera_to_colmap
 from polmvs.scene import SparseModel, some_tracks
 
@@ -64,8 +64,7 @@ def undistorted_model(
     }
     views = tuple(replace(view, camera=cameras[view.camera]) for view in sparse_model.views)
     tracks, obs_xy = sparse_model.tracks, np.full(sparse_model.tracks.obs_xy.shape, np.nan)
-    for index, view in enumerate(sparse_model.views):
-        own = tracks.obs_view == index
+    for view, own in zip(sparse_model.views, tracks.of_views(len(views)), strict=True):
         obs_xy[own] = undistort_xy(tracks.obs_xy[own], view.camera, cameras[view.camera])
     kept = np.isfinite(obs_xy).all(axis=-1)
     tracks = replace(
@@ -95,10 +94,12 @@ def warp_image(
     """
     if image.shape[:2] != (source.height, source.width):
         raise ValueError(f"{image.shape=} but expected {source.height}x{source.width} pixels.")
+    if source == target:
+        return np.asarray(image, np.float32), np.ones(image.shape[:2], np.bool_)
     rays = target.rays(pixel_centers(target.width, target.height))
     xy = np.asarray(source.project(rays), np.float64)
     size = np.array([source.width, source.height])
-    mask = np.asarray(((xy >= 0) & (xy <= size)).all(axis=-1))
+    mask = in_frame(xy, source.width, source.height)
     # Within half a pixel of the border there is nothing to interpolate with beyond it.
     inner = np.clip(xy, 0.5, size - 0.5)
     warped = sample_image(np.asarray(image, np.float32), np.where(mask[..., None], inner, np.nan))

@@ -121,13 +121,15 @@ def visible_points(points: Floats, normals: Floats, phase_map: PhaseMap) -> tupl
     hit : (H / CELL_PX, W / CELL_PX) bool, rounded up
     """
     view, inside = phase_map.view, phase_map.region.inside
-    xy, distance = view.project(points), view.ranges(points)
-    facing = view.faces(points, normals)
-    seen = facing & (sample_image(inside.astype(np.float32), xy, nearest=True) > 0)
+    seen = np.flatnonzero(view.faces(points, normals))
+    xy = view.project(points[seen])
+    shown = sample_image(inside.astype(np.float32), xy, nearest=True) > 0
+    seen, xy = seen[shown], xy[shown]
+    distance = view.ranges(points[seen])
     height, width = inside.shape
-    cells, nearest = depth_buffer(xy[seen], distance[seen], width, height, cell_px=CELL_PX)
+    cells, nearest = depth_buffer(xy, distance, width, height, cell_px=CELL_PX)
     visible = np.zeros(len(points), np.bool_)
-    visible[seen] = distance[seen] <= (1 + MAX_RELATIVE_EXCESS) * nearest
+    visible[seen] = distance <= (1 + MAX_RELATIVE_EXCESS) * nearest
     return visible, np.isfinite(cells)
 
 

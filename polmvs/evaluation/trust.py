@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import depth_buffer, sample_image
+from polmvs.camera import depth_buffer, in_image, sample_image
 from polmvs.config import AngleModel, PropagationOptions
 from polmvs.evaluation.consistency import (
     CELL_PX,
@@ -226,12 +226,12 @@ def measure_trust(
 def _in_sight(points: Floats, normals: Floats, phase_map: PhaseMap) -> Mask:
     """Points that face a view, lie in its image, and have none clearly nearer in their cell."""
     view, (height, width) = phase_map.view, phase_map.region.inside.shape
-    xy, distance = view.project(points), view.ranges(points)
-    with np.errstate(invalid="ignore"):
-        within = ((xy > 0) & (xy < [width, height])).all(axis=-1)
-    facing = view.faces(points, normals) & within
+    facing = np.flatnonzero(view.faces(points, normals))
+    xy = view.project(points[facing])
+    shown = in_image(view.camera, xy)
+    facing, xy = facing[shown], xy[shown]
+    distance = view.ranges(points[facing])
+    _, nearest = depth_buffer(xy, distance, width, height, cell_px=CELL_PX)
     seen = np.zeros(len(points), np.bool_)
-    if facing.any():
-        _, nearest = depth_buffer(xy[facing], distance[facing], width, height, cell_px=CELL_PX)
-        seen[facing] = distance[facing] <= (1 + MAX_RELATIVE_EXCESS) * nearest
+    seen[facing] = distance <= (1 + MAX_RELATIVE_EXCESS) * nearest
     return seen

@@ -118,8 +118,7 @@ def track_normals(
     """
     # A track on no region of its own views has no normal; one stands for all others.
     own = np.zeros(len(tracks.points_in_world), bool)
-    for k, phase_map in enumerate(maps):
-        here = tracks.obs_view == k
+    for phase_map, here in zip(maps, tracks.of_views(len(maps)), strict=True):
         seen = tracks.obs_track[here]
         xy = phase_map.view.project(tracks.points_in_world[seen])
         own[seen[sample_image(phase_map.region.inside.astype(np.float32), xy) > 0]] = True
@@ -181,10 +180,9 @@ def inside_shares(
     num_tracks = len(tracks.points_in_world)
     inside = np.zeros(len(tracks.obs_track), bool)
     kernel = np.ones((margin_px, margin_px), np.uint8)
-    for k, phase_map in enumerate(maps):
+    for phase_map, here in zip(maps, tracks.of_views(len(maps)), strict=True):
         flags = phase_map.region.inside.astype(np.uint8)
         eroded = cv2.erode(flags, kernel, borderType=cv2.BORDER_REPLICATE).astype(np.float32)
-        here = tracks.obs_view == k
         inside[here] = sample_image(eroded, tracks.obs_xy[here], nearest=True) > 0
     count = np.bincount(tracks.obs_track, minlength=num_tracks)
     return np.asarray(np.bincount(tracks.obs_track, inside, num_tracks) / np.maximum(count, 1))
@@ -213,8 +211,7 @@ def dolp_shares(
     NaN where the surface is nowhere polarised enough to tell.
     """
     ratio = np.full(len(tracks.obs_track), np.nan)
-    for k, phase_map in enumerate(maps):
-        here = np.flatnonzero(tracks.obs_view == k)
+    for phase_map, here in zip(maps, tracks.of_views(len(maps)), strict=True):
         xy = tracks.obs_xy[here]
         lowest = sample_image(phase_map.lowest_dolp.astype(np.float32), xy, nearest=True) / 255
         about = sample_image(phase_map.samples, xy, nearest=True)
@@ -253,12 +250,17 @@ def select_seeds(
     """
     good = (
         estimate.valid
-        & (inside_shares(tracks, maps) >= tolerances.min_inside_share)
-        & (seen_shares(tracks.points_in_world, estimate.normals, maps) >= tolerances.min_seen_share)
-        & ~(dolp_shares(tracks, maps, tolerances=tolerances) > tolerances.max_dolp_share)
         & (estimate.num_rows >= 3)
         & (estimate.sigma_deg < tolerances.max_sigma_deg)
         & (estimate.residual < tolerances.max_residual)
     )
-    sigma = point_sigmas(tracks, [m.view for m in maps])
-    return Seeds(tracks.points_in_world[good], estimate.normals[good], sigma[good]), good
+    # The dearest question last, of those that are left: all points are asked of all views.
+    some = some_tracks(tracks, good)
+    good[good] = (inside_shares(some, maps) >= tolerances.min_inside_share) & ~(
+        dolp_shares(some, maps, tolerances=tolerances) > tolerances.max_dolp_share
+    )
+    points, normals = tracks.points_in_world[good], estimate.normals[good]
+    good[good] = seen_shares(points, normals, maps) >= tolerances.min_seen_share
+    some = some_tracks(tracks, good)
+    sigma = point_sigmas(some, [m.view for m in maps])
+    return Seeds(some.points_in_world, estimate.normals[good], sigma), good

@@ -127,8 +127,7 @@ def retriangulate(
 def _intersect(views: Sequence[View], tracks: Tracks) -> Array:
     """Points ``(T, 3)`` nearest to the rays of each track; NaN where these do not tell."""
     centers, rays = np.zeros((2, len(tracks.obs_view), 3))
-    for k, view in enumerate(views):
-        own = tracks.obs_view == k
+    for view, own in zip(views, tracks.of_views(len(views)), strict=True):
         centers[own] = view.center_in_world
         rays[own] = view.rays_in_world(tracks.obs_xy[own])
     points = np.full((len(tracks.point3D_ids), 3), np.nan)
@@ -146,8 +145,7 @@ def _intersect(views: Sequence[View], tracks: Tracks) -> Array:
 def _mean_errors(views: Sequence[View], points: Array, tracks: Tracks) -> Array:
     """Mean reprojection error ``(T,)``, px; NaN where a view does not see the point."""
     errors = np.zeros(len(tracks.obs_view))
-    for k, view in enumerate(views):
-        own = tracks.obs_view == k
+    for view, own in zip(views, tracks.of_views(len(views)), strict=True):
         xy = view.project(points[tracks.obs_track[own]])
         errors[own] = np.linalg.norm(xy - tracks.obs_xy[own], axis=1)
     count = np.bincount(tracks.obs_track, minlength=len(points))

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from polmvs.camera import sample_image
+from polmvs.camera import in_frame, sample_image
 from polmvs.config import AngleModel
 from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
@@ -325,9 +325,8 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: HollowTol
         medians = []
         for points in (inner, ring):
             xy = phase_map.view.camera.project(phase_map.view.cam_from_world * points)
-            size = np.array([phase_map.view.camera.width, phase_map.view.camera.height])
-            with np.errstate(invalid="ignore"):
-                shown = ((xy >= 1) & (xy <= size - 1)).all(axis=-1)
+            camera = phase_map.view.camera
+            shown = in_frame(xy, camera.width, camera.height, 1)
             if len(points) and shown.mean() > 0.5:
                 intensity = np.asarray(phase_map.intensity, np.float32)
                 medians.append(float(np.median(sample_image(intensity, xy[shown]))))

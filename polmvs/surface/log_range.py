@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from polmvs.fitting import annealed_scales, cauchy_weights
+from polmvs.geometry import dots, lengths
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
@@ -74,9 +75,9 @@ def log_range_increment(normals: Floats, rays_tail: Floats, rays_head: Floats) -
 
     The normal may be of any length.
     """
-    least = -MAX_GRAZING * np.maximum(np.linalg.norm(normals, axis=-1), 1e-12)
-    tail = np.minimum((normals * rays_tail).sum(axis=-1), least)
-    head = np.minimum((normals * rays_head).sum(axis=-1), least)
+    least = -MAX_GRAZING * np.maximum(lengths(normals), 1e-12)
+    tail = np.minimum(dots(normals, rays_tail), least)
+    head = np.minimum(dots(normals, rays_head), least)
     return np.asarray(np.log(tail / head), np.float64)
 
 

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import Camera, PinholeCamera, pixel_centers
+from polmvs.camera import Camera, PinholeCamera, in_frame, pixel_centers
 from polmvs.colmap.dense_workspace import ImageLoader, write_dense_workspace
 from polmvs.colmap.maps import DepthNormals, map_pixel_xy
+from polmvs.geometry import dots, lengths
 from polmvs.scene import SparseModel, View
 from polmvs.surface.dense_view import DenseView
 from polmvs.surface.log_range import MAX_GRAZING, log_range_increment
@@ -156,7 +157,8 @@ def _extend(
     ranges, normals = np.zeros(rays.shape[:2]), np.zeros(rays.shape)
     height, width = dense.range_map.shape
     # Comparisons with NaN are False.
-    hit = np.asarray(((position > -1) & (position < (width, height))).all(axis=-1))
+    x, y = position[..., 0], position[..., 1]
+    hit = np.asarray((x > -1) & (x < width) & (y > -1) & (y < height))
     col, row = np.floor(position[hit]).astype(np.int64).T
     hit[hit] = _some_known(dense.range_map > 0)[row + 1, col + 1]
     if not hit.any():
@@ -183,7 +185,7 @@ def _neighbour(
 ) -> _Neighbours:
     """What the lattice points ``index`` (N, 2), (col, row), say of the rays (N, 3)."""
     height, width = dense.range_map.shape
-    inside = np.asarray(((index >= 0) & (index < (width, height))).all(axis=-1))
+    inside = in_frame(index, width - 1, height - 1)
     col, row = np.where(inside[:, None], index, 0).T
     lattice_rays = view.camera.rays((index + 0.5) * dense.stride_px)
     ranges = np.asarray(dense.range_map[row, col], np.float64)
@@ -192,7 +194,7 @@ def _neighbour(
     # Comparisons with NaN are False: unknown normals and rays drop out here.
     known: Mask = inside & (ranges > 0)
     for direction in (rays, lattice_rays):
-        known &= (normals * direction).sum(axis=-1) < -MAX_GRAZING
+        known &= dots(normals, direction) < -MAX_GRAZING
     normals = np.where(known[:, None], normals, 0)
     log_range = np.log(np.where(known, ranges, 1))
     log_range += np.where(known, log_range_increment(normals, lattice_rays, rays), 0)
@@ -218,14 +220,16 @@ def _blend(
     nearest = distance.argmin(axis=0), np.arange(len(rays))
     known = distance[nearest] <= tolerances.reach
     # Of two surfaces the one seen more steeply sets the bound: a limb must not hide an edge.
-    cosine = -(normals * rays).sum(axis=-1)
+    cosine = -dots(normals, np.broadcast_to(rays, normals.shape))
     cosine = np.maximum(np.maximum(cosine, cosine[nearest]), MAX_GRAZING)
     same: Mask = np.abs(log_range - log_range[nearest]) <= tolerances.max_turn * stride / cosine**2
-    same &= (normals * normals[nearest]).sum(axis=-1) >= np.cos(tolerances.max_turn)
+    same &= dots(normals, np.broadcast_to(normals[nearest], normals.shape)) >= np.cos(
+        tolerances.max_turn
+    )
     share = np.where(same & np.isfinite(distance), weight, 0)
     share[nearest] += 1e-9  # no division by zero where nothing is known
     share /= share.sum(axis=0)
     normal = np.einsum("kn,knc->nc", share, normals)
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    length = lengths(normal)[:, None]
     normal = np.where(known[:, None], normal / np.where(length > 0, length, 1), 0)
     return np.where(known, np.exp((share * log_range).sum(axis=0)), 0), normal

@@ -27,7 +27,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from polmvs.camera import sample_image
+from polmvs.camera import in_frame, sample_image
 from polmvs.config import AngleModel
 from polmvs.io.arrays import kept_array
 from polmvs.normals.rows import Rows, gather_rows
@@ -742,9 +742,7 @@ def _seen(places: Array, face: Face, phase_map: PhaseMap) -> tuple[Image, Mask]:
     """Pixels (H, W, 2) of places on a face, and whether the view can see them."""
     view = phase_map.view
     xy = np.asarray(view.camera.project(view.cam_from_world * places))
-    size = np.array([view.camera.width, view.camera.height])
-    with np.errstate(invalid="ignore"):
-        seen = ((xy >= 1) & (xy <= size - 1)).all(axis=-1)
+    seen = in_frame(xy, view.camera.width, view.camera.height, 1)
     return xy.astype(np.float32), np.asarray(seen & view.faces(places, face.normal))
 
 
@@ -834,7 +832,7 @@ def _hidden(
             between = (share > 0) & (share < 1)
             meeting = center + np.where(between, share, 0.0)[..., None] * away
             cell = np.rint(grid.cells(meeting)).astype(np.int64)
-            on_grid = between & ((cell >= 0) & (cell < size)).all(axis=-1)
+            on_grid = between & in_frame(cell, *(size - 1))
             cell = np.clip(cell, 0, size - 1)
             covered |= on_grid & (labels[cell[..., 0], cell[..., 1]] == other)
         hidden.append(covered)

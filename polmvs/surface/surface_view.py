@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from polmvs.camera import sample_image
+from polmvs.camera import in_frame, sample_image
 from polmvs.config import AngleModel
 from polmvs.geometry import lengths
 from polmvs.io.arrays import kept_array
@@ -162,8 +162,7 @@ class SurfaceView:
 
     def in_image(self, xy: Floats, margin_px: float = 0.0) -> Mask:
         """Which image coordinates ``(N, 2)`` lie in the image; not those that are NaN."""
-        low, high = margin_px, np.array([self.width, self.height]) - margin_px
-        return np.asarray(((xy >= low) & (xy <= high)).all(axis=-1))
+        return in_frame(xy, self.width, self.height, margin_px)
 
     def footprint(self, points: Floats) -> Array:
         """Length ``(N,)`` in space that a pixel covers at points, across the optical axis."""

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import PinholeCamera, pixel_centers, sample_image
+from polmvs.camera import PinholeCamera, in_frame, pixel_centers, sample_image
 from polmvs.config import FusionOptions
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import DISPLAY_GAMMA
@@ -154,8 +154,7 @@ def part_shares(tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int) -> Arr
     """Share ``(T,)`` of each track's observations in or beside a region; 1 without any."""
     num_tracks = len(tracks.points_in_world)
     on_part = np.zeros(len(tracks.obs_track), bool)
-    for k, phase_map in enumerate(maps):
-        here = tracks.obs_view == k
+    for phase_map, here in zip(maps, tracks.of_views(len(maps)), strict=True):
         grown = grow_mask(phase_map.region.inside, margin_px).astype(np.float32)
         on_part[here] = sample_image(grown, tracks.obs_xy[here], nearest=True) > 0
     count = np.bincount(tracks.obs_track, minlength=num_tracks)
@@ -178,8 +177,8 @@ def relative_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
     num_tracks = len(tracks.points_in_world)
     count = np.bincount(tracks.obs_track, minlength=num_tracks)
     total = np.zeros(num_tracks)
-    for k, view in enumerate(views):
-        seen = tracks.obs_track[tracks.obs_view == k]
+    for view, own in zip(views, tracks.of_views(len(views)), strict=True):
+        seen = tracks.obs_track[own]
         offsets = tracks.points_in_world[seen] - view.center_in_world
         total[seen] += np.linalg.norm(offsets, axis=-1)
     # Keypoints of deviation s per axis are sqrt(pi / 2) s off on average, less what the point's
@@ -301,7 +300,8 @@ def stereo_surroundings(
     task = partial(_match_view, folder, stride_px, tolerances=tolerances)
     groups = [[maps[k], *(maps[j] for j in chosen[k])] for k in used]
     dense: list[DenseView] = []
-    points = [certain.points_in_world[certain.obs_track[certain.obs_view == k]] for k in used]
+    own = certain.of_views(len(maps))
+    points = [certain.points_in_world[certain.obs_track[own[k]]] for k in used]
     for done in workers.map(task, groups, points):
         dense.append(done)
         if on_progress is not None:
@@ -429,9 +429,8 @@ def warp(
     """Resample an image of a view for a virtual camera at its centre, and where it has pixels."""
     rays = camera.rays(pixel_centers(camera.width, camera.height))
     xy = view.camera.project(rays @ (view.cam_from_world.rotation @ rotation.T).T)
-    margin, size = tolerances.border_px, np.array([view.camera.width, view.camera.height])
-    inside = ((xy >= margin) & (xy <= size - margin)).all(axis=-1)
-    return sample_image(image, xy), np.asarray(inside)
+    inside = in_frame(xy, view.camera.width, view.camera.height, tolerances.border_px)
+    return sample_image(image, xy), inside
 
 
 def match(

@@ -184,7 +184,8 @@ def _write_view(folder: Path, scene: PrintedScene, maps: bool, view: View, seed:
     part, depth = render_printed_truth(view, scene)
     seen = part.mask & (part.depth <= depth + 1e-9)
     stem = folder / "gt" / Path(view.name).stem
-    encoded = np.rint(np.nan_to_num(depth, posinf=0) / DEPTH_UNIT_M)
+    encoded = np.rint(depth / DEPTH_UNIT_M)
+    encoded = np.where(encoded <= np.iinfo(np.uint16).max, encoded, 0)  # the far ground: unknown
     write_png(f"{stem}_depth.png", encoded.astype(np.uint16))
     write_png(f"{stem}_mask.png", np.where(seen, 255, 0).astype(np.uint8))
     normals = np.rint((np.where(seen[..., None], part.normals_in_cam, 0) + 1) * 32767.5)

@@ -18,6 +18,7 @@ from polmvs.colmap.models import (
     match_model_to_capture,
     model_from_reconstruction,
     read_model,
+    read_views,
     write_model,
 )
 from polmvs.errors import DataError
@@ -55,13 +56,17 @@ def reconstruction():
     return synthetic()
 
 
-def assert_same_model(first: SparseModel, second: SparseModel) -> None:
-    assert [view.name for view in first.views] == [view.name for view in second.views]
-    for one, two in zip(first.views, second.views, strict=True):
+def assert_same_views(first, second) -> None:
+    assert [view.name for view in first] == [view.name for view in second]
+    for one, two in zip(first, second, strict=True):
         assert one.camera == two.camera
         for part in ("rotation", "translation"):
             a, b = getattr(one.cam_from_world, part), getattr(two.cam_from_world, part)
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+def assert_same_model(first: SparseModel, second: SparseModel) -> None:
+    assert_same_views(first.views, second.views)
     for name in Tracks.__dataclass_fields__:
         np.testing.assert_allclose(getattr(first.tracks, name), getattr(second.tracks, name))
     assert first.tracks.point3D_ids.dtype == second.tracks.point3D_ids.dtype == np.int64
@@ -167,6 +172,7 @@ def test_read_model(tmp_path, reconstruction, suffix, files, parent):
     before = {path: path.read_bytes() for path in folder.iterdir()}
     model = read_model(tmp_path)
     assert_same_model(model, model_from_reconstruction(reconstruction))
+    assert_same_views(read_views(tmp_path), model.views)
     assert find_model(tmp_path) == folder
     assert before == {path: path.read_bytes() for path in folder.iterdir()}
 
@@ -184,6 +190,13 @@ def test_model_agrees_with_the_reconstruction(reconstruction):
         points = tracks.points_in_world[tracks.obs_track[own]]
         projected = view.camera.project(view.cam_from_world * points)
         np.testing.assert_allclose(projected, tracks.obs_xy[own], atol=1e-6)
+
+
+def test_keypoints_without_a_point_are_passed_over(tmp_path):
+    reconstruction = synthetic(num_points2D_without_point3D=7)
+    assert any(not p.has_point3D() for p in reconstruction.image(1).points2D)
+    reconstruction.write_binary(str(tmp_path))
+    assert_same_model(read_model(tmp_path), model_from_reconstruction(reconstruction))
 
 
 @pytest.mark.parametrize("name", ["cameras", "rigs", "frames", "images", "points3D"])

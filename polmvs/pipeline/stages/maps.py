@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.colmap.models import read_model
+from polmvs.colmap.models import read_model, read_views
 from polmvs.config import AngleModel, Light, RegionOptions
 from polmvs.errors import DataError
 from polmvs.io.images import read_mask
@@ -104,7 +104,7 @@ def build_maps(
         Fewer than three views have a pose, or a mosaic or mask is unusable.
     """
     options = options or RegionOptions()
-    views, tracks = _posed(sparse)
+    views, tracks = posed_views(sparse), read_model(sparse).tracks
     names = image_names(capture)
     workers = workers or Workers()
     with replacing(target) as folder, workers.stopped_on_error():
@@ -179,19 +179,14 @@ def posed_views(sparse: Path) -> tuple[View, ...]:
     DataError
         There are too few for normals.
     """
-    return _posed(sparse)[0]
-
-
-def _posed(sparse: Path) -> tuple[tuple[View, ...], Tracks]:
-    model = read_model(sparse)
-    views = model.views
+    views = read_views(sparse)
     if len(views) < MIN_VIEWS:
         raise DataError(
             sparse,
             f"{len(views)} views with a pose; normals need {MIN_VIEWS} or more. "
             "Record more views, or give a better model with `sfm.sparse`.",
         )
-    return views, model.tracks
+    return views
 
 
 def find_mask(folder: Path, image: str) -> Path:
