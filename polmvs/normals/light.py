@@ -3,8 +3,8 @@
 The two differ by a quarter turn of the phase, so the wrong choice puts every plane of incidence
 at a right angle to the true one. One view cannot tell; three or more can, because wrong planes of
 incidence do not meet in one normal. Every sparse point on a part votes with the likelihoods of
-its two best normals. Where a part has too few of them its pixels vote the same way, placed as far
-off as explains their phases best, for either kind of light: normals hardly depend on that. What
+its two best normals, and so do pixels of the part, placed where the regions of most views have it
+(their visual hull), as deep in it as explains their phases best, for either kind of light. What
 one view says of a thing is doubtful, so that a part is decided by all views that show it. The
 degree of polarisation has a say where phases have none (specular light is polarised up to wholly,
 diffuse light of a smooth dielectric hardly over 0.4).
@@ -19,8 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import sample_image
+from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, NormalOptions
+from polmvs.geometry import lengths
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, Rows, gather_rows_under
 from polmvs.normals.tracks import (
@@ -53,7 +54,9 @@ class LightTolerances:
     max_pixel_views : views, evenly spread over all, that a part's pixels are looked up in. Guess;
         more cost time only.
     num_pixels : of a part that are placed in space. Guess; costs time only.
-    num_ranges : distances that these are tried at. Guess; normals hardly depend on them.
+    num_steps : of the search for the hull along their rays. Guess: a step is 2 % of the distance.
+    num_ranges : depths in the hull that they are tried at. Guess; the first is right where it is
+        convex.
     widening : of the distances beyond those of the scene's points, factor. Guess.
     """
 
@@ -63,6 +66,7 @@ class LightTolerances:
     dolp_votes: float = 20.0
     max_pixel_views: int = 60
     num_pixels: int = 64
+    num_steps: int = 48
     num_ranges: int = 7
     widening: float = 1.3
 
@@ -76,8 +80,8 @@ def find_diffuse_parts(
 ) -> list[Mask]:
     """Connected parts of each view's region whose light is diffuse-dominant.
 
-    Every part is decided as a whole: by the votes of its points, else of its pixels, and of the
-    parts of other views that show the same, else with the majority of the capture.
+    Every part is decided as a whole: by the votes of its points and pixels, and of the parts of
+    other views that show the same, else with the majority of the capture.
 
     Parameters
     ----------
@@ -97,13 +101,13 @@ def find_diffuse_parts(
         _part_votes(m, on_parts.points_in_world[voting], votes[voting], t.min_rows) for m in maps
     ]
     slots = _place_pixels(maps, tracks.points_in_world, t)
-    of_pixels = _pixel_votes(slots, of_points, maps, t, max_rows)
+    of_pixels = _pixel_votes(slots, maps, t, max_rows)
     overall = float(votes[voting].sum()) + _dolp_votes(maps, t)
     own = []
     for known, dense in zip(of_points, of_pixels, strict=True):
-        undecided = ~np.isfinite(known)
-        own.append(np.where(undecided, dense, known))
-        overall += float(np.nansum(dense[undecided]))
+        unknown = np.isnan(known) & np.isnan(dense)
+        own.append(np.where(unknown, np.nan, np.nan_to_num(known) + np.nan_to_num(dense)))
+        overall += float(np.nansum(dense))
     # Without any evidence light is specular: what polarises most.
     tie = overall if overall != 0 else 1.0
     verdicts = (
@@ -159,24 +163,20 @@ def _part_votes(phase_map: PhaseMap, points: Array, votes: Array, min_points: in
 
 
 def _pixel_votes(
-    slots: _Slots,
-    of_points: Sequence[Array],
-    maps: Sequence[PhaseMap],
-    t: LightTolerances,
-    max_rows: int,
+    slots: _Slots, maps: Sequence[PhaseMap], t: LightTolerances, max_rows: int
 ) -> list[Array]:
-    """Votes (P,) of the pixels of each view's undecided parts; NaN where no view sees enough.
+    """Votes (P,) of the pixels of each view's parts; NaN where no view sees enough.
+
+    Of many views some are asked, evenly spread; the parts of the others are decided with these.
 
     Parameters
     ----------
     slots : pixels of all parts.
-    of_points : votes (P,) of the sparse points for each view's parts; NaN where undecided.
     maps : of all views, under the assumption of specular light.
     """
-    undecided = slots.of_parts([~np.isfinite(votes) for votes in of_points])
-    asked = np.flatnonzero(undecided[slots.owner])
-    points, owner = slots.points[asked], slots.owner[asked]
     seen_by = _looked_up(len(maps), t)
+    asked = np.isin(slots.view, seen_by)
+    points, owner = slots.points[asked], slots.owner[asked]
     total, sums = np.zeros(slots.num), np.zeros((2, slots.num))
     step = max(1, max_rows // max(len(seen_by), 1))
     for start in range(0, len(owner), step):
@@ -194,7 +194,7 @@ def _pixel_votes(
     mean = np.divide(sums, total, out=np.full((2, slots.num), np.inf), where=total > 0)
     dense = []
     for rows_there, costs_there in zip(slots.by_view(total), slots.by_view(mean), strict=True):
-        # Of each part, per kind of light, the least cost of a row at any of the distances.
+        # Of each part, per kind of light, the least cost of a row at any of the depths.
         least, num_rows = costs_there.min(axis=1), rows_there.max(axis=0)
         known = np.isfinite(least).all(axis=0)
         of_view = np.full(len(num_rows), np.nan)
@@ -208,8 +208,8 @@ def _pooled_votes(
 ) -> list[Array]:
     """Votes (P,) of each part with those of the parts of other views that show the same.
 
-    A part's pixels, as far off as most views have a part where they fall, pass on the votes of what
-    they fall on. A thing of another light beside it keeps its own.
+    A part's pixels, as deep in the hull as most views have a part where they fall, pass on the
+    votes of what they fall on. A thing of another light beside it keeps its own.
 
     Parameters
     ----------
@@ -244,16 +244,16 @@ def _looked_up(num_views: int, t: LightTolerances) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class _Slots:
-    """Some pixels of parts of all views, placed in space at each of several distances.
+    """Some pixels of parts of all views, placed in space at each of several depths in the hull.
 
-    A slot is a part of a view at one of the distances.
+    A slot is a part of a view at one of the depths.
 
     Attributes
     ----------
     points : (N, 3), world.
     owner, view : (N,), the slot and the view of each point.
     num_parts : of each view.
-    num_ranges : distances.
+    num_ranges : depths.
     """
 
     points: Array
@@ -267,12 +267,8 @@ class _Slots:
         """Slots of all views."""
         return self.num_ranges * sum(self.num_parts)
 
-    def of_parts(self, values: Sequence[Mask]) -> Mask:
-        """Values (P,) of the parts of each view as those of their slots (slots,)."""
-        return np.concatenate([np.tile(of_view, self.num_ranges) for of_view in values])
-
     def by_view(self, values: Array) -> list[Array]:
-        """Values (..., slots) as arrays (..., distances, parts), one for each view."""
+        """Values (..., slots) as arrays (..., depths, parts), one for each view."""
         ends = self.num_ranges * np.cumsum(self.num_parts)
         return [
             of_view.reshape(*of_view.shape[:-1], self.num_ranges, num)
@@ -283,37 +279,85 @@ class _Slots:
 
 
 def _place_pixels(maps: Sequence[PhaseMap], points: Array, t: LightTolerances) -> _Slots:
-    """Place pixels of all parts at distances at which the scene's points (T, 3) lie."""
-    placed, owner, view = [np.zeros((0, 3))], [], []
-    num_parts: list[int] = []
-    for index, phase_map in enumerate(maps):
-        labels = _parts_of(phase_map)
-        begin = t.num_ranges * sum(num_parts)
-        num_parts.append(int(labels.max(initial=0)) + 1)
-        in_cam = phase_map.view.cam_from_world * points
-        ahead = in_cam[in_cam[:, 2] > 0]
-        if not len(ahead) or num_parts[-1] < 2:
-            continue
-        reliable, pixels, of_part = phase_map.region.reliable, [], []
-        for part in range(1, num_parts[-1]):
-            rows, cols = np.nonzero((labels == part) & reliable)
-            step = max(1, len(rows) // t.num_pixels)
-            pixels.append(np.stack([cols[::step], rows[::step]], axis=-1) + 0.5)
-            of_part.append(np.full(len(pixels[-1]), part))
-        rays = phase_map.view.rays_in_world(np.concatenate(pixels))
-        distances = np.linalg.norm(ahead, axis=-1)
-        nearest, farthest = np.percentile(distances, [2, 98]) * [1 / t.widening, t.widening]
-        for step, distance in enumerate(np.geomspace(nearest, farthest, t.num_ranges)):
-            placed.append(phase_map.view.center_in_world + distance * rays)
-            owner.append(begin + step * num_parts[-1] + np.concatenate(of_part))
-            view.append(np.full(len(rays), index))
-    none = [np.zeros(0, np.int64)]
+    """Place pixels of all parts in the hull of the regions, about where the scene's points lie.
+
+    Parameters
+    ----------
+    points : (T, 3), world, of the scene.
+    """
+    chosen = [_choose_pixels(phase_map, points, t) for phase_map in maps]
+    support = [np.zeros((len(one.distances), len(one.rays)), np.int16) for one in chosen]
+    for k in _looked_up(len(maps), t):
+        inside, camera = maps[k].region.inside.astype(np.float32), maps[k].view.camera
+        for one, views in zip(chosen, support, strict=True):
+            xy = maps[k].view.project(one.places())
+            shown = sample_image(inside, xy, nearest=True) > 0
+            # What lies outside of an image it says nothing of.
+            views += np.where(in_image(camera, xy), np.where(shown, 1, -1), 0).astype(np.int16)
+    placed, owner, view = [np.zeros((0, 3))], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    begin = 0
+    for index, (one, views) in enumerate(zip(chosen, support, strict=True)):
+        most = views == views.max(axis=0, initial=-len(maps))
+        first = one.distances[most.argmax(axis=0)]
+        last = one.distances[len(most) - 1 - most[::-1].argmax(axis=0)]
+        for slot, share in enumerate(np.linspace(0, 1, t.num_ranges)):
+            placed.append(one.center + (first ** (1 - share) * last**share)[:, None] * one.rays)
+            owner.append(begin + slot * one.num_parts + one.part)
+            view.append(np.full(len(one.rays), index))
+        begin += t.num_ranges * one.num_parts
     return _Slots(
         points=np.concatenate(placed),
-        owner=np.concatenate(none + owner),
-        view=np.concatenate(none + view),
-        num_parts=tuple(num_parts),
+        owner=np.concatenate(owner),
+        view=np.concatenate(view),
+        num_parts=tuple(one.num_parts for one in chosen),
         num_ranges=t.num_ranges,
+    )
+
+
+@dataclass(frozen=True)
+class _ChosenPixels:
+    """Some pixels of the parts of one view, and where along their rays they may lie.
+
+    Attributes
+    ----------
+    center : (3,), world, of the camera.
+    rays : (N, 3), world, unit.
+    part : (N,), of each pixel.
+    num_parts : of the view.
+    distances : (S,), that are tried.
+    """
+
+    center: Array
+    rays: Array
+    part: NDArray[np.int64]
+    num_parts: int
+    distances: Array
+
+    def places(self) -> Array:
+        """Points (S, N, 3), world, at all distances of all rays."""
+        return self.center + self.distances[:, None, None] * self.rays
+
+
+def _choose_pixels(phase_map: PhaseMap, points: Array, t: LightTolerances) -> _ChosenPixels:
+    """Evenly spread pixels of each part, and distances about those of points (T, 3)."""
+    labels, reliable = _parts_of(phase_map), phase_map.region.reliable
+    view, num_parts = phase_map.view, int(labels.max(initial=0)) + 1
+    pixels: list[Floats] = [np.zeros((0, 2))]
+    of_part = [np.zeros(0, np.int64)]
+    in_cam = view.cam_from_world * points
+    ahead = lengths(in_cam[in_cam[:, 2] > 0])
+    for part in range(1, num_parts if len(ahead) else 1):
+        rows, cols = np.nonzero((labels == part) & reliable)
+        step = max(1, len(rows) // t.num_pixels)
+        pixels.append(np.stack([cols[::step], rows[::step]], axis=-1) + 0.5)
+        of_part.append(np.full(len(pixels[-1]), part))
+    near, far = np.percentile(ahead, [2, 98]) if len(ahead) else (1.0, 1.0)
+    return _ChosenPixels(
+        center=view.center_in_world,
+        rays=view.rays_in_world(np.concatenate(pixels)),
+        part=np.concatenate(of_part),
+        num_parts=num_parts,
+        distances=np.geomspace(near / t.widening, far * t.widening, t.num_steps),
     )
 
 

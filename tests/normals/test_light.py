@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import analytic_objects as objects
 import numpy as np
 import pytest
 from scenes import CAMERA, Scene, board_scene, phase_map_of, tracks_at
@@ -14,6 +15,7 @@ from polmvs.normals.light import LightTolerances, diffuse_pixels, find_diffuse_p
 from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import track_normals
 from polmvs.polarization.phase_map import as_tilted, open_phase_map, store_phase_map, turned
+from polmvs.scene import Tracks, some_tracks
 from polmvs.synthetic.captures import Plane, Sphere, render_view, ring_of_views
 from polmvs.synthetic.surfaces import Group
 
@@ -211,3 +213,39 @@ def test_without_points_no_model_fits_best():
         track_residual_median_deg=float("nan"),
     )
     assert best_fitting_model({AngleModel.PPA: none}) is None
+
+
+@pytest.mark.parametrize("light", [Light.SPECULAR, Light.DIFFUSE])
+def test_few_misled_points_do_not_decide_against_all_pixels(light):
+    """What lies in the air before a thing, or is mirrored in it, votes by chance."""
+    rng = np.random.default_rng(0)
+    views = objects.ring_of_views(10)
+    steps = objects.union(objects.box((1.0, 0.8, 0.25)), objects.box((0.4, 0.5, 0.7)))
+    maps = objects.phase_maps_of(steps, views, noise=0.02, rng=rng)
+    if light is Light.DIFFUSE:
+        maps = [turned(m, m.region.inside) for m in maps]
+        maps = [m.changed(diffuse=np.zeros_like(m.diffuse)) for m in maps]
+    points = rng.uniform(-0.3, 0.3, (300, 3)) + np.array([0.0, 0.0, 1.0])
+    tracks = observed(views, points)
+    votes, voting = light_module._track_votes(tracks, maps, LightTolerances(), 10**6)
+    wrong = np.where(voting, votes * (1 if light is Light.SPECULAR else -1), 0)
+    misled = np.isin(np.arange(len(points)), np.argsort(wrong)[:5])
+    assert wrong[misled].sum() < -5
+    masks = diffuse_masks(some_tracks(tracks, misled), maps)
+    for phase_map, mask in zip(maps, masks, strict=True):
+        expected = phase_map.region.inside if light is Light.DIFFUSE else np.zeros_like(mask)
+        np.testing.assert_array_equal(mask, expected)
+
+
+def observed(views, points):
+    """Tracks of points that all views see."""
+    num = len(points)
+    return Tracks(
+        point3D_ids=np.arange(1, num + 1),
+        points_in_world=points,
+        colors=np.zeros((num, 3), np.uint8),
+        errors=np.zeros(num),
+        obs_track=np.tile(np.arange(num), len(views)),
+        obs_view=np.repeat(np.arange(len(views)), num),
+        obs_xy=np.concatenate([view.project(points) for view in views]),
+    )
