@@ -123,9 +123,8 @@ def diffuse_pixels(phase_map: PhaseMap, parts: Mask) -> Mask:
 
 
 def _rows_of_both(points: Array, maps: Sequence[PhaseMap]) -> tuple[Rows, ...]:
-    """Rows of averaged phases under specular and under diffuse light."""
-    windows = window_maps(maps, NormalOptions().window_px)
-    return gather_rows_under((AS_MEASURED, OTHER_LIGHT), AngleModel.PPA, points, windows)
+    """Rows under specular and under diffuse light."""
+    return gather_rows_under((AS_MEASURED, OTHER_LIGHT), AngleModel.PPA, points, maps)
 
 
 def _track_votes(
@@ -133,11 +132,12 @@ def _track_votes(
 ) -> tuple[Array, Mask]:
     """As :func:`specular_votes` of all tracks, many at a time."""
     votes, voting = [], []
-    estimator = NormalOptions().estimator
+    options = NormalOptions()
+    windows = window_maps(maps, options.window_px)  # on a mark itself light is mixed
     for some in in_tiles(tracks, len(maps), max_rows):
         specular, diffuse = (
-            normals_from_rows(some, rows, estimator)
-            for rows in _rows_of_both(some.points_in_world, maps)
+            normals_from_rows(some, rows, options.estimator)
+            for rows in _rows_of_both(some.points_in_world, windows)
         )
         of_some = specular_votes(specular, diffuse, t)
         votes.append(of_some[0])
@@ -167,6 +167,7 @@ def _pixel_votes(
 ) -> list[Array]:
     """Votes (P,) of the pixels of each view's parts; NaN where no view sees enough.
 
+    By the phases of single pixels: averaged over a window, those of a thin thing tell nothing.
     Of many views some are asked, evenly spread; the parts of the others are decided with these.
 
     Parameters
