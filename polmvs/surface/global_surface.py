@@ -39,6 +39,7 @@ from polmvs.surface.refinement import (
     median_residual,
     place_deviations,
     refine,
+    settled,
 )
 from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.surface_quality import (
@@ -49,6 +50,7 @@ from polmvs.surface.surface_quality import (
     find_contradictions,
     fit_normals,
     point_offset,
+    points_deny,
     supported_faces,
 )
 from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, surface_view
@@ -296,6 +298,13 @@ def _surface(
     fitted = fit_normals(mesh, views, rows, row_sigma=row_sigma)
     normals = sided_normals(mesh, fitted.normals, fitted.is_fitted)
     mesh = sharpened(mesh, normals)
+    moved = sharpened(
+        settled(mesh, views, rows, hull.footprint, row_error, known=known, tolerances=tolerances),
+        normals,
+    )
+    # Where outlines are wrong (a glossy table) and points many, these had it better.
+    if not points_deny(moved, mesh, known, hull.footprint):
+        mesh = moved
     given.report(1)
     evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
     supported = supported_faces(mesh, evidence, min_views=given.min_views)

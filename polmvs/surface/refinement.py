@@ -29,7 +29,8 @@ from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, phase_rows
 
 logger = logging.getLogger(__name__)
 
-SETTLING_STEPS = 2  # until a mesh made anew, which shrinks by some tenths of a pixel, is at rest
+# Until a mesh made anew, which shrinks by some tenths of a pixel, or a sharpened one is at rest.
+SETTLING_STEPS = 2
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -470,6 +471,36 @@ def _refined_at(
     # A model that leaves something out (OPA the perspective) errs by more than its phases' noise;
     # held against that, most of its rows were outliers. Every model is treated alike.
     return _State(mesh, tilt_share, shown)
+
+
+def settled(
+    mesh: TriangleMesh,
+    views: Sequence[SurfaceView],
+    angle_model: AngleModel,
+    footprint: float,
+    row_error: RowSigma,
+    *,
+    known: KnownPoints | None = None,
+    tolerances: RefinementTolerances | None = None,
+) -> TriangleMesh:
+    """A mesh with sharp edges, moved a little to where outlines, points and phases have it.
+
+    While its edges were round, outlines drew its faces outwards by what the edges lacked: 0.4 px,
+    measured on analytic boxes, whose Chamfer distance halves.
+
+    Parameters
+    ----------
+    mesh : sharpened; its triangles stay.
+    views, angle_model, footprint, known, tolerances : as in :func:`refine`.
+    row_error : deviations of the rows, as :func:`median_residual` finds them.
+    """
+    tol = tolerances or RefinementTolerances()
+    row_sigma = RowSigma(*(max(s, tol.row_sigma) for s in (row_error.direct, row_error.mirrored)))
+    level, edge = replace(tol.levels[-1], with_slope=False), mesh.mean_edge
+    for _ in range(SETTLING_STEPS):
+        energy = _energy(mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol)
+        mesh, _ = _step(mesh, energy, edge, tol)
+    return mesh
 
 
 def certain_rays(view: SurfaceView, stride_px: int) -> Array:
