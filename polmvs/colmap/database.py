@@ -16,7 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from polmvs.colmap.pairs import Pairs
-from polmvs.errors import DataError
+from polmvs.errors import DataError, PolmvsError
 from polmvs.scene import match_names
 
 FLOAT_BYTES = 4
@@ -40,6 +40,10 @@ class GivenDatabase:
     ids: Mapping[str, int]
     num_cameras: int
     has_matches: bool
+
+
+class NoRoomError(PolmvsError):
+    """A database cannot be written where there should be room for it."""
 
 
 def check_database(path: Path, names: Sequence[str], width: int, height: int) -> GivenDatabase:
@@ -76,10 +80,22 @@ def copy_database(given: GivenDatabase, target: Path) -> None:
     """A copy in a new file, whose images carry the capture's names.
 
     Images that are none of the capture's stay in it, named by their numbers.
+
+    Raises
+    ------
+    NoRoomError
+        The copy cannot be written.
+    DataError
+        The database is damaged.
     """
     with sound(given.path):
         with closing(_open_read_only(given.path)) as source, closing(sqlite3.connect(target)) as to:
-            source.backup(to)
+            try:
+                source.backup(to)
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
+                    raise NoRoomError(str(error)) from error
+                raise
         with _renamed(target, {number: name for name, number in given.ids.items()}, keep=True):
             pass
         with opened(target):

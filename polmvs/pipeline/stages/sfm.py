@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from polmvs.colmap.camera_uncertainty import camera_uncertainty
+from polmvs.colmap.database import NoRoomError
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.sfm import NoModelError, run_sfm
 from polmvs.colmap.sfm_failure import why_no_model
@@ -100,6 +101,8 @@ def find_model(
         try:
             # Where its database cannot be written COLMAP ends the process.
             model = run_separately(_run_sfm, images, names, work, new, options, on_message=on_step)
+        except NoRoomError as error:
+            raise DataError(target.parent, CANNOT_WRITE) from error
         except CrashError as error:
             if FULL_DISK.search(error.said):
                 raise DataError(target.parent, CANNOT_WRITE) from error
