@@ -255,7 +255,7 @@ def _tracks(
     Parameters
     ----------
     stored : keypoints of each image that have a point, with rows of ``KEYPOINT``; None: they are
-        taken from pycolmap, which hands them over one by one, 3 microseconds each.
+        taken from pycolmap, which hands them over one by one, 1 to 3 microseconds each.
     """
     points = sorted(reconstruction.points3D.items())
     ids = np.array([i for i, _ in points], np.int64)
@@ -482,7 +482,7 @@ def _add_points(
     """Add all tracks; ``point2D_idx`` is each observation's index in its image."""
     order = np.argsort(tracks.obs_track, kind="stable")
     starts = np.searchsorted(tracks.obs_track[order], np.arange(len(tracks.point3D_ids) + 1))
-    # Plain numbers, handed over one by one, are twice as fast as a list of its elements.
+    # Plain numbers, handed over one by one, take two thirds of the time of a list of elements.
     image_ids = (tracks.obs_view[order] + 1).tolist()
     indices = point2D_idx[order].tolist()
     for index, point3D_id in enumerate(tracks.point3D_ids):
