@@ -76,6 +76,17 @@ def sound(path: Path) -> Iterator[None]:
         raise DataError(path, f"is no sound COLMAP database ({reason}). {REMEDY}") from error
 
 
+@contextmanager
+def _room() -> Iterator[None]:
+    """What SQLite cannot write meanwhile is no fault of a database."""
+    try:
+        yield
+    except sqlite3.OperationalError as error:
+        if error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
+            raise NoRoomError(str(error)) from error
+        raise
+
+
 def copy_database(given: GivenDatabase, target: Path) -> None:
     """A copy in a new file, whose images carry the capture's names.
 
@@ -88,14 +99,9 @@ def copy_database(given: GivenDatabase, target: Path) -> None:
     DataError
         The database is damaged.
     """
-    with sound(given.path):
+    with sound(given.path), _room():
         with closing(_open_read_only(given.path)) as source, closing(sqlite3.connect(target)) as to:
-            try:
-                source.backup(to)
-            except sqlite3.OperationalError as error:
-                if error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
-                    raise NoRoomError(str(error)) from error
-                raise
+            source.backup(to)
         with _renamed(target, {number: name for name, number in given.ids.items()}, keep=True):
             pass
         with opened(target):

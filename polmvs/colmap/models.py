@@ -64,12 +64,7 @@ def read_model(path: PathArg) -> SparseModel:
         keypoints = None
         if _model_suffix(folder) == ".bin":
             keypoints = _stored_keypoints(folder / "images.bin")
-        images = _registered(reconstruction)
-        sparse_model = SparseModel(
-            views=_views(reconstruction, images),
-            tracks=_tracks(reconstruction, images, keypoints),
-            unregistered=_unregistered(reconstruction, images),
-        )
+        sparse_model = _sparse_model(reconstruction, stored=keypoints)
     _require_sound(folder, sparse_model.views, sparse_model.tracks)
     return sparse_model
 
@@ -201,11 +196,22 @@ def model_from_reconstruction(
     reconstruction : with any rigs and camera models.
     names : of all images that were to be registered, in addition to the reconstruction's own.
     """
+    return _sparse_model(reconstruction, names)
+
+
+def _sparse_model(
+    reconstruction: pycolmap.Reconstruction,
+    names: Iterable[str] = (),
+    stored: Mapping[int, NDArray[np.void]] | None = None,
+) -> SparseModel:
+    """As :func:`model_from_reconstruction`; ``stored`` as in :func:`_tracks`."""
     images = _registered(reconstruction)
+    views = _views(reconstruction, images)
+    known = {str(image.name) for image in reconstruction.images.values()} | set(names)
     return SparseModel(
-        views=_views(reconstruction, images),
-        tracks=_tracks(reconstruction, images),
-        unregistered=_unregistered(reconstruction, images, names),
+        views=views,
+        tracks=_tracks(reconstruction, images, stored),
+        unregistered=tuple(sorted(known - {view.name for view in views})),
     )
 
 
@@ -213,16 +219,6 @@ def _registered(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]
     """Images with a pose, sorted by name."""
     images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
     return sorted(images, key=lambda image: str(image.name))
-
-
-def _unregistered(
-    reconstruction: pycolmap.Reconstruction,
-    registered: Iterable[pycolmap.Image],
-    names: Iterable[str] = (),
-) -> tuple[str, ...]:
-    """Names of the images without a pose, sorted; ``names`` are known beside the model's own."""
-    known = {str(image.name) for image in reconstruction.images.values()} | set(names)
-    return tuple(sorted(known - {str(image.name) for image in registered}))
 
 
 def _views(

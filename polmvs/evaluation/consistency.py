@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from polmvs.geometry import unit
 from polmvs.io.clouds import Cloud
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import PointKind
+from polmvs.scene import PointKind, View
 
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -120,17 +120,35 @@ def visible_points(points: Floats, normals: Floats, phase_map: PhaseMap) -> tupl
     visible : (N,) bool
     hit : (H / CELL_PX, W / CELL_PX) bool, rounded up
     """
-    view, inside = phase_map.view, phase_map.region.inside
+    visible, cells = first_seen(points, normals, phase_map.view, phase_map.shows_surface)
+    return visible, np.isfinite(cells)
+
+
+def first_seen(
+    points: Floats, normals: Floats, view: View, shows: Callable[[Floats], Mask]
+) -> tuple[Mask, NDArray[np.float64]]:
+    """Points that face a view, are shown where they fall, and have none clearly nearer there.
+
+    Parameters
+    ----------
+    points, normals : (N, 3), world.
+    shows : whether image coordinates (M, 2), which lie in the image then, show the points.
+
+    Returns
+    -------
+    visible : (N,) bool
+    cells : (H / CELL_PX, W / CELL_PX), rounded up: distance of the nearest point, inf without.
+    """
     seen = np.flatnonzero(view.faces(points, normals))
     xy = view.project(points[seen])
-    shown = sample_image(inside.astype(np.float32), xy, nearest=True) > 0
+    shown = shows(xy)
     seen, xy = seen[shown], xy[shown]
     distance = view.ranges(points[seen])
-    height, width = inside.shape
-    cells, nearest = depth_buffer(xy, distance, width, height, cell_px=CELL_PX)
+    camera = view.camera
+    cells, nearest = depth_buffer(xy, distance, camera.width, camera.height, cell_px=CELL_PX)
     visible = np.zeros(len(points), np.bool_)
     visible[seen] = distance <= (1 + MAX_RELATIVE_EXCESS) * nearest
-    return visible, np.isfinite(cells)
+    return visible, cells
 
 
 def _region_cells(inside: Mask) -> Mask:

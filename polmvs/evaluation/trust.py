@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import depth_buffer, in_image, sample_image
+from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, PropagationOptions
 from polmvs.evaluation.consistency import (
-    CELL_PX,
-    MAX_RELATIVE_EXCESS,
+    first_seen,
     measure_consistency,
     phase_residuals_deg,
 )
@@ -200,9 +200,10 @@ def measure_trust(
     in_sigmas, num_seen, num_inside = [np.zeros(0)], 0, 0
     nearest = np.full(len(points), np.inf)
     for phase_map in maps if len(points) else ():
-        nearest = np.minimum(nearest, phase_map.view.ranges(points))
-        seen = _in_sight(points, normals, phase_map) & chosen
-        xy = phase_map.view.project(points[seen])
+        view = phase_map.view
+        nearest = np.minimum(nearest, view.ranges(points))
+        seen = first_seen(points, normals, view, partial(in_image, view.camera))[0] & chosen
+        xy = view.project(points[seen])
         size = 2 * OUTLINE_MARGIN_PX + 1
         region = cv2.dilate(phase_map.region.inside.astype(np.float32), np.ones((size, size)))
         inside = sample_image(np.asarray(region, np.float32), xy, nearest=True) > 0
@@ -221,17 +222,3 @@ def measure_trust(
         determined=consistency.coverage,
         sigma_share=float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else float("nan"),
     )
-
-
-def _in_sight(points: Floats, normals: Floats, phase_map: PhaseMap) -> Mask:
-    """Points that face a view, lie in its image, and have none clearly nearer in their cell."""
-    view, (height, width) = phase_map.view, phase_map.region.inside.shape
-    facing = np.flatnonzero(view.faces(points, normals))
-    xy = view.project(points[facing])
-    shown = in_image(view.camera, xy)
-    facing, xy = facing[shown], xy[shown]
-    distance = view.ranges(points[facing])
-    _, nearest = depth_buffer(xy, distance, width, height, cell_px=CELL_PX)
-    seen = np.zeros(len(points), np.bool_)
-    seen[facing] = distance <= (1 + MAX_RELATIVE_EXCESS) * nearest
-    return seen

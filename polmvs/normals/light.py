@@ -45,7 +45,7 @@ class LightTolerances:
 
     Attributes
     ----------
-    min_rows : of a point that votes, and points of a part that decide for it. Derived: two planes
+    min_rows : of a point that votes, and points of a part whose votes count. Derived: two planes
         of incidence always meet in a normal.
     max_row_cost : of one row, so that a single one cannot outvote the others. Guess.
     diffuse_dolp : largest DoLP of diffuse light. Derived: smooth dielectric of ior 1.5, seen at a

@@ -293,13 +293,13 @@ def _surface(
         )
     if not len(mesh.faces):
         return Undetermined("the surface vanishes under the phases of the views"), meshes
-    row_error, median = median_residual(mesh, views, rows)
-    row_sigma = max(row_error.direct, tolerances.row_sigma)
+    shown, median = median_residual(mesh, views, rows, tolerances)
+    row_sigma = shown.direct
     fitted = fit_normals(mesh, views, rows, row_sigma=row_sigma)
     normals = sided_normals(mesh, fitted.normals, fitted.is_fitted)
     mesh = sharpened(mesh, normals)
     moved = sharpened(
-        settled(mesh, views, rows, hull.footprint, row_error, known=known, tolerances=tolerances),
+        settled(mesh, views, rows, hull.footprint, shown, known=known, tolerances=tolerances),
         normals,
     )
     # Where outlines are wrong (a glossy table) and points many, these had it better.

@@ -478,7 +478,7 @@ def settled(
     views: Sequence[SurfaceView],
     angle_model: AngleModel,
     footprint: float,
-    row_error: RowSigma,
+    row_sigma: RowSigma,
     *,
     known: KnownPoints | None = None,
     tolerances: RefinementTolerances | None = None,
@@ -492,10 +492,9 @@ def settled(
     ----------
     mesh : sharpened; its triangles stay.
     views, angle_model, footprint, known, tolerances : as in :func:`refine`.
-    row_error : deviations of the rows, as :func:`median_residual` finds them.
+    row_sigma : deviations of the rows, as :func:`median_residual` finds them.
     """
     tol = tolerances or RefinementTolerances()
-    row_sigma = RowSigma(*(max(s, tol.row_sigma) for s in (row_error.direct, row_error.mirrored)))
     level, edge = replace(tol.levels[-1], with_slope=False), mesh.mean_edge
     for _ in range(SETTLING_STEPS):
         energy = _energy(mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol)
@@ -741,7 +740,7 @@ def median_residual(
 
     Returns
     -------
-    row_sigma : robust deviations of ``m . n``.
+    row_sigma : robust deviations of ``m . n``, at least that of the tolerances.
     median : of the absolute residuals; 0 without any.
     """
     tol = tolerances or RefinementTolerances()
@@ -750,8 +749,10 @@ def median_residual(
     residuals = np.concatenate([np.zeros(0), *(row.residual for row in rows)])
     is_mirrored = np.concatenate([np.zeros(0, np.bool_), *(row.is_mirrored for row in rows)])
     if not len(residuals):
-        return RowSigma(0.0, 0.0), 0.0
-    return RowSigma.shown_by(residuals, is_mirrored, 0.0), float(np.median(np.abs(residuals)))
+        return equal, 0.0
+    return RowSigma.shown_by(residuals, is_mirrored, tol.row_sigma), float(
+        np.median(np.abs(residuals))
+    )
 
 
 def solve(matrix: sparse.csr_array, right: Array, damping: Array, shared: Array) -> Array:

@@ -15,7 +15,7 @@ from polmvs.normals.light import LightTolerances, diffuse_pixels, find_diffuse_p
 from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import track_normals
 from polmvs.polarization.phase_map import as_tilted, open_phase_map, store_phase_map, turned
-from polmvs.scene import Tracks, some_tracks
+from polmvs.scene import some_tracks
 from polmvs.synthetic.captures import Plane, Sphere, render_view, ring_of_views
 from polmvs.synthetic.surfaces import Group
 
@@ -225,7 +225,7 @@ def test_few_misled_points_do_not_decide_against_all_pixels(light):
         maps = [turned(m, m.region.inside) for m in maps]
         maps = [m.changed(diffuse=np.zeros_like(m.diffuse)) for m in maps]
     points = rng.uniform(-1.0, 1.0, (300, 3))
-    tracks = observed(views, points)
+    tracks = tracks_at(Scene(None, views, [], maps), points)
     votes, voting = light_module._track_votes(tracks, maps, LightTolerances(), 10**6)
     wrong = np.where(voting, votes * (1 if light is Light.SPECULAR else -1), 0)
     misled = np.isin(np.arange(len(points)), np.argsort(wrong)[:5])
@@ -234,17 +234,3 @@ def test_few_misled_points_do_not_decide_against_all_pixels(light):
     for phase_map, mask in zip(maps, masks, strict=True):
         expected = phase_map.region.inside if light is Light.DIFFUSE else np.zeros_like(mask)
         np.testing.assert_array_equal(mask, expected)
-
-
-def observed(views, points):
-    """Tracks of points that all views see."""
-    num = len(points)
-    return Tracks(
-        point3D_ids=np.arange(1, num + 1),
-        points_in_world=points,
-        colors=np.zeros((num, 3), np.uint8),
-        errors=np.zeros(num),
-        obs_track=np.tile(np.arange(num), len(views)),
-        obs_view=np.repeat(np.arange(len(views)), num),
-        obs_xy=np.concatenate([view.project(points) for view in views]),
-    )

@@ -104,7 +104,8 @@ def build_maps(
         Fewer than three views have a pose, or a mosaic or mask is unusable.
     """
     options = options or RegionOptions()
-    views, tracks = posed_views(sparse), read_model(sparse).tracks
+    model = read_model(sparse)
+    views, tracks = _enough(model.views, sparse), model.tracks
     names = image_names(capture)
     workers = workers or Workers()
     with replacing(target) as folder, workers.stopped_on_error():
@@ -179,7 +180,10 @@ def posed_views(sparse: Path) -> tuple[View, ...]:
     DataError
         There are too few for normals.
     """
-    views = read_views(sparse)
+    return _enough(read_views(sparse), sparse)
+
+
+def _enough(views: tuple[View, ...], sparse: Path) -> tuple[View, ...]:
     if len(views) < MIN_VIEWS:
         raise DataError(
             sparse,
