@@ -75,7 +75,7 @@ def test_processor_time_of_workers_counts_once() -> None:
         alive = cpu_seconds() - first
     all_ended, times = cpu_seconds() - first, os.times()
     own, children = (sum(times[k] - first_times[k] for k in places) for places in ((0, 1), (2, 3)))
-    # Workers take time to start and to end, as the machine will: the truth is the system's own count,
-    # counts of children once they have ended. Times come in ticks of 10 ms.
+    # Workers take time to start and to end, as the machine will: the truth is the system's count
+    # of children that have ended. Times come in ticks of 10 ms.
     assert 0.56 < alive <= own + children + 0.04
     assert all_ended == pytest.approx(own + children, abs=0.04)
