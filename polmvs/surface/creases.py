@@ -10,17 +10,21 @@ Sun et al., Fast and effective feature-preserving mesh denoising, TVCG 2007.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from polmvs.geometry import dots
 from polmvs.surface.mesh_geometry import TriangleMesh
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
+
+GRADIENT_STEP = 0.1  # of a mesh's edge: small against what it can show
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +86,50 @@ def sided_normals(
         average.data = near * np.exp(-0.5 * apart / tol.like_sine**2)
         normals = _unit(average @ normals)
     return normals
+
+
+def wall_normals(
+    mesh: TriangleMesh,
+    normals: Array,
+    is_fitted: Mask,
+    carvings: Sequence[Callable[[Array], Floats]],
+    to_uncarved: Floats,
+    tolerances: CreaseTolerances | None = None,
+) -> tuple[Array, Mask]:
+    """Normals ``(F, 3)``, those of carved walls as they were carved, and which faces ``(F,)`` are.
+
+    Walls of steps and of hollows see what stands beside them, and their phases are those of its
+    mirror image.
+
+    Parameters
+    ----------
+    mesh : carved, with F faces.
+    normals, is_fitted : as of :func:`sided_normals`.
+    carvings : signed distances of points ``(N, 3)``, positive in the space that is carved away.
+    to_uncarved : (F,), distances of the faces to the surface before.
+    """
+    tol = tolerances or CreaseTolerances()
+    carved, is_carved = normals.copy(), np.zeros(len(normals), np.bool_)
+    # The grid has rounded the edges of walls: a face belongs to what passes nearest to it.
+    nearest = np.minimum(to_uncarved, mesh.mean_edge)
+    for values in carvings:
+        distance = np.abs(values(mesh.centers))
+        own = np.flatnonzero(distance < nearest)
+        carved[own] = _gradients(values, mesh.centers[own], GRADIENT_STEP * mesh.mean_edge)
+        nearest[own], is_carved[own] = distance[own], True
+    to_carved = dots(carved, mesh.face_normals)
+    # A face that is rounded across a right-angled edge is turned by no more than half of it; where
+    # phases show another side than the carving, the face has that of the two which is nearer.
+    is_wall = is_carved & (to_carved > np.sqrt(0.5))
+    is_wall &= ~is_fitted | (to_carved > dots(normals, mesh.face_normals))
+    is_wall &= dots(carved, normals) < np.cos(np.radians(tol.crease_deg))
+    return np.where(is_wall[:, None], carved, normals), is_wall
+
+
+def _gradients(values: Callable[[Array], Floats], points: Array, step: float) -> Array:
+    """Unit gradients ``(N, 3)`` of a function at points ``(N, 3)``, from central differences."""
+    slopes = [values(points + step * axis) - values(points - step * axis) for axis in np.eye(3)]
+    return _unit(np.stack(slopes, axis=-1).astype(np.float64))
 
 
 def sharpened(

@@ -21,7 +21,7 @@ from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds, View
-from polmvs.surface.creases import corner_normals, sharpened, sided_normals
+from polmvs.surface.creases import corner_normals, sharpened, sided_normals, wall_normals
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
 from polmvs.surface.hollows import Hollow, SurfaceFaces, find_hollows
@@ -283,6 +283,7 @@ def _surface(
     hollows = _hollows(given, mesh, hull.footprint) or hollows
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
+    uncarved = mesh
     if carvings and len(mesh.faces):
         mesh = remeshed(
             mesh,
@@ -296,7 +297,13 @@ def _surface(
     shown, median = median_residual(mesh, views, rows, tolerances)
     row_sigma = shown.direct
     fitted = fit_normals(mesh, views, rows, row_sigma=row_sigma)
-    normals = sided_normals(mesh, fitted.normals, fitted.is_fitted)
+    facing, is_wall = fitted.normals, np.zeros(len(mesh.faces), np.bool_)
+    if carvings:
+        to_uncarved = RayScene(uncarved).signed_distance(mesh.centers, num_rays=1)
+        facing, is_wall = wall_normals(
+            mesh, fitted.normals, fitted.is_fitted, carvings, np.abs(to_uncarved)
+        )
+    normals = sided_normals(mesh, facing, fitted.is_fitted | is_wall)
     mesh = sharpened(mesh, normals)
     moved = sharpened(
         settled(mesh, views, rows, hull.footprint, shown, known=known, tolerances=tolerances),
