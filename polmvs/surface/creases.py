@@ -88,6 +88,28 @@ def sided_normals(
     return normals
 
 
+def sides_known(
+    mesh: TriangleMesh, normals: Array, is_known: Mask, tolerances: CreaseTolerances | None = None
+) -> Mask:
+    """Which faces ``(F,)`` belong to a side of which some face near them is known.
+
+    Parameters
+    ----------
+    mesh : with F faces.
+    normals : (F, 3) unit, as of :func:`sided_normals`.
+    is_known : (F,) bool, faces whose normals something shows.
+    """
+    tol = tolerances or CreaseTolerances()
+    one, other = sparse.csr_array(mesh.incidence @ mesh.incidence.T).tocoo().coords
+    alike = (normals[one] * normals[other]).sum(axis=1) > np.cos(np.radians(tol.crease_deg))
+    one, other = one[alike], other[alike]
+    for _ in range(2):  # rings of triangles over which an edge is rounded
+        near = one[is_known[other]]
+        is_known = is_known.copy()
+        is_known[near] = True
+    return is_known
+
+
 def wall_normals(
     mesh: TriangleMesh,
     normals: Array,

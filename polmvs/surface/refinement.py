@@ -29,8 +29,8 @@ from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, phase_rows
 
 logger = logging.getLogger(__name__)
 
-# Until a mesh made anew, which shrinks by some tenths of a pixel, or a sharpened one is at rest.
-SETTLING_STEPS = 2
+SETTLING_STEPS = 2  # until a mesh made anew, which shrinks by some tenths of a pixel, is at rest
+RIM_HALVINGS = 4  # of a pixel, in which a mesh's outline is looked for: to a sixteenth
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -473,33 +473,40 @@ def _refined_at(
     return _State(mesh, tilt_share, shown)
 
 
-def settled(
+def settling_step(
     mesh: TriangleMesh,
     views: Sequence[SurfaceView],
     angle_model: AngleModel,
     footprint: float,
     row_sigma: RowSigma,
     *,
+    is_shown: Mask,
     known: KnownPoints | None = None,
     tolerances: RefinementTolerances | None = None,
-) -> TriangleMesh:
-    """A mesh with sharp edges, moved a little to where outlines, points and phases have it.
-
-    While its edges were round, outlines drew its faces outwards by what the edges lacked: 0.4 px,
-    measured on analytic boxes, whose Chamfer distance halves.
+) -> tuple[TriangleMesh, bool]:
+    """A mesh with sharp edges, one step nearer to where outlines, points and phases have it.
 
     Parameters
     ----------
     mesh : sharpened; its triangles stay.
     views, angle_model, footprint, known, tolerances : as in :func:`refine`.
     row_sigma : deviations of the rows, as :func:`median_residual` finds them.
+    is_shown : (F,) bool, faces of sides whose normal is known: outlines between others, which are
+        still round, do not count.
+
+    Returns
+    -------
+    The mesh, and whether it was at rest.
     """
     tol = tolerances or RefinementTolerances()
     level, edge = replace(tol.levels[-1], with_slope=False), mesh.mean_edge
-    for _ in range(SETTLING_STEPS):
-        energy = _energy(mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol)
-        mesh, _ = _step(mesh, energy, edge, tol)
-    return mesh
+    energy = _energy(
+        mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol, is_shown=is_shown
+    )
+    moved, displacement = _step(mesh, energy, edge, tol)
+    # In the median: the vertices of an edge are rounded and sharpened in turn.
+    free = np.abs(displacement[energy.free])
+    return moved, not len(free) or float(np.median(free)) < tol.converged * edge
 
 
 def certain_rays(view: SurfaceView, stride_px: int) -> Array:
@@ -605,8 +612,11 @@ def _energy(
     known: KnownPoints | None,
     row_sigma: RowSigma,
     tol: RefinementTolerances,
+    is_shown: Mask | None = None,
 ) -> _Energy:
     scene, edges = RayScene(mesh), shared_edges(mesh)
+    if is_shown is not None:
+        edges = edges.only(np.all(is_shown[edges.faces], axis=1))
 
     def look_at(view: SurfaceView) -> tuple[_RimRows | None, FaceRows]:
         rim = _rim_rows(mesh, scene, view, edges, level) if view.has_outline else None
@@ -957,6 +967,10 @@ class SharedEdges:
     ends: Indices
     faces: Indices
 
+    def only(self, kept: Mask) -> SharedEdges:
+        """The ``kept`` (E,) of them."""
+        return SharedEdges(self.ends[kept], self.faces[kept])
+
 
 def shared_edges(mesh: TriangleMesh) -> SharedEdges:
     """All edges that two faces share."""
@@ -976,8 +990,8 @@ class Rim:
 
     Attributes
     ----------
-    ends : (K, 2) vertices; the points lie in the middle between them.
-    xy : (K, 2) image coordinates.
+    ends : (K, 2) vertices; the points lie at the middle between them.
+    xy : (K, 2) image coordinates, on the outline.
     length_px : (K,) of the outline that each stands for.
     """
 
@@ -1011,7 +1025,15 @@ def find_rim(mesh: TriangleMesh, scene: RayScene, view: SurfaceView, edges: Shar
     before = scene.cast(view.center, away - 1.0 * pixel[:, None] * outwards).distance
     slack = 4 * mesh.mean_edge / distance[:, 0]
     rim = ~np.isfinite(beyond) & (np.abs(before - 1) < slack)
-    return Rim(ends[rim], xy[rim], length[rim])
+    # Edges wander to and fro about the outline; their middles lie within it, never beyond.
+    away, step = away[rim], (pixel[:, None] * outwards)[rim]
+    low, high = np.zeros(len(away)), np.ones(len(away))
+    for _ in range(RIM_HALVINGS):
+        middle = 0.5 * (low + high)
+        met = np.isfinite(scene.cast(view.center, away + middle[:, None] * step).distance)
+        low, high = np.where(met, middle, low), np.where(met, high, middle)
+    xy, _ = view.project(view.center + away + (0.5 * (low + high))[:, None] * step)
+    return Rim(ends[rim], xy, length[rim])
 
 
 def rim_residuals(view: SurfaceView, xy: Array) -> tuple[Array, Array]:
