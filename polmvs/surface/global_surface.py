@@ -318,7 +318,7 @@ def _surface(
     mesh = sharpened(mesh, normals)
     start = mesh
     for _ in range(SHARP_STEPS):
-        moved, is_at_rest = settling_step(
+        mesh, is_at_rest = settling_step(
             mesh,
             views,
             rows,
@@ -328,12 +328,12 @@ def _surface(
             known=known,
             tolerances=tolerances,
         )
-        if is_at_rest:
-            break
-        mesh = sharpened(moved, normals)
+        mesh = sharpened(mesh, normals)
         # Where outlines are wrong (a glossy table) and points many, these had it better.
         if points_deny(mesh, start, known, hull.footprint):
             mesh = start
+            break
+        if is_at_rest:
             break
     given.report(1)
     evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
