@@ -51,6 +51,9 @@ class Level:
     with_slope : count how a row changes as its place moves through the phase image (see
         :func:`_add_phases`) if the views are then clearly explained better: levels go both ways
         until one is better without, and the last of several goes the way of the one before.
+    on_outline : hold the mesh's very outline against the silhouettes, and not the middles of its
+        edges, which wander to and fro about it and lie some tenths of a pixel within. A coarse
+        mesh cannot follow.
     """
 
     edge_px: float
@@ -58,6 +61,7 @@ class Level:
     loss_scale: float
     rim_gate_px: float
     with_slope: bool = True
+    on_outline: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +116,7 @@ class RefinementTolerances:
     levels: tuple[Level, ...] = (
         Level(edge_px=6.0, num_steps=18, loss_scale=12.0, rim_gate_px=25.0),
         Level(edge_px=3.0, num_steps=4, loss_scale=6.0, rim_gate_px=8.0),
-        Level(edge_px=2.0, num_steps=3, loss_scale=4.0, rim_gate_px=4.0),
+        Level(edge_px=2.0, num_steps=3, loss_scale=4.0, rim_gate_px=4.0, on_outline=True),
     )
     thin_levels: tuple[Level, ...] = (
         Level(edge_px=3.0, num_steps=60, loss_scale=12.0, rim_gate_px=25.0),
@@ -499,7 +503,8 @@ def settling_step(
     The mesh, and whether it was at rest.
     """
     tol = tolerances or RefinementTolerances()
-    level, edge = replace(tol.levels[-1], with_slope=False), mesh.mean_edge
+    level = replace(tol.levels[-1], with_slope=False, on_outline=True)
+    edge = mesh.mean_edge
     energy = _energy(
         mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol, is_shown=is_shown
     )
@@ -990,8 +995,8 @@ class Rim:
 
     Attributes
     ----------
-    ends : (K, 2) vertices; the points lie at the middle between them.
-    xy : (K, 2) image coordinates, on the outline.
+    ends : (K, 2) vertices; the points lie in the middle between them.
+    xy : (K, 2) image coordinates of the points, or of the mesh's outline beside them.
     length_px : (K,) of the outline that each stands for.
     """
 
@@ -1000,8 +1005,18 @@ class Rim:
     length_px: Array
 
 
-def find_rim(mesh: TriangleMesh, scene: RayScene, view: SurfaceView, edges: SharedEdges) -> Rim:
-    """The outline of a mesh in a view: edges between faces to and fro with nothing behind them."""
+def find_rim(
+    mesh: TriangleMesh,
+    scene: RayScene,
+    view: SurfaceView,
+    edges: SharedEdges,
+    *,
+    on_outline: bool = False,
+) -> Rim:
+    """The outline of a mesh in a view: edges between faces to and fro with nothing behind them.
+
+    With ``on_outline`` each point is moved outwards to where rays begin to pass the mesh.
+    """
     towards = view.center - mesh.centers
     front = dots(towards, mesh.face_normals) > 0
     turning = front[edges.faces[:, 0]] != front[edges.faces[:, 1]]
@@ -1025,7 +1040,8 @@ def find_rim(mesh: TriangleMesh, scene: RayScene, view: SurfaceView, edges: Shar
     before = scene.cast(view.center, away - 1.0 * pixel[:, None] * outwards).distance
     slack = 4 * mesh.mean_edge / distance[:, 0]
     rim = ~np.isfinite(beyond) & (np.abs(before - 1) < slack)
-    # Edges wander to and fro about the outline; their middles lie within it, never beyond.
+    if not on_outline:
+        return Rim(ends[rim], xy[rim], length[rim])
     away, step = away[rim], (pixel[:, None] * outwards)[rim]
     low, high = np.zeros(len(away)), np.ones(len(away))
     for _ in range(RIM_HALVINGS):
@@ -1062,7 +1078,7 @@ class _RimRows:
 def _rim_rows(
     mesh: TriangleMesh, scene: RayScene, view: SurfaceView, edges: SharedEdges, level: Level
 ) -> _RimRows:
-    rim = find_rim(mesh, scene, view, edges)
+    rim = find_rim(mesh, scene, view, edges, on_outline=level.on_outline)
     residual, gradient = rim_residuals(view, rim.xy)
     near = np.abs(residual) < level.rim_gate_px
     ends, residual, gradient = rim.ends[near], residual[near], gradient[near]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from polmvs.surface.creases import sharpened, sided_normals, wall_normals
+from polmvs.surface.creases import sharpened, sided_normals, sides_known, wall_normals
 from polmvs.surface.mesh_geometry import RayScene, mesh_from_grid, remeshed
 
 STEP, HALF = 0.08, 1.9
@@ -104,3 +104,18 @@ def test_sides_that_were_not_carved_keep_their_normals(meshes):
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     beside = ((x > 0.99) & (z < -0.2)) | ((z > 0.99) & (x < -0.2))
     assert not of_walls(meshes, tilted, np.ones(len(normals), bool))[1][beside].any()
+
+
+def test_a_side_is_known_up_to_its_edges_and_no_farther(meshes):
+    _, mesh = meshes
+    normals = true_normals(mesh)
+    local = mesh.centers @ TURN
+    top = (local[:, 2] > 0.98) & (normals @ TURN[:, 2] > 0.5)
+    inside = 1 - np.maximum(np.abs(local[:, 1]), -local[:, 0])  # of the nearest edge of the top
+    fitted = top & (inside > 1.5 * mesh.mean_edge)
+    known = sides_known(mesh, normals, fitted)
+    assert not known[normals @ TURN[:, 2] < 0.5].any()
+    beside = top & (inside < 0.5 * mesh.mean_edge) & (local[:, 0] < -0.2)
+    assert beside.sum() > 20
+    assert known[beside].mean() > 0.9
+    assert not sides_known(mesh, normals, np.zeros(len(normals), bool)).any()

@@ -114,6 +114,32 @@ def test_the_rim_is_the_outline_of_the_mesh(ball):
     assert 0.8 < rim.length_px.sum() / (2 * np.pi * expected) < 2.5
 
 
+def test_rim_points_lie_on_the_outline_not_within_it():
+    """Middles of edges that wander about a rough outline lie within it."""
+    view, mesh = views_of(sphere())[0], extracted(sphere(), step=0.2)
+    rng = np.random.default_rng(0)
+    rough = mesh.moved(0.03 * rng.standard_normal((len(mesh.vertices), 1)) * mesh.vertices)
+    scene, edges = RayScene(rough), shared_edges(rough)
+    center, _ = view.project(np.zeros((1, 3)))
+
+    def beyond_px(xy):
+        """How far outwards, at least, nothing of the mesh is met."""
+        outwards = (xy - center) / np.linalg.norm(xy - center, axis=1, keepdims=True)
+        reach = np.arange(-1.5, 1.6, 0.05)
+        places = (xy[:, None] + reach[:, None] * outwards[:, None]).reshape(-1, 2)
+        rays = view.view.rays_in_world(places)
+        met = np.isfinite(scene.cast(view.center, rays).distance).reshape(-1, len(reach))
+        return np.where(
+            met.any(axis=1), reach[len(reach) - 1 - met[:, ::-1].argmax(axis=1)], np.nan
+        )
+
+    within = beyond_px(find_rim(rough, scene, view, edges).xy)
+    on = beyond_px(find_rim(rough, scene, view, edges, on_outline=True).xy)
+    assert np.nanmedian(within) > 0.1
+    assert abs(np.nanmedian(on)) < 0.07  # a sixteenth of a pixel
+    assert np.nanmean(np.abs(on)) < 0.5 * np.nanmean(np.abs(within))
+
+
 def test_every_inner_edge_is_shared_once():
     mesh = extracted(sphere(), step=0.2)
     edges = shared_edges(mesh)
