@@ -51,9 +51,10 @@ class Level:
     with_slope : count how a row changes as its place moves through the phase image (see
         :func:`_add_phases`) if the views are then clearly explained better: levels go both ways
         until one is better without, and the last of several goes the way of the one before.
-    on_outline : hold the mesh's very outline against the silhouettes, and not the middles of its
-        edges, which wander to and fro about it and lie some tenths of a pixel within. A coarse
-        mesh cannot follow.
+    on_outline : hold the very outline of a sharp mesh against the silhouettes, and not the middles
+        of edges, which wander to and fro about it and lie some tenths of a pixel within. Measured:
+        so for the last level of refinement too, whose mesh is round, normals of `board` err by
+        0.32 and not 0.24 deg, those of a bolt by 2.05 and not 2.15.
     """
 
     edge_px: float
@@ -116,7 +117,7 @@ class RefinementTolerances:
     levels: tuple[Level, ...] = (
         Level(edge_px=6.0, num_steps=18, loss_scale=12.0, rim_gate_px=25.0),
         Level(edge_px=3.0, num_steps=4, loss_scale=6.0, rim_gate_px=8.0),
-        Level(edge_px=2.0, num_steps=3, loss_scale=4.0, rim_gate_px=4.0, on_outline=True),
+        Level(edge_px=2.0, num_steps=3, loss_scale=4.0, rim_gate_px=4.0),
     )
     thin_levels: tuple[Level, ...] = (
         Level(edge_px=3.0, num_steps=60, loss_scale=12.0, rim_gate_px=25.0),

@@ -115,7 +115,7 @@ def test_a_side_is_known_up_to_its_edges_and_no_farther(meshes):
     fitted = top & (inside > 1.5 * mesh.mean_edge)
     known = sides_known(mesh, normals, fitted)
     assert not known[normals @ TURN[:, 2] < 0.5].any()
-    beside = top & (inside < 0.5 * mesh.mean_edge) & (local[:, 0] < -0.2)
+    beside = top & (inside < 1.5 * mesh.mean_edge) & (local[:, 0] < -0.2)
     assert beside.sum() > 20
     assert known[beside].mean() > 0.9
     assert not sides_known(mesh, normals, np.zeros(len(normals), bool)).any()
