@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, default_num_workers
+from polmvs.geometry import lengths
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.polarization.phase_map import PhaseMap
@@ -308,17 +309,16 @@ def _surface(
     fitted = fit_normals(mesh, views, rows, row_sigma=row_sigma)
     facing, is_wall = fitted.normals, np.zeros(len(mesh.faces), np.bool_)
     if carvings:
-        to_uncarved = RayScene(uncarved).signed_distance(mesh.centers, num_rays=1)
+        to_uncarved = lengths(RayScene(uncarved).closest(mesh.centers)[0] - mesh.centers)
         facing, is_wall = wall_normals(
-            mesh, fitted.normals, fitted.is_fitted, carvings, np.abs(to_uncarved)
+            mesh, fitted.normals, fitted.is_fitted, carvings, to_uncarved
         )
     is_known = fitted.is_fitted | is_wall
     normals = sided_normals(mesh, facing, is_known)
     is_shown = sides_known(mesh, normals, is_known)
-    mesh = sharpened(mesh, normals)
-    start = mesh
-    for _ in range(SHARP_STEPS):
-        mesh, is_at_rest = settling_step(
+
+    def settle(mesh: TriangleMesh) -> tuple[TriangleMesh, bool]:
+        return settling_step(
             mesh,
             views,
             rows,
@@ -328,13 +328,8 @@ def _surface(
             known=known,
             tolerances=tolerances,
         )
-        mesh = sharpened(mesh, normals)
-        # Where outlines are wrong (a glossy table) and points many, these had it better.
-        if points_deny(mesh, start, known, hull.footprint):
-            mesh = start
-            break
-        if is_at_rest:
-            break
+
+    mesh = _at_rest(sharpened(mesh, normals), normals, settle, known, hull.footprint)
     given.report(1)
     evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
     supported = supported_faces(mesh, evidence, min_views=given.min_views)
@@ -364,6 +359,24 @@ def _surface(
         tilt_share=refined.tilt_share,
     )
     return surface, meshes
+
+
+def _at_rest(
+    sharp: TriangleMesh,
+    normals: Array,
+    settle: Callable[[TriangleMesh], tuple[TriangleMesh, bool]],
+    known: KnownPoints,
+    footprint: float,
+) -> TriangleMesh:
+    """A sharpened mesh, moved by steps until it is at rest, unless known points deny them."""
+    mesh, is_at_rest, steps_left = sharp, False, SHARP_STEPS
+    while not is_at_rest and steps_left:
+        mesh, is_at_rest = settle(mesh)
+        mesh, steps_left = sharpened(mesh, normals), steps_left - 1
+        # Where outlines are wrong (a glossy table) and points many, these had it better.
+        if points_deny(mesh, sharp, known, footprint):
+            return sharp
+    return mesh
 
 
 def _hollows(given: _Given, mesh: TriangleMesh, footprint: float) -> tuple[Hollow, ...]:
