@@ -102,7 +102,6 @@ def test_the_faces_of_a_box_are_not_drawn_outwards_by_its_edges():
     inner = np.sort(beyond, axis=1)[:, 1] < -3 * FOOTPRINT
     for axis in range(3):
         offset = beyond[inner & (side == axis), axis] / FOOTPRINT
-        print("OFF", axis, np.median(offset))
         assert abs(np.median(offset)) < 0.2, axis
 
 
