@@ -82,8 +82,8 @@ def test_a_dark_wall_keeps_its_own_phase_beside_a_bright_face():
     assert np.abs(found[:, :17]).max() < 0.01
 
 
-def test_noisy_pixels_count_less():
-    """Dark pixels of mere noise do not turn the phase of those that tell."""
+def test_noise_of_dark_pixels_is_stated():
+    """Dark pixels of mere noise turn the phase by no more than what is stated."""
     rng = np.random.default_rng(5)
     everywhere = np.ones((HEIGHT, WIDTH), bool)
     dark = rng.random(everywhere.shape) < 0.4
@@ -93,9 +93,9 @@ def test_noisy_pixels_count_less():
     s2 = sigma * rng.standard_normal(s0.shape)
     phase_map = build(s0, s1, s2, np.full_like(s0, sigma), everywhere, model_sigma=0.0)
     turn = 0.5 * np.arctan2(phase_map.samples[..., 1], phase_map.samples[..., 0])
-    # Of some 8 pixels that tell, each with a deviation of 0.02 rad.
-    assert np.std(turn[5:-5, 5:-5]) < 0.02
-    assert np.std(turn * np.sqrt(phase_map.samples[..., 2])) < 1.1
+    shares = turn * np.sqrt(phase_map.samples[..., 2])
+    # Of 1,140 correlated values, a ninth or so independent; what is stated is no wider than a third.
+    assert 0.7 < np.std(shares[5:-5, 5:-5]) < 1.1
 
 
 def test_no_light_gives_no_phase():
