@@ -187,12 +187,13 @@ def _outline_shift(
     contrast = slope * 2 * step * 2.5 / np.maximum(profile.max(axis=1, keepdims=True), 1e-6)
     score = contrast * np.exp(-0.5 * (along / (tol.edge_prior_px * max(scale, 1.0))) ** 2)
     score[:, np.abs(along) > reach] = 0
-    best = score.argmax(axis=1)
-    index = np.arange(len(best))
+    best, index = score.argmax(axis=1), np.arange(len(score))
+    # The border only chooses among steps: their places are their own.
+    for _ in range(round(1 / step)):
+        beside = np.stack([contrast[index, best + side] for side in (-1, 0, 1)])
+        best = np.clip(best + beside.argmax(axis=0) - 1, 1, len(along) - 2)
     found = along[best] + step * _vertex_of_parabola(
-        score[index, best - 1],
-        score[index, best],
-        score[index, np.minimum(best + 1, len(along) - 1)],
+        *(contrast[index, best + side] for side in (-1, 0, 1))
     )
     weight = np.clip(contrast[index, best] / tol.edge_contrast - 1, 0, 1)
     shifts, weights = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
