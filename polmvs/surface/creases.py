@@ -110,6 +110,27 @@ def sides_known(
     return is_known
 
 
+def crease_vertices(
+    mesh: TriangleMesh, is_shown: Mask, tolerances: CreaseTolerances | None = None
+) -> Mask:
+    """Which vertices ``(V,)`` of a sharpened mesh lie on an edge between sides that are known.
+
+    Parameters
+    ----------
+    mesh : with V vertices and F faces.
+    is_shown : (F,) bool, faces of sides that are known.
+    """
+    tol = tolerances or CreaseTolerances()
+    corner = mesh.faces.ravel()
+    apart = dots(mesh.vertex_normals[corner], np.repeat(mesh.face_normals, 3, axis=0))
+    # Two sides are turned from their mean by half of what they are from each other.
+    turned = apart < np.cos(np.radians(0.5 * tol.crease_deg))
+    found = np.zeros(len(mesh.vertices), np.bool_)
+    found[corner[turned]] = True
+    found[mesh.faces[~is_shown]] = False
+    return found
+
+
 def wall_normals(
     mesh: TriangleMesh,
     normals: Array,

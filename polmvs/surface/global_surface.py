@@ -57,7 +57,6 @@ from polmvs.surface.surface_quality import (
     find_contradictions,
     fit_normals,
     point_offset,
-    points_deny,
     supported_faces,
 )
 from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, surface_view
@@ -329,7 +328,7 @@ def _surface(
             tolerances=tolerances,
         )
 
-    mesh = _at_rest(sharpened(mesh, normals), normals, settle, known, hull.footprint)
+    mesh = _at_rest(sharpened(mesh, normals), normals, settle)
     given.report(1)
     evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
     supported = supported_faces(mesh, evidence, min_views=given.min_views)
@@ -362,20 +361,15 @@ def _surface(
 
 
 def _at_rest(
-    sharp: TriangleMesh,
+    mesh: TriangleMesh,
     normals: Array,
     settle: Callable[[TriangleMesh], tuple[TriangleMesh, bool]],
-    known: KnownPoints,
-    footprint: float,
 ) -> TriangleMesh:
-    """A sharpened mesh, moved by steps until it is at rest, unless known points deny them."""
-    mesh, is_at_rest, steps_left = sharp, False, SHARP_STEPS
+    """A sharpened mesh, moved by steps and sharpened again until it is at rest."""
+    is_at_rest, steps_left = False, SHARP_STEPS
     while not is_at_rest and steps_left:
         mesh, is_at_rest = settle(mesh)
         mesh, steps_left = sharpened(mesh, normals), steps_left - 1
-        # Where outlines are wrong (a glossy table) and points many, these had it better.
-        if points_deny(mesh, sharp, known, footprint):
-            return sharp
     return mesh
 
 

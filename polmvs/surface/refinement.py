@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,14 @@ from polmvs.config import AngleModel, default_num_workers
 from polmvs.fitting import CAUCHY_SCALE, annealed_scales, robust_deviation
 from polmvs.geometry import dots, lengths
 from polmvs.normals.estimator import smallest_eigenvectors
+from polmvs.surface.creases import CreaseTolerances, crease_vertices
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, visible_points
 from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, phase_rows
 
 logger = logging.getLogger(__name__)
 
 SETTLING_STEPS = 2  # until a mesh made anew, which shrinks by some tenths of a pixel, is at rest
+EDGE_NOISE = 0.1  # of the sines of normals beside an edge: half of what parts its sides
 RIM_HALVINGS = 4  # of a pixel, in which a mesh's outline is looked for: to a sixteenth
 
 Array = NDArray[np.float64]
@@ -303,6 +305,11 @@ class FaceRows:
     tilt: Array
     is_mirrored: Mask
 
+    def only(self, kept: Mask) -> FaceRows:
+        """The ``kept`` (K,) of them."""
+        names = [own.name for own in fields(self)]
+        return FaceRows(**{name: getattr(self, name)[kept] for name in names})
+
 
 def face_rows(
     mesh: TriangleMesh,
@@ -496,8 +503,8 @@ def settling_step(
     mesh : sharpened; its triangles stay.
     views, angle_model, footprint, known, tolerances : as in :func:`refine`.
     row_sigma : deviations of the rows, as :func:`median_residual` finds them.
-    is_shown : (F,) bool, faces of sides whose normal is known: outlines between others, which are
-        still round, do not count.
+    is_shown : (F,) bool, faces of sides whose normal is known: edges between others are still
+        round. Their outlines do not count, and smoothness holds them.
 
     Returns
     -------
@@ -510,8 +517,7 @@ def settling_step(
         mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol, is_shown=is_shown
     )
     moved, displacement = _step(mesh, energy, edge, tol)
-    # In the median: the vertices of an edge are rounded and sharpened in turn.
-    free = np.abs(displacement[energy.free])
+    free = np.abs(displacement[energy.free & ~energy.sharp])
     return moved, not len(free) or float(np.median(free)) < tol.converged * edge
 
 
@@ -595,6 +601,7 @@ class _Energy:
     pull: Array
     smooth_factor: sparse.csr_array
     free: Mask
+    sharp: Mask
 
     def matrix(self) -> sparse.csr_array:
         """Of all parts ``(V, V)``, without damping."""
@@ -621,12 +628,18 @@ def _energy(
     is_shown: Mask | None = None,
 ) -> _Energy:
     scene, edges = RayScene(mesh), shared_edges(mesh)
+    sharp = np.zeros(len(mesh.vertices), np.bool_)
     if is_shown is not None:
         edges = edges.only(np.all(is_shown[edges.faces], axis=1))
+        sharp = crease_vertices(mesh, is_shown)
+    # Edges go where their sides meet: the faces there say nothing of the sides beside them.
+    flat = ~np.any(sharp[mesh.faces], axis=1)
 
     def look_at(view: SurfaceView) -> tuple[_RimRows | None, FaceRows]:
-        rim = _rim_rows(mesh, scene, view, edges, level) if view.has_outline else None
-        return rim, face_rows(mesh, scene, view, angle_model, row_sigma, tol)
+        outlined = view.has_outline
+        rim = _rim_rows(mesh, scene, view, edges, level, sharp) if outlined else None
+        rows = face_rows(mesh, scene, view, angle_model, row_sigma, tol)
+        return rim, rows.only(flat[rows.face])
 
     # Threads, for products of large arrays and the casting of rays let go of Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
@@ -663,10 +676,10 @@ def _energy(
     if known is not None and len(known.points) and everything.is_seen.any():
         weight = tol.point_weight(len(views))
         _add_points(points, mesh, everything.is_seen, known, weight, footprint, level, tol)
-    smooth, pull, factor = _smoothness(mesh, edge, tol)
+    smooth, pull, factor = _smoothness(mesh, edge, tol, sharp)
     free = np.zeros(len(mesh.vertices), np.bool_)
     free[mesh.faces[everything.is_seen]] = True
-    return _Energy(everything, of_views, points, smooth, pull, factor, free)
+    return _Energy(everything, of_views, points, smooth, pull, factor, free, sharp)
 
 
 def _step(
@@ -677,7 +690,8 @@ def _step(
     shared = energy.views.tilt.column()
     displacement = -solve(energy.matrix(), energy.gradient(), 1 / damping**2, shared)
     displacement = np.clip(np.nan_to_num(displacement), -edge, edge)
-    return mesh.moved(displacement[:, None] * mesh.vertex_normals), displacement
+    moves = displacement[:, None] * mesh.vertex_normals
+    return mesh.moved(_with_edges(mesh, moves, energy.sharp)), displacement
 
 
 def place_deviations(
@@ -997,11 +1011,13 @@ class Rim:
     Attributes
     ----------
     ends : (K, 2) vertices; the points lie in the middle between them.
+    faces : (K, 2) that share these edges.
     xy : (K, 2) image coordinates of the points, or of the mesh's outline beside them.
     length_px : (K,) of the outline that each stands for.
     """
 
     ends: Indices
+    faces: Indices
     xy: Array
     length_px: Array
 
@@ -1021,7 +1037,7 @@ def find_rim(
     towards = view.center - mesh.centers
     front = dots(towards, mesh.face_normals) > 0
     turning = front[edges.faces[:, 0]] != front[edges.faces[:, 1]]
-    ends = edges.ends[turning]
+    ends, faces = edges.ends[turning], edges.faces[turning]
     middle = 0.5 * (mesh.vertices[ends[:, 0]] + mesh.vertices[ends[:, 1]])
     xy, z = view.project(middle)
     start, _ = view.project(mesh.vertices[ends[:, 0]])
@@ -1029,7 +1045,7 @@ def find_rim(
     length = lengths(stop - start)
     pixel = np.abs(z) / view.view.camera.mean_focal_px
     kept = view.in_image(xy, 3.0) & (z > 0) & np.isfinite(length)
-    ends = ends[kept]
+    ends, faces = ends[kept], faces[kept]
     middle, xy, length, pixel = (a[kept] for a in (middle, xy, length, pixel))
     outwards = mesh.vertex_normals[ends].sum(axis=1)
     away = middle - view.center
@@ -1042,7 +1058,7 @@ def find_rim(
     slack = 4 * mesh.mean_edge / distance[:, 0]
     rim = ~np.isfinite(beyond) & (np.abs(before - 1) < slack)
     if not on_outline:
-        return Rim(ends[rim], xy[rim], length[rim])
+        return Rim(ends[rim], faces[rim], xy[rim], length[rim])
     away, step = away[rim], (pixel[:, None] * outwards)[rim]
     low, high = np.zeros(len(away)), np.ones(len(away))
     for _ in range(RIM_HALVINGS):
@@ -1050,7 +1066,7 @@ def find_rim(
         met = np.isfinite(scene.cast(view.center, away + middle[:, None] * step).distance)
         low, high = np.where(met, middle, low), np.where(met, high, middle)
     xy, _ = view.project(view.center + away + (0.5 * (low + high))[:, None] * step)
-    return Rim(ends[rim], xy, length[rim])
+    return Rim(ends[rim], faces[rim], xy, length[rim])
 
 
 def rim_residuals(view: SurfaceView, xy: Array) -> tuple[Array, Array]:
@@ -1077,23 +1093,71 @@ class _RimRows:
 
 
 def _rim_rows(
-    mesh: TriangleMesh, scene: RayScene, view: SurfaceView, edges: SharedEdges, level: Level
+    mesh: TriangleMesh,
+    scene: RayScene,
+    view: SurfaceView,
+    edges: SharedEdges,
+    level: Level,
+    sharp: Mask,
 ) -> _RimRows:
     rim = find_rim(mesh, scene, view, edges, on_outline=level.on_outline)
     residual, gradient = rim_residuals(view, rim.xy)
     near = np.abs(residual) < level.rim_gate_px
     ends, residual, gradient = rim.ends[near], residual[near], gradient[near]
-    # Both ends move the point by half of their own displacements.
+    vertices, directions = _rim_moves(mesh, ends, rim.faces[near], sharp)
     jacobian = np.zeros((len(ends), 3))
     middle = mesh.vertices[ends].mean(axis=1)
     reach = 1e-3 * mesh.mean_edge
     for column in (0, 1):
-        step = reach * mesh.vertex_normals[ends[:, column]]
-        ahead, _ = view.project(middle + step)
-        behind, _ = view.project(middle - step)
-        jacobian[:, column] = 0.5 * dots(gradient, ahead - behind) / (2 * reach)
-    vertices = np.column_stack([ends, ends[:, 0]])
+        ahead, _ = view.project(middle + reach * directions[:, column])
+        behind, _ = view.project(middle - reach * directions[:, column])
+        jacobian[:, column] = dots(gradient, ahead - behind) / (2 * reach)
+    vertices = np.column_stack([vertices, vertices[:, 0]])
     return _RimRows(vertices, np.nan_to_num(jacobian), residual, rim.length_px[near])
+
+
+def _rim_moves(
+    mesh: TriangleMesh, ends: Indices, faces: Indices, sharp: Mask
+) -> tuple[Indices, Array]:
+    """How the middles of edges move with two vertices each ``(K, 2)``: directions ``(K, 2, 3)``.
+
+    Both ends move the middle by half of their own displacements. An edge between two sides of the
+    object is where these meet: it moves with them, each along what leaves the other in its plane.
+    """
+    directions = 0.5 * mesh.vertex_normals[ends]
+    one, other = np.moveaxis(mesh.face_normals[faces], 1, 0)
+    cosine = dots(one, other)
+    meets = np.all(sharp[ends], axis=1) & (cosine < np.cos(np.radians(CreaseTolerances.crease_deg)))
+    opposite = mesh.faces[faces].sum(axis=2) - ends.sum(axis=1, keepdims=True)
+    dual = np.stack([one - cosine[:, None] * other, other - cosine[:, None] * one], axis=1)
+    dual /= np.maximum(1 - cosine**2, 1e-9)[:, None, None]
+    # A side of one row of triangles has no vertex but those of its edges.
+    along = dots(mesh.vertex_normals[opposite], mesh.face_normals[faces]) * ~sharp[opposite]
+    directions[meets] = (dual * along[..., None])[meets]
+    return np.where(meets[:, None], opposite, ends), directions
+
+
+def _with_edges(mesh: TriangleMesh, moves: Array, sharp: Mask) -> Array:
+    """Moves ``(V, 3)`` of vertices, those of ``sharp`` ones (V,) such that their sides meet there.
+
+    A side moves as those of its vertices do that lie on no edge.
+    """
+    free = ~sharp[mesh.faces]
+    touching = np.flatnonzero(~free.all(axis=1) & free.any(axis=1))
+    corners, free, normals = mesh.faces[touching], free[touching], mesh.face_normals[touching]
+    along = dots(moves[corners], normals[:, None]) * free
+    height = along.sum(axis=1) / free.sum(axis=1)
+    area = mesh.face_areas[touching]
+    squares = (area[:, None, None] * normals[:, :, None] * normals[:, None, :]).reshape(-1, 9)
+    incidence = mesh.incidence[touching].T
+    matrix = (incidence @ squares).reshape(-1, 3, 3)
+    right = incidence @ ((area * height)[:, None] * normals)
+    total = np.maximum(np.trace(matrix, axis1=1, axis2=2), 1e-300)
+    # Along an edge, where only noise turns the normals, nothing moves.
+    matrix += EDGE_NOISE**2 * total[:, None, None] * np.eye(3)
+    moved = moves.copy()
+    moved[sharp] = np.linalg.solve(matrix[sharp], right[sharp][..., None])[..., 0]
+    return moved
 
 
 def _rim_sigma(residuals: Array, tol: RefinementTolerances) -> float:
@@ -1153,12 +1217,16 @@ def _add_points(
 
 
 def _smoothness(
-    mesh: TriangleMesh, edge: float, tol: RefinementTolerances
+    mesh: TriangleMesh, edge: float, tol: RefinementTolerances, sharp: Mask
 ) -> tuple[sparse.csr_array, Array, sparse.csr_array]:
-    """Curvature free of scale, drawn to most of its own surroundings' mean."""
+    """Curvature free of scale, drawn to most of its own surroundings' mean.
+
+    That of ``sharp`` (V,) vertices is what it is: to smooth an edge draws the faces beside it in.
+    """
     normals = mesh.vertex_normals
     laplacian = sparse.eye_array(len(mesh.vertices)) - mesh.neighbor_mean
     curvature = dots(laplacian @ mesh.vertices, normals) / edge
+    curvature[sharp] = 0.0
     target = tol.smoothness_memory * (mesh.neighbor_mean @ (mesh.neighbor_mean @ curvature))
     entries = laplacian.tocoo()
     rows, cols = entries.coords
@@ -1166,6 +1234,7 @@ def _smoothness(
     change = sparse.coo_array((data, (rows, cols)), shape=laplacian.shape).tocsr()
     residual = curvature - target
     weight = 1 / (1 + (residual / (5 * tol.smoothness)) ** 2) ** 2 / tol.smoothness**2
+    weight[sharp] = 0.0
     factor = sparse.csr_array(change.T @ sparse.diags_array(np.sqrt(weight)))
     matrix = sparse.csr_array(factor @ factor.T)
     return matrix, np.asarray(factor @ (np.sqrt(weight) * residual)), factor

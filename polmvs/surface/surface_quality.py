@@ -351,29 +351,6 @@ def find_contradictions(
     )
 
 
-def points_deny(
-    moved: TriangleMesh, mesh: TriangleMesh, known: KnownPoints, footprint: float
-) -> bool:
-    """Whether known points lie nearer to a mesh than to the same mesh moved.
-
-    By the statistic of the signed-rank test (Wilcoxon 1945), by more than its standard error: the
-    mesh as it was is the simpler way (Breiman et al. 1984). What few points say is no objection.
-    (The test of scipy.stats takes most of a second to be imported.)
-    """
-    (far, _, on_moved), (near, _, on_mesh) = (
-        _offsets(surface, known, footprint) for surface in (moved, mesh)
-    )
-    both = on_moved & on_mesh
-    if both.sum() < MIN_POINTS:
-        return False
-    change = np.abs(far[both]) - np.abs(near[both])
-    change = change[change != 0]
-    num = len(change)
-    farther = np.flatnonzero(change[np.argsort(np.abs(change))] > 0) + 1
-    mean, variance = num * (num + 1) / 4, num * (num + 1) * (2 * num + 1) / 24
-    return bool(farther.sum() - mean > np.sqrt(variance))
-
-
 def _offsets(
     mesh: TriangleMesh, known: KnownPoints, footprint: float
 ) -> tuple[Array, NDArray[np.int64], Mask]:
