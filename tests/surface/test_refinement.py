@@ -10,6 +10,7 @@ from test_mesh_geometry import euler_number, extracted
 from polmvs.config import AngleModel
 from polmvs.polarization.angle_models import tilt_turn
 from polmvs.polarization.phase_map import view_rays
+from polmvs.surface.creases import crease_vertices, sharpened
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.refinement import (
     FaceRows,
@@ -19,12 +20,15 @@ from polmvs.surface.refinement import (
     RowSigma,
     _agreed_weights,
     _Equations,
+    _rim_moves,
     _SharedError,
+    _with_edges,
     face_rows,
     find_rim,
     normal_changes,
     place_deviations,
     refine,
+    settling_step,
     shared_edges,
     solve,
     unexplained_shares,
@@ -138,6 +142,96 @@ def test_rim_points_lie_on_the_outline_not_within_it():
     assert np.nanmedian(within) > 0.1
     assert abs(np.nanmedian(on)) < 0.07  # a sixteenth of a pixel
     assert np.nanmean(np.abs(on)) < 0.5 * np.nanmean(np.abs(within))
+
+
+HALF = np.array([0.8, 0.6, 0.5])
+
+
+def sharp_box(half=HALF, step=2 * FOOTPRINT):
+    """Triangles of a box whose sides are grids that share the vertices of their edges."""
+    vertices, faces, count = [], [], 0
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        nums = [round(2 * half[a] / step) + 1 for a in (u, v)]
+        for sign in (-1, 1):
+            grid = np.zeros((*nums, 3))
+            grid[..., axis] = sign * half[axis]
+            grid[..., u] = np.linspace(-half[u], half[u], nums[0])[:, None]
+            grid[..., v] = np.linspace(-half[v], half[v], nums[1])
+            index = count + np.arange(nums[0] * nums[1]).reshape(nums)
+            a, b, c, d = (
+                i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
+            )
+            own = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+            faces.append(own[:, ::sign])
+            vertices.append(grid.reshape(-1, 3))
+            count += nums[0] * nums[1]
+    _, first, same = np.unique(
+        np.round(np.concatenate(vertices), 9), axis=0, return_index=True, return_inverse=True
+    )
+    return TriangleMesh(np.concatenate(vertices)[first], same.ravel()[np.concatenate(faces)])
+
+
+def test_edges_go_where_their_sides_meet():
+    mesh = sharp_box()
+    sharp = crease_vertices(mesh, np.ones(len(mesh.faces), bool))
+    on_edge = (np.abs(np.abs(mesh.vertices) - HALF) < 1e-9).sum(axis=1) >= 2
+    assert np.array_equal(sharp, on_edge)
+    rise = 0.3 * FOOTPRINT
+    on_top = mesh.vertices[:, 2] > HALF[2] - 1e-9
+    moves = np.where((on_top & ~sharp)[:, None], [0, 0, rise], np.zeros(3))
+    moved = _with_edges(mesh, moves, sharp)
+    # Less by the square of `EDGE_NOISE` and what it is for each side; faces of a corner alone have
+    # no vertex that could tell how their side moves.
+    corner = (np.abs(np.abs(mesh.vertices) - HALF) < 1e-9).all(axis=1)
+    assert np.allclose(moved[on_top & ~corner, 2], rise, rtol=0.05)
+    assert np.abs(moved[~on_top]).max() < 1e-12
+    assert np.abs(moved[:, :2]).max() < 0.05 * rise
+
+
+def test_outlines_of_edges_move_with_their_sides():
+    """By what is stated, when one side moves: the top, which the walls' vertices do not."""
+    mesh, view = sharp_box(), views_of(box(), ring_of_views(1, elevations=(30.0,)))[0]
+    sharp = crease_vertices(mesh, np.ones(len(mesh.faces), bool))
+    rim = find_rim(mesh, RayScene(mesh), view, shared_edges(mesh))
+    vertices, directions = _rim_moves(mesh, rim.ends, rim.faces, sharp)
+    rise = 1e-3 * FOOTPRINT
+    top = (mesh.vertices[:, 2] > HALF[2] - 1e-9) & ~sharp
+    stated = rise * (directions * top[vertices][..., None]).sum(axis=1)
+    moves = np.where(top[:, None], [0, 0, rise], np.zeros(3))
+    actual = _with_edges(mesh, moves, sharp)[rim.ends].mean(axis=1)
+    # Where the middle of an edge of the box is; at its ends three sides meet.
+    middle = mesh.vertices[rim.ends].mean(axis=1)
+    inner = (np.abs(np.abs(middle) - HALF) < 2.5 * FOOTPRINT).sum(axis=1) < 3
+    upper = inner & (middle[:, 2] > HALF[2] - 1e-9)
+    assert upper.sum() > 10
+    assert np.allclose(stated[upper, 2], rise, rtol=0.01)
+    assert np.allclose(actual[upper, 2], rise, rtol=0.05)
+    assert np.abs(stated[inner & ~upper]).max() < 1e-9
+
+
+def test_outlines_move_walls_and_leave_a_top_that_points_hold():
+    """Walls lie 0.4 px outside; to lower the top would fit the outlines of its edges as well."""
+    views = views_of(box(HALF), ring_of_views(12, elevations=(20.0, 45.0)))
+    mesh = sharp_box(HALF + np.array([0.4, 0.4, 0.0]) * FOOTPRINT)
+    shown = np.ones(len(mesh.faces), bool)
+    normals = mesh.face_normals
+    rng = np.random.default_rng(0)
+    known = KnownPoints(
+        np.column_stack([rng.uniform(-0.5, 0.5, (40, 2)), np.full(40, HALF[2])]),
+        np.full(40, 0.4 * FOOTPRINT),
+    )
+    for _ in range(4):
+        mesh, _ = settling_step(
+            mesh, views, PPA, FOOTPRINT, RowSigma(0.01, 0.01), is_shown=shown, known=known
+        )
+        mesh = sharpened(mesh, normals)
+    beyond = (np.abs(mesh.centers) - HALF) / FOOTPRINT
+    side = np.abs(normals).argmax(axis=1)
+    seen = mesh.centers[:, 2] > -0.3
+    assert np.abs(np.median(beyond[seen & (side == 0), 0])) < 0.15
+    assert np.abs(np.median(beyond[seen & (side == 1), 1])) < 0.15
+    assert np.abs(np.median(beyond[seen & (side == 2), 2])) < 0.05
 
 
 def test_every_inner_edge_is_shared_once():

@@ -1,11 +1,12 @@
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from analytic_objects import looking_at, phase_map_of, sphere
 
 from polmvs.polarization.region import Region
-from polmvs.surface.silhouettes import find_silhouette
+from polmvs.surface.silhouettes import SilhouetteTolerances, _outline_shift, find_silhouette
 from polmvs.surface.surface_view import FAR_PX, Silhouette, signed_distance_px
 
 VIEW = looking_at((5.0, 0, 2.0))
@@ -90,8 +91,6 @@ def test_dark_pixels_that_go_on_are_unknown(ball):
 
 def test_outlines_follow_the_step_of_intensity(ball):
     """A region that has leaked over the object's border by two pixels."""
-    import cv2
-
     grown = cv2.dilate(ball.region.inside.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     true = signed_distance_px(ball.region.inside)
     ring = np.abs(true) < 0.6
@@ -99,6 +98,18 @@ def test_outlines_follow_the_step_of_intensity(ball):
     after = found_silhouette(with_region(ball, grown)).inner[..., 0][ring]
     assert np.median(before) < -1.4
     assert abs(np.median(after)) < 0.5
+
+
+@pytest.mark.parametrize("leak", [0, 1, 2, 3])
+def test_how_far_a_region_leaks_does_not_move_the_outline(leak):
+    """Its border chooses among steps of intensity, and does not draw the chosen one to itself."""
+    inside = np.zeros((60, 80), bool)
+    inside[:, :40] = True
+    intensity = cv2.GaussianBlur(np.where(inside, 0.2, 0.6).astype(np.float32), (0, 0), 0.8)
+    leaked = np.zeros_like(inside)
+    leaked[:, : 40 + leak] = True
+    shift = _outline_shift(leaked, intensity, 1.0, SilhouetteTolerances())
+    assert shift[20:40, 40] == pytest.approx(-leak, abs=0.03)
 
 
 def test_nothing_polarised_gives_an_empty_silhouette(ball):
