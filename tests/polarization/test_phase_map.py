@@ -94,7 +94,7 @@ def test_noise_of_dark_pixels_is_stated():
     phase_map = build(s0, s1, s2, np.full_like(s0, sigma), everywhere, model_sigma=0.0)
     turn = 0.5 * np.arctan2(phase_map.samples[..., 1], phase_map.samples[..., 0])
     shares = turn * np.sqrt(phase_map.samples[..., 2])
-    # Of 1,140 correlated values, a ninth or so independent; what is stated is no wider than a third.
+    # Of 1,140 correlated values, a ninth or so independent.
     assert 0.7 < np.std(shares[5:-5, 5:-5]) < 1.1
 
 

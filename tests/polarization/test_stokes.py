@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -14,6 +15,7 @@ from polmvs.polarization.stokes import (
     Stokes,
     axial_difference,
     axial_mean,
+    combine,
     ideal_analyzers,
     stokes_by_least_squares,
     stokes_from_intensities,
@@ -306,3 +308,40 @@ def test_real_polarizer_films_give_their_angles():
         spread = axial_difference(stokes.aolp[film][inside], mean)
         assert np.degrees(np.median(np.abs(spread))) < 2
     assert 0.13 < np.mean(~stokes.valid) < 0.17  # the saturated sky
+
+
+def edge_images(*, turned: bool):
+    """Stokes images of two sides: one is brighter and, if ``turned``, of another phase."""
+    rng = np.random.default_rng(3)
+    right = np.arange(160) >= 80
+    s0 = np.where(right, 0.6, 0.3) * np.ones((120, 1))
+    turn = np.where(right, 0.8 if turned else 0.0, 0.0)
+    clean = s0, 0.4 * s0 * np.cos(turn), 0.4 * s0 * np.sin(turn)
+    blurred = [cv2.GaussianBlur(image, (0, 0), 0.8) for image in clean]
+    noise = 0.002 * rng.standard_normal((3, *s0.shape))
+    return [np.asarray(b + n, np.float32) for b, n in zip(blurred, noise, strict=True)]
+
+
+def at_edge_and_beside(stokes):
+    columns = np.abs(np.arange(stokes.shape[1]) - 79.5)
+    sigma = np.sqrt(np.mean(np.square(stokes.sigma), axis=0))
+    return sigma[columns < 1].mean(), sigma[(columns > 10) & (columns < 60)].mean()
+
+
+@pytest.mark.parametrize("images", ["Stokes", "angles", "colours"])
+@pytest.mark.parametrize("turned", [True, False])
+def test_mixed_phases_widen_sigma_and_mere_brightness_does_not(images, turned):
+    """Whatever the images are: what an edge mixes agrees with itself, and noise averages out."""
+    s0, s1, s2 = edge_images(turned=turned)
+    valid = np.ones(s0.shape, bool)
+    if images == "angles":
+        analyzers = ideal_analyzers([0, 20, 40, 60, 80, 100, 120, 140, 160])
+        intensities = np.tensordot(analyzers, np.stack([s0, s1, s2]), 1).astype(np.float32)
+        stokes = stokes_by_least_squares(intensities, analyzers, ~valid)
+    else:
+        stokes = stokes_from_maps(s0, s1, s2, valid)
+    if images == "colours":
+        flat = replace(stokes, sigma=np.full_like(s0, 0.002))
+        stokes = combine([flat, flat, flat])
+    edge, beside = at_edge_and_beside(stokes)
+    assert edge > 3 * beside if turned else edge < 1.5 * beside
