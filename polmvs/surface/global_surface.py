@@ -57,6 +57,7 @@ from polmvs.surface.surface_quality import (
     find_contradictions,
     fit_normals,
     point_offset,
+    points_deny,
     supported_faces,
 )
 from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, surface_view
@@ -328,7 +329,7 @@ def _surface(
             tolerances=tolerances,
         )
 
-    mesh = _at_rest(sharpened(mesh, normals), normals, settle)
+    mesh = _at_rest(sharpened(mesh, normals), normals, settle, known, hull.footprint)
     given.report(1)
     evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
     supported = supported_faces(mesh, evidence, min_views=given.min_views)
@@ -361,15 +362,20 @@ def _surface(
 
 
 def _at_rest(
-    mesh: TriangleMesh,
+    sharp: TriangleMesh,
     normals: Array,
     settle: Callable[[TriangleMesh], tuple[TriangleMesh, bool]],
+    known: KnownPoints,
+    footprint: float,
 ) -> TriangleMesh:
-    """A sharpened mesh, moved by steps and sharpened again until it is at rest."""
-    is_at_rest, steps_left = False, SHARP_STEPS
+    """A sharpened mesh, moved by steps until it is at rest, unless known points deny them."""
+    mesh, is_at_rest, steps_left = sharp, False, SHARP_STEPS
     while not is_at_rest and steps_left:
         mesh, is_at_rest = settle(mesh)
         mesh, steps_left = sharpened(mesh, normals), steps_left - 1
+        # Phases read by a model that their camera does not follow sink it, OPA's by millimetres.
+        if points_deny(mesh, sharp, known, footprint):
+            return sharp
     return mesh
 
 

@@ -16,8 +16,8 @@ from polmvs.surface.global_surface import (
     surface_points,
 )
 from polmvs.surface.mesh_geometry import RayScene
-from polmvs.surface.refinement import Level, RefinementTolerances
-from polmvs.surface.surface_quality import Contradictions
+from polmvs.surface.refinement import KnownPoints, Level, RefinementTolerances
+from polmvs.surface.surface_quality import Contradictions, points_deny
 
 PPA = AngleModel.PPA
 NO_SEEDS = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
@@ -103,6 +103,22 @@ def test_the_faces_of_a_box_are_not_drawn_outwards_by_its_edges():
     for axis in range(3):
         offset = beyond[inner & (side == axis), axis] / FOOTPRINT
         assert abs(np.median(offset)) < 0.2, axis
+
+
+def test_points_deny_what_is_farther_from_them(surface):
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(60, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ball = surface.mesh.moved(
+        (1 / np.linalg.norm(surface.mesh.vertices, axis=1) - 1)[:, None] * surface.mesh.vertices
+    )
+    larger = ball.moved(0.3 * FOOTPRINT * ball.vertices)
+    noise = 1 + 0.3 * FOOTPRINT * rng.standard_normal((60, 1))
+    known = KnownPoints(noise * directions, np.full(60, FOOTPRINT))
+    assert points_deny(larger, ball, known, FOOTPRINT)
+    assert not points_deny(ball, larger, known, FOOTPRINT)
+    few = KnownPoints(known.points[:6], known.sigma[:6])
+    assert not points_deny(larger, ball, few, FOOTPRINT)
 
 
 def test_a_view_that_sees_nothing_has_no_depth(surface):
