@@ -7,7 +7,9 @@ import sys
 from collections.abc import Sequence
 from types import FrameType
 
-__all__ = ["entry_point", "main"]
+__all__ = ["entry_point", "interrupts", "main"]
+
+interrupts: list[int] = []  # signals that asked this process to end
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -22,6 +24,8 @@ def entry_point() -> None:
     """Run the console command; a plain kill ends it as cleanly as Ctrl-C does."""
     try:
         signal.signal(signal.SIGTERM, _interrupt)
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored
+            signal.signal(signal.SIGINT, _interrupt)
         status = main()
     except KeyboardInterrupt:  # while modules are imported
         status = 130
@@ -29,4 +33,5 @@ def entry_point() -> None:
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:
+    interrupts.append(signum)
     raise KeyboardInterrupt

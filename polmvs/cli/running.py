@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
+from polmvs.cli import interrupts
 from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.flags import USAGE_ERROR, Command, UsageError, in_flags, parse
 from polmvs.errors import OptionError, PolmvsError
@@ -82,7 +83,7 @@ def keep_sigterm() -> None:
 def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
     """Run a command; its exit status, or that of what went wrong."""
     try:
-        return command()
+        return _interruptible(command)
     except KeyboardInterrupt:
         kept = "; finished stages are kept, go on with --resume" if terminal.log else ""
         _complain(terminal, prog, f"interrupted{kept}")
@@ -120,6 +121,17 @@ def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
         where = f"; see {terminal.log}" if terminal.log else ""
         _complain(terminal, prog, f"internal error: {type(error).__name__}: {error}{where}")
         return 1
+
+
+def _interruptible(command: Callable[[], int]) -> int:
+    """Run a command. Libraries that an interrupt reaches make errors of their own of it."""
+    try:
+        return command()
+    except Exception as error:
+        if interrupts:
+            _trace(logging.DEBUG)
+            raise KeyboardInterrupt from error
+        raise
 
 
 def _trace(level: int) -> None:

@@ -1127,7 +1127,9 @@ def _rim_moves(
     directions = 0.5 * mesh.vertex_normals[ends]
     one, other = np.moveaxis(mesh.face_normals[faces], 1, 0)
     cosine = dots(one, other)
-    meets = np.all(sharp[ends], axis=1) & (cosine < np.cos(np.radians(CreaseTolerances.crease_deg)))
+    # Of a fold, too, whose sides turn their backs on each other, the middle is its own.
+    apart = np.abs(cosine) < np.cos(np.radians(CreaseTolerances.crease_deg))
+    meets = np.all(sharp[ends], axis=1) & apart
     opposite = mesh.faces[faces].sum(axis=2) - ends.sum(axis=1, keepdims=True)
     dual = np.stack([one - cosine[:, None] * other, other - cosine[:, None] * one], axis=1)
     dual /= np.maximum(1 - cosine**2, 1e-9)[:, None, None]

@@ -138,3 +138,25 @@ def test_a_terminal_gets_a_bar_with_name_and_count() -> None:
     assert "4/4" in text
     assert "warning: look" in text
     assert "12 points" in text
+
+
+def test_what_goes_wrong_after_an_interrupt_is_the_interrupt(monkeypatch, capsys):
+    """Libraries that it reaches make errors of their own of it."""
+    from polmvs.cli import interrupts, running
+
+    class Silent:
+        log = None
+
+        def close(self) -> None:
+            pass
+
+    def command() -> int:
+        raise RuntimeError("a callback failed")
+
+    shown: list[str] = []
+    monkeypatch.setattr(running, "_complain", lambda terminal, prog, text: shown.append(text))
+    assert running._guarded(command, Silent(), "polmvs") == 1
+    monkeypatch.setitem(vars(running), "interrupts", [15])
+    assert interrupts == []
+    assert running._guarded(command, Silent(), "polmvs") == 130
+    assert shown[-1] == "interrupted"

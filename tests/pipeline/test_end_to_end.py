@@ -233,7 +233,7 @@ def test_interrupt_keeps_finished_stages_only(demo_run: Path, tmp_path: Path, nu
     wait_until(lambda: unfinished(out, "views_opa"), process)
     process.send_signal(number)
     stdout, stderr = process.communicate(timeout=300)
-    assert process.returncode == 130
+    assert process.returncode == 130, stderr
     assert stderr == ("polmvs demo: interrupted; finished stages are kept, go on with --resume\n")
     assert stdout == ""
     assert_no_temporary_files(out)
