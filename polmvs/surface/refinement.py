@@ -592,6 +592,7 @@ class _Energy:
     smooth, pull : matrix ``(V, V)`` and gradient ``(V,)`` of the smoothness, and the matrix
         ``(V, V)`` whose product with its own transpose is the former.
     free : (V,) bool, vertices of faces that some view sees.
+    sharp : (V,) bool, vertices on edges between sides.
     """
 
     views: _Evidence
@@ -636,10 +637,11 @@ def _energy(
     flat = ~np.any(sharp[mesh.faces], axis=1)
 
     def look_at(view: SurfaceView) -> tuple[_RimRows | None, FaceRows]:
-        outlined = view.has_outline
-        rim = _rim_rows(mesh, scene, view, edges, level, sharp) if outlined else None
+        rim = None
+        if view.has_outline:
+            rim = _rim_rows(mesh, scene, view, edges, level, sharp)
         rows = face_rows(mesh, scene, view, angle_model, row_sigma, tol)
-        return rim, rows.only(flat[rows.face])
+        return rim, rows if flat.all() else rows.only(flat[rows.face])
 
     # Threads, for products of large arrays and the casting of rays let go of Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
@@ -1144,6 +1146,8 @@ def _with_edges(mesh: TriangleMesh, moves: Array, sharp: Mask) -> Array:
 
     A side moves as those of its vertices do that lie on no edge.
     """
+    if not sharp.any():
+        return moves
     free = ~sharp[mesh.faces]
     touching = np.flatnonzero(~free.all(axis=1) & free.any(axis=1))
     corners, free, normals = mesh.faces[touching], free[touching], mesh.face_normals[touching]
