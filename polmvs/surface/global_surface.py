@@ -290,7 +290,7 @@ def _surface(
     mesh = refined.mesh
     views = [replace(view, tilt_share=refined.tilt_share) for view in given.views]
     # A refined outer wall places the inner one better than the hull's.
-    hollows = _hollows(given, mesh, hull.footprint) or hollows
+    hollows = _hollows(given, mesh, hull.footprint, hollows) or hollows
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
     uncarved = mesh
@@ -379,8 +379,10 @@ def _at_rest(
     return mesh
 
 
-def _hollows(given: _Given, mesh: TriangleMesh, footprint: float) -> tuple[Hollow, ...]:
-    """Hollows of a mesh that see only themselves."""
+def _hollows(
+    given: _Given, mesh: TriangleMesh, footprint: float, before: Sequence[Hollow] = ()
+) -> tuple[Hollow, ...]:
+    """Hollows of a mesh that see only themselves, ``before`` of an earlier state of it."""
     if not len(mesh.faces):
         return ()
     faces = SurfaceFaces(
@@ -391,7 +393,12 @@ def _hollows(given: _Given, mesh: TriangleMesh, footprint: float) -> tuple[Hollo
         footprint,
     )
     return find_hollows(
-        faces, given.maps, given.angle_model, tilt_aware=given.tilt_aware, folder=given.folder
+        faces,
+        given.maps,
+        given.angle_model,
+        tilt_aware=given.tilt_aware,
+        before=before,
+        folder=given.folder,
     )
 
 

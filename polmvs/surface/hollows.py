@@ -52,6 +52,8 @@ Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+SAME_PLANE_PX = HullTolerances.step_px  # footprints within which a rim is known: a cell of the hull
+
 
 @dataclass(frozen=True, kw_only=True)
 class HollowTolerances:
@@ -148,6 +150,7 @@ def find_hollows(
     tilt_aware: bool = True,
     tolerances: HollowTolerances | None = None,
     offset_tolerances: OffsetTolerances | None = None,
+    before: Sequence[Hollow] = (),
     folder: Path | None = None,
 ) -> tuple[Hollow, ...]:
     """Mouths that a surface closes with a cap, and the hollows presumed behind them.
@@ -158,6 +161,8 @@ def find_hollows(
     maps : phase maps of the views.
     angle_model, tilt_aware : of the rows, as in :func:`polmvs.normals.rows.gather_rows`.
     tolerances, offset_tolerances : numbers of the search, and of the borders.
+    before : hollows of an earlier state of the surface, whose mouths are looked for first: a cap
+        that phases have bent lies in no plane by itself.
     folder : as of :func:`polmvs.surface.offsets.face_scene`.
     """
     tol, face_tol = tolerances or HollowTolerances(), offset_tolerances or OffsetTolerances()
@@ -165,7 +170,8 @@ def find_hollows(
         return ()
     scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=face_tol, folder=folder)
     found: list[Hollow] = []
-    for flat in _flat_pieces(surface, tol, face_tol):
+    known = [_on_surface(hollow.rim, surface) for hollow in before]
+    for flat in [*known, *_flat_pieces(surface, tol, face_tol)]:
         rim = _rim(surface, flat, scene, tol, face_tol)
         if rim is None or any(_is_same(rim, other.rim, surface) for other in found):
             continue
@@ -201,6 +207,13 @@ def _flat_pieces(
     )
     faces = find_faces(seeds, search, max_faces=tol.max_planes)
     return tuple(replace(face, members=chosen[face.members]) for face in faces)
+
+
+def _on_surface(rim: Face, surface: SurfaceFaces) -> Face:
+    """A rim's plane with the faces of a surface that lie in it."""
+    near = np.abs(rim.height(surface.centers)) < SAME_PLANE_PX * surface.footprint
+    near &= surface.normals @ rim.normal > np.cos(np.radians(CreaseTolerances.crease_deg))
+    return replace(rim, members=np.flatnonzero(near))
 
 
 def _rim(
@@ -248,7 +261,7 @@ def _rim(
 
 def _is_same(rim: Face, other: Face, surface: SurfaceFaces) -> bool:
     """Whether two rims are of the same mouth."""
-    near = np.abs(other.height(surface.centers[rim.members])) < 4 * surface.footprint
+    near = np.abs(other.height(surface.centers[rim.members])) < SAME_PLANE_PX * surface.footprint
     return bool(near.mean() > 0.5)
 
 

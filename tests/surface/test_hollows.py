@@ -10,7 +10,7 @@ from polmvs.config import AngleModel, Light
 from polmvs.polarization.phase_map import build_phase_map
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
-from polmvs.surface.hollows import SurfaceFaces, find_hollows
+from polmvs.surface.hollows import HollowTolerances, SurfaceFaces, find_hollows
 from polmvs.synthetic.captures import Cylinder, Group, Plane, render_view, ring_of_views
 
 CAMERA = PinholeCamera(width=280, height=240, fx=260.0, fy=260.0, cx=140.0, cy=120.0)
@@ -112,6 +112,21 @@ def test_a_dark_mouth_with_a_rim_of_one_width_opens_into_a_hollow():
     assert np.quantile(np.abs(values - inwards)[near], 0.9) < 1e-3
     # Nothing under the bottom, nor beside the vessel above its rim.
     assert (hollow.values(np.array([[0, 0, 0.004], [0.055, 0, HEIGHT + 0.002]])) < 0).all()
+
+
+def test_a_mouth_once_found_is_looked_for_at_its_place():
+    maps, surface = vessel_maps(), closed_cylinder()
+    before = find_hollows(surface, maps, AngleModel.PPA)
+    x, y, z = surface.centers.T
+    # Phases have bent one side of the cap up, and no plane is found in it.
+    bent_up = (surface.normals[:, 2] > 0.5) & (x > 0)
+    height = np.where(bent_up, z + 3.5 * FOOTPRINT, z)
+    bent = replace(surface, centers=np.stack([x, y, height], axis=1))
+    no_plane = HollowTolerances(max_planes=0)
+    assert find_hollows(bent, maps, AngleModel.PPA, tolerances=no_plane) == ()
+    (hollow,) = find_hollows(bent, maps, AngleModel.PPA, tolerances=no_plane, before=before)
+    assert hollow.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
+    assert hollow.rim.offset == pytest.approx(HEIGHT, abs=0.5 * FOOTPRINT)
 
 
 def test_a_closed_body_has_no_hollow():
