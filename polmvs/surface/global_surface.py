@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -42,11 +43,13 @@ from polmvs.surface.mesh_geometry import (
 from polmvs.surface.offsets import find_faces, stepped_faces
 from polmvs.surface.refinement import (
     KnownPoints,
+    KnownSides,
     RefinementTolerances,
     median_residual,
     place_deviations,
     refine,
     settling_step,
+    unexplained_shares,
 )
 from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.surface_quality import (
@@ -58,6 +61,7 @@ from polmvs.surface.surface_quality import (
     fit_normals,
     point_offset,
     points_deny,
+    stand_apart,
     supported_faces,
 )
 from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, surface_view
@@ -101,6 +105,7 @@ class GlobalSurface:
     presumed : (F,) bool, faces that no phase shows: walls of hollows, presumed as thick inside as
         the rim shows them.
     tilt_share : as in :class:`polmvs.surface.refinement.Refined`.
+    left_out : (K,) bool, views that contradict the others; the surface is made without them.
     """
 
     mesh: TriangleMesh
@@ -113,6 +118,7 @@ class GlobalSurface:
     contradictions: Contradictions
     presumed: Mask
     tilt_share: float
+    left_out: Mask
 
 
 @dataclass(frozen=True)
@@ -183,23 +189,36 @@ def reconstruct_surface(
 
     def report(count: int) -> None:
         nonlocal done
+        # Steps of a surface that is given up count, up to the number announced.
+        count = min(count, num_surface_steps(0) - done)
         done += count
         if on_progress is not None:
             on_progress(count)
 
-    given = _Given(
-        angle_model=angle_model,
-        tilt_aware=tilt_aware,
-        maps=maps,
-        views=views,
-        seeds=seeds,
-        plane=supporting_plane(surroundings, np.array([view.center for view in views])),
-        min_views=min_views,
-        folder=folder,
-        report=report,
-    )
+    def given_by(kept: Mask) -> _Given:
+        own = list(compress(views, kept))
+        return _Given(
+            angle_model=angle_model,
+            tilt_aware=tilt_aware,
+            maps=list(compress(maps, kept)),
+            views=own,
+            seeds=seeds,
+            plane=supporting_plane(surroundings, np.array([view.center for view in own])),
+            min_views=min_views,
+            folder=folder,
+            report=report,
+        )
+
     tolerances, hull_tolerances = tolerances or RefinementTolerances(), HullTolerances()
-    found, meshes = _surface(given, hull_tolerances, tolerances)
+    kept, found = np.ones(len(views), np.bool_), None
+    while found is None:
+        given = given_by(kept)
+        made, meshes = _surface(given, hull_tolerances, tolerances)
+        if isinstance(made, _Contradicted):
+            made.warn(given)
+            kept[np.flatnonzero(kept)[made.odd]] = False
+        else:
+            found = made
     if tolerances.thin_levels and _uncovered_share(found) > MAX_SHARE:
         logger.warning(
             "%s: %.0f %% of the polarised regions stay uncovered, walls may be thin: the surface "
@@ -211,8 +230,10 @@ def reconstruct_surface(
         thin = replace(tolerances, levels=tolerances.thin_levels)
         unheard = replace(given, report=lambda count: None)
         again, fine_meshes = _surface(unheard, fine, thin)
-        if _uncovered_share(again) < _uncovered_share(found):
+        if isinstance(again, GlobalSurface) and _uncovered_share(again) < _uncovered_share(found):
             found, meshes = again, fine_meshes
+    if isinstance(found, GlobalSurface):
+        found = replace(found, left_out=~kept)
     report(max(num_surface_steps(0) - done, 0))
     if on_mesh is not None:
         for mesh in meshes:
@@ -235,6 +256,33 @@ class _Given:
     report: OnProgress
 
 
+@dataclass(frozen=True)
+class _Contradicted:
+    """Views that contradict the others, as a first surface of all shows.
+
+    Attributes
+    ----------
+    unexplained : (K,) share of what each view shows that this surface does not explain.
+    odd : (K,) bool.
+    """
+
+    unexplained: Array
+    odd: Mask
+
+    def warn(self, given: _Given) -> None:
+        """Say which, and what to look at."""
+        for view, share in compress(zip(given.views, self.unexplained, strict=True), self.odd):
+            logger.warning(
+                "%s: %s contradicts the other views: %.0f %% of what it shows is not explained by "
+                "a first surface (median of all: %.0f %%). It is left out; its pose, its mask "
+                "or its image may be wrong.",
+                given.angle_model,
+                view.view.name,
+                100 * share,
+                100 * np.nanmedian(self.unexplained),
+            )
+
+
 def _uncovered_share(found: GlobalSurface | Undetermined) -> float:
     """Mean share of the silhouettes that a surface does not cover; 1 without one."""
     return 1.0 if isinstance(found, Undetermined) else found.contradictions.uncovered_share
@@ -242,8 +290,11 @@ def _uncovered_share(found: GlobalSurface | Undetermined) -> float:
 
 def _surface(
     given: _Given, hull_tolerances: HullTolerances, tolerances: RefinementTolerances
-) -> tuple[GlobalSurface | Undetermined, list[TriangleMesh]]:
-    """The surface, with the hull and the mesh after each level of its refinement."""
+) -> tuple[GlobalSurface | Undetermined | _Contradicted, list[TriangleMesh]]:
+    """The surface, with the hull and the mesh after each level of its refinement.
+
+    None is made where views contradict what the first level finds.
+    """
     maps, seeds, angle_model, tilt_aware = (
         given.maps,
         given.seeds,
@@ -277,6 +328,17 @@ def _surface(
         # Phases of what sees only itself would be dug after.
         still = tuple(replace(level, with_slope=False) for level in tolerances.levels)
         tolerances = replace(tolerances, levels=still)
+    contradicted: list[_Contradicted] = []
+
+    def is_agreed(mesh: TriangleMesh) -> bool:
+        meshes.append(mesh)
+        if len(meshes) == 2:  # the hull and the first level
+            unexplained = unexplained_shares(mesh, given.views, rows, tolerances)
+            odd = stand_apart(unexplained)
+            if odd.any():
+                contradicted.append(_Contradicted(unexplained, odd))
+        return not contradicted
+
     refined = refine(
         hull.mesh,
         given.views,
@@ -285,8 +347,10 @@ def _surface(
         known=known,
         tolerances=tolerances,
         on_progress=given.report,
-        on_level=meshes.append,
+        go_on=is_agreed,
     )
+    if contradicted:
+        return contradicted[0], meshes
     mesh = refined.mesh
     views = [replace(view, tilt_share=refined.tilt_share) for view in given.views]
     # A refined outer wall places the inner one better than the hull's.
@@ -315,7 +379,7 @@ def _surface(
         )
     is_known = fitted.is_fitted | is_wall
     normals = sided_normals(mesh, facing, is_known)
-    is_shown = sides_known(mesh, normals, is_known)
+    sides = KnownSides(sides_known(mesh, normals, is_known), fitted.is_fitted & ~is_wall)
 
     def settle(mesh: TriangleMesh) -> tuple[TriangleMesh, bool]:
         return settling_step(
@@ -324,7 +388,7 @@ def _surface(
             rows,
             hull.footprint,
             shown,
-            is_shown=is_shown,
+            sides=sides,
             known=known,
             tolerances=tolerances,
         )
@@ -357,6 +421,7 @@ def _surface(
         contradictions=contradictions,
         presumed=presumed,
         tilt_share=refined.tilt_share,
+        left_out=np.zeros(len(views), np.bool_),
     )
     return surface, meshes
 

@@ -14,7 +14,7 @@ walls between the faces that no smoothness has rounded.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
@@ -29,6 +29,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.camera import in_frame, sample_image
 from polmvs.config import AngleModel
+from polmvs.geometry import lengths
 from polmvs.io.arrays import kept_array
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.normals.tracks import SeedTolerances
@@ -36,6 +37,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
 from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.refinement import RefinementTolerances
+from polmvs.surface.silhouettes import SilhouetteTolerances, nearest_steps, step_slope
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX
 
 Array = NDArray[np.float64]
@@ -47,6 +49,7 @@ FirstHit: TypeAlias = Callable[[Array, Array], tuple[Floats, Floats]]
 
 NO_FACE = -1
 BESIDE, ACROSS = ((0, 1), (1, 0)), ((1, 1), (1, -1))  # neighbours of a cell: down, right
+SPACING = 0.25  # of samples across a border, cells
 CUT_UNIT = 10_000  # of the weights of a cut, which are whole numbers
 MAX_COST = 0.5  # median loss beyond which phases contradict a face: that of ``sigmas`` deviations
 
@@ -162,9 +165,12 @@ class FaceGrid:
 
     def points(self, face: Face) -> Array:
         """Points ``(H, W, 3)`` of a face over all cells."""
-        rows, cols = np.indices(self.shape)
+        return self.lifted(np.moveaxis(np.indices(self.shape), 0, -1), face)
+
+    def lifted(self, cells: Floats | NDArray[np.int64], face: Face) -> Array:
+        """Points ``(..., 3)`` of a face over fractional cells ``(..., 2)``."""
         base = self.origin + self.step * (
-            rows[..., None] * self.first + cols[..., None] * self.second
+            cells[..., :1] * self.first + cells[..., 1:] * self.second
         )
         rise = -face.height(base) / (self.axis @ face.normal)
         return np.asarray(base + rise[..., None] * self.axis)
@@ -180,12 +186,15 @@ class SteppedFaces:
     grid : of the labels.
     labels : (H, W) int64, number of the face, ``NO_FACE`` where none is shown.
     shown : (H, W) bool, where the views show the face; beside, its label is carried on.
+    shifts : (G, H, W), by how many cells the border of each face with lower ones lies outside of
+        its labels', at each cell that of the nearest place of this border.
     """
 
     faces: tuple[Face, ...]
     grid: FaceGrid
     labels: NDArray[np.int64]
     shown: Mask
+    shifts: Image
 
     def values(self, points: Floats) -> Array:
         """Signed distance ``(N,)`` of points to what the faces leave: positive in free space.
@@ -197,16 +206,21 @@ class SteppedFaces:
         points = np.asarray(points, np.float64)
         cells = np.moveaxis(self.grid.cells(points), -1, 0)
         solid = self._interpolated(self._beside(self.labels == NO_FACE), cells)
-        heights = np.stack([self._rise(face) for face in self.faces])
-        at_label = np.take_along_axis(heights, np.maximum(self.labels, 0)[None], axis=0)[0]
         for number, face in enumerate(self.faces):
-            # A face goes on below those that stand on it: no border inside of the solid.
-            own = self.labels == number
-            under = own | (self.labels == NO_FACE) | (at_label >= heights[number])
-            if own.any():
-                across = self._interpolated(self._beside(under), cells)
+            if (self.labels == number).any():
+                beside = self._beside(self.not_below(number), self.shifts[number])
+                across = self._interpolated(beside, cells)
                 solid = np.minimum(solid, np.maximum(across, face.height(points)))
         return solid
+
+    def not_below(self, number: int) -> Mask:
+        """Cells (H, W) of a face, of those above it, and of none.
+
+        A face goes on below those that stand on it: no border inside of the solid.
+        """
+        heights = np.stack([self._rise(face) for face in self.faces])
+        at_label = np.take_along_axis(heights, np.maximum(self.labels, 0)[None], axis=0)[0]
+        return np.asarray((self.labels == NO_FACE) | (at_label >= heights[number]))
 
     def solid(self, points: Floats) -> Array:
         """Signed distance ``(N,)`` of points to what stands on the lowest face: negative in it.
@@ -231,17 +245,22 @@ class SteppedFaces:
         """The faces, the lowest first, with the distance to the cells that show each."""
         rise = [float(np.median(self._rise(face))) for face in self.faces]
         return [
-            (self.faces[number], self._beside(self.shown & (self.labels == number)))
+            (
+                self.faces[number],
+                self._beside(self.shown & (self.labels == number), self.shifts[number]),
+            )
             for number in np.argsort(rise, kind="stable")
         ]
 
     def _rise(self, face: Face) -> Array:
         return np.asarray((self.grid.points(face) - self.grid.origin) @ self.grid.axis)
 
-    def _beside(self, inside: Mask) -> Image:
-        """Signed distance (H, W) to a set of cells, world units, negative inside, smoothed."""
-        smooth = ndimage.gaussian_filter(cells_beside(inside), 1.0, mode="nearest")
-        return np.asarray(smooth * self.grid.step, np.float32)
+    def _beside(self, inside: Mask, shift: Image | float = 0.0) -> Image:
+        """Signed distance (H, W) to a set of cells, world units, negative inside.
+
+        Its border is shifted outwards by ``shift`` (H, W) cells.
+        """
+        return np.asarray((_smoothly_beside(inside) - shift) * self.grid.step, np.float32)
 
     def _interpolated(self, image: Image, cells: Array) -> Array:
         """Values at fractional cells ``(2, N)``; those of the border beyond it."""
@@ -257,6 +276,11 @@ def cells_beside(inside: Mask) -> Array:
     outwards = ndimage.distance_transform_edt(~inside)
     inwards = ndimage.distance_transform_edt(inside) if not inside.all() else far
     return np.where(inside, 0.5 - inwards, outwards - 0.5)
+
+
+def _smoothly_beside(inside: Mask) -> Array:
+    """As :func:`cells_beside`, without the corners of single cells."""
+    return np.asarray(ndimage.gaussian_filter(cells_beside(inside), 1.0, mode="nearest"))
 
 
 def find_faces(
@@ -402,8 +426,56 @@ def stepped_faces(
             continue
         labels, shown = _labels(group, seeds, grid, scene, first_hit, tol)
         if (labels != NO_FACE).any():
-            found.append(SteppedFaces(tuple(group), grid, labels, shown))
+            nowhere = np.zeros((len(group), *grid.shape), np.float32)
+            steps = SteppedFaces(tuple(group), grid, labels, shown, nowhere)
+            shifts = [_border_shift(steps, number, scene) for number in range(len(group))]
+            found.append(replace(steps, shifts=np.stack(shifts)))
     return tuple(found)
+
+
+def _border_shift(steps: SteppedFaces, number: int, scene: FaceScene) -> Image:
+    """By how many cells (H, W) the border of a face with lower ones lies outside of its labels'.
+
+    Labels end at a cell, and follow lines of polarisation, too, which the phases' smoothing draws
+    outwards. The border is where the views together show the step of intensity that is nearest.
+    """
+    grid, face = steps.grid, steps.faces[number]
+    inside = steps.not_below(number)
+    beside = ndimage.binary_dilation(~inside)
+    rows, cols = np.nonzero((steps.labels == number) & beside)
+    if not len(rows):
+        return np.zeros(grid.shape, np.float32)
+    tol, face_tol = SilhouetteTolerances(), OffsetTolerances()
+    distance = _smoothly_beside(inside)
+    outwards = np.asarray(np.gradient(distance))[:, rows, cols].T
+    outwards = outwards / np.maximum(lengths(outwards)[:, None], 1e-6)
+    along = np.arange(-tol.edge_reach_px - 1, tol.edge_reach_px + 1 + SPACING, SPACING)
+    cells = np.stack([rows, cols], axis=1)[:, None] + outwards[:, None] * (
+        along[:, None] - distance[rows, cols, None, None]
+    )
+    places = grid.lifted(cells, face)
+    steepness, num_views = np.zeros(places.shape[:2]), np.zeros(len(rows))
+    for phase_map, images in zip(scene.maps, scene.features, strict=True):
+        xy, seen = _seen(places, face, phase_map)
+        values = sample_image(np.asarray(images), xy)
+        shown = np.all(seen & (values[..., 3] == 1), axis=1)  # and no printed mark
+        if shown.any():
+            slope = step_slope(values[shown, :, 0]) / SPACING
+            steepness[shown] += slope / max(1.4826 * float(np.median(slope)), face_tol.dark)
+            num_views += shown
+    # Neighbours along the border see together.
+    volume = np.zeros((*grid.shape, len(along) + 1), np.float32)
+    volume[rows, cols] = np.column_stack([steepness, num_views])
+    width = tol.edge_smoothing_px
+    together = ndimage.gaussian_filter(volume, (width, width, 0))[rows, cols]
+    steepness = together[:, :-1] / np.maximum(together[:, -1:], 1e-6)
+    found, height = nearest_steps(steepness, along, 1.0, tol)
+    nearest = ndimage.distance_transform_edt(
+        ~(inside & beside), return_distances=False, return_indices=True
+    )
+    shifts = np.zeros(grid.shape, np.float32)
+    shifts[rows, cols] = np.clip(height - 1, 0, 1) * found
+    return np.asarray(shifts[nearest[0], nearest[1]])
 
 
 def _grouped(faces: Sequence[Face]) -> list[list[Face]]:

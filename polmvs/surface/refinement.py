@@ -160,6 +160,22 @@ class KnownPoints:
     sigma: Array
 
 
+@dataclass(frozen=True)
+class KnownSides:
+    """What is known of the sides of a sharpened mesh with F faces.
+
+    Attributes
+    ----------
+    is_shown : (F,) bool, faces of sides whose normal is known: edges between others are still
+        round. Their outlines do not count, and smoothness holds them.
+    is_fitted : (F,) bool, faces whose normal phases show. Those of others are no one side's, or
+        what they mirror: they push a step's walls out by up to 1.3 mm (`step`).
+    """
+
+    is_shown: Mask
+    is_fitted: Mask
+
+
 @dataclass
 class _Equations:
     """Normal equations of displacements that are being summed."""
@@ -367,7 +383,7 @@ def refine(
     known: KnownPoints | None = None,
     tolerances: RefinementTolerances | None = None,
     on_progress: Callable[[int], None] | None = None,
-    on_level: Callable[[TriangleMesh], None] | None = None,
+    go_on: Callable[[TriangleMesh], bool] | None = None,
 ) -> Refined:
     """Move a closed mesh until the views' phases and silhouettes agree with it.
 
@@ -384,7 +400,7 @@ def refine(
     known : points of the surface.
     tolerances : numbers of the energy, with the levels to do.
     on_progress : called with the number of steps done.
-    on_level : called with the mesh after each level.
+    go_on : asked with the mesh after each level, whether to refine it further.
     """
     tol = tolerances or RefinementTolerances()
     state, with_slope = _State(mesh, 0.0, RowSigma(tol.row_sigma, tol.row_sigma)), True
@@ -407,8 +423,8 @@ def refine(
         state = found[-1] if with_slope else found[0]
         if not len(state.mesh.faces):
             break
-        if on_level is not None:
-            on_level(state.mesh)
+        if go_on is not None and not go_on(state.mesh):
+            break
     return Refined(state.mesh, state.tilt_share)
 
 
@@ -492,7 +508,7 @@ def settling_step(
     footprint: float,
     row_sigma: RowSigma,
     *,
-    is_shown: Mask,
+    sides: KnownSides,
     known: KnownPoints | None = None,
     tolerances: RefinementTolerances | None = None,
 ) -> tuple[TriangleMesh, bool]:
@@ -503,8 +519,7 @@ def settling_step(
     mesh : sharpened; its triangles stay.
     views, angle_model, footprint, known, tolerances : as in :func:`refine`.
     row_sigma : deviations of the rows, as :func:`median_residual` finds them.
-    is_shown : (F,) bool, faces of sides whose normal is known: edges between others are still
-        round. Their outlines do not count, and smoothness holds them.
+    sides : what is known of its faces.
 
     Returns
     -------
@@ -513,9 +528,7 @@ def settling_step(
     tol = tolerances or RefinementTolerances()
     level = replace(tol.levels[-1], with_slope=False, on_outline=True)
     edge = mesh.mean_edge
-    energy = _energy(
-        mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol, is_shown=is_shown
-    )
+    energy = _energy(mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol, sides)
     moved, displacement = _step(mesh, energy, edge, tol)
     free = np.abs(displacement[energy.free & ~energy.sharp])
     return moved, not len(free) or float(np.median(free)) < tol.converged * edge
@@ -626,22 +639,23 @@ def _energy(
     known: KnownPoints | None,
     row_sigma: RowSigma,
     tol: RefinementTolerances,
-    is_shown: Mask | None = None,
+    sides: KnownSides | None = None,
 ) -> _Energy:
     scene, edges = RayScene(mesh), shared_edges(mesh)
     sharp = np.zeros(len(mesh.vertices), np.bool_)
-    if is_shown is not None:
-        edges = edges.only(np.all(is_shown[edges.faces], axis=1))
-        sharp = crease_vertices(mesh, is_shown)
-    # Edges go where their sides meet: the faces there say nothing of the sides beside them.
-    flat = ~np.any(sharp[mesh.faces], axis=1)
+    asked = np.ones(len(mesh.faces), np.bool_)
+    if sides is not None:
+        edges = edges.only(np.all(sides.is_shown[edges.faces], axis=1))
+        sharp = crease_vertices(mesh, sides.is_shown)
+        # Edges go where their sides meet: the faces there say nothing of the sides beside them.
+        asked = sides.is_fitted & ~np.any(sharp[mesh.faces], axis=1)
 
     def look_at(view: SurfaceView) -> tuple[_RimRows | None, FaceRows]:
         rim = None
         if view.has_outline:
             rim = _rim_rows(mesh, scene, view, edges, level, sharp)
         rows = face_rows(mesh, scene, view, angle_model, row_sigma, tol)
-        return rim, rows if flat.all() else rows.only(flat[rows.face])
+        return rim, rows if asked.all() else rows.only(asked[rows.face])
 
     # Threads, for products of large arrays and the casting of rays let go of Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:

@@ -20,6 +20,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX, Silhouette, signed_distance_px
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
@@ -183,19 +184,9 @@ def _outline_shift(
         along[:, None] - distance[rows, cols][:, None, None]
     )
     profile = sample_image(intensity, places)
-    slope = np.abs(ndimage.gaussian_filter1d(profile, 2.0, axis=1, order=1)) / step
-    contrast = slope * 2 * step * 2.5 / np.maximum(profile.max(axis=1, keepdims=True), 1e-6)
-    score = contrast * np.exp(-0.5 * (along / (tol.edge_prior_px * max(scale, 1.0))) ** 2)
-    score[:, np.abs(along) > reach] = 0
-    best, index = score.argmax(axis=1), np.arange(len(score))
-    # The border only chooses among steps: their places are their own.
-    for _ in range(round(1 / step)):
-        beside = np.stack([contrast[index, best + side] for side in (-1, 0, 1)])
-        best = np.clip(best + beside.argmax(axis=0) - 1, 1, len(along) - 2)
-    found = along[best] + step * _vertex_of_parabola(
-        *(contrast[index, best + side] for side in (-1, 0, 1))
-    )
-    weight = np.clip(contrast[index, best] / tol.edge_contrast - 1, 0, 1)
+    contrast = step_slope(profile) * 5 / np.maximum(profile.max(axis=1, keepdims=True), 1e-6)
+    found, height = nearest_steps(contrast, along, scale, tol)
+    weight = np.clip(height / tol.edge_contrast - 1, 0, 1)
     shifts, weights = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
     shifts[rows, cols], weights[rows, cols] = weight * found, weight
     width = tol.edge_smoothing_px * max(scale, 1.0)
@@ -206,7 +197,35 @@ def _outline_shift(
     return np.asarray(mean[nearest[0], nearest[1]])
 
 
-def _vertex_of_parabola(before: Array, at: Array, after: Array) -> Array:
+def step_slope(profile: Image) -> Image:
+    """Slopes (N, S) along profiles ``(N, S)``, smoothed over two samples, per sample."""
+    return np.asarray(np.abs(ndimage.gaussian_filter1d(profile, 2.0, axis=1, order=1)))
+
+
+def nearest_steps(
+    contrast: Floats, along: Array, scale: float, tolerances: SilhouetteTolerances | None = None
+) -> tuple[Array, Array]:
+    """Places ``(N,)`` of steps that borders choose on profiles across them, and their contrasts.
+
+    Parameters
+    ----------
+    contrast : (N, S), how steep each profile is.
+    along : (S,) equidistant, distances from the border, of ``scale`` times the tolerances' unit.
+    """
+    tol = tolerances or SilhouetteTolerances()
+    step = float(along[1] - along[0])
+    score = contrast * np.exp(-0.5 * (along / (tol.edge_prior_px * max(scale, 1.0))) ** 2)
+    score[:, np.abs(along) > tol.edge_reach_px * max(scale, 1.0)] = 0
+    best, index = score.argmax(axis=1), np.arange(len(score))
+    # The border only chooses among steps: their places are their own.
+    for _ in range(round(1 / step)):
+        beside = np.stack([contrast[index, best + side] for side in (-1, 0, 1)])
+        best = np.clip(best + beside.argmax(axis=0) - 1, 1, len(along) - 2)
+    vertex = _vertex_of_parabola(*(contrast[index, best + side] for side in (-1, 0, 1)))
+    return along[best] + step * vertex, np.asarray(contrast[index, best], np.float64)
+
+
+def _vertex_of_parabola(before: Floats, at: Floats, after: Floats) -> Array:
     """Place of the maximum of a parabola through three values, in steps from the middle one."""
     bend = before - 2 * at + after
     with np.errstate(divide="ignore", invalid="ignore"):

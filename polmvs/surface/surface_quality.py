@@ -27,7 +27,7 @@ from polmvs.surface.refinement import (
     certain_rays,
     face_rows,
 )
-from polmvs.surface.surface_view import SurfaceView, phase_rows
+from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, phase_rows
 from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]
@@ -38,6 +38,9 @@ MAX_SIGMAS = 3.0  # of one figure, before it is called a contradiction
 MAX_SHARE = 0.1  # of a surface or its silhouettes in contradiction. Guess
 ONE_SIDED = 1.645  # deviations of a normal distribution, which 5 % exceed
 MIN_POINTS = 10  # on the surface, for their median to be one
+# Of what the median view shows explained, that a view which belongs to the surface has. Measured on
+# eleven captures, each with the pose of one view exchanged: 0.91 at least, wrong ones 0.36 at most.
+MIN_EXPLAINED = 0.5
 MAX_ROWS = 500_000  # faces times views at a time; bounds memory
 
 
@@ -350,6 +353,25 @@ def find_contradictions(
         denied_share=float(area[denied].sum()) / total,
         uncovered_share=float(np.mean(known)) if known else 0.0,
     )
+
+
+def stand_apart(unexplained: Array) -> Mask:
+    """Which views a surface explains much less well than the median one.
+
+    Parameters
+    ----------
+    unexplained : (K,), as :func:`polmvs.surface.refinement.unexplained_shares` finds it.
+
+    Returns
+    -------
+    (K,) bool. None of them where fewer than three would be left: two agree by chance.
+    """
+    explained = 1 - unexplained
+    known = np.isfinite(explained)
+    odd = np.zeros(len(explained), np.bool_)
+    if known.any():
+        odd[known] = explained[known] < MIN_EXPLAINED * np.median(explained[known])
+    return odd if (~odd).sum() >= MIN_VIEWS else np.zeros_like(odd)
 
 
 def points_deny(

@@ -137,6 +137,29 @@ def test_one_wrong_mask_and_one_wrong_pose_do_no_harm(maps):
     assert not isinstance(found, Undetermined)
     radii = np.linalg.norm(found.mesh.centers[found.supported], axis=1)
     assert np.median(np.abs(radii - 1)) < 1.5 * FOOTPRINT
+    assert found.left_out[0]
+
+
+def test_views_that_contradict_the_others_are_named_and_left_out(caplog):
+    """One with the pose of another, one with the mask of something else."""
+    half = np.array([0.8, 0.6, 0.5])
+    maps = phase_maps_of(box(half), VIEWS, noise=np.radians(0.5))
+    exchanged = replace(VIEWS[3], cam_from_world=VIEWS[4].cam_from_world)
+    corner = np.zeros_like(maps[9].region.inside)
+    corner[:20, :20] = True
+    maps[3] = replace(maps[3], view=exchanged)
+    maps[9] = replace(maps[9], region=Region(corner, corner, np.zeros_like(corner)))
+    found = reconstruct(maps)
+    assert np.flatnonzero(found.left_out).tolist() == [3, 9]
+    told = [record.message for record in caplog.records if "contradicts" in record.message]
+    assert [VIEWS[index].name in told[place] for place, index in enumerate((3, 9))] == [True, True]
+    cloud, _ = surface_points(found, [maps[0], maps[6]], 0.5 * FOOTPRINT)
+    off = np.abs(box(half)(cloud.points))
+    assert np.quantile(off, 0.9) < 2 * FOOTPRINT
+
+
+def test_views_that_agree_are_all_kept(surface):
+    assert not surface.left_out.any()
 
 
 def test_several_objects():

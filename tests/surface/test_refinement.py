@@ -15,6 +15,7 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.refinement import (
     FaceRows,
     KnownPoints,
+    KnownSides,
     Level,
     RefinementTolerances,
     RowSigma,
@@ -214,7 +215,7 @@ def test_outlines_move_walls_and_leave_a_top_that_points_hold():
     """Walls lie 0.4 px outside; to lower the top would fit the outlines of its edges as well."""
     views = views_of(box(HALF), ring_of_views(12, elevations=(20.0, 45.0)))
     mesh = sharp_box(HALF + np.array([0.4, 0.4, 0.0]) * FOOTPRINT)
-    shown = np.ones(len(mesh.faces), bool)
+    sides = KnownSides(*np.ones((2, len(mesh.faces)), bool))
     normals = mesh.face_normals
     rng = np.random.default_rng(0)
     known = KnownPoints(
@@ -223,7 +224,7 @@ def test_outlines_move_walls_and_leave_a_top_that_points_hold():
     )
     for _ in range(4):
         mesh, _ = settling_step(
-            mesh, views, PPA, FOOTPRINT, RowSigma(0.01, 0.01), is_shown=shown, known=known
+            mesh, views, PPA, FOOTPRINT, RowSigma(0.01, 0.01), sides=sides, known=known
         )
         mesh = sharpened(mesh, normals)
     beyond = (np.abs(mesh.centers) - HALF) / FOOTPRINT
@@ -232,6 +233,24 @@ def test_outlines_move_walls_and_leave_a_top_that_points_hold():
     assert np.abs(np.median(beyond[seen & (side == 0), 0])) < 0.15
     assert np.abs(np.median(beyond[seen & (side == 1), 1])) < 0.15
     assert np.abs(np.median(beyond[seen & (side == 2), 2])) < 0.05
+
+
+@pytest.mark.parametrize("is_fitted", [True, False])
+def test_phases_of_faces_that_they_do_not_show_move_nothing(is_fitted):
+    """A top that is turned by 3 deg: nothing but its phases could turn it back."""
+    views = views_of(box(HALF), ring_of_views(12, elevations=(45.0,)))
+    mesh = sharp_box()
+    top = mesh.face_normals[:, 2] > 0.5
+    on_top = np.zeros(len(mesh.vertices), bool)
+    on_top[mesh.faces[top]] = True
+    slope = np.tan(np.radians(3))
+    mesh = mesh.moved(np.where(on_top[:, None], slope * mesh.vertices[:, :1] * [0, 0, 1], 0.0))
+    edges = np.zeros(len(mesh.faces), bool)  # of no known side: no outline counts
+    sides = KnownSides(edges, np.full(len(mesh.faces), is_fitted))
+    moved, _ = settling_step(mesh, views, PPA, FOOTPRINT, RowSigma(0.01, 0.01), sides=sides)
+    inner = top & (np.abs(mesh.centers[:, :2]) < HALF[:2] - 4 * FOOTPRINT).all(axis=1)
+    turned = np.degrees(np.arccos(np.median(moved.face_normals[inner, 2])))
+    assert turned == pytest.approx(3.0, abs=0.1) if not is_fitted else turned < 2.0
 
 
 def test_every_inner_edge_is_shared_once():

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import TypeVar
 
@@ -226,13 +227,16 @@ def _global_surface(
     for sentence in surface.contradictions.warnings():
         logger.warning("%s: %s.", model, sentence)
     scene = RayScene(surface.mesh)
-    for phase_map in maps:
-        dense = render_view(surface, scene, phase_map.view, propagation.stride_px)
+    for phase_map, left_out in zip(maps, surface.left_out, strict=True):
+        dense = None
+        if not left_out:
+            dense = render_view(surface, scene, phase_map.view, propagation.stride_px)
         if dense is not None:
             store_dense_view(dense, views / phase_map.view.name)
         on_progress(1)
     spacing = fusion.voxel if fusion.voxel is not None else fusion.voxel_px * surface.footprint
-    points = surface_points(surface, maps, spacing or FINEST_SPACING_PX * surface.footprint)
+    believed = list(compress(maps, ~surface.left_out))
+    points = surface_points(surface, believed, spacing or FINEST_SPACING_PX * surface.footprint)
     write_mesh(views / SURFACE_MESH, supported_mesh(surface))
     for number, mesh in enumerate(levels):
         faces = mesh.faces.astype(np.int32)
