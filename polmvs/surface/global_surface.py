@@ -333,7 +333,9 @@ def _surface(
     def is_agreed(mesh: TriangleMesh) -> bool:
         meshes.append(mesh)
         if len(meshes) == 2:  # the hull and the first level
-            unexplained = unexplained_shares(mesh, given.views, rows, tolerances)
+            # A model that leaves something out (OPA the perspective) contradicts all views.
+            shown, _ = median_residual(mesh, given.views, rows, tolerances)
+            unexplained = unexplained_shares(mesh, given.views, rows, shown.direct)
             odd = stand_apart(unexplained)
             if odd.any():
                 contradicted.append(_Contradicted(unexplained, odd))

@@ -418,7 +418,9 @@ def refine(
             for way in ways
         ]
         if len(found) > 1:
-            shares = [unexplained_shares(one.mesh, views, angle_model, tol) for one in found]
+            shares = [
+                unexplained_shares(one.mesh, views, angle_model, tol.row_sigma) for one in found
+            ]
             with_slope = _is_less(shares[1], shares[0])
         state = found[-1] if with_slope else found[0]
         if not len(state.mesh.faces):
@@ -546,15 +548,15 @@ def unexplained_shares(
     mesh: TriangleMesh,
     views: Sequence[SurfaceView],
     angle_model: AngleModel,
-    tolerances: RefinementTolerances | None = None,
+    row_sigma: float = RefinementTolerances.row_sigma,
     *,
     stride_px: int = 4,
 ) -> Array:
     """How little a mesh explains of each view: mean ``(K,)`` over its certain silhouette's pixels.
 
-    1 where it shows nothing, or a normal that the phase contradicts by far; 0 where both agree.
+    1 where it shows nothing, or a normal that the phase contradicts by far more than ``row_sigma``
+    (of ``m . n``); 0 where both agree.
     """
-    tol = tolerances or RefinementTolerances()
     scene, shares = RayScene(mesh), np.full(len(views), np.nan)
     for index, view in enumerate(views):
         rays = certain_rays(view, stride_px)
@@ -562,7 +564,7 @@ def unexplained_shares(
         hit = hits.face >= 0
         points = view.center + hits.distance[hit, None] * rays[hit]
         found = phase_rows(view, angle_model, points)
-        square = (dots(found.rows, mesh.face_normals[hits.face[hit]]) / tol.row_sigma) ** 2
+        square = (dots(found.rows, mesh.face_normals[hits.face[hit]]) / row_sigma) ** 2
         loss = np.ones(len(rays))
         known = found.precision > 0
         loss[np.flatnonzero(hit)[known]] = (square / (square + CAUCHY_SCALE**2))[known]
