@@ -39,8 +39,8 @@ MAX_SHARE = 0.1  # of a surface or its silhouettes in contradiction. Guess
 ONE_SIDED = 1.645  # deviations of a normal distribution, which 5 % exceed
 MIN_POINTS = 10  # on the surface, for their median to be one
 # Of what the median view shows explained, that a view which belongs to the surface has. Measured on
-# eleven captures, each with the pose of one view exchanged: 0.80 and more, wrong ones under PPA 0.47
-# and less.
+# eleven captures, each with the pose of one view exchanged: 0.80 and more; wrong ones under PPA had
+# 0.47 and less.
 MIN_EXPLAINED = 0.65
 MAX_ROWS = 500_000  # faces times views at a time; bounds memory
 
