@@ -205,13 +205,25 @@ class SteppedFaces:
         """
         points = np.asarray(points, np.float64)
         cells = np.moveaxis(self.grid.cells(points), -1, 0)
-        solid = self._interpolated(self._beside(self.labels == NO_FACE), cells)
-        for number, face in enumerate(self.faces):
-            if (self.labels == number).any():
-                beside = self._beside(self.not_below(number), self.shifts[number])
-                across = self._interpolated(beside, cells)
-                solid = np.minimum(solid, np.maximum(across, face.height(points)))
+        solid = self._interpolated(self._without_face, cells)
+        for face, beside in self._borders:
+            across = self._interpolated(beside, cells)
+            solid = np.minimum(solid, np.maximum(across, face.height(points)))
         return solid
+
+    @cached_property
+    def _without_face(self) -> Image:
+        """Distance to the cells that show no face."""
+        return self._beside(self.labels == NO_FACE)
+
+    @cached_property
+    def _borders(self) -> list[tuple[Face, Image]]:
+        """The faces that cells show, with the distance to the cells that are not below each."""
+        return [
+            (face, self._beside(self.not_below(number), self.shifts[number]))
+            for number, face in enumerate(self.faces)
+            if (self.labels == number).any()
+        ]
 
     def not_below(self, number: int) -> Mask:
         """Cells (H, W) of a face, of those above it, and of none.
@@ -428,12 +440,14 @@ def stepped_faces(
         if (labels != NO_FACE).any():
             nowhere = np.zeros((len(group), *grid.shape), np.float32)
             steps = SteppedFaces(tuple(group), grid, labels, shown, nowhere)
-            shifts = [_border_shift(steps, number, scene) for number in range(len(group))]
+            shifts = [_border_shift(steps, number, scene, tol) for number in range(len(group))]
             found.append(replace(steps, shifts=np.stack(shifts)))
     return tuple(found)
 
 
-def _border_shift(steps: SteppedFaces, number: int, scene: FaceScene) -> Image:
+def _border_shift(
+    steps: SteppedFaces, number: int, scene: FaceScene, face_tol: OffsetTolerances
+) -> Image:
     """By how many cells (H, W) the border of a face with lower ones lies outside of its labels'.
 
     Labels end at a cell, and follow lines of polarisation, too, which the phases' smoothing draws
@@ -445,7 +459,7 @@ def _border_shift(steps: SteppedFaces, number: int, scene: FaceScene) -> Image:
     rows, cols = np.nonzero((steps.labels == number) & beside)
     if not len(rows):
         return np.zeros(grid.shape, np.float32)
-    tol, face_tol = SilhouetteTolerances(), OffsetTolerances()
+    tol = SilhouetteTolerances()
     distance = _smoothly_beside(inside)
     outwards = np.asarray(np.gradient(distance))[:, rows, cols].T
     outwards = outwards / np.maximum(lengths(outwards)[:, None], 1e-6)
