@@ -25,6 +25,7 @@ from polmvs.config import AngleModel
 from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import KEYPOINT_SIGMA_PX, Seeds
+from polmvs.surface.borders import cells_beside
 from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.mesh_geometry import MAX_CELLS
 from polmvs.surface.offsets import (
@@ -34,7 +35,6 @@ from polmvs.surface.offsets import (
     FaceGrid,
     FaceScene,
     OffsetTolerances,
-    cells_beside,
     face_evidence,
     face_lines,
     face_scene,

@@ -29,12 +29,12 @@ from scipy.spatial import cKDTree
 
 from polmvs.camera import in_frame, sample_image
 from polmvs.config import AngleModel
-from polmvs.geometry import lengths
 from polmvs.io.arrays import kept_array
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.normals.tracks import SeedTolerances
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
+from polmvs.surface.borders import drawn_border, smoothly_beside
 from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.refinement import RefinementTolerances
 from polmvs.surface.silhouettes import SilhouetteTolerances, nearest_steps, step_slope
@@ -186,15 +186,15 @@ class SteppedFaces:
     grid : of the labels.
     labels : (H, W) int64, number of the face, ``NO_FACE`` where none is shown.
     shown : (H, W) bool, where the views show the face; beside, its label is carried on.
-    shifts : (G, H, W), by how many cells the border of each face with lower ones lies outside of
-        its labels', at each cell that of the nearest place of this border.
+    beside : (G, H, W), signed distance in cells to the cells that are not below each face,
+        negative inside; its border lies between cells.
     """
 
     faces: tuple[Face, ...]
     grid: FaceGrid
     labels: NDArray[np.int64]
     shown: Mask
-    shifts: Image
+    beside: Image
 
     def values(self, points: Floats) -> Array:
         """Signed distance ``(N,)`` of points to what the faces leave: positive in free space.
@@ -214,13 +214,13 @@ class SteppedFaces:
     @cached_property
     def _without_face(self) -> Image:
         """Distance to the cells that show no face."""
-        return self._beside(self.labels == NO_FACE)
+        return self._smoothly_beside(self.labels == NO_FACE)
 
     @cached_property
     def _borders(self) -> list[tuple[Face, Image]]:
         """The faces that cells show, with the distance to the cells that are not below each."""
         return [
-            (face, self._beside(self.not_below(number), self.shifts[number]))
+            (face, self.grid.step * self.beside[number])
             for number, face in enumerate(self.faces)
             if (self.labels == number).any()
         ]
@@ -254,45 +254,25 @@ class SteppedFaces:
 
     @cached_property
     def _by_height(self) -> list[tuple[Face, Image]]:
-        """The faces, the lowest first, with the distance to the cells that show each."""
+        """The faces, the lowest first, with the distance to the cells shown not below each."""
         rise = [float(np.median(self._rise(face))) for face in self.faces]
+        shown = self._smoothly_beside(self.shown)
         return [
-            (
-                self.faces[number],
-                self._beside(self.shown & (self.labels == number), self.shifts[number]),
-            )
+            (self.faces[number], np.maximum(shown, self.grid.step * self.beside[number]))
             for number in np.argsort(rise, kind="stable")
         ]
 
     def _rise(self, face: Face) -> Array:
         return np.asarray((self.grid.points(face) - self.grid.origin) @ self.grid.axis)
 
-    def _beside(self, inside: Mask, shift: Image | float = 0.0) -> Image:
-        """Signed distance (H, W) to a set of cells, world units, negative inside.
-
-        Its border is shifted outwards by ``shift`` (H, W) cells.
-        """
-        return np.asarray((_smoothly_beside(inside) - shift) * self.grid.step, np.float32)
+    def _smoothly_beside(self, inside: Mask) -> Image:
+        """Signed distance (H, W) to a set of cells, world units, negative inside."""
+        return np.asarray(smoothly_beside(inside) * self.grid.step, np.float32)
 
     def _interpolated(self, image: Image, cells: Array) -> Array:
         """Values at fractional cells ``(2, N)``; those of the border beyond it."""
         found = ndimage.map_coordinates(image, cells, order=1, mode="nearest")
         return np.asarray(found, np.float64)
-
-
-def cells_beside(inside: Mask) -> Array:
-    """Signed distance (H, W) in cells to the border of a set of cells, negative inside."""
-    far = float(max(inside.shape))
-    if not inside.any():
-        return np.full(inside.shape, far)
-    outwards = ndimage.distance_transform_edt(~inside)
-    inwards = ndimage.distance_transform_edt(inside) if not inside.all() else far
-    return np.where(inside, 0.5 - inwards, outwards - 0.5)
-
-
-def _smoothly_beside(inside: Mask) -> Array:
-    """As :func:`cells_beside`, without the corners of single cells."""
-    return np.asarray(ndimage.gaussian_filter(cells_beside(inside), 1.0, mode="nearest"))
 
 
 def find_faces(
@@ -438,58 +418,53 @@ def stepped_faces(
             continue
         labels, shown = _labels(group, seeds, grid, scene, first_hit, tol)
         if (labels != NO_FACE).any():
-            nowhere = np.zeros((len(group), *grid.shape), np.float32)
-            steps = SteppedFaces(tuple(group), grid, labels, shown, nowhere)
-            shifts = [_border_shift(steps, number, scene, tol) for number in range(len(group))]
-            found.append(replace(steps, shifts=np.stack(shifts)))
+            as_labelled = np.zeros((len(group), *grid.shape), np.float32)
+            steps = SteppedFaces(tuple(group), grid, labels, shown, as_labelled)
+            beside = [_border(steps, number, scene, tol) for number in range(len(group))]
+            found.append(replace(steps, beside=np.stack(beside)))
     return tuple(found)
 
 
-def _border_shift(
+def _border(
     steps: SteppedFaces, number: int, scene: FaceScene, face_tol: OffsetTolerances
 ) -> Image:
-    """By how many cells (H, W) the border of a face with lower ones lies outside of its labels'.
+    """Signed distance (H, W) in cells to the border of a face with lower ones, negative inside.
 
-    Labels end at a cell, and follow lines of polarisation, too, which the phases' smoothing draws
-    outwards. The border is where the views together show the step of intensity that is nearest.
+    Labels follow lines of polarisation, too, which the phases' smoothing draws outwards. The border
+    is where the views together show the step of intensity that is nearest.
     """
     grid, face = steps.grid, steps.faces[number]
     inside = steps.not_below(number)
-    beside = ndimage.binary_dilation(~inside)
-    rows, cols = np.nonzero((steps.labels == number) & beside)
-    if not len(rows):
-        return np.zeros(grid.shape, np.float32)
-    tol = SilhouetteTolerances()
-    distance = _smoothly_beside(inside)
-    outwards = np.asarray(np.gradient(distance))[:, rows, cols].T
-    outwards = outwards / np.maximum(lengths(outwards)[:, None], 1e-6)
-    along = np.arange(-tol.edge_reach_px - 1, tol.edge_reach_px + 1 + SPACING, SPACING)
-    cells = np.stack([rows, cols], axis=1)[:, None] + outwards[:, None] * (
-        along[:, None] - distance[rows, cols, None, None]
-    )
-    places = grid.lifted(cells, face)
-    steepness, num_views = np.zeros(places.shape[:2]), np.zeros(len(rows))
-    for phase_map, images in zip(scene.maps, scene.features, strict=True):
-        xy, seen = _seen(places, face, phase_map)
-        values = sample_image(np.asarray(images), xy)
-        shown = np.all(seen & (values[..., 3] == 1), axis=1)  # and no printed mark
-        if shown.any():
-            slope = step_slope(values[shown, :, 0]) / SPACING
-            steepness[shown] += slope / max(1.4826 * float(np.median(slope)), face_tol.dark)
-            num_views += shown
-    # Neighbours along the border see together.
-    volume = np.zeros((*grid.shape, len(along) + 1), np.float32)
-    volume[rows, cols] = np.column_stack([steepness, num_views])
-    width = tol.edge_smoothing_px
-    together = ndimage.gaussian_filter(volume, (width, width, 0))[rows, cols]
-    steepness = together[:, :-1] / np.maximum(together[:, -1:], 1e-6)
-    found, height = nearest_steps(steepness, along, 1.0, tol)
+    is_border = inside & ndimage.binary_dilation(~inside)
+    own = is_border & (steps.labels == number)
+    if not own.any():
+        return smoothly_beside(inside).astype(np.float32)
     nearest = ndimage.distance_transform_edt(
-        ~(inside & beside), return_distances=False, return_indices=True
+        ~is_border, return_distances=False, return_indices=True
     )
-    shifts = np.zeros(grid.shape, np.float32)
-    shifts[rows, cols] = np.clip(height - 1, 0, 1) * found
-    return np.asarray(shifts[nearest[0], nearest[1]])
+    tol = SilhouetteTolerances()
+    along = np.arange(-tol.edge_reach_px - 1, tol.edge_reach_px + 1 + SPACING, SPACING)
+
+    def across(curve: Array, normals: Array) -> tuple[Array, Array]:
+        last = np.array(grid.shape) - 1
+        cell = np.clip(np.rint(curve), 0, last).astype(np.int64)
+        is_own = own[tuple(nearest[:, cell[:, 0], cell[:, 1]])] & in_frame(curve, *last)
+        places = grid.lifted(curve[:, None] + normals[:, None] * along[:, None], face)
+        steepness, num_views = np.zeros(places.shape[:2]), np.zeros(len(curve))
+        for phase_map, images in zip(scene.maps, scene.features, strict=True):
+            xy, seen = _seen(places, face, phase_map)
+            values = sample_image(np.asarray(images), xy)
+            shown = is_own & np.all(seen & (values[..., 3] == 1), axis=1)  # and no printed mark
+            if shown.any():
+                slope = step_slope(values[shown, :, 0]) / SPACING
+                steepness[shown] += slope / max(1.4826 * float(np.median(slope)), face_tol.dark)
+                num_views += shown
+        found, height = nearest_steps(
+            steepness / np.maximum(num_views[:, None], 1), along, 1.0, tol
+        )
+        return found, np.where(is_own, np.clip(height - 1, 0, 1), np.nan)
+
+    return drawn_border(inside, across).astype(np.float32)
 
 
 def _grouped(faces: Sequence[Face]) -> list[list[Face]]:

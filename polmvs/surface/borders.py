@@ -1,0 +1,224 @@
+"""Borders of regions on a grid, as closed curves that are drawn to what is seen across them.
+
+Labels of cells end at whole cells, and where nothing shows a border they end by chance. A curve
+can lie between cells. It goes to the steps that are found on lines across it, and elsewhere as
+straight as these allow: what it pays for is the sum of its turns. That sum is the same for all
+convex curves, so that neither a corner nor a round border is drawn in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
+
+from polmvs.geometry import dots, lengths
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Across = Callable[[Array, Array], tuple[Array, Array]]
+
+MIN_POINTS = 8  # of a curve: with fewer it has no direction
+SUBDIVISIONS = 8  # of a curve's pieces, for distances to it
+LEAST_TURN = 1e-4  # radians, of the reweighting: straight for all that is seen
+
+
+@dataclass(frozen=True, kw_only=True)
+class BorderTolerances:
+    """Numbers of the curves; lengths are in cells, which are about a pixel.
+
+    Attributes
+    ----------
+    turn : of a curve at one of its points, radians, that costs as much as a step of half a
+        squared deviation.
+    sigma : least deviation of the steps' places. That of an analytic box's is 0.06 px; what is
+        behind is the least that poses add.
+    sigmas : deviations from which a step counts as a false one.
+    fit_rounds : of the reweighting, which makes squares of turns their amounts.
+    fit_decay : of the turn that is still squared, from round to round.
+    at_rest : move after which the steps are not looked for again: under the deviation.
+    max_passes : of looking for steps across the curve as it lies.
+    reach : of one move.
+    """
+
+    turn: float = 0.05
+    sigma: float = 0.1
+    sigmas: float = 3.0
+    fit_rounds: int = 30
+    fit_decay: float = 0.7
+    at_rest: float = 0.05
+    max_passes: int = 5
+    reach: float = 6.0
+
+
+def cells_beside(inside: Mask) -> Array:
+    """Signed distance (H, W) in cells to the border of a set of cells, negative inside."""
+    far = float(max(inside.shape))
+    if not inside.any():
+        return np.full(inside.shape, far)
+    outwards = ndimage.distance_transform_edt(~inside)
+    inwards = ndimage.distance_transform_edt(inside) if not inside.all() else far
+    return np.where(inside, 0.5 - inwards, outwards - 0.5)
+
+
+def smoothly_beside(inside: Mask) -> Array:
+    """As :func:`cells_beside`, without the corners of single cells."""
+    return np.asarray(ndimage.gaussian_filter(cells_beside(inside), 1.0, mode="nearest"))
+
+
+def drawn_border(inside: Mask, across: Across, tolerances: BorderTolerances | None = None) -> Array:
+    """Signed distance (H, W) in cells to the border of a region, drawn to steps, negative inside.
+
+    Parameters
+    ----------
+    inside : (H, W) bool, the region as labels of cells have it.
+    across : for points ``(P, 2)``, rows and columns, of a curve and its unit normals ``(P, 2)``
+        outwards: by how many cells ``(P,)`` the step lies outside, and its weight ``(P,)`` in
+        [0, 1]; NaN where the border is none of those that are to move. Points may lie beyond the
+        grid.
+    tolerances : of the curves.
+    """
+    tol = tolerances or BorderTolerances()
+    if inside.all() or not inside.any():
+        return smoothly_beside(inside)
+    # Regions go on beyond the grid, and close there: its edge is no border of them.
+    beyond = 2 * math.ceil(tol.reach)
+    inside = np.pad(np.pad(inside, beyond - 1, mode="edge"), 1)
+    on_grid = (slice(beyond, -beyond),) * 2
+    distance = smoothly_beside(inside)
+    slope = _slope(distance)
+
+    def across_padded(curve: Array, normals: Array) -> tuple[Array, Array]:
+        return across(curve - beyond, normals)
+
+    curves = [
+        _drawn(curve, slope, across_padded, tol) for curve in _outlines(inside, distance, slope)
+    ]
+    return (_distance_to(curves, distance) if curves else distance)[on_grid]
+
+
+def _outlines(inside: Mask, distance: Array, slope: Array) -> list[Array]:
+    """Closed curves (P, 2) about the regions and their holes, points a cell apart."""
+    found = cv2.findContours(inside.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
+    curves = []
+    for contour in found:
+        cells = contour[:, 0, ::-1]
+        if len(cells) < MIN_POINTS:
+            continue
+        at = tuple(cells.T)
+        foot = cells - distance[at][:, None] * _unit(slope[at])
+        curves.append(_evenly(ndimage.gaussian_filter1d(foot, 1.0, axis=0, mode="wrap")))
+    return curves
+
+
+def _evenly(curve: Array) -> Array:
+    """A closed curve with points about a cell apart."""
+    closed = np.concatenate([curve, curve[:1]])
+    pieces = lengths(np.diff(closed, axis=0))
+    along = np.concatenate([[0.0], np.cumsum(pieces)])
+    kept = np.concatenate([[True], pieces > 0])
+    num = max(round(along[-1]), MIN_POINTS)
+    places = np.linspace(0, along[-1], num, endpoint=False)
+    columns = [np.interp(places, along[kept], column[kept]) for column in closed.T]
+    return np.stack(columns, axis=1)
+
+
+def _drawn(curve: Array, slope: Array, across: Across, tol: BorderTolerances) -> Array:
+    """A closed curve, moved along its normals until it is at rest."""
+    for _ in range(tol.max_passes):
+        normals = _normals(curve, slope)
+        step, weight = across(curve, normals)
+        if not (weight > 0).any():
+            return curve
+        moved = _straightened(curve, normals, step, weight, tol)
+        curve = _evenly(curve + moved[:, None] * normals)
+        if np.abs(moved).max() < tol.at_rest:
+            break
+    return curve
+
+
+def _normals(curve: Array, slope: Array) -> Array:
+    """Unit normals (P, 2) of a closed curve, up the slope (H, W, 2)."""
+    along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
+    along = ndimage.gaussian_filter1d(along, 2.0, axis=0, mode="wrap")
+    normals = _unit(np.stack([-along[:, 1], along[:, 0]], axis=1))
+    columns = np.moveaxis(slope, -1, 0)
+    up = [ndimage.map_coordinates(one, curve.T, order=1, mode="nearest") for one in columns]
+    return np.asarray(normals * np.sign(dots(normals, np.stack(up, axis=1)).sum()))
+
+
+def _straightened(
+    curve: Array, normals: Array, step: Array, weight: Array, tol: BorderTolerances
+) -> Array:
+    """By how much (P,) the points of a closed curve move along their normals.
+
+    The least sum of squared distances to the steps, under a robust loss, and of the amounts of the
+    turns between its pieces, by reweighting.
+    """
+    num = len(curve)
+    index = np.arange(num)
+    around = [np.roll(index, side) for side in (-1, 0, 1)]
+    turns = sparse.csr_array(
+        (np.repeat([1.0, -2.0, 1.0], num), (np.tile(index, 3), np.concatenate(around)))
+    )
+    by_move = [turns @ sparse.diags_array(column) for column in normals.T]
+    given = turns @ curve
+    is_free = np.isfinite(weight)
+    step, weight = np.where(weight > 0, step, 0.0), np.where(is_free, weight, 0.0)
+    used = weight > 0
+    moved, turned = np.zeros(num), 1.0
+    for _ in range(tol.fit_rounds):
+        off = moved - step
+        sigma = max(1.4826 * float(np.median(np.abs(off[used]))), tol.sigma)
+        certain = weight / sigma**2 / (1 + (off / (tol.sigmas * sigma)) ** 2) ** 2
+        certain = np.where(is_free, certain + 1e-6, tol.sigma**-4)
+        now = np.stack([one @ moved for one in by_move], axis=1) + given
+        amount = np.sqrt((now**2).sum(axis=1) + turned**2)
+        stiff = 1 / (tol.turn * amount)
+        normal, right = sparse.csc_array(sparse.diags_array(certain)), certain * step
+        for one, column in zip(by_move, given.T, strict=True):
+            normal = normal + one.T @ sparse.diags_array(stiff) @ one
+            right = right - one.T @ (stiff * column)
+        moved = np.clip(spsolve(normal.tocsc(), right), -tol.reach, tol.reach)
+        turned = max(tol.fit_decay * turned, LEAST_TURN)
+    return np.asarray(moved)
+
+
+def _distance_to(curves: Sequence[Array], before: Array) -> Array:
+    """Signed distance (H, W) to closed curves whose sides are those of a distance before."""
+    places, outwards = [], []
+    for curve in curves:
+        ahead = np.roll(curve, -1, axis=0) - curve
+        normals = _unit(np.stack([-ahead[:, 1], ahead[:, 0]], axis=1))
+        at = np.clip(np.rint(curve), 0, np.array(before.shape) - 1).astype(np.int64)
+        slope = _slope(before)[tuple(at.T)]
+        normals *= np.sign(dots(normals, slope).sum())
+        # At a corner the mean of its sides tells in from out.
+        corners = _unit(normals + np.roll(normals, 1, axis=0))
+        for k in range(SUBDIVISIONS):
+            places.append(curve + k / SUBDIVISIONS * ahead)
+            outwards.append(normals if k else corners)
+    nodes, normals = np.concatenate(places), np.concatenate(outwards)
+    cells = np.moveaxis(np.indices(before.shape), 0, -1).reshape(-1, 2).astype(np.float64)
+    far, nearest = cKDTree(nodes).query(cells)
+    height = dots(cells - nodes[nearest], normals[nearest])
+    beside = np.sqrt(np.maximum(far**2 - height**2, 0))
+    signed = np.where(beside <= 1 / SUBDIVISIONS, height, np.copysign(far, height))
+    return np.asarray(signed.reshape(before.shape))
+
+
+def _slope(image: Array) -> Array:
+    """Gradient (H, W, 2), along rows and along columns."""
+    down, right = np.gradient(image)
+    return np.stack([down, right], axis=-1)
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.maximum(lengths(vectors)[..., None], 1e-12))
