@@ -40,10 +40,17 @@ from polmvs.surface.mesh_geometry import (
     remeshed,
     sample_surface,
 )
-from polmvs.surface.offsets import find_faces, stepped_faces
+from polmvs.surface.offsets import (
+    FaceScene,
+    SteppedFaces,
+    face_scene,
+    find_faces,
+    stepped_faces,
+)
 from polmvs.surface.refinement import (
     KnownPoints,
     KnownSides,
+    Refined,
     RefinementTolerances,
     median_residual,
     place_deviations,
@@ -54,11 +61,14 @@ from polmvs.surface.refinement import (
 from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.surface_quality import (
     MAX_SHARE,
+    MIN_EXPLAINED,
+    MIN_OUTLINED,
     Contradictions,
     FaceEvidence,
     face_evidence,
     find_contradictions,
     fit_normals,
+    outline_mismatch,
     point_offset,
     points_deny,
     stand_apart,
@@ -68,6 +78,7 @@ from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, surface_view
 from polmvs.surface.visual_hull import (
     HullTolerances,
     Plane,
+    VisualHull,
     supporting_plane,
     visual_hull,
 )
@@ -185,6 +196,7 @@ def reconstruct_surface(
         views = list(pool.map(look_at, maps))
     if reason := _no_hull(views):
         return Undetermined(reason)
+    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, folder=folder)
     done = 0
 
     def report(count: int) -> None:
@@ -195,30 +207,33 @@ def reconstruct_surface(
         if on_progress is not None:
             on_progress(count)
 
-    def given_by(kept: Mask) -> _Given:
+    def given_by(kept: Mask, *, is_suspicion: bool = False) -> _Given:
         own = list(compress(views, kept))
         return _Given(
-            angle_model=angle_model,
-            tilt_aware=tilt_aware,
-            maps=list(compress(maps, kept)),
+            all_views=views,
+            kept=kept,
+            is_suspicion=is_suspicion,
             views=own,
+            scene=scene.of(kept),
             seeds=seeds,
             plane=supporting_plane(surroundings, np.array([view.center for view in own])),
             min_views=min_views,
-            folder=folder,
             report=report,
         )
 
     tolerances, hull_tolerances = tolerances or RefinementTolerances(), HullTolerances()
-    kept, found = np.ones(len(views), np.bool_), None
-    while found is None:
-        given = given_by(kept)
-        made, meshes = _surface(given, hull_tolerances, tolerances)
-        if isinstance(made, _Contradicted):
-            made.warn(given)
-            kept[np.flatnonzero(kept)[made.odd]] = False
-        else:
-            found = made
+    given = given_by(np.ones(len(views), np.bool_))
+    hull = given.hull(hull_tolerances)
+    suspects = stand_apart(outline_mismatch(hull.mesh, views), MIN_OUTLINED)
+    if suspects.any():
+        given = given_by(~suspects, is_suspicion=True)
+        hull = given.hull(hull_tolerances)
+    attempt = _surface(given, hull, tolerances)
+    while attempt.found is None:
+        given = given_by(~attempt.odd)
+        attempt = _surface(given, given.hull(hull_tolerances), tolerances)
+    attempt.warn(given)
+    found, meshes = attempt.found, attempt.meshes
     if tolerances.thin_levels and _uncovered_share(found) > MAX_SHARE:
         logger.warning(
             "%s: %.0f %% of the polarised regions stay uncovered, walls may be thin: the surface "
@@ -228,12 +243,10 @@ def reconstruct_surface(
         )
         fine = replace(hull_tolerances, step_px=0.5 * hull_tolerances.step_px)
         thin = replace(tolerances, levels=tolerances.thin_levels)
-        unheard = replace(given, report=lambda count: None)
-        again, fine_meshes = _surface(unheard, fine, thin)
-        if isinstance(again, GlobalSurface) and _uncovered_share(again) < _uncovered_share(found):
-            found, meshes = again, fine_meshes
-    if isinstance(found, GlobalSurface):
-        found = replace(found, left_out=~kept)
+        unheard = replace(given, is_suspicion=False, report=lambda count: None)
+        again = _surface(unheard, unheard.hull(fine), thin)
+        if again.found is not None and _uncovered_share(again.found) < _uncovered_share(found):
+            found, meshes = again.found, again.meshes
     report(max(num_surface_steps(0) - done, 0))
     if on_mesh is not None:
         for mesh in meshes:
@@ -243,40 +256,69 @@ def reconstruct_surface(
 
 @dataclass(frozen=True, kw_only=True)
 class _Given:
-    """What a surface is made from; the names are those of :func:`reconstruct_surface`."""
-
-    angle_model: AngleModel
-    tilt_aware: bool
-    maps: Sequence[PhaseMap]
-    views: Sequence[SurfaceView]
-    seeds: Seeds
-    plane: Plane | None
-    min_views: int
-    folder: Path | None
-    report: OnProgress
-
-
-@dataclass(frozen=True)
-class _Contradicted:
-    """Views that contradict the others, as a first surface of all shows.
+    """What a surface is made from.
 
     Attributes
     ----------
-    unexplained : (K,) share of what each view shows that this surface does not explain.
-    odd : (K,) bool.
+    all_views, kept : what the views show, and which of them ``(K,)`` are believed.
+    is_suspicion : the others are left out for their outlines alone: they may come back.
+    views, scene : of those believed.
+    seeds, min_views : as of :func:`reconstruct_surface`.
+    plane : on which the objects stand.
+    report : progress.
     """
 
+    all_views: Sequence[SurfaceView]
+    kept: Mask
+    is_suspicion: bool
+    views: Sequence[SurfaceView]
+    scene: FaceScene
+    seeds: Seeds
+    plane: Plane | None
+    min_views: int
+    report: OnProgress
+
+    @property
+    def rows(self) -> AngleModel:
+        """Of the phases' rows: those of a tilted map are those of PPA, its samples corrected."""
+        return AngleModel.OPA if self.scene.angle_model is AngleModel.OPA else AngleModel.PPA
+
+    @property
+    def known(self) -> KnownPoints:
+        """Sparse points on the surface."""
+        return KnownPoints(self.seeds.points_in_world, self.seeds.sigma)
+
+    def hull(self, tolerances: HullTolerances) -> VisualHull:
+        """The first surface."""
+        return visual_hull(self.views, self.plane, tolerances=tolerances)
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A surface from views that may contradict each other.
+
+    Attributes
+    ----------
+    found : None where other views are to be left out than were.
+    meshes : the hull, and the mesh after each level of its refinement.
+    unexplained : (K,) share of what each of all views shows that the first level does not explain.
+    odd : (K,) bool, which are to be left out.
+    """
+
+    found: GlobalSurface | Undetermined | None
+    meshes: list[TriangleMesh]
     unexplained: Array
     odd: Mask
 
     def warn(self, given: _Given) -> None:
-        """Say which, and what to look at."""
-        for view, share in compress(zip(given.views, self.unexplained, strict=True), self.odd):
+        """Say which are left out, and what to look at."""
+        shares = zip(given.all_views, self.unexplained, strict=True)
+        for view, share in compress(shares, self.odd):
             logger.warning(
                 "%s: %s contradicts the other views: %.0f %% of what it shows is not explained by "
                 "a first surface (median of all: %.0f %%). It is left out; its pose, its mask "
                 "or its image may be wrong.",
-                given.angle_model,
+                given.scene.angle_model,
                 view.view.name,
                 100 * share,
                 100 * np.nanmedian(self.unexplained),
@@ -288,79 +330,64 @@ def _uncovered_share(found: GlobalSurface | Undetermined) -> float:
     return 1.0 if isinstance(found, Undetermined) else found.contradictions.uncovered_share
 
 
-def _surface(
-    given: _Given, hull_tolerances: HullTolerances, tolerances: RefinementTolerances
-) -> tuple[GlobalSurface | Undetermined | _Contradicted, list[TriangleMesh]]:
-    """The surface, with the hull and the mesh after each level of its refinement.
-
-    None is made where views contradict what the first level finds.
-    """
-    maps, seeds, angle_model, tilt_aware = (
-        given.maps,
-        given.seeds,
-        given.angle_model,
-        given.tilt_aware,
-    )
+def _surface(given: _Given, hull: VisualHull, tolerances: RefinementTolerances) -> _Attempt:
+    """The surface that a hull is refined to."""
     meshes: list[TriangleMesh] = []
-    hull = visual_hull(given.views, given.plane, tolerances=hull_tolerances)
+    unexplained, odd = np.full(len(given.kept), np.nan), ~given.kept
+
+    def attempt(found: GlobalSurface | Undetermined | None) -> _Attempt:
+        return _Attempt(found, meshes, unexplained, odd)
+
     if not len(hull.mesh.faces):
-        return Undetermined("the polarised regions of the views have no common object"), meshes
+        return attempt(Undetermined("the polarised regions of the views have no common object"))
     logger.info("visual hull: %d vertices.", len(hull.mesh.vertices))
     steps = stepped_faces(
-        find_faces(seeds),
-        seeds,
-        maps,
-        angle_model,
-        tilt_aware=tilt_aware,
+        find_faces(given.seeds),
+        given.seeds,
+        given.scene,
         signed_distance=RayScene(hull.mesh).signed_distance,
         first_hit=_first_hit(hull.mesh),
-        folder=given.folder,
     )
     if steps:
         logger.info("%d groups of faces that silhouettes do not tell apart.", len(steps))
         hull = hull.carved([group.values for group in steps])
-    # Rows of a tilted map are those of PPA: its samples are corrected.
-    rows = AngleModel.OPA if angle_model is AngleModel.OPA else AngleModel.PPA
-    known = KnownPoints(seeds.points_in_world, seeds.sigma)
     meshes.append(hull.mesh)
-    hollows = _hollows(given, hull.mesh, hull.footprint)
+    hollows = _hollows(given.scene, hull.mesh, hull.footprint)
     if hollows:
         # Phases of what sees only itself would be dug after.
         still = tuple(replace(level, with_slope=False) for level in tolerances.levels)
         tolerances = replace(tolerances, levels=still)
-    contradicted: list[_Contradicted] = []
 
     def is_agreed(mesh: TriangleMesh) -> bool:
+        nonlocal unexplained, odd
         meshes.append(mesh)
         if len(meshes) == 2:  # the hull and the first level
             # A model that leaves something out (OPA the perspective) contradicts all views.
-            shown, _ = median_residual(mesh, given.views, rows, tolerances)
-            unexplained = unexplained_shares(mesh, given.views, rows, shown.direct)
-            odd = stand_apart(unexplained)
-            if odd.any():
-                contradicted.append(_Contradicted(unexplained, odd))
-        return not contradicted
+            shown, _ = median_residual(mesh, given.views, given.rows, tolerances)
+            unexplained = unexplained_shares(mesh, given.all_views, given.rows, shown.direct)
+            judged = given.kept | given.is_suspicion
+            odd = ~judged
+            odd[judged] = stand_apart(unexplained[judged], MIN_EXPLAINED)
+        return bool((odd == ~given.kept).all())
 
     refined = refine(
         hull.mesh,
         given.views,
-        rows,
+        given.rows,
         hull.footprint,
-        known=known,
+        known=given.known,
         tolerances=tolerances,
         on_progress=given.report,
         go_on=is_agreed,
     )
-    if contradicted:
-        return contradicted[0], meshes
-    mesh = refined.mesh
-    views = [replace(view, tilt_share=refined.tilt_share) for view in given.views]
+    if (odd == given.kept).any():
+        return attempt(None)
     # A refined outer wall places the inner one better than the hull's.
-    hollows = _hollows(given, mesh, hull.footprint, hollows) or hollows
-    # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
+    hollows = _hollows(given.scene, refined.mesh, hull.footprint, hollows) or hollows
     carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
-    uncarved = mesh
+    mesh = refined.mesh
     if carvings and len(mesh.faces):
+        # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
         mesh = remeshed(
             mesh,
             mesh.mean_edge / REMESHED_EDGE,
@@ -369,13 +396,47 @@ def _surface(
             smoothing=0,
         )
     if not len(mesh.faces):
-        return Undetermined("the surface vanishes under the phases of the views"), meshes
-    shown, median = median_residual(mesh, views, rows, tolerances)
-    row_sigma = shown.direct
-    fitted = fit_normals(mesh, views, rows, row_sigma=row_sigma)
+        return attempt(Undetermined("the surface vanishes under the phases of the views"))
+    settled = _settled(given, mesh, refined, carvings, hull.footprint, tolerances)
+    return attempt(_borne_out(given, settled, steps, hollows, hull.footprint, refined.tilt_share))
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """A sharp mesh at rest.
+
+    Attributes
+    ----------
+    mesh : with F faces.
+    views : which know what of the tilt is taken back.
+    normals : (F, 3) unit, of the sides of edges.
+    sigma_deg : (F,) of the normals that the phases show.
+    row_sigma, median : of the phases' residuals, and their median.
+    """
+
+    mesh: TriangleMesh
+    views: Sequence[SurfaceView]
+    normals: Array
+    sigma_deg: Array
+    row_sigma: float
+    median: float
+
+
+def _settled(
+    given: _Given,
+    mesh: TriangleMesh,
+    refined: Refined,
+    carvings: Sequence[Callable[[Array], Floats]],
+    footprint: float,
+    tolerances: RefinementTolerances,
+) -> _Settled:
+    """A carved mesh with the sides of its edges sharp, moved until it is at rest."""
+    views = [replace(view, tilt_share=refined.tilt_share) for view in given.views]
+    shown, median = median_residual(mesh, views, given.rows, tolerances)
+    fitted = fit_normals(mesh, views, given.rows, row_sigma=shown.direct)
     facing, is_wall = fitted.normals, np.zeros(len(mesh.faces), np.bool_)
     if carvings:
-        to_uncarved = lengths(RayScene(uncarved).closest(mesh.centers)[0] - mesh.centers)
+        to_uncarved = lengths(RayScene(refined.mesh).closest(mesh.centers)[0] - mesh.centers)
         facing, is_wall = wall_normals(
             mesh, fitted.normals, fitted.is_fitted, carvings, to_uncarved
         )
@@ -387,45 +448,57 @@ def _surface(
         return settling_step(
             mesh,
             views,
-            rows,
-            hull.footprint,
+            given.rows,
+            footprint,
             shown,
             sides=sides,
-            known=known,
+            known=given.known,
             tolerances=tolerances,
         )
 
-    mesh = _at_rest(sharpened(mesh, normals), normals, settle, known, hull.footprint)
+    mesh = _at_rest(sharpened(mesh, normals), normals, settle, given.known, footprint)
     given.report(1)
-    evidence = face_evidence(mesh, views, rows, row_sigma=row_sigma)
+    return _Settled(mesh, views, normals, fitted.sigma_deg, shown.direct, median)
+
+
+def _borne_out(
+    given: _Given,
+    settled: _Settled,
+    steps: Sequence[SteppedFaces],
+    hollows: Sequence[Hollow],
+    footprint: float,
+    tilt_share: float,
+) -> GlobalSurface:
+    """A surface with what the views bear out of it."""
+    mesh, views, rows, known = settled.mesh, settled.views, given.rows, given.known
+    evidence = face_evidence(mesh, views, rows, row_sigma=settled.row_sigma)
     supported = supported_faces(mesh, evidence, min_views=given.min_views)
     seen = evidence.num_views >= given.min_views
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     presumed = seen & ~supported & _lie_on(mesh, [hollow.values for hollow in hollows])
     supported |= presumed
     given.report(1)
-    sigma = _deviations(mesh, views, rows, hull.footprint, known)
+    sigma = _deviations(mesh, views, rows, footprint, known)
     given.report(1)
-    offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, hull.footprint)
+    offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, footprint)
     contradictions = replace(
-        find_contradictions(mesh, evidence, supported, views, median),
+        find_contradictions(mesh, evidence, supported, views, settled.median),
         point_offset_px=offset_px,
         point_offset_sigmas=offset_sigmas,
     )
-    surface = GlobalSurface(
+    return GlobalSurface(
         mesh=mesh,
         supported=supported,
         evidence=evidence,
-        normals=corner_normals(mesh, normals),
-        sigma_deg=fitted.sigma_deg,
+        normals=corner_normals(mesh, settled.normals),
+        sigma_deg=settled.sigma_deg,
         sigma=sigma,
-        footprint=hull.footprint,
+        footprint=footprint,
         contradictions=contradictions,
         presumed=presumed,
-        tilt_share=refined.tilt_share,
-        left_out=np.zeros(len(views), np.bool_),
+        tilt_share=tilt_share,
+        left_out=~given.kept,
     )
-    return surface, meshes
 
 
 def _at_rest(
@@ -447,7 +520,7 @@ def _at_rest(
 
 
 def _hollows(
-    given: _Given, mesh: TriangleMesh, footprint: float, before: Sequence[Hollow] = ()
+    scene: FaceScene, mesh: TriangleMesh, footprint: float, before: Sequence[Hollow] = ()
 ) -> tuple[Hollow, ...]:
     """Hollows of a mesh that see only themselves, ``before`` of an earlier state of it."""
     if not len(mesh.faces):
@@ -459,14 +532,7 @@ def _hollows(
         RayScene(mesh).inside_along,
         footprint,
     )
-    return find_hollows(
-        faces,
-        given.maps,
-        given.angle_model,
-        tilt_aware=given.tilt_aware,
-        before=before,
-        folder=given.folder,
-    )
+    return find_hollows(faces, scene, before=before)
 
 
 def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:

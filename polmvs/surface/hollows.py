@@ -14,14 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from polmvs.camera import in_frame, sample_image
-from polmvs.config import AngleModel
 from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import KEYPOINT_SIGMA_PX, Seeds
@@ -37,7 +35,6 @@ from polmvs.surface.offsets import (
     OffsetTolerances,
     face_evidence,
     face_lines,
-    face_scene,
     find_faces,
     median_loss,
     row_losses,
@@ -144,31 +141,25 @@ class SurfaceFaces:
 
 def find_hollows(
     surface: SurfaceFaces,
-    maps: Sequence[PhaseMap],
-    angle_model: AngleModel,
+    scene: FaceScene,
     *,
-    tilt_aware: bool = True,
     tolerances: HollowTolerances | None = None,
     offset_tolerances: OffsetTolerances | None = None,
     before: Sequence[Hollow] = (),
-    folder: Path | None = None,
 ) -> tuple[Hollow, ...]:
     """Mouths that a surface closes with a cap, and the hollows presumed behind them.
 
     Parameters
     ----------
     surface : the visual hull or better; its outside decides where the hollow's walls are.
-    maps : phase maps of the views.
-    angle_model, tilt_aware : of the rows, as in :func:`polmvs.normals.rows.gather_rows`.
+    scene : the views.
     tolerances, offset_tolerances : numbers of the search, and of the borders.
     before : hollows of an earlier state of the surface, whose mouths are looked for first: a cap
         that phases have bent lies in no plane by itself.
-    folder : as of :func:`polmvs.surface.offsets.face_scene`.
     """
     tol, face_tol = tolerances or HollowTolerances(), offset_tolerances or OffsetTolerances()
-    if not len(surface.centers) or len(maps) < MIN_VIEWS:
+    if not len(surface.centers) or len(scene.maps) < MIN_VIEWS:
         return ()
-    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=face_tol, folder=folder)
     found: list[Hollow] = []
     known = [_on_surface(hollow.rim, surface) for hollow in before]
     for flat in [*known, *_flat_pieces(surface, tol, face_tol)]:
@@ -180,7 +171,7 @@ def find_hollows(
         mouth = _mouth(rim, grid, scene, tol, face_tol)
         inner = ndimage.binary_erosion(mouth, iterations=3)
         places = grid.points(rim)
-        if not _is_dark(places[inner], places[_ring_about(mouth, tol)], maps, tol):
+        if not _is_dark(places[inner], places[_ring_about(mouth, tol)], scene.maps, tol):
             continue
         hollow = _hollow(surface, rim, grid, mouth, tol)
         if hollow is not None:

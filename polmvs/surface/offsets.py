@@ -14,8 +14,10 @@ walls between the faces that no smoothness has rounded.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
 from typing import TypeAlias
 
@@ -28,7 +30,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from polmvs.camera import in_frame, sample_image
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, default_num_workers
 from polmvs.io.arrays import kept_array
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.normals.tracks import SeedTolerances
@@ -377,14 +379,11 @@ def _without_interlopers(faces: Sequence[Face], points: Array, tol: OffsetTolera
 def stepped_faces(
     faces: Sequence[Face],
     seeds: Seeds,
-    maps: Sequence[PhaseMap],
-    angle_model: AngleModel,
+    scene: FaceScene,
     *,
-    tilt_aware: bool = True,
     signed_distance: SignedDistance | None = None,
     first_hit: FirstHit | None = None,
     tolerances: OffsetTolerances | None = None,
-    folder: Path | None = None,
 ) -> tuple[SteppedFaces, ...]:
     """Groups of faces of like normal that a first surface does not explain, with their extents.
 
@@ -392,28 +391,23 @@ def stepped_faces(
     ----------
     faces : of :func:`find_faces`.
     seeds : whose members they are.
-    maps : phase maps of the views.
-    angle_model, tilt_aware : of the rows, as in :func:`polmvs.normals.rows.gather_rows`.
+    scene : the views.
     signed_distance : of points ``(N, 3)`` to the first surface. Groups whose seeds all lie on it
         are left out. None: all are looked at.
     first_hit : distance and normal where rays from ``(N, 3)`` along ``(3,)`` first meet the first
         surface (inf where they do not): it keeps the places that it explains better.
     tolerances : numbers of the search.
-    folder : as of :func:`face_scene`.
     """
     tol = tolerances or OffsetTolerances()
-    if not faces:
-        return ()
-    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, tolerances=tol, folder=folder)
     found = []
     for group in _grouped(faces):
         points = seeds.points_in_world[np.concatenate([face.members for face in group])]
-        footprint = _footprint(points, maps)
+        footprint = _footprint(points, scene.maps)
         if signed_distance is not None and not any(
             _is_off(face, seeds, signed_distance, tol.seed_cells * footprint) for face in group
         ):
             continue
-        grid = _grid_over(group, points, maps, footprint, tol)
+        grid = _grid_over(group, points, scene.maps, footprint, tol)
         if grid is None:
             continue
         labels, shown = _labels(group, seeds, grid, scene, first_hit, tol)
@@ -551,6 +545,11 @@ class FaceScene:
     tilt_aware: bool
     features: Sequence[ArrayLike]
 
+    def of(self, kept: Mask) -> FaceScene:
+        """The same with some of the views, ``(K,)`` bool."""
+        maps, features = list(compress(self.maps, kept)), list(compress(self.features, kept))
+        return replace(self, maps=maps, features=features)
+
     def rows(self, points: Array, maps: Sequence[PhaseMap] | None = None) -> Rows:
         """Rows of points ``(N, 3)``, of all views or of some."""
         chosen = self.maps if maps is None else maps
@@ -570,12 +569,18 @@ def face_scene(
     tolerances: OffsetTolerances | None = None,
     folder: Path | None = None,
 ) -> FaceScene:
-    """What is asked about faces, from the views' phase maps; kept in a folder or in memory."""
+    """What is asked about faces, from the views' phase maps; kept in a folder or in memory.
+
+    ``angle_model`` and ``tilt_aware`` are those of :func:`polmvs.normals.rows.gather_rows`.
+    """
     tol = tolerances or OffsetTolerances()
-    features = [
-        kept_array(_features(one, tol), folder and folder / f"{one.view.name}.features.npy")
-        for one in maps
-    ]
+
+    def features_of(one: PhaseMap) -> ArrayLike:
+        path = folder and folder / f"{one.view.name}.features.npy"
+        return kept_array(_features(one, tol), path)
+
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        features = list(pool.map(features_of, maps))
     return FaceScene(maps, angle_model, tilt_aware, features)
 
 

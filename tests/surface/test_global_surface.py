@@ -3,10 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from analytic_objects import box, looking_at, phase_maps_of, ring_of_views, sphere, trace, union
+from test_mesh_geometry import extracted
 
 from polmvs.config import AngleModel
 from polmvs.polarization.region import Region
 from polmvs.scene import Seeds
+from polmvs.surface import global_surface
 from polmvs.surface.global_surface import (
     Undetermined,
     num_surface_steps,
@@ -17,7 +19,15 @@ from polmvs.surface.global_surface import (
 )
 from polmvs.surface.mesh_geometry import RayScene
 from polmvs.surface.refinement import KnownPoints, Level, RefinementTolerances
-from polmvs.surface.surface_quality import Contradictions, points_deny
+from polmvs.surface.silhouettes import find_silhouette
+from polmvs.surface.surface_quality import (
+    MIN_OUTLINED,
+    Contradictions,
+    outline_mismatch,
+    points_deny,
+    stand_apart,
+)
+from polmvs.surface.surface_view import surface_view
 
 PPA = AngleModel.PPA
 NO_SEEDS = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
@@ -160,6 +170,40 @@ def test_views_that_contradict_the_others_are_named_and_left_out(caplog):
 
 def test_views_that_agree_are_all_kept(surface):
     assert not surface.left_out.any()
+
+
+def half_unpolarised(phase_map):
+    """The phase map of a view that shows half of the object only, and nothing wrong."""
+    inside = phase_map.region.inside.copy()
+    inside[:, inside.shape[1] // 2 :] = False
+    return replace(phase_map, region=Region(inside, inside, np.zeros_like(inside)))
+
+
+def test_a_view_suspected_for_its_outline_comes_back_where_its_phases_agree(maps, monkeypatch):
+    suspected = []
+
+    def noted(mesh, views):
+        shares = outline_mismatch(mesh, views)
+        suspected.append(stand_apart(shares, MIN_OUTLINED))
+        return shares
+
+    monkeypatch.setattr(global_surface, "outline_mismatch", noted)
+    found = reconstruct([*maps[:7], half_unpolarised(maps[7]), *maps[8:]], masks_given=True)
+    assert np.flatnonzero(suspected[0]).tolist() == [7]
+    assert not found.left_out.any()
+
+
+def test_outlines_are_held_against_a_mesh(maps):
+    views = [surface_view(one, find_silhouette(one, mask_given=True), PPA) for one in maps[:3]]
+    views[1] = surface_view(
+        half_unpolarised(maps[1]), find_silhouette(half_unpolarised(maps[1]), mask_given=True), PPA
+    )
+    ball = extracted(sphere(), step=0.05)
+    whole, half, also_whole = outline_mismatch(ball, views)
+    assert half == pytest.approx(0.5, abs=0.08)  # as much as a column of those asked
+    assert max(whole, also_whole) < 0.06  # a pixel of its border, asked every fourth
+    away = ball.moved(np.broadcast_to([0.0, 0.0, 5.0], ball.vertices.shape))
+    assert (outline_mismatch(away, views) == 1).all()
 
 
 def test_several_objects():

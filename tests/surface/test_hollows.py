@@ -11,6 +11,7 @@ from polmvs.polarization.phase_map import build_phase_map
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
 from polmvs.surface.hollows import HollowTolerances, SurfaceFaces, find_hollows
+from polmvs.surface.offsets import face_scene
 from polmvs.synthetic.captures import Cylinder, Group, Plane, render_view, ring_of_views
 
 CAMERA = PinholeCamera(width=280, height=240, fx=260.0, fy=260.0, cx=140.0, cy=120.0)
@@ -98,7 +99,7 @@ def closed_cylinder():
 
 def test_a_dark_mouth_with_a_rim_of_one_width_opens_into_a_hollow():
     maps = vessel_maps()
-    (hollow,) = find_hollows(closed_cylinder(), maps, AngleModel.PPA)
+    (hollow,) = find_hollows(closed_cylinder(), face_scene(maps, AngleModel.PPA))
     assert hollow.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
     assert hollow.thickness_sigma < 0.7 * FOOTPRINT
     np.testing.assert_allclose(hollow.rim.normal, [0, 0, 1], atol=0.01)
@@ -115,35 +116,35 @@ def test_a_dark_mouth_with_a_rim_of_one_width_opens_into_a_hollow():
 
 
 def test_a_mouth_once_found_is_looked_for_at_its_place():
-    maps, surface = vessel_maps(), closed_cylinder()
-    before = find_hollows(surface, maps, AngleModel.PPA)
+    surface, scene = closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA)
+    before = find_hollows(surface, scene)
     x, y, z = surface.centers.T
     # Phases have bent one side of the cap up, and no plane is found in it.
     bent_up = (surface.normals[:, 2] > 0.5) & (x > 0)
     height = np.where(bent_up, z + 3.5 * FOOTPRINT, z)
     bent = replace(surface, centers=np.stack([x, y, height], axis=1))
     no_plane = HollowTolerances(max_planes=0)
-    assert find_hollows(bent, maps, AngleModel.PPA, tolerances=no_plane) == ()
-    (hollow,) = find_hollows(bent, maps, AngleModel.PPA, tolerances=no_plane, before=before)
+    assert find_hollows(bent, scene, tolerances=no_plane) == ()
+    (hollow,) = find_hollows(bent, scene, tolerances=no_plane, before=before)
     assert hollow.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
     assert hollow.rim.offset == pytest.approx(HEIGHT, abs=0.5 * FOOTPRINT)
 
 
 def test_a_closed_body_has_no_hollow():
     maps = vessel_maps(bore=1e-4)
-    assert find_hollows(closed_cylinder(), maps, AngleModel.PPA) == ()
+    assert find_hollows(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
 
 
 def test_a_rim_of_varying_width_presumes_nothing():
     maps = vessel_maps(bore=0.035, offset=0.015)
-    assert find_hollows(closed_cylinder(), maps, AngleModel.PPA) == ()
+    assert find_hollows(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
 
 
 def test_a_bright_label_without_phase_is_no_mouth():
     maps = vessel_maps(dark=1.0)
-    assert find_hollows(closed_cylinder(), maps, AngleModel.PPA) == ()
+    assert find_hollows(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
 
 
 def test_too_few_views_find_nothing():
     maps = vessel_maps()[:2]
-    assert find_hollows(closed_cylinder(), maps, AngleModel.PPA) == ()
+    assert find_hollows(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()

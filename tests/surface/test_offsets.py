@@ -9,7 +9,7 @@ from scenes import phase_map_of
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.config import AngleModel
 from polmvs.scene import Seeds
-from polmvs.surface.offsets import find_faces, snapped_border, stepped_faces
+from polmvs.surface.offsets import face_scene, find_faces, snapped_border, stepped_faces
 from polmvs.synthetic.captures import Group, Plane, Sphere, render_view, ring_of_views
 
 CAMERA = PinholeCamera(width=320, height=256, fx=270.0, fy=270.0, cx=160.0, cy=128.0)
@@ -114,7 +114,7 @@ def test_space_above_the_faces_of_a_step_is_free(height, tilt_deg):
     scene = step_scene(height, tilt_deg)
     faces = find_faces(scene.seeds)
     assert sorted(len(face.members) for face in faces) == [9, 10]
-    (group,) = stepped_faces(faces, scene.seeds, scene.maps, AngleModel.PPA)
+    (group,) = stepped_faces(faces, scene.seeds, face_scene(scene.maps, AngleModel.PPA))
     points = column_points()
     above = points[:, 2] - scene.true_height(points[:, :2])
     clear = np.abs(above) > 1e-3
@@ -133,7 +133,9 @@ def test_walls_stand_where_the_intensity_steps(top_gain, most):
     Polarisation alone shows the border then, whose steps the regions' smoothing widens.
     """
     scene = step_scene(0.03, top_gain=top_gain)
-    (group,) = stepped_faces(find_faces(scene.seeds), scene.seeds, scene.maps, AngleModel.PPA)
+    (group,) = stepped_faces(
+        find_faces(scene.seeds), scene.seeds, face_scene(scene.maps, AngleModel.PPA)
+    )
     along = np.linspace(-0.7, 0.7, 41) * BOX
     beside = np.arange(-3, 3.05, 0.1) * FOOTPRINT
     medians, squares = [], []
@@ -158,7 +160,10 @@ def test_a_surface_that_explains_all_points_is_left_alone():
 
     faces = find_faces(scene.seeds)
     assert (
-        stepped_faces(faces, scene.seeds, scene.maps, AngleModel.PPA, signed_distance=exact) == ()
+        stepped_faces(
+            faces, scene.seeds, face_scene(scene.maps, AngleModel.PPA), signed_distance=exact
+        )
+        == ()
     )
     # A plain box: one face, on the surface that silhouettes give.
     plain = Seeds(
@@ -167,7 +172,10 @@ def test_a_surface_that_explains_all_points_is_left_alone():
     )
     (face,) = find_faces(plain)
     found = stepped_faces(
-        [face], plain, scene.maps, AngleModel.PPA, signed_distance=lambda points: points[:, 2]
+        [face],
+        plain,
+        face_scene(scene.maps, AngleModel.PPA),
+        signed_distance=lambda points: points[:, 2],
     )
     assert found == ()
 
@@ -188,7 +196,9 @@ def test_what_stands_on_a_face_is_not_carved(knows_the_ball):
         def first_hit(origins, direction):
             return ball.intersect(origins, np.broadcast_to(direction, origins.shape))
 
-    (group,) = stepped_faces(find_faces(seeds), seeds, maps, AngleModel.PPA, first_hit=first_hit)
+    (group,) = stepped_faces(
+        find_faces(seeds), seeds, face_scene(maps, AngleModel.PPA), first_hit=first_hit
+    )
     rng = np.random.default_rng(0)
     inside = rng.normal(size=(500, 3))
     inside = center + 0.8 * radius * inside / np.linalg.norm(inside, axis=1, keepdims=True)
@@ -221,7 +231,7 @@ def test_points_of_a_curved_surface_or_too_few_make_no_large_face():
     assert find_faces(few) == ()
     unknown = Seeds(0.05 * normals, np.full((60, 3), np.nan), np.full(60, SIGMA))
     assert find_faces(unknown) == ()
-    assert stepped_faces((), few, [], AngleModel.PPA) == ()
+    assert stepped_faces((), few, face_scene([], AngleModel.PPA)) == ()
 
 
 def test_a_border_follows_its_lines_around_corners():
@@ -243,7 +253,7 @@ def test_a_border_follows_its_lines_around_corners():
 def test_what_stands_on_the_lowest_face_is_solid():
     scene = step_scene(0.03, 0.0)
     faces = find_faces(scene.seeds)
-    (group,) = stepped_faces(faces, scene.seeds, scene.maps, AngleModel.PPA)
+    (group,) = stepped_faces(faces, scene.seeds, face_scene(scene.maps, AngleModel.PPA))
     points = column_points()
     inside = (np.abs(points[:, :2]) < BOX).all(axis=1) & (points[:, 2] > 0) & (points[:, 2] < 0.03)
     clear = np.minimum(np.abs(points[:, 2]), np.abs(points[:, 2] - 0.03)) > 1e-3
