@@ -33,6 +33,7 @@ from polmvs.surface.offsets import (
     FaceGrid,
     FaceScene,
     OffsetTolerances,
+    border_of_steps,
     face_evidence,
     face_lines,
     find_faces,
@@ -173,7 +174,8 @@ def find_hollows(
         places = grid.points(rim)
         if not _is_dark(places[inner], places[_ring_about(mouth, tol)], scene.maps, tol):
             continue
-        hollow = _hollow(surface, rim, grid, mouth, tol)
+        beside = border_of_steps(mouth, _inner_border(mouth), rim, grid, scene, face_tol)
+        hollow = _hollow(surface, rim, grid, mouth, beside, tol)
         if hollow is not None:
             found.append(hollow)
     return tuple(found)
@@ -339,6 +341,10 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: HollowTol
     return len(ratios) >= MIN_VIEWS and float(np.median(ratios)) < tol.max_brightness
 
 
+def _inner_border(mask: Mask) -> Mask:
+    return np.asarray(mask & ~ndimage.binary_erosion(mask), np.bool_)
+
+
 def _ring_about(mouth: Mask, tol: HollowTolerances) -> Mask:
     """Cells (H, W) of the rim about a mouth, off the line between them."""
     line = ndimage.binary_dilation(mouth, iterations=2)
@@ -351,10 +357,14 @@ def _hollow(
     rim: Face,
     grid: FaceGrid,
     mouth: Mask,
+    beside: Floats,
     tol: HollowTolerances,
 ) -> Hollow | None:
-    """The hollow under a mouth, its wall as thick as at the rim; None where that varies."""
-    border = mouth & ~ndimage.binary_erosion(mouth)
+    """The hollow under a mouth, its wall as thick as at the rim; None where that varies.
+
+    The mouth's border lies ``beside`` (H, W) cells off the cells, negative inside.
+    """
+    border = _inner_border(mouth)
     spacing, most = 0.5 * tol.rounding, MAX_CELLS // mouth.size
     depths = np.array([tol.rounding, *(spacing * np.arange(1, most))], np.float64)
     order = np.argsort(depths)
@@ -368,12 +378,12 @@ def _hollow(
         # What the silhouettes left open inside of the wall is no wall.
         return cells_beside(np.asarray(ndimage.binary_fill_holes(inside), np.bool_))
 
-    wall = -outside_of(insides[0])[border] - 0.5
+    wall = (beside - outside_of(insides[0]))[border]
     thickness = float(np.median(wall))
     sigma = 1.4826 * float(np.median(np.abs(wall - thickness)))
     if thickness <= 1 or sigma > max(tol.thickness_spread * thickness, 1.0):
         return None
-    free = -cells_beside(mouth)
+    free = -np.asarray(beside, np.float64)
     layers = [free]
     for depth, inside in zip(depths[1:], insides[1:], strict=True):
         if not inside.any():

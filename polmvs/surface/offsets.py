@@ -419,20 +419,37 @@ def stepped_faces(
     return tuple(found)
 
 
-def _border(
-    steps: SteppedFaces, number: int, scene: FaceScene, face_tol: OffsetTolerances
+def _border(steps: SteppedFaces, number: int, scene: FaceScene, tol: OffsetTolerances) -> Image:
+    """Signed distance (H, W) in cells to the border of a face with lower ones, negative inside."""
+    inside = steps.not_below(number)
+    own = inside & ndimage.binary_dilation(~inside) & (steps.labels == number)
+    return border_of_steps(inside, own, steps.faces[number], steps.grid, scene, tol)
+
+
+def border_of_steps(
+    inside: Mask,
+    own: Mask,
+    face: Face,
+    grid: FaceGrid,
+    scene: FaceScene,
+    face_tol: OffsetTolerances,
 ) -> Image:
-    """Signed distance (H, W) in cells to the border of a face with lower ones, negative inside.
+    """Signed distance (H, W) in cells to the border of a region on a face, negative inside.
 
     Labels follow lines of polarisation, too, which the phases' smoothing draws outwards. The border
     is where the views together show the step of intensity that is nearest.
+
+    Parameters
+    ----------
+    inside : (H, W) bool, the region.
+    own : (H, W) bool, cells at its border that may move it.
+    face, grid : over which the region is one.
+    scene : the views.
+    face_tol : numbers.
     """
-    grid, face = steps.grid, steps.faces[number]
-    inside = steps.not_below(number)
-    is_border = inside & ndimage.binary_dilation(~inside)
-    own = is_border & (steps.labels == number)
     if not own.any():
         return smoothly_beside(inside).astype(np.float32)
+    is_border = inside & ndimage.binary_dilation(~inside)
     nearest = ndimage.distance_transform_edt(
         ~is_border, return_distances=False, return_indices=True
     )
