@@ -8,7 +8,6 @@ convex curves, so that neither a corner nor a round border is drawn in.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -26,6 +25,7 @@ Mask = NDArray[np.bool_]
 Across = Callable[[Array, Array], tuple[Array, Array]]
 
 MIN_POINTS = 8  # of a curve: with fewer it has no direction
+BEYOND = 12  # cells: farther than steps are looked for
 SUBDIVISIONS = 8  # of a curve's pieces, for distances to it
 LEAST_TURN = 1e-4  # radians, of the reweighting: straight for all that is seen
 
@@ -36,26 +36,26 @@ class BorderTolerances:
 
     Attributes
     ----------
-    turn : of a curve at one of its points, radians, that costs as much as a step of half a
-        squared deviation.
-    sigma : least deviation of the steps' places. That of an analytic box's is 0.06 px; what is
-        behind is the least that poses add.
-    sigmas : deviations from which a step counts as a false one.
-    fit_rounds : of the reweighting, which makes squares of turns their amounts.
-    fit_decay : of the turn that is still squared, from round to round.
+    turn : of a curve at one of its points, radians, that costs as much as a step a deviation off.
+        Measured on the box of `step`, slope of its walls against the true ones: 1.4, 1.2, 0.9 deg
+        with twice this, this and its half; a round border becomes a polygon of longer sides.
+    sigma : least deviation of the steps' places. An analytic box's are 0.06 px off, and poses add
+        to it. Measured likewise: 0.8, 1.2, 1.5 deg with twice, once, half.
+    sigmas : deviations from which a step counts as a false one. Measured likewise: 1.3 and 1.0 deg
+        with twice and half.
+    fit_decay : of the turn that is still squared, from round to round: the square root of it moves
+        those walls by less than 0.1 deg.
     at_rest : move after which the steps are not looked for again: under the deviation.
-    max_passes : of looking for steps across the curve as it lies.
-    reach : of one move.
+    max_passes : of looking for steps across the curve as it lies. Measured likewise: 1.2 and 1.1
+        deg with 3 and 10.
     """
 
     turn: float = 0.05
     sigma: float = 0.1
     sigmas: float = 3.0
-    fit_rounds: int = 30
     fit_decay: float = 0.7
     at_rest: float = 0.05
     max_passes: int = 5
-    reach: float = 6.0
 
 
 def cells_beside(inside: Mask) -> Array:
@@ -89,14 +89,13 @@ def drawn_border(inside: Mask, across: Across, tolerances: BorderTolerances | No
     if inside.all() or not inside.any():
         return smoothly_beside(inside)
     # Regions go on beyond the grid, and close there: its edge is no border of them.
-    beyond = 2 * math.ceil(tol.reach)
-    inside = np.pad(np.pad(inside, beyond - 1, mode="edge"), 1)
-    on_grid = (slice(beyond, -beyond),) * 2
+    inside = np.pad(np.pad(inside, BEYOND - 1, mode="edge"), 1)
+    on_grid = (slice(BEYOND, -BEYOND),) * 2
     distance = smoothly_beside(inside)
     slope = _slope(distance)
 
     def across_padded(curve: Array, normals: Array) -> tuple[Array, Array]:
-        return across(curve - beyond, normals)
+        return across(curve - BEYOND, normals)
 
     curves = [
         _drawn(curve, slope, across_padded, tol) for curve in _outlines(inside, distance, slope)
@@ -174,7 +173,7 @@ def _straightened(
     step, weight = np.where(weight > 0, step, 0.0), np.where(is_free, weight, 0.0)
     used = weight > 0
     moved, turned = np.zeros(num), 1.0
-    for _ in range(tol.fit_rounds):
+    while turned > LEAST_TURN:
         off = moved - step
         sigma = max(1.4826 * float(np.median(np.abs(off[used]))), tol.sigma)
         certain = weight / sigma**2 / (1 + (off / (tol.sigmas * sigma)) ** 2) ** 2
@@ -186,8 +185,8 @@ def _straightened(
         for one, column in zip(by_move, given.T, strict=True):
             normal = normal + one.T @ sparse.diags_array(stiff) @ one
             right = right - one.T @ (stiff * column)
-        moved = np.clip(spsolve(normal.tocsc(), right), -tol.reach, tol.reach)
-        turned = max(tol.fit_decay * turned, LEAST_TURN)
+        moved = spsolve(normal.tocsc(), right)
+        turned *= tol.fit_decay
     return np.asarray(moved)
 
 
