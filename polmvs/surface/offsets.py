@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from scipy.sparse.linalg import splu
-from scipy.spatial import cKDTree
+from scipy.spatial import Delaunay, cKDTree
 
 from polmvs.camera import in_frame, sample_image
 from polmvs.config import AngleModel, default_num_workers
@@ -290,8 +290,8 @@ def find_faces(
 
     Returns
     -------
-    Faces without common seeds. Points among those of a larger face, but off it, are no face of
-    their own (mirror images and false matches).
+    Faces without common seeds. Points among those of a larger face, but below it, are no face of
+    their own (mirror images).
     """
     tol = tolerances or OffsetTolerances()
     points, normals = seeds.points_in_world, seeds.normals_in_world
@@ -355,22 +355,28 @@ def _fitted(seeds: Seeds, members: NDArray[np.int64], tol: OffsetTolerances) -> 
 
 
 def _without_interlopers(faces: Sequence[Face], points: Array, tol: OffsetTolerances) -> list[Face]:
-    """Faces whose seeds do not lie, sideways, among those of a larger face of like normal."""
+    """Faces that are no mirror images in a larger one of like normal.
+
+    What a face mirrors lies behind it, sideways within its points and scattered among them. A face
+    below that goes on beside the one above lies around its points, the floor of a recess apart.
+    """
     kept: list[Face] = []
     for face in faces:
-        alike = [
+        mirrors = [
             other
             for other in kept
             if face.normal @ other.normal > np.cos(np.radians(CreaseTolerances.crease_deg))
+            and np.median(other.height(points[face.members])) < 0
         ]
-        if alike:
+        if mirrors:
             tangents = np.linalg.svd(face.normal[None])[2][1:]
             own = points[face.members] @ tangents.T
-            others = np.concatenate([points[other.members] for other in alike]) @ tangents.T
+            others = np.concatenate([points[other.members] for other in mirrors]) @ tangents.T
+            within = Delaunay(others, qhull_options="QJ").find_simplex(own) >= 0
             tree = cKDTree(np.concatenate([own, others]))
             num = min(tol.min_points + 1, len(own) + len(others))
             near = np.atleast_2d(tree.query(own, num)[1])
-            if np.mean(near[:, 1:] < len(own)) < 0.5:
+            if np.mean(within) > 0.5 and np.mean(near[:, 1:] < len(own)) < 0.5:
                 continue
         kept.append(face)
     return kept

@@ -234,6 +234,29 @@ def test_points_of_a_curved_surface_or_too_few_make_no_large_face():
     assert stepped_faces((), few, face_scene([], AngleModel.PPA)) == ()
 
 
+def face_seeds(xy, height):
+    """Seeds at places (N, 2) of a level face."""
+    points = np.column_stack([xy, np.full(len(xy), height)])
+    return Seeds(points, np.tile([0.0, 0.0, 1.0], (len(xy), 1)), np.full(len(xy), SIGMA))
+
+
+@pytest.mark.parametrize("below", [0.03, -0.03])
+def test_few_points_around_many_of_another_face_are_a_face(below):
+    """Their nearest neighbours are the other's; around it, or above, no mirror image lies."""
+    rng = np.random.default_rng(0)
+    many = rng.uniform(-0.05, 0.05, (40, 2))
+    angles = np.arange(7) * 2 * np.pi / 7
+    around = (0.09 if below > 0 else 0.04) * np.column_stack([np.cos(angles), np.sin(angles)])
+    parts = [face_seeds(many, below), face_seeds(around, 0.0)]
+    seeds = Seeds(
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("points_in_world", "normals_in_world", "sigma")
+        )
+    )
+    assert sorted(len(face.members) for face in find_faces(seeds)) == [7, 40]
+
+
 def test_a_border_follows_its_lines_around_corners():
     """A turned square, drawn too small and without its corners; noise stands for texture."""
     rows, cols = np.indices((160, 160))
