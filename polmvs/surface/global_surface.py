@@ -313,7 +313,7 @@ class _Attempt:
     def warn(self, given: _Given) -> None:
         """Say which are left out, and what to look at."""
         shares = zip(given.all_views, self.unexplained, strict=True)
-        for view, share in compress(shares, self.odd):
+        for view, share in compress(shares, self.odd & np.isfinite(self.unexplained)):
             logger.warning(
                 "%s: %s contradicts the other views: %.0f %% of what it shows is not explained by "
                 "a first surface (median of all: %.0f %%). It is left out; its pose, its mask "
