@@ -78,7 +78,7 @@ def sided_normals(
     (F, 3) unit.
     """
     tol = tolerances or CreaseTolerances()
-    average = sparse.csr_array(mesh.incidence @ mesh.incidence.T)
+    average = mesh.face_pairs.copy()
     one, other = average.tocoo().coords
     near = np.exp(-0.5 * _squared_distance(mesh.centers, one, other) / mesh.mean_edge**2)
     certain = mesh.face_areas * np.where(is_fitted, 1.0, tol.unfitted_weight)
@@ -134,7 +134,7 @@ def sides_known(
     is_known : (F,) bool, faces whose normals something shows.
     """
     tol = tolerances or CreaseTolerances()
-    one, other = sparse.csr_array(mesh.incidence @ mesh.incidence.T).tocoo().coords
+    one, other = mesh.face_pairs.tocoo().coords
     alike = (normals[one] * normals[other]).sum(axis=1) > np.cos(np.radians(tol.crease_deg))
     one, other = one[alike], other[alike]
     for _ in range(2):  # rings of triangles over which an edge is rounded

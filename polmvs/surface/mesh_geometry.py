@@ -118,6 +118,11 @@ class TriangleMesh:
         return sparse.coo_array((np.ones(3 * num), indices), shape=shape).tocsr()
 
     @cached_property
+    def face_pairs(self) -> sparse.csr_array:
+        """How many vertices two faces share, ``(F, F)``, where they share any."""
+        return sparse.csr_array(self.incidence @ self.incidence.T)
+
+    @cached_property
     def face_components(self) -> NDArray[np.int64]:
         """Label ``(F,)`` of the connected piece of each face, from 0."""
         labels = connected_components(self.adjacency, directed=False)[1]
