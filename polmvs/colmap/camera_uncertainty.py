@@ -1,16 +1,17 @@
-"""What an estimated camera leaves uncertain of a model's shape.
+"""What estimated cameras and poses leave uncertain.
 
 Few views fix a camera badly, and an error of its focal length or principal point bends the whole
 model while every image fits. Bundle adjustment's covariance says how well each combination of the
 camera's parameters is known. The model is adjusted anew with the camera moved by one standard
 deviation along each of them: how its points move then is a *mode*, and the modes' squares add up to
-the variance of any place.
+the variance of any place. That of the poses is what is left once the cameras' centres are aligned.
 """
 
 from __future__ import annotations
 
 import copy
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -108,6 +109,89 @@ def camera_uncertainty(
     return CameraUncertainty(focal=focal, modes=stacked)
 
 
+def pose_uncertainty(
+    model: Path, *, tolerances: CameraTolerances = CameraTolerances()
+) -> Array | None:
+    """Covariances of the poses that bundle adjustment estimated, with the camera as it is.
+
+    Parameters
+    ----------
+    model : folder of a COLMAP model.
+
+    Returns
+    -------
+    (V, 6, 6) of the views sorted by name: of a small turn of the camera about the world's axes,
+    radians, and of its centre, world units, where the centres of all are aligned by a similarity.
+    None where there are too many views, or no covariance can be had.
+    """
+    reconstruction = read_reconstruction(model)
+    if reconstruction.num_reg_images() > tolerances.max_views:
+        return None
+    images = sorted(
+        (reconstruction.image(i) for i in reconstruction.reg_image_ids()), key=lambda one: one.name
+    )
+    adjuster = _adjuster(reconstruction, tolerances, free=False, free_point=False)
+    options = pycolmap.BACovarianceOptions()
+    options.params = pycolmap.BACovarianceOptionsParams.POSES
+    found = pycolmap.estimate_ba_covariance(options, reconstruction, adjuster)
+    if found is None:
+        return None
+    num = len(images)
+    joint, by_step = np.zeros((2, 6 * num, 6 * num))
+    for row, one in enumerate(images):
+        here = slice(6 * row, 6 * row + 6)
+        by_step[here, here] = _in_world(one.cam_from_world())
+        for col, other in enumerate(images[: row + 1]):
+            there = slice(6 * col, 6 * col + 6)
+            block = (
+                found.get_cam_cov_from_world(one.image_id)
+                if row == col
+                else found.get_cam_cross_cov_from_world(one.image_id, other.image_id)
+            )
+            if block is not None and block.shape == (6, 6):  # none: held by the gauge
+                joint[here, there], joint[there, here] = block, block.T
+    by_step = _with_centers_aligned([one.projection_center() for one in images]) @ by_step
+    # The estimate takes residuals of one pixel. Those of few views are small by being adjusted.
+    covariance = by_step @ joint @ by_step.T * _residual_px(reconstruction, tolerances) ** 2
+    each = np.array([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(num)])
+    return each if np.isfinite(each).all() else None
+
+
+def _in_world(cam_from_world: pycolmap.Rigid3d) -> Array:
+    """Turn and move (6, 6) of a camera in the world by those of ``cam_from_world``."""
+    rotation = np.asarray(cam_from_world.rotation.matrix(), np.float64)
+    x, y, z = cam_from_world.translation
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    step = np.zeros((6, 6))
+    step[:3, :3] = -rotation.T
+    step[3:, :3], step[3:, 3:] = -rotation.T @ cross, -rotation.T
+    return step
+
+
+def _with_centers_aligned(centers: Sequence[Array]) -> Array:
+    """What is left (6 V, 6 V) of turns and moves when a similarity takes the centres back."""
+    num = len(centers)
+    around = np.asarray(centers) - np.mean(centers, axis=0)
+    by_similarity = np.zeros((num, 6, 7))  # a turn, a move, a scale
+    by_similarity[:, :3, :3] = np.eye(3)
+    for axis in range(3):
+        by_similarity[:, 3:, axis] = np.cross(np.eye(3)[axis], around)
+    by_similarity[:, 3:, 3:6] = np.eye(3)
+    by_similarity[:, 3:, 6] = around
+    of_centers = np.zeros((num, 3, 6 * num))
+    for k in range(num):
+        of_centers[k, :, 6 * k + 3 : 6 * k + 6] = np.eye(3)
+    fitted = np.linalg.pinv(by_similarity[:, 3:].reshape(3 * num, 7)) @ of_centers.reshape(
+        3 * num, 6 * num
+    )
+    return np.asarray(np.eye(6 * num) - by_similarity.reshape(6 * num, 7) @ fitted)
+
+
+def _residual_px(reconstruction: pycolmap.Reconstruction, t: CameraTolerances) -> float:
+    """Deviation of a keypoint's coordinate; the mean of a 2D distance is 1.25 deviations."""
+    return float(max(reconstruction.compute_mean_reprojection_error() / 1.2533, t.min_residual_px))
+
+
 def _mode(
     reconstruction: pycolmap.Reconstruction, step: Array, t: CameraTolerances, *, free: bool
 ) -> tuple[Array, float]:
@@ -142,9 +226,8 @@ def _parameter_covariance(
     covariance = None if found is None else found.get_other_params_cov(camera.params)
     if covariance is None or covariance.shape != (len(estimated), len(estimated)):
         return None
-    # The estimate takes residuals of one pixel; the mean of a 2D distance is 1.25 deviations.
-    residual = max(reconstruction.compute_mean_reprojection_error() / 1.2533, t.min_residual_px)
-    covariance = np.asarray(covariance, np.float64) * residual**2
+    # The estimate takes residuals of one pixel.
+    covariance = np.asarray(covariance, np.float64) * _residual_px(reconstruction, t) ** 2
     positive = bool((np.diag(covariance) > 0).all())
     return covariance if positive and np.isfinite(covariance).all() else None
 

@@ -20,7 +20,8 @@ R = TypeVar("R")
 # Of ``run.json``; to be raised with every change of the record or of what a stage gives.
 # 1: the first releases, which did not name it. 2: stages with their results. 3: SfM as a stage of
 # its own, trust, notes on the capture. 4: seeds are sparse points alone. 5: what stages wrote.
-SCHEMA_VERSION = 5
+# 6: covariances of the poses.
+SCHEMA_VERSION = 6
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pycolmap", "open3d")
 
 

@@ -22,6 +22,7 @@ LOG_FILE = "polmvs.log"
 SURFACE_MESH = "surface.ply"  # among dense views: the mesh that they are rendered from
 NOT_OURS = "was not written by polmvs. Move it out of the way."
 CAMERA_MODES = "camera_modes.npy"  # beside the model of SfM: what its camera leaves open
+POSE_COVARIANCES = "pose_covariances.npy"  # likewise: what its adjustment leaves of the poses
 SURFACE_LEVELS = "surface_{number}.ply"  # and those on its way: its hull, then after each level
 DENSE_MARKER = "polmvs-files.txt"  # in a COLMAP workspace: the files that were written with it
 
@@ -56,6 +57,11 @@ class RunFolder:
     def camera_modes(self) -> Path:
         """What an estimated camera leaves open, in the frame of ``sparse``."""
         return self.root / "tracks" / "camera.npy"
+
+    @property
+    def pose_covariances(self) -> Path:
+        """What estimated poses leave open, in the frame of ``sparse``."""
+        return self.root / "tracks" / "poses.npy"
 
     @property
     def seeds(self) -> Path:
@@ -122,11 +128,12 @@ _MODEL_FILES = {f"{name}.bin" for name in ("cameras", "images", "points3D", "rig
 _SURFACES = {SURFACE_MESH, *(SURFACE_LEVELS.format(number=number) for number in range(10))}
 # What a run writes in its folders, by folder.
 FOLDER_FILES = {
-    HERE.sfm.name: {*_MODEL_FILES, CAMERA_MODES},
+    HERE.sfm.name: {*_MODEL_FILES, CAMERA_MODES, POSE_COVARIANCES},
     HERE.sparse.name: _MODEL_FILES,
     HERE.seeds.parent.name: {
         HERE.seeds.name,
         HERE.camera_modes.name,
+        HERE.pose_covariances.name,
         *(HERE.track_normals(model).name for model in AngleModel),
     },
     **{HERE.views(model).name: _SURFACES for model in AngleModel},

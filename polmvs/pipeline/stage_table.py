@@ -131,6 +131,7 @@ def _place_model(run: StageInput) -> poses.PosesResult:
         images.image_names(run.capture),
         folder.sparse,
         folder.camera_modes,
+        folder.pose_covariances,
         run.options.reference,
     )
 
@@ -193,6 +194,7 @@ def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
         model,
         sparse=folder.sparse,
         camera_modes=folder.camera_modes,
+        pose_covariances=folder.pose_covariances,
         images=folder.images,
         maps=folder.maps(model),
         track_normals=folder.track_normals(model),
@@ -293,7 +295,7 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             name="poses",
             command=SFM,
             reads=(HERE.images, HERE.sfm),
-            writes=(HERE.sparse, HERE.camera_modes),
+            writes=(HERE.sparse, HERE.camera_modes, HERE.pose_covariances),
             decides=("reference",),
             work=_place_model,
             result=poses.PosesResult,
@@ -380,7 +382,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             command=DENSIFY,
             angle_model=model,
             reads=(
-                *(HERE.sparse, HERE.camera_modes, HERE.images),
+                *(HERE.sparse, HERE.camera_modes, HERE.pose_covariances, HERE.images),
                 *(HERE.maps(model), track_normals, HERE.seeds),
             ),
             writes=(cloud, views),

@@ -1,16 +1,17 @@
-"""What an estimated camera adds to the stated deviations of a surface."""
+"""What estimated cameras and poses add to the stated deviations of a surface."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from polmvs.scene import View
+from polmvs.scene import MIN_FACING_COSINE, View
 from polmvs.surface.dense_view import find_dense_view, store_dense_view
 from polmvs.surface.fusion import FusedCloud
 
@@ -55,12 +56,45 @@ class CameraModes:
     def widen_stored(self, views: Sequence[View], folder: Path) -> None:
         """Have the deviations of stored dense views hold the camera's."""
         for view in views if self._tree is not None else ():
-            dense = find_dense_view(folder / view.name)
-            if dense is None:
-                continue
-            known = dense.known
-            rays = view.rays_in_world(dense.lattice_xy()[known])
-            points = view.center_in_world + rays * dense.range_map[known][:, None]
-            sigma = np.array(dense.sigma)
-            sigma[known] = np.hypot(sigma[known], self.sigma_along(points, rays))
-            store_dense_view(replace(dense, sigma=sigma, path=None), folder / view.name)
+            _widen(view, folder, lambda points, rays, normals: self.sigma_along(points, rays))
+
+
+def widen_by_poses(views: Sequence[View], covariances: Array, folder: Path) -> None:
+    """Have the deviations of stored dense views hold those of the views' own poses.
+
+    The surface is where all views have it; how far it is from one of them hangs on its own pose.
+
+    Parameters
+    ----------
+    views, covariances : (V, 6, 6), as of :func:`polmvs.colmap.camera_uncertainty.pose_uncertainty`;
+        none where nothing is known of them.
+    folder : of the stored views.
+    """
+    if not len(covariances):
+        return
+    for view, covariance in zip(views, covariances, strict=True):
+        _widen(view, folder, partial(_range_sigma, view.center_in_world, covariance))
+
+
+def _range_sigma(
+    center: Array, covariance: Array, points: Array, rays: Array, normals: Array
+) -> Array:
+    """Deviation (N,) of the ranges of points on planes of given normals ``(N, 3)``."""
+    facing = np.minimum((normals * rays).sum(axis=1), -MIN_FACING_COSINE)
+    by_pose = np.concatenate([np.cross(points - center, normals), normals], axis=1)
+    by_pose /= facing[:, None]
+    return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", by_pose, covariance, by_pose)))
+
+
+def _widen(view: View, folder: Path, sigma_of: Callable[[Array, Array, Array], Array]) -> None:
+    """Add deviations, of points, rays and normals ``(N, 3)``, to those of a stored view."""
+    dense = find_dense_view(folder / view.name)
+    if dense is None:
+        return
+    known = dense.known
+    rays = view.rays_in_world(dense.lattice_xy()[known])
+    points = view.center_in_world + rays * dense.range_map[known][:, None]
+    normals = np.asarray(dense.normals_in_world[known], np.float64)
+    sigma = np.array(dense.sigma)
+    sigma[known] = np.hypot(sigma[known], sigma_of(points, rays, normals))
+    store_dense_view(replace(dense, sigma=sigma, path=None), folder / view.name)

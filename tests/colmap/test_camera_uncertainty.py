@@ -5,8 +5,14 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
-from polmvs.colmap.camera_uncertainty import CameraTolerances, camera_uncertainty
+from polmvs.colmap.camera_uncertainty import (
+    CameraTolerances,
+    camera_uncertainty,
+    pose_uncertainty,
+)
+from polmvs.geometry import align_points
 
 NOISE_PX = 0.5
 TRUE = (1280.0, 512.0, 384.0)  # f, cx, cy
@@ -31,11 +37,12 @@ def noisy_model(folder: Path, *, num_views: int, seed: int, single: bool = True)
     return folder
 
 
-def adjusted(folder: Path, *, point: bool) -> float:
+def adjusted(folder: Path, *, point: bool, focal: bool = True) -> float:
     """Have the camera estimated, written back; the error of its focal length, px."""
     model = pycolmap.Reconstruction(str(folder))
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = point
+    options.refine_focal_length = options.refine_extra_params = focal
     options.print_summary = False
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
@@ -88,3 +95,46 @@ def test_what_is_not_estimated_is_none(tmp_path: Path, case: str) -> None:
     folder = noisy_model(tmp_path / "a", num_views=4, seed=3, single=single)
     limit = CameraTolerances(max_views=3 if single else 40)
     assert camera_uncertainty(folder, tolerances=limit) is None
+
+
+def aligned_poses(folder: Path, true: pycolmap.Reconstruction) -> np.ndarray:
+    """Turns about the world's axes and moves (V, 6) of the poses, the centres laid on the true."""
+    model = pycolmap.Reconstruction(str(folder))
+    ids = sorted(model.reg_image_ids(), key=lambda i: model.image(i).name)
+    centers, true_centers = (
+        np.array([one.image(i).projection_center() for i in ids]) for one in (model, true)
+    )
+    back = align_points(centers, true_centers)
+    found = []
+    for i, center, true_center in zip(ids, centers, true_centers, strict=True):
+        rotation, true_rotation = (
+            one.image(i).cam_from_world().rotation.matrix() for one in (model, true)
+        )
+        turned = Rotation.from_matrix((rotation @ back.rotation.T).T @ true_rotation)
+        found.append(np.concatenate([turned.as_rotvec(), back * center - true_center]))
+    return np.array(found)
+
+
+def test_poses_err_as_stated(tmp_path: Path) -> None:
+    """Errors of six poses, twelve times, in their stated deviations."""
+    squares = []
+    for seed in range(12):
+        folder = noisy_model(tmp_path / str(seed), num_views=6, seed=seed)
+        true = pycolmap.Reconstruction(str(folder))  # noise is in the keypoints alone
+        adjusted(folder, point=False, focal=False)
+        found = pose_uncertainty(folder)
+        assert found is not None
+        assert found.shape == (6, 6, 6)
+        errors = aligned_poses(folder, true)
+        for part in (slice(3), slice(3, 6)):
+            variance = np.trace(found[:, part, part], axis1=1, axis2=2)
+            squares.append([(errors[:, part] ** 2).sum(axis=1), variance])
+    turns, moves = np.array(squares[::2]), np.array(squares[1::2])
+    for errors, variance in ((turns[:, 0], turns[:, 1]), (moves[:, 0], moves[:, 1])):
+        # Of 12 x 6 errors of three coordinates: within a quarter (3 sigma), were they independent.
+        assert 0.7 < np.sqrt(errors.sum() / variance.sum()) < 1.4
+
+
+def test_poses_of_many_views_have_none(tmp_path: Path) -> None:
+    folder = noisy_model(tmp_path / "a", num_views=4, seed=3)
+    assert pose_uncertainty(folder, tolerances=CameraTolerances(max_views=3)) is None

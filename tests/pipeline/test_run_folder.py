@@ -80,7 +80,7 @@ def test_record_survives_writing_and_reading(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "{}", '{"stages": 3}', '{"schema_version": 5, "stages": []}', "\0"]
+    "text", ["", "[]", "{}", '{"stages": 3}', '{"schema_version": 6, "stages": []}', "\0"]
 )
 def test_damaged_record_is_one_clear_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
@@ -103,7 +103,7 @@ def test_run_of_the_version_before_is_refused_by_name_and_version(tmp_path: Path
     run_folder.run_file.write_text(json.dumps(content))
     message = (
         rf"{tmp_path}: holds a run of polmvs 0\.1\.0, whose run\.json has schema version 1; this "
-        r"is polmvs .*, which reads version 5 .*Give another OUT, or begin anew there: .*with "
+        r"is polmvs .*, which reads version 6 .*Give another OUT, or begin anew there: .*with "
         r"`run\.overwrite` delete that run"
     )
     with pytest.raises(DataError, match=message):

@@ -30,12 +30,12 @@ from polmvs.parallel import Workers
 from polmvs.pipeline.monitor import OnProgress, no_progress
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, replace_folder, scratch
 from polmvs.pipeline.stages.maps import open_maps, posed_views
-from polmvs.pipeline.stages.poses import load_camera_modes
+from polmvs.pipeline.stages.poses import load_camera_modes, load_pose_covariances
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind, Seeds
-from polmvs.surface.camera_sigma import CameraModes
+from polmvs.surface.camera_sigma import CameraModes, widen_by_poses
 from polmvs.surface.consensus import hidden_by
 from polmvs.surface.contour import propagate
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
@@ -87,6 +87,7 @@ def densify(
     *,
     sparse: Path,
     camera_modes: Path,
+    pose_covariances: Path,
     images: Path,
     maps: Path,
     track_normals: Path,
@@ -110,7 +111,7 @@ def densify(
     ----------
     model : angle model.
     sparse, images : folders of the COLMAP model and of its images.
-    camera_modes : file of what the estimated camera leaves open.
+    camera_modes, pose_covariances : files of what the estimated camera and poses leave open.
     maps : folder of the phase maps for ``model``.
     track_normals, seeds : files of the model's normals of the sparse points, and of the seeds.
     cloud : PLY to write.
@@ -165,10 +166,10 @@ def densify(
                 workers=workers,
                 on_progress=on_progress,
             )
-        modes = CameraModes(
-            read_model(sparse).tracks.points_in_world, load_camera_modes(camera_modes)
-        )
+        sparse_model = read_model(sparse)
+        modes = CameraModes(sparse_model.tracks.points_in_world, load_camera_modes(camera_modes))
         modes.widen_stored([phase_map.view for phase_map in phase_maps], new_views)
+        widen_by_poses(sparse_model.views, load_pose_covariances(pose_covariances), new_views)
         surface = surface_cloud(modes.widened(fused))
         surface.scalars["kind"][: len(presumed)][presumed] = PointKind.PRESUMED
         around = _surroundings_cloud(

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from polmvs.colmap.models import read_model, write_model
 from polmvs.config import ReferenceOptions
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.images import read_bytes, read_gray, write_bytes
-from polmvs.pipeline.run_folder import CAMERA_MODES, replace_folder, scratch
+from polmvs.pipeline.run_folder import CAMERA_MODES, POSE_COVARIANCES, replace_folder, scratch
 from polmvs.poses.metric_frame import Frame, metric_frame, transform_model
 
 
@@ -77,17 +78,19 @@ def place_model(
     names: Iterable[str],
     target: Path,
     camera: Path,
+    poses: Path,
     reference: ReferenceOptions | None = None,
 ) -> PosesResult:
     """Bring the model of SfM, or a given one, into the metric frame that is asked for.
 
     Parameters
     ----------
-    source : folder of the model in its own frame, with ``CAMERA_MODES``.
+    source : folder of the model in its own frame, with ``CAMERA_MODES`` and
+        ``POSE_COVARIANCES``.
     images : folder of the intensity images, in which markers are looked for.
     names : of the images in it.
     target : folder of the COLMAP model, whole or not at all.
-    camera : file for the camera's modes in the same frame.
+    camera, poses : files for the camera's modes and the poses' covariances in the same frame.
     reference : defaults where None.
 
     Raises
@@ -97,13 +100,17 @@ def place_model(
     """
     model = read_model(source)
     modes = np.asarray(map_array(source / CAMERA_MODES), np.float64)
+    covariances = np.asarray(map_array(source / POSE_COVARIANCES), np.float64)
     frame = metric_frame(
         model, reference or ReferenceOptions(), lambda name: read_gray(images / name)
     )
     if frame is not None:
         similarity = frame.metric_from_world
         model = transform_model(model, similarity)
-        modes = similarity.scale * modes @ np.asarray(similarity.rotation).T
+        rotation = np.asarray(similarity.rotation)
+        modes = similarity.scale * modes @ rotation.T
+        both = block_diag(rotation, similarity.scale * rotation)
+        covariances = both @ covariances @ both.T
     with scratch(target) as folder:
         if frame is None:  # bit for bit what SfM wrote
             (folder / "sparse").mkdir()
@@ -114,6 +121,7 @@ def place_model(
         replace_folder(folder / "sparse", target)
     camera.parent.mkdir(exist_ok=True)
     save_array(camera, modes)
+    save_array(poses, covariances)
     return PosesResult(
         num_views=len(model.views),
         unregistered=tuple(sorted(set(names) - {view.name for view in model.views})),
@@ -124,6 +132,11 @@ def place_model(
 
 def load_camera_modes(source: Path) -> NDArray[np.float64]:
     """The camera's modes (K, T, 3) at the sparse points, as :func:`place_model` stored them."""
+    return np.asarray(map_array(source), np.float64)
+
+
+def load_pose_covariances(source: Path) -> NDArray[np.float64]:
+    """The poses' covariances (V, 6, 6), sorted by name; V is 0 where nothing is known of them."""
     return np.asarray(map_array(source), np.float64)
 
 

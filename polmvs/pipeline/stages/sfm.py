@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from polmvs.colmap.camera_uncertainty import camera_uncertainty
+from polmvs.colmap.camera_uncertainty import camera_uncertainty, pose_uncertainty
 from polmvs.colmap.database import NoRoomError
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.sfm import NoModelError, run_sfm
@@ -20,7 +20,7 @@ from polmvs.errors import DataError
 from polmvs.io.arrays import save_array
 from polmvs.io.clouds import preload
 from polmvs.pipeline.monitor import OnProgress, no_progress
-from polmvs.pipeline.run_folder import CAMERA_MODES, replace_folder, scratch
+from polmvs.pipeline.run_folder import CAMERA_MODES, POSE_COVARIANCES, replace_folder, scratch
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture
 from polmvs.scene import SparseModel, short_list
@@ -80,8 +80,8 @@ def find_model(
     ----------
     images : folder of 8-bit intensity images.
     names : of the images in it.
-    target : folder of the COLMAP model, whole or not at all; with it goes ``CAMERA_MODES``, which
-        :func:`polmvs.colmap.camera_uncertainty.camera_uncertainty` explains.
+    target : folder of the COLMAP model, whole or not at all; with it go ``CAMERA_MODES`` and
+        ``POSE_COVARIANCES``, which :mod:`polmvs.colmap.camera_uncertainty` explains.
     options : defaults where None.
 
     Raises
@@ -117,6 +117,10 @@ def find_model(
             found = camera_uncertainty(new)
         modes = np.zeros((0, len(model.tracks.point3D_ids), 3)) if found is None else found.modes
         save_array(new / CAMERA_MODES, modes)
+        covariances = pose_uncertainty(new)
+        save_array(
+            new / POSE_COVARIANCES, np.zeros((0, 6, 6)) if covariances is None else covariances
+        )
         replace_folder(new, target)
     _warn_of_missing(model, images)
     _warn_of_few(len(model.views))
@@ -179,6 +183,7 @@ def take_model(model: SparseModel, source: Path, target: Path) -> SfmResult:
         write_model(model, folder / "sparse")
         modes = np.zeros((0, len(model.tracks.point3D_ids), 3))
         save_array(folder / "sparse" / CAMERA_MODES, modes)
+        save_array(folder / "sparse" / POSE_COVARIANCES, np.zeros((0, 6, 6)))
         replace_folder(folder / "sparse", target)
     _warn_of_missing(model, source)
     _warn_of_few(len(model.views))
