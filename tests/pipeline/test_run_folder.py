@@ -110,9 +110,9 @@ def test_run_of_the_version_before_is_refused_by_name_and_version(tmp_path: Path
         prepare_output(run_folder, overwrite=False, resume=True)
     with pytest.raises(DataError, match=message):
         read_options(run_folder)
-    content["schema_version"] = 6
+    content["schema_version"] = 7
     run_folder.run_file.write_text(json.dumps(content))
-    with pytest.raises(DataError, match="has schema version 6"):
+    with pytest.raises(DataError, match="has schema version 7"):
         load_record(run_folder)
     assert prepare_output(run_folder, overwrite=True, resume=False) == Record()
     assert list(tmp_path.iterdir()) == []
