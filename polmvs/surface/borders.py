@@ -100,7 +100,7 @@ def drawn_border(inside: Mask, across: Across, tolerances: BorderTolerances | No
     curves = [
         _drawn(curve, slope, across_padded, tol) for curve in _outlines(inside, distance, slope)
     ]
-    return (_distance_to(curves, distance) if curves else distance)[on_grid]
+    return (_distance_to(curves, slope) if curves else distance)[on_grid]
 
 
 def _outlines(inside: Mask, distance: Array, slope: Array) -> list[Array]:
@@ -190,27 +190,27 @@ def _straightened(
     return np.asarray(moved)
 
 
-def _distance_to(curves: Sequence[Array], before: Array) -> Array:
-    """Signed distance (H, W) to closed curves whose sides are those of a distance before."""
+def _distance_to(curves: Sequence[Array], slope: Array) -> Array:
+    """Signed distance (H, W) to closed curves, positive up the slope (H, W, 2)."""
+    shape = slope.shape[:2]
     places, outwards = [], []
     for curve in curves:
         ahead = np.roll(curve, -1, axis=0) - curve
         normals = _unit(np.stack([-ahead[:, 1], ahead[:, 0]], axis=1))
-        at = np.clip(np.rint(curve), 0, np.array(before.shape) - 1).astype(np.int64)
-        slope = _slope(before)[tuple(at.T)]
-        normals *= np.sign(dots(normals, slope).sum())
+        at = np.clip(np.rint(curve), 0, np.array(shape) - 1).astype(np.int64)
+        normals *= np.sign(dots(normals, slope[tuple(at.T)]).sum())
         # At a corner the mean of its sides tells in from out.
         corners = _unit(normals + np.roll(normals, 1, axis=0))
         for k in range(SUBDIVISIONS):
             places.append(curve + k / SUBDIVISIONS * ahead)
             outwards.append(normals if k else corners)
     nodes, normals = np.concatenate(places), np.concatenate(outwards)
-    cells = np.moveaxis(np.indices(before.shape), 0, -1).reshape(-1, 2).astype(np.float64)
+    cells = np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 2).astype(np.float64)
     far, nearest = cKDTree(nodes).query(cells)
     height = dots(cells - nodes[nearest], normals[nearest])
     beside = np.sqrt(np.maximum(far**2 - height**2, 0))
     signed = np.where(beside <= 1 / SUBDIVISIONS, height, np.copysign(far, height))
-    return np.asarray(signed.reshape(before.shape))
+    return np.asarray(signed.reshape(shape))
 
 
 def _slope(image: Array) -> Array:

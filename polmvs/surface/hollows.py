@@ -174,7 +174,7 @@ def find_hollows(
         places = grid.points(rim)
         if not _is_dark(places[inner], places[_ring_about(mouth, tol)], scene.maps, tol):
             continue
-        beside = border_of_steps(mouth, _inner_border(mouth), rim, grid, scene, face_tol)
+        beside = border_of_steps(mouth, mouth, rim, grid, scene, face_tol)
         hollow = _hollow(surface, rim, grid, mouth, beside, tol)
         if hollow is not None:
             found.append(hollow)
@@ -341,10 +341,6 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: HollowTol
     return len(ratios) >= MIN_VIEWS and float(np.median(ratios)) < tol.max_brightness
 
 
-def _inner_border(mask: Mask) -> Mask:
-    return np.asarray(mask & ~ndimage.binary_erosion(mask), np.bool_)
-
-
 def _ring_about(mouth: Mask, tol: HollowTolerances) -> Mask:
     """Cells (H, W) of the rim about a mouth, off the line between them."""
     line = ndimage.binary_dilation(mouth, iterations=2)
@@ -364,7 +360,7 @@ def _hollow(
 
     The mouth's border lies ``beside`` (H, W) cells off the cells, negative inside.
     """
-    border = _inner_border(mouth)
+    border = mouth & ~ndimage.binary_erosion(mouth)
     spacing, most = 0.5 * tol.rounding, MAX_CELLS // mouth.size
     depths = np.array([tol.rounding, *(spacing * np.arange(1, most))], np.float64)
     order = np.argsort(depths)

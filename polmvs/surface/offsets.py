@@ -418,8 +418,8 @@ def stepped_faces(
             continue
         labels, shown = _labels(group, seeds, grid, scene, first_hit, tol)
         if (labels != NO_FACE).any():
-            as_labelled = np.zeros((len(group), *grid.shape), np.float32)
-            steps = SteppedFaces(tuple(group), grid, labels, shown, as_labelled)
+            not_drawn = np.zeros((len(group), *grid.shape), np.float32)
+            steps = SteppedFaces(tuple(group), grid, labels, shown, not_drawn)
             beside = [_border(steps, number, scene, tol) for number in range(len(group))]
             found.append(replace(steps, beside=np.stack(beside)))
     return tuple(found)
@@ -427,8 +427,7 @@ def stepped_faces(
 
 def _border(steps: SteppedFaces, number: int, scene: FaceScene, tol: OffsetTolerances) -> Image:
     """Signed distance (H, W) in cells to the border of a face with lower ones, negative inside."""
-    inside = steps.not_below(number)
-    own = inside & ndimage.binary_dilation(~inside) & (steps.labels == number)
+    inside, own = steps.not_below(number), steps.labels == number
     return border_of_steps(inside, own, steps.faces[number], steps.grid, scene, tol)
 
 
@@ -448,14 +447,14 @@ def border_of_steps(
     Parameters
     ----------
     inside : (H, W) bool, the region.
-    own : (H, W) bool, cells at its border that may move it.
+    own : (H, W) bool, cells whose part of the border may move.
     face, grid : over which the region is one.
     scene : the views.
     face_tol : numbers.
     """
-    if not own.any():
-        return smoothly_beside(inside).astype(np.float32)
     is_border = inside & ndimage.binary_dilation(~inside)
+    if not (is_border & own).any():
+        return smoothly_beside(inside).astype(np.float32)
     nearest = ndimage.distance_transform_edt(
         ~is_border, return_distances=False, return_indices=True
     )
