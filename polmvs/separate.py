@@ -44,9 +44,15 @@ class CrashError(PolmvsError):
         self.status = status
         self.said = said
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Errors are made again of what they say, which is not what this one is made of."""
+        return type(self), (self.status, self.said)
+
 
 def run_separately(
-    function: Callable[..., T], *arguments: Any, on_message: Callable[[str], None]
+    function: Callable[..., T],
+    *arguments: Any,
+    on_message: Callable[[str], None] = lambda text: None,
 ) -> T:
     """What a function returns that is called in a process of its own.
 

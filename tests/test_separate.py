@@ -31,6 +31,10 @@ def crash(on_message):
     os.abort()
 
 
+def crash_farther_down(on_message):
+    run_separately(crash)
+
+
 def wait(path, on_message):
     path.write_text(str(os.getpid()))
     time.sleep(60)
@@ -52,6 +56,13 @@ def test_a_crash_is_an_error(caplog) -> None:
         run_separately(crash, on_message=print)
     assert found.value.said.startswith("disk I/O error")
     assert "disk I/O error" in caplog.text
+
+
+def test_a_crash_of_a_process_of_the_process_is_the_same_error() -> None:
+    with pytest.raises(CrashError, match="a library crashed \\(signal 6\\)") as found:
+        run_separately(crash_farther_down)
+    assert found.value.status == -6
+    assert found.value.said.startswith("disk I/O error")
 
 
 WAITING = """

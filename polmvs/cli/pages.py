@@ -92,7 +92,7 @@ def _shown(files: Sequence[Path]) -> bool:
         return False
     try:
         # Where the display does not answer Open3D ends the process.
-        run_separately(_show, files, on_message=lambda text: None)
+        run_separately(_show, files)
     except CrashError:
         return False
     return True

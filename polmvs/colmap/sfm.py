@@ -370,8 +370,6 @@ def _take_database(
 
 def _match(database: Path, names: Sequence[str], options: SfmOptions) -> None:
     """Match the pairs of images that are asked for, or that are likely to show the same."""
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = options.seed
     numbers = image_numbers(database)
     with opened(database) as content:
         pairs = choose_pairs(
@@ -380,7 +378,7 @@ def _match(database: Path, names: Sequence[str], options: SfmOptions) -> None:
             lambda name: read_descriptors(content, numbers[name]),
             seed=options.seed,
         )
-    match_pairs(database, pairs, verification)
+    match_pairs(database, pairs, seed=options.seed)
 
 
 def _mapper_options(
