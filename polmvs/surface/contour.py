@@ -30,7 +30,14 @@ from polmvs.polarization.angle_models import rows_from_axial
 from polmvs.polarization.phase_map import PhaseMap, view_rays
 from polmvs.scene import Seeds
 from polmvs.surface.dense_view import DenseView, store_dense_view
-from polmvs.surface.integration import relax, spread_nodes, surface_at_seeds
+from polmvs.surface.integration import (
+    RoundPlan,
+    ViewTask,
+    in_rounds,
+    relax,
+    spread_nodes,
+    surface_at_seeds,
+)
 from polmvs.surface.pixel_graph import Nodes, uncrossed, visible_seeds
 from polmvs.surface.view_selection import choose_neighbors
 
@@ -95,7 +102,6 @@ def propagate(
     """
     workers = workers or Workers(1)
     report = on_progress or (lambda count: None)
-    neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
     nodes: list[Nodes | None] = []
     for started in workers.map(
         partial(_start, angle_model, seeds, options, tolerances=tolerances),
@@ -103,25 +109,11 @@ def propagate(
     ):
         nodes += started
         report(len(started))
-    folder.mkdir(parents=True, exist_ok=True)
-    dense: list[DenseView | None] = [None] * len(maps)
-    for round_index in range(options.num_rounds):
-        last = round_index == options.num_rounds - 1
-        tasks = [
-            _Task(
-                maps=[maps[j] for j in near],
-                dense=[dense[j] for j in near],
-                nodes=nodes[k],
-                stride_px=options.stride_px if last else 2 * options.stride_px,
-                path=folder / f"{maps[k].view.name}.{round_index}",
-            )
-            for k, near in enumerate(neighbors)
-        ]
-        solve = partial(_round, angle_model, seeds, options, tilt_aware)
-        for k, result in enumerate(workers.map(solve, tasks)):
-            nodes[k], dense[k] = result
-            report(1)
-    return dense
+    strides = [2 * options.stride_px] * (options.num_rounds - 1) + [options.stride_px]
+    plans = [RoundPlan(stride_px, use_consensus=False) for stride_px in strides]
+    neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
+    solve = partial(_round, angle_model, seeds, options, tilt_aware)
+    return in_rounds(solve, plans, maps, neighbors, folder, workers, report, nodes)
 
 
 def _chunks(maps: Sequence[PhaseMap], *, tolerances: ContourTolerances) -> list[Sequence[PhaseMap]]:
@@ -220,23 +212,12 @@ def _start_view(
     )
 
 
-@dataclass(frozen=True)
-class _Task:
-    """One view in one round: its own map first, then its neighbours'."""
-
-    maps: list[PhaseMap]
-    dense: list[DenseView | None]
-    nodes: Nodes | None
-    stride_px: int
-    path: Path
-
-
 def _round(
     angle_model: AngleModel,
     seeds: Seeds,
     options: PropagationOptions,
     tilt_aware: bool,
-    task: _Task,
+    task: ViewTask,
 ) -> tuple[Nodes | None, DenseView | None]:
     """Normals and ranges of one view's nodes, and the dense view that they make."""
     if task.nodes is None:
@@ -251,7 +232,8 @@ def _round(
         tilt_aware=tilt_aware,
         along_contours=options.contour is Contour.TANGENT,
     )
-    dense = spread_nodes(task.maps[0], nodes.surface, task.stride_px, 2 * options.spacing_px)
+    stride_px, max_gap_px = task.plan.stride_px, 2 * options.spacing_px
+    dense = spread_nodes(task.maps[0], nodes.surface, stride_px, max_gap_px)
     return nodes, store_dense_view(dense, task.path) if dense is not None else None
 
 

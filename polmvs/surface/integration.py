@@ -124,29 +124,10 @@ def integrate(
     -------
     Per view its dense result, or None where neither a seed nor another view reaches it.
     """
-    workers = workers or Workers(1)
+    workers, report = workers or Workers(1), on_progress or (lambda count: None)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
-    folder.mkdir(parents=True, exist_ok=True)
-    dense: list[DenseView | None] = [None] * len(maps)
-    for index, plan in enumerate(plan_rounds(options)):
-        tasks = [
-            _Task(
-                maps=[maps[j] for j in near],
-                dense=[dense[j] for j in near],
-                plan=plan,
-                path=folder / f"{maps[k].view.name}.{index}",
-            )
-            for k, near in enumerate(neighbors)
-        ]
-        dense = []
-        solve = partial(
-            _round, angle_model, seeds, options.bending, tilt_aware, tolerances=tolerances
-        )
-        for result in workers.map(solve, tasks):
-            dense.append(result)
-            if on_progress is not None:
-                on_progress(1)
-    return dense
+    solve = partial(_round, angle_model, seeds, options.bending, tilt_aware, tolerances=tolerances)
+    return in_rounds(solve, plan_rounds(options), maps, neighbors, folder, workers, report)
 
 
 @dataclass(frozen=True)
@@ -169,13 +150,67 @@ def plan_rounds(options: PropagationOptions) -> list[RoundPlan]:
 
 
 @dataclass(frozen=True)
-class _Task:
-    """One view in one round: its own map and last result first, then its neighbours'."""
+class ViewTask:
+    """One view in one round: its own map and last result first, then its neighbours'.
+
+    Attributes
+    ----------
+    maps, dense : of the view and its neighbours.
+    nodes : of the view, if the round before handed any on.
+    plan : of the round.
+    path : stem of the files of the view's result.
+    """
 
     maps: list[PhaseMap]
     dense: list[DenseView | None]
+    nodes: Nodes | None
     plan: RoundPlan
     path: Path
+
+
+def in_rounds(
+    solve: Callable[[ViewTask], tuple[Nodes | None, DenseView | None]],
+    plans: Sequence[RoundPlan],
+    maps: Sequence[PhaseMap],
+    neighbors: Sequence[Sequence[int]],
+    folder: Path,
+    workers: Workers,
+    report: Callable[[int], None],
+    nodes: Sequence[Nodes | None] | None = None,
+) -> list[DenseView | None]:
+    """Solve all views anew in every round, from what the round before made of them.
+
+    Parameters
+    ----------
+    solve : one view's nodes for its next round, and its dense result.
+    plans : of the rounds.
+    maps : of the views.
+    neighbors : per view the indices of the views that help it, itself first.
+    folder : for the dense views.
+    workers : processes to share the views among.
+    report : called with 1 for each view of each round.
+    nodes : per view those of the first round; None: ``solve`` makes its own.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    dense: list[DenseView | None] = [None] * len(maps)
+    nodes = nodes or [None] * len(maps)
+    for index, plan in enumerate(plans):
+        tasks = [
+            ViewTask(
+                maps=[maps[j] for j in near],
+                dense=[dense[j] for j in near],
+                nodes=nodes[k],
+                plan=plan,
+                path=folder / f"{maps[k].view.name}.{index}",
+            )
+            for k, near in enumerate(neighbors)
+        ]
+        nodes, dense = [], []
+        for own_nodes, result in workers.map(solve, tasks):
+            nodes.append(own_nodes)
+            dense.append(result)
+            report(1)
+    return dense
 
 
 def _round(
@@ -183,16 +218,16 @@ def _round(
     seeds: Seeds,
     bending: float,
     tilt_aware: bool,
-    task: _Task,
+    task: ViewTask,
     *,
     tolerances: IntegrationTolerances,
-) -> DenseView | None:
-    """One view's result on its lattice."""
+) -> tuple[None, DenseView | None]:
+    """One view's result on its lattice, which the next round's nodes are made of."""
     stride_px = task.plan.stride_px
     wanted = open_lattice(task.maps[0], stride_px)
     surface = _start(task, seeds, wanted, tolerances=tolerances)
     if surface is None:
-        return None
+        return None, None
     nodes = relax(
         angle_model,
         task.maps,
@@ -205,11 +240,11 @@ def _round(
         tolerances=tolerances,
     )
     dense = dense_view(nodes.surface, wanted, stride_px)
-    return store_dense_view(dense, task.path) if dense.known.any() else None
+    return None, store_dense_view(dense, task.path) if dense.known.any() else None
 
 
 def _start(
-    task: _Task, seeds: Seeds, wanted: Mask, *, tolerances: IntegrationTolerances
+    task: ViewTask, seeds: Seeds, wanted: Mask, *, tolerances: IntegrationTolerances
 ) -> SurfaceSamples | None:
     """The lattice's surface: of the view's last result; else of the seeds, or of the others."""
     phase_map, before = task.maps[0], task.dense[0]
