@@ -194,8 +194,7 @@ def _round(
         tilt_aware=tilt_aware,
         along_contours=options.contour is Contour.TANGENT,
     )
-    stride_px, max_gap_px = task.plan.stride_px, 2 * options.spacing_px
-    dense = spread_nodes(task.maps[0], nodes.surface, stride_px, max_gap_px)
+    dense = spread_nodes(task.maps[0], nodes, task.plan.stride_px)
     return nodes, store_dense_view(dense, task.path) if dense is not None else None
 
 

@@ -16,7 +16,7 @@ from polmvs.neighbors import voxel_of_each
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE
-from polmvs.surface.consensus import sight
+from polmvs.surface.consensus import MAX_DEVIATIONS, sight
 from polmvs.surface.dense_view import DenseView
 
 Array = NDArray[np.float64]
@@ -30,10 +30,6 @@ class FusionTolerances:
 
     Attributes
     ----------
-    max_conflict_share : of the views that could see a point and see something else there.
-        Derived: the majority.
-    max_deviations : of both by which two views may differ. Derived: 0.3 % of right ones do by
-        more.
     min_tolerance : share of the tolerance that is left to views however certain they are.
         Guess.
     min_sigma_px : of a range, in footprints: no view is trusted more than that. Guess.
@@ -41,8 +37,6 @@ class FusionTolerances:
     outlier_spacings : usual distances to that neighbour from which a point is alone. Guess.
     """
 
-    max_conflict_share: float = 0.5
-    max_deviations: float = 3.0
     min_tolerance: float = 0.5
     min_sigma_px: float = 0.02
     outlier_neighbors: int = 8
@@ -172,7 +166,7 @@ def _confirm(
     for other_map, other in views[1:]:
         seen = sight(other_map, other, center, rays, distance, normals)
         other_sigma = _finite_sigma(seen.sigma, footprint, tolerances=tolerances)
-        explained = tolerances.max_deviations * np.hypot(sigma, other_sigma)
+        explained = MAX_DEVIATIONS * np.hypot(sigma, other_sigma)
         allowed = np.clip(explained, tolerances.min_tolerance * tolerance, tolerance)
         agrees = (np.abs(seen.place - distance) < allowed) & (seen.cosine > min_cosine)
         votes += agrees
@@ -183,9 +177,7 @@ def _confirm(
         place += weight * np.where(agrees, seen.place, 0)
         normal += weight[:, None] * seen.normals
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    keep = (votes >= options.min_views) & (
-        conflicts <= tolerances.max_conflict_share * (votes + conflicts)
-    )
+    keep = (votes >= options.min_views) & (conflicts <= votes)
     cloud = FusedCloud(
         points=center + (place / total)[:, None] * rays,
         normals=normal,
