@@ -8,11 +8,10 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
 from polmvs.config import FusionOptions
-from polmvs.neighbors import voxel_of_each
+from polmvs.neighbors import are_usual, point_spacings, voxel_of_each
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE
@@ -33,14 +32,10 @@ class FusionTolerances:
     min_tolerance : share of the tolerance that is left to views however certain they are.
         Guess.
     min_sigma_px : of a range, in footprints: no view is trusted more than that. Guess.
-    outlier_neighbors : whose distance tells whether a point is alone. Guess.
-    outlier_spacings : usual distances to that neighbour from which a point is alone. Guess.
     """
 
     min_tolerance: float = 0.5
     min_sigma_px: float = 0.02
-    outlier_neighbors: int = 8
-    outlier_spacings: float = 4.0
 
 
 @dataclass(frozen=True)
@@ -127,7 +122,8 @@ def fuse(
         return cloud
     footprint = float(np.median(np.concatenate(footprints)))
     voxel = options.voxel if options.voxel is not None else options.voxel_px * footprint
-    return _without_lone_points(merge(cloud, voxel), tolerances=tolerances)
+    cloud = merge(cloud, voxel)
+    return cloud[are_usual(point_spacings(cloud.points))]
 
 
 @dataclass(frozen=True)
@@ -234,12 +230,3 @@ def merge(cloud: FusedCloud, voxel: float) -> FusedCloud:
         sigma_deg=mean(cloud.sigma_deg).astype(np.float32),
         sigma=mean(cloud.sigma).astype(np.float32),
     )
-
-
-def _without_lone_points(cloud: FusedCloud, *, tolerances: FusionTolerances) -> FusedCloud:
-    """Remove points far from their neighbours, by the spacing that is usual in the cloud."""
-    k = min(tolerances.outlier_neighbors + 1, len(cloud.points))
-    if k < 2:
-        return cloud
-    gaps = cKDTree(cloud.points).query(cloud.points, k=k, workers=-1)[0][:, -1]
-    return cloud[gaps <= tolerances.outlier_spacings * np.median(gaps)]
