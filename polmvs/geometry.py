@@ -35,7 +35,7 @@ def unit(vectors: ArrayLike) -> Array:
 
 
 def unit_or_zero(vectors: NDArray[Float]) -> NDArray[Float]:
-    """Vectors ``(..., 3)`` scaled to unit length; 0 where they have none."""
+    """Vectors ``(..., D)`` scaled to unit length; 0 where they have none."""
     return np.asarray(vectors / np.maximum(lengths(vectors)[..., None], 1e-300))
 
 

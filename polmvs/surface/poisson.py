@@ -86,7 +86,7 @@ def poisson_mesh(
     Raises
     ------
     DataError
-        If the cloud has no normals, fewer than ``MIN_POINTS`` usable points, or most of them coincide.
+        If the cloud has no normals, too few usable points, or most of them coincide.
     """
     points, normals, colors = _usable(cloud, kinds, source)
     spacings = point_spacings(points)

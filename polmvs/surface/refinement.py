@@ -22,7 +22,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, default_num_workers
 from polmvs.fitting import CAUCHY_SCALE, annealed_scales, robust_deviation
-from polmvs.geometry import dots, lengths
+from polmvs.geometry import dots, lengths, unit_or_zero
 from polmvs.normals.estimator import smallest_eigenvectors
 from polmvs.surface.creases import CreaseTolerances, crease_vertices
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, visible_points
@@ -1068,8 +1068,7 @@ def find_rim(
     outwards = mesh.vertex_normals[ends].sum(axis=1)
     away = middle - view.center
     distance = lengths(away)[:, None]
-    outwards -= dots(outwards, away)[:, None] / distance**2 * away
-    outwards /= np.maximum(lengths(outwards)[:, None], 1e-300)
+    outwards = unit_or_zero(outwards - dots(outwards, away)[:, None] / distance**2 * away)
     # A pixel beyond the outline there is nothing, a pixel before it the surface itself.
     beyond = scene.cast(view.center, away + 1.0 * pixel[:, None] * outwards).distance
     before = scene.cast(view.center, away - 1.0 * pixel[:, None] * outwards).distance
