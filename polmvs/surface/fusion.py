@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import FusionOptions
+from polmvs.config import FusionOptions, PropagationOptions
+from polmvs.geometry import unit_or_zero
 from polmvs.neighbors import are_usual, point_spacings, voxel_of_each
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
@@ -72,7 +73,7 @@ def fuse(
     dense: Sequence[DenseView | None],
     options: FusionOptions,
     *,
-    max_neighbors: int = 15,
+    max_neighbors: int = PropagationOptions.max_neighbors,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
     on_confirmed: Callable[[int, Mask], None] | None = None,
@@ -219,12 +220,11 @@ def merge(cloud: FusedCloud, voxel: float) -> FusedCloud:
 
     points = np.stack([mean(cloud.points[:, i]) for i in range(3)], axis=-1)
     normals = np.stack([mean(cloud.normals[:, i]) for i in range(3)], axis=-1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     views = np.zeros(num, np.int32)
     np.maximum.at(views, inverse, cloud.num_views)
     return FusedCloud(
         points=points,
-        normals=normals,
+        normals=unit_or_zero(normals),
         intensity=mean(cloud.intensity).astype(np.float32),
         num_views=views,
         sigma_deg=mean(cloud.sigma_deg).astype(np.float32),
