@@ -1,4 +1,4 @@
-"""Voxels of large clouds, thinning to them, and nearest neighbours."""
+"""Voxels of large clouds, thinning to them, spacings, and nearest neighbours."""
 
 from __future__ import annotations
 
