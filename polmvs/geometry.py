@@ -34,6 +34,11 @@ def unit(vectors: ArrayLike) -> Array:
         return np.asarray(array / np.linalg.norm(array, axis=-1, keepdims=True))
 
 
+def unit_or_zero(vectors: NDArray[Float]) -> NDArray[Float]:
+    """Vectors ``(..., D)`` scaled to unit length; 0 where they have none."""
+    return np.asarray(vectors / np.maximum(lengths(vectors)[..., None], 1e-300))
+
+
 def nearest_rotation(matrix: Array) -> Array | None:
     """The rotation ``(3, 3)`` nearest to a matrix that is one up to a text file's rounding.
 

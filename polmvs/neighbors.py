@@ -1,4 +1,4 @@
-"""Voxels of large clouds, thinning to them, and nearest neighbours."""
+"""Voxels of large clouds, thinning to them, spacings, and nearest neighbours."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from scipy.spatial import cKDTree
 Array = NDArray[np.float64]
 
 _AXIS_BITS = 21
+NUM_NEIGHBORS = 8  # by which the density about a point is told; a guess
+LONE_SPACINGS = 4.0  # the usual one: a point with a larger one is an outlier; a guess
 _SHIFT = 0.37  # surfaces like to lie at round coordinates: shifted voxels do not split them in two
 
 
@@ -39,6 +41,23 @@ def voxel_representatives(points: Array, side: float) -> NDArray[np.intp]:
     order = np.argsort(((scaled - cells - 0.5) ** 2).sum(axis=1))
     _, first = np.unique(_cell_keys(cells)[order], return_index=True)
     return np.sort(order[first])
+
+
+def point_spacings(points: Array) -> Array:
+    """Distance ``(N,)`` between points ``(N, 3)`` of a surface as their density about each tells.
+
+    The side of the square that each point would have to itself; the nearest neighbour alone
+    would be that of a pair that noise has brought together.
+    """
+    k = min(NUM_NEIGHBORS, len(points) - 1)
+    radius = cKDTree(points).query(points, k=[k + 1], workers=-1)[0][:, 0]
+    # The disc to the k-th neighbour holds it by half, k - 1 others and the point itself.
+    return np.asarray(radius * np.sqrt(np.pi / (k + 0.5)), np.float64)
+
+
+def are_usual(spacings: Array) -> NDArray[np.bool_]:
+    """Which points ``(N,)`` are not far from their neighbours, by the spacing usual among them."""
+    return np.asarray(spacings <= LONE_SPACINGS * np.median(spacings), np.bool_)
 
 
 def in_cells_beside(points: Array, others: Array, side: float) -> NDArray[np.bool_]:

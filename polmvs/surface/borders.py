@@ -18,7 +18,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
-from polmvs.geometry import dots, lengths
+from polmvs.geometry import dots, lengths, unit_or_zero
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -112,7 +112,7 @@ def _outlines(inside: Mask, distance: Array, slope: Array) -> list[Array]:
         if len(cells) < MIN_POINTS:
             continue
         at = tuple(cells.T)
-        foot = cells - distance[at][:, None] * _unit(slope[at])
+        foot = cells - distance[at][:, None] * unit_or_zero(slope[at])
         curves.append(_evenly(ndimage.gaussian_filter1d(foot, 1.0, axis=0, mode="wrap")))
     return curves
 
@@ -147,7 +147,7 @@ def _normals(curve: Array, slope: Array) -> Array:
     """Unit normals (P, 2) of a closed curve, up the slope (H, W, 2)."""
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
     along = ndimage.gaussian_filter1d(along, 2.0, axis=0, mode="wrap")
-    normals = _unit(np.stack([-along[:, 1], along[:, 0]], axis=1))
+    normals = unit_or_zero(np.stack([-along[:, 1], along[:, 0]], axis=1))
     columns = np.moveaxis(slope, -1, 0)
     up = [ndimage.map_coordinates(one, curve.T, order=1, mode="nearest") for one in columns]
     return np.asarray(normals * np.sign(dots(normals, np.stack(up, axis=1)).sum()))
@@ -196,11 +196,11 @@ def _distance_to(curves: Sequence[Array], slope: Array) -> Array:
     places, outwards = [], []
     for curve in curves:
         ahead = np.roll(curve, -1, axis=0) - curve
-        normals = _unit(np.stack([-ahead[:, 1], ahead[:, 0]], axis=1))
+        normals = unit_or_zero(np.stack([-ahead[:, 1], ahead[:, 0]], axis=1))
         at = np.clip(np.rint(curve), 0, np.array(shape) - 1).astype(np.int64)
         normals *= np.sign(dots(normals, slope[tuple(at.T)]).sum())
         # At a corner the mean of its sides tells in from out.
-        corners = _unit(normals + np.roll(normals, 1, axis=0))
+        corners = unit_or_zero(normals + np.roll(normals, 1, axis=0))
         for k in range(SUBDIVISIONS):
             places.append(curve + k / SUBDIVISIONS * ahead)
             outwards.append(normals if k else corners)
@@ -217,7 +217,3 @@ def _slope(image: Array) -> Array:
     """Gradient (H, W, 2), along rows and along columns."""
     down, right = np.gradient(image)
     return np.stack([down, right], axis=-1)
-
-
-def _unit(vectors: Array) -> Array:
-    return np.asarray(vectors / np.maximum(lengths(vectors)[..., None], 1e-12))

@@ -12,11 +12,19 @@ from polmvs.camera import depth_buffer, in_image, sample_image
 from polmvs.normals.rows import OCCLUSION_TOLERANCE
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
-from polmvs.surface.dense_view import DenseView, SurfaceSamples, extend_planes, view_samples
+from polmvs.surface.dense_view import (
+    REACH,
+    DenseView,
+    SurfaceSamples,
+    extend_planes,
+    view_samples,
+)
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
+
+MAX_DEVIATIONS = 3.0  # of what views say of one place, apart: 0.3 % of right ones are farther
 
 
 @dataclass(frozen=True)
@@ -96,7 +104,6 @@ def surface_of_others(
     maps: Sequence[PhaseMap],
     dense: Sequence[DenseView | None],
     xy: Floats,
-    max_gap_strides: float,
 ) -> SurfaceSamples | None:
     """A first guess of the surface at pixels of the first view: what the other views show there.
 
@@ -104,7 +111,6 @@ def surface_of_others(
     ----------
     maps, dense : of the views, the first one's own first.
     xy : (N, 2), where the surface is wanted.
-    max_gap_strides : from the others' points to the pixels, in strides of their lattices.
 
     Returns
     -------
@@ -140,7 +146,7 @@ def surface_of_others(
         return None
     stride_px = max(result.stride_px for _, result in known)
     rays = view.rays_in_world(xy)
-    return extend_planes(shown, xy, rays, max_gap_strides * stride_px)
+    return extend_planes(shown, xy, rays, REACH * stride_px)
 
 
 def hidden_by(dense: DenseView, view: View, points: Floats, normals: Floats) -> Mask:

@@ -20,6 +20,7 @@ Image = NDArray[np.float32]
 
 MAX_STRIDE = 1 << 16  # px, more than any image has
 NUM_NEAREST = 4  # known points that a point of the surface between them is made of
+REACH = 2.0  # their spacings, from them to what they tell of: a cell's diagonal, with a margin
 MEMBERS = ("range", "normals", "sigma_deg", "sigma", "confidence")  # of a stored view
 
 

@@ -8,15 +8,15 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
-from polmvs.config import FusionOptions
-from polmvs.neighbors import voxel_of_each
+from polmvs.config import FusionOptions, PropagationOptions
+from polmvs.geometry import unit_or_zero
+from polmvs.neighbors import are_usual, point_spacings, voxel_of_each
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE
-from polmvs.surface.consensus import sight
+from polmvs.surface.consensus import MAX_DEVIATIONS, sight
 from polmvs.surface.dense_view import DenseView
 
 Array = NDArray[np.float64]
@@ -30,23 +30,13 @@ class FusionTolerances:
 
     Attributes
     ----------
-    max_conflict_share : of the views that could see a point and see something else there.
-        Derived: the majority.
-    max_deviations : of both by which two views may differ. Derived: 0.3 % of right ones do by
-        more.
     min_tolerance : share of the tolerance that is left to views however certain they are.
         Guess.
     min_sigma_px : of a range, in footprints: no view is trusted more than that. Guess.
-    outlier_neighbors : whose distance tells whether a point is alone. Guess.
-    outlier_spacings : usual distances to that neighbour from which a point is alone. Guess.
     """
 
-    max_conflict_share: float = 0.5
-    max_deviations: float = 3.0
     min_tolerance: float = 0.5
     min_sigma_px: float = 0.02
-    outlier_neighbors: int = 8
-    outlier_spacings: float = 4.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +73,7 @@ def fuse(
     dense: Sequence[DenseView | None],
     options: FusionOptions,
     *,
-    max_neighbors: int = 15,
+    max_neighbors: int = PropagationOptions.max_neighbors,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
     on_confirmed: Callable[[int, Mask], None] | None = None,
@@ -133,7 +123,8 @@ def fuse(
         return cloud
     footprint = float(np.median(np.concatenate(footprints)))
     voxel = options.voxel if options.voxel is not None else options.voxel_px * footprint
-    return _without_lone_points(merge(cloud, voxel), tolerances=tolerances)
+    cloud = merge(cloud, voxel)
+    return cloud[are_usual(point_spacings(cloud.points))]
 
 
 @dataclass(frozen=True)
@@ -172,7 +163,7 @@ def _confirm(
     for other_map, other in views[1:]:
         seen = sight(other_map, other, center, rays, distance, normals)
         other_sigma = _finite_sigma(seen.sigma, footprint, tolerances=tolerances)
-        explained = tolerances.max_deviations * np.hypot(sigma, other_sigma)
+        explained = MAX_DEVIATIONS * np.hypot(sigma, other_sigma)
         allowed = np.clip(explained, tolerances.min_tolerance * tolerance, tolerance)
         agrees = (np.abs(seen.place - distance) < allowed) & (seen.cosine > min_cosine)
         votes += agrees
@@ -183,9 +174,7 @@ def _confirm(
         place += weight * np.where(agrees, seen.place, 0)
         normal += weight[:, None] * seen.normals
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    keep = (votes >= options.min_views) & (
-        conflicts <= tolerances.max_conflict_share * (votes + conflicts)
-    )
+    keep = (votes >= options.min_views) & (conflicts <= votes)
     cloud = FusedCloud(
         points=center + (place / total)[:, None] * rays,
         normals=normal,
@@ -231,23 +220,13 @@ def merge(cloud: FusedCloud, voxel: float) -> FusedCloud:
 
     points = np.stack([mean(cloud.points[:, i]) for i in range(3)], axis=-1)
     normals = np.stack([mean(cloud.normals[:, i]) for i in range(3)], axis=-1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     views = np.zeros(num, np.int32)
     np.maximum.at(views, inverse, cloud.num_views)
     return FusedCloud(
         points=points,
-        normals=normals,
+        normals=unit_or_zero(normals),
         intensity=mean(cloud.intensity).astype(np.float32),
         num_views=views,
         sigma_deg=mean(cloud.sigma_deg).astype(np.float32),
         sigma=mean(cloud.sigma).astype(np.float32),
     )
-
-
-def _without_lone_points(cloud: FusedCloud, *, tolerances: FusionTolerances) -> FusedCloud:
-    """Remove points far from their neighbours, by the spacing that is usual in the cloud."""
-    k = min(tolerances.outlier_neighbors + 1, len(cloud.points))
-    if k < 2:
-        return cloud
-    gaps = cKDTree(cloud.points).query(cloud.points, k=k, workers=-1)[0][:, -1]
-    return cloud[gaps <= tolerances.outlier_spacings * np.median(gaps)]

@@ -29,8 +29,11 @@ from polmvs.normals.rows import gather_rows
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
-from polmvs.surface.consensus import sight, surface_of_others
+from polmvs.surface.consensus import MAX_DEVIATIONS, sight, surface_of_others
+from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.dense_view import (
+    NUM_NEAREST,
+    REACH,
     DenseView,
     SurfaceSamples,
     dense_view,
@@ -67,15 +70,8 @@ class IntegrationTolerances:
 
     Attributes
     ----------
-    max_gap_strides : from a point of the coarser lattice to those made of it. Derived: its
-        diagonal, with a margin.
-    num_starting_seeds : nearest ones whose median starts a node: a wrong one does not spoil
-        it. Guess.
     min_agreeing : views that tie a node: the error of a single one must not return to it as
         another's agreement. Derived.
-    min_agreeing_cosine : between the normals of a node and of the surface another view sees;
-        26 deg. Guess.
-    max_deviations : from the views' median. Derived: 0.3 % of right ones are farther.
     correlation_px : Errors of another view's map are alike over about this distance: its
         points within it are worth one. Measured on the shared captures.
     common_share : of a tie's deviation that all ties of a view have in common, as the views
@@ -85,11 +81,7 @@ class IntegrationTolerances:
         deviations off. Derived.
     """
 
-    max_gap_strides: float = 2.0
-    num_starting_seeds: int = 5
     min_agreeing: int = 2
-    min_agreeing_cosine: float = 0.9
-    max_deviations: float = 3.0
     correlation_px: float = 24.0
     common_share: float = 0.5
     min_own_weight: float = 0.25
@@ -124,29 +116,10 @@ def integrate(
     -------
     Per view its dense result, or None where neither a seed nor another view reaches it.
     """
-    workers = workers or Workers(1)
+    workers, report = workers or Workers(1), on_progress or (lambda count: None)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
-    folder.mkdir(parents=True, exist_ok=True)
-    dense: list[DenseView | None] = [None] * len(maps)
-    for index, plan in enumerate(plan_rounds(options)):
-        tasks = [
-            _Task(
-                maps=[maps[j] for j in near],
-                dense=[dense[j] for j in near],
-                plan=plan,
-                path=folder / f"{maps[k].view.name}.{index}",
-            )
-            for k, near in enumerate(neighbors)
-        ]
-        dense = []
-        solve = partial(
-            _round, angle_model, seeds, options.bending, tilt_aware, tolerances=tolerances
-        )
-        for result in workers.map(solve, tasks):
-            dense.append(result)
-            if on_progress is not None:
-                on_progress(1)
-    return dense
+    solve = partial(_round, angle_model, seeds, options.bending, tilt_aware, tolerances=tolerances)
+    return in_rounds(solve, plan_rounds(options), maps, neighbors, folder, workers, report)
 
 
 @dataclass(frozen=True)
@@ -169,13 +142,67 @@ def plan_rounds(options: PropagationOptions) -> list[RoundPlan]:
 
 
 @dataclass(frozen=True)
-class _Task:
-    """One view in one round: its own map and last result first, then its neighbours'."""
+class ViewTask:
+    """One view in one round: its own map and last result first, then its neighbours'.
+
+    Attributes
+    ----------
+    maps, dense : of the view and its neighbours.
+    nodes : of the view, if the round before handed any on.
+    plan : of the round.
+    path : stem of the files of the view's result.
+    """
 
     maps: list[PhaseMap]
     dense: list[DenseView | None]
+    nodes: Nodes | None
     plan: RoundPlan
     path: Path
+
+
+def in_rounds(
+    solve: Callable[[ViewTask], tuple[Nodes | None, DenseView | None]],
+    plans: Sequence[RoundPlan],
+    maps: Sequence[PhaseMap],
+    neighbors: Sequence[Sequence[int]],
+    folder: Path,
+    workers: Workers,
+    report: Callable[[int], None],
+    nodes: Sequence[Nodes | None] | None = None,
+) -> list[DenseView | None]:
+    """Solve all views anew in every round, from what the round before made of them.
+
+    Parameters
+    ----------
+    solve : one view's nodes for its next round, and its dense result.
+    plans : of the rounds.
+    maps : of the views.
+    neighbors : per view the indices of the views that help it, itself first.
+    folder : for the dense views.
+    workers : processes to share the views among.
+    report : called with 1 for each view of each round.
+    nodes : per view those of the first round; None: ``solve`` makes its own.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    dense: list[DenseView | None] = [None] * len(maps)
+    nodes = nodes or [None] * len(maps)
+    for index, plan in enumerate(plans):
+        tasks = [
+            ViewTask(
+                maps=[maps[j] for j in near],
+                dense=[dense[j] for j in near],
+                nodes=nodes[k],
+                plan=plan,
+                path=folder / f"{maps[k].view.name}.{index}",
+            )
+            for k, near in enumerate(neighbors)
+        ]
+        nodes, dense = [], []
+        for own_nodes, result in workers.map(solve, tasks):
+            nodes.append(own_nodes)
+            dense.append(result)
+            report(1)
+    return dense
 
 
 def _round(
@@ -183,16 +210,16 @@ def _round(
     seeds: Seeds,
     bending: float,
     tilt_aware: bool,
-    task: _Task,
+    task: ViewTask,
     *,
     tolerances: IntegrationTolerances,
-) -> DenseView | None:
-    """One view's result on its lattice."""
+) -> tuple[None, DenseView | None]:
+    """One view's result on its lattice, which the next round's nodes are made of."""
     stride_px = task.plan.stride_px
     wanted = open_lattice(task.maps[0], stride_px)
-    surface = _start(task, seeds, wanted, tolerances=tolerances)
+    surface = _start(task, seeds, wanted)
     if surface is None:
-        return None
+        return None, None
     nodes = relax(
         angle_model,
         task.maps,
@@ -205,23 +232,19 @@ def _round(
         tolerances=tolerances,
     )
     dense = dense_view(nodes.surface, wanted, stride_px)
-    return store_dense_view(dense, task.path) if dense.known.any() else None
+    return None, store_dense_view(dense, task.path) if dense.known.any() else None
 
 
-def _start(
-    task: _Task, seeds: Seeds, wanted: Mask, *, tolerances: IntegrationTolerances
-) -> SurfaceSamples | None:
+def _start(task: ViewTask, seeds: Seeds, wanted: Mask) -> SurfaceSamples | None:
     """The lattice's surface: of the view's last result; else of the seeds, or of the others."""
     phase_map, before = task.maps[0], task.dense[0]
     xy = lattice_points(wanted, task.plan.stride_px)
     if before is None:
-        surface = surface_at_seeds(phase_map, seeds, xy, tolerances=tolerances)
-        return surface or surface_of_others(task.maps, task.dense, xy, tolerances.max_gap_strides)
+        surface = surface_at_seeds(phase_map, seeds, xy)
+        return surface or surface_of_others(task.maps, task.dense, xy)
     camera, rotation = phase_map.view.camera, phase_map.view.cam_from_world.rotation
     coarse = view_samples(before, camera.rays(before.lattice_xy()) @ rotation)
-    return extend_planes(
-        coarse, xy, camera.rays(xy) @ rotation, tolerances.max_gap_strides * before.stride_px
-    )
+    return extend_planes(coarse, xy, camera.rays(xy) @ rotation, REACH * before.stride_px)
 
 
 def _lattice_nodes(
@@ -241,13 +264,7 @@ def _lattice_nodes(
     )
 
 
-def surface_at_seeds(
-    phase_map: PhaseMap,
-    seeds: Seeds,
-    xy: Floats,
-    *,
-    tolerances: IntegrationTolerances = IntegrationTolerances(),
-) -> SurfaceSamples | None:
+def surface_at_seeds(phase_map: PhaseMap, seeds: Seeds, xy: Floats) -> SurfaceSamples | None:
     """A first guess of the surface at some pixels: range and normal of the nearest seeds.
 
     None where the view sees no seed.
@@ -257,7 +274,7 @@ def surface_at_seeds(
         return None
     view = phase_map.view
     distance = np.linalg.norm(seeds.points_in_world[visible] - view.center_in_world, axis=-1)
-    k = min(tolerances.num_starting_seeds, len(distance))
+    k = min(NUM_NEAREST, len(distance))
     nearest = cKDTree(seed_xy[visible]).query(xy, k=k)[1].reshape(len(xy), k)
     unknown = np.full(len(xy), np.nan)
     return SurfaceSamples(
@@ -326,8 +343,7 @@ def relax(
         node_edges(angle_model, nodes, rows.sigma[0], along_contours=along_contours),
         ties,
         num_known,
-        modes=bending_modes(surface.xy) if bending > 0 else None,
-        mode_sigma=bending,
+        modes=bending * bending_modes(surface.xy) if bending > 0 else None,
     )
     surface = replace(surface, log_range=solution.log_range, log_range_sigma=solution.sigma)
     return replace(nodes, surface=surface)
@@ -361,13 +377,14 @@ def tie_to_consensus(
     """
     surface, center = nodes.surface, maps[0].view.center_in_world
     distance = np.exp(surface.log_range)
+    min_cosine = np.cos(np.radians(CreaseTolerances.crease_deg))
     said, deviations = [], []
     for phase_map, other in zip(maps[1:], dense[1:], strict=True):
         if other is None:
             continue
         seen = sight(phase_map, other, center, surface.rays_in_world, distance, surface.normals)
         with np.errstate(invalid="ignore"):
-            counts = (seen.cosine > tolerances.min_agreeing_cosine) & (seen.place > 0)
+            counts = (seen.cosine > min_cosine) & (seen.place > 0)
         said.append(np.where(counts, seen.place, np.nan))
         deviations.append(np.where(counts, seen.sigma, np.nan))
     if not said:
@@ -375,7 +392,7 @@ def tie_to_consensus(
         return SeedTies(
             node=none, seed=none, value=np.zeros(0), sigma=np.zeros(0), common=np.zeros(0)
         )
-    place, sigma, count = _consensus(np.array(said), np.array(deviations), tolerances=tolerances)
+    place, sigma, count = _consensus(np.array(said), np.array(deviations))
     node = np.flatnonzero(
         (count >= tolerances.min_agreeing) & np.isfinite(place) & np.isfinite(sigma)
     )
@@ -390,9 +407,7 @@ def tie_to_consensus(
     )
 
 
-def _consensus(
-    places: Array, sigmas: Array, *, tolerances: IntegrationTolerances
-) -> tuple[Array, Array, Array]:
+def _consensus(places: Array, sigmas: Array) -> tuple[Array, Array, Array]:
     """Robust weighted mean (N,) of what K views say (K, N), NaN: nothing.
 
     With it its deviation, which the number of views does not narrow because their errors are not
@@ -405,7 +420,7 @@ def _consensus(
     with np.errstate(invalid="ignore", divide="ignore"):
         gap = np.abs(places - median)
         spread = np.sort(gap, axis=0)[np.maximum(count - 1, 0) // 2, columns]
-        near = gap <= tolerances.max_deviations * np.maximum(1.5 * spread, sigmas)
+        near = gap <= MAX_DEVIATIONS * np.maximum(1.5 * spread, sigmas)
         weight = np.where(near, 1 / sigmas**2, 0)
         total = weight.sum(axis=0)
         place = (weight * np.where(near, places, 0)).sum(axis=0) / total
@@ -431,14 +446,14 @@ def open_lattice(phase_map: PhaseMap, stride_px: int) -> Mask:
     return np.asarray(sample_image(open_pixels, xy, nearest=True) > 0)
 
 
-def spread_nodes(
-    phase_map: PhaseMap, surface: SurfaceSamples, stride_px: int, max_gap_px: float
-) -> DenseView | None:
+def spread_nodes(phase_map: PhaseMap, nodes: Nodes, stride_px: int) -> DenseView | None:
     """Ranges and normals on the lattice of the region, from the planes of the nearest nodes."""
+    surface = nodes.surface
     good = np.isfinite(surface.log_range) & np.isfinite(surface.normals).all(axis=-1)
     if not good.any():
         return None
     wanted = open_lattice(phase_map, stride_px)
     xy = lattice_points(wanted, stride_px)
     rays = phase_map.view.rays_in_world(xy)
-    return dense_view(extend_planes(surface[good], xy, rays, max_gap_px), wanted, stride_px)
+    extended = extend_planes(surface[good], xy, rays, REACH * nodes.spacing_px)
+    return dense_view(extended, wanted, stride_px)

@@ -11,7 +11,9 @@ from scipy.spatial import cKDTree
 
 from polmvs.colmap.dense_workspace import DenseWorkspace, WorkspaceView
 from polmvs.colmap.maps import map_pixel_xy
+from polmvs.config import PropagationOptions
 from polmvs.neighbors import voxel_of_each
+from polmvs.scene import KEYPOINT_SIGMA_PX
 from polmvs.surface.fusion import FusedCloud, concatenate, merge, no_points
 
 Array = NDArray[np.float64]
@@ -25,24 +27,17 @@ class KeptDepthTolerances:
 
     Attributes
     ----------
-    stride_px : every how many-th pixel is used; a guess, as dense as the polarised surface.
-    min_views : that must have a point in the same voxel; derived: one has nobody to confirm it.
-    agreement_px : side of that voxel; a guess, several times COLMAP's deviation.
+    stride_px : every how many-th pixel is used, and the side of the voxel in which a second view
+        must have a point. Derived: as dense as the polarised surface.
     min_agreement : share of the points that have a second view, below which the maps are doubted;
         a guess: COLMAP keeps what other views confirm, so that most have one, and hardly one by
         chance where the maps are of another unit or frame than the poses.
-    voxel_px : side of the merging voxel; derived: a pixel's.
-    depth_sigma_px : of COLMAP's depth; it matches to about half a pixel.
     normal_sigma_deg : that COLMAP's fusion allows between views.
     clearance_px : from the polarised surface; a guess.
     """
 
-    stride_px: int = 2
-    min_views: int = 2
-    agreement_px: float = 2.0
+    stride_px: int = PropagationOptions.stride_px
     min_agreement: float = 0.1
-    voxel_px: float = 1.0
-    depth_sigma_px: float = 0.5
     normal_sigma_deg: float = 10.0
     clearance_px: float = 6.0
 
@@ -74,9 +69,9 @@ def kept_cloud(
         return no_points()
     cloud, footprint = concatenate(clouds), float(np.median(footprints))
     owner = np.repeat(np.arange(len(clouds)), [len(part.points) for part in clouds])
-    num_views = _views_in_voxel(cloud.points, owner, tolerances.agreement_px * footprint)
+    num_views = _views_in_voxel(cloud.points, owner, tolerances.stride_px * footprint)
     cloud = replace(cloud, num_views=num_views)
-    keep = num_views >= tolerances.min_views
+    keep = num_views > 1
     if keep.mean() < tolerances.min_agreement:
         logger.warning(
             "%s: two views agree on %.2g %% of the points of its depth maps. Are they of its own "
@@ -88,7 +83,7 @@ def kept_cloud(
         reach = tolerances.clearance_px * footprint
         distance = cKDTree(surface_points).query(cloud.points, distance_upper_bound=reach)[0]
         keep &= ~np.isfinite(distance)
-    return merge(cloud[keep], tolerances.voxel_px * footprint)
+    return merge(cloud[keep], footprint)
 
 
 def _views_in_voxel(points: Array, owner: NDArray[np.int64], voxel: float) -> NDArray[np.int32]:
@@ -119,6 +114,7 @@ def _view_cloud(item: WorkspaceView, tolerances: KeptDepthTolerances) -> tuple[F
         intensity=(item.load_image()[lattice][known][facing] / 255).astype(np.float32),
         num_views=np.ones(num, np.int32),
         sigma_deg=np.full(num, tolerances.normal_sigma_deg, np.float32),
-        sigma=(tolerances.depth_sigma_px * ranges / camera.mean_focal_px).astype(np.float32),
+        # COLMAP matches patches about as well as keypoints.
+        sigma=(KEYPOINT_SIGMA_PX * ranges / camera.mean_focal_px).astype(np.float32),
     )
     return cloud, float(np.median(ranges)) / camera.mean_focal_px if num else 0.0

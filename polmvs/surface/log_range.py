@@ -94,7 +94,6 @@ def solve_log_ranges(
     num_seeds: int,
     *,
     modes: Array | None = None,
-    mode_sigma: float = 1.0,
     num_rounds: int = 4,
 ) -> RangeSolution:
     """Robust least squares for the log-ranges of the nodes that seeds reach.
@@ -109,8 +108,7 @@ def solve_log_ranges(
     num_seeds : S; a seed is tied to several nodes and right or wrong as a whole.
     modes : (N, M), smooth functions of the nodes. The log-range is the integral of the edges
         plus a combination of these: the errors of the increments are not independent, a wrong
-        camera model bends the whole surface.
-    mode_sigma : standard deviation of a mode's coefficient.
+        camera model bends the whole surface. Each as large as one standard deviation of it.
     num_rounds : of reweighting.
     """
     modes = np.zeros((num_nodes, 0)) if modes is None else modes
@@ -126,7 +124,7 @@ def solve_log_ranges(
         )
     system = _System(reached, edges, keep, ties, modes)
     target = np.concatenate([edges.delta[keep], ties.value, np.zeros(num_modes)])
-    sigma = np.concatenate([edges.sigma[keep], ties.sigma, np.full(num_modes, mode_sigma)])
+    sigma = np.concatenate([edges.sigma[keep], ties.sigma, np.ones(num_modes)])
     precision = 1 / sigma**2
     robust = np.ones(len(target))
     for scale in annealed_scales(num_rounds):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from os import PathLike
 from typing import NamedTuple
 
@@ -13,7 +12,8 @@ from numpy.typing import NDArray
 from polmvs.camera import Camera, PinholeCamera, in_frame, pixel_centers
 from polmvs.colmap.dense_workspace import ImageLoader, write_dense_workspace
 from polmvs.colmap.maps import DepthNormals, map_pixel_xy
-from polmvs.geometry import dots, lengths
+from polmvs.config import FusionOptions
+from polmvs.geometry import dots, unit_or_zero
 from polmvs.scene import SparseModel, View
 from polmvs.surface.dense_view import DenseView
 from polmvs.surface.log_range import MAX_GRAZING, log_range_increment
@@ -24,22 +24,12 @@ DenseLoader = Callable[[str], DenseView | None]
 
 BAND_ROWS = 128  # worked on at once: what bounds the memory
 CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
-
-
-@dataclass(frozen=True, kw_only=True)
-class WarpTolerances:
-    """Which lattice points of a view tell the depth of a map's pixel.
-
-    Attributes
-    ----------
-    reach : from a ray to the nearest known point, strides; derived: a lattice point stands for its
-        cell, whose corners are 0.71 strides away, so that outlines hardly grow.
-    max_turn : of a surface between neighbouring lattice points, rad; more is an edge. A guess,
-        about what the fusion of clouds takes for two surfaces (15 degrees).
-    """
-
-    reach: float = 0.75
-    max_turn: float = float(np.radians(15.0))
+# From a ray to the nearest known point, strides: a lattice point stands for its cell, up to the
+# corners.
+REACH = float(np.sqrt(0.5))
+# Of a surface between neighbouring lattice points, rad; more is what the fusion of clouds takes for
+# two surfaces.
+MAX_TURN = float(np.radians(FusionOptions.max_normal_difference_deg))
 
 
 def export_dense_workspace(
@@ -80,18 +70,12 @@ def export_dense_workspace(
     )
 
 
-def warp_dense_view(
-    dense: DenseView,
-    view: View,
-    target: PinholeCamera,
-    *,
-    tolerances: WarpTolerances = WarpTolerances(),
-) -> DepthNormals:
+def warp_dense_view(dense: DenseView, view: View, target: PinholeCamera) -> DepthNormals:
     """Depth and normals of a dense view at the map pixels of an undistorted camera.
 
     Every known lattice point beside a pixel's ray extends its plane to that ray. Those that agree
     with the nearest one are averaged bilinearly; across a depth edge or a crease the nearest one
-    decides. A ray further from every known point than ``tolerances.reach`` has no depth.
+    decides. A ray further from every known point than ``REACH`` has no depth.
 
     Parameters
     ----------
@@ -99,32 +83,28 @@ def warp_dense_view(
     view : camera and pose; the target has the same pose.
     target : camera of the maps.
     """
-    return _maps_at(map_pixel_xy(target.width, target.height), target, dense, view, tolerances)
+    return _maps_at(map_pixel_xy(target.width, target.height), target, dense, view)
 
 
-def sensor_maps(
-    dense: DenseView, view: View, *, tolerances: WarpTolerances = WarpTolerances()
-) -> DepthNormals:
+def sensor_maps(dense: DenseView, view: View) -> DepthNormals:
     """Depth and normals of a dense view at the centres of the sensor's own pixels.
 
     Parameters
     ----------
-    dense, view, tolerances : see :func:`warp_dense_view`; the camera may have any distortion.
+    dense, view : see :func:`warp_dense_view`; the camera may have any distortion.
     """
     camera = view.camera
-    return _maps_at(pixel_centers(camera.width, camera.height), camera, dense, view, tolerances)
+    return _maps_at(pixel_centers(camera.width, camera.height), camera, dense, view)
 
 
-def _maps_at(
-    xy: Array, camera: Camera, dense: DenseView, view: View, tolerances: WarpTolerances
-) -> DepthNormals:
+def _maps_at(xy: Array, camera: Camera, dense: DenseView, view: View) -> DepthNormals:
     """Depth and normals at image coordinates ``(H, W, 2)`` of a camera at the view's pose."""
     depth = np.zeros(xy.shape[:2], np.float32)
     normals = np.zeros((*xy.shape[:2], 3), np.float32)
     for rows in _bands(len(xy)):
         rays = camera.rays(xy[rows])
         position = np.asarray(view.camera.project(rays), np.float64) / dense.stride_px - 0.5
-        ranges, normals[rows] = _extend(dense, view, rays, position, tolerances)
+        ranges, normals[rows] = _extend(dense, view, rays, position)
         depth[rows] = ranges * rays[..., 2]
     return DepthNormals(depth, normals)
 
@@ -147,9 +127,7 @@ class _Neighbours(NamedTuple):
     weight: Array
 
 
-def _extend(
-    dense: DenseView, view: View, rays: Array, position: Array, tolerances: WarpTolerances
-) -> tuple[Array, Array]:
+def _extend(dense: DenseView, view: View, rays: Array, position: Array) -> tuple[Array, Array]:
     """Ranges (h, w) and camera-frame normals (h, w, 3) of rays; 0 where unknown.
 
     ``position`` (h, w, 2) is where the rays meet the lattice, in units of its points.
@@ -170,7 +148,7 @@ def _extend(
     ]
     neighbours = _Neighbours(*(np.stack(part) for part in zip(*corners, strict=True)))
     stride = dense.stride_px / view.camera.mean_focal_px
-    ranges[hit], normals[hit] = _blend(neighbours, rays[hit], stride, tolerances)
+    ranges[hit], normals[hit] = _blend(neighbours, rays[hit], stride)
     return ranges, normals
 
 
@@ -207,9 +185,7 @@ def _neighbour(
     )
 
 
-def _blend(
-    neighbours: _Neighbours, rays: Array, stride: float, tolerances: WarpTolerances
-) -> tuple[Array, Array]:
+def _blend(neighbours: _Neighbours, rays: Array, stride: float) -> tuple[Array, Array]:
     """Average the neighbours (4, N) that show the same surface as the nearest one.
 
     On a surface that turns by ``t`` over one stride (radians of ray), the planes through its
@@ -218,18 +194,15 @@ def _blend(
     """
     log_range, normals, distance, weight = neighbours
     nearest = distance.argmin(axis=0), np.arange(len(rays))
-    known = distance[nearest] <= tolerances.reach
+    known = distance[nearest] <= REACH
     # Of two surfaces the one seen more steeply sets the bound: a limb must not hide an edge.
     cosine = -dots(normals, np.broadcast_to(rays, normals.shape))
     cosine = np.maximum(np.maximum(cosine, cosine[nearest]), MAX_GRAZING)
-    same: Mask = np.abs(log_range - log_range[nearest]) <= tolerances.max_turn * stride / cosine**2
-    same &= dots(normals, np.broadcast_to(normals[nearest], normals.shape)) >= np.cos(
-        tolerances.max_turn
-    )
+    same: Mask = np.abs(log_range - log_range[nearest]) <= MAX_TURN * stride / cosine**2
+    same &= dots(normals, np.broadcast_to(normals[nearest], normals.shape)) >= np.cos(MAX_TURN)
     share = np.where(same & np.isfinite(distance), weight, 0)
     share[nearest] += 1e-9  # no division by zero where nothing is known
     share /= share.sum(axis=0)
-    normal = np.einsum("kn,knc->nc", share, normals)
-    length = lengths(normal)[:, None]
-    normal = np.where(known[:, None], normal / np.where(length > 0, length, 1), 0)
+    normal = unit_or_zero(np.einsum("kn,knc->nc", share, normals))
+    normal = np.where(known[:, None], normal, 0)
     return np.where(known, np.exp((share * log_range).sum(axis=0)), 0), normal

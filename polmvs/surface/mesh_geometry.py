@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 
-from polmvs.geometry import dots, lengths
+from polmvs.geometry import dots, lengths, unit_or_zero
 from polmvs.io.open3d_import import import_open3d
 
 Array = NDArray[np.float64]
@@ -82,8 +82,7 @@ class TriangleMesh:
             ],
             axis=-1,
         )
-        length = lengths(total)[:, None]
-        return np.asarray(total / np.maximum(length, 1e-300))
+        return unit_or_zero(total)
 
     @cached_property
     def adjacency(self) -> sparse.csr_array:

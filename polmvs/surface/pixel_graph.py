@@ -13,8 +13,15 @@ from polmvs.config import AngleModel
 from polmvs.normals.estimator import NormalEstimate
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
-from polmvs.surface.dense_view import SurfaceSamples
-from polmvs.surface.log_range import Edges, SeedTies, log_range_increment, slope_sigma
+from polmvs.surface.dense_view import NUM_NEAREST, REACH, SurfaceSamples
+from polmvs.surface.log_range import (
+    MAX_GRAZING,
+    Edges,
+    SeedTies,
+    log_range_increment,
+    slope_sigma,
+)
+from polmvs.surface.surface_view import MIN_VIEWS
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
@@ -28,28 +35,19 @@ class GraphTolerances:
 
     Attributes
     ----------
-    normal_sigma_floor : rad, systematic error of multi-view normals between nodes
-        ``reference_angle`` apart. Errors of edges count as independent: that of denser ones
-        must be larger to add up to the same. Measured on the shared captures.
-    reference_angle : rad; 6 px of the captures that the floor was measured on.
-    max_seed_distance_px : from a seed to the nodes it is tied to. Guess; more than the
-        diagonal of the coarsest lattice.
-    num_ties : nodes that a seed is tied to. Derived: the corners of its cell.
+    normal_error : systematic error of multi-view normals between nodes an angle apart, rad, times
+        the root of that angle. Errors of edges count as independent: that of denser ones must be
+        larger to add up to the same. Measured on the shared captures: 0.012 rad at 0.0135 rad.
     min_seed_cosine : between the normals of a seed and of a node it is tied to: 5.7 deg.
         Guess.
-    min_crease_angle : rad, between neighbouring normals. Guess.
     crease_factor : by which a crease turns the normal more than noise or local curvature does.
         Derived: on a cylinder half of the edges of a lattice turn, their local mean is a
         quarter of a turn, which must pass.
-    filled_sigma : rad, of a normal taken from the neighbours. Guess.
+    filled_sigma : rad, of a normal taken from the neighbours, and from which one is. Guess.
     """
 
-    normal_sigma_floor: float = 0.012
-    reference_angle: float = 0.0135
-    max_seed_distance_px: float = 12.0
-    num_ties: int = 4
+    normal_error: float = 0.0014
     min_seed_cosine: float = 0.995
-    min_crease_angle: float = 0.03
     crease_factor: float = 5.0
     filled_sigma: float = 0.1
 
@@ -132,11 +130,11 @@ def fill_normals(
 ) -> tuple[Array, Array]:
     """Normals with the gaps filled from neighbours, which widens their deviation."""
     sigma = np.radians(estimate.sigma_deg)
-    good = estimate.valid & (estimate.num_rows >= 3) & (estimate.sigma_deg < 5)
+    good = estimate.valid & (estimate.num_rows >= MIN_VIEWS) & (sigma < tolerances.filled_sigma)
     if not good.any():
         return estimate.normals, sigma
     xy, normals = nodes.surface.xy, estimate.normals.copy()
-    k = min(8, int(good.sum()))
+    k = min(NUM_NEAREST, int(good.sum()))
     index = cKDTree(xy[good]).query(xy[~good], k=k)[1].reshape(-1, k)
     mean = normals[good][index].mean(axis=1)
     normals[~good] = mean / np.linalg.norm(mean, axis=-1, keepdims=True)
@@ -163,8 +161,7 @@ def node_edges(
     tolerances : of this step.
     """
     surface = nodes.surface
-    floor = tolerances.normal_sigma_floor * np.sqrt(tolerances.reference_angle / nodes.spacing)
-    sigma = np.hypot(surface.normal_sigma, floor)
+    sigma = np.hypot(surface.normal_sigma, tolerances.normal_error / np.sqrt(nodes.spacing))
     joined = _smooth_edges(nodes, surface.normals, sigma, tolerances=tolerances)
     tail, head = nodes.tail[joined], nodes.head[joined]
     rays = surface.rays_in_world.astype(np.float64)
@@ -189,7 +186,7 @@ def node_edges(
     turn = 0.5 * (own_sigma[tail] + own_sigma[head])
     cosine = np.abs((mean * rays[tail]).sum(axis=-1))
     constant_sigma = (
-        angle * turn * np.sqrt(1 - np.minimum(cosine, 1) ** 2) / np.maximum(cosine, 0.05)
+        angle * turn * np.sqrt(1 - np.minimum(cosine, 1) ** 2) / np.maximum(cosine, MAX_GRAZING)
     )
     use = nodes.on_contour[joined] & finite & np.isfinite(constant_sigma)
     return Edges(
@@ -213,10 +210,7 @@ def _smooth_edges(
     local = ((np.bincount(tail, root, num) + np.bincount(head, root, num)) / degree) ** 2
     noise = np.hypot(sigma[tail], sigma[head])
     expected = np.minimum(local[tail], local[head])
-    limit = np.maximum(
-        tolerances.min_crease_angle, tolerances.crease_factor * np.maximum(noise, expected)
-    )
-    return np.asarray(~(turn > limit))
+    return np.asarray(~(turn > tolerances.crease_factor * np.maximum(noise, expected)))
 
 
 def tie_seeds(
@@ -231,7 +225,7 @@ def tie_seeds(
     visible, seed_xy = visible_seeds(phase_map, seeds)
     to_seed = seeds.points_in_world - phase_map.view.center_in_world
     distance = np.linalg.norm(to_seed, axis=-1)
-    k = min(tolerances.num_ties, len(surface.xy))
+    k = min(NUM_NEAREST, len(surface.xy))
     gap, node = cKDTree(surface.xy).query(np.where(visible[:, None], seed_xy, -1e6), k=k)
     gap, node = gap.reshape(-1, k), node.reshape(-1, k)
     seed = np.repeat(np.arange(len(distance)), k)
@@ -245,7 +239,7 @@ def tie_seeds(
         step = log_range_increment(chord, rays, node_rays)
         # A seed of another surface, hidden behind this one, has another normal.
         alike = ~((seed_normals * node_normals).sum(axis=-1) < tolerances.min_seed_cosine)
-    ok = visible[seed] & alike & (gap < tolerances.max_seed_distance_px) & np.isfinite(step)
+    ok = visible[seed] & alike & (gap < REACH * nodes.spacing_px) & np.isfinite(step)
     seed, node, gap, step = seed[ok], node[ok], gap[ok], step[ok]
     footprint = 1 / phase_map.view.camera.mean_focal_px
     sigma = np.sqrt(

@@ -14,25 +14,21 @@ from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from polmvs.errors import DataError
+from polmvs.geometry import dots, unit_or_zero
 from polmvs.io.clouds import Cloud, Mesh, solve_poisson
+from polmvs.neighbors import are_usual, point_spacings
 from polmvs.scene import PointKind
+from polmvs.surface.mesh_geometry import TriangleMesh
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Triangles = NDArray[np.int32]
 
 logger = logging.getLogger(__name__)
 
 MIN_POINTS = 100
-# Points scattered at random leave a void of this radius with probability exp(-pi 2.5^2) = 3e-9.
-SUPPORT_SPACINGS = 2.5
-MIN_ISLAND_SPACINGS = 20.0  # side of the square whose area an island must have
-MAX_DEPTH = 10  # of the octree: 1024 cells a side, about 2 GB for a surface that fills them
 KIND = "kind"
 
 
@@ -42,24 +38,21 @@ class MeshTolerances:
 
     Attributes
     ----------
-    num_neighbors : by which the density about a point is told. Guess.
     num_smoothed : points whose normals a vertex takes. Guess.
-    lone_spacings : a point whose neighbours are this much farther than usual is an outlier.
-        Guess.
-    border_spacings : a point stands for its cell, which ends half-way to the next one.
-        Derived.
-    min_facing_cosine : between a vertex's normal and its nearest point's. Derived: the other
-        side of the sheet.
+    support : vertices farther than this from any point go. Derived: points scattered at random
+        leave a void of this radius with probability exp(-pi 2.5^2) = 3e-9.
+    min_island : side of a square; separate pieces of a smaller area go. Guess.
     min_depth : of the octree, that Open3D takes.
+    max_depth : of the octree, whatever the points' spacing: 1024 cells a side, about 2 GB for a
+        surface that fills them.
     cube_scale : of Poisson's cube over the cloud's extent; Open3D's own.
     """
 
-    num_neighbors: int = 8
     num_smoothed: int = 4
-    lone_spacings: float = 4.0
-    border_spacings: float = 0.5
-    min_facing_cosine: float = 0.0
+    support: float = 2.5
+    min_island: float = 20.0
     min_depth: int = 2
+    max_depth: int = 10
     cube_scale: float = 1.1
 
 
@@ -67,9 +60,6 @@ def poisson_mesh(
     cloud: Cloud,
     *,
     kinds: Collection[int] = (PointKind.SURFACE,),
-    max_depth: int = MAX_DEPTH,
-    support_spacings: float = SUPPORT_SPACINGS,
-    min_island_spacings: float = MIN_ISLAND_SPACINGS,
     source: str | PathLike[str] = "cloud",
     tolerances: MeshTolerances = MeshTolerances(),
 ) -> Mesh:
@@ -85,9 +75,6 @@ def poisson_mesh(
     cloud : with normals that point away from the surface; if it has a scalar ``kind``, only
         points of the given kinds count. Points and normals that are not finite do not.
     kinds : of points to use, see :class:`polmvs.surface.surroundings.PointKind`.
-    max_depth : of the octree, whatever the points' spacing; bounds memory.
-    support_spacings : vertices farther than this from any point go, in spacings of the points.
-    min_island_spacings : side of a square, in spacings; separate pieces of a smaller area go.
     source : where the cloud came from, for messages.
     tolerances : of this step.
 
@@ -99,40 +86,37 @@ def poisson_mesh(
     Raises
     ------
     DataError
-        If the cloud has no normals, fewer than 100 usable points, or most of them coincide.
+        If the cloud has no normals, too few usable points, or most of them coincide.
     """
     points, normals, colors = _usable(cloud, kinds, source)
-    spacings = point_spacings(points, tolerances=tolerances)
-    usual = spacings <= tolerances.lone_spacings * np.median(spacings)
+    spacings = point_spacings(points)
+    usual = are_usual(spacings)
     points, normals = points[usual], normals[usual]
     colors = None if colors is None else colors[usual]
     spacing = float(np.median(spacings[usual]))
     if not spacing > 0:
         raise DataError(source, "has most of its points in the same places; merge them first.")
-    depth = octree_depth(points, spacing, max_depth, tolerances=tolerances)
+    depth = octree_depth(points, spacing, tolerances=tolerances)
     vertices, triangles = solve_poisson(points, normals, depth=depth, scale=tolerances.cube_scale)
     logger.debug("Poisson: depth %d, spacing %.3g, %d vertices", depth, spacing, len(vertices))
+    surface = TriangleMesh(vertices, triangles.astype(np.int64))
     tree = cKDTree(points)
     distance, nearest = tree.query(vertices, k=tolerances.num_smoothed, workers=-1)
-    near_normals = _mean_normals(normals[nearest])
-    facing = (vertex_normals(vertices, triangles) * near_normals).sum(axis=-1)
-    supported = (distance[:, 0] <= support_spacings * spacing) & (
-        facing > tolerances.min_facing_cosine
-    )
-    supported = _without_rim(
-        vertices, triangles, supported, (support_spacings - tolerances.border_spacings) * spacing
-    )
-    kept = np.flatnonzero(supported[triangles].all(axis=1))
-    kept = kept[_large_islands(vertices, triangles[kept], (min_island_spacings * spacing) ** 2)]
-    used = np.unique(triangles[kept])
-    index = np.full(len(vertices), -1, np.int32)
-    index[used] = np.arange(len(used))
-    final = index[triangles[kept]]
+    near_normals = unit_or_zero(normals[nearest].sum(axis=1))
+    # One that faces away from the points beside it is of the other side of a sheet.
+    supported = dots(surface.vertex_normals, near_normals) > 0
+    supported &= distance[:, 0] <= tolerances.support * spacing
+    # A point stands for its cell, which ends half-way to the next one.
+    supported = _without_rim(surface, supported, (tolerances.support - 0.5) * spacing)
+    islands = TriangleMesh(vertices, surface.faces[supported[surface.faces].all(axis=1)])
+    areas = np.bincount(islands.face_components, islands.face_areas)
+    kept = areas[islands.face_components] >= (tolerances.min_island * spacing) ** 2
+    used, final = np.unique(islands.faces[kept], return_inverse=True)
     return Mesh(
         vertices=vertices[used],
         normals=near_normals[used],
         colors=None if colors is None else colors[nearest[used, 0]],
-        triangles=final,
+        triangles=final.reshape(-1, 3).astype(np.int32),
     )
 
 
@@ -156,93 +140,26 @@ def _usable(
     return cloud.points[used], normals, None if cloud.colors is None else cloud.colors[used]
 
 
-def point_spacings(points: Array, *, tolerances: MeshTolerances = MeshTolerances()) -> Array:
-    """Distance between points ``(N, 3)`` of a surface as their density about each tells.
-
-    The side of the square that each point would have to itself; the nearest neighbour alone
-    would be that of a pair that noise has brought together.
-    """
-    k = min(tolerances.num_neighbors, len(points) - 1)
-    radius = cKDTree(points).query(points, k=k + 1, workers=-1)[0][:, -1]
-    # The disc to the k-th neighbour holds it by half, k - 1 others and the point itself.
-    return np.asarray(radius * np.sqrt(np.pi / (k + 0.5)), np.float64)
-
-
 def octree_depth(
-    points: Array,
-    spacing: float,
-    max_depth: int = MAX_DEPTH,
-    *,
-    tolerances: MeshTolerances = MeshTolerances(),
+    points: Array, spacing: float, *, tolerances: MeshTolerances = MeshTolerances()
 ) -> int:
     """The greatest depth at which Poisson's cells are no narrower than the spacing."""
     side = tolerances.cube_scale * float(np.ptp(points, axis=0).max())
-    if not (side > 0 and spacing > 0):
-        return tolerances.min_depth
-    return int(np.clip(np.floor(np.log2(side / spacing)), tolerances.min_depth, max_depth))
+    depth = np.floor(np.log2(side / spacing))
+    return int(np.clip(depth, tolerances.min_depth, tolerances.max_depth))
 
 
-def triangle_areas(vertices: Array, triangles: Triangles) -> Array:
-    """Areas ``(F,)``."""
-    return np.asarray(0.5 * np.linalg.norm(_crosses(vertices, triangles), axis=-1))
-
-
-def vertex_normals(vertices: Array, triangles: Triangles) -> Array:
-    """Unit normals ``(V, 3)``, means of the triangles' weighted by area; 0 without any."""
-    crosses = _crosses(vertices, triangles)
-    total = np.stack(
-        [
-            np.bincount(triangles.ravel(), np.repeat(crosses[:, i], 3), len(vertices))
-            for i in range(3)
-        ],
-        axis=-1,
-    )
-    length = np.linalg.norm(total, axis=-1, keepdims=True)
-    return np.asarray(total / np.where(length > 0, length, 1))
-
-
-def boundary_edges(triangles: Triangles) -> NDArray[np.int32]:
-    """Edges ``(E, 2)`` that belong to one triangle only, lower vertex first."""
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    return np.asarray(unique[count == 1], np.int32)
-
-
-def _crosses(vertices: Array, triangles: Triangles) -> Array:
-    """Normals of the triangles, twice their areas long."""
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    return np.asarray(np.cross(b - a, c - a))
-
-
-def _mean_normals(normals: Array) -> Array:
-    """Unit mean ``(V, 3)`` of normals ``(V, K, 3)``; 0 where they cancel."""
-    total = normals.sum(axis=1)
-    length = np.linalg.norm(total, axis=-1, keepdims=True)
-    return np.asarray(total / np.where(length > 0, length, 1))
-
-
-def _without_rim(vertices: Array, triangles: Triangles, supported: Mask, width: float) -> Mask:
+def _without_rim(surface: TriangleMesh, supported: Mask, width: float) -> Mask:
     """Take back by ``width`` from its edges what reached beyond the points by more than that.
 
     Together with the support this closes narrow holes and leaves the outline, and that of wide
     holes, where the points end (a morphological closing).
     """
-    num_supported = supported[triangles].sum(axis=1)
-    cut = np.unique(triangles[(num_supported > 0) & (num_supported < 3)])
+    num_supported = supported[surface.faces].sum(axis=1)
+    cut = np.unique(surface.faces[(num_supported > 0) & (num_supported < 3)])
     beyond = cut[~supported[cut]]
     if not len(beyond) or not supported.any():
         return supported
-    gap = cKDTree(vertices[beyond]).query(vertices, distance_upper_bound=width, workers=-1)[0]
+    tree = cKDTree(surface.vertices[beyond])
+    gap = tree.query(surface.vertices, distance_upper_bound=width, workers=-1)[0]
     return np.asarray(supported & ~np.isfinite(gap))
-
-
-def _large_islands(vertices: Array, triangles: Triangles, min_area: float) -> Mask:
-    """Which triangles ``(F,)`` belong to a connected piece of at least this area."""
-    if not len(triangles):
-        return np.zeros(0, bool)
-    tail, head = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
-    ones = np.ones(len(tail), np.int8)
-    graph = sparse.coo_matrix((ones, (tail, head)), shape=2 * (len(vertices),))
-    label = connected_components(graph, directed=False)[1][triangles[:, 0]]
-    area = np.bincount(label, triangle_areas(vertices, triangles))
-    return np.asarray(area[label] >= min_area)

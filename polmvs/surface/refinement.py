@@ -22,7 +22,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, default_num_workers
 from polmvs.fitting import CAUCHY_SCALE, annealed_scales, robust_deviation
-from polmvs.geometry import dots, lengths
+from polmvs.geometry import dots, lengths, unit_or_zero
 from polmvs.normals.estimator import smallest_eigenvectors
 from polmvs.surface.creases import CreaseTolerances, crease_vertices
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, visible_points
@@ -403,6 +403,7 @@ def refine(
     go_on : asked with the mesh after each level, whether to refine it further.
     """
     tol = tolerances or RefinementTolerances()
+    given = _Given(views, angle_model, footprint, known, tol)
     state, with_slope = _State(mesh, 0.0, RowSigma(tol.row_sigma, tol.row_sigma)), True
     for number, level in enumerate(tol.levels):
         edge = level.edge_px * footprint
@@ -413,10 +414,7 @@ def refine(
         ways = [replace(level, with_slope=False), level][: 1 + with_slope]
         if number and number == len(tol.levels) - 1:  # the way of the level before
             ways = ways[-1:]
-        found = [
-            _refined_at(state, views, angle_model, footprint, edge, way, known, tol, on_progress)
-            for way in ways
-        ]
+        found = [_refined_at(state, given, edge, way, on_progress) for way in ways]
         if len(found) > 1:
             shares = [
                 unexplained_shares(one.mesh, views, angle_model, tol.row_sigma) for one in found
@@ -446,6 +444,17 @@ def _is_less(values: Array, others: Array) -> bool:
 
 
 @dataclass(frozen=True)
+class _Given:
+    """What a mesh is refined by, as in :func:`refine`."""
+
+    views: Sequence[SurfaceView]
+    angle_model: AngleModel
+    footprint: float
+    known: KnownPoints | None
+    tol: RefinementTolerances
+
+
+@dataclass(frozen=True)
 class _State:
     """What one level of refinement hands on to the next."""
 
@@ -456,19 +465,14 @@ class _State:
 
 def _refined_at(
     state: _State,
-    views: Sequence[SurfaceView],
-    angle_model: AngleModel,
-    footprint: float,
+    given: _Given,
     edge: float,
     level: Level,
-    known: KnownPoints | None,
-    tol: RefinementTolerances,
     on_progress: Callable[[int], None] | None,
 ) -> _State:
     """The surface after one level, with edges of the given length."""
     report = on_progress if on_progress is not None else lambda count: None
-    mesh, tilt_share, row_sigma = state.mesh, state.tilt_share, state.row_sigma
-    shown = row_sigma
+    mesh, tilt_share, shown, tol = state.mesh, state.tilt_share, state.row_sigma, given.tol
     moved = np.zeros(len(mesh.vertices))
     for step in range(level.num_steps):
         # A mesh that has moved far is uneven and may intersect itself; one that has not is
@@ -477,9 +481,9 @@ def _refined_at(
             mesh = remeshed(mesh, edge)
             moved = np.zeros(len(mesh.vertices))
         if not len(mesh.faces):
-            return _State(mesh, tilt_share, row_sigma)
-        turned = [replace(view, tilt_share=tilt_share) for view in views]
-        energy = _energy(mesh, turned, angle_model, footprint, edge, level, known, row_sigma, tol)
+            return _State(mesh, tilt_share, state.row_sigma)
+        turned = [replace(view, tilt_share=tilt_share) for view in given.views]
+        energy = _energy(mesh, replace(given, views=turned), edge, level, state.row_sigma)
         mesh, displacement = _step(mesh, energy, edge, tol)
         tilt_share += energy.views.tilt.solved(displacement)
         tilt_share = float(np.clip(tilt_share, 0, 1))
@@ -489,9 +493,9 @@ def _refined_at(
         change = float(np.sqrt(np.mean(free**2))) if len(free) else 0.0
         logger.info(
             "edges of %.1f px, %d vertices: moved by %.3f px; %.2f of the polarizers' tilt.",
-            edge / footprint,
+            edge / given.footprint,
             len(mesh.vertices),
-            change / footprint,
+            change / given.footprint,
             tilt_share,
         )
         report(1)
@@ -530,7 +534,8 @@ def settling_step(
     tol = tolerances or RefinementTolerances()
     level = replace(tol.levels[-1], with_slope=False, on_outline=True)
     edge = mesh.mean_edge
-    energy = _energy(mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol, sides)
+    given = _Given(views, angle_model, footprint, known, tol)
+    energy = _energy(mesh, given, edge, level, row_sigma, sides)
     moved, displacement = _step(mesh, energy, edge, tol)
     free = np.abs(displacement[energy.free & ~energy.sharp])
     return moved, not len(free) or float(np.median(free)) < tol.converged * edge
@@ -633,16 +638,13 @@ class _Energy:
 
 def _energy(
     mesh: TriangleMesh,
-    views: Sequence[SurfaceView],
-    angle_model: AngleModel,
-    footprint: float,
+    given: _Given,
     edge: float,
     level: Level,
-    known: KnownPoints | None,
     row_sigma: RowSigma,
-    tol: RefinementTolerances,
     sides: KnownSides | None = None,
 ) -> _Energy:
+    views, known, tol = given.views, given.known, given.tol
     scene, edges = RayScene(mesh), shared_edges(mesh)
     sharp = np.zeros(len(mesh.vertices), np.bool_)
     asked = np.ones(len(mesh.faces), np.bool_)
@@ -656,7 +658,7 @@ def _energy(
         rim = None
         if view.has_outline:
             rim = _rim_rows(mesh, scene, view, edges, level, sharp)
-        rows = face_rows(mesh, scene, view, angle_model, row_sigma, tol)
+        rows = face_rows(mesh, scene, view, given.angle_model, row_sigma, tol)
         return rim, rows if asked.all() else rows.only(asked[rows.face])
 
     # Threads, for products of large arrays and the casting of rays let go of Python's lock.
@@ -665,7 +667,7 @@ def _energy(
     rims, rows = [rim for rim, _ in found], [row for _, row in found]
     residuals = [np.zeros(0), *(rim.residual for rim in rims if rim is not None)]
     rim_sigma = _rim_sigma(np.concatenate(residuals), tol)
-    agreed = _agreed_weights(rows, views, mesh.centers, 0.5 * edge / footprint, tol)
+    agreed = _agreed_weights(rows, views, mesh.centers, 0.5 * edge / given.footprint, tol)
     with_slope = level.with_slope or not any(rims)
 
     def of_views(chosen: Sequence[int]) -> _Evidence:
@@ -674,16 +676,9 @@ def _energy(
         # known as what else the rows share.
         taken_back = views[0].tilt_share if views else 0.0
         tilt = _SharedError(len(mesh.vertices), prior=tol.phase_correlation, expected=-taken_back)
+        seen_by = [(views[index], rows[index], agreed[index]) for index in chosen]
         is_seen, shown = _add_phases(
-            equations,
-            tilt,
-            mesh,
-            [(views[index], rows[index], agreed[index]) for index in chosen],
-            angle_model,
-            footprint,
-            level,
-            tol,
-            with_slope=with_slope,
+            equations, tilt, mesh, seen_by, given, level.loss_scale, with_slope=with_slope
         )
         own = [rim for rim in (rims[index] for index in chosen) if rim is not None]
         outline_slope = _add_rims(equations, own, rim_sigma, level, tol)
@@ -692,8 +687,7 @@ def _energy(
     everything = of_views(range(len(views)))
     points = _Equations(len(mesh.vertices))
     if known is not None and len(known.points) and everything.is_seen.any():
-        weight = tol.point_weight(len(views))
-        _add_points(points, mesh, everything.is_seen, known, weight, footprint, level, tol)
+        _add_points(points, mesh, everything.is_seen, known, given, level.rim_gate_px)
     smooth, pull, factor = _smoothness(mesh, edge, tol, sharp)
     free = np.zeros(len(mesh.vertices), np.bool_)
     free[mesh.faces[everything.is_seen]] = True
@@ -746,14 +740,11 @@ def place_deviations(
         return np.zeros(0)
     edge, row_sigma = mesh.mean_edge, RowSigma(tol.row_sigma, tol.row_sigma)
 
-    def energy_of(mesh: TriangleMesh) -> _Energy:
-        level = tol.levels[-1]
-        return _energy(mesh, views, angle_model, footprint, edge, level, known, row_sigma, tol)
-
-    energy = energy_of(mesh)
+    given = _Given(views, angle_model, footprint, known, tol)
+    energy = _energy(mesh, given, edge, tol.levels[-1], row_sigma)
     for _ in range(SETTLING_STEPS):
         mesh, _ = _step(mesh, energy, edge, tol)
-        energy = energy_of(mesh)
+        energy = _energy(mesh, given, edge, tol.levels[-1], row_sigma)
     matrix = energy.matrix()
     # Nothing but the energy holds the surface here; what no view sees is not asked for.
     loose = 1 / (np.where(energy.free, 100.0, tol.unseen_damping) * edge) ** 2
@@ -837,10 +828,8 @@ def _add_phases(
     tilt: _SharedError,
     mesh: TriangleMesh,
     seen_by: Sequence[tuple[SurfaceView, FaceRows, Array]],
-    angle_model: AngleModel,
-    footprint: float,
-    level: Level,
-    tol: RefinementTolerances,
+    given: _Given,
+    loss_scale: float,
     *,
     with_slope: bool,
 ) -> tuple[Mask, RowSigma]:
@@ -858,12 +847,12 @@ def _add_phases(
     is_seen : (F,) faces that some view sees.
     row_sigma : what the rows' residuals show of it.
     """
-    num_faces = len(mesh.faces)
+    num_faces, footprint = len(mesh.faces), given.footprint
     blocks, gradient = np.zeros((num_faces, 3, 3)), np.zeros((num_faces, 3))
     is_seen = np.zeros(num_faces, np.bool_)
     change = normal_changes(mesh)
     along = dots(mesh.vertex_normals.take(mesh.faces, axis=0), mesh.face_normals[:, None]) / 3
-    share = np.minimum(mesh.face_areas / (tol.independent_px * footprint**2), 1.0)
+    share = np.minimum(mesh.face_areas / (given.tol.independent_px * footprint**2), 1.0)
     reach = min(0.5 * mesh.mean_edge, 1.5 * footprint)
     steepest = 0.5 / footprint
     residuals, mirrored = [np.zeros(0)], [np.zeros(0, np.bool_)]
@@ -877,9 +866,9 @@ def _add_phases(
         jacobian = np.einsum("nij,nj->ni", change.take(face, axis=0), across)
         if with_slope:
             centers = mesh.centers.take(face, axis=0)
-            slope = _row_slope(view, angle_model, centers, normals, seen.rows, reach)
+            slope = _row_slope(view, given.angle_model, centers, normals, seen.rows, reach)
             jacobian += along[face] * np.clip(slope, -steepest, steepest)[:, None]
-        weight = np.maximum(_loss_weights(residual, level.loss_scale**2 * seen.variance), agreed)
+        weight = np.maximum(_loss_weights(residual, loss_scale**2 * seen.variance), agreed)
         weight *= share[face] / seen.variance
         blocks[face] += np.einsum("ni,nj->nij", weight[:, None] * jacobian, jacobian)
         gradient[face] += (weight * residual)[:, None] * jacobian
@@ -888,7 +877,7 @@ def _add_phases(
         mirrored.append(seen.is_mirrored)
     equations.add_blocks(mesh.faces, blocks, gradient)
     everything, is_mirrored = np.concatenate(residuals), np.concatenate(mirrored)
-    return is_seen, RowSigma.shown_by(everything, is_mirrored, tol.row_sigma)
+    return is_seen, RowSigma.shown_by(everything, is_mirrored, given.tol.row_sigma)
 
 
 def _loss_weights(residual: Array, square: Array | float) -> Array:
@@ -1068,8 +1057,7 @@ def find_rim(
     outwards = mesh.vertex_normals[ends].sum(axis=1)
     away = middle - view.center
     distance = lengths(away)[:, None]
-    outwards -= dots(outwards, away)[:, None] / distance**2 * away
-    outwards /= np.maximum(lengths(outwards)[:, None], 1e-300)
+    outwards = unit_or_zero(outwards - dots(outwards, away)[:, None] / distance**2 * away)
     # A pixel beyond the outline there is nothing, a pixel before it the surface itself.
     beyond = scene.cast(view.center, away + 1.0 * pixel[:, None] * outwards).distance
     before = scene.cast(view.center, away - 1.0 * pixel[:, None] * outwards).distance
@@ -1217,24 +1205,23 @@ def _add_points(
     mesh: TriangleMesh,
     seen: Mask,
     known: KnownPoints,
-    weight: float,
-    footprint: float,
-    level: Level,
-    tol: RefinementTolerances,
+    given: _Given,
+    gate_px: float,
 ) -> None:
     """Draw the faces that are ``seen`` (F,), not those behind them, to known points near them."""
+    tol, footprint = given.tol, given.footprint
     visible = TriangleMesh(mesh.vertices, mesh.faces[seen])
     place, face, barycentric = RayScene(visible).closest(known.points)
     face = np.flatnonzero(seen)[face]
     normals = mesh.face_normals[face]
     residual = dots(place - known.points, normals)
     sigma = np.hypot(known.sigma, tol.place_sigma_px * footprint)
-    near = lengths(place - known.points) < level.rim_gate_px * footprint
+    near = lengths(place - known.points) < gate_px * footprint
     face, residual, sigma = face[near], residual[near], sigma[near]
     along = dots(mesh.vertex_normals[mesh.faces[face]], normals[near][:, None])
     jacobian = barycentric[near] * along
-    scale = np.maximum(4 * sigma, 0.1 * level.rim_gate_px * footprint) ** 2
-    weights = weight * _loss_weights(residual, scale) / sigma**2
+    scale = np.maximum(4 * sigma, 0.1 * gate_px * footprint) ** 2
+    weights = tol.point_weight(len(given.views)) * _loss_weights(residual, scale) / sigma**2
     equations.add(mesh.faces[face], jacobian, residual, weights)
 
 

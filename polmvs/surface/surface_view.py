@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from polmvs.camera import in_frame, sample_image
 from polmvs.config import AngleModel
-from polmvs.geometry import lengths
+from polmvs.geometry import unit_or_zero
 from polmvs.io.arrays import kept_array
 from polmvs.polarization.angle_models import rows_from_axial, tilt_turn
 from polmvs.polarization.phase_map import PhaseMap, view_rays
@@ -198,7 +198,7 @@ def phase_rows(view: SurfaceView, angle_model: AngleModel, points: Floats) -> Ph
     """
     in_cam = view.to_camera(points)
     xy = view.view.camera.project(in_cam)
-    rays = in_cam / np.maximum(lengths(in_cam)[:, None], 1e-300)
+    rays = unit_or_zero(in_cam)
     cos2, sin2, precision = (
         np.asarray(column, np.float64) for column in sample_image(view.phase_map.samples, xy).T
     )

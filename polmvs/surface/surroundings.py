@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, in_frame, pixel_centers, sample_image
-from polmvs.config import FusionOptions
+from polmvs.config import FusionOptions, PropagationOptions
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map
@@ -53,10 +53,9 @@ class SurroundingsTolerances:
     Attributes
     ----------
     min_observations : two rays that meet say nothing about whether they belong together.
-        Derived. As many views must agree on a point of stereo.
-    max_part_share : points of which a larger share of the observations lies on parts are left
-        out: they are on the part, which has its own cloud, or mirror images behind it. Derived: of
-        three, none; of four, one.
+        Derived. As many views must agree on a point of stereo. Points of which more than one in
+        so many observations lies on parts are left out: they are on the part, which has its own
+        cloud, or mirror images behind it.
     max_relative_sigma : points are left out whose place is less certain than this share of their
         mean distance from the cameras, along the worst axis. Measured on `dome`: twice as much
         keeps 1.2 times as many.
@@ -81,7 +80,6 @@ class SurroundingsTolerances:
     """
 
     min_observations: int = 3
-    max_part_share: float = 1 / 3
     max_relative_sigma: float = 0.005
     min_angle_deg: float = 5.0
     max_angle_deg: float = 25.0
@@ -139,7 +137,7 @@ def sparse_surroundings(
     sigma = relative_sigmas(tracks, [phase_map.view for phase_map in maps])
     kept = (
         (num_views >= tolerances.min_observations)
-        & (part_share <= tolerances.max_part_share)
+        & (part_share <= 1 / tolerances.min_observations)
         & (sigma <= tolerances.max_relative_sigma)
     )
     return SparseSurroundings(
@@ -273,7 +271,6 @@ def stereo_surroundings(
     maps: Sequence[PhaseMap],
     folder: Path,
     *,
-    stride_px: int = 2,
     workers: Workers | None = None,
     on_progress: Callable[[int], None] | None = None,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
@@ -286,7 +283,6 @@ def stereo_surroundings(
         depths.
     maps : phase maps of the views.
     folder : where the views' ranges are kept meanwhile; the caller removes it.
-    stride_px : distance between matched pixels of a view, px.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done, twice for each view with points.
     tolerances : of this step.
@@ -297,7 +293,7 @@ def stereo_surroundings(
     certain = some_tracks(tracks, kept)
     chosen = choose_partners(certain, [m.view for m in maps], tolerances=tolerances)
     used = [k for k, partners in enumerate(chosen) if partners]
-    task = partial(_match_view, folder, stride_px, tolerances=tolerances)
+    task = partial(_match_view, folder, tolerances=tolerances)
     groups = [[maps[k], *(maps[j] for j in chosen[k])] for k in used]
     dense: list[DenseView] = []
     own = certain.of_views(len(maps))
@@ -317,7 +313,6 @@ def stereo_surroundings(
 
 def _match_view(
     folder: Path,
-    stride_px: int,
     maps: Sequence[PhaseMap],
     points: Array,
     *,
@@ -326,6 +321,7 @@ def _match_view(
     """Match the first view with the others and store what comes of it."""
     # A match may leak over a part's outline by its patch and a neighbour's.
     excluded = grow_mask(maps[0].region.inside, 2 * tolerances.border_px)
+    stride_px = PropagationOptions.stride_px  # as dense as the polarised surface
     dense = stereo_view(maps[0], maps[1:], points, excluded, stride_px, tolerances=tolerances)
     return store_dense_view(dense, folder / f"{maps[0].view.name}.stereo")
 

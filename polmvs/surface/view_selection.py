@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from polmvs.geometry import unit_or_zero
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
 from polmvs.surface.pixel_graph import visible_seeds
@@ -28,8 +29,7 @@ def choose_neighbors(maps: Sequence[PhaseMap], seeds: Seeds, max_neighbors: int)
     """
     seen = np.array([visible_seeds(m, seeds)[0] for m in maps], bool).reshape(len(maps), -1)
     centers = np.array([m.view.center_in_world for m in maps])
-    to_camera = centers[:, None] - seeds.points_in_world
-    to_camera /= np.maximum(np.linalg.norm(to_camera, axis=-1, keepdims=True), 1e-300)
+    to_camera = unit_or_zero(centers[:, None] - seeds.points_in_world)
     neighbors = []
     for k in range(len(maps)):
         places = np.flatnonzero(seen[k] if seen[k].any() else seen.any(axis=0))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,21 +184,21 @@ def visual_hull(
     if len(used) < 2:
         return nothing
     wrong = round(tol.wrong_share * len(used)) if num_wrong is None else num_wrong
+    on_grid = partial(_values_on_grid, used, wrong, plane, tol)
     center = _meeting_point(used)
     distance = float(np.median([np.linalg.norm(view.center - center) for view in used]))
     footprint = float(np.median([distance / view.view.camera.mean_focal_px for view in used]))
     low, high = center - distance, center + distance
     for num_cells in (32, 48, 64):
         step = float((high - low).max() / num_cells)
-        values = _values_on_grid(used, low, high, step, wrong, plane, tol)
+        values = on_grid(low, high, step)
         near = np.argwhere(values < 1.8 * step)  # the diagonal of a cell
         if not len(near):
             return nothing
         low, high = low + (near.min(axis=0) - 1) * step, low + (near.max(axis=0) + 1) * step
     fine = max(tol.step_px * footprint, float(np.prod(high - low) / MAX_CELLS) ** (1 / 3))
     low, high = low - 3 * fine, high + 3 * fine
-    values = _refined(used, low, high, fine, wrong, plane, tol)
-    values = _cleaned(values, fine, tol)
+    values = _cleaned(_refined(on_grid, low, high, fine), fine, tol)
     return VisualHull(values, low, fine, footprint)
 
 
@@ -220,10 +220,9 @@ def hull_values(
     points: Floats,
     num_wrong: int,
     plane: Plane | None,
-    tolerances: HullTolerances | None = None,
+    tol: HullTolerances,
 ) -> NDArray[np.float32]:
     """Signed distance ``(N,)`` to the hull's cones at points ``(N, 3)``, negative inside."""
-    tol = tolerances or HullTolerances()
     of_views = np.empty((len(views), len(points)), np.float32)
     num_seen = np.zeros(len(points), np.int32)
     for index, view in enumerate(views):
@@ -251,12 +250,12 @@ def _grid(low: Array, high: Array, step: float) -> tuple[int, ...]:
 
 def _values_on_grid(
     views: Sequence[SurfaceView],
-    low: Array,
-    high: Array,
-    step: float,
     num_wrong: int,
     plane: Plane | None,
     tol: HullTolerances,
+    low: Array,
+    high: Array,
+    step: float,
     where: Mask | None = None,
     values: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
@@ -275,19 +274,13 @@ def _values_on_grid(
 
 
 def _refined(
-    views: Sequence[SurfaceView],
-    low: Array,
-    high: Array,
-    step: float,
-    num_wrong: int,
-    plane: Plane | None,
-    tol: HullTolerances,
+    on_grid: Callable[..., NDArray[np.float32]], low: Array, high: Array, step: float
 ) -> NDArray[np.float32]:
     """Values on the fine grid, computed only where the coarse one comes near to zero."""
     ratio = 4
     shape = _grid(low, high, step)
     coarse_high = low + (np.array(shape) + ratio) * step
-    coarse = _values_on_grid(views, low, coarse_high, ratio * step, num_wrong, plane, tol)
+    coarse = on_grid(low, coarse_high, ratio * step)
     limit = np.float32(1.8 * ratio * step)
     coarse = np.clip(coarse, -limit, limit)
     index = np.meshgrid(*(np.arange(n) / ratio for n in shape), indexing="ij", sparse=True)
@@ -303,9 +296,7 @@ def _refined(
             )
         )
     ]
-    return _values_on_grid(
-        views, low, high, step, num_wrong, plane, tol, where=fine_near, values=values
-    )
+    return on_grid(low, high, step, where=fine_near, values=values)
 
 
 def _cleaned(values: NDArray[np.float32], step: float, tol: HullTolerances) -> NDArray[np.float32]:

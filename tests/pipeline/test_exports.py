@@ -28,7 +28,7 @@ from polmvs.pipeline.run_folder import DENSE_MARKER
 from polmvs.poses.metric_frame import transform_model
 from polmvs.scene import PointKind
 from polmvs.surface.kept_depth import kept_cloud
-from polmvs.surface.map_export import WarpTolerances
+from polmvs.surface.map_export import REACH
 
 BOARD_HEIGHT_M = 0.012  # of the true plane z = const, in the capture's gt/scene.json
 # A pixel is 1.3 mm on the board; SfM's poses bend and shift it by some tenths of that.
@@ -167,7 +167,7 @@ def test_colmap_fuses_the_workspace(
     cloud = fuse(tmp_path / "dense", min_num_pixels=3)
     assert len(cloud.points) > 10_000
     # A map's pixel takes the plane of the nearest point of the lattice, of two pixels.
-    assert_on_board(off_board(cloud.points), 2 * WarpTolerances().reach)
+    assert_on_board(off_board(cloud.points), 2 * REACH)
     assert cloud.normals is not None
     assert np.median(cloud.normals[:, 2]) > np.cos(np.radians(1))
     # The whole board: hardly a point of the truth is far from the fused cloud.

@@ -152,7 +152,7 @@ def test_the_others_surface_starts_a_view_that_knows_nothing():
     scene = scene_of(BALL)
     samples, _ = true_samples(scene, 0)
     dense = [None, true_view(scene, 1), true_view(scene, 2)]
-    guess = surface_of_others(scene.maps, dense, samples.xy, 2.0)
+    guess = surface_of_others(scene.maps, dense, samples.xy)
     found = np.isfinite(guess.log_range)
     assert found.mean() > 0.7
     # At the rim, where the range changes by much from pixel to pixel, it is a guess indeed.
@@ -165,12 +165,12 @@ def test_the_others_surface_starts_a_view_that_knows_nothing():
 def test_no_others_no_start():
     scene = scene_of(BOARD)
     xy = true_samples(scene, 0)[0].xy
-    assert surface_of_others(scene.maps, [None] * 3, xy, 2.0) is None
+    assert surface_of_others(scene.maps, [None] * 3, xy) is None
     region = scene.maps[0].region
     nowhere = replace(region, inside=np.zeros_like(region.inside))
     hidden = replace(scene.maps[0], region=nowhere)
     dense = [None, true_view(scene, 1), None]
-    assert surface_of_others([hidden, *scene.maps[1:]], dense, xy, 2.0) is None
+    assert surface_of_others([hidden, *scene.maps[1:]], dense, xy) is None
 
 
 def test_what_lies_behind_another_surface_is_hidden():

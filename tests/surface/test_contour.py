@@ -97,7 +97,7 @@ def test_a_circular_field_gives_closed_curves_once():
 def test_covering_reaches_every_part_of_the_region_at_about_the_spacing(scene):
     mask = scene.rendered[0].mask
     contours = cover_with_contours(
-        field_of(scene, AngleModel.PPA), np.zeros((0, 2)), mask, spacing_px=6.0
+        field_of(scene, AngleModel.PPA), np.zeros((0, 2)), mask, spacing_px=6.0, step_px=0.5
     )
     pixels = np.argwhere(mask)[:, ::-1] + 0.5
     gap = np.sqrt(((pixels[:, None] - contours.xy[None]) ** 2).sum(-1)).min(axis=1)
@@ -109,6 +109,6 @@ def test_places_without_direction_become_single_nodes():
     inside = np.zeros((60, 60), bool)
     inside[10:50, 10:50] = True
     field = np.zeros((60, 60, 2), np.float32)
-    contours = cover_with_contours(field, np.zeros((0, 2)), inside, spacing_px=5.0)
+    contours = cover_with_contours(field, np.zeros((0, 2)), inside, spacing_px=5.0, step_px=0.5)
     assert len(contours.xy) >= 49
     assert len(np.unique(contours.curve)) == len(contours.xy)

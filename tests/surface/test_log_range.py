@@ -107,7 +107,7 @@ def test_modes_take_up_an_error_that_all_increments_share():
     seeds = ties(nodes, truth[nodes], sigma=3e-4)
     modes = np.stack([x, 1.5 * x**2 - 0.5], axis=-1)
     plain = solve_log_ranges(61, bent, seeds, 3).log_range
-    straight = solve_log_ranges(61, bent, seeds, 3, modes=modes, mode_sigma=0.01).log_range
+    straight = solve_log_ranges(61, bent, seeds, 3, modes=0.01 * modes).log_range
     assert np.abs(straight - truth).max() < 2e-4
     assert np.abs(plain - truth).max() > 1e-3
 
@@ -115,7 +115,7 @@ def test_modes_take_up_an_error_that_all_increments_share():
 def test_modes_do_nothing_where_the_increments_are_right():
     modes = np.linspace(-1, 1, 40)[:, None] ** [1, 2]
     seeds = ties([3, 20, 36], 0.01 * np.array([3, 20, 36]))
-    solution = solve_log_ranges(40, chain(40), seeds, 3, modes=modes, mode_sigma=0.01)
+    solution = solve_log_ranges(40, chain(40), seeds, 3, modes=0.01 * modes)
     np.testing.assert_allclose(solution.log_range, 0.01 * np.arange(40), atol=1e-6)
 
 
@@ -156,7 +156,7 @@ def test_the_bordered_solution_is_the_least_squares_one(num_modes):
     rng = np.random.default_rng(5)
     edges, modes = lattice(6, 7, rng), polynomials(6, 7, num_modes)
     seeds = noisy_ties([3, 17, 30, 41, 17], rng)
-    result = solve_log_ranges(42, edges, seeds, 5, modes=modes, mode_sigma=0.03, num_rounds=1)
+    result = solve_log_ranges(42, edges, seeds, 5, modes=0.03 * modes, num_rounds=1)
     matrix = dense_system(42, edges, seeds, modes)
     target = np.concatenate([edges.delta, seeds.value, np.zeros(num_modes)])
     sigma = np.concatenate([edges.sigma, seeds.sigma, np.full(num_modes, 0.03)])
@@ -172,7 +172,7 @@ def test_the_deviation_is_that_of_the_normal_matrix(num_modes):
     edges, modes = lattice(9, 9, rng), polynomials(9, 9, num_modes)
     seeds = noisy_ties([3, 17, 30, 41, 70], rng)
     seeds.value[2] += 0.06  # a doubtful one, so that a weight differs from one
-    result = solve_log_ranges(81, edges, seeds, 5, modes=modes, mode_sigma=0.03, num_rounds=30)
+    result = solve_log_ranges(81, edges, seeds, 5, modes=0.03 * modes, num_rounds=30)
     assert result.seed_weight[2] < 0.9
     weight = np.concatenate([result.edge_weight, result.seed_weight, np.ones(num_modes)])
     sigma = np.concatenate([edges.sigma, seeds.sigma, np.full(num_modes, 0.03)])

@@ -3,15 +3,10 @@ import pytest
 
 from polmvs.errors import DataError
 from polmvs.io.clouds import Cloud, Mesh, read_mesh, write_mesh
+from polmvs.neighbors import point_spacings
 from polmvs.scene import PointKind
-from polmvs.surface.poisson import (
-    boundary_edges,
-    octree_depth,
-    point_spacings,
-    poisson_mesh,
-    triangle_areas,
-    vertex_normals,
-)
+from polmvs.surface.mesh_geometry import TriangleMesh
+from polmvs.surface.poisson import MeshTolerances, octree_depth, poisson_mesh
 
 SPACING = 0.01
 NUM = 80  # points along a side
@@ -42,7 +37,14 @@ def sphere_cap(radius=0.3, height=0.2, num=12000):
 
 
 def area_of(mesh):
-    return float(triangle_areas(mesh.vertices, mesh.triangles).sum())
+    return float(TriangleMesh(mesh.vertices, mesh.triangles).face_areas.sum())
+
+
+def boundary_edges(triangles):
+    """Edges that belong to one triangle only, lower vertex first."""
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    return unique[count == 1]
 
 
 def num_loops(mesh):
@@ -85,7 +87,9 @@ def test_a_sphere_cap_faces_outwards():
     assert area_of(mesh) == pytest.approx(area, rel=0.03)
     assert num_loops(mesh) == 1
     assert (mesh.normals * mesh.vertices).sum(axis=1).min() > 0.29
-    assert (vertex_normals(mesh.vertices, mesh.triangles) * mesh.normals).sum(axis=1).min() > 0.9
+    assert (TriangleMesh(mesh.vertices, mesh.triangles).vertex_normals * mesh.normals).sum(
+        axis=1
+    ).min() > 0.9
 
 
 def test_a_wide_hole_stays_and_a_narrow_one_is_closed():
@@ -145,13 +149,14 @@ def test_spacing_depth_and_edges_of_known_sets():
     scattered = np.random.default_rng(0).uniform(size=(20000, 3)) * [1, 1, 0]
     assert np.median(point_spacings(scattered)) == pytest.approx(20000**-0.5, rel=0.06)
     assert octree_depth(grid, 0.2) == 5  # 1.1 x 9.8 over 32 cells is 0.34, over 64 less than 0.2
-    assert octree_depth(grid, 1e-9, max_depth=8) == 8
-    assert octree_depth(np.zeros((5, 3)), 0.0) == 2
+    assert octree_depth(grid, 1e-9) == MeshTolerances().max_depth
+    assert octree_depth(grid, 1e9) == MeshTolerances().min_depth
     square = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     np.testing.assert_array_equal(boundary_edges(square), [[0, 1], [0, 3], [1, 2], [2, 3]])
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    np.testing.assert_allclose(triangle_areas(corners, square), 0.5)
-    np.testing.assert_allclose(vertex_normals(corners, square), [[0, 0, 1]] * 4)
+    mesh = TriangleMesh(corners, square)
+    np.testing.assert_allclose(mesh.face_areas, 0.5)
+    np.testing.assert_allclose(mesh.vertex_normals, [[0, 0, 1]] * 4)
 
 
 def test_clouds_that_make_no_mesh_are_named():

@@ -280,7 +280,7 @@ def test_the_lattice_leaves_out_edges(board):
 
 def test_nodes_are_spread_over_the_lattice(board):
     nodes = nodes_of(board)
-    dense = spread_nodes(board.maps[0], nodes.surface, 2, 6.0)
+    dense = spread_nodes(board.maps[0], nodes, 2)
     truth, hit = true_samples(board, 0, 2)
     known = dense.known & hit
     assert known.sum() > 0.9 * open_lattice(board.maps[0], 2).sum()
@@ -288,7 +288,7 @@ def test_nodes_are_spread_over_the_lattice(board):
     ranges[hit] = np.exp(truth.log_range)
     np.testing.assert_allclose(dense.range_map[known], ranges[known], rtol=1e-5)
     lost = replace(nodes.surface, log_range=np.full(len(nodes.surface.xy), np.nan))
-    assert spread_nodes(board.maps[0], lost, 2, 6.0) is None
+    assert spread_nodes(board.maps[0], replace(nodes, surface=lost), 2) is None
 
 
 @pytest.fixture(scope="module")
