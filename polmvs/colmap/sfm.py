@@ -44,7 +44,7 @@ from polmvs.config import Mapper, SfmOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.images import read_gray
 from polmvs.io.intrinsics import Intrinsics, read_intrinsics
-from polmvs.scene import SparseModel, View, short_list
+from polmvs.scene import KEYPOINT_SIGMA_PX, SparseModel, View, short_list
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +52,8 @@ NO_MODEL_REMEDY = (
     "The surroundings of the part need texture and neighbouring views more overlap; give "
     "`sfm.intrinsics` where they are known, or a COLMAP model as `sfm.sparse`."
 )
+
+COLMAP_DEFAULTS = pycolmap.IncrementalMapperOptions()
 
 OnProgress = Callable[[str], None]
 
@@ -71,9 +73,8 @@ class SfmTolerances:
     Attributes
     ----------
     max_reproj_error_px : of an observation that is kept; measured, of 1, 2 and 4.
-    min_tri_angle_deg : of a point that is kept; COLMAP's own.
-    loss_scale_px : of the last adjustment's Cauchy loss; measured, about twice the error of a good
-        keypoint.
+    loss_scale_px : of the last adjustment's Cauchy loss. Derived: the deviation of a keypoint,
+        about twice the error of a good one; measured.
     max_cost_change : relative, of the cost in an adjustment's step, at which it ends. Measured: of
         40 views a hundredth of this takes three times the steps, for 0.5 % of the cameras' errors;
         COLMAP's own 0 goes on to its last allowed step.
@@ -84,32 +85,30 @@ class SfmTolerances:
         measured: at COLMAP's own 1.1 it takes most of the mapper's time.
     min_views_principal_point : from which the principal point is freed; measured: of three views
         two captures of three got worse, of four none.
-    max_principal_point_shift : of the image's width; a guess, more is an estimate gone astray.
-    min_pair_matches : that each pair keeps where the mapper is given fewer; what COLMAP asks of
-        the pair that it begins with. Measured: docs/scale.md.
+    max_principal_point_shift : from where a principal point belongs, in sides of the image; a
+        guess. Farther from the centre an estimate has gone astray; as near to the lower right
+        corner given intrinsics are those of the full mosaic, which have it there.
+    min_pair_matches : that each pair keeps where the mapper is given fewer. Derived: what COLMAP
+        asks of the pair that it begins with. Measured: docs/scale.md.
     max_images_dense : up to which the last adjustment's equations are solved as a dense matrix.
         Measured: of 100 and 282 images faster than sparse, 8.2 of 9.6 and 19 of 32 s; a guess
         where that ends, as the cube of the images does.
     max_images_two_view_tracks : up to which tracks of two views count; a guess: with few images
         most tracks have two views only, with more those are mostly mismatches.
     focal_range : focal lengths that are believed, in widths of the image: 136 to 6 degrees.
-    corner_tolerance : of a principal point from the image's lower right corner, in sides of the
-        image; a guess. Intrinsics of the full mosaic have it there.
     """
 
     max_reproj_error_px: float = 2.0
-    min_tri_angle_deg: float = 1.5
-    loss_scale_px: float = 0.5
+    loss_scale_px: float = KEYPOINT_SIGMA_PX
     max_cost_change: float = 1e-4
     max_refinements: int = 1
     model_growth: float = 1.3
     min_views_principal_point: int = 4
     max_principal_point_shift: float = 0.1
-    min_pair_matches: int = 100
+    min_pair_matches: int = COLMAP_DEFAULTS.init_min_num_inliers
     max_images_dense: int = 400
     max_images_two_view_tracks: int = 5
     focal_range: tuple[float, float] = (0.2, 10.0)
-    corner_tolerance: float = 0.15
 
 
 def run_sfm(
@@ -252,7 +251,8 @@ def check_intrinsics(
         The principal point or a focal length is out of range; the message names the remedy.
     """
     fx, fy, cx, cy = intrinsics
-    if max(abs(cx / width - 1), abs(cy / height - 1)) < tolerances.corner_tolerance:
+    from_corner = max(abs(cx / width - 1), abs(cy / height - 1))
+    if from_corner < tolerances.max_principal_point_shift:
         half = ",".join(f"{value / 2:.10g}" for value in intrinsics)
         raise OptionError(
             f"has the principal point {cx:g},{cy:g} in the corner of the {width}x{height} px "
@@ -574,7 +574,9 @@ def _adjust(
     # Not pycolmap.bundle_adjustment: release 4.2 turns the log level back to INFO in it.
     pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
     observations = pycolmap.ObservationManager(reconstruction)
-    observations.filter_all_points3D(tolerances.max_reproj_error_px, tolerances.min_tri_angle_deg)
+    observations.filter_all_points3D(
+        tolerances.max_reproj_error_px, COLMAP_DEFAULTS.filter_min_tri_angle
+    )
     reconstruction.update_point_3d_errors()
 
 
