@@ -151,10 +151,7 @@ def run_sfm(
     to_match = names if given is None else list(given.ids)
     if options.pairs_file is not None:  # before the features, which take longer
         read_pairs(options.pairs_file, to_match)
-    work_folder.mkdir(parents=True, exist_ok=True)
-    database = work_folder / "database.db"
-    for left_over in work_folder.glob("database.db*"):
-        left_over.unlink()
+    database = _place_of_database(work_folder)
     pycolmap.set_random_seed(options.seed)
     with quiet_colmap(), nullcontext() if given is None else sound(given.path):
         on_progress("features")
@@ -186,9 +183,6 @@ def triangulate_views(
     views: Sequence[View],
     work_folder: Path,
     sparse_folder: Path,
-    *,
-    seed: int = 0,
-    tolerances: SfmTolerances = SfmTolerances(),
 ) -> SparseModel:
     """A model of known cameras: features are matched and triangulated, no pose is changed.
 
@@ -210,22 +204,19 @@ def triangulate_views(
         if (view.camera.width, view.camera.height) != (width, height):
             raise DataError(image_folder / view.name, "is of another size than its known camera.")
     single = all(view.camera == ordered[0].camera for view in ordered)
-    options = SfmOptions(seed=seed, single_camera=single)
+    options = SfmOptions(single_camera=single)
     reader = pycolmap.ImageReaderOptions()
     camera = camera_to_colmap(ordered[0].camera)
     reader.camera_model = camera.model.name
     reader.camera_params = camera.params_to_string()
-    work_folder.mkdir(parents=True, exist_ok=True)
-    database = work_folder / "database.db"
-    for left_over in work_folder.glob("database.db*"):
-        left_over.unlink()
-    pycolmap.set_random_seed(seed)
+    database = _place_of_database(work_folder)
+    pycolmap.set_random_seed(options.seed)
     with quiet_colmap():
         _extract_features(database, image_folder, names, reader, options)
         _match(database, names, options)
         # Images were imported in the order of names, so their ids are those of the views here.
         known = reconstruction_of_views(ordered, single_camera=single)
-        mapper = _mapper_options(names, options, tolerances)
+        mapper = _mapper_options(names, options, SfmTolerances())
         output = work_folder / "triangulated"
         output.mkdir(exist_ok=True)
         found = pycolmap.triangulate_points(known, database, image_folder, output, options=mapper)
@@ -234,6 +225,14 @@ def triangulate_views(
     model = model_from_reconstruction(found, names)
     _log_result(model, found.compute_mean_reprojection_error())
     return model
+
+
+def _place_of_database(work_folder: Path) -> Path:
+    """Where COLMAP's database is to lie; what an earlier run left there is removed."""
+    work_folder.mkdir(parents=True, exist_ok=True)
+    for left_over in work_folder.glob("database.db*"):
+        left_over.unlink()
+    return work_folder / "database.db"
 
 
 def check_intrinsics(
