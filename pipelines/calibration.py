@@ -35,7 +35,7 @@ from polmvs.synthetic.sensor import FaultySensor, faulty_sensor
 
 Array = NDArray[np.float64]
 
-PATTERN = (90, 45, 135, 0)
+PATTERN = CaptureOptions.pattern
 POLARIZER_DEG = (0, 20, 45, 70, 90, 110, 135, 160)
 NUM_FRAMES = 30
 CAMERA = PinholeCamera(width=306, height=256, fx=280, fy=280, cx=153, cy=128)

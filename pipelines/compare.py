@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 
+from polmvs.cli import EMPTY_STATUS
 from polmvs.cli.call import Call
 from polmvs.cli.commands import HOW, TO_CLOUD
 from polmvs.cli.flags import Command
@@ -46,7 +47,7 @@ def _compare(call: Call, terminal: Terminal) -> int:
         outcome = compare(replace(job, capture=capture, out=out, options=options))
         assert outcome.comparison is not None
         print(f"{capture}\n{outcome.comparison.table()}\n")
-        status = status if outcome.empty is None else 3
+        status = status if outcome.empty is None else EMPTY_STATUS
     return status
 
 

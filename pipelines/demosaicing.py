@@ -23,7 +23,7 @@ from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.flags import Command
 from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
-from polmvs.config import AngleModel, OptionGroup, option
+from polmvs.config import AngleModel, CaptureOptions, OptionGroup, RegionOptions, option
 from polmvs.evaluation.tables import format_table
 from polmvs.geometry import unit
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
@@ -36,8 +36,8 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Way = Callable[[Image], Image]
 
-PATTERN = (90, 45, 135, 0)
-MIN_DOLP = 0.1
+PATTERN = CaptureOptions.pattern
+MIN_DOLP = RegionOptions.min_dolp
 EDGE_SLOPE = 0.1  # of the intensity, relative, per half-size px: texture
 CUBIC = (-0.0703125, 0.8671875, 0.2265625, -0.0234375)  # Catmull-Rom at a quarter
 NUM_VIEWS = 4  # of a capture, evenly spread

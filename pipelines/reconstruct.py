@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from polmvs.cli import EMPTY_STATUS
 from polmvs.cli.call import Call
 from polmvs.cli.commands import HOW, TO_CLOUD, JobArguments, ModelChoice
 from polmvs.cli.flags import Command
@@ -25,7 +26,7 @@ def _reconstruct(call: Call, terminal: Terminal) -> int:
     outcome = reconstruct(job_of(call, terminal), model)
     cloud = outcome.run_folder.cloud(model)
     print(outcome.empty or f"{cloud}: {outcome.result(DensifyResult, model)}")
-    return 0 if outcome.empty is None else 3
+    return 0 if outcome.empty is None else EMPTY_STATUS
 
 
 COMMAND = Command(

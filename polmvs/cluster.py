@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import lru_cache
@@ -233,8 +233,13 @@ class Cluster:
 @lru_cache(maxsize=1)
 def own_versions() -> dict[str, str]:
     """Versions that decide a task's result."""
+    return installed_versions(PACKAGES)
+
+
+def installed_versions(packages: Iterable[str]) -> dict[str, str]:
+    """Versions of this package and of others by their names, "unknown" of what is missing."""
     found = {"polmvs": __version__}
-    for name in PACKAGES:
+    for name in packages:
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -7,7 +7,11 @@ import sys
 from collections.abc import Sequence
 from types import FrameType
 
-__all__ = ["entry_point", "interrupts", "main"]
+__all__ = ["EMPTY_STATUS", "INTERRUPTED", "entry_point", "interrupts", "main"]
+
+# Exit statuses beside those of errors.
+EMPTY_STATUS = 3  # the run came to its end, and has no points
+INTERRUPTED = 130  # as shells report a program ended by Ctrl-C
 
 interrupts: list[int] = []  # signals that asked this process to end
 
@@ -28,7 +32,7 @@ def entry_point() -> None:
             signal.signal(signal.SIGINT, _interrupt)
         status = main()
     except KeyboardInterrupt:  # while modules are imported
-        status = 130
+        status = INTERRUPTED
     sys.exit(status)
 
 

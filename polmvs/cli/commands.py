@@ -276,7 +276,7 @@ COMMANDS = (
     Command(
         name="batch",
         help_text="'reconstruct' for many captures side by side, and one table of what came out",
-        run="polmvs.cli.batch:batch",
+        run="polmvs.cli.jobs:batch",
         groups=(BatchArguments, ModelChoice, *TO_CLOUD, ExportOptions, *HOW),
     ),
     Command(

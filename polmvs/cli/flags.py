@@ -46,7 +46,6 @@ _NAMED_IN_MESSAGES: tuple[type[OptionGroup], ...] = (
 )
 
 HELP_ALL = "--help-all"
-USAGE_ERROR = 2
 
 
 @dataclass(frozen=True, kw_only=True)

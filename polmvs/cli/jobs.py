@@ -1,4 +1,4 @@
-"""The commands that run a job in an output folder: each calls one function of the pipeline."""
+"""The commands that run jobs in output folders: each calls one function of the pipeline."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import Any
 
 import polmvs
 from polmvs.camera import PinholeCamera
+from polmvs.cli import EMPTY_STATUS
 from polmvs.cli.call import Call, RecordingOptions
 from polmvs.cli.commands import (
+    BatchArguments,
     ComparedModels,
     DemoArguments,
     JobArguments,
@@ -19,10 +21,12 @@ from polmvs.cli.commands import (
 from polmvs.cli.flags import in_flags
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
+from polmvs.errors import PolmvsError
 from polmvs.evaluation.tables import best_fit_lines
 from polmvs.evaluation.trust import Trust
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.pipeline import jobs as pipeline
+from polmvs.pipeline.batch import TABLE_FILE, BatchRow, State, batch_table, read_batch, run_batch
 from polmvs.pipeline.record import is_finished, read_options
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.dense_workspace import DenseWorkspaceResult
@@ -32,7 +36,6 @@ from polmvs.pipeline.stages.normals import NormalsResult
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
 
-EMPTY_STATUS = 3
 DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"
 
 
@@ -109,6 +112,29 @@ def export(call: Call, terminal: Terminal) -> int:
     model = call.get(ModelChoice).angle_model
     outcome = pipeline.export(job_of(call, terminal, continues=True), model)
     return _show_cloud(outcome, model, terminal)
+
+
+def batch(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs batch``."""
+    arguments = call.get(BatchArguments)
+    model = call.get(ModelChoice).angle_model
+    entries = read_batch(arguments.list_file, call.options(), model)
+    with terminal.stage("captures", len(entries)) as progress:
+
+        def show(row: BatchRow) -> None:
+            progress(1)
+            found = row.message or f"{row.num_points:,} points"
+            terminal.say(in_flags(f"{row.name:<20} {row.seconds:7.1f} s  {row.state}: {found}"))
+
+        rows = run_batch(entries, arguments.out, call.get(RunOptions), show)
+    states = [row.state for row in rows]
+    text = f"{in_flags(batch_table(rows))}\n{arguments.out / TABLE_FILE}: " + ", ".join(
+        f"{states.count(state)} {state}" for state in State if state in states
+    )
+    terminal.show(text, {"out": arguments.out, "captures": rows})
+    if State.FAILED in states:
+        return PolmvsError.exit_status
+    return EMPTY_STATUS if State.EMPTY in states else 0
 
 
 def _reported(outcome: pipeline.JobOutcome, call: Call, terminal: Terminal) -> pipeline.JobOutcome:

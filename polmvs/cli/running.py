@@ -11,12 +11,10 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
-from polmvs.cli import interrupts
+from polmvs.cli import INTERRUPTED, interrupts
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import USAGE_ERROR, Command, UsageError, in_flags, parse
+from polmvs.cli.flags import Command, UsageError, in_flags, parse
 from polmvs.errors import OptionError, PolmvsError
-
-INTERRUPTED = 130  # as shells report a program ended by Ctrl-C
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +39,7 @@ def run(
         parsed = parse(commands, sys.argv[1:] if argv is None else argv, prog, about)
     except UsageError as error:
         _print(error.prog, f"error: {error.message} (see {error.prog} --help)")
-        return USAGE_ERROR
+        return OptionError.exit_status
     if parsed.show is not None:
         parsed.show()
         return 0

@@ -20,6 +20,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_reconstruction
+from polmvs.colmap.sfm import SfmTolerances
 from polmvs.geometry import align_points
 from polmvs.scene import KEYPOINT_SIGMA_PX
 
@@ -40,14 +41,14 @@ class CameraTolerances:
         own deviations are made of. Features near each other err alike, which residuals hide.
         Measured: cameras of five captures err by 1.8 times what residuals of 0.17 px say (RMS of 12
         parameters, from five views each), of ``demo`` with ten views by 4 times.
-    loss_scale_px : of the adjustment's Cauchy loss, as that of SfM's last one.
+    loss_scale_px : of the adjustment's Cauchy loss. Derived: that of SfM's last one.
     max_views : of a model that is looked at: each mode costs an adjustment, and the camera of so
         many views is known. Guess.
     """
 
     principal_point_sigma: float = 0.01
     min_residual_px: float = KEYPOINT_SIGMA_PX
-    loss_scale_px: float = 0.5
+    loss_scale_px: float = SfmTolerances.loss_scale_px
     max_views: int = 40
 
 

@@ -26,14 +26,13 @@ PERSPECTIVE_MODELS = frozenset(
 # times this they are declared invisible. A guess: wide enough for a point half a pixel outside.
 FIELD_MARGIN = 1.05
 BORDER_SAMPLES = 64  # along each side of the image
-FATAL = 3  # glog's level
 
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
     """Keep COLMAP's own log to fatal errors meanwhile: it prints every step by default."""
     before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = FATAL
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     try:
         yield
     finally:

@@ -45,8 +45,6 @@ class PairTolerances:
         ``docs/scale.md``.
     num_in_time : images before and after that each one is matched with, where names count up; a
         guess.
-    sequential_overlap : images after that each is matched with, if the order of names is all that
-        pairs are made of; a guess.
     num_words : of the vocabulary; a guess, published figures hardly change from 64 to 256.
     num_training : descriptors that the vocabulary is made of; a guess, 300 for each word.
     min_change : of the mean distance to the words at which the vocabulary is done; a guess.
@@ -55,7 +53,6 @@ class PairTolerances:
     max_exhaustive_images: int = 40
     num_similar: int = 10
     num_in_time: int = 2
-    sequential_overlap: int = 20
     num_words: int = 64
     num_training: int = 20_000
     min_change: float = 1e-3
@@ -92,7 +89,8 @@ def choose_pairs(
     if choice == PairChoice.EXHAUSTIVE:
         pairs = _neighbours(names, len(names))
     elif choice == PairChoice.SEQUENTIAL:
-        pairs = _neighbours(names, t.sequential_overlap)
+        # Before and after: as many partners as in the largest set that is matched in all pairs.
+        pairs = _neighbours(names, t.max_exhaustive_images // 2)
     elif choice == PairChoice.RETRIEVAL:
         similarity = image_similarity(names, descriptors, seed=seed, tolerances=t)
         pairs = similar_pairs(names, similarity, t.num_similar)

@@ -44,7 +44,7 @@ from polmvs.config import Mapper, SfmOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.images import read_gray
 from polmvs.io.intrinsics import Intrinsics, read_intrinsics
-from polmvs.scene import SparseModel, View, short_list
+from polmvs.scene import KEYPOINT_SIGMA_PX, SparseModel, View, short_list
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +52,8 @@ NO_MODEL_REMEDY = (
     "The surroundings of the part need texture and neighbouring views more overlap; give "
     "`sfm.intrinsics` where they are known, or a COLMAP model as `sfm.sparse`."
 )
+
+COLMAP_DEFAULTS = pycolmap.IncrementalMapperOptions()
 
 OnProgress = Callable[[str], None]
 
@@ -71,9 +73,8 @@ class SfmTolerances:
     Attributes
     ----------
     max_reproj_error_px : of an observation that is kept; measured, of 1, 2 and 4.
-    min_tri_angle_deg : of a point that is kept; COLMAP's own.
-    loss_scale_px : of the last adjustment's Cauchy loss; measured, about twice the error of a good
-        keypoint.
+    loss_scale_px : of the last adjustment's Cauchy loss. Derived: the deviation of a keypoint,
+        about twice the error of a good one; measured.
     max_cost_change : relative, of the cost in an adjustment's step, at which it ends. Measured: of
         40 views a hundredth of this takes three times the steps, for 0.5 % of the cameras' errors;
         COLMAP's own 0 goes on to its last allowed step.
@@ -84,32 +85,30 @@ class SfmTolerances:
         measured: at COLMAP's own 1.1 it takes most of the mapper's time.
     min_views_principal_point : from which the principal point is freed; measured: of three views
         two captures of three got worse, of four none.
-    max_principal_point_shift : of the image's width; a guess, more is an estimate gone astray.
-    min_pair_matches : that each pair keeps where the mapper is given fewer; what COLMAP asks of
-        the pair that it begins with. Measured: docs/scale.md.
+    max_principal_point_shift : from where a principal point belongs, in sides of the image; a
+        guess. Farther from the centre an estimate has gone astray; as near to the lower right
+        corner given intrinsics are those of the full mosaic, which have it there.
+    min_pair_matches : that each pair keeps where the mapper is given fewer. Derived: what COLMAP
+        asks of the pair that it begins with. Measured: docs/scale.md.
     max_images_dense : up to which the last adjustment's equations are solved as a dense matrix.
         Measured: of 100 and 282 images faster than sparse, 8.2 of 9.6 and 19 of 32 s; a guess
         where that ends, as the cube of the images does.
     max_images_two_view_tracks : up to which tracks of two views count; a guess: with few images
         most tracks have two views only, with more those are mostly mismatches.
     focal_range : focal lengths that are believed, in widths of the image: 136 to 6 degrees.
-    corner_tolerance : of a principal point from the image's lower right corner, in sides of the
-        image; a guess. Intrinsics of the full mosaic have it there.
     """
 
     max_reproj_error_px: float = 2.0
-    min_tri_angle_deg: float = 1.5
-    loss_scale_px: float = 0.5
+    loss_scale_px: float = KEYPOINT_SIGMA_PX
     max_cost_change: float = 1e-4
     max_refinements: int = 1
     model_growth: float = 1.3
     min_views_principal_point: int = 4
     max_principal_point_shift: float = 0.1
-    min_pair_matches: int = 100
+    min_pair_matches: int = COLMAP_DEFAULTS.init_min_num_inliers
     max_images_dense: int = 400
     max_images_two_view_tracks: int = 5
     focal_range: tuple[float, float] = (0.2, 10.0)
-    corner_tolerance: float = 0.15
 
 
 def run_sfm(
@@ -152,10 +151,7 @@ def run_sfm(
     to_match = names if given is None else list(given.ids)
     if options.pairs_file is not None:  # before the features, which take longer
         read_pairs(options.pairs_file, to_match)
-    work_folder.mkdir(parents=True, exist_ok=True)
-    database = work_folder / "database.db"
-    for left_over in work_folder.glob("database.db*"):
-        left_over.unlink()
+    database = _place_of_database(work_folder)
     pycolmap.set_random_seed(options.seed)
     with quiet_colmap(), nullcontext() if given is None else sound(given.path):
         on_progress("features")
@@ -187,9 +183,6 @@ def triangulate_views(
     views: Sequence[View],
     work_folder: Path,
     sparse_folder: Path,
-    *,
-    seed: int = 0,
-    tolerances: SfmTolerances = SfmTolerances(),
 ) -> SparseModel:
     """A model of known cameras: features are matched and triangulated, no pose is changed.
 
@@ -211,22 +204,19 @@ def triangulate_views(
         if (view.camera.width, view.camera.height) != (width, height):
             raise DataError(image_folder / view.name, "is of another size than its known camera.")
     single = all(view.camera == ordered[0].camera for view in ordered)
-    options = SfmOptions(seed=seed, single_camera=single)
+    options = SfmOptions(single_camera=single)
     reader = pycolmap.ImageReaderOptions()
     camera = camera_to_colmap(ordered[0].camera)
     reader.camera_model = camera.model.name
     reader.camera_params = camera.params_to_string()
-    work_folder.mkdir(parents=True, exist_ok=True)
-    database = work_folder / "database.db"
-    for left_over in work_folder.glob("database.db*"):
-        left_over.unlink()
-    pycolmap.set_random_seed(seed)
+    database = _place_of_database(work_folder)
+    pycolmap.set_random_seed(options.seed)
     with quiet_colmap():
         _extract_features(database, image_folder, names, reader, options)
         _match(database, names, options)
         # Images were imported in the order of names, so their ids are those of the views here.
         known = reconstruction_of_views(ordered, single_camera=single)
-        mapper = _mapper_options(names, options, tolerances)
+        mapper = _mapper_options(names, options, SfmTolerances())
         output = work_folder / "triangulated"
         output.mkdir(exist_ok=True)
         found = pycolmap.triangulate_points(known, database, image_folder, output, options=mapper)
@@ -235,6 +225,14 @@ def triangulate_views(
     model = model_from_reconstruction(found, names)
     _log_result(model, found.compute_mean_reprojection_error())
     return model
+
+
+def _place_of_database(work_folder: Path) -> Path:
+    """Where COLMAP's database is to lie; what an earlier run left there is removed."""
+    work_folder.mkdir(parents=True, exist_ok=True)
+    for left_over in work_folder.glob("database.db*"):
+        left_over.unlink()
+    return work_folder / "database.db"
 
 
 def check_intrinsics(
@@ -252,7 +250,8 @@ def check_intrinsics(
         The principal point or a focal length is out of range; the message names the remedy.
     """
     fx, fy, cx, cy = intrinsics
-    if max(abs(cx / width - 1), abs(cy / height - 1)) < tolerances.corner_tolerance:
+    from_corner = max(abs(cx / width - 1), abs(cy / height - 1))
+    if from_corner < tolerances.max_principal_point_shift:
         half = ",".join(f"{value / 2:.10g}" for value in intrinsics)
         raise OptionError(
             f"has the principal point {cx:g},{cy:g} in the corner of the {width}x{height} px "
@@ -572,7 +571,9 @@ def _adjust(
     # Not pycolmap.bundle_adjustment: release 4.2 turns the log level back to INFO in it.
     pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
     observations = pycolmap.ObservationManager(reconstruction)
-    observations.filter_all_points3D(tolerances.max_reproj_error_px, tolerances.min_tri_angle_deg)
+    observations.filter_all_points3D(
+        tolerances.max_reproj_error_px, COLMAP_DEFAULTS.filter_min_tri_angle
+    )
     reconstruction.update_point_3d_errors()
 
 

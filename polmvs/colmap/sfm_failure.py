@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,46 +12,31 @@ from polmvs.config import SfmOptions
 from polmvs.scene import short_list
 
 
-@dataclass(frozen=True, kw_only=True)
-class FailureTolerances:
-    """What SfM needs to begin.
-
-    Attributes
-    ----------
-    min_features : of an image. Guess; images that make a model have thousands.
-    min_inliers : matches of a pair that one geometry explains; what COLMAP's mapper asks of the
-        pair that it begins with (100) and of an image that it adds (30), the latter.
-    min_start : the former.
-    """
-
-    min_features: int = 100
-    min_inliers: int = 30
-    min_start: int = 100
-
-
-def why_no_model(
-    database: Path,
-    options: SfmOptions,
-    *,
-    tolerances: FailureTolerances = FailureTolerances(),
-) -> str:
+def why_no_model(database: Path, options: SfmOptions) -> str:
     """One or two sentences: what is missing, and which setting or change of the capture helps.
 
     Parameters
     ----------
     database : COLMAP's, with features and matches.
     options : of the run that failed.
+
+    Notes
+    -----
+    A pair that begins a model, and an image that is added to one, need as many matches as COLMAP's
+    mapper asks of them; an image with fewer features than such a pair shares is poor. Those that
+    make a model have thousands.
     """
-    t = tolerances
+    asked = pycolmap.IncrementalMapperOptions()
+    to_begin, to_add = asked.init_min_num_inliers, asked.abs_pose_min_num_inliers
     with closing(pycolmap.Database.open(database)) as content:
         images = {image.image_id: str(image.name) for image in content.read_all_images()}
         features = {i: int(content.num_keypoints_for_image(i)) for i in images}
         pairs, inliers = content.read_two_view_geometry_num_inliers()
         ids = [pycolmap.pair_id_to_image_pair(pair) for pair in pairs]
-    if np.median(list(features.values())) < t.min_features:
-        poor = [images[i] for i, num in features.items() if num < t.min_features]
+    if np.median(list(features.values())) < to_begin:
+        poor = [images[i] for i, num in features.items() if num < to_begin]
         return (
-            f"the images show too little texture: under {t.min_features} features in "
+            f"the images show too little texture: under {to_begin} features in "
             f"{len(poor)} of {len(images)} ({short_list(poor)}). SfM lives on the surroundings of "
             "the part: put a printed pattern about it, expose more, or give poses with "
             "`sfm.sparse`."
@@ -60,11 +44,11 @@ def why_no_model(
     best = dict.fromkeys(images, 0)
     for (first, second), num in zip(ids, inliers, strict=True):
         best[first], best[second] = max(best[first], int(num)), max(best[second], int(num))
-    if max(best.values(), default=0) < t.min_start:
-        lonely = [images[i] for i, num in best.items() if num < t.min_inliers]
+    if max(best.values(), default=0) < to_begin:
+        lonely = [images[i] for i, num in best.items() if num < to_add]
         return (
             f"the images overlap too little: the two most alike share {max(best.values())} "
-            f"features, and {len(lonely)} of {len(images)} share under {t.min_inliers} with any "
+            f"features, and {len(lonely)} of {len(images)} share under {to_add} with any "
             "other. Record views in between, 20 degrees apart at most, of surroundings that stay "
             "in place, or give poses with `sfm.sparse`."
         )

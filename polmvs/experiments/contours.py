@@ -54,14 +54,13 @@ MIN_NORMAL = 1e-9  # length that a direction in a file must have; a guess, less 
 MEASURED_PX = 1.0  # distance between the points of a contour that are measured
 MIN_SEEN_SHARE = 0.9  # of the seeds, that a second view must see
 
-METHODS = ("opa", "ppa_normals", "ppa_tangent", "tilted_tangent")
-
 CONTOUR_LABELS = {
     "opa": "OPA, iso-depth",
     "ppa_normals": "PPA, two-view normals, same 2D paths",
     "ppa_tangent": "PPA, iso-range, one view",
     "tilted_tangent": "tilted, iso-range, one view",
 }
+METHODS = tuple(CONTOUR_LABELS)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
 from polmvs._version import __version__
+from polmvs.cluster import PACKAGES, installed_versions
 from polmvs.config import AngleModel
 from polmvs.errors import DataError
 from polmvs.io.typed_json import from_json, parse_json, write_json
@@ -22,7 +22,6 @@ R = TypeVar("R")
 # its own, trust, notes on the capture. 4: seeds are sparse points alone. 5: what stages wrote.
 # 6: covariances of the poses.
 SCHEMA_VERSION = 6
-PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pycolmap", "open3d")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,10 +250,5 @@ def _no_record(run_folder: RunFolder, why: object) -> DataError:
 
 def versions() -> dict[str, str]:
     """Versions of Python, this package and what it stands on."""
-    found = {"polmvs": __version__, "python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "unknown"
-    return found
+    installed = installed_versions((*PACKAGES, "open3d"))
+    return {"python": platform.python_version(), **installed}

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MIN_CAMERAS = 3  # that fix a similarity
+# Of a search for the majority: the fewest that fix a fit, drawn anew. A guess, bounds the time; of
+# data half of which are wrong one triple in eight is right, and one pair in four.
+MAX_STARTS = 500
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +33,6 @@ class AlignmentTolerances:
     ----------
     outlier_floor : residual that is always allowed, as a share of the cameras' spread; a guess,
         centres are usually good to 0.1 %.
-    min_robust_cameras : from which cameras are left out; derived: of four any three agree.
-    max_triples : of cameras from which the search starts; a guess, bounds the time. Of cameras
-        half of which are wrong one triple in eight is right.
     max_relative_rms : residual over the cameras' spread, beyond which they are of other captures;
         a guess, unrelated centres give about 1.
     max_turn_deg : median angle between the orientations, likewise. Three centres always fit well;
@@ -40,8 +40,6 @@ class AlignmentTolerances:
     """
 
     outlier_floor: float = 0.005
-    min_robust_cameras: int = 5
-    max_triples: int = 500
     max_relative_rms: float = 0.2
     max_turn_deg: float = 15.0
 
@@ -172,11 +170,11 @@ def _consistent_cameras(
     centers: Array, true_centers: Array, tolerances: AlignmentTolerances
 ) -> Mask:
     """Which cameras one similarity explains; all of them when there are few."""
-    used = np.ones(len(centers), np.bool_)
-    if len(centers) < tolerances.min_robust_cameras:
-        return used
+    majority = max(len(centers) // 2 + 1, MIN_CAMERAS + 1)  # any three agree well enough
+    if len(centers) <= majority:
+        return np.ones(len(centers), np.bool_)
     spread = float(np.sqrt(((true_centers - true_centers.mean(axis=0)) ** 2).sum(1).mean()))
-    used = _best_majority(centers, true_centers, tolerances.max_triples)
+    used = _best_majority(centers, true_centers, majority)
     for _ in range(len(centers)):
         transform = align_points(centers[used], true_centers[used])
         residuals = align_residuals(transform, centers, true_centers)
@@ -187,12 +185,11 @@ def _consistent_cameras(
     return used
 
 
-def _best_majority(centers: Array, true_centers: Array, max_triples: int) -> Mask:
+def _best_majority(centers: Array, true_centers: Array, majority: int) -> Mask:
     """The majority of cameras that the alignment of some three of them explains best."""
     num = len(centers)
-    majority = max(num // 2 + 1, MIN_CAMERAS + 1)  # three alone would always agree well enough
     best, best_residuals = np.inf, np.zeros(num)
-    for triple in _triples(num, max_triples):
+    for triple in _triples(num):
         try:
             transform = align_points(centers[triple], true_centers[triple])
         except ValueError:
@@ -204,9 +201,9 @@ def _best_majority(centers: Array, true_centers: Array, max_triples: int) -> Mas
     return best_residuals <= best
 
 
-def _triples(num: int, most: int) -> list[list[int]]:
+def _triples(num: int) -> list[list[int]]:
     """All triples of indices, or a fixed random choice of them."""
-    if comb(num, MIN_CAMERAS) <= most:
+    if comb(num, MIN_CAMERAS) <= MAX_STARTS:
         return [list(triple) for triple in combinations(range(num), MIN_CAMERAS)]
     rng = np.random.default_rng(0)
-    return [rng.choice(num, MIN_CAMERAS, replace=False).tolist() for _ in range(most)]
+    return [rng.choice(num, MIN_CAMERAS, replace=False).tolist() for _ in range(MAX_STARTS)]

@@ -24,7 +24,8 @@ from polmvs.errors import DataError, OptionError
 from polmvs.fitting import MEDIAN_OF_NORMAL, cauchy_weights, like_most
 from polmvs.geometry import intersect_rays
 from polmvs.polarization.capture import DISPLAY_GAMMA
-from polmvs.scene import View, short_list
+from polmvs.poses.alignment import MAX_STARTS
+from polmvs.scene import KEYPOINT_SIGMA_PX, View, short_list
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,10 +33,11 @@ Gray = NDArray[np.uint8]
 
 logger = logging.getLogger(__name__)
 
-NUM_PROFILES = 32  # across each edge
-NUM_SAMPLES = 25  # of a profile
+NUM_SAMPLES = 32  # along each edge, and of the profile across it at each
 ROUNDS = 8  # of a fit; each converges in three or four
-DIFFERENCE = 1e-6  # step of numerical derivatives, as a share of the depth
+# Step of numerical derivatives, as a share of the depth. Derived: to either side, truncation errs
+# with its square and rounding with its inverse.
+DIFFERENCE = float(np.cbrt(np.finfo(np.float64).eps))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,12 +50,10 @@ class EdgeTolerances:
         blur of the other edge reaches.
     reach_px : of a profile to each side, least and most; a guess: it covers the blur and the
         error of the detector's corners, and ends half-way into the marker's outer module.
-    min_contrast : of white, in linear light; a guess: half a step of 8 bits is 0.002 there.
     """
 
     corner_share: float = 0.15
     reach_px: tuple[float, float] = (1.5, 3.0)
-    min_contrast: float = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,18 +62,15 @@ class TriangulationTolerances:
 
     Attributes
     ----------
-    max_pairs : of views from which the search starts; a guess, bounds the time.
-    outlier_floor_px : error that is always allowed; a guess, that of a good pose.
-    max_residual_px : error that never is; COLMAP too drops observations beyond this.
-    huber_px : of the robust loss; a guess, beyond the noise of a refined corner (0.1 px) and of
-        a usual pose (0.3 px).
+    huber_px : of the robust loss, and a view's error that is always allowed. Derived: a keypoint's
+        deviation, which is beyond the noise of a refined corner (0.1 px) and of a usual pose
+        (0.3 px).
+    max_residual_px : error that never is allowed; COLMAP too drops observations beyond this.
     min_sigma_px : of a corner; a guess: few residuals can be small by chance.
     """
 
-    max_pairs: int = 200
-    outlier_floor_px: float = 1.0
+    huber_px: float = KEYPOINT_SIGMA_PX
     max_residual_px: float = 4.0
-    huber_px: float = 0.5
     min_sigma_px: float = 0.05
 
 
@@ -242,7 +239,7 @@ def _edge_points(
 ) -> Array:
     """Points ``(4, P, 2)`` on the edges between the corners' rays ``(4, 3)``; NaN where none."""
     beside = tolerances.corner_share
-    along = np.linspace(beside, 1 - beside, NUM_PROFILES)[:, None]
+    along = np.linspace(beside, 1 - beside, NUM_SAMPLES)[:, None]
     between = (1 - along) * rays[:, None] + along * np.roll(rays, -1, axis=0)[:, None]
     xy = np.asarray(camera.project(between), np.float64)  # (4, P, 2)
     tangent = np.gradient(xy, axis=1)
@@ -252,11 +249,11 @@ def _edge_points(
     places = xy[..., None, :] + offsets[:, None] * outward[..., None, :]  # (4, P, S, 2)
     height, width = linear.shape
     beyond = np.maximum(0.5 - places, places - [width - 0.5, height - 0.5])
-    inside = beyond.reshape(4, NUM_PROFILES, -1).max(axis=-1) <= 0
+    inside = beyond.reshape(4, NUM_SAMPLES, -1).max(axis=-1) <= 0
     profiles = sample_image(linear, places).astype(np.float64)
     dark = profiles[..., :2].sum(axis=-1) / 2  # the inner end
     bright = profiles[..., -2:].sum(axis=-1) / 2
-    step = np.where(inside & (bright - dark > tolerances.min_contrast), bright - dark, np.nan)
+    step = np.where(inside & (bright > dark), bright - dark, np.nan)
     # A step at x, however blurred, has the area reach - x under its profile.
     area = trapezoid((profiles - dark[..., None]) / step[..., None], offsets, axis=-1)
     return np.asarray(xy + (reach - area)[..., None] * outward)
@@ -268,7 +265,7 @@ def _fit_planes(rays: Array) -> Array:
     NaN where less than half of the rays are known.
     """
     valid = np.asarray(np.isfinite(rays).all(axis=-1), np.bool_)
-    if (valid.sum(axis=1) < NUM_PROFILES // 2).any():
+    if (valid.sum(axis=1) < NUM_SAMPLES // 2).any():
         return np.full((4, 3), np.nan)
     rays = np.where(valid[..., None], rays, 0.0)
     weights = valid.astype(np.float64)
@@ -325,7 +322,7 @@ def triangulate_together(
     num = len(views)
     if xy.ndim != 3 or len(xy) != num or xy.shape[2] != 2:
         raise ValueError(f"{xy.shape=} but expected ({num}, K, 2).")
-    start = _best_pair(views, xy, tolerances) if num >= 2 else None
+    start = _best_pair(views, xy) if num >= 2 else None
     if start is None:
         return None
     points, used = start, _agreeing(_errors(views, start, xy), tolerances)
@@ -342,15 +339,13 @@ def triangulate_together(
     return _with_uncertainty(views, points, xy, used, tolerances)
 
 
-def _best_pair(
-    views: Sequence[View], xy: Array, tolerances: TriangulationTolerances
-) -> Array | None:
+def _best_pair(views: Sequence[View], xy: Array) -> Array | None:
     """Points ``(K, 3)`` from the two views that the majority agrees with best."""
     centers = np.array([view.center_in_world for view in views])
     rays = np.array([view.rays_in_world(own) for view, own in zip(views, xy, strict=True)])
     pairs = np.array(list(combinations(range(len(views)), 2)))
-    if len(pairs) > tolerances.max_pairs:
-        pairs = np.random.default_rng(0).choice(pairs, tolerances.max_pairs, replace=False)
+    if len(pairs) > MAX_STARTS:
+        pairs = np.random.default_rng(0).choice(pairs, MAX_STARTS, replace=False)
     pair_rays = rays[pairs].swapaxes(1, 2)  # (P, K, 2, 3)
     pair_centers = np.broadcast_to(centers[pairs][:, None], pair_rays.shape)
     points = intersect_rays(pair_centers, pair_rays)  # (P, K, 3)
@@ -370,7 +365,7 @@ def _errors(views: Sequence[View], points: Array, xy: Array) -> Array:
 
 def _agreeing(errors: Array, tolerances: TriangulationTolerances) -> Mask:
     """Views whose error is like that of most."""
-    return like_most(errors, floor=tolerances.outlier_floor_px, ceiling=tolerances.max_residual_px)
+    return like_most(errors, floor=tolerances.huber_px, ceiling=tolerances.max_residual_px)
 
 
 def _refine(

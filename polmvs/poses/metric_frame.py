@@ -19,7 +19,12 @@ from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import SimilarityTransform, nearest_rotation
 from polmvs.io.typed_json import parse_json
-from polmvs.poses.alignment import MIN_CAMERAS, align_cameras, align_residuals
+from polmvs.poses.alignment import (
+    MIN_CAMERAS,
+    AlignmentTolerances,
+    align_cameras,
+    align_residuals,
+)
 from polmvs.poses.markers import (
     ScaleTolerances,
     detect_markers,
@@ -40,8 +45,6 @@ ImageLoader = Callable[[str], NDArray[np.uint8]]
 
 logger = logging.getLogger(__name__)
 
-SCALE_TOLERANCES = ScaleTolerances()
-
 
 @dataclass(frozen=True, kw_only=True)
 class FrameTolerances:
@@ -53,13 +56,12 @@ class FrameTolerances:
         about 0.1 % of their spread, so that 1 % leaves the rotation about the line through them
         uncertain by 0.1 rad.
     max_turn_sigma : rad, of the same rotation as the residuals tell it; likewise.
-    max_relative_rms : RMS residual over the cameras' spread; a guess, unrelated centres give
-        about 1.
+    max_relative_rms : RMS residual over the cameras' spread. Derived: that of an alignment.
     """
 
     min_breadth: float = 0.01
     max_turn_sigma: float = 0.1
-    max_relative_rms: float = 0.2
+    max_relative_rms: float = AlignmentTolerances.max_relative_rms
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -317,9 +319,7 @@ def scaling(scale: float) -> SimilarityTransform:
     return SimilarityTransform(scale, np.eye(3), np.zeros(3))
 
 
-def require_agreement(
-    first: Frame, other: Frame, *, tolerances: ScaleTolerances = SCALE_TOLERANCES
-) -> None:
+def require_agreement(first: Frame, other: Frame) -> None:
     """Two sources must give one scale, within what their uncertainties allow and 1 %.
 
     Raises
@@ -328,7 +328,7 @@ def require_agreement(
         They contradict each other.
     """
     sigma = np.hypot(first.relative_sigma or 0.0, other.relative_sigma or 0.0)
-    allowed = tolerances.allowed(float(sigma))
+    allowed = ScaleTolerances().allowed(float(sigma))
     # The logarithm makes it the same whichever comes first.
     if not abs(np.log(other.scale / first.scale)) <= allowed:
         raise OptionError(

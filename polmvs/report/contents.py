@@ -28,9 +28,8 @@ from polmvs.surface.dense_view import DenseView
 
 Floats = NDArray[np.floating]
 
-FULL_DOLP = 0.6  # from which the AoLP picture has its full colour; specular light reaches more
 MAX_RESIDUAL_DEG = 20.0  # top of the colour scales: OPA's phase errors on oblique surfaces
-MAX_DEPTH_ERROR_M = 0.005
+MAX_ERROR_M = 0.005  # of distances from the truth
 MAX_NORMAL_ERROR_DEG = 15.0
 MAX_SAMPLES_A_VIEW = 4000  # of errors for the plots: quartiles of 16 views then err by under 1 %
 
@@ -120,7 +119,7 @@ def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[Pictu
         _picture(
             "AoLP",
             "angle of linear polarisation in cyclic colours, faint where the DoLP is low",
-            pictures.angle_picture(aolp, strength=dolp / FULL_DOLP),
+            pictures.angle_picture(aolp, strength=dolp / pictures.FULL_DOLP),
         ),
         _picture(
             "DoLP",
@@ -180,10 +179,8 @@ def _of_model(
         _picture(
             f"{name}: depth error",
             "absolute error of the depth against the truth",
-            pictures.scalar_picture(
-                np.abs(errors.depth_m), 0, MAX_DEPTH_ERROR_M, colors=pictures.ERROR
-            ),
-            scale=("0", f"{1e3 * MAX_DEPTH_ERROR_M:g} mm", pictures.ERROR),
+            pictures.scalar_picture(np.abs(errors.depth_m), 0, MAX_ERROR_M, colors=pictures.ERROR),
+            scale=("0", f"{1e3 * MAX_ERROR_M:g} mm", pictures.ERROR),
         ),
         _picture(
             f"{name}: normal error",

@@ -20,7 +20,8 @@ Mask = NDArray[np.bool_]
 
 CYCLIC, SEQUENTIAL, ERROR = "twilight", "viridis", "inferno"
 NOTHING = 236  # grey of pixels without a value; reads on light and dark pages
-WEBP_QUALITY = 82  # of 100; 100 px of a thumbnail hardly show a difference above
+FULL_DOLP = 0.6  # from which a phase has its full colour; specular light reaches more
+QUALITY = 82  # of 100, of what compresses; 100 px of a thumbnail hardly show a difference above
 
 
 @lru_cache(maxsize=8)
@@ -107,6 +108,6 @@ def data_uri(picture: NDArray[np.uint8]) -> str:
     """A picture, RGB or RGBA, as text that a page takes for an image (WebP)."""
     order = cv2.COLOR_RGBA2BGRA if picture.shape[-1] == 4 else cv2.COLOR_RGB2BGR
     _, code = cv2.imencode(
-        ".webp", cv2.cvtColor(picture, order), [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY]
+        ".webp", cv2.cvtColor(picture, order), [cv2.IMWRITE_WEBP_QUALITY, QUALITY]
     )
     return "data:image/webp;base64," + base64.b64encode(code.tobytes()).decode("ascii")

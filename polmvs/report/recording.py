@@ -29,7 +29,8 @@ from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.report.layers import KIND_COLORS
-from polmvs.report.pictures import angle_picture
+from polmvs.report.pictures import FULL_DOLP, QUALITY, angle_picture
+from polmvs.report.rendering import SURFACE
 from polmvs.scene import PointKind, View
 
 OnProgress = Callable[[int], None]
@@ -37,10 +38,7 @@ OnProgress = Callable[[int], None]
 SUFFIX = ".rrd"
 TIMELINE = "stage"
 STAGES = "log/stages"
-FULL_DOLP = 0.6  # from which a phase has its full colour, as in the report
-JPEG_QUALITY = 85  # of 100: pictures to look at
 PIXEL_POINTS = 1.5  # radius of a point on the screen, px
-UNKNOWN_GREY = 214
 
 
 def require_rerun(path: Path) -> None:
@@ -121,7 +119,7 @@ class _Recorder:
         self.begin("images", f"{len(self.model.views)} images")
         for view in self.model.views:
             image = read_gray(self.folder.images / view.name)
-            log(f"{self.entity(view)}/image", rr.Image(image).compress(jpeg_quality=JPEG_QUALITY))
+            log(f"{self.entity(view)}/image", rr.Image(image).compress(jpeg_quality=QUALITY))
         self.begin("poses", str(self.record.result(PosesResult)))
         for view in self.model.views:
             self.camera(view)
@@ -172,7 +170,7 @@ class _Recorder:
             cos2, sin2 = phase_map.samples[..., 0], phase_map.samples[..., 1]
             phase = np.where(phase_map.samples[..., 2] > 0, 0.5 * np.arctan2(sin2, cos2), np.nan)
             picture = angle_picture(phase, strength=np.hypot(cos2, sin2) / FULL_DOLP)
-            image = self.rerun.Image(picture).compress(jpeg_quality=JPEG_QUALITY)
+            image = self.rerun.Image(picture).compress(jpeg_quality=QUALITY)
             self.stream.log(f"{self.entity(phase_map.view)}/phase", image)
             on_progress(1)
 
@@ -222,7 +220,7 @@ class _Recorder:
         """A mesh at the present step."""
         colors = mesh.colors
         if colors is None:
-            colors = np.full((len(mesh.vertices), 3), UNKNOWN_GREY, np.uint8)
+            colors = np.full((len(mesh.vertices), 3), SURFACE, np.uint8)
         self.stream.log(
             entity,
             self.rerun.Mesh3D(

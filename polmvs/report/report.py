@@ -30,10 +30,16 @@ from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
-from polmvs.polarization.capture import Capture, open_capture
+from polmvs.polarization.capture import WHITE_PERCENTILE, Capture, open_capture
 from polmvs.poses.alignment import align_views
 from polmvs.report import pictures, plots
-from polmvs.report.contents import MAX_NORMAL_ERROR_DEG, ErrorSamples, ViewInput, view_page
+from polmvs.report.contents import (
+    MAX_ERROR_M,
+    MAX_NORMAL_ERROR_DEG,
+    ErrorSamples,
+    ViewInput,
+    view_page,
+)
 from polmvs.report.layers import KIND, Channel, Layer, Scene3D, pack_scene, thinned
 from polmvs.report.page import Page, Plot, Table, ViewPage, page_text
 from polmvs.scene import PointKind, SparseModel, View
@@ -43,9 +49,7 @@ logger = logging.getLogger(__name__)
 Floats = NDArray[np.floating]
 
 MAX_POINTS = 150_000  # of each cloud on the page: two clouds turn smoothly, and 2 MB each
-MAX_ERROR_M = 0.005  # top of the colour scale of distances from the truth
 ANGLE_BINS_DEG = np.arange(0.0, 91.0, 5.0)
-WHITE_PERCENTILE = 99.0  # of an image's intensities: shown white
 # Rows of the comparison that tell the models apart at a glance.
 HEADLINE = (
     "part of the region covered, %",

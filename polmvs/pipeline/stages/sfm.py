@@ -13,7 +13,7 @@ import numpy as np
 from polmvs.colmap.camera_uncertainty import camera_uncertainty, pose_uncertainty
 from polmvs.colmap.database import NoRoomError
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
-from polmvs.colmap.sfm import NoModelError, run_sfm
+from polmvs.colmap.sfm import NoModelError, SfmTolerances, run_sfm
 from polmvs.colmap.sfm_failure import why_no_model
 from polmvs.config import PropagationOptions, SfmOptions
 from polmvs.errors import DataError
@@ -34,8 +34,8 @@ CANNOT_WRITE = "cannot be written: is the disk full?"
 MAX_SAID = 120  # characters of COLMAP's words
 NUM_SFM_STEPS = 4  # that run_sfm reports
 # Of views: under it most points of a surface are seen by two or three views, of which none can be
-# told to be wrong.
-FEW_VIEWS = 5
+# told to be wrong. Derived: as few as those whose tracks of two views SfM needs.
+FEW_VIEWS = SfmTolerances.max_images_two_view_tracks
 # Of the distance. The surfaces allow their shape to bend by that much by errors of the camera.
 LARGE_BENDING = PropagationOptions.bending
 
