@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import CaptureKind, CaptureOptions, Resolution
+from polmvs.config import CaptureKind, CaptureOptions, RegionOptions, Resolution
 from polmvs.io.images import write_png
 from polmvs.polarization.capture import Capture, intensity_image_8bit, open_capture
 from polmvs.polarization.stokes import Stokes
@@ -24,7 +24,6 @@ from polmvs.polarization.stokes import Stokes
 Image = NDArray[np.float32]
 Picture = NDArray[np.uint8]
 
-POLARIZED_DOLP = 0.1  # from which a pixel counts as polarised, as --min-dolp
 SHOWN_DOLP = 0.5  # DoLP that is shown white, and AoLP in full colour
 SHEET_VIEWS = 8
 TILE_PX = 320  # width of one picture
@@ -274,7 +273,7 @@ def _figures_of(name: str, stokes: Stokes, darkness: float) -> ViewFigures:
     valid, s0 = stokes.valid, stokes.s0
     dolp = stokes.dolp
     dark = ~valid & (s0 < 2.0 * darkness)
-    polarized = valid & (dolp >= POLARIZED_DOLP)
+    polarized = valid & (dolp >= RegionOptions.min_dolp)
     sigma = np.degrees(np.median(stokes.sigma_aolp[polarized])) if polarized.any() else np.nan
     return ViewFigures(
         name=name,
@@ -342,8 +341,9 @@ def _warnings(
     polarized = float(np.mean([v.polarized for v in views]))
     if polarized < limits.polarized:
         lines.append(
-            f"{100 * polarized:.1f} % of the pixels are polarised (DoLP {POLARIZED_DOLP:g}); "
-            "is it a polarization camera's raw format, and is the part glossy?"
+            f"{100 * polarized:.1f} % of the pixels are polarised (DoLP "
+            f"{RegionOptions.min_dolp:g}); is it a polarization camera's raw format, and is the "
+            "part glossy?"
         )
     blurred = [v.name for v in views if v.edge_px > limits.edge_px]
     if blurred:

@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.config import CaptureOptions
 from polmvs.polarization.mosaic import ANGLES_DEG, clipped_cells, split_mosaic, turned_pattern
 
 Pattern = tuple[int, int, int, int]
 
-STANDARD: Pattern = (90, 45, 135, 0)  # of the polarization sensors that are sold
 # Pairs of places of a cell (row by row) that may be perpendicular.
 PAIRINGS = (((0, 3), (1, 2)), ((0, 1), (2, 3)), ((0, 2), (1, 3)))
 PAIRING_NAMES = ("diagonals", "rows", "columns")
@@ -135,8 +135,8 @@ def _pairing_of(pattern: Pattern) -> int:
 
 
 def _patterns_of(pairing: int) -> tuple[Pattern, ...]:
-    """Patterns of a pairing: the standard one and its turned images first, if it is theirs."""
-    turned = [turned_pattern(STANDARD, orientation) for orientation in range(1, 9)]
+    """Patterns of a pairing: that of the sensors sold and its turned images first, if theirs."""
+    turned = [turned_pattern(CaptureOptions.pattern, orientation) for orientation in range(1, 9)]
     every = [(a, b, c, d) for a, b, c, d in permutations(ANGLES_DEG)]
     order = [*turned, *every]
     return tuple(dict.fromkeys(p for p in order if _pairing_of(p) == pairing))

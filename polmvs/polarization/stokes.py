@@ -51,9 +51,9 @@ from typing import Any, NamedTuple, TypeAlias
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import stdtrit
+from scipy.special import ndtr, stdtrit
 
-from polmvs.config import Light
+from polmvs.config import CaptureOptions, Light
 from polmvs.polarization.mosaic import INTERPOLATION_NOISE_GAIN
 
 Image: TypeAlias = NDArray[np.float32]
@@ -70,7 +70,6 @@ PATCH_QUANTILE_OF_WHITE = 0.768  # the same of white noise
 # And of its second differences along both axes, of two images together.
 PATCH_QUANTILE_OF_CURVATURE = 0.74
 CURVATURE_SPACING_PX = 2  # what a mosaic's interpolation gives neighbours in common is not between
-ONE_SIGMA = 0.8413  # one-sided probability of one standard deviation
 UNPOLARIZED = 0.1  # DoLP under which the redundancy shows the gains
 MIN_UNPOLARIZED = 200  # pixels, of one in 16
 MIN_PATCHES = 40
@@ -164,7 +163,7 @@ def stokes_from_intensities(
     intensities: Image,
     clipped: Mask,
     *,
-    darkness: float = 0.004,
+    darkness: float = CaptureOptions.darkness,
     quantum: float = 1 / 255,
     lossy_variance: float = 0.0,
 ) -> Stokes:
@@ -221,7 +220,7 @@ def stokes_by_least_squares(
     analyzers: NDArray[np.floating[Any]],
     clipped: Mask,
     *,
-    darkness: float = 0.004,
+    darkness: float = CaptureOptions.darkness,
     quantum: float = 1 / 255,
     interpolated: bool = False,
     lossy_variance: float = 0.0,
@@ -383,15 +382,15 @@ def estimate_noise(
     """
     if floor is None:
         floor = 2.0 * INTERPOLATION_NOISE_GAIN * (quantum or 0.0) ** 2 / 12.0
-    usable = _patch_means(valid.astype(np.float32)) > 1.0 - 0.5 / PATCH_PX**2
+    usable = patch_means(valid.astype(np.float32)) > 1.0 - 0.5 / PATCH_PX**2
     if np.count_nonzero(usable) < MIN_PATCHES:
         return NoiseModel(floor, 0.0)
-    level = _patch_means(s0)[usable]
+    level = patch_means(s0)[usable]
     stack = redundancy if redundancy.ndim == 3 else redundancy[None]
     spread = np.zeros(len(level))
     for image in stack:
-        mean = _patch_means(image)[usable].astype(np.float64)
-        square = _patch_means(np.square(image))[usable].astype(np.float64)
+        mean = patch_means(image)[usable].astype(np.float64)
+        square = patch_means(np.square(image))[usable].astype(np.float64)
         spread += np.maximum(square - mean * mean, 0.0) / len(stack)
     order = np.argsort(level)
     classes = np.array_split(order, min(MAX_CLASSES, len(order) // MIN_PATCHES))
@@ -472,7 +471,7 @@ def _gain_sigma(s0: Image, s1: Image, s2: Image, redundancy: Image, valid: Mask)
         weak[:] = True
     shares = [np.median(image[sample][lit][weak] / level[weak]) for image in redundancy]
     num = len(shares)
-    student = float(stdtrit(num, ONE_SIGMA))
+    student = float(stdtrit(num, ndtr(1.0)))  # as likely as one deviation of a normal one
     return float(student * np.sqrt(np.mean(np.square(shares)) / 2.0))
 
 
@@ -514,7 +513,7 @@ def _wrap(angle: Any) -> Any:
     return np.where(wrapped >= np.pi, 0, wrapped)
 
 
-def _patch_means(image: Image) -> Image:
+def patch_means(image: Image) -> Image:
     """Means of squares of PATCH_PX, the rest at the image's far sides left out."""
     rows, cols = image.shape[0] // PATCH_PX, image.shape[1] // PATCH_PX
     if not rows or not cols:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.config import CaptureOptions
 from polmvs.synthetic.captures import add_noise
 
 Array = NDArray[np.float64]
@@ -42,7 +43,7 @@ def faulty_sensor(
     shape: tuple[int, int],
     rng: np.random.Generator,
     *,
-    pattern: tuple[int, int, int, int] = (90, 45, 135, 0),
+    pattern: tuple[int, int, int, int] = CaptureOptions.pattern,
     gain_sigma: float = 0.02,
     angle_sigma_deg: float = 1.0,
     extinction_ratio: float = 50.0,
