@@ -70,7 +70,6 @@ WHITE_SAMPLES = 20_000  # cells of each
 # 1.29 in single linear images of the shared captures, 1.00 to 1.03 in whole captures.
 CHECKED_IMAGES = 3
 MOST_PIXELS, MAX_DOLP = 0.9, 1.5  # a map of which a tenth exceeds this holds something else
-CLEARLY_WRONG = 0.5  # disagreement of the best pairing over that of the pattern: refused below
 # A camera that records 16 bits hardly needs 1/65536 to tell its levels apart; floats say nothing.
 FLOAT_QUANTUM = 2.0**-CONTAINER_BITS
 EVEN = "Set the camera's region of interest to even offsets and sizes."
@@ -667,7 +666,7 @@ def _lossy_steps(sampled: Sequence[RawImage]) -> tuple[float, ...] | None:
 def _check_pattern(
     files: CaptureFiles, options: CaptureOptions, levels: Levels, sampled: Sequence[RawImage]
 ) -> PatternCheck | None:
-    """Check the pattern of a monochrome mosaic; one that clearly does not fit is refused."""
+    """Check the pattern of a monochrome mosaic; one that does not fit is refused."""
     if files.kind is not CaptureKind.MOSAIC or options.bayer is not None:
         return None
     linear = [
@@ -675,10 +674,7 @@ def _check_pattern(
     ]
     check = check_pattern(linear, options.pattern, clip=options.saturation)
     if check.fits is False:
-        own = check.disagreement[check.pairing]
-        if min(check.disagreement) < CLEARLY_WRONG * own:
-            raise OptionError(f"{files.folder}: {check.message}.")
-        logger.warning("%s: %s.", files.folder, check.message)
+        raise OptionError(f"{files.folder}: {check.message}.")
     return check
 
 

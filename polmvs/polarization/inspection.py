@@ -20,6 +20,7 @@ from polmvs.config import CaptureKind, CaptureOptions, RegionOptions, Resolution
 from polmvs.io.images import write_png
 from polmvs.polarization.capture import Capture, intensity_image_8bit, open_capture
 from polmvs.polarization.stokes import Stokes
+from polmvs.scene import short_list
 
 Image = NDArray[np.float32]
 Picture = NDArray[np.uint8]
@@ -334,7 +335,8 @@ def _warnings(
     spoiled = [v.name for v in views if v.saturated > limits.saturated]
     if spoiled:
         lines.append(
-            f"more than {100 * limits.saturated:.0f} % is clipped in {_some(spoiled)}; expose less"
+            f"more than {100 * limits.saturated:.0f} % is clipped in {short_list(spoiled)}; "
+            "expose less"
         )
     if white < limits.dark_white:
         lines.append(f"the brightest 0.5 % are at {100 * white:.0f} % of full scale; expose more")
@@ -347,19 +349,11 @@ def _warnings(
         )
     blurred = [v.name for v in views if v.edge_px > limits.edge_px]
     if blurred:
-        lines.append(f"no sharp edge in {_some(blurred)}: out of focus or moved")
+        lines.append(f"no sharp edge in {short_list(blurred)}: out of focus or moved")
     levels = [v.median_intensity for v in views if v.median_intensity > 0]
     if levels and max(levels) > limits.uneven * min(levels):
         lines.append(
             f"the views' intensities differ by a factor of {max(levels) / min(levels):.1f}; was "
             "automatic exposure on?"
         )
-    if capture.pattern_check is not None and capture.pattern_check.fits is False:
-        lines.append(capture.pattern_check.message)
     return lines
-
-
-def _some(names: Sequence[str]) -> str:
-    """A few of many names."""
-    shown = ", ".join(names[:3])
-    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"

@@ -30,9 +30,9 @@ SMOOTHING_PX = 9
 MIN_LIGHT = 0.02  # share of the brightest
 MIN_PIXELS = 500  # polarised ones
 # A wrong pairing shows polarised light as disagreement: several times what the right one has.
-# Between these ratios nothing is said (guess; right patterns of rendered and real captures have
-# 0.1 to 0.4, a swapped one the inverse).
-CLEAR_RATIO = 0.6
+# Between this ratio and its inverse nothing is said (guess; right patterns of rendered and real
+# captures have 0.1 to 0.4, a swapped one the inverse).
+CLEAR_RATIO = 0.5
 POLARIZED_SHARE = 0.05  # of s0, beyond which the sums of the best pairing count as polarised
 
 
@@ -55,11 +55,6 @@ class PatternCheck:
     num_pixels: int
     fits: bool | None
     fitting: tuple[Pattern, ...]
-
-    @property
-    def pairing(self) -> int:
-        """Index of the pattern's own pairing in ``PAIRING_NAMES``."""
-        return _pairing_of(self.pattern)
 
     @property
     def message(self) -> str:

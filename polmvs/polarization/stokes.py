@@ -53,7 +53,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, stdtrit
 
-from polmvs.config import CaptureOptions, Light
+from polmvs.config import CaptureOptions, Light, RegionOptions
 from polmvs.polarization.mosaic import INTERPOLATION_NOISE_GAIN
 
 Image: TypeAlias = NDArray[np.float32]
@@ -70,7 +70,6 @@ PATCH_QUANTILE_OF_WHITE = 0.768  # the same of white noise
 # And of its second differences along both axes, of two images together.
 PATCH_QUANTILE_OF_CURVATURE = 0.74
 CURVATURE_SPACING_PX = 2  # what a mosaic's interpolation gives neighbours in common is not between
-UNPOLARIZED = 0.1  # DoLP under which the redundancy shows the gains
 MIN_UNPOLARIZED = 200  # pixels, of one in 16
 MIN_PATCHES = 40
 TINY = 1e-20  # keeps noise-free black images from a division by zero
@@ -466,7 +465,8 @@ def _gain_sigma(s0: Image, s1: Image, s2: Image, redundancy: Image, valid: Mask)
     level = s0[sample][lit]
     if len(redundancy) == 0 or level.size == 0:
         return 0.0
-    weak = np.hypot(s1[sample][lit], s2[sample][lit]) < UNPOLARIZED * level
+    # Of light that counts as unpolarised.
+    weak = np.hypot(s1[sample][lit], s2[sample][lit]) < RegionOptions.min_dolp * level
     if np.count_nonzero(weak) < MIN_UNPOLARIZED:
         weak[:] = True
     shares = [np.median(image[sample][lit][weak] / level[weak]) for image in redundancy]
