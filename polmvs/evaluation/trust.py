@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, PropagationOptions
 from polmvs.evaluation.consistency import (
+    MAX_RESIDUAL_POINTS,
     first_seen,
     measure_consistency,
     phase_residuals_deg,
@@ -28,8 +29,6 @@ from polmvs.scene import PointKind
 
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
-
-MAX_POINTS = 20_000  # of a cloud, evenly spread, that single views are asked about; costs time only
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +193,7 @@ def measure_trust(
     surface = cloud.only(cloud.scalars["kind"] == PointKind.SURFACE)
     nothing = np.zeros((0, 3))
     points, normals = surface.points, nothing if surface.normals is None else surface.normals
-    step = -(-len(points) // MAX_POINTS) or 1
+    step = -(-len(points) // MAX_RESIDUAL_POINTS) or 1
     chosen = np.zeros(len(points), np.bool_)
     chosen[::step] = True
     in_sigmas, num_seen, num_inside = [np.zeros(0)], 0, 0
