@@ -21,12 +21,12 @@ from polmvs.normals.rows import AS_MEASURED, Reading, gather_rows_under
 from polmvs.normals.tracks import (
     MAX_ROWS,
     in_tiles,
-    inside_shares,
     normals_from_rows,
+    tracks_on_parts,
     window_maps,
 )
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Tracks, some_tracks
+from polmvs.scene import Tracks
 
 Array = NDArray[np.float64]
 
@@ -111,7 +111,7 @@ def check_axes(
     maps : phase maps built under either kind of light, one for all.
     """
     t, options = tolerances, NormalOptions()
-    on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=0) > 0)
+    on_parts = tracks_on_parts(tracks, maps)
     windows = window_maps(maps, options.window_px)
     others = (MIRRORED, TURNED, TURNED_MIRRORED)
     every = [

@@ -27,12 +27,12 @@ from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, Rows, gather_rows_unde
 from polmvs.normals.tracks import (
     MAX_ROWS,
     in_tiles,
-    inside_shares,
     normals_from_rows,
+    tracks_on_parts,
     window_maps,
 )
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Tracks, some_tracks
+from polmvs.scene import Tracks
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -95,7 +95,7 @@ def find_diffuse_parts(
     For each map ``(P,)`` bool, of the parts that :func:`diffuse_pixels` takes.
     """
     t = tolerances or LightTolerances()
-    on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=0) > 0)
+    on_parts = tracks_on_parts(tracks, maps)
     votes, voting = _track_votes(on_parts, maps, t, max_rows)
     of_points = [
         _part_votes(m, on_parts.points_in_world[voting], votes[voting], t.min_rows) for m in maps

@@ -14,12 +14,12 @@ from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
 from polmvs.normals.tracks import (
     MAX_ROWS,
     in_tiles,
-    inside_shares,
     normals_from_rows,
+    tracks_on_parts,
     window_maps,
 )
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Tracks, some_tracks
+from polmvs.scene import Tracks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> Light
     maps : phase maps built under the given light.
     """
     options = NormalOptions()
-    on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=0) > 0)
+    on_parts = tracks_on_parts(tracks, maps)
     windows = window_maps(maps, options.window_px)
     readings = (AS_MEASURED, OTHER_LIGHT)
     of_tiles = []

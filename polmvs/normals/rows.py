@@ -13,7 +13,7 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.polarization.angle_models import rows_from_axial, tilt_turn
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import View
+from polmvs.scene import MIN_DISTANCE, View
 
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
@@ -106,7 +106,7 @@ def gather_rows_under(
     for k, phase_map in enumerate(maps):
         in_cam = (phase_map.view.cam_from_world * points).astype(np.float32)
         distance = np.linalg.norm(in_cam, axis=-1)
-        ray = in_cam / np.maximum(distance, 1e-12)[:, None]
+        ray = in_cam / np.maximum(distance, MIN_DISTANCE)[:, None]
         xy = phase_map.view.camera.project(in_cam)
         samples = sample_image(phase_map.samples, xy)
         precision = samples[:, 2]

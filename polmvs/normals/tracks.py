@@ -172,6 +172,11 @@ def normals_from_rows(tracks: Tracks, rows: Rows, estimator: Estimator) -> Norma
     return solve_normals(rows.rows, rows.rays, sigma, robust=robust, initial_normals=own.normals.T)
 
 
+def tracks_on_parts(tracks: Tracks, maps: Sequence[PhaseMap]) -> Tracks:
+    """The tracks that any of their views sees in its region."""
+    return some_tracks(tracks, inside_shares(tracks, maps, margin_px=0) > 0)
+
+
 def inside_shares(
     tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int = BORDER_MARGIN_PX
 ) -> Array:

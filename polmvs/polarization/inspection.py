@@ -30,7 +30,6 @@ SHEET_VIEWS = 8
 TILE_PX = 320  # width of one picture
 MARGIN_PX = 6
 HEADER_PX = 96
-CAPTION_PX = 22
 LINE_PX, CHARACTER_PX = 22, 8
 WHITE, GRAY, ORANGE = (255, 255, 255), (160, 160, 160), (60, 160, 255)  # BGR
 
@@ -242,9 +241,9 @@ def _tile(picture: Picture, caption: str) -> Picture:
     """A picture of the tiles' width with its caption and a margin."""
     height = round(picture.shape[0] * TILE_PX / picture.shape[1])
     small = cv2.resize(picture, (TILE_PX, height), interpolation=cv2.INTER_AREA)
-    tile = np.zeros((height + CAPTION_PX + MARGIN_PX, TILE_PX + MARGIN_PX, 3), np.uint8)
-    tile[CAPTION_PX : CAPTION_PX + height, :TILE_PX] = small
-    _write(tile, caption, (2, CAPTION_PX - 7), WHITE)
+    tile = np.zeros((height + LINE_PX + MARGIN_PX, TILE_PX + MARGIN_PX, 3), np.uint8)
+    tile[LINE_PX : LINE_PX + height, :TILE_PX] = small
+    _write(tile, caption, (2, LINE_PX - 7), WHITE)
     return tile
 
 

@@ -54,6 +54,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, stdtrit
 
 from polmvs.config import CaptureOptions, Light, RegionOptions
+from polmvs.polarization.lossy import BLOCK
 from polmvs.polarization.mosaic import INTERPOLATION_NOISE_GAIN
 
 Image: TypeAlias = NDArray[np.float32]
@@ -94,7 +95,7 @@ class Stokes:
         differing gains of the polarizer channels may do.
     lossy_sigma : the part of ``sigma`` that lossy compression makes, which the pixels of a block
         share.
-    lossy_block_px : side of such a block, px.
+    lossy_block_px : side of such a block, px; by default at half the resolution of the samples.
     """
 
     s0: Image
@@ -104,7 +105,7 @@ class Stokes:
     valid: Mask
     gain_sigma: float = 0.0
     lossy_sigma: float = 0.0
-    lossy_block_px: float = 4.0
+    lossy_block_px: float = BLOCK / 2
 
     @property
     def shape(self) -> tuple[int, int]:
