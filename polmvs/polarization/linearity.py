@@ -34,7 +34,6 @@ class LinearityTolerances:
         off, darker ones look encoded.
     max_contrast : deviation of the intensity within a patch over its mean. Guess.
     min_patches : Guess.
-    max_patches : evenly spread; costs time only.
     min_quadratic : deviation of ``q^2 - u^2`` over the patches, for them to tell anything. Guess:
         that of light polarised by 7 % in all directions.
     num_rounds : of weights and exponents; the exponent converges quadratically.
@@ -50,7 +49,6 @@ class LinearityTolerances:
     min_level: float = 0.02
     max_contrast: float = 0.1
     min_patches: int = 200
-    max_patches: int = 6000
     min_quadratic: float = 0.0035
     num_rounds: int = 4
     num_groups: int = 8
@@ -160,8 +158,7 @@ def _patches(
     x, y = cols / s0.shape[1] - 0.5, (rows - 0.5 * s0.shape[0]) / s0.shape[1]
     stack = np.stack([s0, (i0 - i90) / s0, (i45 - i135) / s0, (i0 + i90 - i45 - i135) / s0, x, y])
     group = (rows * 8 // s0.shape[0] * 3 + cols * 8 // s0.shape[1]) % t.num_groups
-    step = max(1, -(-int(np.count_nonzero(good)) // t.max_patches))
-    return np.asarray(stack[:, good].T[::step], np.float64), group[good][::step]
+    return np.asarray(stack[:, good].T, np.float64), group[good]
 
 
 def _quadratic_part(
