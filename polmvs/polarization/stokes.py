@@ -191,7 +191,9 @@ def stokes_from_intensities(
     s1, s2 = np.subtract(i0, i90, out=odd), i45 - i135
     valid = s0 >= np.float32(2.0 * darkness)
     valid &= ~clipped
-    noise = estimate_noise(s0, redundancy, valid, quantum=quantum)
+    # Of s1 and s2, two samples each, by rounding alone.
+    floor = 2.0 * INTERPOLATION_NOISE_GAIN * quantum**2 / 12.0
+    noise = estimate_noise(s0, redundancy, valid, floor=floor)
     gain_sigma = _gain_sigma(s0, s1, s2, redundancy[None], valid)
     variance = noise.variance(s0)
     variance += _mismatch_variance(s0, redundancy, valid, variance)
@@ -364,8 +366,7 @@ def estimate_noise(
     redundancy: Image,
     valid: Mask,
     *,
-    quantum: float | None = None,
-    floor: float | None = None,
+    floor: float,
     quantile_of_noise: float = PATCH_QUANTILE_OF_NOISE,
 ) -> NoiseModel:
     """Noise of s1 and s2 from the redundancy of one image; see the head of this module.
@@ -376,12 +377,9 @@ def estimate_noise(
         combinations with that variance.
     valid : (H, W) bool, pixels to learn from. With fewer than 40 patches of 8x8 px of them only
         the rounding of the samples is known, and returned.
-    quantum : step of a raw sample of a mosaic, share of full scale; or
     floor : the least variance of s1 and s2.
     quantile_of_noise : of the variance of a patch, over the variance; of interpolated noise.
     """
-    if floor is None:
-        floor = 2.0 * INTERPOLATION_NOISE_GAIN * (quantum or 0.0) ** 2 / 12.0
     usable = patch_means(valid.astype(np.float32)) > 1.0 - 0.5 / PATCH_PX**2
     if np.count_nonzero(usable) < MIN_PATCHES:
         return NoiseModel(floor, 0.0)
