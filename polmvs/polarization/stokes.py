@@ -51,7 +51,7 @@ from typing import Any, NamedTuple, TypeAlias
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtr, stdtrit
+from scipy.special import stdtrit
 
 from polmvs.config import CaptureOptions, Light, RegionOptions
 from polmvs.polarization.lossy import BLOCK
@@ -71,6 +71,7 @@ PATCH_QUANTILE_OF_WHITE = 0.768  # the same of white noise
 # And of its second differences along both axes, of two images together.
 PATCH_QUANTILE_OF_CURVATURE = 0.74
 CURVATURE_SPACING_PX = 2  # what a mosaic's interpolation gives neighbours in common is not between
+ONE_SIGMA = 0.8413  # one-sided probability of one standard deviation
 MIN_UNPOLARIZED = 200  # pixels, of one in 16
 MIN_PATCHES = 40
 TINY = 1e-20  # keeps noise-free black images from a division by zero
@@ -470,7 +471,7 @@ def _gain_sigma(s0: Image, s1: Image, s2: Image, redundancy: Image, valid: Mask)
         weak[:] = True
     shares = [np.median(image[sample][lit][weak] / level[weak]) for image in redundancy]
     num = len(shares)
-    student = float(stdtrit(num, ndtr(1.0)))  # as likely as one deviation of a normal one
+    student = float(stdtrit(num, ONE_SIGMA))
     return float(student * np.sqrt(np.mean(np.square(shares)) / 2.0))
 
 
