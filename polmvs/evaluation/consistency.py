@@ -72,8 +72,10 @@ def measure_consistency(
         inside += int(cells.sum())
         if num == 0 or cloud.normals is None:
             continue
-        visible, hit = visible_points(cloud.points, cloud.normals, phase_map)
-        covered += int((hit & cells).sum())
+        visible, nearest = first_seen(
+            cloud.points, cloud.normals, phase_map.view, phase_map.shows_surface
+        )
+        covered += int((np.isfinite(nearest) & cells).sum())
         seeing += visible
         chosen = np.flatnonzero(visible[::step]) * step
         errors.append(
@@ -104,24 +106,6 @@ def _track_residual(tracks: Cloud) -> float:
     if not used.any():
         return float("nan")
     return float(np.degrees(np.arcsin(min(float(np.median(residuals[used])), 1.0))))
-
-
-def visible_points(points: Floats, normals: Floats, phase_map: PhaseMap) -> tuple[Mask, Mask]:
-    """Which points a view sees in its region, and which of its cells show one.
-
-    A point is seen if it faces the camera and no point in its cell is clearly nearer.
-
-    Parameters
-    ----------
-    points, normals : (N, 3), world.
-
-    Returns
-    -------
-    visible : (N,) bool
-    hit : (H / CELL_PX, W / CELL_PX) bool, rounded up
-    """
-    visible, cells = first_seen(points, normals, phase_map.view, phase_map.shows_surface)
-    return visible, np.isfinite(cells)
 
 
 def first_seen(

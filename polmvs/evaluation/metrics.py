@@ -44,7 +44,6 @@ Floats = NDArray[np.floating]
 
 # These define the figures; they are no tolerances of an algorithm.
 THRESHOLDS_M = (0.001, 0.002, 0.005)
-OFF_SURFACE_M = 0.005
 FAR_M = 0.02
 TANGENT_REACH = 1.5  # in spacings of the truth
 MIN_DOLP = 0.1  # of pixels whose phase is compared
@@ -216,7 +215,7 @@ def evaluate_cloud(
         normal_median_deg=angles.median_deg,
         num_points=len(cloud),
         num_on_part=round(share_on_part * len(cloud)) if len(cloud) else 0,
-        off_surface_share=_mean(distances > OFF_SURFACE_M),
+        off_surface_share=_mean(distances > THRESHOLDS_M[-1]),
     )
 
 

@@ -17,19 +17,18 @@ from numpy.typing import NDArray
 from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, PropagationOptions
 from polmvs.evaluation.consistency import (
+    MAX_RESIDUAL_POINTS,
     first_seen,
     measure_consistency,
     phase_residuals_deg,
 )
 from polmvs.io.clouds import Cloud
+from polmvs.normals.tracks import BORDER_MARGIN_PX
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind
 
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
-
-MAX_POINTS = 20_000  # of a cloud, evenly spread, that single views are asked about; costs time only
-OUTLINE_MARGIN_PX = 3  # a region's border is that uncertain: marks and smoothing; a guess
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +193,7 @@ def measure_trust(
     surface = cloud.only(cloud.scalars["kind"] == PointKind.SURFACE)
     nothing = np.zeros((0, 3))
     points, normals = surface.points, nothing if surface.normals is None else surface.normals
-    step = -(-len(points) // MAX_POINTS) or 1
+    step = -(-len(points) // MAX_RESIDUAL_POINTS) or 1
     chosen = np.zeros(len(points), np.bool_)
     chosen[::step] = True
     in_sigmas, num_seen, num_inside = [np.zeros(0)], 0, 0
@@ -204,7 +203,7 @@ def measure_trust(
         nearest = np.minimum(nearest, view.ranges(points))
         seen = first_seen(points, normals, view, partial(in_image, view.camera))[0] & chosen
         xy = view.project(points[seen])
-        size = 2 * OUTLINE_MARGIN_PX + 1
+        size = 2 * BORDER_MARGIN_PX + 1
         region = cv2.dilate(phase_map.region.inside.astype(np.float32), np.ones((size, size)))
         inside = sample_image(np.asarray(region, np.float32), xy, nearest=True) > 0
         num_seen, num_inside = num_seen + len(inside), num_inside + int(inside.sum())

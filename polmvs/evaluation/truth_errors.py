@@ -14,7 +14,6 @@ from polmvs.camera import in_image, pixel_centers
 from polmvs.config import AngleModel
 from polmvs.evaluation.metrics import (
     MIN_DOLP,
-    THRESHOLDS_M,
     AngleStats,
     CloudMetrics,
     angular_errors_deg,
@@ -65,8 +64,6 @@ def evaluate(
     cloud_normals: Floats | None,
     views: Sequence[View],
     truth: GroundTruth,
-    *,
-    thresholds_m: tuple[float, ...] = THRESHOLDS_M,
 ) -> tuple[CloudMetrics, Alignment]:
     """Align a cloud by its cameras and compare it with the truth.
 
@@ -75,7 +72,6 @@ def evaluate(
     cloud_points : (N, 3), estimated world, any scale; rows that are not finite are ignored
     cloud_normals : (N, 3) or None, estimated world; NaN rows have no normal
     views : estimated views, in the same world
-    thresholds_m : distances of accuracy, completeness and F-score, m.
 
     Raises
     ------
@@ -91,7 +87,6 @@ def evaluate(
         surface.points,
         surface.normals,
         surface.is_part,
-        thresholds_m,
         spacing_m=surface.spacing_m,
     )
     return metrics, report
@@ -194,16 +189,14 @@ def phase_errors(
     return errors
 
 
-def phase_errors_on_part(
-    measured: Measured, truth: GroundTruth, *, min_dolp: float = MIN_DOLP
-) -> dict[AngleModel, AngleStats]:
+def phase_errors_on_part(measured: Measured, truth: GroundTruth) -> dict[AngleModel, AngleStats]:
     """Axial errors of the phases that each model predicts from the true normals.
 
     Parameters
     ----------
     measured : name, phase (not AoLP), rad modulo pi, and DoLP (H, W) of each image, one at a
-        time; pixels whose phase is NaN and images without a truth are left out.
-    min_dolp : pixels count above this DoLP.
+        time; pixels whose phase is NaN or whose DoLP is not above 0.1 and images without a truth
+        are left out.
 
     Returns
     -------
@@ -219,7 +212,7 @@ def phase_errors_on_part(
             raise ValueError(
                 f"{phase.shape=}, {dolp.shape=} but expected {(camera.height, camera.width)}."
             )
-        counted = truth.mask(view.name) & (dolp > min_dolp) & np.isfinite(phase)
+        counted = truth.mask(view.name) & (dolp > MIN_DOLP) & np.isfinite(phase)
         normals = truth.normals(view.name)[counted]
         rays = camera.rays(pixel_centers(camera.width, camera.height)[counted])
         for angle_model, values in errors.items():

@@ -38,7 +38,6 @@ Mask = NDArray[np.bool_]
 
 AUTHOR_OPTIONS = CaptureOptions(pattern=(90, 45, 135, 0), gamma=0.5)
 MAX_OFF_PLANE = 0.02  # of the corners from the plane, in sizes of the board; a guess
-MAX_SIDE = 1 << 16  # of a depth map, px; a guess, a longer one is a damaged header
 DMB_FLOAT = 1
 _DMB_HEADER = struct.Struct("<4i")
 
@@ -208,8 +207,7 @@ def read_dmb(path: Path) -> Image:
     if len(data) < _DMB_HEADER.size:
         raise DataError(path, "is truncated; copy it again.")
     kind, height, width, channels = _DMB_HEADER.unpack_from(data)
-    sides = (height, width, channels)
-    if kind != DMB_FLOAT or min(sides) < 1 or max(sides) > MAX_SIDE:
+    if kind != DMB_FLOAT or min(height, width, channels) < 1:
         raise DataError(path, "is no .dmb map of 32-bit floats.")
     if len(data) != _DMB_HEADER.size + 4 * height * width * channels:
         raise DataError(path, f"is truncated: {width}x{height} px are promised; copy it again.")

@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 
 from polmvs.config import AngleModel, CaptureKind, CaptureOptions, NormalOptions
 from polmvs.normals.estimator import NormalEstimate
+from polmvs.normals.light import row_costs
 from polmvs.normals.rows import AS_MEASURED, Reading, gather_rows_under
 from polmvs.normals.tracks import (
     MAX_ROWS,
     in_tiles,
-    inside_shares,
     normals_from_rows,
+    tracks_on_parts,
     window_maps,
 )
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Tracks, some_tracks
+from polmvs.scene import Tracks
 
 Array = NDArray[np.float64]
 
@@ -35,26 +36,27 @@ TURNED_MIRRORED: Reading = ((0, 1), (1, 0))
 
 
 @dataclass(frozen=True, kw_only=True)
-class AxesTolerances:
-    """When other angles are said to be the right ones.
+class VoteTolerances:
+    """When another setting than the given one, of angles or of light, is said to be the right one.
 
     Attributes
     ----------
-    min_rows : of a point that votes. Derived: three rows fix a normal and leave one to tell.
+    min_rows : of a point that votes on angles. Derived: three rows fix a normal and leave one to
+        tell.
     min_votes : points. Guess.
-    min_share : of them, that speak for the other angles. Guess.
-    min_z : mean vote over its standard error. Guess: points on one surface see the same light, so
-        that their votes are worth fewer than their number.
-    min_gain : mean vote, log-likelihood of a row. Guess: noise alone gives a few hundredths.
-    max_row_cost : of one row. Guess, as of the choice between specular and diffuse light.
+    min_share : of them, that speak for the other setting. Guess.
+    min_z : mean vote over its standard error: by chance once in 30,000 captures. Guess: points on
+        one surface see the same light, so that their votes are worth fewer than their number.
+        Right settings of nine captures had -2.3 to -46.
+    min_gain : mean vote on angles, log-likelihood of a row. Guess: noise alone gives a few
+        hundredths.
     """
 
     min_rows: int = 4
     min_votes: int = 8
-    min_share: float = 0.8
-    min_z: float = 6.0
+    min_share: float = 0.7
+    min_z: float = 4.0
     min_gain: float = 0.2
-    max_row_cost: float = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +101,7 @@ class AxesCheck:
 
 
 def check_axes(
-    tracks: Tracks, maps: Sequence[PhaseMap], *, tolerances: AxesTolerances = AxesTolerances()
+    tracks: Tracks, maps: Sequence[PhaseMap], *, tolerances: VoteTolerances = VoteTolerances()
 ) -> AxesCheck:
     """Have the sparse points vote on the angles of polarization.
 
@@ -109,7 +111,7 @@ def check_axes(
     maps : phase maps built under either kind of light, one for all.
     """
     t, options = tolerances, NormalOptions()
-    on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
+    on_parts = tracks_on_parts(tracks, maps)
     windows = window_maps(maps, options.window_px)
     others = (MIRRORED, TURNED, TURNED_MIRRORED)
     every = [
@@ -126,19 +128,22 @@ def check_axes(
     # Of each point (N,): mean cost of a row, under the better kind of light.
     given, *changed = np.minimum(costs[::2], costs[1::2])
     best = AxesCheck(num_votes=int(np.isfinite(given).sum()), share=0.0, change=None)
-    if best.num_votes < t.min_votes:
-        return best
     most = t.min_gain
     for change, cost in zip(others, changed, strict=True):
         votes = given - cost
         votes = votes[np.isfinite(votes)]
-        if len(votes) < t.min_votes:
-            continue
-        mean, error = float(votes.mean()), float(votes.std(ddof=1)) / np.sqrt(len(votes))
-        share = float(np.mean(votes > 0))
-        if mean > most and mean > t.min_z * error and share > t.min_share:
-            best, most = AxesCheck(num_votes=len(votes), share=share, change=change), mean
+        if is_clear(votes, t) and votes.mean() > most:
+            share = float(np.mean(votes > 0))
+            best, most = AxesCheck(num_votes=len(votes), share=share, change=change), votes.mean()
     return best
+
+
+def is_clear(votes: Array, t: VoteTolerances) -> bool:
+    """Whether the votes (N,) of points clearly are for another setting: most positive, and far."""
+    if len(votes) < t.min_votes:
+        return False
+    error = float(votes.std(ddof=1)) / np.sqrt(len(votes))
+    return bool(votes.mean() > t.min_z * error and np.mean(votes > 0) > t.min_share)
 
 
 def changed_pattern(
@@ -171,11 +176,9 @@ def _other_light(reading: Reading) -> Reading:
     return (-a, -b), (-c, -d)
 
 
-def _row_cost(estimate: NormalEstimate, t: AxesTolerances) -> Array:
+def _row_cost(estimate: NormalEstimate, t: VoteTolerances) -> Array:
     """Mean Cauchy cost of a point's rows (N,); NaN where too few are given."""
-    weights = estimate.row_weights
-    given = weights > 0
-    costs = np.minimum(-np.log(np.maximum(weights, 1e-6)), t.max_row_cost)
+    given = estimate.row_weights > 0
     count = given.sum(axis=0)
-    mean = np.where(given, costs, 0).sum(axis=0) / np.maximum(count, 1)
+    mean = np.where(given, row_costs(estimate), 0).sum(axis=0) / np.maximum(count, 1)
     return np.where(count >= t.min_rows, mean, np.nan)

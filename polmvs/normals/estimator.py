@@ -6,8 +6,8 @@ points, so that thousands of 3x3 problems are solved by a few vector operations.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +33,13 @@ class EstimatorTolerances:
     num_pairs : of rows that a doubtful point is started from again. Derived: with three of ten
         rows wrong one pair of 24 is right but once in 3,000,000.
     min_rows_to_doubt : that count; of fewer, some agree by chance. Guess.
-    min_pair_sine : of the angle between the two rows. Guess.
     min_spread : of the rows, over the variance of their noise. Where all planes of incidence are
         one (camera centres and normal in one plane, as on a linear rail) the noise alone spreads
         them. Derived: their mean variance is more than this many times the expected one for fewer
         than 1 in 1000 of three rows (chi-squared of 3, over 3, is 5.4 there).
     min_rows : of a normal. Derived.
-    min_conditioning : ratio of singular values under which rows count as one. Guess.
+    min_conditioning : ratio of singular values under which rows count as one; that of two rows is
+        half the sine of the small angle between them. Guess.
     """
 
     min_sin_zenith: float = 0.1
@@ -48,7 +48,6 @@ class EstimatorTolerances:
     doubtful_loss: float = 0.25
     num_pairs: int = 24
     min_rows_to_doubt: int = 7
-    min_pair_sine: float = 0.05
     min_spread: float = 6.0
     min_rows: int = 2
     min_conditioning: float = 0.02
@@ -171,7 +170,7 @@ def solve_normals(
     normals = _smallest(rows, weights)[1]
     if robust:
         problem = _Problem(rows, rays, precision, weights, tolerances)
-        normals = problem.iterate(normals)
+        normals = problem.iterate(normals, annealed_scales(tolerances.num_rounds))
         normals = problem.try_again(normals)
         weights, outlier_weights = problem.weights(normals, CAUCHY_SCALE)
         facing = outlier_weights > 0
@@ -199,9 +198,9 @@ class _Problem:
     votes: Floats
     tolerances: EstimatorTolerances
 
-    def iterate(self, normals: Array, first_round: int = 0) -> Array:
-        """Reweight and solve again, in ``num_rounds`` rounds."""
-        for scale in islice(annealed_scales(self.tolerances.num_rounds), first_round, None):
+    def iterate(self, normals: Array, scales: Iterable[float]) -> Array:
+        """Reweight and solve again, a round for each scale of the loss."""
+        for scale in scales:
             normals = _smallest(self.rows, self.weights(normals, scale)[0])[1]
         return normals
 
@@ -235,7 +234,9 @@ class _Problem:
             self.votes[..., where],
             self.tolerances,
         )
-        again = some.iterate(some._best_pair(normals[:, where]), first_round=2)
+        # A pair of right rows is near enough: no wide loss has to find the place.
+        scales = (s for s in annealed_scales(self.tolerances.num_rounds) if s == CAUCHY_SCALE)
+        again = some.iterate(some._best_pair(normals[:, where]), scales)
         better = some.losses(again) < losses[where]
         improved = normals.copy()
         improved[:, where[better]] = again[:, better]
@@ -249,6 +250,7 @@ class _Problem:
         order = np.argsort(self.precision <= 0, axis=0, kind="stable")
         count = (self.precision > 0).sum(axis=0)
         points = np.arange(len(count))
+        min_sine = 2 * self.tolerances.min_conditioning
         for _ in range(self.tolerances.num_pairs):
             first, step = rng.random((2, len(count)))
             i = np.floor(first * count).astype(np.int64)
@@ -256,10 +258,8 @@ class _Problem:
             a, b = (self.rows[:, order[k, points], points] for k in (i, j))
             candidate = np.cross(a, b, axis=0).astype(np.float64)
             length = np.linalg.norm(candidate, axis=0)
-            candidate /= np.maximum(length, self.tolerances.min_pair_sine)
-            losses = np.where(
-                length > self.tolerances.min_pair_sine, self.losses(candidate), np.inf
-            )
+            candidate /= np.maximum(length, min_sine)
+            losses = np.where(length > min_sine, self.losses(candidate), np.inf)
             better = losses < least
             best[:, better], least[better] = candidate[:, better], losses[better]
         return best

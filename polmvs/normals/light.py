@@ -27,12 +27,12 @@ from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, Rows, gather_rows_unde
 from polmvs.normals.tracks import (
     MAX_ROWS,
     in_tiles,
-    inside_shares,
     normals_from_rows,
+    tracks_on_parts,
     window_maps,
 )
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Tracks, some_tracks
+from polmvs.scene import Tracks
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -95,7 +95,7 @@ def find_diffuse_parts(
     For each map ``(P,)`` bool, of the parts that :func:`diffuse_pixels` takes.
     """
     t = tolerances or LightTolerances()
-    on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
+    on_parts = tracks_on_parts(tracks, maps)
     votes, voting = _track_votes(on_parts, maps, t, max_rows)
     of_points = [
         _part_votes(m, on_parts.points_in_world[voting], votes[voting], t.min_rows) for m in maps
@@ -186,7 +186,7 @@ def _pixel_votes(
             solve_normals(rows.rows, rows.rays, rows.sigma)
             for rows in _rows_of_both(tile, [maps[k] for k in seen_by])
         )
-        costs, compared = _row_costs(specular, diffuse, t.max_row_cost)
+        costs, compared = _costs_of_both(specular, diffuse, t.max_row_cost)
         counts = compared.sum(axis=0) * (compared.sum(axis=0) >= t.min_rows)
         total += np.bincount(here, counts, slots.num)
         for which, cost in enumerate(costs):
@@ -362,16 +362,21 @@ def _choose_pixels(phase_map: PhaseMap, points: Array, t: LightTolerances) -> _C
     )
 
 
-def _row_costs(
-    specular: NormalEstimate, diffuse: NormalEstimate, max_cost: float
-) -> tuple[list[Floats], Mask]:
-    """Cauchy costs (K, N) of the rows under either light, and which rows count under both.
+def row_costs(
+    estimate: NormalEstimate, *, max_cost: float = LightTolerances.max_row_cost
+) -> Floats:
+    """Cauchy costs (K, N) of the rows of normals, log-likelihoods.
 
     The robust weight is ``1 / (1 + z^2 / c^2)``: minus its logarithm is the row's cost.
     """
-    costs = [
-        np.minimum(-np.log(np.maximum(e.row_weights, 1e-6)), max_cost) for e in (specular, diffuse)
-    ]
+    return np.asarray(-np.log(np.maximum(estimate.row_weights, np.exp(-max_cost))))
+
+
+def _costs_of_both(
+    specular: NormalEstimate, diffuse: NormalEstimate, max_cost: float
+) -> tuple[list[Floats], Mask]:
+    """Costs (K, N) of the rows under either light, and which rows count under both."""
+    costs = [row_costs(estimate, max_cost=max_cost) for estimate in (specular, diffuse)]
     return costs, np.asarray((specular.row_weights > 0) & (diffuse.row_weights > 0))
 
 
@@ -386,7 +391,7 @@ def specular_votes(
     tolerances : see there.
     """
     t = tolerances or LightTolerances()
-    costs, compared = _row_costs(specular, diffuse, t.max_row_cost)
+    costs, compared = _costs_of_both(specular, diffuse, t.max_row_cost)
     votes = ((costs[1] - costs[0]) * compared).sum(axis=0)
     enough = np.maximum(specular.num_rows, diffuse.num_rows) >= t.min_rows
     # Under the wrong kind of light the rows often leave no normal at all.

@@ -8,23 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from polmvs.config import AngleModel, Light, NormalOptions
+from polmvs.normals.axes_check import VoteTolerances, is_clear
 from polmvs.normals.light import specular_votes
 from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
 from polmvs.normals.tracks import (
     MAX_ROWS,
     in_tiles,
-    inside_shares,
     normals_from_rows,
+    tracks_on_parts,
     window_maps,
 )
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Tracks, some_tracks
-
-MIN_VOTES = 8  # sparse points; a guess
-# Mean vote over its standard error: by chance once in 30,000 captures. Points near each other see
-# the same light, so that their votes are worth fewer; a guess allows for it.
-MIN_Z = 4.0
-MIN_SHARE = 0.7  # of the points, that vote for the other light; a guess
+from polmvs.scene import Tracks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +60,7 @@ def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> Light
     maps : phase maps built under the given light.
     """
     options = NormalOptions()
-    on_parts = some_tracks(tracks, inside_shares(tracks, maps, margin_px=1) > 0)
+    on_parts = tracks_on_parts(tracks, maps)
     windows = window_maps(maps, options.window_px)
     readings = (AS_MEASURED, OTHER_LIGHT)
     of_tiles = []
@@ -78,9 +73,6 @@ def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> Light
         of_tiles.append(votes[voting])
     votes = np.concatenate(of_tiles)
     num = len(votes)
-    if num < MIN_VOTES:
-        return LightCheck(given=given, num_votes=num, share=0.0, contradicted=False)
-    share = float(np.mean(votes < 0))
-    error = float(votes.std(ddof=1)) / np.sqrt(num)
-    contradicted = share > MIN_SHARE and float(votes.mean()) < -MIN_Z * error
-    return LightCheck(given=given, num_votes=num, share=share, contradicted=bool(contradicted))
+    contradicted = is_clear(-votes, VoteTolerances())
+    share = float(np.mean(votes < 0)) if num else 0.0
+    return LightCheck(given=given, num_votes=num, share=share, contradicted=contradicted)

@@ -13,7 +13,7 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.polarization.angle_models import rows_from_axial, tilt_turn
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import View
+from polmvs.scene import MIN_DISTANCE, View
 
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
@@ -50,7 +50,6 @@ def gather_rows(
     maps: Sequence[PhaseMap],
     range_maps: Sequence[Image | None] | None = None,
     *,
-    range_tolerance: float = OCCLUSION_TOLERANCE,
     tilt_aware: bool = True,
 ) -> Rows:
     """Rows of points from all views that see them (paper, eq. coeff_2, before stacking).
@@ -63,7 +62,6 @@ def gather_rows(
         points_in_world,
         maps,
         range_maps,
-        range_tolerance=range_tolerance,
         tilt_aware=tilt_aware,
     )
     return rows
@@ -76,7 +74,6 @@ def gather_rows_under(
     maps: Sequence[PhaseMap],
     range_maps: Sequence[Image | None] | None = None,
     *,
-    range_tolerance: float = OCCLUSION_TOLERANCE,
     tilt_aware: bool = True,
 ) -> tuple[Rows, ...]:
     """Rows of points under several readings of the same phases, the maps asked once.
@@ -88,7 +85,7 @@ def gather_rows_under(
     points_in_world : (N, 3).
     maps : K phase maps.
     range_maps : per view ``(h, w)`` distances from the camera centre, 0 where unknown: a point
-        that lies behind its view's map by more than ``range_tolerance`` (relative) is occluded.
+        that lies behind its view's map by more than ``OCCLUSION_TOLERANCE`` (relative) is occluded.
     tilt_aware : add to a row's variance the square of what its model leaves out: to OPA's and
         PPA's phases the turn that a tilt of the polarizers would give them
         (:func:`polmvs.polarization.angle_models.tilt_turn`), to OPA's rows their angle to PPA's.
@@ -109,7 +106,7 @@ def gather_rows_under(
     for k, phase_map in enumerate(maps):
         in_cam = (phase_map.view.cam_from_world * points).astype(np.float32)
         distance = np.linalg.norm(in_cam, axis=-1)
-        ray = in_cam / np.maximum(distance, 1e-12)[:, None]
+        ray = in_cam / np.maximum(distance, MIN_DISTANCE)[:, None]
         xy = phase_map.view.camera.project(in_cam)
         samples = sample_image(phase_map.samples, xy)
         precision = samples[:, 2]
@@ -117,7 +114,7 @@ def gather_rows_under(
         if range_map is not None:
             shown = sample_range(range_map, phase_map.view, xy)
             precision = np.where(
-                (shown > 0) & (distance > (1 + range_tolerance) * shown), 0, precision
+                (shown > 0) & (distance > (1 + OCCLUSION_TOLERANCE) * shown), 0, precision
             )
         rotation = phase_map.view.cam_from_world.rotation.astype(np.float32)
         rays[:, k] = (ray @ rotation).T

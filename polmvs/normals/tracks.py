@@ -28,7 +28,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MAX_ROWS = MemoryNeeds.max_rows  # of points and views together, at a time, without a budget
-BORDER_MARGIN_PX = 7  # points nearer to the region's border may lie on the background
+# A region's border is that uncertain, by marks and smoothing: points nearer to it may lie on the
+# background. Guess.
+BORDER_MARGIN_PX = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,20 +39,17 @@ class SeedTolerances:
 
     Attributes
     ----------
-    min_inside_share : of a track's views that must see it in their region. Guess.
-    min_seen_share : of the views that a point faces, to show the surface at its place. Guess.
+    min_inside_share : of a track's views that must see it in their region, and of the views that
+        its point faces, to show the surface at its place. Guess.
     max_dolp_share : of a mark's DoLP in that of the surface about it. Guess.
     clear_dolp : of the surface, for the comparison to tell. Guess.
-    max_sigma_deg : of the normal. Guess.
-    max_residual : sine; 3.4 deg between the normal and the planes of incidence. Guess.
+    max_sigma_deg : of the normal, and of its angle to the planes of incidence. Guess.
     """
 
     min_inside_share: float = 0.8
-    min_seen_share: float = 0.7
     max_dolp_share: float = 0.85
     clear_dolp: float = 0.15
     max_sigma_deg: float = 3.0
-    max_residual: float = 0.06
 
 
 def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
@@ -173,13 +172,18 @@ def normals_from_rows(tracks: Tracks, rows: Rows, estimator: Estimator) -> Norma
     return solve_normals(rows.rows, rows.rays, sigma, robust=robust, initial_normals=own.normals.T)
 
 
+def tracks_on_parts(tracks: Tracks, maps: Sequence[PhaseMap]) -> Tracks:
+    """The tracks that any of their views sees in its region."""
+    return some_tracks(tracks, inside_shares(tracks, maps, margin_px=0) > 0)
+
+
 def inside_shares(
     tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int = BORDER_MARGIN_PX
 ) -> Array:
     """Share ``(T,)`` of each track's observations that lie well inside their view's region."""
     num_tracks = len(tracks.points_in_world)
     inside = np.zeros(len(tracks.obs_track), bool)
-    kernel = np.ones((margin_px, margin_px), np.uint8)
+    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
     for phase_map, here in zip(maps, tracks.of_views(len(maps)), strict=True):
         flags = phase_map.region.inside.astype(np.uint8)
         eroded = cv2.erode(flags, kernel, borderType=cv2.BORDER_REPLICATE).astype(np.float32)
@@ -252,7 +256,7 @@ def select_seeds(
         estimate.valid
         & (estimate.num_rows >= 3)
         & (estimate.sigma_deg < tolerances.max_sigma_deg)
-        & (estimate.residual < tolerances.max_residual)
+        & (estimate.residual < np.sin(np.radians(tolerances.max_sigma_deg)))
     )
     # The dearest question last, of those that are left: all points are asked of all views.
     some = some_tracks(tracks, good)
@@ -260,7 +264,7 @@ def select_seeds(
         dolp_shares(some, maps, tolerances=tolerances) > tolerances.max_dolp_share
     )
     points, normals = tracks.points_in_world[good], estimate.normals[good]
-    good[good] = seen_shares(points, normals, maps) >= tolerances.min_seen_share
+    good[good] = seen_shares(points, normals, maps) >= tolerances.min_inside_share
     some = some_tracks(tracks, good)
     sigma = point_sigmas(some, [m.view for m in maps])
     return Seeds(some.points_in_world, estimate.normals[good], sigma), good

@@ -24,12 +24,11 @@ from numpy.typing import NDArray
 CONTAINER_BITS = 16
 DEPTHS = (8, 10, 12, 14, 16)  # bits that cameras use
 DEFAULT_DEPTHS = (12, 14, 16)  # without a pile that tells
-# A pile holds more samples than each of so many levels below it by this factor: a tail that ends
-# by chance does not double at its last level (derived: a tail falls).
+# A pile holds more samples than each of so many levels below it, which there must be, by this
+# factor: a tail that ends by chance does not double at its last level (derived: a tail falls).
 PILE_FACTOR = 2.0
 PILE_NEIGHBORS = 16
 MIN_PILE = 3  # samples; one or two at the top of a tail are chance
-MIN_PILE_LEVELS = 16  # occupied, before a pile elsewhere than at a full scale is one
 # Sensors that clip before their converter do so in its upper part; a pile below is a bright
 # surface of one level (guess).
 MIN_CLIP_SHARE = 0.85
@@ -109,7 +108,7 @@ class LevelCounts:
             return top
         crowd = int(self.counts[occupied[-1 - PILE_NEIGHBORS : -1]].max(initial=0))
         enough = self.counts[top] >= max(MIN_PILE, PILE_FACTOR * crowd)
-        return top if enough and len(occupied) >= MIN_PILE_LEVELS else None
+        return top if enough and len(occupied) >= PILE_NEIGHBORS else None
 
 
 def decide_levels(counts: LevelCounts, full_scale: float | None = None) -> Levels:

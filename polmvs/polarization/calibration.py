@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import BayerOrder
+from polmvs.config import BayerOrder, CaptureOptions
 from polmvs.errors import DataError
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.images import write_bytes
@@ -44,7 +44,6 @@ Image = NDArray[np.float32]
 Pattern = tuple[int, int, int, int]
 
 VERSION = 1
-STANDARD: Pattern = (90, 45, 135, 0)  # where the file names none
 MAX_ANGLE_ERROR_DEG = 20.0  # of a channel; more is another pattern, or angles of another direction
 MIN_DIATTENUATION = 0.3  # of a channel; sensors have 0.9 and more
 MIN_LIGHT = 0.01  # mean of a frame, share of full scale
@@ -365,7 +364,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
             path,
             f"unknown key {min(unknown)!r}." if unknown else f"is not of version {VERSION}.",
         )
-    pattern = _numbers_of(path, content, "pattern", STANDARD, 1)
+    pattern = _numbers_of(path, content, "pattern", CaptureOptions.pattern, 1)
     if sorted(pattern) != list(ANGLES_DEG):
         raise DataError(path, "pattern must hold 0, 45, 90 and 135 once each.")
     bayer = content.get("bayer")

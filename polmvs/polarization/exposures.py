@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-# Variance of a sample: photons, read noise, and their ratio at full scale; only the ratio of the
-# two matters here. A full well of 10,000 electrons with a read noise of 2.5 (IMX250), measured in
-# neither file; wrong by ten it costs a few percent of noise in dark pixels.
-PHOTON_VARIANCE = 1e-4
-READ_VARIANCE = 6e-8
+# Variance of reading a sample, over that of its photons at full scale. A full well of 10,000
+# electrons with a read noise of 2.5 (IMX250), measured in neither file; wrong by ten it costs a few
+# percent of noise in dark pixels.
+READ_VARIANCE = 6e-4
 
 
 def merge_exposures(
@@ -49,8 +48,9 @@ def merge_exposures(
     total = np.zeros_like(images[0], np.float32)
     weights = np.zeros_like(total)
     for image, share, use in zip(images, shares, usable, strict=True):
-        # Variance of x / share: (photons * pooled * share + read) / share^2.
-        weight = use * share**2 / (PHOTON_VARIANCE * pooled * share + READ_VARIANCE)
+        # Variance of x / share, in that of the photons at full scale:
+        # (pooled * share + read) / share^2.
+        weight = use * share**2 / (pooled * share + READ_VARIANCE)
         total += weight * image / share
         weights += weight
     nowhere = weights == 0

@@ -16,21 +16,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import CaptureKind, CaptureOptions, Resolution
+from polmvs.config import CaptureKind, CaptureOptions, RegionOptions, Resolution
 from polmvs.io.images import write_png
 from polmvs.polarization.capture import Capture, intensity_image_8bit, open_capture
 from polmvs.polarization.stokes import Stokes
+from polmvs.scene import short_list
 
 Image = NDArray[np.float32]
 Picture = NDArray[np.uint8]
 
-POLARIZED_DOLP = 0.1  # from which a pixel counts as polarised, as --min-dolp
 SHOWN_DOLP = 0.5  # DoLP that is shown white, and AoLP in full colour
 SHEET_VIEWS = 8
 TILE_PX = 320  # width of one picture
 MARGIN_PX = 6
 HEADER_PX = 96
-CAPTION_PX = 22
 LINE_PX, CHARACTER_PX = 22, 8
 WHITE, GRAY, ORANGE = (255, 255, 255), (160, 160, 160), (60, 160, 255)  # BGR
 
@@ -242,9 +241,9 @@ def _tile(picture: Picture, caption: str) -> Picture:
     """A picture of the tiles' width with its caption and a margin."""
     height = round(picture.shape[0] * TILE_PX / picture.shape[1])
     small = cv2.resize(picture, (TILE_PX, height), interpolation=cv2.INTER_AREA)
-    tile = np.zeros((height + CAPTION_PX + MARGIN_PX, TILE_PX + MARGIN_PX, 3), np.uint8)
-    tile[CAPTION_PX : CAPTION_PX + height, :TILE_PX] = small
-    _write(tile, caption, (2, CAPTION_PX - 7), WHITE)
+    tile = np.zeros((height + LINE_PX + MARGIN_PX, TILE_PX + MARGIN_PX, 3), np.uint8)
+    tile[LINE_PX : LINE_PX + height, :TILE_PX] = small
+    _write(tile, caption, (2, LINE_PX - 7), WHITE)
     return tile
 
 
@@ -274,7 +273,7 @@ def _figures_of(name: str, stokes: Stokes, darkness: float) -> ViewFigures:
     valid, s0 = stokes.valid, stokes.s0
     dolp = stokes.dolp
     dark = ~valid & (s0 < 2.0 * darkness)
-    polarized = valid & (dolp >= POLARIZED_DOLP)
+    polarized = valid & (dolp >= RegionOptions.min_dolp)
     sigma = np.degrees(np.median(stokes.sigma_aolp[polarized])) if polarized.any() else np.nan
     return ViewFigures(
         name=name,
@@ -335,31 +334,25 @@ def _warnings(
     spoiled = [v.name for v in views if v.saturated > limits.saturated]
     if spoiled:
         lines.append(
-            f"more than {100 * limits.saturated:.0f} % is clipped in {_some(spoiled)}; expose less"
+            f"more than {100 * limits.saturated:.0f} % is clipped in {short_list(spoiled)}; "
+            "expose less"
         )
     if white < limits.dark_white:
         lines.append(f"the brightest 0.5 % are at {100 * white:.0f} % of full scale; expose more")
     polarized = float(np.mean([v.polarized for v in views]))
     if polarized < limits.polarized:
         lines.append(
-            f"{100 * polarized:.1f} % of the pixels are polarised (DoLP {POLARIZED_DOLP:g}); "
-            "is it a polarization camera's raw format, and is the part glossy?"
+            f"{100 * polarized:.1f} % of the pixels are polarised (DoLP "
+            f"{RegionOptions.min_dolp:g}); is it a polarization camera's raw format, and is the "
+            "part glossy?"
         )
     blurred = [v.name for v in views if v.edge_px > limits.edge_px]
     if blurred:
-        lines.append(f"no sharp edge in {_some(blurred)}: out of focus or moved")
+        lines.append(f"no sharp edge in {short_list(blurred)}: out of focus or moved")
     levels = [v.median_intensity for v in views if v.median_intensity > 0]
     if levels and max(levels) > limits.uneven * min(levels):
         lines.append(
             f"the views' intensities differ by a factor of {max(levels) / min(levels):.1f}; was "
             "automatic exposure on?"
         )
-    if capture.pattern_check is not None and capture.pattern_check.fits is False:
-        lines.append(capture.pattern_check.message)
     return lines
-
-
-def _some(names: Sequence[str]) -> str:
-    """A few of many names."""
-    shown = ", ".join(names[:3])
-    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"

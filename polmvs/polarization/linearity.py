@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.fitting import cauchy_weights, robust_deviation
 from polmvs.polarization.mosaic import clipped_cells, split_mosaic
+from polmvs.polarization.stokes import patch_means
 
 Array = NDArray[np.float64]
 
@@ -29,18 +30,13 @@ class LinearityTolerances:
 
     Attributes
     ----------
-    patch_px : side of the squares over which samples are averaged. Guess: cells that see
-        texture differ, their mean does not.
     min_level : of a patch's mean, share of full scale. Guess: where samples near nought are cut
         off, darker ones look encoded.
     max_contrast : deviation of the intensity within a patch over its mean. Guess.
     min_patches : Guess.
-    max_patches : evenly spread; costs time only.
     min_quadratic : deviation of ``q^2 - u^2`` over the patches, for them to tell anything. Guess:
         that of light polarised by 7 % in all directions.
     num_rounds : of weights and exponents; the exponent converges quadratically.
-    scale_of_loss : Cauchy's, in deviations of the residual; 95 % as efficient as least squares
-        for normal noise.
     num_groups : of patches, neighbours together, each of which is left out once (jackknife), as is
         each image.
     min_z : of the logarithm of the two gammas' ratio, in its standard deviations. Derived: by
@@ -50,14 +46,11 @@ class LinearityTolerances:
     max_log_sigma : of the gamma's logarithm, for an estimate to be named. Guess.
     """
 
-    patch_px: int = 8
     min_level: float = 0.02
     max_contrast: float = 0.1
     min_patches: int = 200
-    max_patches: int = 6000
     min_quadratic: float = 0.0035
     num_rounds: int = 4
-    scale_of_loss: float = 2.385
     num_groups: int = 8
     min_z: float = 4.0
     min_ratio: float = 1.25
@@ -150,30 +143,22 @@ def _patches(
     images = split_mosaic(raw, pattern)
     usable = (~clipped_cells(raw, clip)).astype(np.float32)
     intensity = 0.25 * images.sum(axis=0)
-    spread = _means(np.square(intensity), t.patch_px) - np.square(_means(intensity, t.patch_px))
-    level = np.maximum(_means(intensity, t.patch_px), 1e-6)
-    good = (_means(usable, t.patch_px) > 0.999) & (spread < np.square(t.max_contrast * level))
+    # Cells that see texture differ, the means of patches do not.
+    mean = patch_means(intensity)
+    spread = patch_means(np.square(intensity)) - np.square(mean)
+    level = np.maximum(mean, 1e-6)
+    good = (patch_means(usable) > 0.999) & (spread < np.square(t.max_contrast * level))
     # By the sum of all four: a choice by single ones would depend on the angle.
     good &= level > t.min_level
     if exponent != 1.0:
         images = np.power(np.maximum(images, 0), np.float32(exponent))
-    i0, i45, i90, i135 = (_means(image, t.patch_px) for image in images)
+    i0, i45, i90, i135 = (patch_means(image) for image in images)
     s0 = np.maximum(0.5 * (i0 + i45 + i90 + i135), 1e-9)
     rows, cols = np.indices(s0.shape)
     x, y = cols / s0.shape[1] - 0.5, (rows - 0.5 * s0.shape[0]) / s0.shape[1]
     stack = np.stack([s0, (i0 - i90) / s0, (i45 - i135) / s0, (i0 + i90 - i45 - i135) / s0, x, y])
     group = (rows * 8 // s0.shape[0] * 3 + cols * 8 // s0.shape[1]) % t.num_groups
-    step = max(1, -(-int(np.count_nonzero(good)) // t.max_patches))
-    return np.asarray(stack[:, good].T[::step], np.float64), group[good][::step]
-
-
-def _means(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Means of squares of an image, the rest at its far sides left out."""
-    rows, cols = image.shape[0] // size, image.shape[1] // size
-    if not rows or not cols:
-        return np.zeros((0, 0), np.float32)
-    whole = np.ascontiguousarray(image[: rows * size, : cols * size], np.float32)
-    return np.asarray(cv2.resize(whole, (cols, rows), interpolation=cv2.INTER_AREA), np.float32)
+    return np.asarray(stack[:, good].T, np.float64), group[good]
 
 
 def _quadratic_part(
@@ -194,8 +179,7 @@ def _quadratic_part(
     for _ in range(t.num_rounds):
         solution = _solve(design, right, loss)
         residual = right - design @ solution
-        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
-        loss = 1.0 / (1.0 + np.square(residual / (t.scale_of_loss * scale)))
+        loss = cauchy_weights(np.square(residual / max(robust_deviation(residual), 1e-9)))
     image = np.repeat(np.arange(len(parts)), [len(rows) for rows, _ in parts])
     deviations = []
     for index in (group, image):

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.config import CaptureOptions
 from polmvs.polarization.mosaic import split_mosaic
 
 BLOCK = 8
@@ -32,7 +33,6 @@ MIN_MAGNITUDE = 1.0  # beyond which a coefficient is not the rounding of samples
 MIN_NONZERO = 24  # coefficients of one frequency, before their spacing means anything
 MIN_COMB = 0.6  # comb strength of a step; unrounded coefficients reach 0.3 with so few (simulated)
 MIN_RHYTHMIC = 6  # frequencies with a comb, before samples count as lossy
-COLUMN_SUM_PATTERN = (90, 45, 135, 0)  # any order has the same variances, averaged over s1 and s2
 
 
 def find_quantization(raw: NDArray[Any]) -> NDArray[np.float64] | None:
@@ -102,7 +102,8 @@ def _stokes_gains() -> NDArray[np.float64]:
             # A single block amid silent ones; the filters reach into the next.
             raw = np.zeros((3 * BLOCK, 3 * BLOCK), np.float32)
             raw[BLOCK : 2 * BLOCK, BLOCK : 2 * BLOCK] = cv2.idct(unit)
-            i0, i45, i90, i135 = split_mosaic(raw, COLUMN_SUM_PATTERN)
+            # Any order has the same variances, averaged over s1 and s2.
+            i0, i45, i90, i135 = split_mosaic(raw, CaptureOptions.pattern)
             total = np.square(i0 - i90).sum() + np.square(i45 - i135).sum()
             gains[v, u] = 0.5 * float(total) / (BLOCK // 2) ** 2
     return gains

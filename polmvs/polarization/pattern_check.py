@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.config import CaptureOptions
 from polmvs.polarization.mosaic import ANGLES_DEG, clipped_cells, split_mosaic, turned_pattern
 
 Pattern = tuple[int, int, int, int]
 
-STANDARD: Pattern = (90, 45, 135, 0)  # of the polarization sensors that are sold
 # Pairs of places of a cell (row by row) that may be perpendicular.
 PAIRINGS = (((0, 3), (1, 2)), ((0, 1), (2, 3)), ((0, 2), (1, 3)))
 PAIRING_NAMES = ("diagonals", "rows", "columns")
@@ -30,9 +30,9 @@ SMOOTHING_PX = 9
 MIN_LIGHT = 0.02  # share of the brightest
 MIN_PIXELS = 500  # polarised ones
 # A wrong pairing shows polarised light as disagreement: several times what the right one has.
-# Between these ratios nothing is said (guess; right patterns of rendered and real captures have
-# 0.1 to 0.4, a swapped one the inverse).
-CLEAR_RATIO = 0.6
+# Between this ratio and its inverse nothing is said (guess; right patterns of rendered and real
+# captures have 0.1 to 0.4, a swapped one the inverse).
+CLEAR_RATIO = 0.5
 POLARIZED_SHARE = 0.05  # of s0, beyond which the sums of the best pairing count as polarised
 
 
@@ -55,11 +55,6 @@ class PatternCheck:
     num_pixels: int
     fits: bool | None
     fitting: tuple[Pattern, ...]
-
-    @property
-    def pairing(self) -> int:
-        """Index of the pattern's own pairing in ``PAIRING_NAMES``."""
-        return _pairing_of(self.pattern)
 
     @property
     def message(self) -> str:
@@ -135,8 +130,8 @@ def _pairing_of(pattern: Pattern) -> int:
 
 
 def _patterns_of(pairing: int) -> tuple[Pattern, ...]:
-    """Patterns of a pairing: the standard one and its turned images first, if it is theirs."""
-    turned = [turned_pattern(STANDARD, orientation) for orientation in range(1, 9)]
+    """Patterns of a pairing: that of the sensors sold and its turned images first, if theirs."""
+    turned = [turned_pattern(CaptureOptions.pattern, orientation) for orientation in range(1, 9)]
     every = [(a, b, c, d) for a, b, c, d in permutations(ANGLES_DEG)]
     order = [*turned, *every]
     return tuple(dict.fromkeys(p for p in order if _pairing_of(p) == pairing))

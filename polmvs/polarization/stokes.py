@@ -53,7 +53,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 
-from polmvs.config import Light
+from polmvs.config import CaptureOptions, Light, RegionOptions
+from polmvs.polarization.lossy import BLOCK
 from polmvs.polarization.mosaic import INTERPOLATION_NOISE_GAIN
 
 Image: TypeAlias = NDArray[np.float32]
@@ -71,7 +72,6 @@ PATCH_QUANTILE_OF_WHITE = 0.768  # the same of white noise
 PATCH_QUANTILE_OF_CURVATURE = 0.74
 CURVATURE_SPACING_PX = 2  # what a mosaic's interpolation gives neighbours in common is not between
 ONE_SIGMA = 0.8413  # one-sided probability of one standard deviation
-UNPOLARIZED = 0.1  # DoLP under which the redundancy shows the gains
 MIN_UNPOLARIZED = 200  # pixels, of one in 16
 MIN_PATCHES = 40
 TINY = 1e-20  # keeps noise-free black images from a division by zero
@@ -96,7 +96,7 @@ class Stokes:
         differing gains of the polarizer channels may do.
     lossy_sigma : the part of ``sigma`` that lossy compression makes, which the pixels of a block
         share.
-    lossy_block_px : side of such a block, px.
+    lossy_block_px : side of such a block, px; by default at half the resolution of the samples.
     """
 
     s0: Image
@@ -106,7 +106,7 @@ class Stokes:
     valid: Mask
     gain_sigma: float = 0.0
     lossy_sigma: float = 0.0
-    lossy_block_px: float = 4.0
+    lossy_block_px: float = BLOCK / 2
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -164,7 +164,7 @@ def stokes_from_intensities(
     intensities: Image,
     clipped: Mask,
     *,
-    darkness: float = 0.004,
+    darkness: float = CaptureOptions.darkness,
     quantum: float = 1 / 255,
     lossy_variance: float = 0.0,
 ) -> Stokes:
@@ -192,7 +192,9 @@ def stokes_from_intensities(
     s1, s2 = np.subtract(i0, i90, out=odd), i45 - i135
     valid = s0 >= np.float32(2.0 * darkness)
     valid &= ~clipped
-    noise = estimate_noise(s0, redundancy, valid, quantum=quantum)
+    # Of s1 and s2, two samples each, by rounding alone.
+    floor = 2.0 * INTERPOLATION_NOISE_GAIN * quantum**2 / 12.0
+    noise = estimate_noise(s0, redundancy, valid, floor=floor)
     gain_sigma = _gain_sigma(s0, s1, s2, redundancy[None], valid)
     variance = noise.variance(s0)
     variance += _mismatch_variance(s0, redundancy, valid, variance)
@@ -221,7 +223,7 @@ def stokes_by_least_squares(
     analyzers: NDArray[np.floating[Any]],
     clipped: Mask,
     *,
-    darkness: float = 0.004,
+    darkness: float = CaptureOptions.darkness,
     quantum: float = 1 / 255,
     interpolated: bool = False,
     lossy_variance: float = 0.0,
@@ -365,8 +367,7 @@ def estimate_noise(
     redundancy: Image,
     valid: Mask,
     *,
-    quantum: float | None = None,
-    floor: float | None = None,
+    floor: float,
     quantile_of_noise: float = PATCH_QUANTILE_OF_NOISE,
 ) -> NoiseModel:
     """Noise of s1 and s2 from the redundancy of one image; see the head of this module.
@@ -377,21 +378,18 @@ def estimate_noise(
         combinations with that variance.
     valid : (H, W) bool, pixels to learn from. With fewer than 40 patches of 8x8 px of them only
         the rounding of the samples is known, and returned.
-    quantum : step of a raw sample of a mosaic, share of full scale; or
     floor : the least variance of s1 and s2.
     quantile_of_noise : of the variance of a patch, over the variance; of interpolated noise.
     """
-    if floor is None:
-        floor = 2.0 * INTERPOLATION_NOISE_GAIN * (quantum or 0.0) ** 2 / 12.0
-    usable = _patch_means(valid.astype(np.float32)) > 1.0 - 0.5 / PATCH_PX**2
+    usable = patch_means(valid.astype(np.float32)) > 1.0 - 0.5 / PATCH_PX**2
     if np.count_nonzero(usable) < MIN_PATCHES:
         return NoiseModel(floor, 0.0)
-    level = _patch_means(s0)[usable]
+    level = patch_means(s0)[usable]
     stack = redundancy if redundancy.ndim == 3 else redundancy[None]
     spread = np.zeros(len(level))
     for image in stack:
-        mean = _patch_means(image)[usable].astype(np.float64)
-        square = _patch_means(np.square(image))[usable].astype(np.float64)
+        mean = patch_means(image)[usable].astype(np.float64)
+        square = patch_means(np.square(image))[usable].astype(np.float64)
         spread += np.maximum(square - mean * mean, 0.0) / len(stack)
     order = np.argsort(level)
     classes = np.array_split(order, min(MAX_CLASSES, len(order) // MIN_PATCHES))
@@ -467,7 +465,8 @@ def _gain_sigma(s0: Image, s1: Image, s2: Image, redundancy: Image, valid: Mask)
     level = s0[sample][lit]
     if len(redundancy) == 0 or level.size == 0:
         return 0.0
-    weak = np.hypot(s1[sample][lit], s2[sample][lit]) < UNPOLARIZED * level
+    # Of light that counts as unpolarised.
+    weak = np.hypot(s1[sample][lit], s2[sample][lit]) < RegionOptions.min_dolp * level
     if np.count_nonzero(weak) < MIN_UNPOLARIZED:
         weak[:] = True
     shares = [np.median(image[sample][lit][weak] / level[weak]) for image in redundancy]
@@ -514,7 +513,7 @@ def _wrap(angle: Any) -> Any:
     return np.where(wrapped >= np.pi, 0, wrapped)
 
 
-def _patch_means(image: Image) -> Image:
+def patch_means(image: Image) -> Image:
     """Means of squares of PATCH_PX, the rest at the image's far sides left out."""
     rows, cols = image.shape[0] // PATCH_PX, image.shape[1] // PATCH_PX
     if not rows or not cols:

@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from polmvs.camera import Camera, pixel_centers
+from polmvs.config import CaptureOptions
 from polmvs.geometry import RigidTransform, unit
+from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.scene import View
 from polmvs.synthetic.surfaces import Cylinder, Group, Plane, Sphere, Surface
 
@@ -39,7 +41,6 @@ __all__ = [
 
 Array: TypeAlias = NDArray[np.float64]
 
-ANGLES_DEG = (0, 45, 90, 135)
 LIGHTS = ("specular", "diffuse")
 SENSORS = ("ppa", "opa", "tilted")
 
@@ -99,7 +100,7 @@ def render_mosaic(
     view: View,
     surface: Surface,
     *,
-    pattern: tuple[int, int, int, int] = (90, 45, 135, 0),
+    pattern: tuple[int, int, int, int] = CaptureOptions.pattern,
     light: str = "specular",
     sensor: str = "ppa",
     ior: float = 1.5,
@@ -123,7 +124,7 @@ def render_mosaic(
 
 
 def mosaic_from_intensities(
-    intensities: NDArray[np.floating], pattern: tuple[int, int, int, int] = (90, 45, 135, 0)
+    intensities: NDArray[np.floating], pattern: tuple[int, int, int, int] = CaptureOptions.pattern
 ) -> Array:
     """Interleave angle images ``(4, H, W)`` into a mosaic ``(2 H, 2 W)``, without resampling."""
     if intensities.ndim != 3 or intensities.shape[0] != 4:

@@ -59,18 +59,17 @@ class PrintedScene:
         return Group((self.part, self.surroundings))
 
 
-def render_printed_mosaic(
-    view: View, scene: PrintedScene, *, sensor: str = "tilted", ior: float = 1.5
-) -> Array:
+def render_printed_mosaic(view: View, scene: PrintedScene) -> Array:
     """Render a raw mosaic ``(2 H, 2 W)`` of the view's half-size image, share of full scale.
+
+    Its polarizers are tilted for oblique rays; see :func:`polmvs.synthetic.captures.render_view`.
 
     Parameters
     ----------
     view : camera of the half-size image, and pose.
     scene : what is seen.
-    sensor, ior : as in :func:`polmvs.synthetic.captures.render_view`.
     """
-    mosaic = render_mosaic(view, scene.part, sensor=sensor, ior=ior, s0=scene.part_s0)
+    mosaic = render_mosaic(view, scene.part, sensor="tilted", s0=scene.part_s0)
     num_rows, num_cols = mosaic.shape
     for start in range(0, num_rows, STRIP):  # which the processor's cache holds
         strip = mosaic[start : start + STRIP]

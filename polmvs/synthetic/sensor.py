@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.config import CaptureOptions
 from polmvs.synthetic.captures import add_noise
 
 Array = NDArray[np.float64]
@@ -26,15 +27,13 @@ class FaultySensor:
     diattenuation: Array
     dark: Array
 
-    def expose(
-        self, stokes: Array, rng: np.random.Generator | None = None, *, full_well: float = 10_000.0
-    ) -> Array:
+    def expose(self, stokes: Array, rng: np.random.Generator | None = None) -> Array:
         """Samples (H, W) of light ``(3, H, W)``, full scales; with noise where ``rng`` is given."""
         twice = 2.0 * np.radians(self.angle_deg)
         polarized = np.cos(twice) * stokes[1] + np.sin(twice) * stokes[2]
         light = 0.5 * self.gain * (stokes[0] + self.diattenuation * polarized)
         if rng is not None:
-            light = add_noise(np.maximum(light, 0), full_well=full_well, rng=rng)
+            light = add_noise(np.maximum(light, 0), rng=rng)
         return np.asarray(light + self.dark)
 
 
@@ -42,7 +41,7 @@ def faulty_sensor(
     shape: tuple[int, int],
     rng: np.random.Generator,
     *,
-    pattern: tuple[int, int, int, int] = (90, 45, 135, 0),
+    pattern: tuple[int, int, int, int] = CaptureOptions.pattern,
     gain_sigma: float = 0.02,
     angle_sigma_deg: float = 1.0,
     extinction_ratio: float = 50.0,

@@ -5,9 +5,9 @@ import pytest
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.geometry import RigidTransform
+from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.scene import View
 from polmvs.synthetic.captures import (
-    ANGLES_DEG,
     Cylinder,
     Group,
     Plane,
