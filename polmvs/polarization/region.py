@@ -31,6 +31,7 @@ class RegionTolerances:
     min_area_px : of a region, single pixels whatever the resolution. Guess.
     min_core_share : of a region: less means that it has run into the background. Guess.
     growth_px : reach of a round of growth is about three times this. Guess.
+    max_growth_rounds : Guess.
     mark_area_px : holes of up to this area are filled whatever they show (printed marks).
         Guess.
     mark_reach_px : marks are told from the mean intensity of the surface about them; deviation of
@@ -46,6 +47,7 @@ class RegionTolerances:
     min_area_px: int = 200
     min_core_share: float = 0.03
     growth_px: float = 15.0
+    max_growth_rounds: int = 6
     mark_area_px: float = 1500.0
     mark_reach_px: float = 8.0
     min_phase_jump: float = 0.12
@@ -151,9 +153,8 @@ def _grow(core: Mask, intensity: Image, texture: Image, *, tolerances: RegionTol
     textureless background) the core stays as it is.
     """
     flat = texture < tolerances.low_texture
-    before, grown = 0, core
-    while grown.sum() > 1.02 * before:
-        before = int(grown.sum())
+    grown = core
+    for _ in range(tolerances.max_growth_rounds):
         weight = smooth(grown.astype(np.float32), tolerances.growth_px)
         reference = smooth(np.where(grown, intensity, 0), tolerances.growth_px) / np.maximum(
             weight, 1e-6
@@ -164,7 +165,10 @@ def _grow(core: Mask, intensity: Image, texture: Image, *, tolerances: RegionTol
             & (intensity * tolerances.similar_intensity > reference)
             & (weight > 1e-3)
         )
+        before = int(grown.sum())
         grown = _touching(_open(grown | similar, 5), core)
+        if grown.sum() < 1.02 * before:
+            break
     grown = _substantial(
         _fill_holes(grown, texture, tolerances=tolerances),
         core,
