@@ -218,7 +218,7 @@ def fit_normals(
     """
     num = len(mesh.faces)
     normals, sigma = mesh.face_normals.copy(), np.full(num, np.inf)
-    misfit = np.zeros((num, 2))  # chi squared and degrees of freedom
+    chi_squared = np.zeros((num, 2))  # chi squared and degrees of freedom
     if not num:
         return FaceNormals(normals, sigma)
     scene, centers = RayScene(mesh), mesh.centers
@@ -247,9 +247,9 @@ def fit_normals(
         good &= estimate.residual < 3 * row_sigma
         normals[part][good] = estimate.normals[good]
         sigma[part][good] = estimate.sigma_deg[good]
-        misfit[part][good, 0] = _chi_squared(rows, rays, turns, estimate)[good]
-        misfit[part][good, 1] = np.maximum(estimate.num_rows[good] - 2, 0)
-    return FaceNormals(normals, sigma * np.sqrt(_misfit_ratio(mesh, misfit)))
+        chi_squared[part][good, 0] = _chi_squared(rows, rays, turns, estimate)[good]
+        chi_squared[part][good, 1] = np.maximum(estimate.num_rows[good] - 2, 0)
+    return FaceNormals(normals, sigma * np.sqrt(_excess_variance(mesh, chi_squared)))
 
 
 def _chi_squared(rows: Floats, rays: Floats, turns: Floats, estimate: NormalEstimate) -> Array:
@@ -259,15 +259,15 @@ def _chi_squared(rows: Floats, rays: Floats, turns: Floats, estimate: NormalEsti
     return np.asarray(np.nansum(estimate.row_weights * squares, axis=0))
 
 
-def _misfit_ratio(mesh: TriangleMesh, misfit: Array) -> Array:
+def _excess_variance(mesh: TriangleMesh, chi_squared: Array) -> Array:
     """Chi squared over degrees of freedom (F,), at least 1, from both (F, 2) about each face.
 
     A face has few degrees of freedom: those of its surroundings are counted with them, and as many
     as one row's of the whole surface.
     """
-    whole = misfit.sum(axis=0)
+    whole = chi_squared.sum(axis=0)
     expected = whole[0] / whole[1] if whole[1] else 1.0
-    about = _smoothed(mesh, misfit)
+    about = _smoothed(mesh, chi_squared)
     return np.maximum((about[:, 0] + expected) / (about[:, 1] + 1), 1.0)
 
 

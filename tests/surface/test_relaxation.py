@@ -71,7 +71,7 @@ def test_others_tie_the_nodes_to_their_common_surface(exact):
     assert len(np.unique(ties.seed)) == len(ties.seed)
 
 
-def test_one_opinion_is_none(exact):
+def test_one_other_view_ties_nothing(exact):
     """Its error would come back to the view as another's agreement."""
     scene, dense = exact
     nodes = nodes_of(scene)
