@@ -133,8 +133,9 @@ class RoundPlan:
 def plan_rounds(options: PropagationOptions) -> list[RoundPlan]:
     """``num_rounds`` on the coarsest lattice, then one on each finer one.
 
-    The last on the coarsest and those on finer ones are tied to the other views. The first ranges come from a few seeds and are wrong by centimetres on a curved part. Each view
-    mends its own fast; ties to others would hold it back.
+    The last on the coarsest and those on finer ones are tied to the other views. The first ranges
+    come from a few seeds and are wrong by centimetres on a curved part: each view mends its own
+    fast, and ties to others would hold it back.
     """
     coarse, *finer = [options.stride_px * factor for factor in REFINEMENTS]
     alone = [RoundPlan(coarse, False)] * (options.num_rounds - 1)
