@@ -11,6 +11,7 @@ from os import PathLike
 from typing import ClassVar
 
 MAX_REASON = 1000  # characters
+MAX_QUOTED = 120  # of these, of words that are a file's or another library's
 
 
 class PolmvsError(Exception):

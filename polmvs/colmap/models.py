@@ -32,7 +32,7 @@ from polmvs.colmap.cameras import (
     quiet_colmap,
     rescaled_camera,
 )
-from polmvs.errors import DataError
+from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.geometry import RigidTransform, nearest_rotation
 from polmvs.io.folders import new_folder, require_unicode
 from polmvs.scene import MAX_COORDINATE, SparseModel, Tracks, View, match_names, short_list
@@ -148,7 +148,7 @@ def _as_data_error(folder: Path) -> Iterator[None]:
         yield
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OverflowError) as error:
         # COLMAP's own words, shortened and without the place in its source.
-        reason = re.sub(r"\[[\w.]+:\d+\]", "", " ".join(str(error).split()))[:120].strip()
+        reason = re.sub(r"\[[\w.]+:\d+\]", "", " ".join(str(error).split()))[:MAX_QUOTED].strip()
         raise DataError(
             folder, f"is no sound COLMAP model ({reason or 'no reason given'}). Export it again."
         ) from error

@@ -16,10 +16,8 @@ import numpy as np
 from numpy import typing as npt
 from numpy.typing import NDArray
 
-from polmvs.errors import DataError
+from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.io.images import write_bytes
-
-MAX_REASON = 120  # characters of NumPy's words
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:
         stamp = path.stat().st_mtime_ns
         array = _map_array(path, stamp)
     except Exception as error:  # the header goes through Python's own parser
-        reason = " ".join(str(error).split())[:MAX_REASON]
+        reason = " ".join(str(error).split())[:MAX_QUOTED]
         raise DataError(
             path, f"cannot be read ({reason}); run again with `run.overwrite`."
         ) from error

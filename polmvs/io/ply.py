@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.errors import DataError
+from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.io.images import read_bytes, write_bytes
 
 MAX_HEADER_BYTES = 1 << 16
@@ -142,7 +142,7 @@ def read_ply_header(path: Path) -> PlyHeader:
             case [] | ["ply"] | ["end_header"] | ["comment", *_] | ["obj_info", *_]:
                 pass
             case _:
-                line = " ".join(words)[:60]
+                line = " ".join(words)[:MAX_QUOTED]
                 raise DataError(path, f"has a header line that no PLY has: {line!r}.")
     if order is None:
         raise DataError(path, "is no PLY file: its format is missing.")
@@ -161,7 +161,7 @@ def _with(path: Path, element: Element, name: str, kind: str, count: str = "") -
     """An element with a further column."""
     known = kind in TYPES and (not count or TYPES.get(count, "f")[0] in "ui")
     if not known or any(other.name == name for other in element.properties):
-        raise DataError(path, f"has a column {name[:40]!r} that no PLY has.")
+        raise DataError(path, f"has a column {name[:MAX_QUOTED]!r} that no PLY has.")
     column = Property(name, TYPES[kind], TYPES[count] if count else "")
     return element._replace(properties=(*element.properties, column))
 

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from polmvs.config import to_plain
+from polmvs.errors import MAX_QUOTED
 from polmvs.io.images import write_bytes
 
 T = TypeVar("T")
 Pairs = Callable[[list[tuple[str, Any]]], Any]
-
-MAX_SHOWN = 60  # characters of a file's own words in a message
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -94,7 +93,7 @@ def _decode_dataclass(kind: Any, value: Any, where: str) -> Any:
     hints = typing.get_type_hints(kind)
     names = {field.name for field in fields(kind)}
     if unknown := sorted(content.keys() - names):
-        raise ValueError(f"{_place(where)} has an unknown key {unknown[0][:MAX_SHOWN]!r}")
+        raise ValueError(f"{_place(where)} has an unknown key {unknown[0][:MAX_QUOTED]!r}")
     if missing := sorted(names - content.keys()):
         raise ValueError(f"{_place(where)} lacks {missing[0]!r}")
     return kind(
@@ -115,9 +114,9 @@ def _decode_tuple(elements: tuple[Any, ...], value: Any, where: str) -> tuple[An
 def _expect(value: Any, kind: Any, where: str) -> Any:
     """The value, if it is of that type; true and false are no numbers."""
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"{_place(where)} cannot be {str(value)[:40]!r}")
+        raise ValueError(f"{_place(where)} cannot be {str(value)[:MAX_QUOTED]!r}")
     return value
 
 
 def _place(where: str) -> str:
-    return where.lstrip(".")[:MAX_SHOWN] or "the file"
+    return where.lstrip(".")[:MAX_QUOTED] or "the file"

@@ -16,7 +16,7 @@ from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.sfm import NoModelError, SfmTolerances, run_sfm
 from polmvs.colmap.sfm_failure import why_no_model
 from polmvs.config import PropagationOptions, SfmOptions
-from polmvs.errors import DataError
+from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.io.arrays import save_array
 from polmvs.io.clouds import preload
 from polmvs.pipeline.monitor import OnProgress, no_progress
@@ -31,7 +31,6 @@ logger = logging.getLogger(__name__)
 # Of SQLite and of the system, in the last words of a process of COLMAP's.
 FULL_DISK = re.compile("disk I/O error|database or disk is full|No space left|readonly database")
 CANNOT_WRITE = "cannot be written: is the disk full?"
-MAX_SAID = 120  # characters of COLMAP's words
 NUM_SFM_STEPS = 4  # that run_sfm reports
 # Of views: under it most points of a surface are seen by two or three views, of which none can be
 # told to be wrong. Derived: as few as those whose tracks of two views SfM needs.
@@ -152,7 +151,7 @@ def _run_sfm(
     try:
         return run_sfm(images, names, work, new, options, on_step)
     except RuntimeError as error:
-        said = " ".join(str(error).split())[:MAX_SAID]
+        said = " ".join(str(error).split())[:MAX_QUOTED]
         raise DataError(new.parent.parent, f"{CANNOT_WRITE} COLMAP says: {said}") from error
 
 
