@@ -15,6 +15,9 @@ MEDIAN_OF_NORMAL = 0.6745  # median of |x|, x normal of unit deviation
 # Of an outlier's residual over the median one. Of normal residuals in one, two and three dimensions
 # 5 medians are 3.4, 5.9 and 7.7 deviations.
 OUTLIER_RATIO = 5.0
+# Deviations of a normal distribution that are not by chance: one of 16,000 is farther, to one side
+# one of 30,000.
+BEYOND_CHANCE = 4.0
 
 
 def cauchy_weights(squares: Floats, scale: float | Floats = CAUCHY_SCALE) -> Floats:

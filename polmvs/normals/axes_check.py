@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import AngleModel, CaptureKind, CaptureOptions, NormalOptions
+from polmvs.fitting import BEYOND_CHANCE
 from polmvs.normals.estimator import NormalEstimate
 from polmvs.normals.light import row_costs
 from polmvs.normals.rows import AS_MEASURED, Reading, gather_rows_under
@@ -45,9 +46,6 @@ class VoteTolerances:
         tell.
     min_votes : points. Guess.
     min_share : of them, that speak for the other setting. Guess.
-    min_z : mean vote over its standard error: by chance once in 30,000 captures. Guess: points on
-        one surface see the same light, so that their votes are worth fewer than their number.
-        Right settings of nine captures had -2.3 to -46.
     min_gain : mean vote on angles, log-likelihood of a row. Guess: noise alone gives a few
         hundredths.
     """
@@ -55,7 +53,6 @@ class VoteTolerances:
     min_rows: int = 4
     min_votes: int = 8
     min_share: float = 0.7
-    min_z: float = 4.0
     min_gain: float = 0.2
 
 
@@ -139,11 +136,16 @@ def check_axes(
 
 
 def is_clear(votes: Array, t: VoteTolerances) -> bool:
-    """Whether the votes (N,) of points clearly are for another setting: most positive, and far."""
+    """Whether the votes (N,) of points clearly are for another setting: most positive, and far.
+
+    Far is not by chance in standard errors of the mean: right settings of nine captures had -2.3
+    to -46. Points on one surface see the same light, so that a guess remains in it: their votes are
+    worth fewer than their number.
+    """
     if len(votes) < t.min_votes:
         return False
     error = float(votes.std(ddof=1)) / np.sqrt(len(votes))
-    return bool(votes.mean() > t.min_z * error and np.mean(votes > 0) > t.min_share)
+    return bool(votes.mean() > BEYOND_CHANCE * error and np.mean(votes > 0) > t.min_share)
 
 
 def changed_pattern(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.fitting import cauchy_weights, robust_deviation
+from polmvs.fitting import BEYOND_CHANCE, cauchy_weights, robust_deviation
 from polmvs.polarization.mosaic import clipped_cells, split_mosaic
 from polmvs.polarization.stokes import patch_means
 
@@ -39,8 +39,6 @@ class LinearityTolerances:
     num_rounds : of weights and exponents; the exponent converges quadratically.
     num_groups : of patches, neighbours together, each of which is left out once (jackknife), as is
         each image.
-    min_z : of the logarithm of the two gammas' ratio, in its standard deviations. Derived: by
-        chance once in 16,000 captures.
     min_ratio : of the two gammas, whatever the certainty. Guess: the degree of polarisation is off
         by as much. Real sensors are linear to some percent.
     max_log_sigma : of the gamma's logarithm, for an estimate to be named. Guess.
@@ -52,7 +50,6 @@ class LinearityTolerances:
     min_quadratic: float = 0.0035
     num_rounds: int = 4
     num_groups: int = 8
-    min_z: float = 4.0
     min_ratio: float = 1.25
     max_log_sigma: float = 0.15
 
@@ -126,7 +123,7 @@ def check_linearity(
     if not sigma < t.max_log_sigma or not abs(log_gamma) < np.log(10.0):
         return unknown
     apart = abs(log_gamma - np.log(gamma))
-    fits = bool(apart < max(t.min_z * sigma, np.log(t.min_ratio)))
+    fits = bool(apart < max(BEYOND_CHANCE * sigma, np.log(t.min_ratio)))
     return LinearityCheck(
         given=gamma, found=float(np.exp(log_gamma)), log_sigma=float(sigma), fits=fits
     )

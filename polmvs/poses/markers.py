@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
 from polmvs.camera import Camera, sample_image, xy_from_opencv
+from polmvs.colmap.sfm import COLMAP_DEFAULTS
 from polmvs.errors import DataError, OptionError
-from polmvs.fitting import MEDIAN_OF_NORMAL, cauchy_weights, like_most
+from polmvs.fitting import BEYOND_CHANCE, MEDIAN_OF_NORMAL, cauchy_weights, like_most
 from polmvs.geometry import intersect_rays
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.poses.alignment import MAX_STARTS
@@ -65,12 +66,12 @@ class TriangulationTolerances:
     huber_px : of the robust loss, and a view's error that is always allowed. Derived: a keypoint's
         deviation, which is beyond the noise of a refined corner (0.1 px) and of a usual pose
         (0.3 px).
-    max_residual_px : error that never is allowed; COLMAP too drops observations beyond this.
+    max_residual_px : error that never is allowed. Derived: COLMAP drops observations beyond this.
     min_sigma_px : of a corner; a guess: few residuals can be small by chance.
     """
 
     huber_px: float = KEYPOINT_SIGMA_PX
-    max_residual_px: float = 4.0
+    max_residual_px: float = COLMAP_DEFAULTS.filter_max_reproj_error
     min_sigma_px: float = 0.05
 
 
@@ -80,19 +81,17 @@ class ScaleTolerances:
 
     Attributes
     ----------
-    num_sigmas : standard deviations that they may differ by; derived: one pair in 16,000 of
-        normal errors does.
-    floor : relative difference that is always allowed; a guess, paper and print are no better.
+    floor : relative difference that is always allowed, beside what chance makes of the deviations;
+        a guess, paper and print are no better.
     max_relative_sigma : of a marker's side; a guess.
     """
 
-    num_sigmas: float = 4.0
     floor: float = 0.01
     max_relative_sigma: float = 0.1
 
     def allowed(self, relative_sigma: float) -> float:
         """Relative difference that is allowed at a standard deviation of it."""
-        return max(self.num_sigmas * relative_sigma, self.floor)
+        return max(BEYOND_CHANCE * relative_sigma, self.floor)
 
 
 @dataclass(frozen=True)
@@ -563,7 +562,7 @@ def _square(marker_id: int, seen: Sequence[Detection], result: Triangulation) ->
 
 def _require_square(squares: Sequence[_Square], source: str, tolerances: ScaleTolerances) -> None:
     for square in squares:
-        allowed = np.maximum(tolerances.num_sigmas * square.sigmas, tolerances.floor * square.side)
+        allowed = np.maximum(BEYOND_CHANCE * square.sigmas, tolerances.floor * square.side)
         if (np.abs(square.lengths - square.side) > allowed).any():
             shares = ", ".join(f"{100 * share:.1f}" for share in square.lengths / square.side)
             raise DataError(

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import AngleModel
-from polmvs.fitting import CAUCHY_SCALE, annealed_scales, robust_deviation
+from polmvs.fitting import BEYOND_CHANCE, CAUCHY_SCALE, annealed_scales, robust_deviation
 from polmvs.normals.estimator import smallest_eigenvectors
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
@@ -52,8 +52,6 @@ class PlaneTolerances:
     max_step : rad, of a Gauss-Newton step. Guess.
     median_pixels : of which a median is taken, at least; time only.
     min_deviation : in units of sigma: keeps exact data from a division by zero.
-    outlier_deviations : robust ones, from which a pixel is an outlier. Derived: 1 of 16,000
-        right ones.
     """
 
     coarse_pixels: int = 16384
@@ -64,7 +62,6 @@ class PlaneTolerances:
     max_step: float = 0.3
     median_pixels: int = 32768
     min_deviation: float = 0.01
-    outlier_deviations: float = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +84,7 @@ class PlaneEstimate:
     rmse_deg, median_deg : root mean square, and median of the absolute, phase residual (measured
         minus predicted by ``normal``), degrees.
     num_pixels : pixels used, outliers included.
-    outlier_share : share of the pixels with a residual beyond 4 robust deviations.
+    outlier_share : share of the pixels with a residual beyond what chance makes.
     """
 
     normal: Array
@@ -243,7 +240,7 @@ def _describe(
     step = max(1, num // tolerances.median_pixels)
     some = np.abs(equations.errors[::step])
     normalized = some * np.sqrt(samples[4, ::step])
-    limit = tolerances.outlier_deviations * residual_scale(normalized, tolerances=tolerances)
+    limit = BEYOND_CHANCE * residual_scale(normalized, tolerances=tolerances)
     return PlaneEstimate(
         normal=normal,
         valid=valid,
