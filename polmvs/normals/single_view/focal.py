@@ -25,7 +25,9 @@ from scipy.optimize import minimize_scalar
 from polmvs.config import AngleModel, Light
 from polmvs.fitting import CAUCHY_SCALE, cauchy_weights
 from polmvs.normals.single_view.plane import (
+    EXACT,
     PlaneEstimate,
+    PlaneTolerances,
     error_gradients,
     phase_errors,
     plane_normal,
@@ -45,19 +47,13 @@ class FocalTolerances:
 
     Attributes
     ----------
-    num_pixels : that are used of the given ones, at least if there are as many; time only.
     num_focals : of the scan. Guess.
-    num_runs : of pixels from whose scatter the uncertainty is taken. Guess.
-    min_eigenvalue : of the scaled normal equations: flatter is not observable. Guess.
     log_step : of the numerical derivative on the logarithm of the focal length.
     max_log_sigma : relative deviation from which a focal length counts as not observable.
         Guess.
     """
 
-    num_pixels: int = 20_000
     num_focals: int = 20
-    num_runs: int = 32
-    min_eigenvalue: float = 1e-6
     log_step: float = 0.01
     max_log_sigma: float = 0.2
 
@@ -151,7 +147,7 @@ def estimate_focal(
     shortest, longest = focal_range_px
     if not 0 < shortest < longest:
         raise ValueError(f"{focal_range_px=} but expected 0 < shortest < longest.")
-    view = _pick(angle_model, parameters, offsets_px, sigma, light, tolerances=tolerances)
+    view = _pick(angle_model, parameters, offsets_px, sigma, light)
     focals = np.geomspace(shortest, longest, tolerances.num_focals)
     planes = []
     for index, focal in enumerate(focals):
@@ -185,8 +181,6 @@ def _pick(
     offsets_px: Floats,
     sigma: Floats,
     light: Light,
-    *,
-    tolerances: FocalTolerances,
 ) -> _View:
     """Evenly spaced ones of the polarised pixels that are known."""
     if parameters.shape != (3, len(sigma)) or offsets_px.shape != (2, len(sigma)):
@@ -196,7 +190,7 @@ def _pick(
         )
     polarized = np.abs(parameters[1]) + np.abs(parameters[2])
     usable = np.flatnonzero((polarized > 0) & (sigma > 0) & (polarized + sigma < np.inf))
-    usable = usable[:: max(1, len(usable) // tolerances.num_pixels)]
+    usable = usable[:: max(1, len(usable) // PlaneTolerances.some_pixels)]
     return _View(parameters[:, usable], offsets_px[:, usable], sigma[usable], angle_model, light)
 
 
@@ -220,7 +214,10 @@ def _refine(view: _View, shortest: float, longest: float, scale: float) -> float
 def _log_sigma(
     view: _View, focal: float, normal: Array, scale: float, *, tolerances: FocalTolerances
 ) -> float:
-    """Deviation of the logarithm of the focal length, the normal being free as well."""
+    """Deviation of the logarithm of the focal length, the normal being free as well.
+
+    Infinite where the equations are as flat as rounding makes them.
+    """
     step = float(np.exp(tolerances.log_step))
     error = view.errors(focal, normal)
     slope = (view.errors(focal * step, normal) - view.errors(focal / step, normal)) / (
@@ -233,10 +230,10 @@ def _log_sigma(
     matrix = weighted @ gradients.T
     # Dividing by the diagonal first makes the test for a flat direction independent of units.
     size = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
-    if np.linalg.eigvalsh(matrix / np.outer(size, size))[0] < tolerances.min_eigenvalue:
+    if np.linalg.eigvalsh(matrix / np.outer(size, size))[0] < EXACT:
         return np.inf
     inverse = np.linalg.inv(matrix)
-    runs = np.array_split(np.arange(len(error)), min(tolerances.num_runs, len(error)))
+    runs = np.array_split(np.arange(len(error)), min(PlaneTolerances.num_runs, len(error)))
     influence = np.array([weighted[:, run] @ error[run] for run in runs]) @ inverse[2]
     scatter = influence @ influence * len(runs) / max(len(runs) - 3, 1)
     return float(np.sqrt(max(scatter, inverse[2, 2])))

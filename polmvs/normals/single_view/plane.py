@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from polmvs.config import AngleModel
 from polmvs.fitting import BEYOND_CHANCE, CAUCHY_SCALE, annealed_scales, robust_deviation
-from polmvs.normals.estimator import smallest_eigenvectors
+from polmvs.normals.estimator import EstimatorTolerances, smallest_eigenvectors
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Array: TypeAlias = NDArray[np.float64]
@@ -36,6 +36,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 CHUNK = 8192  # pixels worked on at a time: the temporaries stay in the cache
 TINY = 1e-12
+EXACT = float(np.finfo(np.float32).eps)  # of angles: what their rounding leaves
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,24 +45,22 @@ class PlaneTolerances:
 
     Attributes
     ----------
-    coarse_pixels : that the first rounds take, at least; time only.
-    coarse_rounds : on these. Guess.
+    some_pixels : evenly spread, that the first rounds, medians and the search for a focal length
+        take, at least; time only.
+    coarse_rounds : on these. Derived: those of normals from many views.
     fine_rounds : over all pixels. Guess.
-    num_runs : of pixels from whose scatter the covariance is taken, at least. Guess.
-    min_conditioning : ratio of singular values under which rows have rank 1. Guess.
+    num_runs : of pixels from whose scatter a covariance is taken, at least. Guess.
+    min_conditioning : ratio of singular values under which rows have rank 1. Derived: that of
+        normals from many views.
     max_step : rad, of a Gauss-Newton step. Guess.
-    median_pixels : of which a median is taken, at least; time only.
-    min_deviation : in units of sigma: keeps exact data from a division by zero.
     """
 
-    coarse_pixels: int = 16384
-    coarse_rounds: int = 6
+    some_pixels: int = 20_000
+    coarse_rounds: int = EstimatorTolerances.num_rounds
     fine_rounds: int = 2
     num_runs: int = 32
-    min_conditioning: float = 0.01
+    min_conditioning: float = EstimatorTolerances.min_conditioning
     max_step: float = 0.3
-    median_pixels: int = 32768
-    min_deviation: float = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,18 +137,13 @@ def plane_normal(
             None,
             tolerances=tolerances,
         )
-    coarse = np.ascontiguousarray(samples[:, :: max(1, num // tolerances.coarse_pixels)])
+    coarse = np.ascontiguousarray(samples[:, :: max(1, num // tolerances.some_pixels)])
     normal = _eigenvector(angle_model, coarse)
     if initial_normal is not None:
         normal = np.array(initial_normal, np.float64)
     scale = CAUCHY_SCALE
-    for loss_scale in annealed_scales(
-        tolerances.coarse_rounds, num_final=tolerances.coarse_rounds - 2
-    ):
-        scale = (
-            residual_scale(phase_errors(normal, coarse) * np.sqrt(coarse[4]), tolerances=tolerances)
-            * loss_scale
-        )
+    for loss_scale in annealed_scales(tolerances.coarse_rounds):
+        scale = residual_scale(phase_errors(normal, coarse) * np.sqrt(coarse[4])) * loss_scale
         normal = _improve(normal, normal_equations(normal, coarse, scale), tolerances=tolerances)
     for _ in range(tolerances.fine_rounds):
         normal = _improve(normal, normal_equations(normal, samples, scale), tolerances=tolerances)
@@ -189,11 +183,9 @@ def _eigenvector(angle_model: AngleModel, samples: Floats) -> Array:
     return smallest_eigenvectors(entries[:, None])[1][:, 0]
 
 
-def residual_scale(
-    normalized_errors: Floats, *, tolerances: PlaneTolerances = PlaneTolerances()
-) -> float:
-    """Deviation of errors, from the median of their size; at least ``MIN_DEVIATION``."""
-    return max(robust_deviation(normalized_errors), tolerances.min_deviation)
+def residual_scale(normalized_errors: Floats) -> float:
+    """Deviation of errors, from the median of their size; that of exact data is its rounding."""
+    return max(robust_deviation(normalized_errors), EXACT)
 
 
 def _improve(normal: Array, equations: NormalEquations, *, tolerances: PlaneTolerances) -> Array:
@@ -237,10 +229,10 @@ def _describe(
         in_plane = _covariance(equations, across / eigenvalues[:, None])
         covariance = across.T @ in_plane @ across
         sigma = float(np.sqrt(np.linalg.eigvalsh(in_plane)[-1]))
-    step = max(1, num // tolerances.median_pixels)
+    step = max(1, num // tolerances.some_pixels)
     some = np.abs(equations.errors[::step])
     normalized = some * np.sqrt(samples[4, ::step])
-    limit = BEYOND_CHANCE * residual_scale(normalized, tolerances=tolerances)
+    limit = BEYOND_CHANCE * residual_scale(normalized)
     return PlaneEstimate(
         normal=normal,
         valid=valid,

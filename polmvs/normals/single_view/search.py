@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from polmvs.config import AngleModel
 from polmvs.normals.single_view.plane import (
     PlaneEstimate,
+    PlaneTolerances,
     phase_errors,
     phase_residuals,
     plane_normal,
@@ -41,8 +42,6 @@ class SearchTolerances:
     num_hypotheses : pairs of rows per plane. Guess.
     num_scored : blocks on which they are scored. Guess; time only.
     num_refined : of the best hypotheses that are refined. Guess.
-    max_reach : blocks between the two of a pair, at most. Guess.
-    min_cross : sine of the angle between the two rows of a pair, at least. Guess.
     coherence_blocks : side of the window in which most blocks have to agree. Guess.
     coherent_share : of that window. Derived: the majority, with a margin.
     model_sigma : rad; error of a block's phase that does not average out. Guess.
@@ -51,8 +50,6 @@ class SearchTolerances:
     num_hypotheses: int = 400
     num_scored: int = 2000
     num_refined: int = 8
-    max_reach: int = 40
-    min_cross: float = 0.02
     coherence_blocks: int = 5
     coherent_share: float = 0.6
     model_sigma: float = 0.01
@@ -203,7 +200,7 @@ def _best_plane(
 ) -> tuple[Array, Mask]:
     """The best hypothesis about the blocks left, refined, and its coherent support."""
     best, support = np.full(3, np.nan), np.zeros_like(left)
-    for hypothesis in _hypotheses(blocks, left, limit, rng, tolerances=tolerances):
+    for hypothesis in _hypotheses(blocks, left, limit, min_blocks, rng, tolerances=tolerances):
         normal: Array = hypothesis
         inside = _coherent(
             blocks.residuals(normal) < limit, left, min_blocks // 2, tolerances=tolerances
@@ -224,6 +221,7 @@ def _hypotheses(
     blocks: _Blocks,
     left: Mask,
     limit: Floats,
+    min_blocks: int,
     rng: np.random.Generator,
     *,
     tolerances: SearchTolerances,
@@ -236,12 +234,14 @@ def _hypotheses(
     height, width = left.shape
     where = np.argwhere(left)
     first = where[rng.integers(len(where), size=tolerances.num_hypotheses)]
-    reach = np.geomspace(4, tolerances.max_reach, tolerances.num_hypotheses)[:, None]
+    # Up to the side of the least plane there is.
+    reach = np.geomspace(4, np.sqrt(min_blocks), tolerances.num_hypotheses)[:, None]
     second = first + np.rint(rng.uniform(-1, 1, first.shape) * reach).astype(np.int64)
     second = np.clip(second, 0, [height - 1, width - 1])
     normals = np.cross(rows[tuple(first.T)], rows[tuple(second.T)])
     length = np.linalg.norm(normals, axis=1)
-    usable = left[tuple(second.T)] & (length > tolerances.min_cross)
+    # The sine of the angle between two rows is twice their conditioning.
+    usable = left[tuple(second.T)] & (length > 2 * PlaneTolerances.min_conditioning)
     normals = normals[usable] / length[usable, None]
     some = left[blocks.known]
     samples = stack_samples(
