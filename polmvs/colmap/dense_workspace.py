@@ -36,7 +36,7 @@ from polmvs.errors import DataError
 from polmvs.geometry import SimilarityTransform, align_points, rotation_angle
 from polmvs.io.folders import new_folder
 from polmvs.io.images import read_gray, write_bytes, write_png
-from polmvs.scene import SparseModel, Tracks, View, short_list
+from polmvs.scene import KEYPOINT_SIGMA_PX, SparseModel, Tracks, View, short_list
 
 PathArg = str | PathLike[str]
 Array = NDArray[np.float64]
@@ -59,7 +59,7 @@ class MatchTolerances:
     Attributes
     ----------
     max_pose_error_px : by which a pose may move a point of the scene; derived: depth cannot tell
-        poses apart by less than half a pixel, and models that went through text files differ by
+        poses apart by less than a keypoint errs, and models that went through text files differ by
         their rounding.
     min_correlation : of the local contrast of two images; derived: from here each explains half
         of the other one's variance. Images of other things explain nothing, the same image nearly
@@ -73,10 +73,10 @@ class MatchTolerances:
     min_common_share : of the compared image that both must show; a guess.
     """
 
-    max_pose_error_px: float = 0.5
+    max_pose_error_px: float = KEYPOINT_SIGMA_PX
     min_correlation: float = float(np.sqrt(0.5))
     max_compared_px: int = 256
-    max_compared_views: int = 8
+    max_compared_views: int = 6
     fine_sigma_px: float = 1.0
     coarse_sigma_px: float = 8.0
     dark_level: float = 4.0

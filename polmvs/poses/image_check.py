@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.colmap.dense_workspace import MatchTolerances
 from polmvs.errors import DataError
 from polmvs.polarization.capture import WHITE_PERCENTILE, Capture, intensity_image_8bit
 from polmvs.scene import View
@@ -31,7 +32,8 @@ class ImageCheckTolerances:
 
     Attributes
     ----------
-    max_views : that are looked at, evenly spread; costs time only.
+    max_views : that are looked at, evenly spread; costs time only. Derived: as many
+        as are compared with a dense workspace.
     max_features : of an image, the strongest; costs time only.
     max_ratio : of the distances of the best and the next descriptor. Lowe's own advice.
     epipolar_px : of a match from the geometry that its pair's own matches have. Guess; features
@@ -39,7 +41,6 @@ class ImageCheckTolerances:
     min_matches : of a pair that one geometry explains. Derived: eight fix a geometry, and of the
         20 to 100 false matches of unrelated images 8 to 15 fit the best one (simulated).
     min_share : of a pair's matches that one geometry explains. Guess.
-    min_total : matches of all pairs, to say anything. Guess.
     max_distance : of a match from the given cameras' epipolar line, as a share of the image's
         diagonal: what poses may err and still be those of the images. Guess. By chance 2 to 4 % of
         the matches lie so near.
@@ -48,13 +49,12 @@ class ImageCheckTolerances:
         their own (least where a pattern repeats), 0.00 to 0.16 where they are not; a guess between.
     """
 
-    max_views: int = 6
+    max_views: int = MatchTolerances.max_compared_views
     max_features: int = 1500
     max_ratio: float = 0.75
     epipolar_px: float = 2.0
     min_matches: int = 20
     min_share: float = 0.5
-    min_total: int = 40
     max_distance: float = 0.01
     min_fitting: float = 0.3
 
@@ -120,7 +120,7 @@ def fit_to_images(
         if matches is not None:
             distances.append(_epipolar_distances(first, second, *matches))
     shares = np.concatenate(distances)
-    if len(shares) < t.min_total:
+    if len(shares) < 2 * t.min_matches:  # one pair alone tells little
         return ImageFit(num_matches=len(shares), fitting=float("nan"), fits=None)
     fitting = float(np.mean(shares < t.max_distance))
     return ImageFit(num_matches=len(shares), fitting=fitting, fits=fitting >= t.min_fitting)
