@@ -27,6 +27,7 @@ MIN_FACING_COSINE = 0.1
 # squares lose all that matters, or overflow, and no measurement lies there.
 MAX_COORDINATE = 1e12
 MIN_DISTANCE = 1e-12
+MIN_VIEWS = 3  # of a point, a normal, a shape: two always agree, right or wrong
 MAX_NAMES_SHOWN = 5
 
 

@@ -32,7 +32,7 @@ from polmvs.normals.tracks import (
     window_maps,
 )
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Tracks
+from polmvs.scene import MIN_VIEWS, Tracks
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -60,7 +60,7 @@ class LightTolerances:
     widening : of the distances beyond those of the scene's points, factor. Guess.
     """
 
-    min_rows: int = 3
+    min_rows: int = MIN_VIEWS
     max_row_cost: float = 4.0
     diffuse_dolp: float = 0.4
     dolp_votes: float = 20.0

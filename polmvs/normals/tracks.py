@@ -22,7 +22,7 @@ from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import MIN_FACING_COSINE, Seeds, Tracks, point_sigmas, some_tracks
+from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -254,7 +254,7 @@ def select_seeds(
     """
     good = (
         estimate.valid
-        & (estimate.num_rows >= 3)
+        & (estimate.num_rows >= MIN_VIEWS)
         & (estimate.sigma_deg < tolerances.max_sigma_deg)
         & (estimate.residual < np.sin(np.radians(tolerances.max_sigma_deg)))
     )

@@ -28,10 +28,11 @@ from polmvs.pipeline.stage_table import (
 )
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.evaluation import evaluate_models
-from polmvs.pipeline.stages.maps import MIN_VIEWS, MapsResult
+from polmvs.pipeline.stages.maps import MapsResult
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
 from polmvs.polarization.capture import open_capture
+from polmvs.scene import MIN_VIEWS
 
 R = TypeVar("R")
 

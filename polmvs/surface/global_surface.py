@@ -22,7 +22,7 @@ from polmvs.geometry import lengths
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Seeds, View
+from polmvs.scene import MIN_VIEWS, Seeds, View
 from polmvs.surface.creases import (
     corner_normals,
     sharpened,
@@ -74,7 +74,7 @@ from polmvs.surface.surface_quality import (
     stand_apart,
     supported_faces,
 )
-from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, surface_view
+from polmvs.surface.surface_view import SurfaceView, surface_view
 from polmvs.surface.visual_hull import (
     HullTolerances,
     Plane,

@@ -22,7 +22,7 @@ from scipy import ndimage
 from polmvs.camera import in_frame, sample_image
 from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import KEYPOINT_SIGMA_PX, Seeds
+from polmvs.scene import KEYPOINT_SIGMA_PX, MIN_VIEWS, Seeds
 from polmvs.surface.borders import cells_beside
 from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.mesh_geometry import MAX_CELLS
@@ -42,7 +42,6 @@ from polmvs.surface.offsets import (
     snapped_border,
 )
 from polmvs.surface.refinement import RefinementTolerances
-from polmvs.surface.surface_view import MIN_VIEWS
 from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]

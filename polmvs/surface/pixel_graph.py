@@ -12,7 +12,7 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.normals.estimator import NormalEstimate
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Seeds
+from polmvs.scene import MIN_VIEWS, Seeds
 from polmvs.surface.dense_view import NUM_NEAREST, REACH, SurfaceSamples
 from polmvs.surface.log_range import (
     MAX_GRAZING,
@@ -21,7 +21,6 @@ from polmvs.surface.log_range import (
     log_range_increment,
     slope_sigma,
 )
-from polmvs.surface.surface_view import MIN_VIEWS
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]

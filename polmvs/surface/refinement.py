@@ -24,9 +24,10 @@ from polmvs.config import AngleModel, default_num_workers
 from polmvs.fitting import CAUCHY_SCALE, annealed_scales, robust_deviation
 from polmvs.geometry import dots, lengths, unit_or_zero
 from polmvs.normals.estimator import smallest_eigenvectors
+from polmvs.scene import MIN_VIEWS
 from polmvs.surface.creases import CreaseTolerances, crease_vertices
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, visible_points
-from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, phase_rows
+from polmvs.surface.surface_view import SurfaceView, phase_rows
 
 logger = logging.getLogger(__name__)
 

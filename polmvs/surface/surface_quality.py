@@ -17,7 +17,7 @@ from polmvs.config import AngleModel
 from polmvs.fitting import robust_deviation
 from polmvs.geometry import dots
 from polmvs.normals.estimator import NormalEstimate, solve_normals
-from polmvs.scene import MIN_FACING_COSINE
+from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS
 from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.dense_view import lattice_xy
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
@@ -28,7 +28,7 @@ from polmvs.surface.refinement import (
     certain_rays,
     face_rows,
 )
-from polmvs.surface.surface_view import MIN_VIEWS, SurfaceView, phase_rows
+from polmvs.surface.surface_view import SurfaceView, phase_rows
 from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]

@@ -24,7 +24,6 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 REFERENCE_FOCAL_PX = 445.0  # of the images that lengths on the image were chosen on
-MIN_VIEWS = 3  # that a shape, a normal, a comparison need: two agree by chance
 FIELD_SMOOTHING_PX = 0.8  # of the distance to a silhouette; takes the steps of its pixels out
 FAR_PX = 1000.0  # distance to a silhouette that the view does not have
 

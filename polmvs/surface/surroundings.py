@@ -30,6 +30,7 @@ from polmvs.polarization.phase_map import PhaseMap, open_phase_map
 from polmvs.scene import (
     KEYPOINT_SIGMA_PX,
     MIN_FACING_COSINE,
+    MIN_VIEWS,
     Tracks,
     View,
     point_sigmas,
@@ -79,7 +80,7 @@ class SurroundingsTolerances:
     min_window_share : of a plane's lattice points that are known. Guess.
     """
 
-    min_observations: int = 3
+    min_observations: int = MIN_VIEWS
     max_relative_sigma: float = 0.005
     min_angle_deg: float = 5.0
     max_angle_deg: float = 25.0

@@ -38,12 +38,11 @@ from polmvs.polarization.phase_map import (
     turned,
 )
 from polmvs.polarization.region import find_region
-from polmvs.scene import Tracks, View
+from polmvs.scene import MIN_VIEWS, Tracks, View
 
 logger = logging.getLogger(__name__)
 
 MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are held together
-MIN_VIEWS = 3  # of normals: with two there is nothing left to check them by
 
 
 @dataclass(frozen=True, kw_only=True)
