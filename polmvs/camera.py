@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 MAX_OPENCV_COORDINATE = 32000.0  # of cv2.remap, px
+MAX_SIDE = 1 << 16  # of an image, px; a guess, more is damage
 OUTSIDE = np.float32(-10.0)
 
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from scipy import sparse
 
@@ -49,6 +50,7 @@ IMAGES, SPARSE, STEREO = "images", "sparse", "stereo"
 DEPTH_MAPS, NORMAL_MAPS, GRAPHS = "depth_maps", "normal_maps", "consistency_graphs"
 FUSION_FILE, PATCH_MATCH_FILE = "fusion.cfg", "patch-match.cfg"
 GEOMETRIC, PHOTOMETRIC = "geometric", "photometric"
+FUSED_NORMAL_DEG = pycolmap.StereoFusionOptions().max_normal_error  # between views
 NUM_SOURCES = 20  # as many as COLMAP's own undistorter asks for
 
 

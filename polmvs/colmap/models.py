@@ -25,7 +25,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polmvs.camera import Camera
+from polmvs.camera import MAX_SIDE, Camera
 from polmvs.colmap.cameras import (
     camera_from_colmap,
     camera_to_colmap,
@@ -41,7 +41,6 @@ PathArg = str | PathLike[str]
 
 logger = logging.getLogger(__name__)
 
-MAX_SIDE = 1 << 16  # of an image, px; a guess, more is damage
 MAX_PARAM = 1e9  # of a camera's parameters; a guess as well
 MODEL_FILES = ("cameras", "images", "points3D")  # rigs and frames came with COLMAP 3.12
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.camera import MAX_SIDE
 from polmvs.errors import DataError
 from polmvs.io.arrays import map_array, save_array
 from polmvs.surface.log_range import log_range_increment
@@ -18,7 +19,6 @@ Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-MAX_STRIDE = 1 << 16  # px, more than any image has
 NUM_NEAREST = 4  # known points that a point of the surface between them is made of
 REACH = 2.0  # their spacings, from them to what they tell of: a cell's diagonal, with a margin
 MEMBERS = ("range", "normals", "sigma_deg", "sigma", "confidence")  # of a stored view
@@ -233,7 +233,7 @@ def find_dense_view(path: Path) -> DenseView | None:
     if not _member(path, "stride").is_file():
         return None
     stride = map_array(_member(path, "stride"), np.integer)
-    if stride.shape != () or not 0 < int(stride) < MAX_STRIDE:
+    if stride.shape != () or not 0 < int(stride) < MAX_SIDE:
         raise DataError(_member(path, "stride"), "holds no stride; run again with `run.overwrite`.")
     return open_dense_view(int(stride), path)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from polmvs.colmap.dense_workspace import DenseWorkspace, WorkspaceView
+from polmvs.colmap.dense_workspace import FUSED_NORMAL_DEG, DenseWorkspace, WorkspaceView
 from polmvs.colmap.maps import map_pixel_xy
 from polmvs.config import PropagationOptions
 from polmvs.neighbors import voxel_of_each
@@ -32,13 +32,13 @@ class KeptDepthTolerances:
     min_agreement : share of the points that have a second view, below which the maps are doubted;
         a guess: COLMAP keeps what other views confirm, so that most have one, and hardly one by
         chance where the maps are of another unit or frame than the poses.
-    normal_sigma_deg : that COLMAP's fusion allows between views.
+    normal_sigma_deg : that COLMAP's fusion allows between views. Derived: its own default.
     clearance_px : from the polarised surface; a guess.
     """
 
     stride_px: int = PropagationOptions.stride_px
     min_agreement: float = 0.1
-    normal_sigma_deg: float = 10.0
+    normal_sigma_deg: float = FUSED_NORMAL_DEG
     clearance_px: float = 6.0
 
 

@@ -37,16 +37,14 @@ class GraphTolerances:
     normal_error : systematic error of multi-view normals between nodes an angle apart, rad, times
         the root of that angle. Errors of edges count as independent: that of denser ones must be
         larger to add up to the same. Measured on the shared captures: 0.012 rad at 0.0135 rad.
-    min_seed_cosine : between the normals of a seed and of a node it is tied to: 5.7 deg.
-        Guess.
     crease_factor : by which a crease turns the normal more than noise or local curvature does.
         Derived: on a cylinder half of the edges of a lattice turn, their local mean is a
         quarter of a turn, which must pass.
-    filled_sigma : rad, of a normal taken from the neighbours, and from which one is. Guess.
+    filled_sigma : rad, of a normal taken from the neighbours, and from which one is: what errs by
+        more tells nothing. Seeds whose normal is as far from a node's are of another face. Guess.
     """
 
     normal_error: float = 0.0014
-    min_seed_cosine: float = 0.995
     crease_factor: float = 5.0
     filled_sigma: float = 0.1
 
@@ -237,7 +235,7 @@ def tie_seeds(
         chord = node_normals + np.where(known, seed_normals, node_normals)
         step = log_range_increment(chord, rays, node_rays)
         # A seed of another surface, hidden behind this one, has another normal.
-        alike = ~((seed_normals * node_normals).sum(axis=-1) < tolerances.min_seed_cosine)
+        alike = ~((seed_normals * node_normals).sum(axis=-1) < np.cos(tolerances.filled_sigma))
     ok = visible[seed] & alike & (gap < REACH * nodes.spacing_px) & np.isfinite(step)
     seed, node, gap, step = seed[ok], node[ok], gap[ok], step[ok]
     footprint = 1 / phase_map.view.camera.mean_focal_px

@@ -21,6 +21,7 @@ from polmvs.geometry import dots, unit_or_zero
 from polmvs.io.clouds import Cloud, Mesh, solve_poisson
 from polmvs.neighbors import are_usual, point_spacings
 from polmvs.scene import PointKind
+from polmvs.surface.dense_view import NUM_NEAREST
 from polmvs.surface.mesh_geometry import TriangleMesh
 
 Array = NDArray[np.float64]
@@ -38,7 +39,6 @@ class MeshTolerances:
 
     Attributes
     ----------
-    num_smoothed : points whose normals a vertex takes. Guess.
     support : vertices farther than this from any point go. Derived: points scattered at random
         leave a void of this radius with probability exp(-pi 2.5^2) = 3e-9.
     min_island : side of a square; separate pieces of a smaller area go. Guess.
@@ -48,7 +48,6 @@ class MeshTolerances:
     cube_scale : of Poisson's cube over the cloud's extent; Open3D's own.
     """
 
-    num_smoothed: int = 4
     support: float = 2.5
     min_island: float = 20.0
     min_depth: int = 2
@@ -101,7 +100,7 @@ def poisson_mesh(
     logger.debug("Poisson: depth %d, spacing %.3g, %d vertices", depth, spacing, len(vertices))
     surface = TriangleMesh(vertices, triangles.astype(np.int64))
     tree = cKDTree(points)
-    distance, nearest = tree.query(vertices, k=tolerances.num_smoothed, workers=-1)
+    distance, nearest = tree.query(vertices, k=NUM_NEAREST, workers=-1)
     near_normals = unit_or_zero(normals[nearest].sum(axis=1))
     # One that faces away from the points beside it is of the other side of a sheet.
     supported = dots(surface.vertex_normals, near_normals) > 0
