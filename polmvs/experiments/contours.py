@@ -39,6 +39,7 @@ from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.parallel import Workers
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map, store_phase_map, view_rays
+from polmvs.scene import MIN_DISTANCE
 from polmvs.surface.contour import Contours, direction_field, trace_contours
 from polmvs.surface.log_range import log_range_increment
 
@@ -50,7 +51,6 @@ Indices = NDArray[np.int64]
 
 # What the experiment measures; these define the figures.
 INSET_PX = 4  # of the seeds: nearer to the edge the blurred light of the background is mixed in
-MIN_NORMAL = 1e-9  # length that a direction in a file must have; a guess, less is nothing
 MEASURED_PX = 1.0  # distance between the points of a contour that are measured
 MIN_SEEN_SHARE = 0.9  # of the seeds, that a second view must see
 
@@ -458,7 +458,7 @@ def _plane(normal: Any, offset: Any) -> PlaneSurface:
     """
     along, level = np.array(normal, np.float64), float(offset)
     length = float(np.linalg.norm(along))
-    if along.shape != (3,) or not (MIN_NORMAL < length < np.inf) or not np.isfinite(level):
+    if along.shape != (3,) or not (MIN_DISTANCE < length < np.inf) or not np.isfinite(level):
         raise ValueError("its plane has no normal of three numbers, or no offset")
     return PlaneSurface(along / length, level / length)
 

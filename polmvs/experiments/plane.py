@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from polmvs.config import AngleModel, ExperimentOptions
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
 from polmvs.experiments.data import OnProgress, Scene, ViewData, load_view, require_counted
+from polmvs.normals.single_view.measurement import MIN_PIXELS
 from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
 from polmvs.parallel import Workers
 from polmvs.polarization.stokes import Stokes
@@ -30,7 +31,6 @@ Floats = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 
 NUM_CANDIDATES = 64  # normals tried as the middle of a patch
-MIN_PIXELS = 100
 MAX_SPREAD_DEG = 0.2  # of the true normals of a plane; 16-bit maps have less
 
 # A lens may or may not tilt the polarizers (:mod:`polmvs.polarization.angle_models`), and PPA

@@ -26,6 +26,7 @@ from polmvs.experiments.data import OnProgress, Scene, load_view, require_counte
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.parallel import Workers
+from polmvs.surface.surface_quality import MIN_POINTS
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -33,7 +34,6 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 UNDER_DEG = 25.0  # the paper's limit
-MIN_POINTS = 10  # of a K: fewer make no statistics
 CHUNK_ROWS = 200_000  # solved at a time: bounds the memory of many views
 
 
