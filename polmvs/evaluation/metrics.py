@@ -35,6 +35,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.config import RegionOptions
 from polmvs.io.ground_truth import PART_SPACING_M
 from polmvs.neighbors import nearest_points
 from polmvs.polarization.stokes import axial_difference
@@ -46,7 +47,7 @@ Floats = NDArray[np.floating]
 THRESHOLDS_M = (0.001, 0.002, 0.005)
 FAR_M = 0.02
 TANGENT_REACH = 1.5  # in spacings of the truth
-MIN_DOLP = 0.1  # of pixels whose phase is compared
+MIN_DOLP = RegionOptions.min_dolp  # of pixels whose phase is compared
 MAX_QUERIES = 2_000_000  # a larger cloud's accuracy is taken from a random subset of this size
 
 

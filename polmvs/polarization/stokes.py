@@ -72,8 +72,7 @@ PATCH_QUANTILE_OF_WHITE = 0.768  # the same of white noise
 PATCH_QUANTILE_OF_CURVATURE = 0.74
 CURVATURE_SPACING_PX = 2  # what a mosaic's interpolation gives neighbours in common is not between
 ONE_SIGMA = 0.8413  # one-sided probability of one standard deviation
-MIN_UNPOLARIZED = 200  # pixels, of one in 16
-MIN_PATCHES = 40
+MIN_SAMPLES = 40  # patches of a class, or pixels, for their quantile or median to be one
 TINY = 1e-20  # keeps noise-free black images from a division by zero
 MAX_CLASSES = 12
 MISMATCH_WINDOW_PX = 5
@@ -382,7 +381,7 @@ def estimate_noise(
     quantile_of_noise : of the variance of a patch, over the variance; of interpolated noise.
     """
     usable = patch_means(valid.astype(np.float32)) > 1.0 - 0.5 / PATCH_PX**2
-    if np.count_nonzero(usable) < MIN_PATCHES:
+    if np.count_nonzero(usable) < MIN_SAMPLES:
         return NoiseModel(floor, 0.0)
     level = patch_means(s0)[usable]
     stack = redundancy if redundancy.ndim == 3 else redundancy[None]
@@ -392,7 +391,7 @@ def estimate_noise(
         square = patch_means(np.square(image))[usable].astype(np.float64)
         spread += np.maximum(square - mean * mean, 0.0) / len(stack)
     order = np.argsort(level)
-    classes = np.array_split(order, min(MAX_CLASSES, len(order) // MIN_PATCHES))
+    classes = np.array_split(order, min(MAX_CLASSES, len(order) // MIN_SAMPLES))
     levels = np.array([level[members].mean() for members in classes], np.float64)
     quantiles = np.array([np.quantile(spread[members], PATCH_QUANTILE) for members in classes])
     variances = np.maximum(quantiles / (2.0 * quantile_of_noise), max(floor, TINY))
@@ -467,7 +466,7 @@ def _gain_sigma(s0: Image, s1: Image, s2: Image, redundancy: Image, valid: Mask)
         return 0.0
     # Of light that counts as unpolarised.
     weak = np.hypot(s1[sample][lit], s2[sample][lit]) < RegionOptions.min_dolp * level
-    if np.count_nonzero(weak) < MIN_UNPOLARIZED:
+    if np.count_nonzero(weak) < MIN_SAMPLES:
         weak[:] = True
     shares = [np.median(image[sample][lit][weak] / level[weak]) for image in redundancy]
     num = len(shares)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.evaluation.map_errors import LatticeErrors, lattice_errors
-from polmvs.evaluation.metrics import axial_errors_deg
+from polmvs.evaluation.metrics import THRESHOLDS_M, axial_errors_deg
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.polarization.angle_models import phase_from_normal
@@ -29,7 +29,7 @@ from polmvs.surface.dense_view import DenseView
 Floats = NDArray[np.floating]
 
 MAX_RESIDUAL_DEG = 20.0  # top of the colour scales: OPA's phase errors on oblique surfaces
-MAX_ERROR_M = 0.005  # of distances from the truth
+MAX_ERROR_M = max(THRESHOLDS_M)  # of distances from the truth
 MAX_NORMAL_ERROR_DEG = 15.0
 MAX_SAMPLES_A_VIEW = 4000  # of errors for the plots: quartiles of 16 views then err by under 1 %
 
