@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
 from polmvs.errors import DataError
-from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
+from polmvs.evaluation.metrics import THRESHOLDS_M, AngleStats, angular_errors_deg
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.poses.alignment import align_views
@@ -28,7 +28,6 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 # These define the figures; they are no tolerances of an algorithm.
-WITHIN_M = 0.001
 WHOLE_SHARE = 0.999  # of the pixels about a lattice point; interpolation rounds
 MAX_SLOPE = 20.0  # depth per width of a pixel's footprint: a surface seen under 3 deg, or a step
 
@@ -228,7 +227,7 @@ def _summary(views: Sequence[LatticeErrors]) -> MapErrors:
         depth_median_m=float(median),
         depth_p95_m=float(p95),
         depth_bias_m=_mean(depth),
-        depth_within_1mm=_mean(size < WITHIN_M),
+        depth_within_1mm=_mean(size < min(THRESHOLDS_M)),
         normals=AngleStats.from_degrees(pooled(lambda one: one.normal_deg)),
         sigma_ratio_median=float(np.median(ratio)) if len(ratio) else float("nan"),
         within_one_sigma=_mean(ratio < 1),

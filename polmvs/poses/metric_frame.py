@@ -55,12 +55,13 @@ class FrameTolerances:
     min_breadth : breadth of the camera centres over their length; derived: centres are good to
         about 0.1 % of their spread, so that 1 % leaves the rotation about the line through them
         uncertain by 0.1 rad.
-    max_turn_sigma : rad, of the same rotation as the residuals tell it; likewise.
+    max_turn_sigma : rad, of the same rotation as the residuals tell it. Derived: places at the side
+        err by that share of their distance, as by the scale of markers.
     max_relative_rms : RMS residual over the cameras' spread. Derived: that of an alignment.
     """
 
     min_breadth: float = 0.01
-    max_turn_sigma: float = 0.1
+    max_turn_sigma: float = ScaleTolerances.max_relative_sigma
     max_relative_rms: float = AlignmentTolerances.max_relative_rms
 
 

@@ -19,6 +19,7 @@ from polmvs.evaluation.metrics import THRESHOLDS_M, axial_errors_deg
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.inspection import SHOWN_DOLP
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.stokes import Stokes
 from polmvs.report import pictures
@@ -28,9 +29,8 @@ from polmvs.surface.dense_view import DenseView
 
 Floats = NDArray[np.floating]
 
-MAX_RESIDUAL_DEG = 20.0  # top of the colour scales: OPA's phase errors on oblique surfaces
+MAX_ERROR_DEG = 20.0  # top of the colour scales: OPA's phase errors on oblique surfaces
 MAX_ERROR_M = max(THRESHOLDS_M)  # of distances from the truth
-MAX_NORMAL_ERROR_DEG = 15.0
 MAX_SAMPLES_A_VIEW = 4000  # of errors for the plots: quartiles of 16 views then err by under 1 %
 
 
@@ -119,7 +119,7 @@ def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[Pictu
         _picture(
             "AoLP",
             "angle of linear polarisation in cyclic colours, faint where the DoLP is low",
-            pictures.angle_picture(aolp, strength=dolp / pictures.FULL_DOLP),
+            pictures.angle_picture(aolp, strength=dolp / SHOWN_DOLP),
         ),
         _picture(
             "DoLP",
@@ -166,8 +166,8 @@ def _of_model(
         _picture(
             f"{name}: residual phase",
             "angle between the measured phase and that of the surface found",
-            pictures.scalar_picture(residual, 0, MAX_RESIDUAL_DEG, colors=pictures.ERROR),
-            scale=("0", f"{MAX_RESIDUAL_DEG:g} deg", pictures.ERROR),
+            pictures.scalar_picture(residual, 0, MAX_ERROR_DEG, colors=pictures.ERROR),
+            scale=("0", f"{MAX_ERROR_DEG:g} deg", pictures.ERROR),
         ),
     ]
     if errors is None:
@@ -185,10 +185,8 @@ def _of_model(
         _picture(
             f"{name}: normal error",
             "angle between the normal and the true one",
-            pictures.scalar_picture(
-                errors.normal_deg, 0, MAX_NORMAL_ERROR_DEG, colors=pictures.ERROR
-            ),
-            scale=("0", f"{MAX_NORMAL_ERROR_DEG:g} deg", pictures.ERROR),
+            pictures.scalar_picture(errors.normal_deg, 0, MAX_ERROR_DEG, colors=pictures.ERROR),
+            scale=("0", f"{MAX_ERROR_DEG:g} deg", pictures.ERROR),
         ),
     ]
 

@@ -23,7 +23,7 @@ from polmvs.scene import PointKind, View
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
-FULL = 65535
+FULL = np.iinfo(np.uint16).max  # of a place, as the page holds it
 FRUSTUM_SHARE = 0.08  # depth of a drawn camera, of the distance from the target
 EYE_DISTANCE = 3.2  # from the target, in radii of the part: all of it in a field of view of 40 deg
 EYE_ELEVATION_DEG = 35.0

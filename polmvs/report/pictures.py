@@ -20,7 +20,6 @@ Mask = NDArray[np.bool_]
 
 CYCLIC, SEQUENTIAL, ERROR = "twilight", "viridis", "inferno"
 NOTHING = 236  # grey of pixels without a value; reads on light and dark pages
-FULL_DOLP = 0.6  # from which a phase has its full colour; specular light reaches more
 QUALITY = 82  # of 100, of what compresses; 100 px of a thumbnail hardly show a difference above
 
 

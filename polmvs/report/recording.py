@@ -28,8 +28,9 @@ from polmvs.pipeline.runner import load_record
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.poses import PosesResult
+from polmvs.polarization.inspection import SHOWN_DOLP
 from polmvs.report.layers import KIND_COLORS
-from polmvs.report.pictures import FULL_DOLP, QUALITY, angle_picture
+from polmvs.report.pictures import QUALITY, angle_picture
 from polmvs.report.rendering import SURFACE
 from polmvs.scene import PointKind, View
 
@@ -169,7 +170,7 @@ class _Recorder:
         for phase_map in maps:
             cos2, sin2 = phase_map.samples[..., 0], phase_map.samples[..., 1]
             phase = np.where(phase_map.samples[..., 2] > 0, 0.5 * np.arctan2(sin2, cos2), np.nan)
-            picture = angle_picture(phase, strength=np.hypot(cos2, sin2) / FULL_DOLP)
+            picture = angle_picture(phase, strength=np.hypot(cos2, sin2) / SHOWN_DOLP)
             image = self.rerun.Image(picture).compress(jpeg_quality=QUALITY)
             self.stream.log(f"{self.entity(phase_map.view)}/phase", image)
             on_progress(1)

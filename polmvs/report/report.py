@@ -34,8 +34,8 @@ from polmvs.polarization.capture import WHITE_PERCENTILE, Capture, open_capture
 from polmvs.poses.alignment import align_views
 from polmvs.report import pictures, plots
 from polmvs.report.contents import (
+    MAX_ERROR_DEG,
     MAX_ERROR_M,
-    MAX_NORMAL_ERROR_DEG,
     ErrorSamples,
     ViewInput,
     view_page,
@@ -259,7 +259,7 @@ def _layers(given: _Given) -> tuple[list[Layer], dict[str, Channel]]:
         channels["normal_error"] = Channel(
             label="angle to the true normal, on the part",
             unit="deg",
-            high=MAX_NORMAL_ERROR_DEG,
+            high=MAX_ERROR_DEG,
             colors=pictures.ERROR,
         )
     layers = [

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from polmvs.geometry import unit
+from polmvs.scene import MIN_DISTANCE
 
 Array: TypeAlias = NDArray[np.float64]
-
-MIN_DISTANCE = 1e-9
 
 
 class Surface(Protocol):
