@@ -18,12 +18,12 @@ from scipy.sparse.linalg import splu
 
 from polmvs.fitting import annealed_scales, cauchy_weights
 from polmvs.geometry import dots, lengths
+from polmvs.scene import MIN_FACING_COSINE
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-MAX_GRAZING = 0.05  # |n . v| under which the increment of a node is not to be trusted
 NUM_DRAWS = 16  # of the noise, for the deviation of the solution: 18 % uncertain where alone
 
 
@@ -73,9 +73,9 @@ class RangeSolution:
 def log_range_increment(normals: Floats, rays_tail: Floats, rays_head: Floats) -> Array:
     """``log r_head - log r_tail`` on a plane with normal ``n`` (all ``(..., 3)``, one frame).
 
-    The normal may be of any length.
+    The normal may be of any length. What is flatter than can be seen counts as what just can.
     """
-    least = -MAX_GRAZING * np.maximum(lengths(normals), 1e-12)
+    least = -MIN_FACING_COSINE * np.maximum(lengths(normals), 1e-12)
     tail = np.minimum(dots(normals, rays_tail), least)
     head = np.minimum(dots(normals, rays_head), least)
     return np.asarray(np.log(tail / head), np.float64)
@@ -83,7 +83,7 @@ def log_range_increment(normals: Floats, rays_tail: Floats, rays_head: Floats) -
 
 def slope_sigma(normals: Floats, rays: Floats, sigma: Floats) -> Array:
     """Deviation of the log-range's slope (per radian of ray) from that of the normal (rad)."""
-    cosine = np.maximum(np.abs((normals * rays).sum(axis=-1)), MAX_GRAZING)
+    cosine = np.maximum(np.abs((normals * rays).sum(axis=-1)), MIN_FACING_COSINE)
     return np.asarray(sigma / cosine**2, np.float64)
 
 

@@ -14,9 +14,9 @@ from polmvs.colmap.dense_workspace import ImageLoader, write_dense_workspace
 from polmvs.colmap.maps import DepthNormals, map_pixel_xy
 from polmvs.config import FusionOptions
 from polmvs.geometry import dots, unit_or_zero
-from polmvs.scene import SparseModel, View
+from polmvs.scene import MIN_FACING_COSINE, SparseModel, View
 from polmvs.surface.dense_view import DenseView
-from polmvs.surface.log_range import MAX_GRAZING, log_range_increment
+from polmvs.surface.log_range import log_range_increment
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -172,7 +172,7 @@ def _neighbour(
     # Comparisons with NaN are False: unknown normals and rays drop out here.
     known: Mask = inside & (ranges > 0)
     for direction in (rays, lattice_rays):
-        known &= dots(normals, direction) < -MAX_GRAZING
+        known &= dots(normals, direction) < -MIN_FACING_COSINE
     normals = np.where(known[:, None], normals, 0)
     log_range = np.log(np.where(known, ranges, 1))
     log_range += np.where(known, log_range_increment(normals, lattice_rays, rays), 0)
@@ -197,7 +197,7 @@ def _blend(neighbours: _Neighbours, rays: Array, stride: float) -> tuple[Array, 
     known = distance[nearest] <= REACH
     # Of two surfaces the one seen more steeply sets the bound: a limb must not hide an edge.
     cosine = -dots(normals, np.broadcast_to(rays, normals.shape))
-    cosine = np.maximum(np.maximum(cosine, cosine[nearest]), MAX_GRAZING)
+    cosine = np.maximum(np.maximum(cosine, cosine[nearest]), MIN_FACING_COSINE)
     same: Mask = np.abs(log_range - log_range[nearest]) <= MAX_TURN * stride / cosine**2
     same &= dots(normals, np.broadcast_to(normals[nearest], normals.shape)) >= np.cos(MAX_TURN)
     share = np.where(same & np.isfinite(distance), weight, 0)

@@ -12,10 +12,9 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel
 from polmvs.normals.estimator import NormalEstimate
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import MIN_VIEWS, Seeds
+from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds
 from polmvs.surface.dense_view import NUM_NEAREST, REACH, SurfaceSamples
 from polmvs.surface.log_range import (
-    MAX_GRAZING,
     Edges,
     SeedTies,
     log_range_increment,
@@ -183,7 +182,10 @@ def node_edges(
     turn = 0.5 * (own_sigma[tail] + own_sigma[head])
     cosine = np.abs((mean * rays[tail]).sum(axis=-1))
     constant_sigma = (
-        angle * turn * np.sqrt(1 - np.minimum(cosine, 1) ** 2) / np.maximum(cosine, MAX_GRAZING)
+        angle
+        * turn
+        * np.sqrt(1 - np.minimum(cosine, 1) ** 2)
+        / np.maximum(cosine, MIN_FACING_COSINE)
     )
     use = nodes.on_contour[joined] & finite & np.isfinite(constant_sigma)
     return Edges(
