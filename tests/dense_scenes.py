@@ -157,6 +157,11 @@ def fuse(folder, *, min_num_pixels=2, max_reproj_error=2.0):
     return read_cloud(target)
 
 
+def without_maps(workspace):
+    """Names of the views of an opened workspace that have no depth map or no normal map."""
+    return tuple(item.view.name for item in workspace.views if item.depth is None)
+
+
 def image_shift(one, two, inside):
     """By how many px (x, y) the second image is moved against the first, by its gradients."""
     one, two = np.asarray(one, np.float64), np.asarray(two, np.float64)

@@ -473,11 +473,3 @@ def written_names() -> tuple[str, ...]:
     """Names of all files and folders that a run may write in its folder, the record last."""
     names = [path.parts[0] for spec in stage_table() for path in spec.writes]
     return (*dict.fromkeys(names), HERE.report.name, LOG_FILE, RUN_FILE)
-
-
-def option_groups(command: str) -> tuple[str, ...]:
-    """Groups of the options that the stages of a command read, those that they need included."""
-    table = stage_table()
-    own = [spec.name for spec in table if spec.command == command]
-    paths = [path for spec in with_needed(own, table) for path in spec.decides]
-    return tuple(dict.fromkeys(path.partition(".")[0] for path in paths))
