@@ -589,9 +589,9 @@ def _job(
     scheduler: str | None,
     monitor: Monitor | None,
 ) -> Any:
-    from polmvs.pipeline.jobs import Job
     from polmvs.pipeline.record import read_options
     from polmvs.pipeline.run_folder import RunFolder
+    from polmvs.pipeline.runner import Job
 
     if resume and options is None:  # those of the run, as the command line does
         options = options_from_plain(read_options(RunFolder(Path(out))), str(out))
