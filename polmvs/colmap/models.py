@@ -32,7 +32,7 @@ from polmvs.colmap.cameras import (
     quiet_colmap,
     rescaled_camera,
 )
-from polmvs.errors import DataError
+from polmvs.errors import DataError, as_data_error
 from polmvs.geometry import RigidTransform, nearest_rotation
 from polmvs.io.folders import new_folder, require_unicode
 from polmvs.scene import MAX_COORDINATE, SparseModel, Tracks, View, match_names, short_list
@@ -540,13 +540,11 @@ def check_binary_model(folder: Path) -> None:
 def _check_file(path: Path, record_end: Reader) -> None:
     """Whether the announced records fill the file."""
     try:
-        with _mapped(path) as data:
+        with as_data_error(path, "read"), _mapped(path) as data:
             position = COUNT.size
             for _ in range(COUNT.unpack_from(data)[0]):
                 position = record_end(data, position)
             complete = position == len(data)
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
     # An empty file, a record past the end, no such model, a length that no file has.
     except (ValueError, OverflowError, IndexError, struct.error):
         complete = False

@@ -13,7 +13,7 @@ from tempfile import mkdtemp
 from typing import Any
 
 from polmvs.config import Experiment, to_plain
-from polmvs.errors import DataError, OptionError
+from polmvs.errors import OptionError, as_data_error
 from polmvs.pipeline.run_folder import has_content
 
 NAMES = tuple(Experiment)
@@ -103,17 +103,14 @@ def write_files(out: Path, files: Mapping[str, bytes]) -> None:
     DataError
         The system refuses.
     """
-    try:
+    with as_data_error(out, "made"):
         out.mkdir(parents=True, exist_ok=True)
         scratch = Path(mkdtemp(prefix=".experiment-", dir=out))
-    except OSError as error:
-        raise DataError(out, f"cannot be made: {error.strerror or error}.") from error
     try:
-        for name, data in files.items():
-            (scratch / name).write_bytes(data)
-        for name in files:
-            os.replace(scratch / name, out / name)
-    except OSError as error:
-        raise DataError(out, f"cannot be written: {error.strerror or error}.") from error
+        with as_data_error(out, "written"):
+            for name, data in files.items():
+                (scratch / name).write_bytes(data)
+            for name in files:
+                os.replace(scratch / name, out / name)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)

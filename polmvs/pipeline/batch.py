@@ -32,7 +32,7 @@ from polmvs.config import (
     values_from_plain,
     with_absolute_paths,
 )
-from polmvs.errors import DataError, OptionError, PolmvsError
+from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.images import write_bytes
 from polmvs.io.typed_json import write_json
@@ -188,10 +188,8 @@ def run_batch(
                 f"{folder}: exists and is not empty. Give `run.overwrite` to delete earlier runs "
                 "in it, `run.resume` to go on with them, or another OUT."
             )
-    try:
+    with as_data_error(out, "made"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(out, f"cannot be made: {error.strerror or error}.") from error
     each = replace(run_options, workers=1, scheduler=None)
     if run_options.scheduler is not None:
         captures = [entry.capture for entry in entries]

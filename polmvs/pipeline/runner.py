@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -26,7 +25,7 @@ from polmvs.config import (
     to_plain,
     with_absolute_paths,
 )
-from polmvs.errors import DataError, OptionError, PolmvsError
+from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.folders import require_unicode
 from polmvs.memory import MemoryPlan, PeakMemory, cpu_seconds, plan_memory
@@ -442,17 +441,8 @@ def _remove_results(run_folder: RunFolder) -> None:
             "Give another OUT.",
         )
     images = read_image_names(run_folder)
-    folders = [path for path in present if path.is_dir()]
-    for folder in folders:
-        require_own(folder, images)
-    try:
-        for path in present:
-            if path in folders:
-                shutil.rmtree(path)
-            else:
-                path.unlink()
-    except OSError as error:
-        raise DataError(root, f"cannot be emptied: {error.strerror or error}.") from error
+    with as_data_error(root, "emptied"):
+        discard(present, images)
 
 
 def _names(paths: Iterable[Path]) -> tuple[str, ...]:

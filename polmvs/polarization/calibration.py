@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import BayerOrder, CaptureOptions
-from polmvs.errors import DataError
+from polmvs.errors import DataError, as_data_error
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.images import write_bytes
 from polmvs.polarization.mosaic import (
@@ -351,9 +351,8 @@ def read_calibration(path: Path) -> PolarizerCalibration:
         It or an array that it names is missing, damaged, or holds impossible values.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+        with as_data_error(path, "read"):
+            content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise DataError(path, "is no TOML file of a calibration.") from error
     known = {"version", "pattern", "bayer", "gains", "angles_deg", "diattenuations", "full_scale"}

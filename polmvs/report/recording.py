@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from polmvs.camera import Camera, PinholeCamera
 from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel
-from polmvs.errors import DataError, OptionError
+from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
 from polmvs.io.images import read_gray
 from polmvs.pipeline.record import Record
@@ -88,11 +88,10 @@ def write_recording(
         raise DataError(run_folder.root, "has no poses to record. Run 'polmvs sfm' first.")
     temporary = path.with_name(f".{path.name}.tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _Recorder(run_folder, record, temporary).write(on_progress)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise DataError(path, f"cannot be written: {error.strerror or error}.") from error
+        with as_data_error(path, "written"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _Recorder(run_folder, record, temporary).write(on_progress)
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
