@@ -64,7 +64,7 @@ def read_model(path: PathArg) -> SparseModel:
         keypoints = None
         if _model_suffix(folder) == ".bin":
             keypoints = _stored_keypoints(folder / "images.bin")
-        sparse_model = _sparse_model(reconstruction, stored=keypoints)
+        sparse_model = model_from_reconstruction(reconstruction, stored=keypoints)
     _require_sound(folder, sparse_model.views, sparse_model.tracks)
     return sparse_model
 
@@ -187,7 +187,10 @@ def _model_suffix(folder: Path) -> str | None:
 
 
 def model_from_reconstruction(
-    reconstruction: pycolmap.Reconstruction, names: Iterable[str] = ()
+    reconstruction: pycolmap.Reconstruction,
+    names: Iterable[str] = (),
+    *,
+    stored: Mapping[int, NDArray[np.void]] | None = None,
 ) -> SparseModel:
     """The registered part of a reconstruction.
 
@@ -195,16 +198,8 @@ def model_from_reconstruction(
     ----------
     reconstruction : with any rigs and camera models.
     names : of all images that were to be registered, in addition to the reconstruction's own.
+    stored : keypoints with a point by image id, where its binary file was read as a whole already.
     """
-    return _sparse_model(reconstruction, names)
-
-
-def _sparse_model(
-    reconstruction: pycolmap.Reconstruction,
-    names: Iterable[str] = (),
-    stored: Mapping[int, NDArray[np.void]] | None = None,
-) -> SparseModel:
-    """As :func:`model_from_reconstruction`; ``stored`` as in :func:`_tracks`."""
     images = _registered(reconstruction)
     views = _views(reconstruction, images)
     known = {str(image.name) for image in reconstruction.images.values()} | set(names)
@@ -439,10 +434,15 @@ def reconstruction_of_views(
         image = pycolmap.Image(
             name=view.name, camera_id=1 if single_camera else index + 1, image_id=index + 1
         )
-        pose = view.cam_from_world
-        matrix = np.column_stack([pose.rotation, pose.translation])
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
+        _add_image(reconstruction, image, view.cam_from_world)
     return reconstruction
+
+
+def _add_image(
+    reconstruction: pycolmap.Reconstruction, image: pycolmap.Image, pose: RigidTransform
+) -> None:
+    matrix = np.column_stack([pose.rotation, pose.translation])
+    reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
 
 
 def _reconstruction(sparse_model: SparseModel) -> pycolmap.Reconstruction:
@@ -465,9 +465,7 @@ def _reconstruction(sparse_model: SparseModel) -> pycolmap.Reconstruction:
             camera_id=cameras.index(view.camera) + 1,
             image_id=index + 1,
         )
-        pose = view.cam_from_world
-        matrix = np.column_stack([pose.rotation, pose.translation])
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
+        _add_image(reconstruction, image, view.cam_from_world)
     _add_points(reconstruction, tracks, point2D_idx)
     return reconstruction
 

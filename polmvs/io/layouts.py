@@ -115,18 +115,26 @@ def read_author_truth(folder: Path, names: Sequence[str], width: int, height: in
     DataError
         A file is missing, damaged, or of another count.
     """
-    views = {}
-    for index, name in enumerate(names):
-        path = folder / "cams" / f"{stem_of(name)}_cam.txt"
-        if not path.is_file():
-            path = folder / "cams" / f"{index:08d}_cam.txt"
-        views[name] = read_camera_text(path, name, width, height)
+    views = read_author_views(folder, names, width, height)
     normal = _read_npy(folder / "normal_w.npy", 3).reshape(3)
     corners = _read_npy(folder / "pts_3d_corners_w.npy", 12).reshape(4, 3)
     length = float(np.linalg.norm(normal))
     if not length > 0:
         raise DataError(folder / "normal_w.npy", "is no direction; copy the data again.")
     return _board(folder, views, normal / length, corners)
+
+
+def read_author_views(
+    folder: Path, names: Sequence[str], width: int, height: int
+) -> dict[str, View]:
+    """The cameras of the authors' demo by name; parameters and errors of its truth."""
+    views = {}
+    for index, name in enumerate(names):
+        path = folder / "cams" / f"{stem_of(name)}_cam.txt"
+        if not path.is_file():
+            path = folder / "cams" / f"{index:08d}_cam.txt"
+        views[name] = read_camera_text(path, name, width, height)
+    return views
 
 
 def _board(folder: Path, views: dict[str, View], normal: Array, corners: Array) -> BoardTruth:

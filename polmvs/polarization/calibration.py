@@ -370,7 +370,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
     if bayer is not None and bayer not in list(BayerOrder):
         raise DataError(path, f"bayer must be one of {', '.join(BayerOrder)}.")
     blocks = 1 if bayer is None else 4
-    values = {
+    values: dict[str, Any] = {
         "gains": _numbers_of(path, content, "gains", (1,) * 4, blocks),
         "angles_deg": _numbers_of(path, content, "angles_deg", ANGLES_DEG, blocks),
         "diattenuations": _numbers_of(path, content, "diattenuations", (1,) * 4, blocks),
@@ -387,7 +387,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
     scale = content.get("full_scale")
     if scale is not None and not (type(scale) in (int, float) and 0 < scale < np.inf):
         raise DataError(path, "full_scale must be a positive number.")
-    files = {}
+    files: dict[str, Any] = {}
     for name in arrays:
         if name in content:
             if not isinstance(content[name], str):
@@ -397,13 +397,8 @@ def read_calibration(path: Path) -> PolarizerCalibration:
     first = [int(angle) for angle in pattern]
     return PolarizerCalibration(
         pattern=(first[0], first[1], first[2], first[3]),
-        gains=values["gains"],
-        angles_deg=values["angles_deg"],
-        diattenuations=values["diattenuations"],
-        dark=files.get("dark"),
-        flat=files.get("flat"),
-        angle_map=files.get("angle_map"),
-        diattenuation_map=files.get("diattenuation_map"),
+        **values,
+        **files,
         full_scale=None if scale is None else float(scale),
         bayer=None if bayer is None else BayerOrder(bayer),
     )

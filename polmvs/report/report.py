@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -311,12 +311,8 @@ def _cloud_layer(given: _Given, model: AngleModel, cloud: Cloud, factor: float) 
     )
     normals = layer.normals @ truth_from_world.rotation.T
     off = np.nan_to_num(angular_errors_deg(normals, true.normals[nearest]))
-    return Layer(
-        label=layer.label,
-        points=layer.points,
-        normals=layer.normals,
-        values={**layer.values, "error": 1e3 * distance, "normal_error": off},
-    )
+    errors = {"error": 1e3 * distance, "normal_error": off}
+    return replace(layer, values={**layer.values, **errors})
 
 
 def _on_surface(cloud: Cloud) -> NDArray[np.bool_]:
