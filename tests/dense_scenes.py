@@ -13,7 +13,8 @@ from polmvs.io.clouds import read_cloud
 from polmvs.scene import SparseModel, Tracks, View
 from polmvs.surface.dense_view import DenseView
 from polmvs.surface.map_export import export_dense_workspace
-from polmvs.synthetic.captures import Plane, ring_of_views
+from polmvs.synthetic.captures import ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 PINHOLE = PinholeCamera(width=160, height=128, fx=120.0, fy=121.0, cx=79.0, cy=63.0)
 OPENCV = ColmapCamera(

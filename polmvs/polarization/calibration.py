@@ -370,7 +370,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
     if bayer is not None and bayer not in list(BayerOrder):
         raise DataError(path, f"bayer must be one of {', '.join(BayerOrder)}.")
     blocks = 1 if bayer is None else 4
-    values: dict[str, Any] = {
+    values = {
         "gains": _numbers_of(path, content, "gains", (1,) * 4, blocks),
         "angles_deg": _numbers_of(path, content, "angles_deg", ANGLES_DEG, blocks),
         "diattenuations": _numbers_of(path, content, "diattenuations", (1,) * 4, blocks),
@@ -397,7 +397,9 @@ def read_calibration(path: Path) -> PolarizerCalibration:
     first = [int(angle) for angle in pattern]
     return PolarizerCalibration(
         pattern=(first[0], first[1], first[2], first[3]),
-        **values,
+        gains=values["gains"],
+        angles_deg=values["angles_deg"],
+        diattenuations=values["diattenuations"],
         **files,
         full_scale=None if scale is None else float(scale),
         bayer=None if bayer is None else BayerOrder(bayer),

@@ -75,8 +75,8 @@ def fuse(
     *,
     max_neighbors: int = PropagationOptions.max_neighbors,
     workers: Workers | None = None,
-    on_progress: Callable[[int], None] | None = None,
-    on_confirmed: Callable[[int, Mask], None] | None = None,
+    on_progress: Callable[[int], None] = lambda count: None,
+    on_confirmed: Callable[[int, Mask], None] = lambda index, confirmed: None,
     tolerances: FusionTolerances = FusionTolerances(),
 ) -> FusedCloud:
     """Fuse the dense views into one cloud.
@@ -114,10 +114,8 @@ def fuse(
     ):
         clouds.append(part.cloud)
         footprints.append(part.footprint)
-        if on_confirmed is not None:
-            on_confirmed(k, part.confirmed)
-        if on_progress is not None:
-            on_progress(1)
+        on_confirmed(k, part.confirmed)
+        on_progress(1)
     cloud = concatenate(clouds)
     if not len(cloud.points):
         return cloud

@@ -12,7 +12,7 @@ range of the view's own pixels and nothing is reprojected.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -272,7 +272,6 @@ def stereo_surroundings(
     folder: Path,
     *,
     workers: Workers | None = None,
-    on_progress: Callable[[int], None] | None = None,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> FusedCloud:
     """Dense cloud of the textured surroundings of the polarised parts, from pairs of views.
@@ -284,7 +283,6 @@ def stereo_surroundings(
     maps : phase maps of the views.
     folder : where the views' ranges are kept meanwhile; the caller removes it.
     workers : processes to share the views among; None: this one.
-    on_progress : called with the number of views done, twice for each view with points.
     tolerances : of this step.
     """
     workers = workers or Workers(1)
@@ -295,20 +293,16 @@ def stereo_surroundings(
     used = [k for k, partners in enumerate(chosen) if partners]
     task = partial(_match_view, folder, tolerances=tolerances)
     groups = [[maps[k], *(maps[j] for j in chosen[k])] for k in used]
-    dense: list[DenseView] = []
     own = certain.of_views(len(maps))
     points = [certain.points_in_world[certain.obs_track[own[k]]] for k in used]
-    for done in workers.map(task, groups, points):
-        dense.append(done)
-        if on_progress is not None:
-            on_progress(1)
+    dense = list(workers.map(task, groups, points))
     options = FusionOptions(
         min_views=tolerances.min_observations,
         max_normal_difference_deg=CreaseTolerances.crease_deg,
         voxel_px=1.0,
     )
     views = [_whole_view(maps[k]) for k in used]
-    return fuse(views, dense, options, workers=workers, on_progress=on_progress)
+    return fuse(views, dense, options, workers=workers)
 
 
 def _match_view(

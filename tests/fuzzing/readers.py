@@ -63,7 +63,8 @@ from polmvs.poses.known_poses import retriangulate
 from polmvs.poses.metric_frame import read_centers
 from polmvs.scene import View, point_sigmas
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
-from polmvs.synthetic.captures import Plane, render_view, ring_of_views
+from polmvs.synthetic.captures import render_view, ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 
 class Kind(NamedTuple):

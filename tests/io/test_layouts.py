@@ -14,7 +14,8 @@ from polmvs.experiments.data import open_author_capture, open_scene
 from polmvs.experiments.phase import measure_phase
 from polmvs.io.layouts import is_author_layout, read_camera_text
 from polmvs.parallel import Workers
-from polmvs.synthetic.captures import Plane, render_mosaic, render_view, ring_of_views
+from polmvs.synthetic.captures import render_mosaic, render_view, ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 # Half-size image; a centred principal point would be (80, 64).
 CAMERA = PinholeCamera(width=160, height=128, fx=120.0, fy=121.0, cx=82.5, cy=63.25)

@@ -16,8 +16,8 @@ from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import track_normals
 from polmvs.polarization.phase_map import as_tilted, open_phase_map, store_phase_map, turned
 from polmvs.scene import some_tracks
-from polmvs.synthetic.captures import Plane, Sphere, render_view, ring_of_views
-from polmvs.synthetic.surfaces import Group
+from polmvs.synthetic.captures import render_view, ring_of_views
+from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
 
 @pytest.fixture(scope="module")

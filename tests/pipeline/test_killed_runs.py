@@ -29,7 +29,8 @@ from polmvs.pipeline.monitor import NoMonitor
 from polmvs.pipeline.run_lock import locked
 from polmvs.pipeline.runner import Job
 from polmvs.scene import SparseModel, Tracks
-from polmvs.synthetic.captures import Plane, quantize, render_mosaic, ring_of_views
+from polmvs.synthetic.captures import quantize, render_mosaic, ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks, and reads /proc")
 

@@ -150,11 +150,7 @@ def test_dense_surroundings_lie_on_the_plane_and_beside_the_part(tmp_path):
     maps = part_maps()
     points = plane_points(400)
     points = points[np.abs(points[:, :2]).max(axis=-1) > PART_SIDE + 0.02]
-    done = []
-    cloud = stereo_surroundings(
-        tracks_of(points, [m.view for m in maps]), maps, tmp_path, on_progress=done.append
-    )
-    assert sum(done) == 24
+    cloud = stereo_surroundings(tracks_of(points, [m.view for m in maps]), maps, tmp_path)
     assert len(cloud.points) > 3000
     assert (cloud.num_views >= 3).all()
     # A pixel's footprint is 3.3 mm here.
