@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -32,7 +32,6 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-OnProgress = Callable[[int], None]  # called with the number of steps done
 
 EXACT_SIGMA = 1e-3  # rad; stands for no noise, far below that of any phase
 BLUR_REACH = 2.0  # deviations of the blur within which a mark spoils a pixel

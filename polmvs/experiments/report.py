@@ -21,7 +21,7 @@ from polmvs.experiments.contours import (
     open_surface,
     pool_lines,
 )
-from polmvs.experiments.data import MODEL_LABELS, OnProgress, Scene, view_indices
+from polmvs.experiments.data import MODEL_LABELS, Scene, view_indices
 from polmvs.experiments.output import Report
 from polmvs.experiments.phase import PhaseResult, SignedStats, measure_phase, phase_images, ratio
 from polmvs.experiments.plane import (
@@ -40,7 +40,7 @@ from polmvs.experiments.tracks import (
     check_k,
     measure_tracks,
 )
-from polmvs.parallel import Workers
+from polmvs.parallel import OnProgress, Workers
 
 NUM_FIGURE_VIEWS = 3
 

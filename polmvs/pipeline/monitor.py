@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.run_folder import RunFolder
-
-OnProgress: TypeAlias = Callable[
-    [int], None
-]  # called with the number of steps done since the last call
 
 
 class Monitor(Protocol):
@@ -44,7 +40,3 @@ class NoMonitor:
 
     def skipped(self, name: str) -> None:
         """Do nothing."""
-
-
-def no_progress(count: int) -> None:
-    """Nobody is told of the steps."""

@@ -20,8 +20,7 @@ from polmvs.config import AngleModel, Options
 from polmvs.evaluation.comparison import SparseFigures
 from polmvs.evaluation.trust import Trust
 from polmvs.memory import MemoryNeeds
-from polmvs.parallel import Workers
-from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import HERE, LOG_FILE, RUN_FILE, RunFolder
 from polmvs.pipeline.stages import (

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from polmvs.config import CaptureKind, CaptureOptions, RegionOptions, Resolution
 from polmvs.io.images import write_png
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.capture import Capture, intensity_image_8bit, open_capture
 from polmvs.polarization.stokes import Stokes
 from polmvs.scene import short_list
@@ -124,7 +125,7 @@ def inspect_capture(
     options: CaptureOptions | None = None,
     *,
     limits: InspectionLimits | None = None,
-    on_progress: Callable[[int], None] | None = None,
+    on_progress: OnProgress = no_progress,
 ) -> Inspection:
     """Look at every view of a capture.
 
@@ -149,8 +150,7 @@ def inspect_capture(
         if not figures:
             colour = _block_differences(opened, stokes)
         figures.append(_figures_of(name, stokes, opened.options.darkness))
-        if on_progress is not None:
-            on_progress(1)
+        on_progress(1)
     warnings = _warnings(opened, white, figures, colour, bounds)
     return Inspection(capture=opened, white=white, views=tuple(figures), warnings=tuple(warnings))
 

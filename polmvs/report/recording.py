@@ -8,7 +8,7 @@ extra, imported when a recording is made.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
 from polmvs.io.images import read_gray
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
 from polmvs.pipeline.runner import load_record
@@ -32,8 +33,6 @@ from polmvs.report.layers import KIND_COLORS
 from polmvs.report.pictures import FULL_DOLP, QUALITY, angle_picture
 from polmvs.report.rendering import SURFACE
 from polmvs.scene import PointKind, View
-
-OnProgress = Callable[[int], None]
 
 SUFFIX = ".rrd"
 TIMELINE = "stage"
@@ -65,7 +64,7 @@ def num_recorded_steps(run_folder: RunFolder) -> int:
 
 
 def write_recording(
-    run_folder: RunFolder, path: Path, *, on_progress: OnProgress = lambda count: None
+    run_folder: RunFolder, path: Path, *, on_progress: OnProgress = no_progress
 ) -> None:
     """Record a finished run.
 

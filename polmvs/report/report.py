@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from polmvs.io.clouds import Cloud, read_cloud, read_mesh
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.images import write_bytes
 from polmvs.neighbors import nearest_points
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import load_record
@@ -84,9 +85,7 @@ class _Given:
     comparison: Comparison | None
 
 
-def write_report(
-    run_folder: RunFolder, *, on_progress: Callable[[int], None] = lambda count: None
-) -> Path:
+def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress) -> Path:
     """Make the report of a run, again if there is one.
 
     Parameters

@@ -26,8 +26,7 @@ from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, FusionOptions, Method, PropagationOptions, Surroundings
 from polmvs.io.clouds import Cloud, Mesh, write_cloud, write_mesh
 from polmvs.io.images import read_gray
-from polmvs.parallel import Workers
-from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, replace_folder, scratch
 from polmvs.pipeline.stages.maps import open_maps, posed_views
 from polmvs.pipeline.stages.poses import load_camera_modes, load_pose_covariances

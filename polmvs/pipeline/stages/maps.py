@@ -24,8 +24,7 @@ from polmvs.normals.axes_check import check_axes
 from polmvs.normals.light import diffuse_pixels, find_diffuse_parts
 from polmvs.normals.light_check import check_light
 from polmvs.normals.tracks import MAX_ROWS
-from polmvs.parallel import Workers
-from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.run_folder import replacing
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture

@@ -19,7 +19,7 @@ from polmvs.config import PropagationOptions, SfmOptions
 from polmvs.errors import DataError
 from polmvs.io.arrays import save_array
 from polmvs.io.clouds import preload
-from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.run_folder import CAMERA_MODES, POSE_COVARIANCES, replace_folder, scratch
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture
