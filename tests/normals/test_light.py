@@ -226,7 +226,7 @@ def test_few_misled_points_do_not_decide_against_all_pixels(light):
         maps = [m.changed(diffuse=np.zeros_like(m.diffuse)) for m in maps]
     points = rng.uniform(-1.0, 1.0, (300, 3))
     tracks = tracks_at(Scene(None, views, [], maps), points)
-    votes, voting = light_module._track_votes(tracks, maps, LightTolerances(), 10**6)
+    votes, voting = light_module.track_votes(tracks, maps, LightTolerances(), max_rows=10**6)
     wrong = np.where(voting, votes * (1 if light is Light.SPECULAR else -1), 0)
     misled = np.isin(np.arange(len(points)), np.argsort(wrong)[:5])
     assert wrong[misled].sum() < -5
