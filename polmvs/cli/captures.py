@@ -94,15 +94,8 @@ def _camera(call: Call, terminal: Terminal, folder: Path, out: Path) -> int:
     capture = open_capture(folder, call.get(CaptureOptions))
     white = capture.exposure()
     pictures = {name: intensity_image_8bit(capture.load(name), white) for name in capture.names}
-    board = Board(
-        cols=given.cols,
-        rows=given.rows,
-        square=given.square,
-        dictionary=given.dictionary,
-        marker=given.marker,
-    )
     try:
-        found = calibrate_camera(pictures, board)
+        found = calibrate_camera(pictures, Board(**vars(given)))
     except ValueError as error:
         raise DataError(folder, str(error)) from error
     comment = f"rms {found.rms_px:.3f} px over {len(found.views)} views of a board"

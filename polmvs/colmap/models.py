@@ -80,7 +80,7 @@ def read_views(path: PathArg) -> tuple[View, ...]:
     folder = find_model(path)
     with _as_data_error(folder):
         reconstruction = _open(folder)
-        views = _views(reconstruction, _registered(reconstruction))
+        views = _views(reconstruction, registered(reconstruction))
     _require_sound(folder, views)
     return views
 
@@ -200,7 +200,7 @@ def model_from_reconstruction(
     names : of all images that were to be registered, in addition to the reconstruction's own.
     stored : keypoints with a point by image id, where its binary file was read as a whole already.
     """
-    images = _registered(reconstruction)
+    images = registered(reconstruction)
     views = _views(reconstruction, images)
     known = {str(image.name) for image in reconstruction.images.values()} | set(names)
     return SparseModel(
@@ -210,7 +210,7 @@ def model_from_reconstruction(
     )
 
 
-def _registered(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+def registered(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """Images with a pose, sorted by name."""
     images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
     return sorted(images, key=lambda image: str(image.name))
