@@ -27,6 +27,7 @@ from polmvs.config import FusionOptions, PropagationOptions
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map
+from polmvs.polarization.region import grow_mask
 from polmvs.scene import (
     KEYPOINT_SIGMA_PX,
     MIN_FACING_COSINE,
@@ -158,12 +159,6 @@ def part_shares(tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int) -> Arr
     count = np.bincount(tracks.obs_track, minlength=num_tracks)
     hits = np.bincount(tracks.obs_track, on_part, num_tracks)
     return np.where(count > 0, hits / np.maximum(count, 1), 1.0)
-
-
-def grow_mask(mask: Mask, margin_px: int) -> Mask:
-    """The mask and all that is within the margin of it, in rows, columns and diagonals, px."""
-    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
 
 
 def relative_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:

@@ -11,7 +11,6 @@ from polmvs.surface.surroundings import (
     SurroundingsTolerances,
     _whole_view,
     choose_partners,
-    grow_mask,
     part_shares,
     relative_sigmas,
     sparse_surroundings,
@@ -111,13 +110,6 @@ def test_no_tracks_and_tracks_without_observations():
     np.testing.assert_array_equal(part_shares(unseen, maps, 3), [1.0])
     assert np.isinf(relative_sigmas(unseen, [m.view for m in maps])).all()
     assert not sparse_surroundings(unseen, maps).is_kept.any()
-
-
-def test_grow_mask():
-    mask = np.zeros((7, 7), bool)
-    mask[3, 3] = True
-    assert grow_mask(mask, 2).sum() == 25
-    np.testing.assert_array_equal(grow_mask(mask, 0), mask)
 
 
 def test_partners_have_a_useful_angle():
