@@ -46,9 +46,9 @@ if TYPE_CHECKING:  # heavy
     from polmvs.evaluation.comparison import Comparison, ModelFigures
     from polmvs.evaluation.trust import Trust
     from polmvs.normals.single_view.plane import PlaneEstimate
-    from polmvs.pipeline.monitor import Monitor
     from polmvs.pipeline.record import Record
     from polmvs.pipeline.run_folder import RunFolder
+    from polmvs.pipeline.runner import Monitor
     from polmvs.polarization.stokes import Stokes
     from polmvs.scene import SparseModel, View
     from polmvs.surface.dense_view import DenseView

@@ -38,9 +38,8 @@ from polmvs.io.images import write_bytes
 from polmvs.io.typed_json import write_json
 from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import JobOutcome, reconstruct
-from polmvs.pipeline.monitor import NoMonitor
 from polmvs.pipeline.run_folder import RunFolder, has_content
-from polmvs.pipeline.runner import Job
+from polmvs.pipeline.runner import Job, NoMonitor
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.poses import PosesResult
 

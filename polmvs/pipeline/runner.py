@@ -12,9 +12,10 @@ import logging
 import os
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 from polmvs.colmap.cameras import quiet_colmap
 from polmvs.config import (
@@ -29,7 +30,7 @@ from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.folders import require_unicode
 from polmvs.memory import MemoryPlan, PeakMemory, cpu_seconds, plan_memory
-from polmvs.parallel import Workers
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.checks import (
     check_input,
     identity_of,
@@ -37,7 +38,6 @@ from polmvs.pipeline.checks import (
     require_apart,
     require_same_capture,
 )
-from polmvs.pipeline.monitor import Monitor, NoMonitor
 from polmvs.pipeline.record import (
     Record,
     StageRecord,
@@ -70,6 +70,39 @@ from polmvs.threads import one_blas_thread
 logger = logging.getLogger(__name__)
 
 FILE_ONLY = {"file_only": True}  # of records that a monitor is told of as well
+
+
+class Monitor(Protocol):
+    """Who watches a run: what a terminal, a notebook or a test implements to follow it."""
+
+    def opened(self, run_folder: RunFolder) -> None:
+        """The run folder is ready."""
+
+    def stage(self, name: str, total: int | None) -> AbstractContextManager[OnProgress]:
+        """A stage begins, of ``total`` steps if that is known; gives who is told of its steps."""
+
+    def finished(self, name: str, seconds: float, summary: str) -> None:
+        """A stage is finished and recorded; the summary is what it found, in a few words."""
+
+    def skipped(self, name: str) -> None:
+        """A stage was finished earlier."""
+
+
+class NoMonitor:
+    """Nobody watches."""
+
+    def opened(self, run_folder: RunFolder) -> None:
+        """Do nothing."""
+
+    def stage(self, name: str, total: int | None) -> AbstractContextManager[OnProgress]:
+        """Do nothing."""
+        return nullcontext(no_progress)
+
+    def finished(self, name: str, seconds: float, summary: str) -> None:
+        """Do nothing."""
+
+    def skipped(self, name: str) -> None:
+        """Do nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)

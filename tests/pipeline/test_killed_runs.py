@@ -25,9 +25,8 @@ from polmvs.config import Method, Options, PropagationOptions, RunOptions, SfmOp
 from polmvs.errors import DataError
 from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import reconstruct
-from polmvs.pipeline.monitor import NoMonitor
 from polmvs.pipeline.run_lock import locked
-from polmvs.pipeline.runner import Job
+from polmvs.pipeline.runner import Job, NoMonitor
 from polmvs.scene import SparseModel, Tracks
 from polmvs.synthetic.captures import quantize, render_mosaic, ring_of_views
 from polmvs.synthetic.surfaces import Plane
