@@ -224,7 +224,7 @@ def track_normals(
     from polmvs.pipeline.stages.normals import load_track_normals, solve_track_normals
     from polmvs.polarization.capture import open_capture
 
-    angle_model = _choice(AngleModel, model, "model")
+    angle_model = _angle_model(model, "model")
     options = change_options(options, changes)
     opened = open_capture(capture, options.capture)
     fitted = _fitted(opened, sparse)
@@ -445,7 +445,7 @@ class RunResult:
 
     def __getitem__(self, model: AngleModel | str) -> Reconstruction:
         """The result of an angle model; KeyError if the run has none of it."""
-        found = self.models.get(_choice(AngleModel, model, "model"))
+        found = self.models.get(_angle_model(model, "model"))
         if found is None:
             raise KeyError(f"{self.folder} has no cloud of {model!r}, but of {list(self.models)}")
         return found
@@ -504,7 +504,7 @@ def reconstruct(
     """
     from polmvs.pipeline import jobs
 
-    angle_model = _choice(AngleModel, model, "model")
+    angle_model = _angle_model(model, "model")
     job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
     outcome = jobs.reconstruct(job, angle_model)
     _warn_if_empty(outcome.empty)
@@ -539,7 +539,7 @@ def compare(
     """
     from polmvs.pipeline import jobs
 
-    chosen = tuple(dict.fromkeys(_choice(AngleModel, model, "models") for model in models))
+    chosen = tuple(dict.fromkeys(_angle_model(model, "models") for model in models))
     job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
     outcome = jobs.compare(job, chosen)
     _warn_if_empty(outcome.empty)
@@ -660,9 +660,9 @@ def _unknown(name: str, known: Iterable[str]) -> OptionError:
     )
 
 
-def _choice(kind: type[AngleModel], value: AngleModel | str, name: str) -> AngleModel:
+def _angle_model(value: AngleModel | str, name: str) -> AngleModel:
     try:
-        return kind(value)
+        return AngleModel(value)
     except ValueError as error:
-        choices = ", ".join(kind)
+        choices = ", ".join(AngleModel)
         raise OptionError(f"must be one of {choices}, not {value!r}.", field=name) from error

@@ -7,6 +7,7 @@ sensor's polarizers and lie in a folder of their own.
 from __future__ import annotations
 
 import logging
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -123,7 +124,7 @@ def build_maps(
             ]
             if options.light is None:
                 questions.append(partial(find_diffuse_parts, tracks, maps, max_rows=max_rows))
-            wrong, *diffuse = workers.map(_answer, questions)
+            wrong, *diffuse = workers.map(operator.call, questions)
             if wrong is not None:
                 logger.warning("%s.", wrong)
             for of_views in diffuse:  # here: turned twice, should a worker be lost, it were wrong
@@ -222,10 +223,6 @@ def _build_map(
     light = options.light or Light.SPECULAR
     store_phase_map(build_phase_map(view, stokes, region, light), folder)
     return int(region.inside.sum())
-
-
-def _answer(question: Callable[[], Any]) -> Any:
-    return question()
 
 
 def _wrong_setting(
