@@ -555,12 +555,10 @@ def open_run(folder: PathArg) -> RunResult:
         The folder holds no run, one of another version, or no dense cloud.
     """
     from polmvs.pipeline.run_folder import RunFolder
-    from polmvs.pipeline.runner import load_record
-    from polmvs.pipeline.stages.densify import DensifyResult
+    from polmvs.pipeline.runner import dense_models, load_record
 
     root = Path(folder)
-    record = load_record(RunFolder(root))
-    models = [model for model in AngleModel if record.find(DensifyResult, model) is not None]
+    models = dense_models(load_record(RunFolder(root)))
     if not models:
         raise DataError(root, "holds a run without a dense cloud. Go on with it: `run.resume`.")
     return _run_result(root, models)

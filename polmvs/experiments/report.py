@@ -386,9 +386,9 @@ def tracks_json(result: TrackResult) -> dict[str, Any]:
 
 def _track_json(errors: TrackErrors) -> dict[str, list[float]]:
     return {
-        "mean_deg": errors.over(lambda e: float(e.mean())),
-        "median_deg": errors.over(lambda e: float(np.median(e))),
-        "p80_deg": errors.over(lambda e: float(np.percentile(e, 80))),
+        "mean_deg": errors.over(np.mean),
+        "median_deg": errors.over(np.median),
+        "p80_deg": errors.over(lambda e: np.percentile(e, 80)),
         "under_25": errors.under,
         "valid_share": errors.valid_share,
     }

@@ -74,7 +74,7 @@ class TrackErrors:
 
     errors_deg: tuple[Array, ...]
 
-    def over(self, statistic: Callable[[Array], float]) -> list[float]:
+    def over(self, statistic: Callable[[Array], np.floating]) -> list[float]:
         """A statistic of the finite errors for each K; NaN where there are none."""
         finite = [errors[np.isfinite(errors)] for errors in self.errors_deg]
         return [float(statistic(errors)) if len(errors) else np.nan for errors in finite]

@@ -19,6 +19,7 @@ from typing import Protocol
 
 from polmvs.colmap.cameras import quiet_colmap
 from polmvs.config import (
+    AngleModel,
     Options,
     RunOptions,
     plain_options,
@@ -63,6 +64,7 @@ from polmvs.pipeline.stage_table import (
     with_dependent,
     written_names,
 )
+from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import open_capture
 from polmvs.threads import one_blas_thread
@@ -411,6 +413,11 @@ def load_record(run_folder: RunFolder) -> Record:
         It is missing, no record of a run, or one of another version.
     """
     return read_record(run_folder, result_types())
+
+
+def dense_models(record: Record) -> tuple[AngleModel, ...]:
+    """Models that a run has made a dense cloud of."""
+    return tuple(m for m in AngleModel if record.find(DensifyResult, m) is not None)
 
 
 def prepare_output(run_folder: RunFolder, *, overwrite: bool, resume: bool) -> Record:

@@ -25,7 +25,7 @@ from polmvs.io.images import read_gray
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
-from polmvs.pipeline.runner import load_record
+from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.poses import PosesResult
@@ -60,7 +60,7 @@ def num_recorded_steps(run_folder: RunFolder) -> int:
     """How often :func:`write_recording` reports."""
     record = load_record(run_folder)
     found = record.find(PosesResult)
-    return (found.num_views if found is not None else 0) + len(_models(record))
+    return (found.num_views if found is not None else 0) + len(dense_models(record))
 
 
 def write_recording(
@@ -124,7 +124,7 @@ class _Recorder:
         tracks = self.model.tracks
         points = rr.Points3D(tracks.points_in_world, colors=tracks.colors, radii=_radius(rr))
         log("world/sparse", points)
-        models = _models(self.record)
+        models = dense_models(self.record)
         first = next(iter(models), None)
         if first is not None:
             self.begin("maps", "phases of the polarised regions")
@@ -235,10 +235,6 @@ class _Recorder:
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)
         centers = np.array([view.center_in_world for view in self.model.views])
         return float(np.median(np.linalg.norm(centers - middle, axis=1))) / 40
-
-
-def _models(record: Record) -> tuple[AngleModel, ...]:
-    return tuple(model for model in AngleModel if record.find(DensifyResult, model) is not None)
 
 
 def _levels(views: Path) -> Iterator[Mesh]:

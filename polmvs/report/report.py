@@ -25,7 +25,7 @@ from polmvs.neighbors import nearest_points
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.runner import load_record
+from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.densify import DensifyResult, open_dense_views
 from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.maps import open_maps
@@ -141,7 +141,7 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
 def _open(folder: RunFolder) -> _Given:
     record = load_record(folder)
     options = options_from_plain(record.options, source=str(folder.run_file))
-    models = tuple(m for m in AngleModel if record.find(DensifyResult, m) is not None)
+    models = dense_models(record)
     if not models:
         raise DataError(folder.root, "has no dense cloud to report on. Run 'polmvs densify' first.")
     sparse = read_model(folder.sparse)
