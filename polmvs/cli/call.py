@@ -159,6 +159,18 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
     return values
 
 
+def require_new(path: Path, *, overwrite: bool) -> None:
+    """Refuse to replace a file that is there already, unless the user asks for it.
+
+    Raises
+    ------
+    OptionError
+        It exists.
+    """
+    if path.exists() and not overwrite:
+        raise OptionError(f"{path}: exists. Give `arguments.overwrite` to replace it.")
+
+
 def _line_of(text: str, error: ValueError) -> str:
     """The line at fault: Python's message does not name the key that is there twice."""
     found = re.search(r"at line (\d+)", str(error))

@@ -15,7 +15,7 @@ from polmvs.errors import DataError
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
 from polmvs.evaluation.map_errors import MapErrors, map_errors
 from polmvs.evaluation.metrics import AngleStats, CloudMetrics
-from polmvs.evaluation.tables import best_fit_lines, comparison_table
+from polmvs.evaluation.tables import best_fit_lines, comparison_rows, format_table
 from polmvs.evaluation.truth_errors import (
     TrackNormalErrors,
     evaluate,
@@ -124,7 +124,7 @@ class Comparison:
 
     def table(self) -> str:
         """The figures, a column for each model, in Markdown."""
-        return comparison_table(self)
+        return format_table(*comparison_rows(self))
 
     def summary(self) -> str:
         """The figures as a page, in Markdown."""
