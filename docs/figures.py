@@ -27,7 +27,8 @@ from polmvs.polarization.angle_models import phase_direction, phase_from_normal,
 from polmvs.polarization.stokes import axial_difference
 from polmvs.report.pictures import NOTHING, angle_picture, gray_picture, scalar_picture
 from polmvs.scene import View
-from polmvs.synthetic.captures import Plane, add_noise, look_at, render_view, ring_of_views
+from polmvs.synthetic.captures import add_noise, look_at, render_view, ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 IMAGES = Path(__file__).parent / "images"
 DEMO = Path(polmvs.__file__).parent / "demo_capture"

@@ -56,10 +56,10 @@ from polmvs.io.images import write_bytes
 from polmvs.normals.estimator import EstimatorTolerances, solve_normals
 from polmvs.normals.single_view.plane import plane_normal
 from polmvs.parallel import Workers
-from polmvs.pipeline.jobs import Job, compare, reconstruct
+from polmvs.pipeline.jobs import compare, reconstruct
 from polmvs.pipeline.record import versions
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
-from polmvs.pipeline.runner import load_record, timing_table
+from polmvs.pipeline.runner import Job, load_record, timing_table
 from polmvs.pipeline.stages.images import write_images
 from polmvs.pipeline.stages.maps import build_maps
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase

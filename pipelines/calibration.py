@@ -30,8 +30,9 @@ from polmvs.config import CaptureOptions, OptionGroup, option
 from polmvs.polarization.calibration import measure_response, write_calibration
 from polmvs.polarization.capture import open_capture
 from polmvs.polarization.stokes import axial_difference
-from polmvs.synthetic.captures import Sphere, render_view, ring_of_views
+from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.sensor import FaultySensor, faulty_sensor
+from polmvs.synthetic.surfaces import Sphere
 
 Array = NDArray[np.float64]
 

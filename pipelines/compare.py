@@ -18,7 +18,8 @@ from polmvs.cli.flags import Command
 from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
 from polmvs.config import OptionGroup, RunOptions, option, replace_option
-from polmvs.pipeline.jobs import Job, compare
+from polmvs.pipeline.jobs import compare
+from polmvs.pipeline.runner import Job
 
 
 @dataclass(frozen=True, kw_only=True)

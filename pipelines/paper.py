@@ -8,7 +8,6 @@ page is ``OUT/paper.md``, its figures lie in ``OUT/CAPTURE/``, all numbers in ``
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
@@ -26,12 +25,12 @@ from polmvs.config import (
     OptionGroup,
     RegionOptions,
     option,
-    to_plain,
 )
 from polmvs.errors import OptionError
 from polmvs.experiments.data import open_experiment, require_apart
 from polmvs.experiments.output import NAMES, Report, write_files, write_report
 from polmvs.experiments.report import check_options, num_steps, run_experiment
+from polmvs.io.typed_json import json_bytes
 from polmvs.memory import PeakMemory
 from polmvs.parallel import Workers
 from polmvs.pipeline.record import versions
@@ -135,8 +134,7 @@ def _page(
         "peak_rss_mb": peak_mb,
         "versions": versions(),
     }
-    text = json.dumps(to_plain(content), indent=1, allow_nan=False) + "\n"
-    return {"paper.md": "\n".join(lines).encode(), "paper.json": text.encode()}
+    return {"paper.md": "\n".join(lines).encode(), "paper.json": json_bytes(content)}
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ def _reconstruct(call: Call, terminal: Terminal) -> int:
     model = call.get(ModelChoice).angle_model
     outcome = reconstruct(job_of(call, terminal), model)
     cloud = outcome.run_folder.cloud(model)
-    print(outcome.empty or f"{cloud}: {outcome.result(DensifyResult, model)}")
+    print(outcome.empty or f"{cloud}: {outcome.record.result(DensifyResult, model)}")
     return 0 if outcome.empty is None else EMPTY_STATUS
 
 

@@ -46,9 +46,9 @@ if TYPE_CHECKING:  # heavy
     from polmvs.evaluation.comparison import Comparison, ModelFigures
     from polmvs.evaluation.trust import Trust
     from polmvs.normals.single_view.plane import PlaneEstimate
-    from polmvs.pipeline.monitor import Monitor
     from polmvs.pipeline.record import Record
     from polmvs.pipeline.run_folder import RunFolder
+    from polmvs.pipeline.runner import Monitor
     from polmvs.polarization.stokes import Stokes
     from polmvs.scene import SparseModel, View
     from polmvs.surface.dense_view import DenseView
@@ -224,7 +224,7 @@ def track_normals(
     from polmvs.pipeline.stages.normals import load_track_normals, solve_track_normals
     from polmvs.polarization.capture import open_capture
 
-    angle_model = _choice(AngleModel, model, "model")
+    angle_model = _angle_model(model, "model")
     options = change_options(options, changes)
     opened = open_capture(capture, options.capture)
     fitted = _fitted(opened, sparse)
@@ -445,7 +445,7 @@ class RunResult:
 
     def __getitem__(self, model: AngleModel | str) -> Reconstruction:
         """The result of an angle model; KeyError if the run has none of it."""
-        found = self.models.get(_choice(AngleModel, model, "model"))
+        found = self.models.get(_angle_model(model, "model"))
         if found is None:
             raise KeyError(f"{self.folder} has no cloud of {model!r}, but of {list(self.models)}")
         return found
@@ -504,7 +504,7 @@ def reconstruct(
     """
     from polmvs.pipeline import jobs
 
-    angle_model = _choice(AngleModel, model, "model")
+    angle_model = _angle_model(model, "model")
     job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
     outcome = jobs.reconstruct(job, angle_model)
     _warn_if_empty(outcome.empty)
@@ -539,7 +539,7 @@ def compare(
     """
     from polmvs.pipeline import jobs
 
-    chosen = tuple(dict.fromkeys(_choice(AngleModel, model, "models") for model in models))
+    chosen = tuple(dict.fromkeys(_angle_model(model, "models") for model in models))
     job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
     outcome = jobs.compare(job, chosen)
     _warn_if_empty(outcome.empty)
@@ -555,12 +555,10 @@ def open_run(folder: PathArg) -> RunResult:
         The folder holds no run, one of another version, or no dense cloud.
     """
     from polmvs.pipeline.run_folder import RunFolder
-    from polmvs.pipeline.runner import load_record
-    from polmvs.pipeline.stages.densify import DensifyResult
+    from polmvs.pipeline.runner import dense_models, load_record
 
     root = Path(folder)
-    record = load_record(RunFolder(root))
-    models = [model for model in AngleModel if record.find(DensifyResult, model) is not None]
+    models = dense_models(load_record(RunFolder(root)))
     if not models:
         raise DataError(root, "holds a run without a dense cloud. Go on with it: `run.resume`.")
     return _run_result(root, models)
@@ -589,9 +587,9 @@ def _job(
     scheduler: str | None,
     monitor: Monitor | None,
 ) -> Any:
-    from polmvs.pipeline.jobs import Job
     from polmvs.pipeline.record import read_options
     from polmvs.pipeline.run_folder import RunFolder
+    from polmvs.pipeline.runner import Job
 
     if resume and options is None:  # those of the run, as the command line does
         options = options_from_plain(read_options(RunFolder(Path(out))), str(out))
@@ -660,9 +658,9 @@ def _unknown(name: str, known: Iterable[str]) -> OptionError:
     )
 
 
-def _choice(kind: type[AngleModel], value: AngleModel | str, name: str) -> AngleModel:
+def _angle_model(value: AngleModel | str, name: str) -> AngleModel:
     try:
-        return kind(value)
+        return AngleModel(value)
     except ValueError as error:
-        choices = ", ".join(kind)
+        choices = ", ".join(AngleModel)
         raise OptionError(f"must be one of {choices}, not {value!r}.", field=name) from error

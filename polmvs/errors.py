@@ -6,7 +6,8 @@ command line puts the flag in its place, a notebook sees the field.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from os import PathLike
 from typing import ClassVar
 
@@ -65,6 +66,21 @@ class OptionError(PolmvsError):
     def __reduce__(self) -> tuple[Callable[[str, str | None], OptionError], tuple[str, str | None]]:
         """Pickle the parts, so that the error of a worker process arrives whole."""
         return _option_error, (self.reason, self.field)
+
+
+@contextmanager
+def as_data_error(path: str | PathLike[str], done: str) -> Iterator[None]:
+    """Name the file or folder that the system refuses: it cannot be read, or whatever is done.
+
+    Raises
+    ------
+    DataError
+        In place of an ``OSError`` from within.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise DataError(path, f"cannot be {done}: {error.strerror or error}.") from error
 
 
 def _short(reason: str) -> str:

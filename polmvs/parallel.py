@@ -22,14 +22,19 @@ from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 from polmvs.threads import keep_to_one_core
 
 T = TypeVar("T")
+OnProgress: TypeAlias = Callable[[int], None]  # called with the steps done since the last call
 
 HELD_BACK = (signal.SIGINT, signal.SIGTERM)
 POSIX = hasattr(signal, "pthread_sigmask")
+
+
+def no_progress(count: int) -> None:
+    """Nobody is told of the steps."""
 
 
 class Backend(Protocol):

@@ -36,7 +36,8 @@ from polmvs.evaluation.tables import format_table
 from polmvs.geometry import RigidTransform
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.raw_formats import read_raw
-from polmvs.pipeline.jobs import AngleModel, Job, compare
+from polmvs.pipeline.jobs import AngleModel, compare
+from polmvs.pipeline.runner import Job
 from polmvs.polarization.capture import open_capture
 
 REFERENCE = "npy, float64"

@@ -13,7 +13,8 @@ from polmvs.io.clouds import read_cloud
 from polmvs.scene import SparseModel, Tracks, View
 from polmvs.surface.dense_view import DenseView
 from polmvs.surface.map_export import export_dense_workspace
-from polmvs.synthetic.captures import Plane, ring_of_views
+from polmvs.synthetic.captures import ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 PINHOLE = PinholeCamera(width=160, height=128, fx=120.0, fy=121.0, cx=79.0, cy=63.0)
 OPENCV = ColmapCamera(
@@ -155,6 +156,11 @@ def fuse(folder, *, min_num_pixels=2, max_reproj_error=2.0):
         str(target), str(folder), input_type="geometric", options=options, output_type="PLY"
     )
     return read_cloud(target)
+
+
+def without_maps(workspace):
+    """Names of the views of an opened workspace that have no depth map or no normal map."""
+    return tuple(item.view.name for item in workspace.views if item.depth is None)
 
 
 def image_shift(one, two, inside):

@@ -8,9 +8,9 @@ import numpy as np
 from polmvs.camera import PinholeCamera
 from polmvs.io.images import write_png
 from polmvs.scene import View
-from polmvs.synthetic.captures import Plane, Sphere, add_noise, quantize
+from polmvs.synthetic.captures import add_noise, quantize
 from polmvs.synthetic.printed import PrintedScene, orbit_views, render_printed_mosaic
-from polmvs.synthetic.surfaces import Group
+from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
 CAMERA = PinholeCamera(width=300, height=250, fx=218.0, fy=218.0, cx=151.0, cy=126.0)
 INTRINSICS = (218.0, 218.0, 151.0, 126.0)

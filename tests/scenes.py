@@ -10,7 +10,8 @@ from polmvs.polarization.phase_map import PhaseMap, build_phase_map
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
 from polmvs.scene import Seeds, Tracks, View
-from polmvs.synthetic.captures import Plane, SyntheticView, render_view, ring_of_views
+from polmvs.synthetic.captures import SyntheticView, render_view, ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 CAMERA = PinholeCamera(width=160, height=128, fx=120.0, fy=120.0, cx=80.0, cy=64.0)
 

@@ -13,7 +13,8 @@ from polmvs.config import AngleModel, Light
 from polmvs.geometry import RigidTransform, align_points
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
 from polmvs.scene import View
-from polmvs.synthetic.captures import Plane, look_at, render_view
+from polmvs.synthetic.captures import look_at, render_view
+from polmvs.synthetic.surfaces import Plane
 
 RNG = np.random.default_rng(0)
 

@@ -4,9 +4,8 @@ import cv2
 import scipy.linalg  # noqa: F401  # its library is told as NumPy's is
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from polmvs.config import Options, RunOptions
 from polmvs.parallel import Workers
-from polmvs.pipeline.runner import open_run
+from polmvs.pipeline.runner import Job, open_run
 from polmvs.threads import one_blas_thread
 
 
@@ -32,14 +31,7 @@ def test_each_worker_keeps_to_one_core(monkeypatch) -> None:
 
 
 def test_a_run_keeps_to_one_thread(demo_capture, tmp_path) -> None:
-    run = open_run(
-        demo_capture,
-        tmp_path / "out",
-        Options(),
-        RunOptions(),
-        table=(),
-        min_images=3,
-        taken_over=(),
-    )
+    job = Job(capture=demo_capture, out=tmp_path / "out")
+    run = open_run(job, table=(), min_images=3, taken_over=())
     with threadpool_limits(2, user_api="blas"), run:
         assert blas_threads() == {1}

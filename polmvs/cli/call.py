@@ -19,7 +19,7 @@ from polmvs.config import (
     require_table,
     values_from_plain,
 )
-from polmvs.errors import DataError, OptionError
+from polmvs.errors import OptionError, as_data_error
 
 Group = TypeVar("Group", bound=OptionGroup)
 
@@ -141,9 +141,8 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
     import tomllib  # not for --help
 
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+        with as_data_error(path, "read"):
+            text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise OptionError(f"{path}: is no TOML file (not UTF-8).") from error
     try:
@@ -158,6 +157,18 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
         require_table(name, table, known, str(path))
         values[name] = values_from_plain(known[name], table, str(path))
     return values
+
+
+def require_new(path: Path, *, overwrite: bool) -> None:
+    """Refuse to replace a file that is there already, unless the user asks for it.
+
+    Raises
+    ------
+    OptionError
+        It exists.
+    """
+    if path.exists() and not overwrite:
+        raise OptionError(f"{path}: exists. Give `arguments.overwrite` to replace it.")
 
 
 def _line_of(text: str, error: ValueError) -> str:

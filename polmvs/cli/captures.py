@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from polmvs.cli.call import Call
+from polmvs.cli.call import Call, require_new
 from polmvs.cli.commands import (
     BoardOptions,
     CalibrateArguments,
@@ -16,11 +16,12 @@ from polmvs.cli.flags import in_flags
 from polmvs.cli.terminal import Terminal
 from polmvs.config import CaptureOptions
 from polmvs.errors import DataError, OptionError
+from polmvs.io.images import write_png
 from polmvs.io.intrinsics import write_intrinsics
 from polmvs.polarization.calibration import write_calibration
 from polmvs.polarization.calibration_frames import calibrate_polarizers
 from polmvs.polarization.capture import intensity_image_8bit, open_capture
-from polmvs.polarization.inspection import inspect_capture, write_contact_sheet
+from polmvs.polarization.inspection import contact_sheet, inspect_capture
 from polmvs.poses.board_calibration import Board, calibrate_camera
 
 
@@ -34,7 +35,7 @@ def inspect(call: Call, terminal: Terminal) -> int:
         inspection = inspect_capture(capture, on_progress=report)
     lines = list(inspection.lines)
     if arguments.sheet is not None:
-        write_contact_sheet(arguments.sheet, capture, in_flags)
+        write_png(arguments.sheet, contact_sheet(capture, in_flags))
         lines.append(f"{arguments.sheet}: contact sheet")
     content = {
         "notes": capture.notes,
@@ -52,8 +53,7 @@ def inspect(call: Call, terminal: Terminal) -> int:
 def calibrate(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs calibrate``."""
     arguments = call.get(CalibrateArguments)
-    if arguments.out.exists() and not arguments.overwrite:
-        raise OptionError(f"{arguments.out}: exists. Give `arguments.overwrite` to replace it.")
+    require_new(arguments.out, overwrite=arguments.overwrite)
     if not arguments.out.parent.is_dir():
         raise DataError(arguments.out.parent, "no such folder.")
     if arguments.kind is CalibrationKind.CAMERA:
@@ -94,15 +94,8 @@ def _camera(call: Call, terminal: Terminal, folder: Path, out: Path) -> int:
     capture = open_capture(folder, call.get(CaptureOptions))
     white = capture.exposure()
     pictures = {name: intensity_image_8bit(capture.load(name), white) for name in capture.names}
-    board = Board(
-        cols=given.cols,
-        rows=given.rows,
-        square=given.square,
-        dictionary=given.dictionary,
-        marker=given.marker,
-    )
     try:
-        found = calibrate_camera(pictures, board)
+        found = calibrate_camera(pictures, Board(**vars(given)))
     except ValueError as error:
         raise DataError(folder, str(error)) from error
     comment = f"rms {found.rms_px:.3f} px over {len(found.views)} views of a board"

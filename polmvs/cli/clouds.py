@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from polmvs.cli.call import Call
+from polmvs.cli.call import Call, require_new
 from polmvs.cli.commands import EvaluateArguments, MeshArguments
 from polmvs.cli.terminal import Terminal
-from polmvs.errors import OptionError
 from polmvs.evaluation.comparison import evaluate_file
 from polmvs.evaluation.tables import evaluation_text
 from polmvs.io.clouds import read_cloud, write_mesh
@@ -23,8 +22,7 @@ def evaluate(call: Call, terminal: Terminal) -> int:
 def mesh(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs mesh``."""
     arguments = call.get(MeshArguments)
-    if arguments.mesh.exists() and not arguments.overwrite:
-        raise OptionError(f"{arguments.mesh}: exists. Give `run.overwrite` to replace it.")
+    require_new(arguments.mesh, overwrite=arguments.overwrite)
     made = poisson_mesh(read_cloud(arguments.cloud), source=arguments.cloud)
     write_mesh(arguments.mesh, made)
     num_triangles = len(made.triangles)

@@ -139,7 +139,8 @@ def _check_plane(folder: Path) -> str:
     from polmvs.io.images import write_png
     from polmvs.normals.single_view.measurement import measure_planes
     from polmvs.scene import View
-    from polmvs.synthetic.captures import Plane, look_at, quantize, render_mosaic, render_view
+    from polmvs.synthetic.captures import look_at, quantize, render_mosaic, render_view
+    from polmvs.synthetic.surfaces import Plane
 
     camera = PinholeCamera(width=160, height=120, fx=110, fy=110, cx=80, cy=60)
     pose = look_at([0.1, 0.5, 0.5], [0.0, 0.1, 0.0])

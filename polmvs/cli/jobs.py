@@ -29,6 +29,7 @@ from polmvs.pipeline import jobs as pipeline
 from polmvs.pipeline.batch import TABLE_FILE, BatchRow, State, batch_table, read_batch, run_batch
 from polmvs.pipeline.record import is_finished, read_options
 from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.runner import Job
 from polmvs.pipeline.stages.dense_workspace import DenseWorkspaceResult
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.mesh import MeshResult
@@ -49,7 +50,7 @@ def demo(call: Call, terminal: Terminal) -> int:
         sfm=SfmOptions(intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy)),
         evaluation=EvaluationOptions(gt=DEMO_CAPTURE / "gt"),
     )
-    job = pipeline.Job(
+    job = Job(
         capture=DEMO_CAPTURE,
         out=call.get(DemoArguments).out,
         options=options,
@@ -79,7 +80,7 @@ def compare(call: Call, terminal: Terminal) -> int:
 def sfm(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs sfm``."""
     outcome = pipeline.find_poses(job_of(call, terminal))
-    num_tracks = outcome.result(PosesResult).num_tracks
+    num_tracks = outcome.record.result(PosesResult).num_tracks
     text = (
         f"{outcome.run_folder.sparse}: {_views(outcome)} have a pose, {num_tracks:,} sparse points"
     )
@@ -91,7 +92,7 @@ def normals(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs normals``."""
     model = call.get(ModelChoice).angle_model
     outcome = pipeline.solve_normals(job_of(call, terminal, continues=True), (model,))
-    found, seeds = outcome.result(NormalsResult, model), outcome.result(SeedsResult)
+    found, seeds = outcome.record.result(NormalsResult, model), outcome.record.result(SeedsResult)
     text = (
         f"{outcome.run_folder.sparse_cloud(model)}: {found.num_normals:,} of "
         f"{found.num_tracks:,} sparse points have a normal, {seeds.num_seeds:,} are seeds"
@@ -159,7 +160,7 @@ def _check_recording(call: Call) -> None:
         require_rerun(recording)
 
 
-def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeline.Job:
+def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> Job:
     """The job; one that goes on takes the options of the run in OUT where none are given."""
     arguments, run_options = call.get(JobArguments), call.get(RunOptions)
     recorded = None
@@ -170,7 +171,7 @@ def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeli
         named = any(option.startswith("reference.") for option in call.given)
         if named and not is_finished(run_folder, "poses"):
             recorded = {name: group for name, group in recorded.items() if name != "reference"}
-    return pipeline.Job(
+    return Job(
         capture=arguments.capture,
         out=arguments.out,
         options=call.options(recorded),
@@ -181,20 +182,20 @@ def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeli
 
 
 def _show_cloud(outcome: pipeline.JobOutcome, model: AngleModel, terminal: Terminal) -> int:
-    folder, cloud = outcome.run_folder, outcome.result(DensifyResult, model)
-    metric = outcome.result(PosesResult).is_metric
+    folder, cloud = outcome.run_folder, outcome.record.result(DensifyResult, model)
+    metric = outcome.record.result(PosesResult).is_metric
     unit = "metres" if metric else "the model's unit, not metric"
     lines = [
         f"{folder.cloud(model)}: {cloud.num_points:,} points from {_views(outcome)}, and "
         f"{cloud.num_surroundings:,} of the surroundings; in {unit}"
     ]
-    mesh = outcome.find(MeshResult, model)
+    mesh = outcome.record.find(MeshResult, model)
     if mesh is not None and mesh.num_triangles:
         lines.append(f"{folder.mesh(model)}: {mesh.num_triangles:,} triangles")
-    dense = outcome.find(DenseWorkspaceResult, model)
+    dense = outcome.record.find(DenseWorkspaceResult, model)
     if dense is not None and dense.folder is not None:
         lines.append(f"{dense.folder}: COLMAP dense workspace")
-    trust = outcome.find(Trust, model)
+    trust = outcome.record.find(Trust, model)
     if trust is not None and cloud.num_points:
         lines += map(str, trust.figures())
     terminal.show(in_flags("\n".join(lines)), _content(outcome, terminal))
@@ -223,7 +224,7 @@ def _content(outcome: pipeline.JobOutcome, terminal: Terminal) -> dict[str, Any]
 
 
 def _views(outcome: pipeline.JobOutcome) -> str:
-    poses = outcome.result(PosesResult)
+    poses = outcome.record.result(PosesResult)
     return f"{poses.num_views} of {poses.num_views + len(poses.unregistered)} views"
 
 

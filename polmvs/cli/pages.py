@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from polmvs.cli.call import Call, RecordingOptions
+from polmvs.cli.call import Call, RecordingOptions, require_new
 from polmvs.cli.commands import FolderArguments, RenderArguments
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel
-from polmvs.errors import DataError, OptionError
+from polmvs.errors import DataError
 from polmvs.io.clouds import Cloud, Mesh, has_triangles, read_cloud, read_mesh, show_in_viewer
 from polmvs.io.images import write_png
 from polmvs.pipeline.run_folder import RunFolder
@@ -105,8 +105,7 @@ def _show(files: Sequence[Path], report: Callable[[str], None]) -> None:
 def render(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs render``."""
     arguments = call.get(RenderArguments)
-    if arguments.picture.exists() and not arguments.overwrite:
-        raise OptionError(f"{arguments.picture}: exists. Give `arguments.overwrite` to replace it.")
+    require_new(arguments.picture, overwrite=arguments.overwrite)
     subjects: list[Cloud | Mesh] = [
         read_mesh(path) if has_triangles(path) else read_cloud(path) for path in arguments.files
     ]

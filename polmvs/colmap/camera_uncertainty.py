@@ -19,8 +19,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polmvs.colmap.models import read_reconstruction
-from polmvs.colmap.sfm import SfmTolerances
+from polmvs.colmap.models import read_reconstruction, registered
+from polmvs.colmap.sfm import SfmTolerances, bundle_of
 from polmvs.geometry import align_points
 from polmvs.scene import KEYPOINT_SIGMA_PX
 
@@ -128,9 +128,7 @@ def pose_uncertainty(
     reconstruction = read_reconstruction(model)
     if reconstruction.num_reg_images() > tolerances.max_views:
         return None
-    images = sorted(
-        (reconstruction.image(i) for i in reconstruction.reg_image_ids()), key=lambda one: one.name
-    )
+    images = registered(reconstruction)
     adjuster = _adjuster(reconstruction, tolerances, free=False, free_point=False)
     options = pycolmap.BACovarianceOptions()
     options.params = pycolmap.BACovarianceOptionsParams.POSES
@@ -247,17 +245,9 @@ def _adjuster(
     free: bool,
     free_point: bool,
 ) -> pycolmap.CeresBundleAdjuster:
-    bundle = pycolmap.BundleAdjustmentOptions()
-    bundle.refine_focal_length = bundle.refine_extra_params = free
-    bundle.refine_principal_point = free_point
-    bundle.print_summary = False
-    bundle.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    bundle.ceres.loss_function_scale = t.loss_scale_px
-    bundle.ceres.solver_options.num_threads = 1
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in reconstruction.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    bundle, config = bundle_of(
+        reconstruction, t.loss_scale_px, free_intrinsics=free, free_principal_point=free_point
+    )
     return pycolmap.create_default_ceres_bundle_adjuster(bundle, config, reconstruction)
 
 

@@ -159,16 +159,11 @@ class DenseWorkspace:
         """Folder of the maps."""
         return self.folder / STEREO
 
-    @property
-    def without_maps(self) -> tuple[str, ...]:
-        """Names of the views that have no depth map or no normal map."""
-        return tuple(item.view.name for item in self.views if item.depth is None)
-
 
 def open_dense_workspace(folder: PathArg) -> DenseWorkspace:
     """Open a dense workspace of COLMAP's or ours, and check what can be checked without loading.
 
-    Views without maps are fine, see :attr:`DenseWorkspace.without_maps`.
+    Views without maps are fine.
 
     Raises
     ------

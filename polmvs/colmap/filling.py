@@ -30,7 +30,7 @@ from polmvs.colmap.dense_workspace import (
     write_maps,
 )
 from polmvs.colmap.maps import DepthNormals
-from polmvs.errors import DataError, OptionError
+from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.folders import new_folder
 
 # Depth and normals of an image in the workspace's pixels by name, None for none.
@@ -109,10 +109,8 @@ def fill_workspace(
 @contextmanager
 def _scratch(folder: Path) -> Iterator[Path]:
     """A temporary folder in another one."""
-    try:
+    with as_data_error(folder, "changed"):
         scratch = Path(tempfile.mkdtemp(prefix=".polmvs-", dir=folder))
-    except OSError as error:
-        raise DataError(folder, f"cannot be changed: {error.strerror or error}.") from error
     try:
         yield scratch
     finally:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera
-from polmvs.errors import DataError
+from polmvs.errors import DataError, as_data_error
 from polmvs.geometry import dots, lengths
 from polmvs.io.images import write_bytes
 
@@ -208,10 +208,8 @@ def _read_header(path: PathArg) -> tuple[tuple[int, int, int], int, int]:
 def _read(path: PathArg) -> Image:
     """Samples ``(C, H, W)`` of a file that was checked."""
     (width, height, channels), start, _ = _read_header(path)
-    try:
+    with as_data_error(path, "read"):
         samples = np.fromfile(path, SAMPLE, offset=start)
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
     if not np.isfinite(samples).all():
         raise DataError(path, f"holds numbers that are not finite. {AGAIN}")
     return samples.reshape(channels, height, width).astype(np.float32, copy=False)

@@ -32,7 +32,7 @@ from polmvs.colmap.cameras import (
     quiet_colmap,
     rescaled_camera,
 )
-from polmvs.errors import MAX_QUOTED, DataError
+from polmvs.errors import MAX_QUOTED, DataError, as_data_error
 from polmvs.geometry import RigidTransform, nearest_rotation
 from polmvs.io.folders import new_folder, require_unicode
 from polmvs.scene import MAX_COORDINATE, SparseModel, Tracks, View, match_names, short_list
@@ -63,7 +63,7 @@ def read_model(path: PathArg) -> SparseModel:
         keypoints = None
         if _model_suffix(folder) == ".bin":
             keypoints = _stored_keypoints(folder / "images.bin")
-        sparse_model = _sparse_model(reconstruction, stored=keypoints)
+        sparse_model = model_from_reconstruction(reconstruction, stored=keypoints)
     _require_sound(folder, sparse_model.views, sparse_model.tracks)
     return sparse_model
 
@@ -79,7 +79,7 @@ def read_views(path: PathArg) -> tuple[View, ...]:
     folder = find_model(path)
     with _as_data_error(folder):
         reconstruction = _open(folder)
-        views = _views(reconstruction, _registered(reconstruction))
+        views = _views(reconstruction, registered(reconstruction))
     _require_sound(folder, views)
     return views
 
@@ -186,7 +186,10 @@ def _model_suffix(folder: Path) -> str | None:
 
 
 def model_from_reconstruction(
-    reconstruction: pycolmap.Reconstruction, names: Iterable[str] = ()
+    reconstruction: pycolmap.Reconstruction,
+    names: Iterable[str] = (),
+    *,
+    stored: Mapping[int, NDArray[np.void]] | None = None,
 ) -> SparseModel:
     """The registered part of a reconstruction.
 
@@ -194,17 +197,9 @@ def model_from_reconstruction(
     ----------
     reconstruction : with any rigs and camera models.
     names : of all images that were to be registered, in addition to the reconstruction's own.
+    stored : keypoints with a point by image id, where its binary file was read as a whole already.
     """
-    return _sparse_model(reconstruction, names)
-
-
-def _sparse_model(
-    reconstruction: pycolmap.Reconstruction,
-    names: Iterable[str] = (),
-    stored: Mapping[int, NDArray[np.void]] | None = None,
-) -> SparseModel:
-    """As :func:`model_from_reconstruction`; ``stored`` as in :func:`_tracks`."""
-    images = _registered(reconstruction)
+    images = registered(reconstruction)
     views = _views(reconstruction, images)
     known = {str(image.name) for image in reconstruction.images.values()} | set(names)
     return SparseModel(
@@ -214,7 +209,7 @@ def _sparse_model(
     )
 
 
-def _registered(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+def registered(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """Images with a pose, sorted by name."""
     images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
     return sorted(images, key=lambda image: str(image.name))
@@ -438,10 +433,15 @@ def reconstruction_of_views(
         image = pycolmap.Image(
             name=view.name, camera_id=1 if single_camera else index + 1, image_id=index + 1
         )
-        pose = view.cam_from_world
-        matrix = np.column_stack([pose.rotation, pose.translation])
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
+        _add_image(reconstruction, image, view.cam_from_world)
     return reconstruction
+
+
+def _add_image(
+    reconstruction: pycolmap.Reconstruction, image: pycolmap.Image, pose: RigidTransform
+) -> None:
+    matrix = np.column_stack([pose.rotation, pose.translation])
+    reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
 
 
 def _reconstruction(sparse_model: SparseModel) -> pycolmap.Reconstruction:
@@ -464,9 +464,7 @@ def _reconstruction(sparse_model: SparseModel) -> pycolmap.Reconstruction:
             camera_id=cameras.index(view.camera) + 1,
             image_id=index + 1,
         )
-        pose = view.cam_from_world
-        matrix = np.column_stack([pose.rotation, pose.translation])
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
+        _add_image(reconstruction, image, view.cam_from_world)
     _add_points(reconstruction, tracks, point2D_idx)
     return reconstruction
 
@@ -539,13 +537,11 @@ def check_binary_model(folder: Path) -> None:
 def _check_file(path: Path, record_end: Reader) -> None:
     """Whether the announced records fill the file."""
     try:
-        with _mapped(path) as data:
+        with as_data_error(path, "read"), _mapped(path) as data:
             position = COUNT.size
             for _ in range(COUNT.unpack_from(data)[0]):
                 position = record_end(data, position)
             complete = position == len(data)
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
     # An empty file, a record past the end, no such model, a length that no file has.
     except (ValueError, OverflowError, IndexError, struct.error):
         complete = False

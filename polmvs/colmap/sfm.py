@@ -554,20 +554,14 @@ def _adjust(
     free_principal_point: bool,
 ) -> None:
     """Bundle adjustment in place on one thread, then drop what is beyond the thresholds."""
-    bundle = pycolmap.BundleAdjustmentOptions()
-    bundle.refine_focal_length = free_intrinsics
-    bundle.refine_extra_params = free_intrinsics
-    bundle.refine_principal_point = free_principal_point
-    bundle.print_summary = False
-    bundle.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    bundle.ceres.loss_function_scale = tolerances.loss_scale_px
+    bundle, config = bundle_of(
+        reconstruction,
+        tolerances.loss_scale_px,
+        free_intrinsics=free_intrinsics,
+        free_principal_point=free_principal_point,
+    )
     bundle.ceres.solver_options.function_tolerance = tolerances.max_cost_change
     bundle.ceres.max_num_images_direct_dense_cpu_solver = tolerances.max_images_dense
-    bundle.ceres.solver_options.num_threads = 1  # sums over threads depend on their timing
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in reconstruction.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # Not pycolmap.bundle_adjustment: release 4.2 turns the log level back to INFO in it.
     pycolmap.create_default_bundle_adjuster(bundle, config, reconstruction).solve()
     observations = pycolmap.ObservationManager(reconstruction)
@@ -575,6 +569,28 @@ def _adjust(
         tolerances.max_reproj_error_px, COLMAP_DEFAULTS.filter_min_tri_angle
     )
     reconstruction.update_point_3d_errors()
+
+
+def bundle_of(
+    reconstruction: pycolmap.Reconstruction,
+    loss_scale_px: float,
+    *,
+    free_intrinsics: bool,
+    free_principal_point: bool,
+) -> tuple[pycolmap.BundleAdjustmentOptions, pycolmap.BundleAdjustmentConfig]:
+    """How a bundle of all registered images is adjusted on one thread, its frame held by two."""
+    bundle = pycolmap.BundleAdjustmentOptions()
+    bundle.refine_focal_length = bundle.refine_extra_params = free_intrinsics
+    bundle.refine_principal_point = free_principal_point
+    bundle.print_summary = False
+    bundle.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    bundle.ceres.loss_function_scale = loss_scale_px
+    bundle.ceres.solver_options.num_threads = 1  # sums over threads depend on their timing
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in reconstruction.reg_image_ids():
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    return bundle, config
 
 
 def _principal_points_plausible(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +15,7 @@ from polmvs.errors import DataError
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
 from polmvs.evaluation.map_errors import MapErrors, map_errors
 from polmvs.evaluation.metrics import AngleStats, CloudMetrics
-from polmvs.evaluation.tables import best_fit_lines, comparison_table
+from polmvs.evaluation.tables import best_fit_lines, comparison_rows, format_table
 from polmvs.evaluation.truth_errors import (
     TrackNormalErrors,
     evaluate,
@@ -123,7 +124,7 @@ class Comparison:
 
     def table(self) -> str:
         """The figures, a column for each model, in Markdown."""
-        return comparison_table(self)
+        return format_table(*comparison_rows(self))
 
     def summary(self) -> str:
         """The figures as a page, in Markdown."""
@@ -186,13 +187,10 @@ def compare_models(
     tasks += [
         partial(measure_consistency, m, e.cloud, e.tracks, e.maps) for m, e in estimates.items()
     ]
-    done = list((workers or Workers()).map(_call, tasks))
+    done = list((workers or Workers()).map(operator.call, tasks))
     found: list[Consistency] = done[len(done) - len(estimates) :]
     consistency = dict(zip(estimates, found, strict=True))
     against_truth: Mapping[AngleModel, TruthFigures] = done[0] if truth is not None else {}
-    phase = None
-    if truth is not None:
-        phase = PhaseFigures(maps=done[1]["maps"], pixels=done[1]["pixels"])
     return Comparison(
         capture=str(capture.folder),
         sparse=sparse,
@@ -200,7 +198,7 @@ def compare_models(
             model: ModelFigures(consistency=consistency[model], truth=against_truth.get(model))
             for model in estimates
         },
-        phase=phase,
+        phase=PhaseFigures(**done[1]) if truth is not None else None,
         best_fit=best_fitting_model(consistency),
     )
 
@@ -286,7 +284,3 @@ def _measure_all(
         )
         for model, one in estimates.items()
     }
-
-
-def _call(task: Callable[[], Any]) -> Any:
-    return task()

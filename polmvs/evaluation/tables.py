@@ -53,11 +53,6 @@ def best_fit_lines(comparison: Comparison) -> list[str]:
     return ["", f"The phases fit {best.upper()} best: {number(residual)} deg at the seeds."]
 
 
-def comparison_table(comparison: Comparison) -> str:
-    """The figures as a table in Markdown, a column for each model."""
-    return format_table(*comparison_rows(comparison))
-
-
 def comparison_rows(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
     """Header and rows of the figures, a column for each model."""
     models = comparison.models

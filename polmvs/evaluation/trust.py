@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +24,7 @@ from polmvs.evaluation.consistency import (
 from polmvs.io.clouds import Cloud
 from polmvs.normals.tracks import BORDER_MARGIN_PX
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.polarization.region import grow_mask
 from polmvs.scene import PointKind
 
 Floats = NDArray[np.floating]
@@ -203,9 +203,8 @@ def measure_trust(
         nearest = np.minimum(nearest, view.ranges(points))
         seen = first_seen(points, normals, view, partial(in_image, view.camera))[0] & chosen
         xy = view.project(points[seen])
-        size = 2 * BORDER_MARGIN_PX + 1
-        region = cv2.dilate(phase_map.region.inside.astype(np.float32), np.ones((size, size)))
-        inside = sample_image(np.asarray(region, np.float32), xy, nearest=True) > 0
+        region = grow_mask(phase_map.region.inside, BORDER_MARGIN_PX).astype(np.float32)
+        inside = sample_image(region, xy, nearest=True) > 0
         num_seen, num_inside = num_seen + len(inside), num_inside + int(inside.sum())
         residuals = phase_residuals_deg(angle_model, points[seen], normals[seen], phase_map)
         precision = sample_image(np.ascontiguousarray(phase_map.samples[..., 2]), xy)

@@ -25,7 +25,6 @@ from polmvs.errors import DataError
 from polmvs.evaluation.metrics import FAR_M
 from polmvs.experiments.data import (
     EXACT_SIGMA,
-    OnProgress,
     Scene,
     Truth,
     load_view,
@@ -37,7 +36,7 @@ from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import nearest_points
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import gather_rows
-from polmvs.parallel import Workers
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map, store_phase_map, view_rays
 from polmvs.scene import MIN_DISTANCE
 from polmvs.surface.contour import Contours, direction_field, trace_contours
@@ -122,7 +121,7 @@ def measure_contours(
     surface: TrueSurface,
     indices: Sequence[int],
     workers: Workers,
-    on_progress: OnProgress = lambda count: None,
+    on_progress: OnProgress = no_progress,
     *,
     num_seeds: int = ExperimentOptions.num_seeds,
     step_px: float = ExperimentOptions.step_px,

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +21,7 @@ from polmvs.pipeline.stages.maps import find_mask
 from polmvs.polarization.angle_models import correct_stokes, phase_sign
 from polmvs.polarization.capture import Capture, open_capture
 from polmvs.polarization.phase_map import PhaseMap, as_tilted, build_phase_map, view_rays
-from polmvs.polarization.region import Region, find_region, smooth
+from polmvs.polarization.region import Region, find_region, grow_mask, smooth
 from polmvs.polarization.stokes import Stokes
 from polmvs.poses.alignment import Alignment, align_views
 from polmvs.poses.image_check import intensity_loader, require_cameras_of_images
@@ -32,7 +31,6 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-OnProgress = Callable[[int], None]  # called with the number of steps done
 
 EXACT_SIGMA = 1e-3  # rad; stands for no noise, far below that of any phase
 BLUR_REACH = 2.0  # deviations of the blur within which a mark spoils a pixel
@@ -141,9 +139,7 @@ class ViewData:
 
     def beside_marks(self, region: Region, blur_px: float) -> Mask:
         """Pixels that printed marks (or other unreliable pixels) reach through the blur."""
-        size = 2 * math.ceil(BLUR_REACH * blur_px) + 1
-        spoiled = (self.part & ~region.reliable).astype(np.uint8)
-        return np.asarray(cv2.dilate(spoiled, np.ones((size, size), np.uint8)) > 0)
+        return grow_mask(self.part & ~region.reliable, math.ceil(BLUR_REACH * blur_px))
 
     def phase_map(self, angle_model: AngleModel, region: Region) -> PhaseMap:
         """The package's own phase map, with precisions."""

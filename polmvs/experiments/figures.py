@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -212,7 +212,8 @@ def draw_track_means(result: TrackResult) -> bytes:
     """Mean and median error against the number of views."""
     figure = _figure(9.5, 3.6)
     axes = figure.subplots(1, 2, sharey=True)
-    for ax, statistic, label in zip(axes, (_mean, _median), ("mean", "median"), strict=True):
+    statistics: dict[str, Callable[[Array], np.floating]] = {"mean": np.mean, "median": np.median}
+    for ax, (label, statistic) in zip(axes, statistics.items(), strict=True):
         for name in ESTIMATORS:
             ax.plot(
                 result.k,
@@ -305,14 +306,6 @@ def draw_contours(view: ViewContours) -> bytes:
     axes[0, 0].legend(fontsize=8, loc="lower left")
     figure.suptitle(f"Contours of {view.name}, seen along the surface", fontsize=10)
     return _png(figure)
-
-
-def _mean(errors: Array) -> float:
-    return float(errors.mean())
-
-
-def _median(errors: Array) -> float:
-    return float(np.median(errors))
 
 
 def _main_direction(points: Array) -> Array:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
-from polmvs.config import Experiment, to_plain
-from polmvs.errors import DataError, OptionError
+from polmvs.config import Experiment
+from polmvs.errors import OptionError, as_data_error
+from polmvs.io.typed_json import json_bytes
 from polmvs.pipeline.run_folder import has_content
 
 NAMES = tuple(Experiment)
@@ -39,7 +39,7 @@ class Report:
     content: Mapping[str, Any]
     text: str
     figures: Mapping[str, tuple[str, bytes]]
-    lines: Mapping[str, bytes]
+    lines: Mapping[str, bytes] = field(default_factory=dict)
 
     def section(self, folder: str = "", *, level: int = 1) -> str:
         """Markdown of the experiment, its heading of a level; figures lie in ``folder``."""
@@ -48,12 +48,11 @@ class Report:
 
     def files(self) -> dict[str, bytes]:
         """All files by name, the JSON last: where it is, the others are."""
-        text = json.dumps(to_plain(self.content), indent=1, allow_nan=False) + "\n"
         return {
             **{name: png for name, (_, png) in self.figures.items()},
             **self.lines,
             f"{self.name}.md": self.section().encode(),
-            f"{self.name}.json": text.encode(),
+            f"{self.name}.json": json_bytes(self.content),
         }
 
 
@@ -103,17 +102,14 @@ def write_files(out: Path, files: Mapping[str, bytes]) -> None:
     DataError
         The system refuses.
     """
-    try:
+    with as_data_error(out, "made"):
         out.mkdir(parents=True, exist_ok=True)
         scratch = Path(mkdtemp(prefix=".experiment-", dir=out))
-    except OSError as error:
-        raise DataError(out, f"cannot be made: {error.strerror or error}.") from error
     try:
-        for name, data in files.items():
-            (scratch / name).write_bytes(data)
-        for name in files:
-            os.replace(scratch / name, out / name)
-    except OSError as error:
-        raise DataError(out, f"cannot be written: {error.strerror or error}.") from error
+        with as_data_error(out, "written"):
+            for name, data in files.items():
+                (scratch / name).write_bytes(data)
+            for name in files:
+                os.replace(scratch / name, out / name)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import AngleModel
-from polmvs.experiments.data import OnProgress, Scene, ViewData, load_view, require_counted
-from polmvs.parallel import Workers
+from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.stokes import axial_difference
 
@@ -104,7 +104,7 @@ class PhaseImages:
 
 
 def measure_phase(
-    scene: Scene, workers: Workers, on_progress: OnProgress = lambda count: None
+    scene: Scene, workers: Workers, on_progress: OnProgress = no_progress
 ) -> PhaseResult:
     """Phase errors of all models over all views.
 

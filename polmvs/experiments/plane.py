@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from polmvs.config import AngleModel, ExperimentOptions
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
-from polmvs.experiments.data import OnProgress, Scene, ViewData, load_view, require_counted
+from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.normals.single_view.measurement import MIN_PIXELS
 from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
-from polmvs.parallel import Workers
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.stokes import Stokes
 
 Array = NDArray[np.float64]
@@ -139,7 +139,7 @@ class PlaneResult:
 def measure_plane(
     scene: Scene,
     workers: Workers,
-    on_progress: OnProgress = lambda count: None,
+    on_progress: OnProgress = no_progress,
     *,
     planar_deg: float = ExperimentOptions.planar_deg,
 ) -> PlaneResult:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -21,7 +21,7 @@ from polmvs.experiments.contours import (
     open_surface,
     pool_lines,
 )
-from polmvs.experiments.data import MODEL_LABELS, OnProgress, Scene, view_indices
+from polmvs.experiments.data import MODEL_LABELS, Scene, view_indices
 from polmvs.experiments.output import Report
 from polmvs.experiments.phase import PhaseResult, SignedStats, measure_phase, phase_images, ratio
 from polmvs.experiments.plane import (
@@ -40,7 +40,7 @@ from polmvs.experiments.tracks import (
     check_k,
     measure_tracks,
 )
-from polmvs.parallel import Workers
+from polmvs.parallel import OnProgress, Workers
 
 NUM_FIGURE_VIEWS = 3
 
@@ -131,7 +131,6 @@ def _run_phase(
             "phase_density.png": (captions[0], figures.draw_phase_density(result)),
             "phase_maps.png": (captions[1], figures.draw_phase_maps(shown)),
         },
-        lines={},
     )
 
 
@@ -170,7 +169,6 @@ def _run_plane(
         },
         text=text,
         figures={"plane_errors.png": (caption, figures.draw_plane(result))},
-        lines={},
     )
 
 
@@ -211,7 +209,6 @@ def _run_tracks(
                 figures.draw_track_boxes(result),
             ),
         },
-        lines={},
     )
 
 
@@ -293,15 +290,19 @@ def _poses(scene: Scene) -> str:
 def phase_json(result: PhaseResult) -> dict[str, Any]:
     """Content of ``phase.json`` beside the settings."""
     return {
-        **{angle_model.value: asdict(stats) for angle_model, stats in result.all_pixels.items()},
-        "ratio_ppa_opa": result.ratio(AngleModel.PPA),
-        "ratio_tilted_opa": result.ratio(AngleModel.TILTED),
-        "outside_marks": {
-            **{angle_model.value: asdict(stats) for angle_model, stats in result.unmarked.items()},
-            "ratio_ppa_opa": result.ratio_unmarked(AngleModel.PPA),
-            "ratio_tilted_opa": result.ratio_unmarked(AngleModel.TILTED),
-        },
+        **_with_ratios(result.all_pixels, result.ratio),
+        "outside_marks": _with_ratios(result.unmarked, result.ratio_unmarked),
         "rmse_deg_per_view": result.per_view,
+    }
+
+
+def _with_ratios(
+    stats: Mapping[AngleModel, SignedStats], share: Callable[[AngleModel], float]
+) -> dict[str, Any]:
+    return {
+        **{angle_model.value: of_model for angle_model, of_model in stats.items()},
+        "ratio_ppa_opa": share(AngleModel.PPA),
+        "ratio_tilted_opa": share(AngleModel.TILTED),
     }
 
 
@@ -341,11 +342,9 @@ def plane_json(result: PlaneResult) -> dict[str, Any]:
     }
     return {
         **estimates,
-        "per_image": [asdict(image) for image in result.per_image],
-        "skipped": list(result.skipped),
-        "pi_ambiguity": {
-            angle_model.value: asdict(a) for angle_model, a in result.ambiguity.items()
-        },
+        "per_image": result.per_image,
+        "skipped": result.skipped,
+        "pi_ambiguity": result.ambiguity,
     }
 
 
@@ -379,17 +378,17 @@ def plane_table(result: PlaneResult) -> str:
 def tracks_json(result: TrackResult) -> dict[str, Any]:
     """Content of ``tracks.json`` beside the settings."""
     return {
-        "k": list(result.k),
-        "num_points": list(result.num_points),
+        "k": result.k,
+        "num_points": result.num_points,
         **{name: _track_json(errors) for name, errors in result.estimators.items()},
     }
 
 
 def _track_json(errors: TrackErrors) -> dict[str, list[float]]:
     return {
-        "mean_deg": errors.over(lambda e: float(e.mean())),
-        "median_deg": errors.over(lambda e: float(np.median(e))),
-        "p80_deg": errors.over(lambda e: float(np.percentile(e, 80))),
+        "mean_deg": errors.over(np.mean),
+        "median_deg": errors.over(np.median),
+        "p80_deg": errors.over(lambda e: np.percentile(e, 80)),
         "under_25": errors.under,
         "valid_share": errors.valid_share,
     }
@@ -415,7 +414,7 @@ def contours_json(views: Sequence[ViewContours], stats: Mapping[str, LineStats])
     """Content of ``contours.json`` beside the settings."""
     opa = stats["opa"].rmse_mm
     return {
-        **{name: asdict(line_stats) for name, line_stats in stats.items()},
+        **stats,
         "ratio_to_opa": {name: ratio(stats[name].rmse_mm, opa) for name in METHODS},
         "per_view": [
             {

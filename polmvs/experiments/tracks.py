@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from polmvs.config import AngleModel, ExperimentOptions, Selection
 from polmvs.errors import OptionError
 from polmvs.evaluation.metrics import angular_errors_deg
-from polmvs.experiments.data import OnProgress, Scene, load_view, require_counted
+from polmvs.experiments.data import Scene, load_view, require_counted
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import Rows, gather_rows
-from polmvs.parallel import Workers
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.surface.surface_quality import MIN_POINTS
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ class TrackErrors:
 
     errors_deg: tuple[Array, ...]
 
-    def over(self, statistic: Callable[[Array], float]) -> list[float]:
+    def over(self, statistic: Callable[[Array], np.floating]) -> list[float]:
         """A statistic of the finite errors for each K; NaN where there are none."""
         finite = [errors[np.isfinite(errors)] for errors in self.errors_deg]
         return [float(statistic(errors)) if len(errors) else np.nan for errors in finite]
@@ -120,7 +120,7 @@ def measure_tracks(
     scene: Scene,
     options: ExperimentOptions,
     workers: Workers,
-    on_progress: OnProgress = lambda count: None,
+    on_progress: OnProgress = no_progress,
 ) -> TrackResult:
     """Errors of normals from K views for every estimator and K.
 

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from polmvs.config import CaptureKind
-from polmvs.errors import DataError, OptionError
+from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.folders import require_unicode
 from polmvs.io.raw_formats import DUMP_SUFFIXES, FLOAT_SUFFIXES, LOSSY_SUFFIXES, SUFFIXES
 
@@ -374,10 +374,8 @@ def _require_usable(folder: Path, name: str) -> None:
 
 def _images_in(folder: Path) -> list[Path]:
     """Image files of a folder by name, hidden ones left out; none where it does not exist."""
-    try:
+    with as_data_error(folder, "read"):
         found = sorted(folder.iterdir()) if folder.is_dir() else []
-    except OSError as error:
-        raise DataError(folder, f"cannot be read: {error.strerror or error}.") from error
     if len(found) > MAX_FILES:
         raise DataError(folder, f"holds {len(found):,} files, more than any capture.")
     return [

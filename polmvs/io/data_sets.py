@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation
 from polmvs.io.images import decode_image, read_bytes
 from polmvs.io.intrinsics import Intrinsics, from_opencv_matrix
-from polmvs.io.layouts import is_author_layout, read_camera_text
+from polmvs.io.layouts import is_author_layout, read_author_views
 from polmvs.io.raw_formats import read_raw
 
 Array = NDArray[np.float64]
@@ -97,9 +97,9 @@ class DataSet:
     capture: Path | None
     options: CaptureOptions
     names: tuple[str, ...]
-    cameras: tuple[PosedImage, ...]
-    sparse: Path | None
-    masks: Mapping[str, Path]
+    cameras: tuple[PosedImage, ...] = ()
+    sparse: Path | None = None
+    masks: Mapping[str, Path] = field(default_factory=dict)
     light: Light | None = None
 
 
@@ -196,11 +196,8 @@ def _read_ppa4p3d(folder: Path, bayer: BayerOrder) -> DataSet:
     images = _files(folder / "images", (".png",))
     width, height = _size_of(next(iter(images.values())))
     cameras = []
-    for index, stem in enumerate(images):
-        path = folder / "cams" / f"{stem}_cam.txt"
-        if not path.is_file():
-            path = folder / "cams" / f"{index:08d}_cam.txt"
-        view = read_camera_text(path, f"{stem}.png", width // 2, height // 2)
+    names = [f"{stem}.png" for stem in images]
+    for view in read_author_views(folder, names, width // 2, height // 2).values():
         assert isinstance(view.camera, PinholeCamera)
         camera = view.camera
         intrinsics = Intrinsics(
@@ -217,8 +214,6 @@ def _read_ppa4p3d(folder: Path, bayer: BayerOrder) -> DataSet:
         options=CaptureOptions(gamma=0.5),
         names=tuple(images),
         cameras=tuple(cameras),
-        sparse=None,
-        masks={},
     )
 
 
@@ -256,7 +251,6 @@ def _read_pisr(folder: Path, bayer: BayerOrder) -> DataSet:
         options=options,
         names=tuple(images),
         cameras=tuple(cameras),
-        sparse=None,
         masks=_files(folder / "mask", (".png",), needed=False),
     )
 
@@ -286,7 +280,6 @@ def _read_pandora(folder: Path, bayer: BayerOrder) -> DataSet:
         capture=None if stokes else folder / "images_raw",
         options=options,
         names=tuple(names),
-        cameras=(),
         sparse=_sparse_of(folder),
         masks=_files(folder / "mask", (".png",), needed=False),
     )
@@ -302,7 +295,6 @@ def _read_nersp(folder: Path, bayer: BayerOrder) -> DataSet:
         options=CaptureOptions(kind=CaptureKind.STOKES),
         names=tuple(images),
         cameras=_read_world_mats(folder / "cameras.npz", tuple(images), width, height),
-        sparse=None,
         masks=_files(folder / "input_azimuth_maps", (".png",), needed=False)
         or _files(folder / "mask", (".png",), needed=False),
     )
@@ -318,7 +310,6 @@ def _read_mvas(folder: Path, bayer: BayerOrder) -> DataSet:
         # Azimuths of normals, clockwise from +x: the phase of diffuse light.
         options=CaptureOptions(clockwise=True, full_scale=1.0),
         names=tuple(images),
-        cameras=(),
         sparse=_sparse_of(folder),
         masks=masks or images,
         light=Light.DIFFUSE,

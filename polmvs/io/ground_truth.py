@@ -231,10 +231,10 @@ def _sample_surfaces(truth: GroundTruth, spacing_m: float, other_spacing_m: floa
     if not 0 < spacing_m <= other_spacing_m:
         raise ValueError(f"{spacing_m=}, {other_spacing_m=} but expected 0 < spacing <= other.")
     parts = [_back_project(truth, name, part=True) for name in truth.names]
-    part = np.concatenate([points for points, _ in parts])
-    normals = np.concatenate([normals for _, normals in parts])
+    part = np.concatenate([np.zeros((0, 3)), *(points for points, _ in parts)])
     if len(part) == 0:
         raise DataError(truth.folder, f"no mask shows the part; {_REMEDY}.")
+    normals = np.concatenate([normals for _, normals in parts])
     kept = voxel_representatives(part, spacing_m)
     part, normals = part[kept], normals[kept]
     del parts

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.errors import DataError
+from polmvs.errors import DataError, as_data_error
 from polmvs.io.temporary import remove_temporary, temporary_path
 
 PathArg: TypeAlias = str | PathLike[str]
@@ -105,10 +105,9 @@ def write_bytes(path: PathArg, data: bytes) -> None:
         raise DataError(target, "exists and is no plain file. Choose another name.")
     temporary = temporary_path(target)
     try:
-        temporary.write_bytes(data)
-        os.replace(temporary, target)
-    except OSError as error:
-        raise DataError(target, f"cannot be written: {error.strerror or error}.") from error
+        with as_data_error(target, "written"):
+            temporary.write_bytes(data)
+            os.replace(temporary, target)
     finally:
         remove_temporary(temporary)
 

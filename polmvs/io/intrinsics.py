@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from polmvs.camera import PinholeCamera, xy_from_opencv
-from polmvs.errors import DataError
+from polmvs.errors import DataError, as_data_error
 from polmvs.io.images import write_bytes
 from polmvs.io.typed_json import parse_json
 
@@ -117,11 +117,10 @@ def read_intrinsics(path: Path) -> Intrinsics:
         The file is missing, of none of these kinds, or its camera is none that COLMAP has.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise DataError(path, "is too large for a calibration file.")
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+        with as_data_error(path, "read"):
+            if path.stat().st_size > MAX_BYTES:
+                raise DataError(path, "is too large for a calibration file.")
+            text = path.read_text(encoding="utf-8")
     except ValueError as error:
         raise DataError(
             path, "is no text file; give YAML, JSON or a COLMAP camera line."

@@ -1,4 +1,4 @@
-"""Other data layouts: the demo that the paper's authors published, and ACMM's depth maps.
+"""The layout of the demo that the authors of the paper published.
 
 The authors' demo is a folder with
 
@@ -16,7 +16,6 @@ nothing stood before it.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,7 @@ from polmvs.camera import PinholeCamera, pixel_centers, xy_from_opencv
 from polmvs.config import CaptureOptions
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation
-from polmvs.io.images import read_bytes, write_bytes
+from polmvs.io.images import read_bytes
 from polmvs.io.raw_formats import read_npy
 from polmvs.scene import View, stem_of
 
@@ -38,8 +37,6 @@ Mask = NDArray[np.bool_]
 
 AUTHOR_OPTIONS = CaptureOptions(pattern=(90, 45, 135, 0), gamma=0.5)
 MAX_OFF_PLANE = 0.02  # of the corners from the plane, in sizes of the board; a guess
-DMB_FLOAT = 1
-_DMB_HEADER = struct.Struct("<4i")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,18 +115,26 @@ def read_author_truth(folder: Path, names: Sequence[str], width: int, height: in
     DataError
         A file is missing, damaged, or of another count.
     """
-    views = {}
-    for index, name in enumerate(names):
-        path = folder / "cams" / f"{stem_of(name)}_cam.txt"
-        if not path.is_file():
-            path = folder / "cams" / f"{index:08d}_cam.txt"
-        views[name] = read_camera_text(path, name, width, height)
+    views = read_author_views(folder, names, width, height)
     normal = _read_npy(folder / "normal_w.npy", 3).reshape(3)
     corners = _read_npy(folder / "pts_3d_corners_w.npy", 12).reshape(4, 3)
     length = float(np.linalg.norm(normal))
     if not length > 0:
         raise DataError(folder / "normal_w.npy", "is no direction; copy the data again.")
     return _board(folder, views, normal / length, corners)
+
+
+def read_author_views(
+    folder: Path, names: Sequence[str], width: int, height: int
+) -> dict[str, View]:
+    """The cameras of the authors' demo by name; parameters and errors of its truth."""
+    views = {}
+    for index, name in enumerate(names):
+        path = folder / "cams" / f"{stem_of(name)}_cam.txt"
+        if not path.is_file():
+            path = folder / "cams" / f"{index:08d}_cam.txt"
+        views[name] = read_camera_text(path, name, width, height)
+    return views
 
 
 def _board(folder: Path, views: dict[str, View], normal: Array, corners: Array) -> BoardTruth:
@@ -186,48 +191,6 @@ def read_camera_text(path: Path, name: str, width: int, height: int) -> View:
         width=width, height=height, fx=K[0, 0], fy=K[1, 1], cx=float(cx), cy=float(cy)
     )
     return View(name=name, camera=camera, cam_from_world=RigidTransform(rotation, pose[:3, 3]))
-
-
-def read_dmb(path: Path) -> Image:
-    """Read a map of ACMM (``.dmb``): int32 type, height, width, channels, then float32.
-
-    Returns
-    -------
-    (H, W) float32, or (H, W, C) where there are more channels than one (normals).
-
-    Raises
-    ------
-    DataError
-        The file is missing, truncated, or of another type.
-    """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
-    if len(data) < _DMB_HEADER.size:
-        raise DataError(path, "is truncated; copy it again.")
-    kind, height, width, channels = _DMB_HEADER.unpack_from(data)
-    if kind != DMB_FLOAT or min(height, width, channels) < 1:
-        raise DataError(path, "is no .dmb map of 32-bit floats.")
-    if len(data) != _DMB_HEADER.size + 4 * height * width * channels:
-        raise DataError(path, f"is truncated: {width}x{height} px are promised; copy it again.")
-    values = np.frombuffer(data, "<f4", offset=_DMB_HEADER.size).astype(np.float32)
-    return values.reshape((height, width) if channels == 1 else (height, width, channels))
-
-
-def write_dmb(path: Path, image: Image) -> None:
-    """Write a map (H, W) or (H, W, C) as ACMM's ``.dmb``, whole or not at all.
-
-    Raises
-    ------
-    DataError
-        The system refuses.
-    """
-    if image.ndim not in (2, 3) or image.size == 0:
-        raise ValueError(f"{image.shape=} but expected (H, W) or (H, W, C).")
-    channels = 1 if image.ndim == 2 else image.shape[2]
-    header = _DMB_HEADER.pack(DMB_FLOAT, *image.shape[:2], channels)
-    write_bytes(path, header + np.ascontiguousarray(image, "<f4").tobytes())
 
 
 def _read_npy(path: Path, num: int) -> Array:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.errors import MAX_QUOTED, DataError
+from polmvs.errors import MAX_QUOTED, DataError, as_data_error
 from polmvs.io.images import read_bytes, write_bytes
 
 MAX_HEADER_BYTES = 1 << 16
@@ -400,8 +400,6 @@ def write_ply(
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
         tables = [rows, faces]
     header = ("\n".join([*lines, "end_header"]) + "\n").encode()
-    try:
+    with as_data_error(path, "written"):
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(path, f"cannot be written: {error.strerror or error}.") from error
     write_bytes(path, b"".join([header, *(table.tobytes() for table in tables)]))

@@ -20,10 +20,14 @@ T = TypeVar("T")
 Pairs = Callable[[list[tuple[str, Any]]], Any]
 
 
+def json_bytes(content: Any) -> bytes:
+    """Dataclasses, mappings and sequences as JSON; NaN becomes null."""
+    return (json.dumps(to_plain(content), indent=1, allow_nan=False) + "\n").encode()
+
+
 def write_json(path: Path, content: Any) -> None:
-    """Write dataclasses, mappings and sequences, whole or not at all; NaN becomes null."""
-    text = json.dumps(to_plain(content), indent=1, allow_nan=False)
-    write_bytes(path, (text + "\n").encode())
+    """Write :func:`json_bytes`, whole or not at all."""
+    write_bytes(path, json_bytes(content))
 
 
 def parse_json(text: str, pairs: Pairs | None = None) -> Any:

@@ -14,18 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel, CaptureKind, CaptureOptions, NormalOptions
+from polmvs.config import CaptureKind, CaptureOptions
 from polmvs.fitting import BEYOND_CHANCE
 from polmvs.normals.estimator import NormalEstimate
 from polmvs.normals.light import row_costs
-from polmvs.normals.rows import AS_MEASURED, Reading, gather_rows_under
-from polmvs.normals.tracks import (
-    MAX_ROWS,
-    in_tiles,
-    normals_from_rows,
-    tracks_on_parts,
-    window_maps,
-)
+from polmvs.normals.rows import AS_MEASURED, Reading
+from polmvs.normals.tracks import MAX_ROWS, normals_under, tracks_on_parts
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks
 
@@ -107,19 +101,14 @@ def check_axes(
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps built under either kind of light, one for all.
     """
-    t, options = tolerances, NormalOptions()
-    on_parts = tracks_on_parts(tracks, maps)
-    windows = window_maps(maps, options.window_px)
+    t, on_parts = tolerances, tracks_on_parts(tracks, maps)
     others = (MIRRORED, TURNED, TURNED_MIRRORED)
     every = [
         reading for change in (AS_MEASURED, *others) for reading in (change, _other_light(change))
     ]
     of_tiles = [
-        [
-            _row_cost(normals_from_rows(some, rows, options.estimator), t)
-            for rows in gather_rows_under(every, AngleModel.PPA, some.points_in_world, windows)
-        ]
-        for some in in_tiles(on_parts, len(maps), MAX_ROWS)
+        [_row_cost(estimate, t) for estimate in estimates]
+        for estimates in normals_under(every, on_parts, maps, max_rows=MAX_ROWS)
     ]
     costs = np.concatenate(of_tiles, axis=1)  # (readings, N)
     # Of each point (N,): mean cost of a row, under the better kind of light.

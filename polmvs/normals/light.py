@@ -20,23 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
-from polmvs.config import AngleModel, NormalOptions
+from polmvs.config import AngleModel
 from polmvs.geometry import lengths
 from polmvs.normals.estimator import NormalEstimate, solve_normals
-from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, Rows, gather_rows_under
-from polmvs.normals.tracks import (
-    MAX_ROWS,
-    in_tiles,
-    normals_from_rows,
-    tracks_on_parts,
-    window_maps,
-)
+from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
+from polmvs.normals.tracks import MAX_ROWS, normals_under, tracks_on_parts
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS, Tracks
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
+
+LIGHTS = (AS_MEASURED, OTHER_LIGHT)  # that of the maps, and the other
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +92,7 @@ def find_diffuse_parts(
     """
     t = tolerances or LightTolerances()
     on_parts = tracks_on_parts(tracks, maps)
-    votes, voting = _track_votes(on_parts, maps, t, max_rows)
+    votes, voting = track_votes(on_parts, maps, t, max_rows=max_rows)
     of_points = [
         _part_votes(m, on_parts.points_in_world[voting], votes[voting], t.min_rows) for m in maps
     ]
@@ -122,24 +118,17 @@ def diffuse_pixels(phase_map: PhaseMap, parts: Mask) -> Mask:
     return np.asarray(parts[_parts_of(phase_map)] & phase_map.region.inside)
 
 
-def _rows_of_both(points: Array, maps: Sequence[PhaseMap]) -> tuple[Rows, ...]:
-    """Rows under specular and under diffuse light."""
-    return gather_rows_under((AS_MEASURED, OTHER_LIGHT), AngleModel.PPA, points, maps)
-
-
-def _track_votes(
-    tracks: Tracks, maps: Sequence[PhaseMap], t: LightTolerances, max_rows: int
+def track_votes(
+    tracks: Tracks,
+    maps: Sequence[PhaseMap],
+    tolerances: LightTolerances | None = None,
+    *,
+    max_rows: int = MAX_ROWS,
 ) -> tuple[Array, Mask]:
-    """As :func:`specular_votes` of all tracks, many at a time."""
+    """As :func:`specular_votes` of all tracks, for the light of the maps over the other."""
     votes, voting = [], []
-    options = NormalOptions()
-    windows = window_maps(maps, options.window_px)  # on a mark itself light is mixed
-    for some in in_tiles(tracks, len(maps), max_rows):
-        specular, diffuse = (
-            normals_from_rows(some, rows, options.estimator)
-            for rows in _rows_of_both(some.points_in_world, windows)
-        )
-        of_some = specular_votes(specular, diffuse, t)
+    for as_built, as_other in normals_under(LIGHTS, tracks, maps, max_rows=max_rows):
+        of_some = specular_votes(as_built, as_other, tolerances)
         votes.append(of_some[0])
         voting.append(of_some[1])
     return np.concatenate(votes), np.concatenate(voting)
@@ -184,7 +173,7 @@ def _pixel_votes(
         tile, here = points[start : start + step], owner[start : start + step]
         specular, diffuse = (
             solve_normals(rows.rows, rows.rays, rows.sigma)
-            for rows in _rows_of_both(tile, [maps[k] for k in seen_by])
+            for rows in gather_rows_under(LIGHTS, AngleModel.PPA, tile, [maps[k] for k in seen_by])
         )
         costs, compared = _costs_of_both(specular, diffuse, t.max_row_cost)
         counts = compared.sum(axis=0) * (compared.sum(axis=0) >= t.min_rows)

@@ -7,17 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polmvs.config import AngleModel, Light, NormalOptions
+from polmvs.config import Light
 from polmvs.normals.axes_check import VoteTolerances, is_clear
-from polmvs.normals.light import specular_votes
-from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
-from polmvs.normals.tracks import (
-    MAX_ROWS,
-    in_tiles,
-    normals_from_rows,
-    tracks_on_parts,
-    window_maps,
-)
+from polmvs.normals.light import track_votes
+from polmvs.normals.tracks import tracks_on_parts
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks
 
@@ -59,19 +52,8 @@ def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> Light
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps built under the given light.
     """
-    options = NormalOptions()
-    on_parts = tracks_on_parts(tracks, maps)
-    windows = window_maps(maps, options.window_px)
-    readings = (AS_MEASURED, OTHER_LIGHT)
-    of_tiles = []
-    for some in in_tiles(on_parts, len(maps), MAX_ROWS):
-        as_given, as_other = (
-            normals_from_rows(some, rows, options.estimator)
-            for rows in gather_rows_under(readings, AngleModel.PPA, some.points_in_world, windows)
-        )
-        votes, voting = specular_votes(as_given, as_other)  # for the first over the second
-        of_tiles.append(votes[voting])
-    votes = np.concatenate(of_tiles)
+    votes, voting = track_votes(tracks_on_parts(tracks, maps), maps)
+    votes = votes[voting]
     num = len(votes)
     contradicted = is_clear(-votes, VoteTolerances())
     share = float(np.mean(votes < 0)) if num else 0.0

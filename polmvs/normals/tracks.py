@@ -20,7 +20,7 @@ from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, Estimator, NormalOptions
 from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
-from polmvs.normals.rows import Rows, gather_rows
+from polmvs.normals.rows import Reading, Rows, gather_rows, gather_rows_under
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
 
@@ -145,6 +145,21 @@ def track_normals(
     return NormalEstimate(
         **{name: values[source] for name, values in joined.items()}, row_weights=weights
     )
+
+
+def normals_under(
+    readings: Sequence[Reading], tracks: Tracks, maps: Sequence[PhaseMap], *, max_rows: int
+) -> Iterator[Iterator[NormalEstimate]]:
+    """Normals under PPA of the tracks, so many at a time, under each reading of the phases.
+
+    Parameters are those of :func:`polmvs.normals.rows.gather_rows_under` and
+    :func:`track_normals`.
+    """
+    options = NormalOptions()
+    windows = window_maps(maps, options.window_px)  # on a mark itself light is mixed
+    for some in in_tiles(tracks, len(maps), max_rows):
+        of_readings = gather_rows_under(readings, AngleModel.PPA, some.points_in_world, windows)
+        yield (normals_from_rows(some, rows, options.estimator) for rows in of_readings)
 
 
 def in_tiles(tracks: Tracks, num_views: int, max_rows: int) -> Iterator[Tracks]:

@@ -32,14 +32,14 @@ from polmvs.config import (
     values_from_plain,
     with_absolute_paths,
 )
-from polmvs.errors import DataError, OptionError, PolmvsError
+from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.images import write_bytes
 from polmvs.io.typed_json import write_json
 from polmvs.parallel import Workers
-from polmvs.pipeline.jobs import Job, JobOutcome, reconstruct
-from polmvs.pipeline.monitor import NoMonitor
+from polmvs.pipeline.jobs import JobOutcome, reconstruct
 from polmvs.pipeline.run_folder import RunFolder, has_content
+from polmvs.pipeline.runner import Job, NoMonitor
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.poses import PosesResult
 
@@ -187,10 +187,8 @@ def run_batch(
                 f"{folder}: exists and is not empty. Give `run.overwrite` to delete earlier runs "
                 "in it, `run.resume` to go on with them, or another OUT."
             )
-    try:
+    with as_data_error(out, "made"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(out, f"cannot be made: {error.strerror or error}.") from error
     each = replace(run_options, workers=1, scheduler=None)
     if run_options.scheduler is not None:
         captures = [entry.capture for entry in entries]
@@ -289,7 +287,7 @@ def _row_of(entry: BatchEntry, outcome: Callable[[], BatchRow]) -> BatchRow:
 
 
 def _finished(entry: BatchEntry, outcome: JobOutcome) -> BatchRow:
-    poses = outcome.result(PosesResult)
+    poses = outcome.record.result(PosesResult)
     return BatchRow(
         name=entry.name,
         capture=entry.capture,
@@ -297,7 +295,7 @@ def _finished(entry: BatchEntry, outcome: JobOutcome) -> BatchRow:
         num_images=len(outcome.record.images),
         num_views=poses.num_views,
         num_tracks=poses.num_tracks,
-        num_points=outcome.result(DensifyResult, entry.angle_model).num_points,
+        num_points=outcome.record.result(DensifyResult, entry.angle_model).num_points,
         seconds=outcome.record.wall_s,
         peak_rss_mb=max(stage.peak_rss_mb for stage in outcome.record.stages),
         message=outcome.empty or "",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,8 +20,6 @@ from polmvs.polarization.capture import Capture, open_capture
 from polmvs.scene import View, stem_of
 
 SAME_CAMERA = 1e-6  # relative difference by the rounding of a set's matrices
-
-OnProgress = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,13 +46,7 @@ class ImportedSet:
     light: Light | None
 
 
-def import_data_set(
-    folder: Path,
-    out: Path,
-    *,
-    bayer: BayerOrder = BayerOrder.RGGB,
-    on_progress: OnProgress = lambda step: None,
-) -> ImportedSet:
+def import_data_set(folder: Path, out: Path, *, bayer: BayerOrder = BayerOrder.RGGB) -> ImportedSet:
     """Read a public set and write what ``reconstruct`` takes beside it.
 
     Parameters
@@ -63,7 +54,6 @@ def import_data_set(
     folder : the set, which is not changed; images that a capture is read from stay there.
     out : folder to make.
     bayer : colours of raw colour mosaics.
-    on_progress : called with the name of each step.
 
     Raises
     ------
@@ -77,16 +67,15 @@ def import_data_set(
     data_set = read_data_set(folder, bayer)
     out.mkdir(parents=True)
     try:
-        return _import(data_set, out, on_progress)
+        return _import(data_set, out)
     except BaseException:
         shutil.rmtree(out, ignore_errors=True)
         raise
 
 
-def _import(data_set: DataSet, out: Path, on_progress: OnProgress) -> ImportedSet:
+def _import(data_set: DataSet, out: Path) -> ImportedSet:
     options, place = data_set.options, data_set.capture
     if place is None:
-        on_progress("images")
         place = out / "capture"
         _convert(data_set, place)
         options = replace(options, kind=CaptureKind.STOKES)
@@ -96,12 +85,10 @@ def _import(data_set: DataSet, out: Path, on_progress: OnProgress) -> ImportedSe
         raise DataError(data_set.folder, f"the image {min(missing)!r} is not whole.")
     sparse, num_points = data_set.sparse, None
     if data_set.cameras:
-        on_progress("poses")
         sparse = out / "sparse"
         num_points = _triangulate(data_set, capture, out)
     masks = None
     if data_set.masks:
-        on_progress("masks")
         masks = out / "masks"
         masks.mkdir()
         for stem in data_set.names:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TypeVar
 
-from polmvs.config import COMPARED_MODELS, AngleModel, Options, RunOptions, options_from_plain
+from polmvs.config import COMPARED_MODELS, AngleModel, options_from_plain
 from polmvs.errors import OptionError
 from polmvs.evaluation.comparison import Comparison, read_comparison
-from polmvs.pipeline.monitor import Monitor
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.runner import Run, load_record, open_run
+from polmvs.pipeline.runner import Job, Run, load_record, open_run
 from polmvs.pipeline.stage_table import (
     COMPARE,
     DENSIFY,
@@ -33,8 +30,6 @@ from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
 from polmvs.polarization.capture import open_capture
 from polmvs.scene import MIN_VIEWS
-
-R = TypeVar("R")
 
 MIN_SFM_IMAGES = 2
 
@@ -58,28 +53,6 @@ NO_POINTS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
-    """What every job is called with.
-
-    Attributes
-    ----------
-    capture : folder of raw mosaics.
-    out : run folder.
-    options : of all stages.
-    run_options : workers, overwrite and resume.
-    monitor : who watches, if anybody.
-    command_line : for the record.
-    """
-
-    capture: Path
-    out: Path
-    options: Options = Options()
-    run_options: RunOptions = RunOptions()
-    monitor: Monitor | None = None
-    command_line: Sequence[str] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
 class JobOutcome:
     """What a job came to.
 
@@ -95,14 +68,6 @@ class JobOutcome:
     record: Record
     empty: str | None = None
     comparison: Comparison | None = None
-
-    def result(self, kind: type[R], model: AngleModel | None = None) -> R:
-        """What the stage that gives this type found; KeyError where it is not finished."""
-        return self.record.result(kind, model)
-
-    def find(self, kind: type[R], model: AngleModel | None = None) -> R | None:
-        """As :meth:`result`; None where the stage is not finished."""
-        return self.record.find(kind, model)
 
 
 def reconstruct(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
@@ -232,7 +197,6 @@ def _with_poses_of_workspace(job: Job) -> Job:
     return replace(job, options=replace(job.options, sfm=sfm))
 
 
-@contextmanager
 def _open(
     job: Job,
     last: Sequence[StageSpec],
@@ -241,24 +205,14 @@ def _open(
     taken_over: set[str] | None = None,
     min_images: int = MIN_VIEWS,
     continues: bool = False,
-) -> Iterator[Run]:
+) -> AbstractContextManager[Run]:
     """Open the run; what it needs is taken over where it is finished."""
     table = table or stage_table()
     if taken_over is None:
         taken_over = {spec.name for spec in with_needed((s.name for s in last), table)}
-    with open_run(
-        job.capture,
-        job.out,
-        job.options,
-        job.run_options,
-        table=table,
-        min_images=min_images,
-        taken_over=taken_over,
-        continues=continues,
-        monitor=job.monitor,
-        command_line=job.command_line,
-    ) as run:
-        yield run
+    return open_run(
+        job, table=table, min_images=min_images, taken_over=taken_over, continues=continues
+    )
 
 
 def _do_all(run: Run, last: Sequence[StageSpec]) -> None:

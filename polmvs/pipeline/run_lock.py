@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from polmvs.errors import DataError
+from polmvs.errors import DataError, as_data_error
 from polmvs.io.temporary import TOKEN, is_temporary, remove_temporary
 from polmvs.pipeline.run_folder import HERE
 
@@ -47,10 +47,8 @@ def locked(root: Path) -> Iterator[None]:
     """
     path = root / LOCK_FILE
     is_new = not root.exists()
-    try:
+    with as_data_error(root, "made"):
         root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(root, f"cannot be made: {error.strerror or error}.") from error
     descriptor = _open_locked(path)
     try:
         tokens = {TOKEN: os.getpid(), **_read(path)}
@@ -85,11 +83,9 @@ def left_over_names(root: Path) -> frozenset[str]:
 def _open_locked(path: Path) -> int:
     """Descriptor of the lock's file, which is locked."""
     while True:
-        try:
+        with as_data_error(path, "written"):
             flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
             descriptor = os.open(path, flags, 0o666)
-        except OSError as error:
-            raise DataError(path, f"cannot be written: {error.strerror or error}.") from error
         try:
             _lock(descriptor)
         except OSError as error:
@@ -135,10 +131,8 @@ def _read(path: Path) -> dict[str, int]:
         The file is not one that a run wrote.
     """
     try:
-        with path.open("rb") as file:
+        with as_data_error(path, "read"), path.open("rb") as file:
             text = file.read(MAX_BYTES).decode("ascii")
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
     except ValueError as error:
         raise DataError(path, "was not written by polmvs. Move it out of the way.") from error
     found = [_LINE.fullmatch(line) for line in text.splitlines()]
@@ -151,13 +145,11 @@ def _read(path: Path) -> dict[str, int]:
 def _write(descriptor: int, path: Path, tokens: dict[str, int]) -> None:
     """Put the list in the place of the old one; killed on the way, it names too much at worst."""
     data = "".join(f"{token} {number}\n" for token, number in tokens.items()).encode()
-    try:
+    with as_data_error(path, "written"):
         os.lseek(descriptor, 0, os.SEEK_SET)
         if os.write(descriptor, data) != len(data):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         os.ftruncate(descriptor, len(data))
-    except OSError as error:
-        raise DataError(path, f"cannot be written: {error.strerror or error}.") from error
 
 
 def _remove_left_over(root: Path, tokens: set[str]) -> set[str]:

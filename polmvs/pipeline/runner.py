@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 from polmvs.colmap.cameras import quiet_colmap
 from polmvs.config import (
+    AngleModel,
     Options,
     RunOptions,
     plain_options,
@@ -26,11 +27,11 @@ from polmvs.config import (
     to_plain,
     with_absolute_paths,
 )
-from polmvs.errors import DataError, OptionError, PolmvsError
+from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.folders import require_unicode
-from polmvs.memory import MemoryNeeds, MemoryPlan, PeakMemory, cpu_seconds, plan_memory
-from polmvs.parallel import Workers
+from polmvs.memory import MemoryPlan, PeakMemory, cpu_seconds, plan_memory
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.checks import (
     check_input,
     identity_of,
@@ -38,7 +39,6 @@ from polmvs.pipeline.checks import (
     require_apart,
     require_same_capture,
 )
-from polmvs.pipeline.monitor import Monitor, NoMonitor, OnProgress, no_progress
 from polmvs.pipeline.record import (
     Record,
     StageRecord,
@@ -64,9 +64,9 @@ from polmvs.pipeline.stage_table import (
     with_dependent,
     written_names,
 )
+from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.images import image_names
-from polmvs.polarization.capture import Capture, open_capture
-from polmvs.scene import SparseModel
+from polmvs.polarization.capture import open_capture
 from polmvs.threads import one_blas_thread
 
 logger = logging.getLogger(__name__)
@@ -74,29 +74,74 @@ logger = logging.getLogger(__name__)
 FILE_ONLY = {"file_only": True}  # of records that a monitor is told of as well
 
 
-@dataclass(kw_only=True)
-class Run:
-    """A run in progress.
+class Monitor(Protocol):
+    """Who watches a run: what a terminal, a notebook or a test implements to follow it."""
+
+    def opened(self, run_folder: RunFolder) -> None:
+        """The run folder is ready."""
+
+    def stage(self, name: str, total: int | None) -> AbstractContextManager[OnProgress]:
+        """A stage begins, of ``total`` steps if that is known; gives who is told of its steps."""
+
+    def finished(self, name: str, seconds: float, summary: str) -> None:
+        """A stage is finished and recorded; the summary is what it found, in a few words."""
+
+    def skipped(self, name: str) -> None:
+        """A stage was finished earlier."""
+
+
+class NoMonitor:
+    """Nobody watches."""
+
+    def opened(self, run_folder: RunFolder) -> None:
+        """Do nothing."""
+
+    def stage(self, name: str, total: int | None) -> AbstractContextManager[OnProgress]:
+        """Do nothing."""
+        return nullcontext(no_progress)
+
+    def finished(self, name: str, seconds: float, summary: str) -> None:
+        """Do nothing."""
+
+    def skipped(self, name: str) -> None:
+        """Do nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What every job is called with.
 
     Attributes
     ----------
-    run_folder, capture, options, workers, monitor : what it works with.
+    capture : folder of raw mosaics.
+    out : run folder.
+    options : of all stages.
+    run_options : workers, overwrite and resume.
+    monitor : who watches, if anybody.
+    command_line : for the record.
+    """
+
+    capture: Path
+    out: Path
+    options: Options = Options()
+    run_options: RunOptions = RunOptions()
+    monitor: Monitor | None = None
+    command_line: Sequence[str] = ()
+
+
+@dataclass(kw_only=True)
+class Run(StageInput):
+    """A run in progress; a stage is given what :class:`StageInput` says of it.
+
+    Attributes
+    ----------
+    monitor : who watches.
     table : all stages, in order.
-    given_model : the sparse model of the options, fitted to the capture.
-    record : what is finished, as in ``run.json``.
-    max_rows : of points and views that normals are solved from at a time.
     budget_gb : of memory, that stages are held to; None: none.
     """
 
-    run_folder: RunFolder
-    capture: Capture
-    options: Options
-    workers: Workers
     monitor: Monitor
     table: Sequence[StageSpec]
-    given_model: SparseModel | None
-    record: Record
-    max_rows: int = MemoryNeeds().max_rows
     budget_gb: float | None = None
     _started: float = field(default_factory=time.perf_counter)
 
@@ -146,10 +191,10 @@ class Run:
         logger.info("%s: begins", spec.name)
         start, cpu_start, memory = time.perf_counter(), cpu_seconds(), PeakMemory()
         with (
-            self.monitor.stage(spec.name, spec.num_steps(self._input())) as on_progress,
+            self.monitor.stage(spec.name, spec.num_steps(self)) as self.on_progress,
             _collected_warnings() as warned,
         ):
-            result = spec.work(self._input(on_progress))
+            result = spec.work(self)
             peak_mb = memory.mb()
             if self.budget_gb is not None and peak_mb > 1e3 * self.budget_gb:
                 logger.warning(
@@ -178,18 +223,6 @@ class Run:
         self.record.stages = tuple(sorted(stages, key=lambda stage: order.index(stage.name)))
         self.save()
         self.monitor.finished(spec.name, seconds, str(result))
-
-    def _input(self, on_progress: OnProgress = no_progress) -> StageInput:
-        return StageInput(
-            run_folder=self.run_folder,
-            capture=self.capture,
-            options=self.options,
-            workers=self.workers,
-            max_rows=self.max_rows,
-            given_model=self.given_model,
-            record=self.record,
-            on_progress=on_progress,
-        )
 
     def _has_changed(self, spec: StageSpec, finished: StageRecord) -> bool:
         """Whether a finished stage was made from other files or options."""
@@ -276,17 +309,12 @@ def _collected_warnings() -> Iterator[list[str]]:
 
 @contextmanager
 def open_run(
-    capture_folder: Path,
-    out: Path,
-    options: Options,
-    run_options: RunOptions,
+    job: Job,
     *,
     table: Sequence[StageSpec],
     min_images: int,
     taken_over: Collection[str],
     continues: bool = False,
-    monitor: Monitor | None = None,
-    command_line: Sequence[str] = (),
 ) -> Iterator[Run]:
     """Check the input, make the run folder ready, and give the run.
 
@@ -295,37 +323,38 @@ def open_run(
 
     Parameters
     ----------
-    capture_folder, out : as the user gave them.
-    options : of all stages.
-    run_options : workers, overwrite and resume.
+    job : as the user gave it.
     table : all stages, in order.
     min_images : the fewest that will do.
     taken_over : names of the stages that are not done again if they are finished.
-    continues : the folder must hold a run, and its finished stages stay, whatever ``run_options``
-        say.
-    monitor : who watches.
-    command_line : for the record.
+    continues : the folder must hold a run, and its finished stages stay, whatever the job's
+        ``run_options`` say.
 
     Raises
     ------
     DataError, OptionError
         The input is unusable, or the run folder is, or another run is at work in it.
     """
-    monitor = monitor if monitor is not None else NoMonitor()
+    monitor = job.monitor if job.monitor is not None else NoMonitor()
+    run_options = job.run_options
     if run_options.scheduler is not None:  # whose workers have other working folders
-        capture_folder, out = capture_folder.absolute(), out.absolute()
-        options = with_absolute_paths(options)
-    run_folder, others = RunFolder(out), inputs_of(options)
-    for path in (capture_folder, out, *others):
+        job = replace(
+            job,
+            capture=job.capture.absolute(),
+            out=job.out.absolute(),
+            options=with_absolute_paths(job.options),
+        )
+    run_folder, others = RunFolder(job.out), inputs_of(job.options)
+    for path in (job.capture, job.out, *others):
         require_unicode(path)
-    require_apart(run_folder, capture=capture_folder, others=others, written=written_names())
+    require_apart(run_folder, capture=job.capture, others=others, written=written_names())
     overwrite, resume = run_options.overwrite and not continues, run_options.resume or continues
     with quiet_colmap():
-        capture = open_capture(capture_folder, options.capture)
+        capture = open_capture(job.capture, job.options.capture)
         if run_folder.run_file.is_file() and (run_options.resume or continues):
             require_same_capture(load_record(run_folder), identity_of(capture), run_folder)
         plan = plan_memory(run_options.memory, run_options.workers, capture.width * capture.height)
-        given_model = check_input(capture, options, min_images)
+        given_model = check_input(capture, job.options, min_images)
         if continues:
             load_record(run_folder)
         require_usable(run_folder, overwrite=overwrite, resume=resume)
@@ -333,8 +362,8 @@ def open_run(
     with (
         quiet_colmap(),
         one_blas_thread(),
-        locked(out),
-        _workers(run_options, plan, capture_folder, out, options) as workers,
+        locked(job.out),
+        _workers(job, plan) as workers,
     ):
         record = prepare_output(run_folder, overwrite=overwrite, resume=resume)
         identity = identity_of(capture)
@@ -342,7 +371,7 @@ def open_run(
         run = Run(
             run_folder=run_folder,
             capture=capture,
-            options=options,
+            options=job.options,
             workers=workers,
             monitor=monitor,
             table=table,
@@ -354,8 +383,8 @@ def open_run(
         run.require_same_options(taken_over)
         record.capture, record.images = identity, tuple(image_names(capture))
         record.notes = capture.notes
-        record.command_line, record.versions = tuple(command_line), versions()
-        record.options = to_plain(options)
+        record.command_line, record.versions = tuple(job.command_line), versions()
+        record.options = to_plain(job.options)
         run.save()
         monitor.opened(run_folder)
         try:
@@ -366,15 +395,13 @@ def open_run(
             raise
 
 
-def _workers(
-    run_options: RunOptions, plan: MemoryPlan, capture_folder: Path, out: Path, options: Options
-) -> Workers:
+def _workers(job: Job, plan: MemoryPlan) -> Workers:
     """Processes here, or those of a cluster that sees what they need."""
-    if run_options.scheduler is None:
+    if job.run_options.scheduler is None:
         return Workers(plan.num_workers)
-    existing = next(folder for folder in (out, *out.parents) if folder.is_dir())
-    sources = [path for path in (capture_folder, *inputs_of(options)) if path.exists()]
-    return Workers.of_cluster(run_options.scheduler, [existing], sources)
+    existing = next(folder for folder in (job.out, *job.out.parents) if folder.is_dir())
+    sources = [path for path in (job.capture, *inputs_of(job.options)) if path.exists()]
+    return Workers.of_cluster(job.run_options.scheduler, [existing], sources)
 
 
 def load_record(run_folder: RunFolder) -> Record:
@@ -386,6 +413,11 @@ def load_record(run_folder: RunFolder) -> Record:
         It is missing, no record of a run, or one of another version.
     """
     return read_record(run_folder, result_types())
+
+
+def dense_models(record: Record) -> tuple[AngleModel, ...]:
+    """Models that a run has made a dense cloud of."""
+    return tuple(m for m in AngleModel if record.find(DensifyResult, m) is not None)
 
 
 def prepare_output(run_folder: RunFolder, *, overwrite: bool, resume: bool) -> Record:
@@ -449,17 +481,8 @@ def _remove_results(run_folder: RunFolder) -> None:
             "Give another OUT.",
         )
     images = read_image_names(run_folder)
-    folders = [path for path in present if path.is_dir()]
-    for folder in folders:
-        require_own(folder, images)
-    try:
-        for path in present:
-            if path in folders:
-                shutil.rmtree(path)
-            else:
-                path.unlink()
-    except OSError as error:
-        raise DataError(root, f"cannot be emptied: {error.strerror or error}.") from error
+    with as_data_error(root, "emptied"):
+        discard(present, images)
 
 
 def _names(paths: Iterable[Path]) -> tuple[str, ...]:

@@ -19,8 +19,8 @@ from typing import Any
 from polmvs.config import AngleModel, Options
 from polmvs.evaluation.comparison import SparseFigures
 from polmvs.evaluation.trust import Trust
-from polmvs.parallel import Workers
-from polmvs.pipeline.monitor import OnProgress
+from polmvs.memory import MemoryNeeds
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import HERE, LOG_FILE, RUN_FILE, RunFolder
 from polmvs.pipeline.stages import (
@@ -45,27 +45,27 @@ SFM, NORMALS, DENSIFY, EXPORT, COMPARE = "sfm", "normals", "densify", "export", 
 TILT_AWARE = "normals.tilt_aware_weights"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class StageInput:
-    """What a run gives to a stage when it begins.
+    """What a run gives to a stage.
 
     Attributes
     ----------
     run_folder, capture, options, workers : what the run works with.
     max_rows : of points and views that normals are solved from at a time.
     given_model : the sparse model of the options, fitted to the capture.
-    record : of the stages that are finished.
-    on_progress : is told of the stage's steps.
+    record : what is finished, as in ``run.json``.
+    on_progress : is told of the steps of the stage in work.
     """
 
     run_folder: RunFolder
     capture: Capture
     options: Options
     workers: Workers
-    max_rows: int
+    max_rows: int = MemoryNeeds().max_rows
     given_model: SparseModel | None
     record: Record
-    on_progress: OnProgress
+    on_progress: OnProgress = no_progress
 
     @property
     def num_views(self) -> int:
@@ -473,11 +473,3 @@ def written_names() -> tuple[str, ...]:
     """Names of all files and folders that a run may write in its folder, the record last."""
     names = [path.parts[0] for spec in stage_table() for path in spec.writes]
     return (*dict.fromkeys(names), HERE.report.name, LOG_FILE, RUN_FILE)
-
-
-def option_groups(command: str) -> tuple[str, ...]:
-    """Groups of the options that the stages of a command read, those that they need included."""
-    table = stage_table()
-    own = [spec.name for spec in table if spec.command == command]
-    paths = [path for spec in with_needed(own, table) for path in spec.decides]
-    return tuple(dict.fromkeys(path.partition(".")[0] for path in paths))

@@ -45,7 +45,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import AngleModel, Light
-from polmvs.polarization.stokes import Stokes
+from polmvs.polarization.stokes import Stokes, wrap_axial
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
@@ -94,9 +94,7 @@ def phase_from_normal(
     n = np.asarray(normals_in_cam, np.float64)
     x = v[..., 0] * n[..., 2] - v[..., 2] * n[..., 0]
     y = v[..., 1] * n[..., 2] - v[..., 2] * n[..., 1]
-    phase = np.mod(-np.arctan2(y, x), np.pi)
-    phase = np.where(phase >= np.pi, 0.0, phase)  # mod of a tiny negative number rounds to pi
-    return np.where(np.hypot(x, y) > 1e-12, phase, np.nan)
+    return np.where(np.hypot(x, y) > 1e-12, wrap_axial(-np.arctan2(y, x)), np.nan)
 
 
 def rows_from_phase(angle_model: AngleModel, phase: Floats, rays_in_cam: Floats) -> Array:

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import BayerOrder, CaptureOptions
-from polmvs.errors import DataError
+from polmvs.errors import DataError, as_data_error
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.images import write_bytes
 from polmvs.polarization.mosaic import (
@@ -351,9 +351,8 @@ def read_calibration(path: Path) -> PolarizerCalibration:
         It or an array that it names is missing, damaged, or holds impossible values.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+        with as_data_error(path, "read"):
+            content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise DataError(path, "is no TOML file of a calibration.") from error
     known = {"version", "pattern", "bayer", "gains", "angles_deg", "diattenuations", "full_scale"}
@@ -388,7 +387,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
     scale = content.get("full_scale")
     if scale is not None and not (type(scale) in (int, float) and 0 < scale < np.inf):
         raise DataError(path, "full_scale must be a positive number.")
-    files = {}
+    files: dict[str, Any] = {}
     for name in arrays:
         if name in content:
             if not isinstance(content[name], str):
@@ -401,10 +400,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
         gains=values["gains"],
         angles_deg=values["angles_deg"],
         diattenuations=values["diattenuations"],
-        dark=files.get("dark"),
-        flat=files.get("flat"),
-        angle_map=files.get("angle_map"),
-        diattenuation_map=files.get("diattenuation_map"),
+        **files,
         full_scale=None if scale is None else float(scale),
         bayer=None if bayer is None else BayerOrder(bayer),
     )

@@ -457,11 +457,6 @@ def open_image(path: Path, options: CaptureOptions | None = None) -> Capture:
     return _open(files, CaptureOptions() if options is None else options)
 
 
-def open_files(files: CaptureFiles, options: CaptureOptions | None = None) -> Capture:
-    """As :func:`open_capture`, of files whose views are known, as those of a data set."""
-    return _open(files, CaptureOptions() if options is None else options)
-
-
 def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
     _require_fitting_options(files, options)
     calibration = None

@@ -9,16 +9,15 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import CaptureKind, CaptureOptions, RegionOptions, Resolution
-from polmvs.io.images import write_png
-from polmvs.polarization.capture import Capture, intensity_image_8bit, open_capture
+from polmvs.config import CaptureKind, RegionOptions, Resolution
+from polmvs.parallel import OnProgress, no_progress
+from polmvs.polarization.capture import Capture, intensity_image_8bit
 from polmvs.polarization.stokes import Stokes
 from polmvs.scene import short_list
 
@@ -120,49 +119,41 @@ class Inspection:
 
 
 def inspect_capture(
-    capture: Capture | Path,
-    options: CaptureOptions | None = None,
+    capture: Capture,
     *,
-    limits: InspectionLimits | None = None,
-    on_progress: Callable[[int], None] | None = None,
+    limits: InspectionLimits = InspectionLimits(),
+    on_progress: OnProgress = no_progress,
 ) -> Inspection:
     """Look at every view of a capture.
 
     Parameters
     ----------
-    capture : an open one, or its folder.
-    options : how it is to be opened.
+    limits : beyond which a figure is warned of.
     on_progress : called with 1 after each view.
 
     Raises
     ------
-    PolmvsError
-        The capture cannot be read, or its pattern does not fit.
+    DataError
+        A view cannot be read.
     """
-    opened = capture if isinstance(capture, Capture) else open_capture(capture, options)
-    bounds = InspectionLimits() if limits is None else limits
-    white = 0.5 * opened.exposure()
+    white = 0.5 * capture.exposure()
     figures: list[ViewFigures] = []
     colour = 0.0
-    for name in opened.names:
-        stokes = opened.load(name)
+    for name in capture.names:
+        stokes = capture.load(name)
         if not figures:
-            colour = _block_differences(opened, stokes)
-        figures.append(_figures_of(name, stokes, opened.options.darkness))
-        if on_progress is not None:
-            on_progress(1)
-    warnings = _warnings(opened, white, figures, colour, bounds)
-    return Inspection(capture=opened, white=white, views=tuple(figures), warnings=tuple(warnings))
+            colour = _block_differences(capture, stokes)
+        figures.append(_figures_of(name, stokes, capture.options.darkness))
+        on_progress(1)
+    warnings = _warnings(capture, white, figures, colour, limits)
+    return Inspection(capture=capture, white=white, views=tuple(figures), warnings=tuple(warnings))
 
 
-def contact_sheet(
-    capture: Capture, names: Sequence[str] | None = None, worded: Callable[[str], str] = str
-) -> Picture:
-    """Pictures of some views: intensity, AoLP, DoLP, one view a row, in two columns of rows.
+def contact_sheet(capture: Capture, worded: Callable[[str], str] = str) -> Picture:
+    """Pictures of eight views: intensity, AoLP, DoLP, one view a row, in two columns of rows.
 
     Parameters
     ----------
-    names : of the views; None for eight, evenly spread.
     worded : what is shown of a line that names options by their paths.
 
     Returns
@@ -170,13 +161,11 @@ def contact_sheet(
     (H, W, 3) uint8, BGR. Clipped pixels are red in the intensity; hue is the AoLP, paler and
     darker where the DoLP is under 0.5.
     """
-    if names is None:
-        count = min(SHEET_VIEWS, len(capture.names))
-        chosen = np.linspace(0, len(capture.names) - 1, count).round().astype(int)
-        names = [capture.names[k] for k in chosen]
+    count = min(SHEET_VIEWS, len(capture.names))
+    chosen = np.linspace(0, len(capture.names) - 1, count).round().astype(int)
     white = capture.exposure()
     tiles = []
-    for name in names:
+    for name in [capture.names[k] for k in chosen]:
         stokes = capture.load(name)
         shown = (intensity_picture(stokes, white), aolp_picture(stokes), dolp_picture(stokes))
         captions = (f"{name}  intensity", "AoLP", f"DoLP, white: {SHOWN_DOLP:g}")
@@ -187,17 +176,6 @@ def contact_sheet(
     rows = [np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)]
     body = np.vstack(rows)
     return np.vstack([_header(capture, body.shape[1], worded), body])
-
-
-def write_contact_sheet(path: Path, capture: Capture, worded: Callable[[str], str] = str) -> None:
-    """Write the contact sheet as PNG, whole or not at all; see :func:`contact_sheet`.
-
-    Raises
-    ------
-    DataError
-        The system refuses, or a view cannot be read.
-    """
-    write_png(path, contact_sheet(capture, worded=worded))
 
 
 def intensity_picture(stokes: Stokes, white: float) -> Picture:

@@ -20,6 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dctn
 
 from polmvs.config import CaptureOptions
 from polmvs.polarization.mosaic import split_mosaic
@@ -68,7 +69,7 @@ def _rhythm(
     rhythmic = 0
     if len(blocks) < MIN_BLOCKS:
         return steps, rhythmic, silent
-    coefficients = _dct(blocks)
+    coefficients = dctn(blocks.astype(np.float64) - 128, axes=(1, 2), norm="ortho")
     for v in range(BLOCK):
         for u in range(BLOCK):
             values = np.abs(coefficients[:, v, u])
@@ -117,14 +118,6 @@ def _blocks(raw: NDArray[Any]) -> NDArray[np.float32]:
     blocks = tiles[::step, :, ::step].transpose(0, 2, 1, 3).reshape(-1, BLOCK, BLOCK)
     low, high = blocks.min(axis=(1, 2)), blocks.max(axis=(1, 2))
     return np.asarray(blocks[(low > 0) & (high < 255) & (low < high)], np.float32)
-
-
-def _dct(blocks: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Orthonormal cosine transform of blocks (N, 8, 8) about grey 128."""
-    n = np.arange(BLOCK)
-    basis = np.cos(np.pi * (2 * n[None] + 1) * n[:, None] / (2 * BLOCK)) * np.sqrt(2 / BLOCK)
-    basis[0] /= np.sqrt(2)
-    return np.asarray(basis @ (blocks - 128.0) @ basis.T, np.float64)
 
 
 def _comb_step(values: NDArray[np.float64]) -> int | None:

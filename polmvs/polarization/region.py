@@ -133,8 +133,10 @@ def _open(mask: Mask, size: int) -> Mask:
     return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0)
 
 
-def _dilate(mask: Mask, size: int) -> Mask:
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)
+def grow_mask(mask: Mask, margin_px: int) -> Mask:
+    """The mask and all that is within the margin of it, in rows, columns and diagonals, px."""
+    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
 
 
 def _relative_gradient(s0: Image) -> Image:
@@ -229,7 +231,7 @@ def _marks(s0: Image, polarised: Mask, reach_px: float) -> Mask:
         weight, 1e-6
     )
     deviation = smooth(s0, 0.8) / np.maximum(reference, 1e-6)
-    return _dilate((weight > 0.02) & ((deviation > 1.5) | (deviation < 0.5)), 3)
+    return grow_mask((weight > 0.02) & ((deviation > 1.5) | (deviation < 0.5)), 1)
 
 
 def _phase_jumps(
@@ -240,5 +242,5 @@ def _phase_jumps(
     dx = cv2.Sobel(unit, cv2.CV_32F, 1, 0, scale=1 / 8)
     dy = cv2.Sobel(unit, cv2.CV_32F, 0, 1, scale=1 / 8)
     jump = np.sqrt((dx**2 + dy**2).sum(axis=-1))
-    near_polarised = _dilate(dolp > min_dolp, 5)
+    near_polarised = grow_mask(dolp > min_dolp, 2)
     return np.asarray((jump > tolerances.min_phase_jump) & near_polarised & (dolp > 0.5 * min_dolp))

@@ -115,7 +115,7 @@ class Stokes:
     @property
     def aolp(self) -> Image:
         """Angle of linear polarization (H, W), rad in [0, pi), anticlockwise from +x as shown."""
-        return np.asarray(_wrap(0.5 * np.arctan2(self.s2, self.s1)), np.float32)
+        return np.asarray(wrap_axial(0.5 * np.arctan2(self.s2, self.s1)), np.float32)
 
     def phase(self, light: Light | str = Light.SPECULAR) -> Image:
         """Direction in which the plane of incidence cuts the image (H, W), rad in [0, pi).
@@ -125,7 +125,7 @@ class Stokes:
         light : reflection that dominates; specular light turns the phase by pi/2 from the AoLP.
         """
         turn = np.float32(0.5 * np.pi if Light(light) is Light.SPECULAR else 0.0)
-        return np.asarray(_wrap(self.aolp + turn), np.float32)
+        return np.asarray(wrap_axial(self.aolp + turn), np.float32)
 
     @property
     def dolp(self) -> Image:
@@ -477,7 +477,7 @@ def _gain_sigma(s0: Image, s1: Image, s2: Image, redundancy: Image, valid: Mask)
 def axial_difference(a: Angles, b: Angles) -> NDArray[np.float64]:
     """Signed difference ``a - b`` of axial angles, rad in [-pi/2, pi/2); shapes broadcast."""
     difference = np.subtract(a, b, dtype=np.float64)
-    return np.asarray(_wrap(difference + 0.5 * np.pi) - 0.5 * np.pi)
+    return np.asarray(wrap_axial(difference + 0.5 * np.pi) - 0.5 * np.pi)
 
 
 def axial_mean(
@@ -502,10 +502,10 @@ def axial_mean(
     x = np.sum(weight * np.cos(doubled), axis=axis)
     y = np.sum(weight * np.sin(doubled), axis=axis)
     known = np.hypot(x, y) > 1e-12 * np.sum(weight, axis=axis)
-    return np.where(known, _wrap(0.5 * np.arctan2(y, x)), np.nan)
+    return np.where(known, wrap_axial(0.5 * np.arctan2(y, x)), np.nan)
 
 
-def _wrap(angle: Any) -> Any:
+def wrap_axial(angle: Any) -> Any:
     """An axial angle to [0, pi), in its own precision."""
     wrapped = np.mod(angle, np.pi)
     # A tiny negative angle rounds to pi itself.

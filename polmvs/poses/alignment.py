@@ -64,11 +64,6 @@ class Alignment:
     dropped: tuple[str, ...]
     rotation_error_median_deg: float
 
-    @property
-    def num_dropped(self) -> int:
-        """Number of cameras left out."""
-        return len(self.dropped)
-
 
 def align_views(
     views: Sequence[View],

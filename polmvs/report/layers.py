@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 import gzip
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -87,8 +87,8 @@ def thinned(layer: Layer, max_points: int) -> Layer:
         return layer
     # A fixed permutation: points come in the order of views or voxels, which a stride would alias.
     index = np.sort(np.random.default_rng(0).permutation(num)[:max_points])
-    return Layer(
-        label=layer.label,
+    return replace(
+        layer,
         points=layer.points[index],
         normals=layer.normals[index],
         values={name: values[index] for name, values in layer.values.items()},

@@ -8,7 +8,7 @@ extra, imported when a recording is made.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from polmvs.camera import Camera, PinholeCamera
 from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel
-from polmvs.errors import DataError, OptionError
+from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
 from polmvs.io.images import read_gray
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
-from polmvs.pipeline.runner import load_record
+from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.poses import PosesResult
@@ -33,8 +34,6 @@ from polmvs.report.layers import KIND_COLORS
 from polmvs.report.pictures import QUALITY, angle_picture
 from polmvs.report.rendering import SURFACE
 from polmvs.scene import PointKind, View
-
-OnProgress = Callable[[int], None]
 
 SUFFIX = ".rrd"
 TIMELINE = "stage"
@@ -62,11 +61,11 @@ def num_recorded_steps(run_folder: RunFolder) -> int:
     """How often :func:`write_recording` reports."""
     record = load_record(run_folder)
     found = record.find(PosesResult)
-    return (found.num_views if found is not None else 0) + len(_models(record))
+    return (found.num_views if found is not None else 0) + len(dense_models(record))
 
 
 def write_recording(
-    run_folder: RunFolder, path: Path, *, on_progress: OnProgress = lambda count: None
+    run_folder: RunFolder, path: Path, *, on_progress: OnProgress = no_progress
 ) -> None:
     """Record a finished run.
 
@@ -89,11 +88,10 @@ def write_recording(
         raise DataError(run_folder.root, "has no poses to record. Run 'polmvs sfm' first.")
     temporary = path.with_name(f".{path.name}.tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _Recorder(run_folder, record, temporary).write(on_progress)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise DataError(path, f"cannot be written: {error.strerror or error}.") from error
+        with as_data_error(path, "written"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _Recorder(run_folder, record, temporary).write(on_progress)
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -127,7 +125,7 @@ class _Recorder:
         tracks = self.model.tracks
         points = rr.Points3D(tracks.points_in_world, colors=tracks.colors, radii=_radius(rr))
         log("world/sparse", points)
-        models = _models(self.record)
+        models = dense_models(self.record)
         first = next(iter(models), None)
         if first is not None:
             self.begin("maps", "phases of the polarised regions")
@@ -238,10 +236,6 @@ class _Recorder:
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)
         centers = np.array([view.center_in_world for view in self.model.views])
         return float(np.median(np.linalg.norm(centers - middle, axis=1))) / 40
-
-
-def _models(record: Record) -> tuple[AngleModel, ...]:
-    return tuple(model for model in AngleModel if record.find(DensifyResult, model) is not None)
 
 
 def _levels(views: Path) -> Iterator[Mesh]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +22,10 @@ from polmvs.io.clouds import Cloud, read_cloud, read_mesh
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.images import write_bytes
 from polmvs.neighbors import nearest_points
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.runner import load_record
+from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.densify import DensifyResult, open_dense_views
 from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.maps import open_maps
@@ -84,9 +85,7 @@ class _Given:
     comparison: Comparison | None
 
 
-def write_report(
-    run_folder: RunFolder, *, on_progress: Callable[[int], None] = lambda count: None
-) -> Path:
+def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress) -> Path:
     """Make the report of a run, again if there is one.
 
     Parameters
@@ -142,7 +141,7 @@ def write_report(
 def _open(folder: RunFolder) -> _Given:
     record = load_record(folder)
     options = options_from_plain(record.options, source=str(folder.run_file))
-    models = tuple(m for m in AngleModel if record.find(DensifyResult, m) is not None)
+    models = dense_models(record)
     if not models:
         raise DataError(folder.root, "has no dense cloud to report on. Run 'polmvs densify' first.")
     sparse = read_model(folder.sparse)
@@ -311,12 +310,8 @@ def _cloud_layer(given: _Given, model: AngleModel, cloud: Cloud, factor: float) 
     )
     normals = layer.normals @ truth_from_world.rotation.T
     off = np.nan_to_num(angular_errors_deg(normals, true.normals[nearest]))
-    return Layer(
-        label=layer.label,
-        points=layer.points,
-        normals=layer.normals,
-        values={**layer.values, "error": 1e3 * distance, "normal_error": off},
-    )
+    errors = {"error": 1e3 * distance, "normal_error": off}
+    return replace(layer, values={**layer.values, **errors})
 
 
 def _on_surface(cloud: Cloud) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ problem per view joins both, so that every node draws on all seeds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, Contour, PropagationOptions
-from polmvs.parallel import Workers
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.angle_models import rows_from_axial
 from polmvs.polarization.phase_map import PhaseMap, view_rays
 from polmvs.scene import Seeds
@@ -79,7 +79,7 @@ def propagate(
     *,
     tilt_aware: bool = True,
     workers: Workers | None = None,
-    on_progress: Callable[[int], None] | None = None,
+    on_progress: OnProgress = no_progress,
     tolerances: ContourTolerances = ContourTolerances(),
 ) -> list[DenseView | None]:
     """Range and normal over the polarised region of every view.
@@ -100,17 +100,16 @@ def propagate(
     Per view its dense result, or None where no seed reaches the view's region.
     """
     workers = workers or Workers(1)
-    report = on_progress or (lambda count: None)
     nodes: list[Nodes | None] = []
     start = partial(_start, angle_model, seeds, options, tolerances=tolerances)
     for started in workers.map(start, maps):
         nodes.append(started)
-        report(1)
+        on_progress(1)
     strides = [2 * options.stride_px] * (options.num_rounds - 1) + [options.stride_px]
     plans = [RoundPlan(stride_px, use_consensus=False) for stride_px in strides]
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
     solve = partial(_round, angle_model, seeds, options, tilt_aware)
-    return in_rounds(solve, plans, maps, neighbors, folder, workers, report, nodes)
+    return in_rounds(solve, plans, maps, neighbors, folder, workers, on_progress, nodes)
 
 
 def _connect(

@@ -13,7 +13,7 @@ from polmvs.camera import sample_image
 from polmvs.config import FusionOptions, PropagationOptions
 from polmvs.geometry import unit_or_zero
 from polmvs.neighbors import are_usual, point_spacings, voxel_of_each
-from polmvs.parallel import Workers
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE
 from polmvs.surface.consensus import MAX_DEVIATIONS, sight
@@ -75,8 +75,8 @@ def fuse(
     *,
     max_neighbors: int = PropagationOptions.max_neighbors,
     workers: Workers | None = None,
-    on_progress: Callable[[int], None] | None = None,
-    on_confirmed: Callable[[int, Mask], None] | None = None,
+    on_progress: OnProgress = no_progress,
+    on_confirmed: Callable[[int, Mask], None] = lambda index, confirmed: None,
     tolerances: FusionTolerances = FusionTolerances(),
 ) -> FusedCloud:
     """Fuse the dense views into one cloud.
@@ -114,10 +114,8 @@ def fuse(
     ):
         clouds.append(part.cloud)
         footprints.append(part.footprint)
-        if on_confirmed is not None:
-            on_confirmed(k, part.confirmed)
-        if on_progress is not None:
-            on_progress(1)
+        on_confirmed(k, part.confirmed)
+        on_progress(1)
     cloud = concatenate(clouds)
     if not len(cloud.points):
         return cloud

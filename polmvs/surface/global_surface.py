@@ -21,6 +21,7 @@ from polmvs.config import AngleModel, default_num_workers
 from polmvs.geometry import lengths
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS, Seeds, View
 from polmvs.surface.creases import (
@@ -88,7 +89,6 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
-OnProgress = Callable[[int], None]
 
 MAX_FILLED_SHARE = 0.35  # of the image's border on the objects, where a silhouette bounds little
 REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured on spheres
@@ -164,7 +164,7 @@ def reconstruct_surface(
     tilt_aware: bool = True,
     min_views: int = 2,
     tolerances: RefinementTolerances | None = None,
-    on_progress: OnProgress | None = None,
+    on_progress: OnProgress = no_progress,
     on_mesh: Callable[[TriangleMesh], None] | None = None,
     folder: Path | None = None,
 ) -> GlobalSurface | Undetermined:
@@ -204,8 +204,7 @@ def reconstruct_surface(
         # Steps of a surface that is given up count, up to the number announced.
         count = min(count, num_surface_steps(0) - done)
         done += count
-        if on_progress is not None:
-            on_progress(count)
+        on_progress(count)
 
     def given_by(kept: Mask, *, is_suspicion: bool = False) -> _Given:
         own = list(compress(views, kept))
@@ -243,7 +242,7 @@ def reconstruct_surface(
         )
         fine = replace(hull_tolerances, step_px=0.5 * hull_tolerances.step_px)
         thin = replace(tolerances, levels=tolerances.thin_levels)
-        unheard = replace(given, is_suspicion=False, report=lambda count: None)
+        unheard = replace(given, is_suspicion=False, report=no_progress)
         again = _surface(unheard, unheard.hull(fine), thin)
         if again.found is not None and _uncovered_share(again.found) < _uncovered_share(found):
             found, meshes = again.found, again.meshes

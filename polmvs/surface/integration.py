@@ -26,7 +26,7 @@ from polmvs.camera import sample_image
 from polmvs.config import AngleModel, PropagationOptions
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
-from polmvs.parallel import Workers
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
 from polmvs.surface.consensus import MAX_DEVIATIONS, sight, surface_of_others
@@ -96,7 +96,7 @@ def integrate(
     *,
     tilt_aware: bool = True,
     workers: Workers | None = None,
-    on_progress: Callable[[int], None] | None = None,
+    on_progress: OnProgress = no_progress,
     tolerances: IntegrationTolerances = IntegrationTolerances(),
 ) -> list[DenseView | None]:
     """Range and normal over the polarised region of every view.
@@ -116,10 +116,10 @@ def integrate(
     -------
     Per view its dense result, or None where neither a seed nor another view reaches it.
     """
-    workers, report = workers or Workers(1), on_progress or (lambda count: None)
+    workers = workers or Workers(1)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
     solve = partial(_round, angle_model, seeds, options.bending, tilt_aware, tolerances=tolerances)
-    return in_rounds(solve, plan_rounds(options), maps, neighbors, folder, workers, report)
+    return in_rounds(solve, plan_rounds(options), maps, neighbors, folder, workers, on_progress)
 
 
 @dataclass(frozen=True)

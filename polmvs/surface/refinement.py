@@ -24,6 +24,7 @@ from polmvs.config import AngleModel, default_num_workers
 from polmvs.fitting import CAUCHY_SCALE, annealed_scales, robust_deviation
 from polmvs.geometry import dots, lengths, unit_or_zero
 from polmvs.normals.estimator import smallest_eigenvectors
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.scene import MIN_VIEWS
 from polmvs.surface.creases import CreaseTolerances, crease_vertices
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, visible_points
@@ -383,7 +384,7 @@ def refine(
     *,
     known: KnownPoints | None = None,
     tolerances: RefinementTolerances | None = None,
-    on_progress: Callable[[int], None] | None = None,
+    on_progress: OnProgress = no_progress,
     go_on: Callable[[TriangleMesh], bool] | None = None,
 ) -> Refined:
     """Move a closed mesh until the views' phases and silhouettes agree with it.
@@ -469,10 +470,9 @@ def _refined_at(
     given: _Given,
     edge: float,
     level: Level,
-    on_progress: Callable[[int], None] | None,
+    on_progress: OnProgress,
 ) -> _State:
     """The surface after one level, with edges of the given length."""
-    report = on_progress if on_progress is not None else lambda count: None
     mesh, tilt_share, shown, tol = state.mesh, state.tilt_share, state.row_sigma, given.tol
     moved = np.zeros(len(mesh.vertices))
     for step in range(level.num_steps):
@@ -499,9 +499,9 @@ def _refined_at(
             change / given.footprint,
             tilt_share,
         )
-        report(1)
+        on_progress(1)
         if change < tol.converged * edge and step > 1:
-            report(level.num_steps - step - 1)
+            on_progress(level.num_steps - step - 1)
             break
     # A model that leaves something out (OPA the perspective) errs by more than its phases' noise;
     # held against that, most of its rows were outliers. Every model is treated alike.

@@ -12,7 +12,7 @@ range of the view's own pixels and nothing is reprojected.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -27,6 +27,7 @@ from polmvs.config import FusionOptions, PropagationOptions
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map
+from polmvs.polarization.region import grow_mask
 from polmvs.scene import (
     KEYPOINT_SIGMA_PX,
     MIN_FACING_COSINE,
@@ -161,12 +162,6 @@ def part_shares(tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int) -> Arr
     return np.where(count > 0, hits / np.maximum(count, 1), 1.0)
 
 
-def grow_mask(mask: Mask, margin_px: int) -> Mask:
-    """The mask and all that is within the margin of it, in rows, columns and diagonals, px."""
-    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
-
-
 def relative_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
     """Standard deviation ``(T,)`` of the points' places as shares of their mean distances.
 
@@ -273,7 +268,6 @@ def stereo_surroundings(
     folder: Path,
     *,
     workers: Workers | None = None,
-    on_progress: Callable[[int], None] | None = None,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> FusedCloud:
     """Dense cloud of the textured surroundings of the polarised parts, from pairs of views.
@@ -285,7 +279,6 @@ def stereo_surroundings(
     maps : phase maps of the views.
     folder : where the views' ranges are kept meanwhile; the caller removes it.
     workers : processes to share the views among; None: this one.
-    on_progress : called with the number of views done, twice for each view with points.
     tolerances : of this step.
     """
     workers = workers or Workers(1)
@@ -296,20 +289,16 @@ def stereo_surroundings(
     used = [k for k, partners in enumerate(chosen) if partners]
     task = partial(_match_view, folder, tolerances=tolerances)
     groups = [[maps[k], *(maps[j] for j in chosen[k])] for k in used]
-    dense: list[DenseView] = []
     own = certain.of_views(len(maps))
     points = [certain.points_in_world[certain.obs_track[own[k]]] for k in used]
-    for done in workers.map(task, groups, points):
-        dense.append(done)
-        if on_progress is not None:
-            on_progress(1)
+    dense = list(workers.map(task, groups, points))
     options = FusionOptions(
         min_views=tolerances.min_observations,
         max_normal_difference_deg=CreaseTolerances.crease_deg,
         voxel_px=1.0,
     )
     views = [_whole_view(maps[k]) for k in used]
-    return fuse(views, dense, options, workers=workers, on_progress=on_progress)
+    return fuse(views, dense, options, workers=workers)
 
 
 def _match_view(

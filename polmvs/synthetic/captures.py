@@ -20,24 +20,9 @@ from polmvs.camera import Camera, pixel_centers
 from polmvs.config import CaptureOptions
 from polmvs.geometry import RigidTransform, unit
 from polmvs.polarization.mosaic import ANGLES_DEG
+from polmvs.polarization.stokes import wrap_axial
 from polmvs.scene import View
-from polmvs.synthetic.surfaces import Cylinder, Group, Plane, Sphere, Surface
-
-__all__ = [
-    "Cylinder",
-    "Group",
-    "Plane",
-    "Sphere",
-    "Surface",
-    "SyntheticView",
-    "add_noise",
-    "look_at",
-    "mosaic_from_intensities",
-    "quantize",
-    "render_mosaic",
-    "render_view",
-    "ring_of_views",
-]
+from polmvs.synthetic.surfaces import Surface
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -188,16 +173,25 @@ def ring_of_views(
 ) -> list[View]:
     """Views all around a target, names ``000.png`` on; elevation is counted from the x-y plane."""
     elevation, roll = np.radians([elevation_deg, roll_deg])
-    cos, sin = np.cos(roll), np.sin(roll)
-    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     views = []
     for i, azimuth in enumerate(np.arange(num_views) * (2 * np.pi / num_views)):
-        across = np.cos(elevation)
-        direction = [across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)]
-        pose = look_at(np.asarray(target, np.float64) + distance * np.array(direction), target)
-        pose = RigidTransform(turn @ pose.rotation, turn @ pose.translation)
+        center = np.asarray(target, np.float64) + distance * direction(azimuth, elevation)
+        pose = rolled(look_at(center, target), roll)
         views.append(View(name=f"{i:03d}.png", camera=camera, cam_from_world=pose))
     return views
+
+
+def direction(azimuth: float, elevation: float) -> Array:
+    """Unit vector (3,) of two angles in rad; elevation is counted from the x-y plane."""
+    across = np.cos(elevation)
+    return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
+
+
+def rolled(pose: RigidTransform, roll: float) -> RigidTransform:
+    """The pose of a camera that is turned about its own axis, by an angle in rad."""
+    cos, sin = np.cos(roll), np.sin(roll)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return RigidTransform(turn @ pose.rotation, turn @ pose.translation)
 
 
 def _render(
@@ -243,8 +237,8 @@ def _render(
         range=distance,
         normals_in_cam=normals,
         mask=mask,
-        phase=_wrap(aolp - (np.pi / 2 if light == "specular" else 0.0)),
-        aolp=_wrap(aolp),
+        phase=wrap_axial(aolp - (np.pi / 2 if light == "specular" else 0.0)),
+        aolp=wrap_axial(aolp),
         dolp=dolp,
         intensities=intensities,
     )
@@ -273,12 +267,6 @@ def _tilted_intensities(rays: Array, axis: Array, dolp: Array, s0: float) -> Arr
         absorbed = 0.5 * (1 - dolp) + dolp * (absorbing * axis).sum(axis=-1) ** 2
         intensities.append(s0 * (1 - absorbed))
     return np.stack(intensities)
-
-
-def _wrap(angle: Array) -> Array:
-    """An axial angle to [0, pi)."""
-    wrapped = np.mod(angle, np.pi)
-    return np.where(wrapped >= np.pi, 0.0, wrapped)  # a tiny negative angle rounds to pi
 
 
 def _pattern_indices(pattern: tuple[int, int, int, int]) -> list[int]:

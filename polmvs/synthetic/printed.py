@@ -18,9 +18,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.camera import Camera, sample_image
-from polmvs.geometry import RigidTransform
 from polmvs.scene import View
-from polmvs.synthetic.captures import SyntheticView, look_at, render_mosaic, render_view
+from polmvs.synthetic.captures import (
+    SyntheticView,
+    direction,
+    look_at,
+    render_mosaic,
+    render_view,
+    rolled,
+)
 from polmvs.synthetic.surfaces import Group, Surface
 
 Array = NDArray[np.float64]
@@ -121,15 +127,13 @@ def orbit_views(
     views = []
     for rank, azimuth in zip(ranks, azimuths, strict=True):
         elevation = rng.uniform(low, high)
-        across = np.cos(elevation)
-        direction = [across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)]
-        center = np.asarray(target) + distance * rng.uniform(0.9, 1.1) * np.array(direction)
+        center = np.asarray(target) + (
+            distance * rng.uniform(0.9, 1.1) * direction(azimuth, elevation)
+        )
         pose = look_at(center, np.asarray(target) + distance * rng.normal(scale=0.02, size=3))
-        cos, sin = np.cos(roll := rng.normal(scale=0.2)), np.sin(roll)
-        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        pose = rolled(pose, rng.normal(scale=0.2))
         name = f"{rank:0{max(3, len(str(num_views - 1)))}d}.png"
-        turned = RigidTransform(turn @ pose.rotation, turn @ pose.translation)
-        views.append(View(name=name, camera=camera, cam_from_world=turned))
+        views.append(View(name=name, camera=camera, cam_from_world=pose))
     return sorted(views, key=lambda view: view.name)
 
 

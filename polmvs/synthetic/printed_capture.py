@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from polmvs.camera import PinholeCamera, in_image
 from polmvs.io.folders import new_folder
 from polmvs.io.ground_truth import DEPTH_UNIT_M
 from polmvs.io.images import write_bytes, write_png
-from polmvs.parallel import Workers
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.scene import SparseModel, Tracks, View
 from polmvs.synthetic.captures import add_noise, quantize
 from polmvs.synthetic.printed import (
@@ -84,7 +84,7 @@ def write_printed_capture(
     maps: bool = False,
     seed: int = 0,
     workers: Workers | None = None,
-    on_progress: Callable[[int], None] = lambda count: None,
+    on_progress: OnProgress = no_progress,
 ) -> list[View]:
     """Write raw mosaics of 8 bits with photon noise, and ``gt/`` as :mod:`polmvs.io.ground_truth`.
 

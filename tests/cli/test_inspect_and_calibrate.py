@@ -12,8 +12,9 @@ from polmvs.camera import PinholeCamera
 from polmvs.io.intrinsics import read_intrinsics
 from polmvs.polarization import inspection
 from polmvs.polarization.calibration import read_calibration
-from polmvs.synthetic.captures import Plane, render_mosaic, ring_of_views
+from polmvs.synthetic.captures import render_mosaic, ring_of_views
 from polmvs.synthetic.sensor import faulty_sensor
+from polmvs.synthetic.surfaces import Plane
 
 SHAPE = (96, 128)
 

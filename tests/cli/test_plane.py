@@ -11,14 +11,8 @@ from polmvs.camera import PinholeCamera
 from polmvs.config import AngleModel, Estimator, PlaneOptions
 from polmvs.normals.single_view.measurement import measure_planes
 from polmvs.scene import View
-from polmvs.synthetic.captures import (
-    Plane,
-    add_noise,
-    look_at,
-    quantize,
-    render_mosaic,
-    render_view,
-)
+from polmvs.synthetic.captures import add_noise, look_at, quantize, render_mosaic, render_view
+from polmvs.synthetic.surfaces import Plane
 
 CARPS = Path(__file__).parents[3] / "shared" / "data" / "real" / "carps_IMX250MZR.png"
 needs_carps = pytest.mark.skipif(not CARPS.is_file(), reason=f"{CARPS} is not here")

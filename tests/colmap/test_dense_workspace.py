@@ -13,6 +13,7 @@ from dense_scenes import (
     fuse,
     image_shift,
     scene_of,
+    without_maps,
 )
 
 from polmvs.camera import PinholeCamera
@@ -68,7 +69,7 @@ def test_files_of_a_workspace(written, scene):
 
 def test_workspace_round_trip(written, scene):
     opened = open_dense_workspace(written)
-    assert opened.without_maps == ("001.png",)
+    assert without_maps(opened) == ("001.png",)
     assert [item.view.name for item in opened.views] == [view.name for view in scene.views]
     item = opened.views[0]
     assert isinstance(item.camera, PinholeCamera)
@@ -103,7 +104,7 @@ def test_against_the_workspace_that_colmap_makes(scene, tmp_path):
     )
     theirs = open_dense_workspace(theirs_folder)
     ours = open_dense_workspace(scene.write(tmp_path / "ours"))
-    assert theirs.without_maps == tuple(view.name for view in scene.views)
+    assert without_maps(theirs) == tuple(view.name for view in scene.views)
     for one, two in zip(ours.views, theirs.views, strict=True):
         assert one.view.name == two.view.name
         assert one.camera == two.camera
@@ -119,7 +120,7 @@ def test_names_with_subfolders(scene, tmp_path):
     nested = in_subfolders(scene)
     folder = nested.write(tmp_path / "workspace")
     opened = open_dense_workspace(folder)
-    assert opened.without_maps == ()
+    assert without_maps(opened) == ()
     name = opened.views[0].view.name
     assert name == "left/a/000.png"
     assert map_files(folder / "stereo", name)[0] == opened.views[0].depth
@@ -171,7 +172,7 @@ def test_a_folder_in_use_is_refused(scene, written, tmp_path):
         scene.write(tmp_path / "file")
     (tmp_path / "empty").mkdir()
     scene.write(tmp_path / "empty", lambda _: None)
-    assert len(open_dense_workspace(tmp_path / "empty").without_maps) == 5
+    assert len(without_maps(open_dense_workspace(tmp_path / "empty"))) == 5
 
 
 def test_whole_or_not_at_all(scene, tmp_path):
@@ -189,14 +190,14 @@ def test_photometric_maps_where_there_are_no_geometric(workspace):
     for path in workspace.rglob("000.png.geometric.bin"):
         path.rename(path.with_name("000.png.photometric.bin"))
     opened = open_dense_workspace(workspace)
-    assert opened.without_maps == ("001.png",)
+    assert without_maps(opened) == ("001.png",)
     assert opened.views[0].depth.name == "000.png.photometric.bin"
     assert opened.views[0].load_maps().depth.any()
 
 
 def test_half_a_pair_of_maps_counts_as_missing(workspace):
     (workspace / "stereo" / "normal_maps" / "000.png.geometric.bin").unlink()
-    assert open_dense_workspace(workspace).without_maps == ("000.png", "001.png")
+    assert without_maps(open_dense_workspace(workspace)) == ("000.png", "001.png")
 
 
 def refused(folder, words):

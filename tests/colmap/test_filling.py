@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from dense_scenes import NORMAL, board_scene, fuse
+from dense_scenes import NORMAL, board_scene, fuse, without_maps
 
 from polmvs.colmap.dense_workspace import open_dense_workspace
 from polmvs.colmap.filling import fill_maps, fill_workspace
@@ -83,7 +83,7 @@ def test_a_new_workspace(scene, made, tmp_path):
     assert fill_workspace(source, tmp_path / "filled", moved) is None
     assert contents(made) == before
     filled = open_dense_workspace(tmp_path / "filled")
-    assert filled.without_maps == ()
+    assert without_maps(filled) == ()
     assert (tmp_path / "filled" / "stereo" / "fusion.cfg").read_text().split() == NAMES
     assert not (tmp_path / "filled" / "fused.ply").exists()
     for old, new in zip(source.views, filled.views, strict=True):
@@ -129,7 +129,7 @@ def test_in_place_with_a_backup(scene, workspace):
     assert {name for name in before if after[name] != before[name]} <= replaced
     assert "stereo/depth_maps/000.png.geometric.bin" in replaced
     assert not any("photometric" in name for name in replaced)
-    assert open_dense_workspace(workspace).without_maps == ()
+    assert without_maps(open_dense_workspace(workspace)) == ()
     assert not [path for path in workspace.iterdir() if path.name.startswith(".")]
     again = open_dense_workspace(workspace)
     second = fill_workspace(again, None, lambda _: None, in_place=True)

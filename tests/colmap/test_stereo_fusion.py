@@ -16,7 +16,8 @@ from dense_scenes import (
 )
 
 from polmvs.colmap.dense_workspace import open_dense_workspace, write_maps
-from polmvs.synthetic.captures import Sphere, ring_of_views
+from polmvs.synthetic.captures import ring_of_views
+from polmvs.synthetic.surfaces import Sphere
 
 CAMERAS = pytest.mark.parametrize(
     "camera", [PINHOLE, OPENCV, FISHEYE], ids=["pinhole", "opencv", "fisheye"]

@@ -23,7 +23,7 @@ from polmvs.colmap.cameras import camera_to_colmap
 from polmvs.colmap.maps import map_pixel_xy
 from polmvs.colmap.undistort import undistort_xy, undistorted_camera, undistorted_model, warp_image
 from polmvs.surface.map_export import warp_dense_view
-from polmvs.synthetic.captures import Group, Plane, Sphere
+from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
 CAMERAS = pytest.mark.parametrize(
     "camera", [PINHOLE, OPENCV, FISHEYE], ids=["pinhole", "opencv", "fisheye"]

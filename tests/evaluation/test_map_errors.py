@@ -17,7 +17,8 @@ from polmvs.geometry import RigidTransform, SimilarityTransform
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView, lattice_xy
-from polmvs.synthetic.captures import Group, Plane, Sphere, Surface, render_view, ring_of_views
+from polmvs.synthetic.captures import render_view, ring_of_views
+from polmvs.synthetic.surfaces import Group, Plane, Sphere, Surface
 
 CAMERA = PinholeCamera(width=160, height=128, fx=150.0, fy=150.0, cx=80.0, cy=64.0)
 VIEWS = ring_of_views(6, CAMERA, target=np.zeros(3), distance=0.5, elevation_deg=45, roll_deg=20)

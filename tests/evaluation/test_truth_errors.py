@@ -65,7 +65,7 @@ def test_truth_scrambled_is_perfect(truth: GroundTruth) -> None:
     assert report.scale == pytest.approx(1 / SCALE, rel=1e-9)
     assert report.rms_residual_mm < 1e-6
     assert report.rotation_error_median_deg < 1e-6
-    assert (report.num_cameras, report.num_dropped) == (10, 0)
+    assert (report.num_cameras, report.dropped) == (10, ())
 
 
 def test_cloud_with_holes_in_its_numbers(truth: GroundTruth) -> None:

@@ -36,7 +36,8 @@ from polmvs.io.images import write_png
 from polmvs.io.open3d_import import import_open3d
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import open_capture
-from polmvs.synthetic.captures import Plane, quantize, render_mosaic, render_view, ring_of_views
+from polmvs.synthetic.captures import quantize, render_mosaic, render_view, ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 DEMO = Path(polmvs.__file__).parent / "demo_capture"
 SURFACE = Plane(point=np.zeros(3), normal=np.array([0.1, -0.05, 1.0]), extent=(0.12, 0.15))

@@ -47,7 +47,7 @@ from polmvs.io.data_sets import load_converted, read_data_set, read_set_mask
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.images import read_gray, read_mask
 from polmvs.io.intrinsics import read_intrinsics
-from polmvs.io.layouts import read_author_truth, read_dmb, write_dmb
+from polmvs.io.layouts import read_author_truth
 from polmvs.io.raw_formats import probe_raw, read_raw
 from polmvs.neighbors import nearest_points, voxel_representatives
 from polmvs.pipeline.batch import read_batch
@@ -63,7 +63,8 @@ from polmvs.poses.known_poses import retriangulate
 from polmvs.poses.metric_frame import read_centers
 from polmvs.scene import View, point_sigmas
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
-from polmvs.synthetic.captures import Plane, render_view, ring_of_views
+from polmvs.synthetic.captures import render_view, ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 
 class Kind(NamedTuple):
@@ -480,10 +481,6 @@ KINDS: dict[str, Kind] = {
     ),
     "truth": Kind(write_truth, use_truth),
     "author truth": Kind(write_author_truth, use_author_truth),
-    "dmb": Kind(
-        lambda folder: write_dmb(folder / "a.dmb", SHARE.astype(np.float32)),
-        lambda folder: read_dmb(folder / "a.dmb"),
-    ),
     "array": Kind(
         lambda folder: np.save(folder / "a.npy", SHARE), lambda folder: map_array(folder / "a.npy")
     ),

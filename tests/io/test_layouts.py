@@ -1,6 +1,5 @@
-"""The authors' demo layout and ACMM's depth maps, against files written by hand here."""
+"""The authors' demo layout, against files written by hand here."""
 
-import struct
 from dataclasses import replace
 
 import cv2
@@ -13,9 +12,10 @@ from polmvs.errors import DataError
 from polmvs.experiments.contours import PlaneSurface, open_surface
 from polmvs.experiments.data import open_author_capture, open_scene
 from polmvs.experiments.phase import measure_phase
-from polmvs.io.layouts import is_author_layout, read_camera_text, read_dmb, write_dmb
+from polmvs.io.layouts import is_author_layout, read_camera_text
 from polmvs.parallel import Workers
-from polmvs.synthetic.captures import Plane, render_mosaic, render_view, ring_of_views
+from polmvs.synthetic.captures import render_mosaic, render_view, ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 # Half-size image; a centred principal point would be (80, 64).
 CAMERA = PinholeCamera(width=160, height=128, fx=120.0, fy=121.0, cx=82.5, cy=63.25)
@@ -110,31 +110,6 @@ def test_missing_and_malformed_files_are_named(demo):
     np.save(folder / "pts_3d_corners_w.npy", CORNERS[:3])
     with pytest.raises(DataError, match="12 numbers"):
         open_author_capture(folder)
-
-
-@pytest.mark.parametrize("shape", [(3, 5), (2, 4, 3)])
-def test_dmb_round_trip_and_bytes(tmp_path, shape):
-    image = np.random.default_rng(0).normal(size=shape).astype(np.float32)
-    path = tmp_path / "depths.dmb"
-    write_dmb(path, image)
-    channels = 1 if len(shape) == 2 else shape[2]
-    by_hand = struct.pack("<4i", 1, shape[0], shape[1], channels) + image.tobytes()
-    assert path.read_bytes() == by_hand
-    np.testing.assert_array_equal(read_dmb(path), image)
-
-
-def test_dmb_that_is_damaged(tmp_path):
-    path = tmp_path / "depths.dmb"
-    write_dmb(path, np.ones((3, 5), np.float32))
-    data = path.read_bytes()
-    for damaged in (b"", data[:10], data[:-1], struct.pack("<i", 2) + data[4:]):
-        path.write_bytes(damaged)
-        with pytest.raises(DataError, match=r"depths\.dmb"):
-            read_dmb(path)
-    with pytest.raises(DataError):
-        read_dmb(tmp_path / "none.dmb")
-    with pytest.raises(ValueError, match="shape"):
-        write_dmb(path, np.ones(3, np.float32))
 
 
 def test_normal_from_behind_still_faces(demo):

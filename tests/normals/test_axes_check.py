@@ -15,7 +15,8 @@ from polmvs.normals.axes_check import (
     check_axes,
 )
 from polmvs.normals.rows import AS_MEASURED
-from polmvs.synthetic.captures import Sphere, render_view
+from polmvs.synthetic.captures import render_view
+from polmvs.synthetic.surfaces import Sphere
 
 STANDARD = (90, 45, 135, 0)
 PAIRED = [p for p in permutations((0, 45, 90, 135)) if abs(p[0] - p[3]) == 90]

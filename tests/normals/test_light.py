@@ -16,8 +16,8 @@ from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import track_normals
 from polmvs.polarization.phase_map import as_tilted, open_phase_map, store_phase_map, turned
 from polmvs.scene import some_tracks
-from polmvs.synthetic.captures import Plane, Sphere, render_view, ring_of_views
-from polmvs.synthetic.surfaces import Group
+from polmvs.synthetic.captures import render_view, ring_of_views
+from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
 
 @pytest.fixture(scope="module")
@@ -226,7 +226,7 @@ def test_few_misled_points_do_not_decide_against_all_pixels(light):
         maps = [m.changed(diffuse=np.zeros_like(m.diffuse)) for m in maps]
     points = rng.uniform(-1.0, 1.0, (300, 3))
     tracks = tracks_at(Scene(None, views, [], maps), points)
-    votes, voting = light_module._track_votes(tracks, maps, LightTolerances(), 10**6)
+    votes, voting = light_module.track_votes(tracks, maps, LightTolerances(), max_rows=10**6)
     wrong = np.where(voting, votes * (1 if light is Light.SPECULAR else -1), 0)
     misled = np.isin(np.arange(len(points)), np.argsort(wrong)[:5])
     assert wrong[misled].sum() < -5

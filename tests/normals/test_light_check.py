@@ -8,7 +8,8 @@ from polmvs.config import Light
 from polmvs.normals import light_check
 from polmvs.normals.light_check import check_light
 from polmvs.polarization.phase_map import turned
-from polmvs.synthetic.captures import Sphere, render_view
+from polmvs.synthetic.captures import render_view
+from polmvs.synthetic.surfaces import Sphere
 
 OTHER = {Light.SPECULAR: Light.DIFFUSE, Light.DIFFUSE: Light.SPECULAR}
 

@@ -15,14 +15,8 @@ from polmvs.normals.single_view.search import find_planes
 from polmvs.polarization.angle_models import normal_from_angles, phase_from_normal
 from polmvs.polarization.capture import open_capture
 from polmvs.scene import View
-from polmvs.synthetic.captures import (
-    Group,
-    Plane,
-    Sphere,
-    add_noise,
-    look_at,
-    render_view,
-)
+from polmvs.synthetic.captures import add_noise, look_at, render_view
+from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 BOARD = SHARED / "board"

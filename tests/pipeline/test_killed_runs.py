@@ -24,11 +24,12 @@ from polmvs.colmap.models import write_model
 from polmvs.config import Method, Options, PropagationOptions, RunOptions, SfmOptions
 from polmvs.errors import DataError
 from polmvs.parallel import Workers
-from polmvs.pipeline.jobs import Job, reconstruct
-from polmvs.pipeline.monitor import NoMonitor
+from polmvs.pipeline.jobs import reconstruct
 from polmvs.pipeline.run_lock import locked
+from polmvs.pipeline.runner import Job, NoMonitor
 from polmvs.scene import SparseModel, Tracks
-from polmvs.synthetic.captures import Plane, quantize, render_mosaic, ring_of_views
+from polmvs.synthetic.captures import quantize, render_mosaic, ring_of_views
+from polmvs.synthetic.surfaces import Plane
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks, and reads /proc")
 

@@ -24,11 +24,10 @@ from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud
 from polmvs.normals.tracks import select_seeds
 from polmvs.parallel import Workers
-from polmvs.pipeline.jobs import Job, compare, reconstruct
-from polmvs.pipeline.monitor import NoMonitor
+from polmvs.pipeline.jobs import compare, reconstruct
 from polmvs.pipeline.record import Record, read_record
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.runner import Run, prepare_output
+from polmvs.pipeline.runner import Job, NoMonitor, Run, prepare_output
 from polmvs.pipeline.stage_table import StageSpec, stage_table
 from polmvs.polarization.capture import open_capture
 from polmvs.scene import SparseModel, some_tracks

@@ -10,7 +10,6 @@ from polmvs.pipeline.run_folder import HERE
 from polmvs.pipeline.stage_table import (
     StageSpec,
     _in_order,
-    option_groups,
     stage_table,
     with_dependent,
     with_needed,
@@ -119,13 +118,6 @@ def test_names_of_all_results() -> None:
     assert {"images", "sparse", "maps", "maps_tilted", "tracks", "normals.ply"} <= set(written)
     assert {"ppa.ply", "views_opa", "tilted_mesh.ply", "dense", "metrics.json"} <= set(written)
     assert len(set(written)) == len(written)
-
-
-def test_option_groups_of_commands() -> None:
-    assert option_groups("sfm") == ("capture", "sfm", "reference")
-    assert option_groups("normals") == ("capture", "sfm", "reference", "region", "normals")
-    assert "evaluation" not in option_groups("export")
-    assert set(option_groups("compare")) == {f.name for f in fields(Options)} - {"export"}
 
 
 def test_exports_are_what_the_options_ask_for() -> None:

@@ -16,8 +16,9 @@ from polmvs.polarization.calibration import (
 )
 from polmvs.polarization.capture import open_capture
 from polmvs.polarization.stokes import axial_difference
-from polmvs.synthetic.captures import Sphere, render_view, ring_of_views
+from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.sensor import faulty_sensor
+from polmvs.synthetic.surfaces import Sphere
 
 PATTERN = (90, 45, 135, 0)
 SHAPE = (192, 256)

@@ -5,7 +5,8 @@ import pytest
 
 from polmvs.camera import PinholeCamera
 from polmvs.polarization.linearity import check_linearity
-from polmvs.synthetic.captures import Plane, Sphere, render_mosaic, ring_of_views
+from polmvs.synthetic.captures import render_mosaic, ring_of_views
+from polmvs.synthetic.surfaces import Plane, Sphere
 
 PATTERN = (90, 45, 135, 0)
 CAMERA = PinholeCamera(width=240, height=192, fx=180.0, fy=180.0, cx=120.0, cy=96.0)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from polmvs.polarization.region import find_region
+from polmvs.polarization.region import find_region, grow_mask
 
 SHAPE = (120, 160)
 RNG = np.random.default_rng(0)
@@ -117,3 +117,10 @@ def test_a_larger_image_of_a_scene_has_the_same_region():
         assert region.inside[200 * times, 300 * times]
         shares.append(region.inside.mean())
     assert abs(shares[0] - shares[1]) < 0.002
+
+
+def test_grow_mask():
+    mask = np.zeros((7, 7), bool)
+    mask[3, 3] = True
+    assert grow_mask(mask, 2).sum() == 25
+    np.testing.assert_array_equal(grow_mask(mask, 0), mask)

@@ -13,7 +13,8 @@ from polmvs.polarization.angle_models import (
     tilt_turn,
 )
 from polmvs.polarization.stokes import Stokes
-from polmvs.synthetic.captures import Plane, Sphere, render_view, ring_of_views
+from polmvs.synthetic.captures import render_view, ring_of_views
+from polmvs.synthetic.surfaces import Plane, Sphere
 
 CAMERA = PinholeCamera(width=48, height=40, fx=27.0, fy=28.0, cx=24.3, cy=19.6)  # 49 deg off axis
 SURFACES = {

@@ -22,7 +22,8 @@ from polmvs.polarization.stokes import (
     turned_axes,
 )
 from polmvs.scene import View
-from polmvs.synthetic.captures import Sphere, render_mosaic, render_view, ring_of_views
+from polmvs.synthetic.captures import render_mosaic, render_view, ring_of_views
+from polmvs.synthetic.surfaces import Sphere
 
 BALL = Sphere(center=np.zeros(3), radius=0.3)
 

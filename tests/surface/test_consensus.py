@@ -8,7 +8,8 @@ from scenes import CAMERA, Scene, phase_map_of
 
 from polmvs.surface.consensus import hidden_by, sight, surface_of_others
 from polmvs.surface.dense_view import SurfaceSamples, dense_view, lattice_points
-from polmvs.synthetic.captures import Plane, Sphere, render_view, ring_of_views
+from polmvs.synthetic.captures import render_view, ring_of_views
+from polmvs.synthetic.surfaces import Plane, Sphere
 
 BALL = Sphere(center=np.array([0.0, 0.0, -0.3]), radius=0.35)
 BOARD = Plane(point=np.zeros(3), normal=np.array([0.1, -0.05, 1.0]), extent=(0.12, 0.15))

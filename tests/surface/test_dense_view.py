@@ -18,7 +18,7 @@ from polmvs.surface.dense_view import (
     store_dense_view,
     view_samples,
 )
-from polmvs.synthetic.captures import Plane, Sphere
+from polmvs.synthetic.surfaces import Plane, Sphere
 
 BALL = Sphere(center=np.array([0.02, -0.01, 0.9]), radius=0.4)
 BOARD = Plane(point=np.array([0.0, 0.0, 0.5]), normal=np.array([0.3, -0.2, -1.0]))

@@ -9,7 +9,7 @@ from scenes import board_scene
 from polmvs.config import FusionOptions
 from polmvs.surface.dense_view import DenseView
 from polmvs.surface.fusion import fuse
-from polmvs.synthetic.captures import Plane
+from polmvs.synthetic.surfaces import Plane
 
 STRIDE = 2
 NUM_VIEWS = 6

@@ -12,7 +12,8 @@ from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
 from polmvs.surface.hollows import HollowTolerances, SurfaceFaces, find_hollows
 from polmvs.surface.offsets import face_scene
-from polmvs.synthetic.captures import Cylinder, Group, Plane, render_view, ring_of_views
+from polmvs.synthetic.captures import render_view, ring_of_views
+from polmvs.synthetic.surfaces import Cylinder, Group, Plane
 
 CAMERA = PinholeCamera(width=280, height=240, fx=260.0, fy=260.0, cx=140.0, cy=120.0)
 RADIUS, HEIGHT, WALL = 0.06, 0.12, 0.012

@@ -15,7 +15,8 @@ from polmvs.surface.dense_view import SurfaceSamples
 from polmvs.surface.fusion import fuse
 from polmvs.surface.integration import REFINEMENTS, integrate, plan_rounds
 from polmvs.surface.pixel_graph import Nodes, node_edges, uncrossed
-from polmvs.synthetic.captures import Group, Plane, Sphere, add_noise, render_view, ring_of_views
+from polmvs.synthetic.captures import add_noise, render_view, ring_of_views
+from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
 OPTIONS = PropagationOptions(num_rounds=2)
 FOOTPRINT = 0.5 / CAMERA.fx  # of a pixel at the scenes' distance, 4 mm

@@ -10,7 +10,8 @@ from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.config import AngleModel
 from polmvs.scene import Seeds
 from polmvs.surface.offsets import face_scene, find_faces, snapped_border, stepped_faces
-from polmvs.synthetic.captures import Group, Plane, Sphere, render_view, ring_of_views
+from polmvs.synthetic.captures import render_view, ring_of_views
+from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
 CAMERA = PinholeCamera(width=320, height=256, fx=270.0, fy=270.0, cx=160.0, cy=128.0)
 PLATE, BOX = 0.14, 0.055  # half sides, m

@@ -8,7 +8,8 @@ from polmvs.camera import PinholeCamera
 from polmvs.config import AngleModel, PropagationOptions
 from polmvs.scene import Seeds
 from polmvs.surface.integration import integrate
-from polmvs.synthetic.captures import Sphere, render_view, ring_of_views
+from polmvs.synthetic.captures import render_view, ring_of_views
+from polmvs.synthetic.surfaces import Sphere
 
 SCALES = (1, 2, 4)  # 306x256, 612x512, 1224x1024
 BALL = Sphere(center=np.zeros(3), radius=0.16)

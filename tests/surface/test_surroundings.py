@@ -11,7 +11,6 @@ from polmvs.surface.surroundings import (
     SurroundingsTolerances,
     _whole_view,
     choose_partners,
-    grow_mask,
     part_shares,
     relative_sigmas,
     sparse_surroundings,
@@ -113,13 +112,6 @@ def test_no_tracks_and_tracks_without_observations():
     assert not sparse_surroundings(unseen, maps).is_kept.any()
 
 
-def test_grow_mask():
-    mask = np.zeros((7, 7), bool)
-    mask[3, 3] = True
-    assert grow_mask(mask, 2).sum() == 25
-    np.testing.assert_array_equal(grow_mask(mask, 0), mask)
-
-
 def test_partners_have_a_useful_angle():
     views = views_of(num=8)  # about 8 deg apart
     partners = choose_partners(tracks_of(plane_points(60), views), views, max_partners=8)
@@ -150,11 +142,7 @@ def test_dense_surroundings_lie_on_the_plane_and_beside_the_part(tmp_path):
     maps = part_maps()
     points = plane_points(400)
     points = points[np.abs(points[:, :2]).max(axis=-1) > PART_SIDE + 0.02]
-    done = []
-    cloud = stereo_surroundings(
-        tracks_of(points, [m.view for m in maps]), maps, tmp_path, on_progress=done.append
-    )
-    assert sum(done) == 24
+    cloud = stereo_surroundings(tracks_of(points, [m.view for m in maps]), maps, tmp_path)
     assert len(cloud.points) > 3000
     assert (cloud.num_views >= 3).all()
     # A pixel's footprint is 3.3 mm here.

@@ -8,10 +8,6 @@ from polmvs.geometry import RigidTransform
 from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.scene import View
 from polmvs.synthetic.captures import (
-    Cylinder,
-    Group,
-    Plane,
-    Sphere,
     add_noise,
     look_at,
     mosaic_from_intensities,
@@ -20,6 +16,7 @@ from polmvs.synthetic.captures import (
     render_view,
     ring_of_views,
 )
+from polmvs.synthetic.surfaces import Cylinder, Group, Plane, Sphere
 
 CAMERA = PinholeCamera(width=48, height=40, fx=35.0, fy=36.0, cx=24.3, cy=19.6)
 NORMAL = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])

@@ -14,7 +14,6 @@ polarised intensity) first.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -127,7 +126,6 @@ def estimate_focal(
     *,
     light: Light,
     focal_range_px: tuple[float, float],
-    progress: Callable[[int, int], None] | None = None,
     tolerances: FocalTolerances = FocalTolerances(),
 ) -> FocalEstimate:
     """Focal length at which one normal explains the phase angles of a plane best.
@@ -141,7 +139,6 @@ def estimate_focal(
     sigma : (N,), standard deviation of the phase, rad.
     light : which reflection dominates.
     focal_range_px : shortest and longest focal length to try, px.
-    progress : called with the number of scanned and of all focal lengths.
     tolerances : of this step.
     """
     shortest, longest = focal_range_px
@@ -149,11 +146,7 @@ def estimate_focal(
         raise ValueError(f"{focal_range_px=} but expected 0 < shortest < longest.")
     view = _pick(angle_model, parameters, offsets_px, sigma, light)
     focals = np.geomspace(shortest, longest, tolerances.num_focals)
-    planes = []
-    for index, focal in enumerate(focals):
-        planes.append(view.plane(float(focal)))
-        if progress is not None:
-            progress(index + 1, len(focals))
+    planes = [view.plane(float(focal)) for focal in focals]
     errors = [view.errors(f, p.normal) for f, p in zip(focals, planes, strict=True)]
     scale = CAUCHY_SCALE * min(residual_scale(error) for error in errors)
     best = int(np.argmin([_loss(error, scale) for error in errors]))

@@ -26,11 +26,10 @@ from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, FusionOptions, Method, PropagationOptions, Surroundings
 from polmvs.io.clouds import Cloud, Mesh, write_cloud, write_mesh
 from polmvs.io.images import read_gray
-from polmvs.parallel import Workers
-from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, replace_folder, scratch
 from polmvs.pipeline.stages.maps import open_maps, posed_views
-from polmvs.pipeline.stages.poses import load_camera_modes, load_pose_covariances
+from polmvs.pipeline.stages.poses import load_floats
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap
@@ -167,9 +166,9 @@ def densify(
                 on_progress=on_progress,
             )
         sparse_model = read_model(sparse)
-        modes = CameraModes(sparse_model.tracks.points_in_world, load_camera_modes(camera_modes))
+        modes = CameraModes(sparse_model.tracks.points_in_world, load_floats(camera_modes))
         modes.widen_stored([phase_map.view for phase_map in phase_maps], new_views)
-        widen_by_poses(sparse_model.views, load_pose_covariances(pose_covariances), new_views)
+        widen_by_poses(sparse_model.views, load_floats(pose_covariances), new_views)
         surface = surface_cloud(modes.widened(fused))
         surface.scalars["kind"][: len(presumed)][presumed] = PointKind.PRESUMED
         around = _surroundings_cloud(

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from polmvs.errors import DataError
 from polmvs.io.images import write_png
-from polmvs.parallel import Workers
-from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.run_folder import replacing
 from polmvs.polarization.capture import Capture, intensity_image_8bit
 

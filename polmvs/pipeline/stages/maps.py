@@ -7,6 +7,7 @@ sensor's polarizers and lie in a folder of their own.
 from __future__ import annotations
 
 import logging
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,8 +25,7 @@ from polmvs.normals.axes_check import check_axes
 from polmvs.normals.light import diffuse_pixels, find_diffuse_parts
 from polmvs.normals.light_check import check_light
 from polmvs.normals.tracks import MAX_ROWS
-from polmvs.parallel import Workers
-from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.run_folder import replacing
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture
@@ -123,7 +123,7 @@ def build_maps(
             ]
             if options.light is None:
                 questions.append(partial(find_diffuse_parts, tracks, maps, max_rows=max_rows))
-            wrong, *diffuse = workers.map(_answer, questions)
+            wrong, *diffuse = workers.map(operator.call, questions)
             if wrong is not None:
                 logger.warning("%s.", wrong)
             for of_views in diffuse:  # here: turned twice, should a worker be lost, it were wrong
@@ -222,10 +222,6 @@ def _build_map(
     light = options.light or Light.SPECULAR
     store_phase_map(build_phase_map(view, stokes, region, light), folder)
     return int(region.inside.sum())
-
-
-def _answer(question: Callable[[], Any]) -> Any:
-    return question()
 
 
 def _wrong_setting(

@@ -99,8 +99,8 @@ def place_model(
         A source of the frame is unusable; the model of SfM stays.
     """
     model = read_model(source)
-    modes = np.asarray(map_array(source / CAMERA_MODES), np.float64)
-    covariances = np.asarray(map_array(source / POSE_COVARIANCES), np.float64)
+    modes = load_floats(source / CAMERA_MODES)
+    covariances = load_floats(source / POSE_COVARIANCES)
     frame = metric_frame(
         model, reference or ReferenceOptions(), lambda name: read_gray(images / name)
     )
@@ -130,13 +130,11 @@ def place_model(
     )
 
 
-def load_camera_modes(source: Path) -> NDArray[np.float64]:
-    """The camera's modes (K, T, 3) at the sparse points, as :func:`place_model` stored them."""
-    return np.asarray(map_array(source), np.float64)
+def load_floats(source: Path) -> NDArray[np.float64]:
+    """The camera's modes (K, T, 3) at the sparse points, or the covariances of the poses.
 
-
-def load_pose_covariances(source: Path) -> NDArray[np.float64]:
-    """The poses' covariances (V, 6, 6), sorted by name; V is 0 where nothing is known of them."""
+    Those are (V, 6, 6), sorted by name; K or V is 0 where nothing is known.
+    """
     return np.asarray(map_array(source), np.float64)
 
 

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from polmvs.colmap.camera_uncertainty import camera_uncertainty, pose_uncertainty
+from polmvs.colmap.camera_uncertainty import CameraUncertainty, camera_uncertainty, pose_uncertainty
 from polmvs.colmap.database import NoRoomError
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.sfm import NoModelError, SfmTolerances, run_sfm
@@ -19,7 +20,7 @@ from polmvs.config import PropagationOptions, SfmOptions
 from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.io.arrays import save_array
 from polmvs.io.clouds import preload
-from polmvs.pipeline.monitor import OnProgress, no_progress
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.run_folder import CAMERA_MODES, POSE_COVARIANCES, replace_folder, scratch
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture
@@ -114,18 +115,13 @@ def find_model(
         found = None
         if options.intrinsics is None and options.camera is None:
             found = camera_uncertainty(new)
-        modes = np.zeros((0, len(model.tracks.point3D_ids), 3)) if found is None else found.modes
-        save_array(new / CAMERA_MODES, modes)
-        covariances = pose_uncertainty(new)
-        save_array(
-            new / POSE_COVARIANCES, np.zeros((0, 6, 6)) if covariances is None else covariances
-        )
+        _store_uncertainty(new, model, found, pose_uncertainty(new))
         replace_folder(new, target)
     _warn_of_missing(model, images)
     _warn_of_few(len(model.views))
     if found is None:
         return _result(model)
-    bending = _bending(model, modes)
+    bending = _bending(model, found.modes)
     if not bending < LARGE_BENDING:
         logger.warning(
             "the %d views do not fix the camera: its focal length is known to %.2g %%, which moves "
@@ -180,16 +176,28 @@ def take_model(model: SparseModel, source: Path, target: Path) -> SfmResult:
     """
     with scratch(target) as folder:
         write_model(model, folder / "sparse")
-        modes = np.zeros((0, len(model.tracks.point3D_ids), 3))
-        save_array(folder / "sparse" / CAMERA_MODES, modes)
-        save_array(folder / "sparse" / POSE_COVARIANCES, np.zeros((0, 6, 6)))
+        _store_uncertainty(folder / "sparse", model, None, None)
         replace_folder(folder / "sparse", target)
     _warn_of_missing(model, source)
     _warn_of_few(len(model.views))
     return _result(model)
 
 
-def _bending(model: SparseModel, modes: np.ndarray) -> float:
+def _store_uncertainty(
+    folder: Path,
+    model: SparseModel,
+    camera: CameraUncertainty | None,
+    covariances: NDArray[np.float64] | None,
+) -> None:
+    """Beside a model what its adjustment leaves open; empty arrays where that is not known."""
+    modes = np.zeros((0, len(model.tracks.point3D_ids), 3)) if camera is None else camera.modes
+    save_array(folder / CAMERA_MODES, modes)
+    save_array(
+        folder / POSE_COVARIANCES, np.zeros((0, 6, 6)) if covariances is None else covariances
+    )
+
+
+def _bending(model: SparseModel, modes: NDArray[np.float64]) -> float:
     """Median over the sparse points of how far the modes move them, share of their distance."""
     if modes.size == 0:
         return 0.0
