@@ -20,6 +20,7 @@ from polmvs.errors import DataError
 from polmvs.io.images import write_bytes
 
 MAX_REASON = 120  # characters of NumPy's words
+MADE_AGAIN = "Delete it and give `run.resume`; what is gone is made again."
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,10 @@ def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:
         array = _map_array(path, stamp)
     except Exception as error:  # the header goes through Python's own parser
         reason = " ".join(str(error).split())[:MAX_REASON]
-        raise DataError(
-            path, f"cannot be read ({reason}); run again with `run.overwrite`."
-        ) from error
+        raise DataError(path, f"cannot be read ({reason}). {MADE_AGAIN}") from error
     rows = isinstance(kind, np.dtype)
     if kind is not None and not (array.dtype == kind if rows else np.issubdtype(array.dtype, kind)):
-        raise DataError(path, "holds something else; run again with `run.overwrite`.")
+        raise DataError(path, f"holds something else. {MADE_AGAIN}")
     return array
 
 
