@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.io.images import write_bytes
 
+MADE_AGAIN = "Delete it and give `run.resume`; what is gone is made again."
+
 
 @dataclass(frozen=True)
 class StoredArray:
@@ -68,12 +70,10 @@ def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:
         array = _map_array(path, stamp)
     except Exception as error:  # the header goes through Python's own parser
         reason = " ".join(str(error).split())[:MAX_QUOTED]
-        raise DataError(
-            path, f"cannot be read ({reason}); run again with `run.overwrite`."
-        ) from error
+        raise DataError(path, f"cannot be read ({reason}). {MADE_AGAIN}") from error
     rows = isinstance(kind, np.dtype)
     if kind is not None and not (array.dtype == kind if rows else np.issubdtype(array.dtype, kind)):
-        raise DataError(path, "holds something else; run again with `run.overwrite`.")
+        raise DataError(path, f"holds something else. {MADE_AGAIN}")
     return array
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from hashlib import blake2b, file_digest
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,12 @@ from polmvs.colmap.database import check_database
 from polmvs.colmap.dense_workspace import open_dense_workspace, require_same_frame
 from polmvs.colmap.pairs import read_pairs
 from polmvs.colmap.sfm import check_camera, check_intrinsics
-from polmvs.config import Options, ReferenceOptions, SfmOptions
-from polmvs.errors import DataError, OptionError
+from polmvs.config import Options, ReferenceOptions, SfmOptions, get_option, option_paths
+from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.images import read_mask
 from polmvs.pipeline.record import CaptureIdentity, Record
-from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.run_folder import RunFolder, files_in
 from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.maps import find_mask
 from polmvs.pipeline.stages.sfm import fit_model
@@ -34,20 +35,28 @@ from polmvs.scene import SparseModel, View, find_name, match_names, short_list
 MAX_CAMERA_DIFFERENCE = 0.01  # of the focal length, between options that say the same; a guess
 
 
-def inputs_of(options: Options) -> list[Path]:
-    """Files and folders that are read beside the capture."""
-    paths = (
-        options.sfm.sparse,
-        options.sfm.camera,
-        options.sfm.database,
-        options.sfm.pairs_file,
-        options.capture.calibration,
-        options.reference.reference,
-        options.region.mask,
-        options.fusion.workspace,
-        options.evaluation.gt,
-    )
-    return [path for path in paths if path is not None]
+def inputs_of(options: Options) -> dict[str, Path]:
+    """Files and folders that are read beside the capture, by the option that names them."""
+    named = {path: get_option(options, path) for path in option_paths()}
+    named["sfm.pairs"] = options.sfm.pairs_file
+    return {path: value for path, value in named.items() if isinstance(value, Path)}
+
+
+def digest_of(path: Path) -> str:
+    """What tells the content of a file, or of all files in a folder, from another.
+
+    Raises
+    ------
+    DataError
+        It cannot be read.
+    """
+    digest = blake2b(digest_size=8)
+    with as_data_error(path, "read"):
+        for file in [path] if path.is_file() else sorted(files_in(path)):
+            digest.update(file.relative_to(path).as_posix().encode(errors="surrogateescape"))
+            with file.open("rb") as stream:
+                digest.update(file_digest(stream, blake2b).digest())
+    return digest.hexdigest()
 
 
 def require_apart(
@@ -91,7 +100,7 @@ def identity_of(capture: Capture) -> CaptureIdentity:
         folder=capture.folder.absolute(),
         width=capture.width,
         height=capture.height,
-        bytes={_path_in(path, capture.folder): path.stat().st_size for path in capture.paths},
+        digests={_path_in(path, capture.folder): digest_of(path) for path in capture.paths},
     )
 
 

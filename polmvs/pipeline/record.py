@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 
 from polmvs._version import __version__
 from polmvs.cluster import PACKAGES, installed_versions
-from polmvs.config import AngleModel
-from polmvs.errors import DataError
+from polmvs.config import AngleModel, options_from_plain
+from polmvs.errors import DataError, OptionError
 from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
 
@@ -20,8 +20,8 @@ R = TypeVar("R")
 # Of ``run.json``; to be raised with every change of the record or of what a stage gives.
 # 1: the first releases, which did not name it. 2: stages with their results. 3: SfM as a stage of
 # its own, trust, notes on the capture. 4: seeds are sparse points alone. 5: what stages wrote.
-# 6: covariances of the poses.
-SCHEMA_VERSION = 6
+# 6: covariances of the poses. 7: what tells the content of the input, number of files.
+SCHEMA_VERSION = 7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +33,11 @@ class StageRecord:
     name : of the stage.
     angle_model : that it is of; None for those of all.
     reads : what it was made from, paths in the run folder.
-    wrote : what it left there, paths in the run folder.
+    wrote : what it left there: how many files, by path in the run folder.
     options : values of the options that decided its result, by path, in terms of JSON.
+    inputs : digests of the files and folders that these options name, by path of the option.
+    is_lost : its files are gone and are not made again yet. What was made of them holds, as long as
+        they are made with the same options.
     seconds : wall time.
     cpu_s : processor time, see :func:`polmvs.memory.cpu_seconds`; not of a cluster's.
     peak_rss_mb : largest resident memory of the run's processes together during it, see
@@ -46,8 +49,10 @@ class StageRecord:
     name: str
     angle_model: AngleModel | None = None
     reads: tuple[str, ...] = ()
-    wrote: tuple[str, ...] = ()
+    wrote: Mapping[str, int] = field(default_factory=dict)
     options: Mapping[str, Any] = field(default_factory=dict)
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    is_lost: bool = False
     seconds: float
     cpu_s: float
     peak_rss_mb: float
@@ -63,18 +68,18 @@ class CaptureIdentity:
     ----------
     folder : of the raw mosaics.
     width, height : of the polarization images, px.
-    bytes : size of each file by its path in the folder.
+    digests : of each file's content, by its path in the folder.
     """
 
     folder: Path
     width: int
     height: int
-    bytes: Mapping[str, int]
+    digests: Mapping[str, str]
 
     def is_same(self, other: CaptureIdentity) -> bool:
         """Whether the images are the same, wherever they lie."""
         mine, others = (self.width, self.height), (other.width, other.height)
-        return mine == others and self.bytes == other.bytes
+        return mine == others and self.digests == other.digests
 
 
 @dataclass(kw_only=True)
@@ -114,6 +119,11 @@ class Record:
         """Drop stages that are to be done again."""
         dropped = set(names)
         self.stages = tuple(stage for stage in self.stages if stage.name not in dropped)
+
+    def put(self, stage: StageRecord) -> None:
+        """Have a stage recorded so, in the place of what was."""
+        self.forget([stage.name])
+        self.stages = (*self.stages, stage)
 
     def find(self, kind: type[R], model: AngleModel | None = None) -> R | None:
         """Result of the finished stage that gives this type; None where it is not finished.
@@ -183,6 +193,10 @@ def read_options(run_folder: RunFolder) -> Mapping[str, Any]:
     options = content.get("options")
     if not isinstance(options, dict):
         raise _no_record(run_folder, "it has no options")
+    try:
+        options_from_plain(options)
+    except OptionError as error:
+        raise _no_record(run_folder, error) from error
     return options if content["stages"] else {}
 
 

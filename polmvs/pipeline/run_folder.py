@@ -277,6 +277,16 @@ def mark_own_workspace(folder: Path) -> None:
     (folder / DENSE_MARKER).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def files_in(folder: Path) -> list[Path]:
+    """All files in a folder and those within it."""
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
+def num_files(path: Path) -> int:
+    """Number of files that a path stands for: one, or those in a folder; none where it is gone."""
+    return len(files_in(path)) if path.is_dir() else int(path.exists())
+
+
 def has_content(folder: Path, apart_from: Set[str] = frozenset()) -> bool:
     """Whether a folder exists and holds anything but these names.
 

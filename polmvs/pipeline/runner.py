@@ -34,6 +34,7 @@ from polmvs.memory import MemoryPlan, PeakMemory, cpu_seconds, plan_memory
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.checks import (
     check_input,
+    digest_of,
     identity_of,
     inputs_of,
     require_apart,
@@ -52,6 +53,7 @@ from polmvs.pipeline.run_folder import (
     RunFolder,
     discard,
     has_content,
+    num_files,
     require_no_link,
     require_own,
 )
@@ -144,15 +146,17 @@ class Run(StageInput):
     table: Sequence[StageSpec]
     budget_gb: float | None = None
     _started: float = field(default_factory=time.perf_counter)
+    _digests: dict[str, str] = field(default_factory=dict)
 
     def is_finished(self, spec: StageSpec) -> bool:
         """Whether a stage is recorded and what it wrote is still there."""
         finished = self.record.stage(spec.name)
-        return finished is not None and not self._lost(finished)
+        return finished is not None and not finished.is_lost and not self._lost(finished)
 
     def _lost(self, finished: StageRecord) -> list[str]:
-        """What a finished stage wrote and is no longer there."""
-        return [path for path in finished.wrote if not (self.run_folder.root / path).exists()]
+        """What a finished stage wrote and is no longer there, or not whole."""
+        root, wrote = self.run_folder.root, finished.wrote
+        return [path for path, number in wrote.items() if num_files(root / path) < number]
 
     def do(self, spec: StageSpec) -> None:
         """Do a stage, unless it is finished, and record it.
@@ -166,11 +170,13 @@ class Run(StageInput):
             A stage that it reads from is not finished.
         """
         finished = self.record.stage(spec.name)
-        if finished is not None and (lost := self._lost(finished)):
-            logger.warning("%s: %s is gone and is made again.", spec.name, ", ".join(lost))
-            self._take_back([spec])
-            finished = None
-        if finished is not None and not (spec.is_redone and self._has_changed(spec, finished)):
+        if finished is not None and not finished.is_lost and (lost := self._lost(finished)):
+            logger.warning(
+                "%s: %s is gone, or part of it, and is made again.", spec.name, ", ".join(lost)
+            )
+            self._delete([spec], replace(finished, is_lost=True))
+        is_finished = self.is_finished(spec)
+        if finished is not None and is_finished and not self._is_redone(spec, finished):
             logger.info("%s: finished earlier", spec.name, extra=FILE_ONLY)
             self.monitor.skipped(spec.name)
             return
@@ -182,7 +188,7 @@ class Run(StageInput):
                     f"its stage {other.name!r} {state}, which {spec.name!r} reads. "
                     f"Run 'polmvs {other.command}' first.",
                 )
-        if finished is not None:
+        if is_finished:
             self.forget([spec.name])
         self._carry_out(spec)
 
@@ -210,8 +216,13 @@ class Run(StageInput):
             name=spec.name,
             angle_model=spec.angle_model,
             reads=_names(spec.reads),
-            wrote=_names(path for path in spec.writes if (self.run_folder.root / path).exists()),
+            wrote={
+                path.as_posix(): num_files(self.run_folder.root / path)
+                for path in spec.writes
+                if (self.run_folder.root / path).exists()
+            },
             options=plain_options(self.options, spec.decides),
+            inputs=self._inputs(spec),
             seconds=seconds,
             cpu_s=round(cpu_seconds() - cpu_start, 3),
             peak_rss_mb=round(peak_mb, 1),
@@ -219,15 +230,26 @@ class Run(StageInput):
             result=result,
         )
         order = [other.name for other in self.table]
-        stages = (*self.record.stages, finished)
-        self.record.stages = tuple(sorted(stages, key=lambda stage: order.index(stage.name)))
+        self.record.put(finished)
+        self.record.stages = tuple(sorted(self.record.stages, key=lambda s: order.index(s.name)))
         self.save()
         self.monitor.finished(spec.name, seconds, str(result))
 
-    def _has_changed(self, spec: StageSpec, finished: StageRecord) -> bool:
-        """Whether a finished stage was made from other files or options."""
-        now = plain_options(self.options, spec.decides)
-        return finished.options != now or finished.reads != _names(spec.reads)
+    def _is_redone(self, spec: StageSpec, finished: StageRecord) -> bool:
+        """Whether a finished stage was made from others than now, and is one to be done again."""
+        now = (plain_options(self.options, spec.decides), self._inputs(spec), _names(spec.reads))
+        return spec.is_redone and (finished.options, finished.inputs, finished.reads) != now
+
+    def _inputs(self, spec: StageSpec) -> dict[str, str]:
+        """Digests of what the options name that decide a stage's result, by path of the option.
+
+        Not of ``fusion.workspace``, in which a run may write (``export.in_place``).
+        """
+        named, decides = inputs_of(self.options), plain_options(self.options, spec.decides)
+        named.pop("fusion.workspace", None)
+        for path in named.keys() & decides.keys() - self._digests.keys():
+            self._digests[path] = digest_of(named[path])
+        return {path: self._digests[path] for path in sorted(named.keys() & decides.keys())}
 
     def forget(self, names: Collection[str]) -> None:
         """Have stages done again, and all that are made from their files; their files go.
@@ -237,10 +259,10 @@ class Run(StageInput):
         DataError
             A folder of theirs holds files that no run wrote; nothing is deleted.
         """
-        self._take_back(with_dependent(names, self.table))
+        self._delete(with_dependent(names, self.table))
 
-    def _take_back(self, stale: Sequence[StageSpec]) -> None:
-        """Delete the files of stages, and what is recorded of them."""
+    def _delete(self, stale: Sequence[StageSpec], remembered: StageRecord | None = None) -> None:
+        """Delete the files of stages, and what is recorded of them but for what is remembered."""
         paths = [self.run_folder.root / path for spec in stale for path in spec.writes]
         paths.append(self.run_folder.report)  # which shows them
         images = frozenset(self.record.images)
@@ -248,6 +270,8 @@ class Run(StageInput):
             if path.is_dir():
                 require_own(path, images)
         self.record.forget(spec.name for spec in stale)
+        if remembered is not None:
+            self.record.put(remembered)
         self.save()  # before the files go: a stage that is recorded has its files
         discard(paths, images)
 
@@ -257,7 +281,7 @@ class Run(StageInput):
         Raises
         ------
         OptionError
-            One is; the option is named with both values.
+            One is; the option is named with both values. Or a file has changed that one names.
         """
         for spec in self.table:
             finished = self.record.stage(spec.name)
@@ -270,6 +294,13 @@ class Run(StageInput):
                         f"is {show_value(now)} but the finished stage {spec.name!r} in "
                         f"{self.run_folder.root} used {show_value(earlier)}. Give the same value, "
                         "or `run.overwrite`.",
+                        field=path,
+                    )
+            for path, digest in self._inputs(spec).items():
+                if finished.inputs.get(path) != digest:
+                    raise OptionError(
+                        f"names what has changed since the finished stage {spec.name!r} in "
+                        f"{self.run_folder.root} used it. Give the same files, or `run.overwrite`.",
                         field=path,
                     )
 
@@ -344,15 +375,16 @@ def open_run(
             out=job.out.absolute(),
             options=with_absolute_paths(job.options),
         )
-    run_folder, others = RunFolder(job.out), inputs_of(job.options)
+    run_folder, others = RunFolder(job.out), list(inputs_of(job.options).values())
     for path in (job.capture, job.out, *others):
         require_unicode(path)
     require_apart(run_folder, capture=job.capture, others=others, written=written_names())
     overwrite, resume = run_options.overwrite and not continues, run_options.resume or continues
     with quiet_colmap():
         capture = open_capture(job.capture, job.options.capture)
+        identity = identity_of(capture)
         if run_folder.run_file.is_file() and (run_options.resume or continues):
-            require_same_capture(load_record(run_folder), identity_of(capture), run_folder)
+            require_same_capture(load_record(run_folder), identity, run_folder)
         plan = plan_memory(run_options.memory, run_options.workers, capture.width * capture.height)
         given_model = check_input(capture, job.options, min_images)
         if continues:
@@ -366,7 +398,6 @@ def open_run(
         _workers(job, plan) as workers,
     ):
         record = prepare_output(run_folder, overwrite=overwrite, resume=resume)
-        identity = identity_of(capture)
         require_same_capture(record, identity, run_folder)
         run = Run(
             run_folder=run_folder,
@@ -400,7 +431,7 @@ def _workers(job: Job, plan: MemoryPlan) -> Workers:
     if job.run_options.scheduler is None:
         return Workers(plan.num_workers)
     existing = next(folder for folder in (job.out, *job.out.parents) if folder.is_dir())
-    sources = [path for path in (job.capture, *inputs_of(job.options)) if path.exists()]
+    sources = [path for path in (job.capture, *inputs_of(job.options).values()) if path.exists()]
     return Workers.of_cluster(job.run_options.scheduler, [existing], sources)
 
 

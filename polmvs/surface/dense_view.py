@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.camera import MAX_SIDE
 from polmvs.errors import DataError
-from polmvs.io.arrays import map_array, save_array
+from polmvs.io.arrays import MADE_AGAIN, map_array, save_array
 from polmvs.surface.log_range import log_range_increment
 
 Floats = NDArray[np.floating]
@@ -224,7 +224,7 @@ def open_dense_view(stride_px: int, path: Path) -> DenseView:
     size = range_map.shape
     shapes = {sigma_deg.shape, sigma.shape, confidence.shape}
     if len(size) != 2 or shapes != {size} or normals.shape != (*size, 3):
-        raise DataError(path, "its files differ in size; run again with `run.overwrite`.")
+        raise DataError(path, f"its files differ in size. {MADE_AGAIN}")
     return DenseView(stride_px, range_map, normals, sigma_deg, sigma, confidence, path)
 
 
@@ -234,7 +234,7 @@ def find_dense_view(path: Path) -> DenseView | None:
         return None
     stride = map_array(_member(path, "stride"), np.integer)
     if stride.shape != () or not 0 < int(stride) < MAX_SIDE:
-        raise DataError(_member(path, "stride"), "holds no stride; run again with `run.overwrite`.")
+        raise DataError(_member(path, "stride"), f"holds no stride. {MADE_AGAIN}")
     return open_dense_view(int(stride), path)
 
 

@@ -12,14 +12,17 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from helpers import content_of, result_of
+from helpers import content_of, record_of, result_of
 
 from polmvs.cli import main
 from polmvs.colmap.cameras import quiet_colmap
 from polmvs.colmap.models import read_model, write_model
 from polmvs.errors import DataError
 from polmvs.io.clouds import read_cloud
-from polmvs.pipeline.stages.images import write_images
+from polmvs.pipeline.checks import identity_of
+from polmvs.pipeline.record import Record, StageRecord, write_record
+from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.stages.images import ImagesResult, write_images
 from polmvs.polarization.capture import open_capture
 from polmvs.scene import PointKind, Tracks
 
@@ -390,6 +393,42 @@ def test_resume_with_another_capture(cli, demo_run: Path, capture: Path) -> None
     assert status == 1
     assert "holds a run of another capture" in err
     assert listing(demo_run) == before
+
+
+def test_resume_with_other_images_of_the_same_size(cli, tmp_path: Path) -> None:
+    """Files of as many bytes, which say nothing of what they show."""
+    capture, out = tmp_path / "capture", tmp_path / "out"
+    capture.mkdir()
+    for number in range(3):
+        image = np.full((48, 64), 100 + number, np.uint8)
+        assert cv2.imwrite(str(capture / f"{number}.bmp"), image)
+    out.mkdir()
+    identity = identity_of(open_capture(capture))
+    done = ImagesResult(num_images=3)
+    stage = StageRecord(name="images", seconds=1.0, cpu_s=1.0, peak_rss_mb=1.0, result=done)
+    write_record(RunFolder(out), Record(capture=identity, stages=(stage,)))
+    shutil.copy(capture / "0.bmp", capture / "1.bmp")
+    status, _, err = cli("sfm", capture, out, "--resume")
+    assert status == 1
+    assert "or its images have changed" in err
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    [("propagation", "stride_px", "3"), ("region", "unknown", 1), (None, "propagation", [])],
+)
+def test_resume_of_a_record_with_damaged_options(
+    cli, demo_run: Path, demo_capture: Path, tmp_path: Path, group, name: str, value
+) -> None:
+    """The file is named, and not a flag that nobody gave."""
+    record = record_of(demo_run)
+    (record["options"] if group is None else record["options"][group])[name] = value
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    status, _, err = cli("reconstruct", demo_capture, tmp_path, "--resume")
+    assert status == 1
+    assert "run.json: is no record of a run" in err
+    assert f"{name}" in err
+    assert err.count("\n") == 1
 
 
 def test_resume_of_a_damaged_record(cli, capture: Path, tmp_path: Path) -> None:

@@ -14,13 +14,16 @@ from helpers import cut_after, record_of, refused, result_of, stages_of
 from polmvs.colmap.models import read_model, write_model
 from polmvs.config import (
     AngleModel,
+    EvaluationOptions,
+    FusionOptions,
     Options,
     PropagationOptions,
+    RegionOptions,
     RunOptions,
     SfmOptions,
     to_plain,
 )
-from polmvs.errors import DataError
+from polmvs.errors import DataError, OptionError
 from polmvs.io.clouds import read_cloud
 from polmvs.normals.tracks import select_seeds
 from polmvs.parallel import Workers
@@ -152,8 +155,83 @@ def test_what_was_deleted_is_made_again_and_nothing_else(make_run, caplog) -> No
     for spec in table:
         again.do(spec)
     assert monitor.events[3:] == ["a: Text(text='a')", "b skipped", "c skipped"]
-    assert "x is gone and is made again" in caplog.text
+    assert "x is gone, or part of it, and is made again" in caplog.text
     assert [stage.name for stage in make_run(table).record.stages] == ["a", "b", "c"]
+
+
+def test_what_is_being_made_again_is_of_the_same_options(make_run) -> None:
+    """A run that is stopped meanwhile does not go on with others: what was made of it is there."""
+    table = [toy("a", "", "x", decides=("region",)), toy("b", "x", "y")]
+    run = make_run(table)
+    for spec in table:
+        run.do(spec)
+    (run.run_folder.root / "x").unlink()
+
+    def stop(run) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_run(table).do(replace(table[0], work=stop))
+    changed = Options(region=RegionOptions(min_dolp=0.4))
+    with pytest.raises(OptionError, match="finished stage 'a'"):
+        make_run(table, changed).require_same_options(["a", "b"])
+    monitor = Recorder()
+    again = make_run(table, monitor=monitor)
+    again.require_same_options(["a", "b"])
+    for spec in table:
+        again.do(spec)
+    assert monitor.events == ["a: Text(text='a')", "b skipped"]
+    assert [stage.is_lost for stage in make_run(table).record.stages] == [False, False]
+
+
+def test_a_folder_that_lost_a_file_is_made_again(make_run) -> None:
+    def work(run) -> Text:
+        (run.run_folder.root / "maps").mkdir()
+        for name in ("1", "2"):
+            (run.run_folder.root / "maps" / name).write_text(name)
+        return Text(text="12")
+
+    spec = toy("a", "", "maps", work=work)
+    run = make_run([spec])
+    run.do(spec)
+    (run.run_folder.root / "maps" / "2").unlink()
+    (run.run_folder.root / "maps" / "1").write_text("damaged")
+    make_run([spec]).do(spec)
+    maps = run.run_folder.root / "maps"
+    assert [path.read_text() for path in sorted(maps.iterdir())] == ["1", "2"]
+
+
+def test_input_of_other_content_is_not_taken_over(make_run, tmp_path: Path) -> None:
+    """Nor is what is quickly done kept of it; an own workspace is left to the run to fill."""
+    masks, truth = tmp_path / "masks", tmp_path / "gt"
+    for folder in (masks, truth):
+        folder.mkdir()
+        (folder / "1.png").write_text("before")
+    options = Options(
+        region=RegionOptions(mask=masks),
+        fusion=FusionOptions(workspace=tmp_path / "workspace"),
+        evaluation=EvaluationOptions(gt=truth),
+    )
+    table = [
+        toy("a", "", "x", decides=("region", "fusion")),
+        toy("b", "x", "y", decides=("evaluation",), is_redone=True),
+    ]
+    run = make_run(table, options)
+    for spec in table:
+        run.do(spec)
+    (tmp_path / "workspace").mkdir()
+    (tmp_path / "workspace" / "filled").write_text("by the run")
+    (truth / "1.png").write_text("behind")
+    monitor = Recorder()
+    again = make_run(table, options, monitor=monitor)
+    again.require_same_options(["a", "b"])
+    for spec in table:
+        again.do(spec)
+    assert monitor.events == ["a skipped", "b: Text(text='ab')"]
+    (masks / "1.png").write_text("behind")
+    with pytest.raises(OptionError, match="changed since the finished stage 'a'") as caught:
+        make_run(table, options).require_same_options(["a"])
+    assert caught.value.field == "region.mask"
 
 
 def test_forgetting_takes_all_that_is_made_from_it(make_run) -> None:
@@ -223,6 +301,20 @@ def copy_of(demo_run: Path, tmp_path: Path):
         return out
 
     return copy
+
+
+def test_a_damaged_map_is_healed_as_its_message_says(copy_of, demo_capture: Path, cli) -> None:
+    """Its own stage is done again, and alone: the normals made from the map are."""
+    out = copy_of("normals_ppa")
+    path = min((out / "maps").glob("*.npy"))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:200])
+    err = refused(cli("normals", demo_capture, out, "--resume"))
+    assert str(path) in err
+    assert "Delete it and give --resume" in err
+    path.unlink()
+    assert cli("normals", demo_capture, out, "--resume", "--workers", 1)[0] == 0
+    assert path.read_bytes() == whole
 
 
 def test_resume_with_other_neighbours_does_not_take_over_the_surface(

@@ -169,5 +169,5 @@ def test_files_of_one_name_in_two_folders_are_told_apart(demo_capture, tmp_path:
             image = np.full((16, 16), 50 + angle + view, np.uint8)
             cv2.imwrite(str(tmp_path / f"I{angle}" / f"{view}.png"), image)
     identity = identity_of(open_capture(tmp_path))
-    assert len(identity.bytes) == 12
-    assert "I45/1.png" in identity.bytes
+    assert len(identity.digests) == 12
+    assert "I45/1.png" in identity.digests

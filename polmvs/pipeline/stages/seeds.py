@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model
 from polmvs.errors import DataError
-from polmvs.io.arrays import map_array, save_array
+from polmvs.io.arrays import MADE_AGAIN, map_array, save_array
 from polmvs.normals.tracks import select_seeds
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.normals import load_track_normals
@@ -103,4 +103,4 @@ def seed_tracks(source: Path, num_tracks: int) -> NDArray[np.bool_]:
 def _require_tracks(source: Path, track: NDArray[np.int64], num_tracks: int) -> None:
     """Refuse seeds of other sparse points."""
     if len(track) and not (track.min() >= 0 and track.max() < num_tracks):
-        raise DataError(source, "is not of these sparse points; run again with `run.overwrite`.")
+        raise DataError(source, f"is not of these sparse points. {MADE_AGAIN}")
