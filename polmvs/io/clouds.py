@@ -73,15 +73,21 @@ class Mesh:
     colors: NDArray[np.uint8] | None = None
 
 
-def preload() -> None:
-    """Begin to import Open3D beside other work, such as that of COLMAP's mapper on one core."""
+def preload() -> threading.Thread:
+    """Begin to import Open3D beside other work, such as that of COLMAP's mapper on one core.
+
+    The thread is to be joined before an array is read: in CPython 3.11 parsing fails now and then
+    (SystemError) where two threads do, as an import and NumPy's reader of headers.
+    """
 
     def load() -> None:
         # What is missing is said when it is needed; a program that ends meanwhile breaks it off.
         with suppress(Exception):
             import_open3d()
 
-    threading.Thread(target=load, name="preload-open3d").start()
+    thread = threading.Thread(target=load, name="preload-open3d")
+    thread.start()
+    return thread
 
 
 def to_open3d(cloud: Cloud) -> Any:

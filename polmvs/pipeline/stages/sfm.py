@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,10 +91,11 @@ def find_model(
         No model comes out, or the options do not fit the images.
     """
     options = options or SfmOptions()
+    loading: list[Thread] = []
 
     def on_step(name: str) -> None:
         if name == "mapping":  # on one core: the other can load what the next stages need
-            preload()
+            loading.append(preload())
         on_progress(1)
 
     with scratch(target) as folder:
@@ -101,6 +103,8 @@ def find_model(
         try:
             # Where its database cannot be written COLMAP ends the process.
             model = run_separately(_run_sfm, images, names, work, new, options, on_message=on_step)
+            for thread in loading:
+                thread.join()
         except NoRoomError as error:
             raise DataError(target.parent, CANNOT_WRITE) from error
         except CrashError as error:
