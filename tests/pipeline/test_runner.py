@@ -185,20 +185,21 @@ def test_what_is_being_made_again_is_of_the_same_options(make_run) -> None:
 
 
 def test_a_folder_that_lost_a_file_is_made_again(make_run) -> None:
-    def work(run) -> Text:
-        (run.run_folder.root / "maps").mkdir()
-        for name in ("1", "2"):
-            (run.run_folder.root / "maps" / name).write_text(name)
-        return Text(text="12")
+    names = ("cameras.bin", "images.bin")
 
-    spec = toy("a", "", "maps", work=work)
+    def work(run) -> Text:
+        run.run_folder.sparse.mkdir()
+        for name in names:
+            (run.run_folder.sparse / name).write_text(name)
+        return Text(text="model")
+
+    spec = toy("a", "", "sparse", work=work)
     run = make_run([spec])
     run.do(spec)
-    (run.run_folder.root / "maps" / "2").unlink()
-    (run.run_folder.root / "maps" / "1").write_text("damaged")
+    (run.run_folder.sparse / names[0]).write_text("damaged")
+    (run.run_folder.sparse / names[1]).unlink()
     make_run([spec]).do(spec)
-    maps = run.run_folder.root / "maps"
-    assert [path.read_text() for path in sorted(maps.iterdir())] == ["1", "2"]
+    assert tuple((run.run_folder.sparse / name).read_text() for name in names) == names
 
 
 def test_input_of_other_content_is_not_taken_over(make_run, tmp_path: Path) -> None:
