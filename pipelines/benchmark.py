@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.cli.call import Call
-from polmvs.cli.commands import HOW, TO_CLOUD
+from polmvs.cli.commands import EXECUTION, TO_CLOUD
 from polmvs.cli.flags import Command
 from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
@@ -129,7 +129,7 @@ def _benchmark(call: Call, terminal: Terminal) -> int:
 COMMAND = Command(
     help_text="times and memory of runs by stage, of single steps, and their growth",
     run=_benchmark,
-    groups=(Arguments, *TO_CLOUD, ExportOptions, EvaluationOptions, *HOW),
+    groups=(Arguments, *TO_CLOUD, ExportOptions, EvaluationOptions, *EXECUTION),
 )
 
 

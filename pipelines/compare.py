@@ -13,7 +13,7 @@ from pathlib import Path
 
 from polmvs.cli import EMPTY_STATUS
 from polmvs.cli.call import Call
-from polmvs.cli.commands import HOW, TO_CLOUD
+from polmvs.cli.commands import EXECUTION, TO_CLOUD
 from polmvs.cli.flags import Command
 from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
@@ -55,7 +55,7 @@ def _compare(call: Call, terminal: Terminal) -> int:
 COMMAND = Command(
     help_text="compare the models on several captures",
     run=_compare,
-    groups=(Arguments, *TO_CLOUD, *HOW),
+    groups=(Arguments, *TO_CLOUD, *EXECUTION),
 )
 
 

@@ -49,7 +49,8 @@ class Arguments(OptionGroup, group="arguments", in_files=False):
 
 def _paper(call: Call, terminal: Terminal) -> int:
     """Run all, then write all."""
-    given, how, options = call.get(Arguments), call.get(ExperimentRun), call.get(ExperimentOptions)
+    given, running = call.get(Arguments), call.get(ExperimentRun)
+    options = call.get(ExperimentOptions)
     names = [folder.resolve().name for folder in given.captures]
     if len(set(names)) < len(names):
         raise OptionError("two captures have the same folder name; their results would mix.")
@@ -57,7 +58,7 @@ def _paper(call: Call, terminal: Terminal) -> int:
         raise OptionError(
             "`experiment.gt` and `experiment.sparse` belong to one capture; give that one alone."
         )
-    if has_content(given.out) and not how.overwrite:
+    if has_content(given.out) and not running.overwrite:
         raise OptionError(
             f"{given.out}: exists and is not empty. Give `run.overwrite` or another OUT."
         )
@@ -70,20 +71,24 @@ def _paper(call: Call, terminal: Terminal) -> int:
     reports: dict[str, list[Report]] = {}
     seconds: dict[str, dict[str, float]] = {}
     memory = PeakMemory()
-    with Workers(how.workers) as workers:
+    with Workers(running.workers) as workers:
         for capture, scene in zip(names, scenes, strict=True):
             reports[capture], seconds[capture] = [], {}
             for name in NAMES:
                 start = time.perf_counter()
-                with terminal.stage(f"{capture} {name}", num_steps(name, scene, options)) as report:
-                    reports[capture].append(run_experiment(name, scene, options, workers, report))
+                with terminal.stage(
+                    f"{capture} {name}", num_steps(name, scene, options)
+                ) as on_progress:
+                    reports[capture].append(
+                        run_experiment(name, scene, options, workers, on_progress)
+                    )
                 seconds[capture][name] = round(time.perf_counter() - start, 2)
                 terminal.finished(f"{capture} {name}", seconds[capture][name], "")
         peak_mb = round(memory.mb())
     for capture in names:
         for made in reports[capture]:
             write_report(given.out / capture, made)
-    write_files(given.out, _page(reports, seconds, peak_mb, how.workers))
+    write_files(given.out, _page(reports, seconds, peak_mb, running.workers))
     terminal.show(str(given.out / "paper.md"), {"page": given.out / "paper.md"})
     return 0
 

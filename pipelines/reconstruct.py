@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from polmvs.cli import EMPTY_STATUS
 from polmvs.cli.call import Call
-from polmvs.cli.commands import HOW, TO_CLOUD, JobArguments, ModelChoice
+from polmvs.cli.commands import EXECUTION, TO_CLOUD, JobArguments, ModelChoice
 from polmvs.cli.flags import Command
 from polmvs.cli.jobs import job_of
 from polmvs.cli.running import run
@@ -32,7 +32,7 @@ def _reconstruct(call: Call, terminal: Terminal) -> int:
 COMMAND = Command(
     help_text="reconstruct a capture with one model",
     run=_reconstruct,
-    groups=(JobArguments, ModelChoice, *TO_CLOUD, ExportOptions, *HOW),
+    groups=(JobArguments, ModelChoice, *TO_CLOUD, ExportOptions, *EXECUTION),
 )
 
 

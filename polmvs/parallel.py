@@ -28,6 +28,7 @@ from polmvs.threads import keep_to_one_core
 
 T = TypeVar("T")
 OnProgress: TypeAlias = Callable[[int], None]  # called with the steps done since the last call
+OnStep: TypeAlias = Callable[[str], None]  # called with the name of a step that begins
 
 HELD_BACK = (signal.SIGINT, signal.SIGTERM)
 POSIX = hasattr(signal, "pthread_sigmask")
@@ -35,6 +36,10 @@ POSIX = hasattr(signal, "pthread_sigmask")
 
 def no_progress(count: int) -> None:
     """Nobody is told of the steps."""
+
+
+def no_step(name: str) -> None:
+    """Nobody is told of the step that begins."""
 
 
 class Backend(Protocol):

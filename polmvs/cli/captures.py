@@ -31,8 +31,8 @@ def inspect(call: Call, terminal: Terminal) -> int:
     if arguments.sheet is not None and arguments.sheet.is_dir():
         raise OptionError("is a folder; name a PNG file.", field="arguments.sheet")
     capture = open_capture(arguments.capture, call.get(CaptureOptions))
-    with terminal.stage("inspect", len(capture.names)) as report:
-        inspection = inspect_capture(capture, on_progress=report)
+    with terminal.stage("inspect", len(capture.names)) as on_progress:
+        inspection = inspect_capture(capture, on_progress=on_progress)
     lines = list(inspection.lines)
     if arguments.sheet is not None:
         write_png(arguments.sheet, contact_sheet(capture, in_flags))

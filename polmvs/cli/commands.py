@@ -251,7 +251,7 @@ TO_POSES = (CaptureOptions, SfmOptions, ReferenceOptions)
 TO_NORMALS = (*TO_POSES, RegionOptions, NormalOptions)
 TO_CLOUD = (*TO_NORMALS, PropagationOptions, FusionOptions)
 SHOWN = (ReportChoice, RecordingOptions)
-HOW = (RunOptions, FileOptions, TerminalOptions)
+EXECUTION = (RunOptions, FileOptions, TerminalOptions)
 
 COMMANDS = (
     Command(
@@ -264,20 +264,20 @@ COMMANDS = (
         name="reconstruct",
         help_text="capture in, dense cloud of one model out",
         run="polmvs.cli.jobs:reconstruct",
-        groups=(JobArguments, ModelChoice, *TO_CLOUD, ExportOptions, *SHOWN, *HOW),
+        groups=(JobArguments, ModelChoice, *TO_CLOUD, ExportOptions, *SHOWN, *EXECUTION),
     ),
     Command(
         name="compare",
         help_text="dense clouds of several models on the same poses, seeds and region, and figures "
         "that tell them apart",
         run="polmvs.cli.jobs:compare",
-        groups=(JobArguments, ComparedModels, *TO_CLOUD, EvaluationOptions, *SHOWN, *HOW),
+        groups=(JobArguments, ComparedModels, *TO_CLOUD, EvaluationOptions, *SHOWN, *EXECUTION),
     ),
     Command(
         name="batch",
         help_text="'reconstruct' for many captures side by side, and one table of what came out",
         run="polmvs.cli.jobs:batch",
-        groups=(BatchArguments, ModelChoice, *TO_CLOUD, ExportOptions, *HOW),
+        groups=(BatchArguments, ModelChoice, *TO_CLOUD, ExportOptions, *EXECUTION),
     ),
     Command(
         name="evaluate",
@@ -289,27 +289,27 @@ COMMANDS = (
         name="sfm",
         help_text="the first stages alone: images and poses",
         run="polmvs.cli.jobs:sfm",
-        groups=(JobArguments, *TO_POSES, *HOW),
+        groups=(JobArguments, *TO_POSES, *EXECUTION),
     ),
     Command(
         name="normals",
         help_text="normals of the sparse points, after 'sfm'",
         run="polmvs.cli.jobs:normals",
-        groups=(JobArguments, ModelChoice, RegionOptions, NormalOptions, *HOW),
+        groups=(JobArguments, ModelChoice, RegionOptions, NormalOptions, *EXECUTION),
         earlier=TO_POSES,
     ),
     Command(
         name="densify",
         help_text="the dense cloud, after 'normals'",
         run="polmvs.cli.jobs:densify",
-        groups=(JobArguments, ModelChoice, PropagationOptions, FusionOptions, *HOW),
+        groups=(JobArguments, ModelChoice, PropagationOptions, FusionOptions, *EXECUTION),
         earlier=TO_NORMALS,
     ),
     Command(
         name="export",
         help_text="mesh and COLMAP dense workspace, after 'densify'",
         run="polmvs.cli.jobs:export",
-        groups=(JobArguments, ModelChoice, ExportOptions, *HOW),
+        groups=(JobArguments, ModelChoice, ExportOptions, *EXECUTION),
         earlier=TO_CLOUD,
     ),
     Command(

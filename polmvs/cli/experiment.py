@@ -14,20 +14,20 @@ from polmvs.parallel import Workers
 
 def experiment(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs experiment``; nothing is written unless it comes to its end."""
-    arguments, how = call.get(ExperimentArguments), call.get(ExperimentRun)
+    arguments, run = call.get(ExperimentArguments), call.get(ExperimentRun)
     name, out = arguments.name, arguments.out
     options = call.get(ExperimentOptions)
-    check_output(out, name, overwrite=how.overwrite)
+    check_output(out, name, overwrite=run.overwrite)
     require_apart(out, arguments.capture)
     scene = open_experiment(
         arguments.capture, options, call.get(CaptureOptions), call.get(RegionOptions)
     )
     check_options(scene, options, (name,))
     with (
-        Workers(how.workers) as workers,
-        terminal.stage(name, num_steps(name, scene, options)) as progress,
+        Workers(run.workers) as workers,
+        terminal.stage(name, num_steps(name, scene, options)) as on_progress,
     ):
-        report = run_experiment(name, scene, options, workers, progress)
+        report = run_experiment(name, scene, options, workers, on_progress)
     write_report(out, report)
     terminal.show(f"{report.text}\n{out / name}.json", report.content)
     return 0

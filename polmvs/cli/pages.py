@@ -98,7 +98,7 @@ def _shown(files: Sequence[Path]) -> bool:
     return True
 
 
-def _show(files: Sequence[Path], report: Callable[[str], None]) -> None:
+def _show(files: Sequence[Path], on_message: Callable[[str], None]) -> None:
     show_in_viewer(files)
 
 

@@ -6,7 +6,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import TextIOWrapper
@@ -19,6 +19,7 @@ from polmvs.cli.flags import in_flags
 from polmvs.cli.running import keep_sigterm
 from polmvs.config import to_plain
 from polmvs.errors import DataError
+from polmvs.parallel import OnProgress, no_progress
 
 if TYPE_CHECKING:  # heavy
     from rich.console import Console
@@ -164,10 +165,10 @@ class Terminal:
         self._add(handler)
 
     @contextmanager
-    def stage(self, name: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    def stage(self, name: str, total: int | None) -> Iterator[OnProgress]:
         """Show a bar with the count and the time that is left, if this is a terminal."""
         if self._silent or not sys.stderr.isatty():
-            yield lambda count: None
+            yield no_progress
             return
         from rich.console import Console
         from rich.progress import (

@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import logging
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +44,7 @@ from polmvs.config import Mapper, SfmOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.images import read_gray
 from polmvs.io.intrinsics import Intrinsics, read_intrinsics
+from polmvs.parallel import OnStep, no_step
 from polmvs.scene import KEYPOINT_SIGMA_PX, SparseModel, View, short_list
 
 logger = logging.getLogger(__name__)
@@ -54,8 +55,6 @@ NO_MODEL_REMEDY = (
 )
 
 COLMAP_DEFAULTS = pycolmap.IncrementalMapperOptions()
-
-OnProgress = Callable[[str], None]
 
 
 class NoModelError(DataError):
@@ -117,7 +116,7 @@ def run_sfm(
     work_folder: Path,
     sparse_folder: Path,
     options: SfmOptions,
-    on_progress: OnProgress = lambda name: None,
+    on_step: OnStep = no_step,
     *,
     tolerances: SfmTolerances = SfmTolerances(),
 ) -> SparseModel:
@@ -133,7 +132,7 @@ def run_sfm(
         is replaced.
     sparse_folder : gets the model as COLMAP binary, whole or not at all.
     options : see :class:`polmvs.config.SfmOptions`; ``sparse`` is not used here.
-    on_progress : called with the name of each stage when it starts.
+    on_step : called with the name of each stage when it starts.
 
     Raises
     ------
@@ -154,17 +153,17 @@ def run_sfm(
     database = _place_of_database(work_folder)
     pycolmap.set_random_seed(options.seed)
     with quiet_colmap(), nullcontext() if given is None else sound(given.path):
-        on_progress("features")
+        on_step("features")
         if given is None:
             _extract_features(database, image_folder, names, reader, options)
         else:
             _take_database(given, database, reader, width, height, options)
-        on_progress("matching")
+        on_step("matching")
         if given is None or not given.has_matches or options.pairs is not None:
             _match(database, to_match, options)
-        on_progress("mapping")
+        on_step("mapping")
         reconstruction = _map(database, image_folder, work_folder, to_match, options, tolerances)
-        on_progress("bundle adjustment")
+        on_step("bundle adjustment")
         single = options.single_camera if given is None else given.num_cameras == 1
         reconstruction = _refine(
             reconstruction,

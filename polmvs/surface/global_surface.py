@@ -199,7 +199,7 @@ def reconstruct_surface(
     scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, folder=folder)
     done = 0
 
-    def report(count: int) -> None:
+    def advance(count: int) -> None:
         nonlocal done
         # Steps of a surface that is given up count, up to the number announced.
         count = min(count, num_surface_steps(0) - done)
@@ -217,7 +217,7 @@ def reconstruct_surface(
             seeds=seeds,
             plane=supporting_plane(surroundings, np.array([view.center for view in own])),
             min_views=min_views,
-            report=report,
+            on_progress=advance,
         )
 
     tolerances, hull_tolerances = tolerances or RefinementTolerances(), HullTolerances()
@@ -242,11 +242,11 @@ def reconstruct_surface(
         )
         fine = replace(hull_tolerances, step_px=0.5 * hull_tolerances.step_px)
         thin = replace(tolerances, levels=tolerances.thin_levels)
-        unheard = replace(given, is_suspicion=False, report=no_progress)
+        unheard = replace(given, is_suspicion=False, on_progress=no_progress)
         again = _surface(unheard, unheard.hull(fine), thin)
         if again.found is not None and _uncovered_share(again.found) < _uncovered_share(found):
             found, meshes = again.found, again.meshes
-    report(max(num_surface_steps(0) - done, 0))
+    advance(max(num_surface_steps(0) - done, 0))
     if on_mesh is not None:
         for mesh in meshes:
             on_mesh(mesh)
@@ -264,7 +264,7 @@ class _Given:
     views, scene : of those believed.
     seeds, min_views : as of :func:`reconstruct_surface`.
     plane : on which the objects stand.
-    report : progress.
+    on_progress : called with the number of steps done.
     """
 
     all_views: Sequence[SurfaceView]
@@ -275,7 +275,7 @@ class _Given:
     seeds: Seeds
     plane: Plane | None
     min_views: int
-    report: OnProgress
+    on_progress: OnProgress
 
     @property
     def rows(self) -> AngleModel:
@@ -376,7 +376,7 @@ def _surface(given: _Given, hull: VisualHull, tolerances: RefinementTolerances) 
         hull.footprint,
         known=given.known,
         tolerances=tolerances,
-        on_progress=given.report,
+        on_progress=given.on_progress,
         go_on=is_agreed,
     )
     if (odd == given.kept).any():
@@ -456,7 +456,7 @@ def _settled(
         )
 
     mesh = _at_rest(sharpened(mesh, normals), normals, settle, given.known, footprint)
-    given.report(1)
+    given.on_progress(1)
     return _Settled(mesh, views, normals, fitted.sigma_deg, shown.direct, median)
 
 
@@ -476,9 +476,9 @@ def _borne_out(
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     presumed = seen & ~supported & _lie_on(mesh, [hollow.values for hollow in hollows])
     supported |= presumed
-    given.report(1)
+    given.on_progress(1)
     sigma = _deviations(mesh, views, rows, footprint, known)
-    given.report(1)
+    given.on_progress(1)
     offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, footprint)
     contradictions = replace(
         find_contradictions(mesh, evidence, supported, views, settled.median),

@@ -168,7 +168,7 @@ def in_rounds(
     neighbors: Sequence[Sequence[int]],
     folder: Path,
     workers: Workers,
-    report: Callable[[int], None],
+    on_progress: OnProgress,
     nodes: Sequence[Nodes | None] | None = None,
 ) -> list[DenseView | None]:
     """Solve all views anew in every round, from what the round before made of them.
@@ -181,7 +181,7 @@ def in_rounds(
     neighbors : per view the indices of the views that help it, itself first.
     folder : for the dense views.
     workers : processes to share the views among.
-    report : called with 1 for each view of each round.
+    on_progress : called with 1 for each view of each round.
     nodes : per view those of the first round; None: ``solve`` makes its own.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -202,7 +202,7 @@ def in_rounds(
         for own_nodes, result in workers.map(solve, tasks):
             nodes.append(own_nodes)
             dense.append(result)
-            report(1)
+            on_progress(1)
     return dense
 
 

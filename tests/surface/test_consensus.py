@@ -44,12 +44,12 @@ def true_view(scene, k, stride=2):
     return dense_view(samples, hit, stride)
 
 
-def ask(scene, dense, away=0.0, turn=None):
+def sighted(scene, dense, away=0.0, turn=None):
     """Sighting of the second view on the first one's true points, moved away from it."""
     samples, _ = true_samples(scene, 0)
     normals = samples.normals if turn is None else samples.normals @ turn.T
     distance = np.exp(samples.log_range)
-    opinion = sight(
+    sighting = sight(
         scene.maps[1],
         dense,
         scene.views[0].center_in_world,
@@ -57,7 +57,7 @@ def ask(scene, dense, away=0.0, turn=None):
         distance + away,
         normals,
     )
-    return samples, distance, opinion
+    return samples, distance, sighting
 
 
 @pytest.mark.parametrize("surface", [BOARD, BALL], ids=["plane", "sphere"])
@@ -65,50 +65,50 @@ def ask(scene, dense, away=0.0, turn=None):
 def test_the_true_surface_is_met_where_it_is(surface, stride):
     """Exactly, on spheres too: planes through the other's points would be met outside of them."""
     scene = scene_of(surface)
-    _, distance, opinion = ask(scene, true_view(scene, 1, stride))
-    said = np.isfinite(opinion.place)
-    assert said.sum() > 0.6 * len(distance)
-    np.testing.assert_allclose(opinion.place[said], distance[said], rtol=3e-6)
-    assert (opinion.cosine[said] > 0.99).mean() > 0.7
+    _, distance, sighting = sighted(scene, true_view(scene, 1, stride))
+    met = np.isfinite(sighting.place)
+    assert met.sum() > 0.6 * len(distance)
+    np.testing.assert_allclose(sighting.place[met], distance[met], rtol=3e-6)
+    assert (sighting.cosine[met] > 0.99).mean() > 0.7
 
 
 def test_a_point_away_from_the_surface_is_sent_back_to_it():
     scene = scene_of(BOARD)
-    _, distance, opinion = ask(scene, true_view(scene, 1), away=0.02)
-    said = np.isfinite(opinion.place)
-    assert said.sum() > 500
-    np.testing.assert_allclose(opinion.place[said], distance[said], rtol=3e-6)
+    _, distance, sighting = sighted(scene, true_view(scene, 1), away=0.02)
+    met = np.isfinite(sighting.place)
+    assert met.sum() > 500
+    np.testing.assert_allclose(sighting.place[met], distance[met], rtol=3e-6)
     # Farther from the first view: behind the surface that the other sees.
-    assert (opinion.excess[said] < -0.005).all()
-    _, _, before = ask(scene, true_view(scene, 1), away=-0.02)
+    assert (sighting.excess[met] < -0.005).all()
+    _, _, before = sighted(scene, true_view(scene, 1), away=-0.02)
     assert (before.excess[np.isfinite(before.place)] > 0.005).all()
 
 
 def test_a_deviation_counts_along_the_first_views_ray():
     scene = scene_of(BOARD)
-    samples, distance, opinion = ask(scene, true_view(scene, 1))
-    said = np.isfinite(opinion.place)
+    samples, distance, sighting = sighted(scene, true_view(scene, 1))
+    met = np.isfinite(sighting.place)
     slant = np.abs((samples.rays_in_world * samples.normals).sum(axis=-1))
     to_point = scene.views[0].center_in_world + distance[:, None] * samples.rays_in_world
     other_range = np.linalg.norm(to_point - scene.views[1].center_in_world, axis=-1)
     expected = SIGMA * other_range / slant
-    np.testing.assert_allclose(opinion.sigma[said], expected[said], rtol=0.02)
+    np.testing.assert_allclose(sighting.sigma[met], expected[met], rtol=0.02)
 
 
 def test_normals_and_facing_are_those_of_the_point():
     scene = scene_of(BOARD)
     axis = np.array([[1, 0, 0], [0, np.cos(0.3), -np.sin(0.3)], [0, np.sin(0.3), np.cos(0.3)]])
-    samples, distance, opinion = ask(scene, true_view(scene, 1), turn=axis)
-    said = np.isfinite(opinion.place)
+    samples, distance, sighting = sighted(scene, true_view(scene, 1), turn=axis)
+    met = np.isfinite(sighting.place)
     turned = samples.normals @ axis.T
     np.testing.assert_allclose(
-        opinion.cosine[said], (samples.normals * turned).sum(-1)[said], atol=1e-5
+        sighting.cosine[met], (samples.normals * turned).sum(-1)[met], atol=1e-5
     )
-    np.testing.assert_allclose(opinion.normals[said], samples.normals[said], atol=1e-5)
+    np.testing.assert_allclose(sighting.normals[met], samples.normals[met], atol=1e-5)
     points = scene.views[0].center_in_world + distance[:, None] * samples.rays_in_world
     to_other = scene.views[1].center_in_world - points
     to_other /= np.linalg.norm(to_other, axis=-1, keepdims=True)
-    np.testing.assert_allclose(opinion.facing, (to_other * turned).sum(-1), atol=1e-6)
+    np.testing.assert_allclose(sighting.facing, (to_other * turned).sum(-1), atol=1e-6)
 
 
 def test_a_view_that_knows_nothing_says_nothing():
@@ -120,10 +120,10 @@ def test_a_view_that_knows_nothing_says_nothing():
         normals_in_world=np.full_like(full.normals_in_world, np.nan),
         sigma=np.full_like(full.sigma, np.nan),
     )
-    _, _, opinion = ask(scene, empty)
-    assert np.isnan(opinion.place).all()
-    assert np.isnan(opinion.excess).all()
-    assert (opinion.normals == 0).all()
+    _, _, sighting = sighted(scene, empty)
+    assert np.isnan(sighting.place).all()
+    assert np.isnan(sighting.excess).all()
+    assert (sighting.normals == 0).all()
 
 
 def test_outside_is_what_the_image_shows_beside_the_region():
@@ -137,7 +137,7 @@ def test_outside_is_what_the_image_shows_beside_the_region():
     to_point = points - view.center_in_world
     distance = np.linalg.norm(to_point, axis=-1)
     normals = np.broadcast_to([0.0, 0.0, 1.0], (4, 3))
-    opinion = sight(
+    sighting = sight(
         other,
         true_view(scene, 1),
         view.center_in_world,
@@ -145,8 +145,8 @@ def test_outside_is_what_the_image_shows_beside_the_region():
         distance,
         normals,
     )
-    np.testing.assert_array_equal(opinion.outside, [False, True, False, False])
-    assert np.isnan(opinion.place[2:]).all()
+    np.testing.assert_array_equal(sighting.outside, [False, True, False, False])
+    assert np.isnan(sighting.place[2:]).all()
 
 
 def test_the_others_surface_starts_a_view_that_knows_nothing():

@@ -1,4 +1,4 @@
-"""One round of one view: who has a say on its nodes, and how certain the result is."""
+"""One round of one view: which views tie its nodes, and how certain the result is."""
 
 from dataclasses import replace
 
@@ -105,7 +105,7 @@ def test_one_of_many_is_outvoted(exact, away):
     assert (error < 1e-4).mean() > 0.9
 
 
-def test_an_opinion_on_another_surface_is_none(exact):
+def test_a_sighting_of_another_surface_ties_nothing(exact):
     """30 degrees between the normals: it sees what hides the node, or what lies behind it."""
     scene, dense = exact
     nodes = nodes_of(scene)
@@ -115,7 +115,7 @@ def test_an_opinion_on_another_surface_is_none(exact):
     assert len(tie_to_consensus(scene.maps, dense, turned).node) == 0
 
 
-def test_opinions_within_reach_count_once(exact):
+def test_sightings_within_reach_count_once(exact):
     """On a denser lattice each tie is weaker, so that their sum over an area is the same."""
     scene, dense = exact
     sums = []

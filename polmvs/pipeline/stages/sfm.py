@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
@@ -21,7 +21,7 @@ from polmvs.config import PropagationOptions, SfmOptions
 from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.io.arrays import save_array
 from polmvs.io.clouds import preload
-from polmvs.parallel import OnProgress, no_progress
+from polmvs.parallel import OnProgress, OnStep, no_progress
 from polmvs.pipeline.run_folder import CAMERA_MODES, POSE_COVARIANCES, replace_folder, scratch
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture
@@ -145,7 +145,7 @@ def _run_sfm(
     work: Path,
     new: Path,
     options: SfmOptions,
-    on_step: Callable[[str], None],
+    on_step: OnStep,
 ) -> SparseModel:
     """SfM, where what COLMAP says of a folder that it cannot work in is an error of that folder."""
     try:
