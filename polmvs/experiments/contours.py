@@ -319,7 +319,7 @@ def step_with_normals(
     ----------
     maps : of the view of the paths, and of the second view.
     range_maps : of the same views, by which occluded rows are told; see
-        :func:`polmvs.polarization.phase_map.gather_rows`.
+        :func:`polmvs.normals.rows.gather_rows`.
     paths : nodes of each curve ordered by their arc, seeds at arc 0; ``curve`` counts in seeds.
     seed_range : (S,), distance of each seed from the camera centre.
 

@@ -337,9 +337,9 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             command=COMPARE,
             reads=(
                 HERE.sparse,
-                HERE.maps(ppa),
                 HERE.seeds,
-                *(HERE.maps(model) for model in compared),
+                # PPA's once: OPA's are the same, and all are measured with them.
+                *dict.fromkeys(HERE.maps(model) for model in (ppa, *compared)),
                 *(HERE.sparse_cloud(model) for model in compared),
                 *(HERE.cloud(model) for model in compared),
                 *(HERE.views(model) for model in compared),

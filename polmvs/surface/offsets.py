@@ -74,7 +74,7 @@ class OffsetTolerances:
     max_cells : of a grid. Memory and time: one solution takes 7 us a cell.
     smoothing_px : of the intensity before its steps are measured.
     dark : intensity by which a mark must at least be brighter, full scales, and least step of noise
-        per cell: one count of 8 bits; synthetic images have less.
+        per cell. Derived: one count of 8 bits; synthetic images have less. Not varied.
     view_share : share of the views that see a place, which must show a line there. A wall of a
         convex part is seen by about half of the views around it. Guess: half of these.
     line_steps : of noise, from which a step hampers the walk. Guess.

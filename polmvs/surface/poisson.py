@@ -73,7 +73,7 @@ def poisson_mesh(
     ----------
     cloud : with normals that point away from the surface; if it has a scalar ``kind``, only
         points of the given kinds count. Points and normals that are not finite do not.
-    kinds : of points to use, see :class:`polmvs.surface.surroundings.PointKind`.
+    kinds : of points to use, see :class:`polmvs.scene.PointKind`.
     source : where the cloud came from, for messages.
     tolerances : of this step.
 

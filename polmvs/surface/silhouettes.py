@@ -37,7 +37,8 @@ class SilhouetteTolerances:
     near_px : reach of the continuation in pixels that resemble the region a little. Measured with
         the next two on an analytic vase: both factors of two within 0.07 points of F at 1 mm.
     far_px : reach in pixels that resemble it much: the inside of a mug is 60 px across.
-    object_quantile : share of the region's pixels whose intensity stands for it.
+    object_quantile : share of the region's pixels whose intensity stands for it. Guess; measured
+        with the two before.
     cut_rounds : of the graph cut; a fourth changes under 0.5 % of the pixels (mug).
     edge_reach_px : of the search for a step of intensity about an outline. The region's Stokes
         images are smoothed over 2 px, so that strong polarisation leaks by about as much.

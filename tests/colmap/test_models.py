@@ -5,6 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,12 @@ import pycolmap
 import pytest
 
 from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.colmap.cameras import ColmapCamera, camera_from_colmap, camera_to_colmap
+from polmvs.colmap.cameras import (
+    ColmapCamera,
+    camera_from_colmap,
+    camera_to_colmap,
+    quiet_colmap,
+)
 from polmvs.colmap.models import (
     find_model,
     match_model_to_capture,
@@ -398,3 +404,12 @@ def test_importing_leaves_colmaps_log_as_it_was():
         [sys.executable, "-c", "import zlib\n" + code], capture_output=True, text=True, check=False
     )
     assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_an_interrupt_leaves_colmaps_log_as_the_user_has_it(level, monkeypatch):
+    monkeypatch.setattr(pycolmap.logging, "minloglevel", level)
+    with suppress(KeyboardInterrupt), quiet_colmap():
+        assert pycolmap.logging.minloglevel == 3
+        raise KeyboardInterrupt
+    assert pycolmap.logging.minloglevel == level

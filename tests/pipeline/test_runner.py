@@ -27,7 +27,7 @@ from polmvs.errors import DataError, OptionError
 from polmvs.io.clouds import read_cloud
 from polmvs.normals.tracks import select_seeds
 from polmvs.parallel import Workers
-from polmvs.pipeline.jobs import compare, reconstruct
+from polmvs.pipeline.jobs import compare
 from polmvs.pipeline.record import Record, read_record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import Job, NoMonitor, Run, prepare_output
@@ -461,21 +461,6 @@ def watch(options, group: str, monitor: Snapshots, monkeypatch: pytest.MonkeyPat
         return object.__getattribute__(self, name)
 
     monkeypatch.setattr(type(options), "__getattribute__", read, raising=False)
-
-
-def test_library_leaves_colmaps_log_as_it_was(tmp_path: Path, capfd) -> None:
-    import pycolmap
-
-    from polmvs.colmap.cameras import quiet_colmap
-
-    before = pycolmap.logging.minloglevel
-    with suppress(KeyboardInterrupt), quiet_colmap():
-        assert pycolmap.logging.minloglevel == 3
-        raise KeyboardInterrupt
-    assert pycolmap.logging.minloglevel == before
-    with pytest.raises(DataError):
-        reconstruct(Job(capture=tmp_path / "none", out=tmp_path / "out"))
-    assert pycolmap.logging.minloglevel == before
 
 
 def test_results_in_the_record_are_those_of_the_job(demo_run: Path) -> None:

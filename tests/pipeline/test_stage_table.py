@@ -65,6 +65,8 @@ def test_names_results_and_files_are_each_of_one_stage() -> None:
     assert len(set(written)) == len(written)
     for path in written:  # nor does one write into a folder of another
         assert not any(other in path.parents for other in written)
+    for spec in table:
+        assert len(set(spec.reads)) == len(spec.reads), spec.name
 
 
 def test_everything_that_is_read_is_written_by_a_stage_before() -> None:
