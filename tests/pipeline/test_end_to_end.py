@@ -64,7 +64,7 @@ def test_run_record(demo_run: Path) -> None:
     assert record["options"]["sfm"]["intrinsics"][0] == pytest.approx(333.75)
     assert record["options"]["fusion"]["min_views"] == 2
     assert {"python", "numpy", "pycolmap", "open3d", "polmvs"} <= set(record["versions"])
-    assert record["schema_version"] == 6
+    assert record["schema_version"] == SCHEMA_VERSION
     poses = result_of(demo_run, "poses")
     assert (poses["num_views"], poses["unregistered"]) == (10, [])
     assert record["command_line"][:2] == ["polmvs", "demo"]

@@ -11,6 +11,7 @@ from polmvs.errors import DataError, OptionError
 from polmvs.io.typed_json import write_json
 from polmvs.pipeline import checks
 from polmvs.pipeline.record import (
+    SCHEMA_VERSION,
     Record,
     StageRecord,
     read_options,
@@ -80,7 +81,15 @@ def test_record_survives_writing_and_reading(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "{}", '{"stages": 3}', '{"schema_version": 6, "stages": []}', "\0"]
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"stages": 3}',
+        f'{{"schema_version": {SCHEMA_VERSION}, "stages": []}}',
+        "\0",
+    ],
 )
 def test_damaged_record_is_one_clear_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
@@ -103,16 +112,16 @@ def test_run_of_the_version_before_is_refused_by_name_and_version(tmp_path: Path
     run_folder.run_file.write_text(json.dumps(content))
     message = (
         rf"{tmp_path}: holds a run of polmvs 0\.1\.0, whose run\.json has schema version 1; this "
-        r"is polmvs .*, which reads version 6 .*Give another OUT, or begin anew there: .*with "
+        r"is polmvs .*, which reads version \d+ .*Give another OUT, or begin anew there: .*with "
         r"`run\.overwrite` delete that run"
     )
     with pytest.raises(DataError, match=message):
         prepare_output(run_folder, overwrite=False, resume=True)
     with pytest.raises(DataError, match=message):
         read_options(run_folder)
-    content["schema_version"] = 7
+    content["schema_version"] = SCHEMA_VERSION + 1
     run_folder.run_file.write_text(json.dumps(content))
-    with pytest.raises(DataError, match="has schema version 7"):
+    with pytest.raises(DataError, match=f"has schema version {SCHEMA_VERSION + 1}"):
         load_record(run_folder)
     assert prepare_output(run_folder, overwrite=True, resume=False) == Record()
     assert list(tmp_path.iterdir()) == []
