@@ -322,7 +322,8 @@ def use_author_truth(folder: Path) -> None:
 def write_run(folder: Path) -> None:
     stage = {
         "name": "images", "angle_model": None, "reads": [], "wrote": {"images": 1},
-        "options": {"capture.gamma": 1.0}, "inputs": {"region.mask": "0123"}, "is_lost": False, "seconds": 1.0, "cpu_s": 1.5,
+        "options": {"capture.gamma": 1.0}, "inputs": {"region.mask": "0123"}, "is_lost": False,
+        "seconds": 1.0, "cpu_s": 1.5,
         "peak_rss_mb": 2.0, "warnings": [], "result": {"num_images": 1},
     }  # fmt: skip
     record = to_plain(Record(images=("a.png",), options=to_plain(Options())))

@@ -17,6 +17,7 @@ from helpers import content_of, cut_after, record_of, result_of, stages_of
 from polmvs.colmap.models import read_model
 from polmvs.config import COMPARED_MODELS, PropagationOptions
 from polmvs.io.clouds import read_cloud
+from polmvs.pipeline.record import SCHEMA_VERSION
 from polmvs.scene import PointKind
 
 BEFORE_CLOUDS = [
