@@ -1,22 +1,28 @@
 """The same scene at half, full and double resolution has the same shape."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import phase_map_of
+from scipy.spatial import cKDTree
 
 from polmvs.camera import PinholeCamera
 from polmvs.config import AngleModel, PropagationOptions
 from polmvs.scene import Seeds
+from polmvs.surface.global_surface import Undetermined, reconstruct_surface
 from polmvs.surface.integration import integrate
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Sphere
 
 SCALES = (1, 2, 4)  # 306x256, 612x512, 1224x1024
 BALL = Sphere(center=np.zeros(3), radius=0.16)
+DISTANCE = 0.6  # of cameras around it, which it is 51, 101 and 203 px in radius for
+NOISE = 1e-3 / np.sqrt(2)  # of intensities, full scales: 1e-3 of s1 and s2, as the maps state
 
 
-def maps_at(scale):
-    camera = PinholeCamera(
+def camera_at(scale):
+    return PinholeCamera(
         width=306 * scale,
         height=256 * scale,
         fx=190.0 * scale,
@@ -24,7 +30,12 @@ def maps_at(scale):
         cx=153.0 * scale,
         cy=128.0 * scale,
     )
-    views = ring_of_views(4, camera, target=np.zeros(3), distance=0.6, elevation_deg=65)
+
+
+def maps_at(scale):
+    views = ring_of_views(
+        4, camera_at(scale), target=np.zeros(3), distance=DISTANCE, elevation_deg=65
+    )
     return [phase_map_of(render_view(v, BALL, s0=0.2, background=0.6)) for v in views]
 
 
@@ -65,3 +76,65 @@ def test_resolution_does_not_change_the_shape(dense, scale):
     assert (np.concatenate(normalized) < 1).mean() > 0.68
     assert (np.concatenate(normalized) < 2).mean() > 0.95
     assert np.median(np.concatenate(turns)) < 0.1
+
+
+def noisy_maps_around(scale):
+    """Maps with a sensor's noise of eight views around the ball, at two heights."""
+    views = [
+        *ring_of_views(8, camera_at(scale), distance=DISTANCE, elevation_deg=15)[::2],
+        *ring_of_views(8, camera_at(scale), distance=DISTANCE, elevation_deg=50)[1::2],
+    ]
+    rng, maps = np.random.default_rng(0), []
+    for view in views:
+        exact = render_view(view, BALL, s0=0.2, background=0.6)
+        noise = NOISE * rng.standard_normal(exact.intensities.shape)
+        maps.append(phase_map_of(replace(exact, intensities=exact.intensities + noise)))
+    return maps
+
+
+@pytest.fixture(scope="module")
+def surfaces():
+    """The surface of all views at the three resolutions."""
+    none = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    found = {}
+    for scale in SCALES:
+        found[scale] = reconstruct_surface(
+            AngleModel.PPA, noisy_maps_around(scale), none, np.zeros((0, 3))
+        )
+        assert not isinstance(found[scale], Undetermined)
+    return found
+
+
+def errors(surface):
+    """Distance from the ball (N,), its stated deviation, and direction (N, 3) of known vertices."""
+    used = np.zeros(len(surface.mesh.vertices), bool)
+    used[surface.mesh.faces[surface.supported]] = True
+    used &= np.isfinite(surface.sigma)
+    radii = np.linalg.norm(surface.mesh.vertices[used], axis=1)
+    directions = surface.mesh.vertices[used] / radii[:, None]
+    return radii - BALL.radius, surface.sigma[used], directions
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_the_surface_of_all_views_is_the_balls(surfaces, scale):
+    """Two deviations hold 95 % of errors where they are those of noise."""
+    surface = surfaces[scale]
+    error, sigma, _ = errors(surface)
+    area = surface.mesh.face_areas[surface.supported].sum()
+    assert area > 0.6 * 4 * np.pi * BALL.radius**2  # no view looks up at it
+    assert (np.abs(error) < 2 * sigma).mean() > 0.95
+    # Nearly all of it is the bias of outlines, of a tenth of a pixel, which all vertices share.
+    assert 0.1 < np.median(sigma) / surface.footprint < 0.2
+
+
+@pytest.mark.parametrize("scale", [1, 4])
+def test_resolution_does_not_change_the_surface_of_all_views(surfaces, scale):
+    """By more than two deviations of the difference, 95 % of it, in the same directions."""
+    error, sigma, directions = errors(surfaces[scale])
+    error_there, sigma_there, others = errors(surfaces[2])
+    apart, nearest = cKDTree(others).query(directions)
+    met = apart < 0.1  # rad; edges of the coarsest mesh are 0.04
+    assert met.mean() > 0.95
+    difference = np.abs(error - error_there[nearest])[met]
+    sigma = np.hypot(sigma, sigma_there[nearest])[met]
+    assert (difference < 2 * sigma).mean() > 0.95
