@@ -15,6 +15,7 @@ import dataclasses
 import functools
 import math
 import os
+import re
 import sys
 import types
 import typing
@@ -259,19 +260,16 @@ class OptionGroup:
         cls.in_files = in_files
 
     def __post_init__(self) -> None:
-        """Check the values; text that names an enum's member or a path is taken as such.
+        """Check the values, which become of their fields' types as :func:`convert_value` does it.
 
         Raises
         ------
         OptionError
-            A value is out of its range, or contradicts another one.
+            A value is of the wrong type, out of its range, or contradicts another one.
         """
         for info in describe_fields(type(self)):
-            value = getattr(self, info.name)
-            if value is None:
-                continue
-            if isinstance(info.kind, type) and not isinstance(value, info.kind):
-                object.__setattr__(self, info.name, self._coerced(info, value))
+            value = convert_value(info, getattr(self, info.name))
+            object.__setattr__(self, info.name, value)
             for number in value if isinstance(value, tuple) else (value,):
                 if isinstance(number, int | float) and not isinstance(number, bool):
                     self.require(number in info.range, info.name, f"must {info.range}", value)
@@ -293,16 +291,6 @@ class OptionGroup:
         if not holds:
             given = f", not {show_value(value[0])}" if value else ""
             raise OptionError(f"{reason}{given}.", field=f"{self.group}.{name}")
-
-    def _coerced(self, info: FieldInfo, value: Any) -> Any:
-        """Text as the enum or path that a field is of; other values as they are."""
-        if issubclass(info.kind, Path) and isinstance(value, str):
-            return Path(value)
-        if issubclass(info.kind, StrEnum) and isinstance(value, str):
-            choices = [member.value for member in info.kind]
-            self.require(value in choices, info.name, f"must be one of {', '.join(choices)}", value)
-            return info.kind(value)
-        return value
 
 
 def default_num_workers() -> int:
@@ -631,6 +619,13 @@ class Options:
     export: ExportOptions = field(default_factory=ExportOptions)
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)
 
+    def __post_init__(self) -> None:
+        """Refuse, by OptionError, what is no group in its place."""
+        for name, cls in groups_of(type(self)).items():
+            group = getattr(self, name)
+            if not isinstance(group, cls):
+                raise OptionError(f"must be {cls.__name__}, not {group!r}.", field=name)
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(OptionGroup, group="run", in_files=False):
@@ -906,8 +901,9 @@ def from_plain(cls: type[T], values: Mapping[str, Any], source: str = "") -> T:
     Raises
     ------
     OptionError
-        A name is unknown, or a value is of the wrong type or out of range; the message names
-        source, table and key. It carries no ``field``: what is at fault is no flag.
+        A name is unknown, or a value is of the wrong type or out of range. Where there is a
+        source, the message names it, table and key, and carries no ``field``: what is at fault is
+        no flag.
     """
     converted = values_from_plain(cls, values, source)
     try:
@@ -924,32 +920,63 @@ def values_from_plain(cls: type, values: Mapping[str, Any], source: str = "") ->
     OptionError
         A name is unknown, or a value is of the wrong type.
     """
-    import msgspec
-
     infos = {info.name: info for info in describe_fields(cls)}
-    begin = _table(getattr(cls, "group", ""), source)
     converted = {}
     for name, value in values.items():
         if name not in infos:
+            begin = _table(getattr(cls, "group", ""), source)
             raise OptionError(f"{begin} has an unknown key {name!r}{_near(name, infos)}")
-        info = infos[name]
-        # JSON has null for None, TOML leaves the key out.
-        if value is None and info.default is None:
-            continue
         try:
-            converted[name] = msgspec.convert(value, info.kind, dec_hook=_decode)
-        except msgspec.ValidationError as error:
-            expected = str(error).partition(" - at ")[0].replace("`", "")
-            raise OptionError(f"{begin} {name} cannot be {value!r}: {expected}.") from error
+            converted[name] = convert_value(infos[name], value)
+        except OptionError as error:
+            raise in_table(error, source) from error
     return converted
 
 
+def convert_value(info: FieldInfo, value: Any) -> Any:
+    """A value in the type of its field; its range is not checked.
+
+    Text that names an enum's member or a path becomes that, a list a tuple, an integer a float
+    where one must be, and NumPy's numbers and arrays become Python's. Nothing is rounded.
+
+    Raises
+    ------
+    OptionError
+        The value is of another type.
+    """
+    import msgspec
+
+    if value is None:
+        if info.default is not None:
+            raise OptionError("cannot be none.", field=info.path)
+        return None
+    if isinstance(info.kind, type) and issubclass(info.kind, StrEnum):
+        if not isinstance(value, str) or value not in set(info.kind):
+            choices = ", ".join(info.kind)
+            raise OptionError(
+                f"must be one of {choices}, not {show_value(value)}.", field=info.path
+            )
+        return info.kind(value)
+    try:
+        return msgspec.convert(_as_python(value), info.kind, dec_hook=_decode)
+    except msgspec.ValidationError as error:
+        expected = str(error).partition(" - at ")[0].replace("`", "")
+        raise OptionError(f"cannot be {value!r}: {expected}.", field=info.path) from error
+
+
 def in_table(error: OptionError, source: str) -> OptionError:
-    """What is wrong with an option, as of a key in a table of a file, and not of a flag."""
-    if error.field is None:
+    """What is wrong with an option, as of a key in a table of a file, and not of a flag.
+
+    Parameters
+    ----------
+    error : of an option.
+    source : the file; where it is empty, the error stays as it is.
+    """
+    if error.field is None or not source:
         return error
     group, _, name = error.field.partition(".")
-    return OptionError(f"{_table(group, source)} {name} {error.reason}")
+    reason = re.sub(r"`(\w+)\.(\w+)`", r"[\1] \2", error.reason)
+    return OptionError(f"{_table(group, source)} {name} {reason}")
 
 
 def _table(group: str, source: str) -> str:
@@ -982,6 +1009,15 @@ def require_table(name: str, table: Any, known: Iterable[str], source: str) -> N
         raise OptionError(f"{begin}{what} {name!r}{_near(name, names)}")
     if not isinstance(table, Mapping):
         raise OptionError(f"{begin}{name!r} must be a table, [{name}].")
+
+
+def _as_python(value: Any) -> Any:
+    """Text for a path, and NumPy's numbers and arrays as Python's, in lists too."""
+    if isinstance(value, tuple | list):
+        return [_as_python(item) for item in value]
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _decode(kind: Any, value: Any) -> Any:

@@ -97,7 +97,7 @@ def test_errors_name_fields_and_not_flags(demo_capture: Path, tmp_path: Path) ->
         "`capture.gamma` must": lambda: polmvs.read_stokes(frame, gamma=0.0),
         "no option 'gama'; is it 'gamma'?": lambda: polmvs.read_stokes(frame, gama=2.0),
         "`capture.gamma` cannot be none": lambda: polmvs.read_stokes(frame, gamma=None),
-        "gamma cannot be '2'": lambda: polmvs.read_stokes(frame, gamma="2"),
+        "`capture.gamma` cannot be '2'": lambda: polmvs.read_stokes(frame, gamma="2"),
         "`model` must be one of opa, ppa, tilted, not 'best'": lambda: polmvs.reconstruct(
             demo_capture, tmp_path / "out", "best"
         ),

@@ -162,9 +162,8 @@ def _check_recording(call: Call) -> None:
 def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeline.Job:
     """The job; one that goes on takes the options of the run in OUT where none are given."""
     arguments, run_options = call.get(JobArguments), call.get(RunOptions)
-    recorded = None
+    recorded, run_folder = None, RunFolder(arguments.out)
     if run_options.resume or continues:
-        run_folder = RunFolder(arguments.out)
         recorded = read_options(run_folder)
         # A reference that failed gives way to the one that is given in its stead.
         named = any(option.startswith("reference.") for option in call.given)
@@ -173,7 +172,7 @@ def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> pipeli
     return pipeline.Job(
         capture=arguments.capture,
         out=arguments.out,
-        options=call.options(recorded),
+        options=call.options(recorded, str(run_folder.run_file)),
         run_options=run_options,
         monitor=terminal,
         command_line=call.command_line,

@@ -119,7 +119,7 @@ def test_mask_and_polygon_say_where(cli, mosaic, tmp_path) -> None:
         (["--polygon", "1,1", "3,1", "3,3"], 1, "only 3 pixels have a DoLP"),
         (["--polygon", "1,1", "3,1", "3,3", "--mask", "m"], 2, "--polygon and --mask exclude"),
         (["--mask", "nowhere.png"], 1, "no such file"),
-        (["--pattern", "0,45,90"], 2, "--pattern needs each of 0, 45, 90, 135"),
+        (["--pattern", "0,45,90"], 2, "--pattern: '0,45,90' is no INT,INT,INT,INT"),
         (["--pattern", "0,45.5,90,135"], 2, "--pattern: '0,45.5,90,135' cannot be read as INT"),
         (["--gamma", "0"], 2, "--gamma must lie in 0.1 to 10, not 0"),
         (["--min-dolp", "1.5"], 2, "--min-dolp must lie in 0 to 1"),
