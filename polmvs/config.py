@@ -459,8 +459,10 @@ class NormalOptions(OptionGroup, group="normals"):
     window_px: int = option(17, "side of the window of rows about a track's point, px", least=1)
     tilt_aware_weights: bool = option(
         True,
-        "rows of oblique rays count less, by what the model leaves out: OPA the perspective, OPA "
-        "and PPA a tilt of the polarizers; without it the models are pure",
+        "what OPA and PPA leave out is made up for: their rows count less the further a tilt of the "
+        "polarizers would turn the phases, OPA's also the further perspective turns them, and the "
+        "surface of all views takes back the share of that turn which its phases show; without it "
+        "the models are pure",
     )
 
     def check(self) -> None:
