@@ -6,7 +6,7 @@ the range). An option is named by its path ``group.field`` such as ``propagation
 messages between backquotes; only the command line knows flags.
 
 This module is light, so that ``--help`` is: it imports neither NumPy nor anything of this package
-but the errors, and msgspec, which converts TOML and JSON, when it is needed.
+but the errors, and msgspec, which checks and converts values, when it is needed.
 """
 
 from __future__ import annotations
@@ -946,8 +946,8 @@ def convert_value(info: FieldInfo, value: Any) -> Any:
     OptionError
         The value is of another type.
     """
-    import msgspec
-
+    if type(value) is info.kind:
+        return value
     if value is None:
         if info.default is not None:
             raise OptionError("cannot be none.", field=info.path)
@@ -955,6 +955,8 @@ def convert_value(info: FieldInfo, value: Any) -> Any:
     if isinstance(info.kind, type) and issubclass(info.kind, StrEnum):
         if not isinstance(value, str) or value not in set(info.kind):
             choices = ", ".join(info.kind)
+    import msgspec  # not for --help, nor for a 'polmvs doctor' that says it is missing
+
             raise OptionError(
                 f"must be one of {choices}, not {show_value(value)}.", field=info.path
             )
