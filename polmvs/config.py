@@ -173,7 +173,6 @@ def option(
     above: float | None = None,
     below: float | None = None,
     metavar: str | tuple[str, ...] | None = None,
-    flag: str | None = None,
 ) -> Any:
     """A field of a group of options.
 
@@ -184,7 +183,6 @@ def option(
     positional : on the command line it is an argument and has no flag.
     least, most, above, below : the range of a number, its ends included or not.
     metavar : name of the value in the help; several for a mixed tuple.
-    flag : on the command line, where it is not that of the field's name.
     """
     return field(
         default=default,
@@ -192,7 +190,6 @@ def option(
             "help": help_text,
             "range": Range(least=least, most=most, above=above, below=below),
             "metavar": metavar,
-            "flag": flag,
             "positional": positional,
         },
     )
@@ -660,10 +657,9 @@ class RunOptions(OptionGroup, group="run", in_files=False):
 class PlaneOptions(OptionGroup, group="plane"):
     """Which pixels count as a plane, and how its normal is solved."""
 
-    angle_model: AngleModel = option(
+    model: AngleModel = option(
         AngleModel.PPA,
         "angle and normal; 'tilted' presumes a lens not telecentric on the image side",
-        flag="--model",
     )
     light: Light = option(Light.SPECULAR, "reflection that dominates the polarisation")
     estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
@@ -706,8 +702,8 @@ class PlaneOptions(OptionGroup, group="plane"):
             self.require(
                 len(self.polygon) >= 3, "polygon", "needs three corners or more", self.polygon
             )
-        apart = not self.find_planes or self.angle_model is not AngleModel.OPA
-        reason = "needs `plane.angle_model` ppa or tilted: under OPA planes are lines"
+        apart = not self.find_planes or self.model is not AngleModel.OPA
+        reason = "needs `plane.model` ppa or tilted: under OPA planes are lines"
         self.require(apart, "find_planes", reason)
 
 
@@ -804,7 +800,7 @@ def _described(cls: Any) -> tuple[FieldInfo, ...]:
             help_text=f.metadata.get("help", ""),
             range=f.metadata.get("range", Range()),
             metavar=f.metadata.get("metavar"),
-            flag=f.metadata.get("flag") or "--" + f.name.replace("_", "-"),
+            flag="--" + f.name.replace("_", "-"),
             positional=f.metadata.get("positional", False),
         )
         for f in fields(cls)
@@ -955,12 +951,12 @@ def convert_value(info: FieldInfo, value: Any) -> Any:
     if isinstance(info.kind, type) and issubclass(info.kind, StrEnum):
         if not isinstance(value, str) or value not in set(info.kind):
             choices = ", ".join(info.kind)
-    import msgspec  # not for --help, nor for a 'polmvs doctor' that says it is missing
-
             raise OptionError(
                 f"must be one of {choices}, not {show_value(value)}.", field=info.path
             )
         return info.kind(value)
+    import msgspec  # not for --help, nor for a 'polmvs doctor' that says it is missing
+
     try:
         return msgspec.convert(_as_python(value), info.kind, dec_hook=_decode)
     except msgspec.ValidationError as error:

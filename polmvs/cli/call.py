@@ -49,7 +49,7 @@ class RecordingOptions(OptionGroup, group="recording", in_files=False):
 class TerminalOptions(OptionGroup, group="terminal", in_files=False):
     """What is shown."""
 
-    verbose: bool = option(False, "show every step", flag="--verbose")
+    verbose: bool = option(False, "show every step")
     quiet: bool = option(False, "show errors and the result only: no progress, no warnings")
     json: bool = option(False, "print the result as JSON; nothing else but errors is shown")
 

@@ -63,7 +63,7 @@ def demo(call: Call, terminal: Terminal) -> int:
 def reconstruct(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs reconstruct``."""
     _check_recording(call)
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     outcome = pipeline.reconstruct(job_of(call, terminal), model)
     return _show_cloud(_reported(outcome, call, terminal), model, terminal)
 
@@ -71,7 +71,7 @@ def reconstruct(call: Call, terminal: Terminal) -> int:
 def compare(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs compare``."""
     _check_recording(call)
-    models = call.get(ComparedModels).angle_models
+    models = call.get(ComparedModels).models
     outcome = pipeline.compare(job_of(call, terminal), models)
     return _show_comparison(_reported(outcome, call, terminal), terminal)
 
@@ -89,7 +89,7 @@ def sfm(call: Call, terminal: Terminal) -> int:
 
 def normals(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs normals``."""
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     outcome = pipeline.solve_normals(job_of(call, terminal, continues=True), (model,))
     found, seeds = outcome.result(NormalsResult, model), outcome.result(SeedsResult)
     text = (
@@ -102,14 +102,14 @@ def normals(call: Call, terminal: Terminal) -> int:
 
 def densify(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs densify``."""
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     outcome = pipeline.densify(job_of(call, terminal, continues=True), (model,))
     return _show_cloud(outcome, model, terminal)
 
 
 def export(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs export``."""
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     outcome = pipeline.export(job_of(call, terminal, continues=True), model)
     return _show_cloud(outcome, model, terminal)
 
@@ -117,7 +117,7 @@ def export(call: Call, terminal: Terminal) -> int:
 def batch(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs batch``."""
     arguments = call.get(BatchArguments)
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     entries = read_batch(arguments.list_file, call.options(), model)
     with terminal.stage("captures", len(entries)) as progress:
 

@@ -155,7 +155,7 @@ def test_defaults_are_those_of_the_options() -> None:
     given = call("compare", "capture", "out")
     assert given.options() == Options()
     assert given.get(RunOptions) == RunOptions()
-    assert given.get(ComparedModels).angle_models == COMPARED_MODELS
+    assert given.get(ComparedModels).models == COMPARED_MODELS
     assert COMPARED_MODELS[:2] == (AngleModel.OPA, AngleModel.PPA)
 
 
@@ -280,5 +280,5 @@ def test_usage_error_names_program_and_command() -> None:
 
 
 def test_messages_name_flags_where_the_library_names_options() -> None:
-    text = "Give `run.overwrite` or `fusion.workspace`; not `a.b` nor `plane.angle_model`."
+    text = "Give `run.overwrite` or `fusion.workspace`; not `a.b` nor `plane.model`."
     assert in_flags(text) == "Give --overwrite or --workspace; not a.b nor --model."

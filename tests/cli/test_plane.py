@@ -66,7 +66,7 @@ def test_normal_and_residuals(cli, mosaic) -> None:
 
 def test_the_command_prints_what_the_library_gives(cli, mosaic) -> None:
     options = PlaneOptions(
-        angle_model=AngleModel.TILTED,
+        model=AngleModel.TILTED,
         estimator=Estimator.ALGEBRAIC,
         intrinsics=(110.0, 110.0, 80.0, 60.0),
     )
@@ -78,7 +78,7 @@ def test_the_command_prints_what_the_library_gives(cli, mosaic) -> None:
 def test_options_from_a_file(cli, mosaic, tmp_path) -> None:
     config = tmp_path / "plane.toml"
     config.write_text(
-        "[plane]\nangle_model = 'tilted'\nintrinsics = [110, 110, 80, 60]\n[capture]\ngamma = 1\n"
+        "[plane]\nmodel = 'tilted'\nintrinsics = [110, 110, 80, 60]\n[capture]\ngamma = 1\n"
     )
     flags = ("--model", "tilted", INTRINSICS)
     assert plane(cli, mosaic[0], "--config", config) == plane(cli, mosaic[0], *flags)
