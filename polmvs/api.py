@@ -519,7 +519,7 @@ def reconstruct(
 def compare(
     capture: PathArg,
     out: PathArg,
-    models: Sequence[AngleModel | str] = COMPARED_MODELS,
+    models: AngleModel | str | Sequence[AngleModel | str] = COMPARED_MODELS,
     *,
     options: Options | None = None,
     overwrite: bool = False,
@@ -544,9 +544,10 @@ def compare(
     """
     from polmvs.pipeline import jobs
 
-    if not models:
+    given = (models,) if isinstance(models, str) else models
+    chosen = tuple(dict.fromkeys(_choice(AngleModel, model, "models") for model in given))
+    if not chosen:
         raise OptionError("needs one angle model or more.", field="models")
-    chosen = tuple(dict.fromkeys(_choice(AngleModel, model, "models") for model in models))
     job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
     with _lost_workers_told(job.run_options.workers):
         outcome = jobs.compare(job, chosen)

@@ -19,7 +19,7 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -267,9 +267,8 @@ class OptionGroup:
         for info in describe_fields(type(self)):
             value = convert_value(info, getattr(self, info.name))
             object.__setattr__(self, info.name, value)
-            for number in value if isinstance(value, tuple) else (value,):
-                if isinstance(number, int | float) and not isinstance(number, bool):
-                    self.require(number in info.range, info.name, f"must {info.range}", value)
+            for number in _numbers(value):
+                self.require(number in info.range, info.name, f"must {info.range}", value)
         self.check()
 
     def check(self) -> None:
@@ -288,6 +287,15 @@ class OptionGroup:
         if not holds:
             given = f", not {show_value(value[0])}" if value else ""
             raise OptionError(f"{reason}{given}.", field=f"{self.group}.{name}")
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """A value that is a number, or those in a tuple."""
+    if isinstance(value, tuple):
+        for item in value:
+            yield from _numbers(item)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield value
 
 
 def default_num_workers() -> int:
@@ -456,10 +464,10 @@ class NormalOptions(OptionGroup, group="normals"):
     window_px: int = option(17, "side of the window of rows about a track's point, px", least=1)
     tilt_aware_weights: bool = option(
         True,
-        "what OPA and PPA leave out is made up for: their rows count less the further a tilt of the "
-        "polarizers would turn the phases, OPA's also the further perspective turns them, and the "
-        "surface of all views takes back the share of that turn which its phases show; without it "
-        "the models are pure",
+        "what OPA and PPA leave out is made up for: their rows count less the further a tilt of "
+        "the polarizers would turn the phases, OPA's also the further perspective turns them, and "
+        "the surface of all views takes back the share of the tilt that its phases show; without "
+        "it the models are pure",
     )
 
     def check(self) -> None:

@@ -117,6 +117,9 @@ def test_errors_name_fields_and_not_flags(demo_capture: Path, tmp_path: Path) ->
         "`models` needs one angle model or more": lambda: polmvs.compare(
             demo_capture, tmp_path / "out", models=()
         ),
+        "`models` must be one of opa, ppa, tilted, not 'best'": lambda: polmvs.compare(
+            demo_capture, tmp_path / "out", models="best"
+        ),
         "`run.workers` cannot be 1.5": lambda: polmvs.track_normals(
             demo_capture, tmp_path, workers=1.5
         ),

@@ -118,6 +118,7 @@ def test_mask_and_polygon_say_where(cli, mosaic, tmp_path) -> None:
         (["--polygon", "1,1", "5", "3,3"], 2, "--polygon: '5' is no NUMBER,NUMBER"),
         (["--polygon", "1,1", "3,1", "3,3"], 1, "only 3 pixels have a DoLP"),
         (["--polygon", "1,1", "3,1", "3,3", "--mask", "m"], 2, "--polygon and --mask exclude"),
+        (["--polygon", "nan,1", "3,1", "3,3"], 2, "--polygon must be a finite number, not nan,1"),
         (["--mask", "nowhere.png"], 1, "no such file"),
         (["--pattern", "0,45,90"], 2, "--pattern: '0,45,90' is no INT,INT,INT,INT"),
         (["--pattern", "0,45.5,90,135"], 2, "--pattern: '0,45.5,90,135' cannot be read as INT"),
