@@ -22,7 +22,7 @@ from polmvs.pipeline.stages.densify import DensifyResult
 
 
 def _reconstruct(call: Call, terminal: Terminal) -> int:
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     outcome = reconstruct(job_of(call, terminal), model)
     cloud = outcome.run_folder.cloud(model)
     print(outcome.empty or f"{cloud}: {outcome.record.result(DensifyResult, model)}")

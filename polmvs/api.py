@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
@@ -33,11 +34,10 @@ from polmvs.config import (
     describe_fields,
     groups_of,
     options_from_plain,
-    to_plain,
-    values_from_plain,
 )
 from polmvs.errors import DataError, OptionError
 from polmvs.io.clouds import Cloud, mesh_to_open3d, read_cloud, read_mesh, to_open3d
+from polmvs.scene import find_name
 
 if TYPE_CHECKING:  # heavy
     import open3d
@@ -57,6 +57,7 @@ PathArg = str | PathLike[str]
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+T = TypeVar("T")
 Group = TypeVar("Group", bound=OptionGroup)
 
 logger = logging.getLogger(__name__)
@@ -88,7 +89,7 @@ def read_stokes(path: PathArg, *, options: CaptureOptions | None = None, **chang
     """
     from polmvs.normals.single_view.pixels import load_stokes
 
-    return load_stokes(Path(path), _changed(options or CaptureOptions(), changes))
+    return load_stokes(Path(path), _changed(_given(CaptureOptions, options), changes))
 
 
 def plane_normal(
@@ -130,13 +131,13 @@ def plane_normal(
     from polmvs.normals.single_view.measurement import select_pixels
     from polmvs.normals.single_view.pixels import PlaneView
 
-    given = {"angle_model": model, "light": light, "estimator": estimator}
+    given = {"model": model, "light": light, "estimator": estimator}
     options = _changed(PlaneOptions(), given | changes)
     inside = None if mask is None else np.asarray(mask, np.bool_)
     used = select_pixels(stokes, options, "these Stokes images", inside)
     view = PlaneView(stokes=stokes, mask=used, light=options.light)
     robust = options.estimator is Estimator.ROBUST
-    return view.plane(options.angle_model, _camera(stokes, camera), robust=robust)
+    return view.plane(options.model, _camera(stokes, camera), robust=robust)
 
 
 def _camera(stokes: Stokes, given: Camera | Sequence[float]) -> Camera:
@@ -199,7 +200,7 @@ def track_normals(
     *,
     model: AngleModel | str = AngleModel.PPA,
     options: Options | None = None,
-    workers: int = 1,
+    workers: int | None = 1,
     **changes: Any,
 ) -> TrackNormals:
     """Normals of the sparse points of a COLMAP model, from the phases of all views.
@@ -210,7 +211,7 @@ def track_normals(
     sparse : folder of a COLMAP model of the same images, or the model itself.
     model : angle model.
     options : of all stages; ``capture``, ``region`` and ``normals`` count. Defaults where None.
-    workers : processes.
+    workers : processes, as in :func:`reconstruct`.
     **changes : single options by name, such as ``min_dolp=0.2``.
 
     Raises
@@ -225,10 +226,14 @@ def track_normals(
     from polmvs.polarization.capture import open_capture
 
     angle_model = _angle_model(model, "model")
-    options = change_options(options, changes)
+    options, num = change_options(options, changes), _run_options(workers).workers
     opened = open_capture(capture, options.capture)
     fitted = _fitted(opened, sparse)
-    with tempfile.TemporaryDirectory(prefix="polmvs-") as scratch, Workers(workers) as pool:
+    with (
+        tempfile.TemporaryDirectory(prefix="polmvs-") as scratch,
+        _lost_workers_told(num),
+        Workers(num) as pool,
+    ):
         folder = Path(scratch)
         write_model(fitted, folder / "sparse")
         maps = folder / "maps"
@@ -350,12 +355,12 @@ class Reconstruction:
 
         Parameters
         ----------
-        name : of the view; without its suffix is enough.
+        name : of the view; without folder and suffix is enough where one view has that name.
 
         Raises
         ------
         KeyError
-            There is no such view.
+            There is no such view, or more than one.
         """
         depth, _ = self._maps(name)
         return np.where(depth > 0, depth, np.float32(np.nan))
@@ -365,12 +370,12 @@ class Reconstruction:
 
         Parameters
         ----------
-        name : of the view; without its suffix is enough.
+        name : of the view; without folder and suffix is enough where one view has that name.
 
         Raises
         ------
         KeyError
-            There is no such view.
+            There is no such view, or more than one.
         """
         depth, normals = self._maps(name)
         return np.where((depth > 0)[..., None], normals, np.float32(np.nan))
@@ -423,8 +428,7 @@ class Reconstruction:
         return maps.depth, maps.normals
 
     def _view(self, name: str) -> View:
-        stems = {Path(known).stem: known for known in self._views}
-        found = name if name in self._views else stems.get(Path(name).stem)
+        found = find_name(name, self._views)
         if found is None:
             raise KeyError(f"{name!r} is no view of {self.folder}; there are {list(self._views)}")
         return self._views[found]
@@ -477,7 +481,7 @@ def reconstruct(
     options: Options | None = None,
     overwrite: bool = False,
     resume: bool = False,
-    workers: int | None = None,
+    workers: int | None = 1,
     scheduler: str | None = None,
     monitor: Monitor | None = None,
     **changes: Any,
@@ -491,8 +495,8 @@ def reconstruct(
     model : angle model.
     options : of all stages; defaults where None.
     overwrite, resume : delete an earlier run in ``out`` first, or go on with it.
-    workers : processes; one for each core where None. With more than one a script needs
-        ``if __name__ == "__main__":``.
+    workers : processes; one for each core where None. They run the script again, so that with
+        more than one it needs ``if __name__ == "__main__":``.
     scheduler : address of a Dask scheduler, whose workers do the per-view work instead.
     monitor : who follows the run, if anybody.
     **changes : single options by name, such as ``intrinsics=(fx, fy, cx, cy)``.
@@ -506,7 +510,8 @@ def reconstruct(
 
     angle_model = _angle_model(model, "model")
     job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
-    outcome = jobs.reconstruct(job, angle_model)
+    with _lost_workers_told(job.run_options.workers):
+        outcome = jobs.reconstruct(job, angle_model)
     _warn_if_empty(outcome.empty)
     return Reconstruction(folder=outcome.run_folder.root, angle_model=angle_model)
 
@@ -514,12 +519,12 @@ def reconstruct(
 def compare(
     capture: PathArg,
     out: PathArg,
-    models: Sequence[AngleModel | str] = COMPARED_MODELS,
+    models: AngleModel | str | Sequence[AngleModel | str] = COMPARED_MODELS,
     *,
     options: Options | None = None,
     overwrite: bool = False,
     resume: bool = False,
-    workers: int | None = None,
+    workers: int | None = 1,
     scheduler: str | None = None,
     monitor: Monitor | None = None,
     **changes: Any,
@@ -528,7 +533,7 @@ def compare(
 
     Parameters
     ----------
-    models : angle models.
+    models : angle models, one or more.
     capture, out, options, overwrite, resume, workers, scheduler, monitor, **changes : see
         :func:`reconstruct`; ``gt`` is the folder of the ground truth.
 
@@ -539,9 +544,13 @@ def compare(
     """
     from polmvs.pipeline import jobs
 
-    chosen = tuple(dict.fromkeys(_angle_model(model, "models") for model in models))
+    given = (models,) if isinstance(models, str) else models
+    chosen = tuple(dict.fromkeys(_angle_model(model, "models") for model in given))
+    if not chosen:
+        raise OptionError("needs one angle model or more.", field="models")
     job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
-    outcome = jobs.compare(job, chosen)
+    with _lost_workers_told(job.run_options.workers):
+        outcome = jobs.compare(job, chosen)
     _warn_if_empty(outcome.empty)
     return _run_result(outcome.run_folder.root, chosen)
 
@@ -593,16 +602,33 @@ def _job(
 
     if resume and options is None:  # those of the run, as the command line does
         options = options_from_plain(read_options(RunFolder(Path(out))), str(out))
-    run_options = RunOptions(overwrite=overwrite, resume=resume, scheduler=scheduler)
-    if workers is not None:
-        run_options = replace(run_options, workers=workers)
     return Job(
         capture=Path(capture),
         out=Path(out),
         options=change_options(options, changes),
-        run_options=run_options,
+        run_options=_run_options(workers, overwrite=overwrite, resume=resume, scheduler=scheduler),
         monitor=monitor,
     )
+
+
+def _run_options(workers: int | None, **given: Any) -> RunOptions:
+    """How a run is carried out, by one process for each core where ``workers`` is None."""
+    return RunOptions(**given) if workers is None else RunOptions(workers=workers, **given)
+
+
+@contextmanager
+def _lost_workers_told(num: int) -> Iterator[None]:
+    """What to do where ``num`` processes end before their work is done, as an OptionError."""
+    from concurrent.futures.process import BrokenProcessPool
+
+    try:
+        yield
+    except BrokenProcessPool as error:
+        raise OptionError(
+            f"is {num}, but the worker processes ended: memory ran out, or the script lacks "
+            "'if __name__ == \"__main__\":' before what it does. Give that, or 1.",
+            field="run.workers",
+        ) from error
 
 
 # Options by name
@@ -621,7 +647,7 @@ def change_options(options: Options | None, changes: Mapping[str, Any]) -> Optio
     OptionError
         A name is unknown, or a value is unusable.
     """
-    options = options or Options()
+    options = _given(Options, options)
     group_of = {
         info.name: group
         for group, cls in groups_of(Options).items()
@@ -636,19 +662,24 @@ def change_options(options: Options | None, changes: Mapping[str, Any]) -> Optio
     return replace(options, **changed)
 
 
+def _given(cls: type[T], options: T | None) -> T:
+    """Options that a caller gave, or the defaults; OptionError where they are something else."""
+    if options is not None and not isinstance(options, cls):
+        raise OptionError(
+            f"must be {cls.__name__}, not {type(options).__name__}; single options are given by "
+            "their names.",
+            field="options",
+        )
+    return cls() if options is None else options
+
+
 def _changed(group: Group, changes: Mapping[str, Any]) -> Group:
-    """A group of options with some of them changed, in the fields' types."""
-    infos = {info.name: info for info in describe_fields(type(group))}
-    for name, value in changes.items():
-        if name not in infos:
-            raise _unknown(name, infos)
-        if value is None and infos[name].default is not None:
-            raise OptionError("cannot be none.", field=infos[name].path)
-    given = {name: value for name, value in changes.items() if value is not None}
-    none = {name: None for name in changes if name not in given}
-    values = {name: getattr(group, name) for name in infos}
-    converted = values_from_plain(type(group), to_plain(given))
-    return type(group)(**{**values, **converted, **none})
+    """A group of options with some of them changed."""
+    known = [info.name for info in describe_fields(type(group))]
+    for name in changes:
+        if name not in known:
+            raise _unknown(name, known)
+    return type(group)(**{**vars(group), **changes})
 
 
 def _unknown(name: str, known: Iterable[str]) -> OptionError:

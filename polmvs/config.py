@@ -6,7 +6,7 @@ the range). An option is named by its path ``group.field`` such as ``propagation
 messages between backquotes; only the command line knows flags.
 
 This module is light, so that ``--help`` is: it imports neither NumPy nor anything of this package
-but the errors, and msgspec, which converts TOML and JSON, when it is needed.
+but the errors, and msgspec, which checks and converts values, when it is needed.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ import dataclasses
 import functools
 import math
 import os
+import re
 import sys
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -172,7 +173,6 @@ def option(
     above: float | None = None,
     below: float | None = None,
     metavar: str | tuple[str, ...] | None = None,
-    flag: str | None = None,
 ) -> Any:
     """A field of a group of options.
 
@@ -183,7 +183,6 @@ def option(
     positional : on the command line it is an argument and has no flag.
     least, most, above, below : the range of a number, its ends included or not.
     metavar : name of the value in the help; several for a mixed tuple.
-    flag : on the command line, where it is not that of the field's name.
     """
     return field(
         default=default,
@@ -191,7 +190,6 @@ def option(
             "help": help_text,
             "range": Range(least=least, most=most, above=above, below=below),
             "metavar": metavar,
-            "flag": flag,
             "positional": positional,
         },
     )
@@ -259,22 +257,18 @@ class OptionGroup:
         cls.in_files = in_files
 
     def __post_init__(self) -> None:
-        """Check the values; text that names an enum's member or a path is taken as such.
+        """Check the values, which become of their fields' types as :func:`convert_value` does it.
 
         Raises
         ------
         OptionError
-            A value is out of its range, or contradicts another one.
+            A value is of the wrong type, out of its range, or contradicts another one.
         """
         for info in describe_fields(type(self)):
-            value = getattr(self, info.name)
-            if value is None:
-                continue
-            if isinstance(info.kind, type) and not isinstance(value, info.kind):
-                object.__setattr__(self, info.name, self._coerced(info, value))
-            for number in value if isinstance(value, tuple) else (value,):
-                if isinstance(number, int | float) and not isinstance(number, bool):
-                    self.require(number in info.range, info.name, f"must {info.range}", value)
+            value = convert_value(info, getattr(self, info.name))
+            object.__setattr__(self, info.name, value)
+            for number in _numbers(value):
+                self.require(number in info.range, info.name, f"must {info.range}", value)
         self.check()
 
     def check(self) -> None:
@@ -294,15 +288,14 @@ class OptionGroup:
             given = f", not {show_value(value[0])}" if value else ""
             raise OptionError(f"{reason}{given}.", field=f"{self.group}.{name}")
 
-    def _coerced(self, info: FieldInfo, value: Any) -> Any:
-        """Text as the enum or path that a field is of; other values as they are."""
-        if issubclass(info.kind, Path) and isinstance(value, str):
-            return Path(value)
-        if issubclass(info.kind, StrEnum) and isinstance(value, str):
-            choices = [member.value for member in info.kind]
-            self.require(value in choices, info.name, f"must be one of {', '.join(choices)}", value)
-            return info.kind(value)
-        return value
+
+def _numbers(value: Any) -> Iterator[float]:
+    """A value that is a number, or those in a tuple."""
+    if isinstance(value, tuple):
+        for item in value:
+            yield from _numbers(item)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield value
 
 
 def default_num_workers() -> int:
@@ -471,8 +464,10 @@ class NormalOptions(OptionGroup, group="normals"):
     window_px: int = option(17, "side of the window of rows about a track's point, px", least=1)
     tilt_aware_weights: bool = option(
         True,
-        "rows of oblique rays count less, by what the model leaves out: OPA the perspective, OPA "
-        "and PPA a tilt of the polarizers; without it the models are pure",
+        "what OPA and PPA leave out is made up for: their rows count less the further a tilt of "
+        "the polarizers would turn the phases, OPA's also the further perspective turns them, and "
+        "the surface of all views takes back the share of the tilt that its phases show; without "
+        "it the models are pure",
     )
 
     def check(self) -> None:
@@ -631,6 +626,13 @@ class Options:
     export: ExportOptions = field(default_factory=ExportOptions)
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)
 
+    def __post_init__(self) -> None:
+        """Refuse, by OptionError, what is no group in its place."""
+        for name, cls in groups_of(type(self)).items():
+            group = getattr(self, name)
+            if not isinstance(group, cls):
+                raise OptionError(f"must be {cls.__name__}, not {group!r}.", field=name)
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(OptionGroup, group="run", in_files=False):
@@ -663,10 +665,9 @@ class RunOptions(OptionGroup, group="run", in_files=False):
 class PlaneOptions(OptionGroup, group="plane"):
     """Which pixels count as a plane, and how its normal is solved."""
 
-    angle_model: AngleModel = option(
+    model: AngleModel = option(
         AngleModel.PPA,
         "angle and normal; 'tilted' presumes a lens not telecentric on the image side",
-        flag="--model",
     )
     light: Light = option(Light.SPECULAR, "reflection that dominates the polarisation")
     estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
@@ -709,8 +710,8 @@ class PlaneOptions(OptionGroup, group="plane"):
             self.require(
                 len(self.polygon) >= 3, "polygon", "needs three corners or more", self.polygon
             )
-        apart = not self.find_planes or self.angle_model is not AngleModel.OPA
-        reason = "needs `plane.angle_model` ppa or tilted: under OPA planes are lines"
+        apart = not self.find_planes or self.model is not AngleModel.OPA
+        reason = "needs `plane.model` ppa or tilted: under OPA planes are lines"
         self.require(apart, "find_planes", reason)
 
 
@@ -807,7 +808,7 @@ def _described(cls: Any) -> tuple[FieldInfo, ...]:
             help_text=f.metadata.get("help", ""),
             range=f.metadata.get("range", Range()),
             metavar=f.metadata.get("metavar"),
-            flag=f.metadata.get("flag") or "--" + f.name.replace("_", "-"),
+            flag="--" + f.name.replace("_", "-"),
             positional=f.metadata.get("positional", False),
         )
         for f in fields(cls)
@@ -906,8 +907,9 @@ def from_plain(cls: type[T], values: Mapping[str, Any], source: str = "") -> T:
     Raises
     ------
     OptionError
-        A name is unknown, or a value is of the wrong type or out of range; the message names
-        source, table and key. It carries no ``field``: what is at fault is no flag.
+        A name is unknown, or a value is of the wrong type or out of range. Where there is a
+        source, the message names it, table and key, and carries no ``field``: what is at fault is
+        no flag.
     """
     converted = values_from_plain(cls, values, source)
     try:
@@ -924,32 +926,65 @@ def values_from_plain(cls: type, values: Mapping[str, Any], source: str = "") ->
     OptionError
         A name is unknown, or a value is of the wrong type.
     """
-    import msgspec
-
     infos = {info.name: info for info in describe_fields(cls)}
-    begin = _table(getattr(cls, "group", ""), source)
     converted = {}
     for name, value in values.items():
         if name not in infos:
+            begin = _table(getattr(cls, "group", ""), source)
             raise OptionError(f"{begin} has an unknown key {name!r}{_near(name, infos)}")
-        info = infos[name]
-        # JSON has null for None, TOML leaves the key out.
-        if value is None and info.default is None:
-            continue
         try:
-            converted[name] = msgspec.convert(value, info.kind, dec_hook=_decode)
-        except msgspec.ValidationError as error:
-            expected = str(error).partition(" - at ")[0].replace("`", "")
-            raise OptionError(f"{begin} {name} cannot be {value!r}: {expected}.") from error
+            converted[name] = convert_value(infos[name], value)
+        except OptionError as error:
+            raise in_table(error, source) from error
     return converted
 
 
+def convert_value(info: FieldInfo, value: Any) -> Any:
+    """A value in the type of its field; its range is not checked.
+
+    Text that names an enum's member or a path becomes that, a list a tuple, an integer a float
+    where one must be, and NumPy's numbers and arrays become Python's. Nothing is rounded.
+
+    Raises
+    ------
+    OptionError
+        The value is of another type.
+    """
+    if type(value) is info.kind:
+        return value
+    if value is None:
+        if info.default is not None:
+            raise OptionError("cannot be none.", field=info.path)
+        return None
+    if isinstance(info.kind, type) and issubclass(info.kind, StrEnum):
+        if not isinstance(value, str) or value not in set(info.kind):
+            choices = ", ".join(info.kind)
+            raise OptionError(
+                f"must be one of {choices}, not {show_value(value)}.", field=info.path
+            )
+        return info.kind(value)
+    import msgspec  # not for --help, nor for a 'polmvs doctor' that says it is missing
+
+    try:
+        return msgspec.convert(_as_python(value), info.kind, dec_hook=_decode)
+    except msgspec.ValidationError as error:
+        expected = str(error).partition(" - at ")[0].replace("`", "")
+        raise OptionError(f"cannot be {value!r}: {expected}.", field=info.path) from error
+
+
 def in_table(error: OptionError, source: str) -> OptionError:
-    """What is wrong with an option, as of a key in a table of a file, and not of a flag."""
-    if error.field is None:
+    """What is wrong with an option, as of a key in a table of a file, and not of a flag.
+
+    Parameters
+    ----------
+    error : of an option.
+    source : the file; where it is empty, the error stays as it is.
+    """
+    if error.field is None or not source:
         return error
     group, _, name = error.field.partition(".")
-    return OptionError(f"{_table(group, source)} {name} {error.reason}")
+    reason = re.sub(r"`(\w+)\.(\w+)`", r"[\1] \2", error.reason)
+    return OptionError(f"{_table(group, source)} {name} {reason}")
 
 
 def _table(group: str, source: str) -> str:
@@ -982,6 +1017,15 @@ def require_table(name: str, table: Any, known: Iterable[str], source: str) -> N
         raise OptionError(f"{begin}{what} {name!r}{_near(name, names)}")
     if not isinstance(table, Mapping):
         raise OptionError(f"{begin}{name!r} must be a table, [{name}].")
+
+
+def _as_python(value: Any) -> Any:
+    """Text for a path, and NumPy's numbers and arrays as Python's, in lists too."""
+    if isinstance(value, tuple | list):
+        return [_as_python(item) for item in value]
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _decode(kind: Any, value: Any) -> Any:

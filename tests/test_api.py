@@ -1,5 +1,6 @@
 """The public API as a notebook uses it."""
 
+import inspect
 import shutil
 import subprocess
 import sys
@@ -97,9 +98,30 @@ def test_errors_name_fields_and_not_flags(demo_capture: Path, tmp_path: Path) ->
         "`capture.gamma` must": lambda: polmvs.read_stokes(frame, gamma=0.0),
         "no option 'gama'; is it 'gamma'?": lambda: polmvs.read_stokes(frame, gama=2.0),
         "`capture.gamma` cannot be none": lambda: polmvs.read_stokes(frame, gamma=None),
-        "gamma cannot be '2'": lambda: polmvs.read_stokes(frame, gamma="2"),
+        "`capture.gamma` cannot be '2'": lambda: polmvs.read_stokes(frame, gamma="2"),
         "`model` must be one of opa, ppa, tilted, not 'best'": lambda: polmvs.reconstruct(
             demo_capture, tmp_path / "out", "best"
+        ),
+        "`plane.model` must be one of opa, ppa, tilted, not best": lambda: polmvs.plane_normal(
+            polmvs.read_stokes(frame), INTRINSICS, model="best"
+        ),
+        "`sfm.intrinsics` must be a finite number, not nan,1,1,1": lambda: polmvs.reconstruct(
+            demo_capture, tmp_path / "out", intrinsics=(np.nan, 1, 1, 1)
+        ),
+        "`options` must be Options, not dict": lambda: polmvs.reconstruct(
+            demo_capture, tmp_path / "out", options={"stride_px": 2}
+        ),
+        "`options` must be CaptureOptions, not Options": lambda: polmvs.read_stokes(
+            frame, options=Options()
+        ),
+        "`models` needs one angle model or more": lambda: polmvs.compare(
+            demo_capture, tmp_path / "out", models=()
+        ),
+        "`models` must be one of opa, ppa, tilted, not 'best'": lambda: polmvs.compare(
+            demo_capture, tmp_path / "out", models="best"
+        ),
+        "`run.workers` cannot be 1.5": lambda: polmvs.track_normals(
+            demo_capture, tmp_path, workers=1.5
         ),
         "no option 'min_view'; is it 'min_views'?": lambda: polmvs.reconstruct(
             demo_capture, tmp_path / "out", min_view=3
@@ -240,6 +262,37 @@ def test_going_on_takes_the_options_of_the_run(
         polmvs.reconstruct(demo_capture, result.folder, resume=True, stride_px=2)
     with pytest.raises(polmvs.OptionError, match=r"Give `run\.overwrite`"):
         polmvs.reconstruct(demo_capture, result.folder, options=Options())
+
+
+def test_a_stem_that_two_views_have_names_none(tmp_path: Path) -> None:
+    result = polmvs.Reconstruction(folder=tmp_path, angle_model=polmvs.AngleModel.PPA)
+    vars(result)["_views"] = {name: name for name in ("a/000.png", "b/000.png", "b/001.png")}
+    assert result._view("001") == "b/001.png"
+    assert result._view("a/000.png") == "a/000.png"
+    with pytest.raises(KeyError, match="'000' is no view"):
+        result._view("000")
+
+
+@pytest.mark.parametrize("name", ["track_normals", "reconstruct", "compare"])
+def test_a_script_starts_no_processes_of_itself(name: str) -> None:
+    assert inspect.signature(getattr(polmvs, name)).parameters["workers"].default == 1
+
+
+def test_a_script_without_a_guard_is_told_of_it(demo_capture: Path, tmp_path: Path) -> None:
+    """Its workers run it again before they work, and end."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import sys, polmvs\n"
+        "try:\n"
+        f"    polmvs.reconstruct({str(demo_capture)!r}, {str(tmp_path / 'out')!r}, workers=2)\n"
+        "except polmvs.PolmvsError as error:\n"
+        "    sys.exit(f'{type(error).__name__}: {error}')\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("OptionError: `run.workers` is 2, but the worker processes ended: ")
+    assert 'if __name__ == "__main__":' in last
 
 
 def test_results_of_an_earlier_run(demo_run: Path, tmp_path: Path) -> None:

@@ -5,10 +5,12 @@ import pickle
 from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from polmvs.config import (
     CaptureOptions,
+    ExportOptions,
     FusionOptions,
     Method,
     Options,
@@ -47,6 +49,61 @@ def test_text_names_choices_and_paths() -> None:
     assert SfmOptions(sparse="model").sparse == Path("model")
     with pytest.raises(OptionError, match=r"must be one of .*contour, not magic"):
         PropagationOptions(method="magic")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: PropagationOptions(stride_px=2.5),
+            "`propagation.stride_px` cannot be 2.5: Expected int, got float.",
+        ),
+        (
+            lambda: PropagationOptions(stride_px="2"),
+            "`propagation.stride_px` cannot be '2': Expected int, got str.",
+        ),
+        (
+            lambda: PropagationOptions(step_px=True),
+            "`propagation.step_px` cannot be True: Expected float, got bool.",
+        ),
+        (lambda: PropagationOptions(stride_px=None), "`propagation.stride_px` cannot be none."),
+        (
+            lambda: PropagationOptions(method=3),
+            "`propagation.method` must be one of surface, integrate, contour, not 3.",
+        ),
+        (lambda: SfmOptions(seed=1.5), "`sfm.seed` cannot be 1.5: Expected int, got float."),
+        (
+            lambda: SfmOptions(single_camera="no"),
+            "`sfm.single_camera` cannot be 'no': Expected bool, got str.",
+        ),
+        (lambda: SfmOptions(sparse=3), "`sfm.sparse` cannot be 3: Expected a path."),
+        (
+            lambda: SfmOptions(intrinsics=("a", 1, 1, 1)),
+            "`sfm.intrinsics` cannot be ('a', 1, 1, 1): Expected float, got str.",
+        ),
+        (
+            lambda: CaptureOptions(pattern=(0, 45, 90)),
+            "`capture.pattern` cannot be (0, 45, 90): Expected array of length 4, got 3.",
+        ),
+        (lambda: ExportOptions(mesh="no"), "`export.mesh` cannot be 'no': Expected bool, got str."),
+        (lambda: Options(sfm=3), "`sfm` must be SfmOptions, not 3."),
+    ],
+)
+def test_groups_take_values_of_their_fields_types_only(make, message: str) -> None:
+    with pytest.raises(OptionError) as caught:
+        make()
+    assert str(caught.value) == message
+
+
+def test_numbers_of_numpy_and_lists_are_values_too() -> None:
+    made = SfmOptions(seed=np.int64(3), intrinsics=np.array([4, 5, 6, 7]), single_camera=np.True_)
+    assert made == SfmOptions(seed=3, intrinsics=(4.0, 5.0, 6.0, 7.0), single_camera=True)
+    assert isinstance(made.seed, int)
+    propagation = PropagationOptions(step_px=1, spacing_px=np.float32(2))
+    assert (propagation.step_px, propagation.spacing_px) == (1.0, 2.0)
+    assert {type(propagation.step_px), type(propagation.spacing_px)} == {float}
+    assert CaptureOptions(pattern=[0, 45, 135, 90]).pattern == (0, 45, 135, 90)
+    assert SfmOptions(pairs=Path("/pairs.txt")).pairs == "/pairs.txt"
 
 
 @pytest.mark.parametrize(
@@ -111,10 +168,18 @@ def test_what_is_read_is_named() -> None:
         ({"gama": 1}, r"f: \[capture\] has an unknown key 'gama'; did you mean 'gamma'\?"),
         ({"gamma": "1"}, r"f: \[capture\] gamma cannot be '1': Expected float, got str"),
         ({"gamma": 99}, r"f: \[capture\] gamma must lie in 0\.1 to 10, not 99"),
+        ({"kind": "foo"}, r"f: \[capture\] kind must be one of mosaic, .*, aolp, not foo\."),
     ):
         with pytest.raises(OptionError, match=message) as caught:
             from_plain(CaptureOptions, values, "f")
         assert caught.value.field is None
+    with pytest.raises(OptionError) as caught:
+        from_plain(PropagationOptions, {"spacing_px": 0.3}, "f")
+    reason = "must be as long as [propagation] step_px or longer, not 0.3."
+    assert str(caught.value) == f"f: [propagation] spacing_px {reason}"
+    with pytest.raises(OptionError, match=r"`capture\.gamma` cannot be '1'") as caught:
+        from_plain(CaptureOptions, {"gamma": "1"})
+    assert caught.value.field == "capture.gamma"
     with pytest.raises(OptionError, match="unknown table 'sfn'; did you mean 'sfm'"):
         options_from_plain({"sfn": {}})
 

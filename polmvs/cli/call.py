@@ -49,7 +49,7 @@ class RecordingOptions(OptionGroup, group="recording", in_files=False):
 class TerminalOptions(OptionGroup, group="terminal", in_files=False):
     """What is shown."""
 
-    verbose: bool = option(False, "show every step", flag="--verbose")
+    verbose: bool = option(False, "show every step")
     quiet: bool = option(False, "show errors and the result only: no progress, no warnings")
     json: bool = option(False, "print the result as JSON; nothing else but errors is shown")
 
@@ -75,13 +75,16 @@ class Call:
     tables: tuple[type[OptionGroup], ...] = ()
     command_line: list[str] = field(default_factory=list)
 
-    def get(self, cls: type[Group], recorded: Mapping[str, Any] | None = None) -> Group:
+    def get(
+        self, cls: type[Group], recorded: Mapping[str, Any] | None = None, record: str = ""
+    ) -> Group:
         """A group of options from, each before the next: flags, the file, an earlier run, defaults.
 
         Parameters
         ----------
         cls : the group.
         recorded : of an earlier run, in terms of JSON, by field.
+        record : file of those, for messages.
 
         Raises
         ------
@@ -94,7 +97,7 @@ class Call:
             if info.path in self.given
         }
         file = self.file.get(cls.group, {}) if cls.in_files else {}
-        before = values_from_plain(cls, recorded or {})
+        before = values_from_plain(cls, recorded or {}, record)
         try:
             return cls(**{**before, **file, **flags})
         except OptionError as error:
@@ -103,16 +106,19 @@ class Call:
                 raise in_table(error, str(self.given["file.config"])) from error
             raise
 
-    def options(self, recorded: Mapping[str, Any] | None = None) -> Options:
+    def options(self, recorded: Mapping[str, Any] | None = None, record: str = "") -> Options:
         """Options of all stages, in the same order of precedence.
 
         Parameters
         ----------
         recorded : those of an earlier run, in terms of JSON, by group and field.
+        record : file of those, for messages.
         """
         before = recorded or {}
-        groups = groups_of(Options)
-        made: dict[str, Any] = {name: self.get(c, before.get(name)) for name, c in groups.items()}
+        made: dict[str, Any] = {
+            name: self.get(cls, before.get(name), record)
+            for name, cls in groups_of(Options).items()
+        }
         return Options(**made)
 
     @cached_property

@@ -58,19 +58,16 @@ class DemoArguments(OptionGroup, group="arguments", in_files=False):
 class ModelChoice(OptionGroup, group="model", in_files=False):
     """Which model."""
 
-    angle_model: AngleModel = option(
-        AngleModel.PPA, "relation of measured angle and normal", flag="--model"
-    )
+    model: AngleModel = option(AngleModel.PPA, "relation of measured angle and normal")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedModels(OptionGroup, group="models", in_files=False):
     """Which models."""
 
-    angle_models: tuple[AngleModel, ...] = option(
+    models: tuple[AngleModel, ...] = option(
         COMPARED_MODELS,
         f"what to compare, of {', '.join(AngleModel)}",
-        flag="--models",
         metavar="MODEL,...",
     )
 

@@ -18,7 +18,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import App, Group, Parameter
-from cyclopts.exceptions import CycloptsError, MissingArgumentError, UnusedCliTokensError
+from cyclopts.exceptions import (
+    CycloptsError,
+    MissingArgumentError,
+    RepeatArgumentError,
+    UnusedCliTokensError,
+)
 from cyclopts.token import Token
 
 import polmvs
@@ -270,11 +275,15 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
         place = inspect.Parameter.POSITIONAL_ONLY
         if elements:
             kind, place = elements[0], inspect.Parameter.VAR_POSITIONAL
+    elif kind is int:
+        common["converter"] = _read_integer
     elif _is_list(kind):
         common |= {"converter": _several(elements[0]), "n_tokens": 1, "consume_multiple": True}
     elif elements and not _is_mixed(kind):
-        common |= {"converter": _one_list(elements[0]), "n_tokens": 1}
-        # Of what length it is is the group's to say.
+        numbers = elements[0] in (int, float)  # the first of them may be negative
+        common |= {"converter": _one_list(kind), "n_tokens": 1}
+        common |= {"allow_leading_hyphen": numbers}
+        # Of what length it is is the converter's to say.
         kind = types.GenericAlias(tuple, (elements[0], ...))
     has_default = not is_required and place is not inspect.Parameter.VAR_POSITIONAL
     return inspect.Parameter(
@@ -298,35 +307,43 @@ def _is_list(kind: Any) -> bool:
     return bool(elements) and (elements[0] is Path or typing.get_origin(elements[0]) is tuple)
 
 
-def _one_list(element: Any) -> Callable[[Any, Sequence[Token]], tuple[Any, ...]]:
+def _read_integer(_: Any, tokens: Sequence[Token]) -> int:
+    """Reads an integer; cyclopts would round what is none."""
+    text = tokens[0].value
+    try:
+        return int(text)
+    except ValueError as error:
+        raise ValueError(f"{text!r} cannot be read as {_name(int)}") from error
+
+
+def _one_list(kind: Any) -> Callable[[Any, Sequence[Token]], tuple[Any, ...]]:
     """Reads a list with commas."""
 
-    def read(kind: Any, tokens: Sequence[Token]) -> tuple[Any, ...]:
-        return _read_list(element, tokens[0].value)
+    def read(_: Any, tokens: Sequence[Token]) -> tuple[Any, ...]:
+        return _read_list(kind, tokens[0].value)
 
     return read
 
 
 def _several(kind: Any) -> Callable[[Any, Sequence[Token]], tuple[Any, ...]]:
-    """Reads several lists with commas, each of the length of a tuple."""
-    elements = typing.get_args(kind)
+    """Reads several lists with commas."""
 
     def read(_: Any, tokens: Sequence[Token]) -> tuple[Any, ...]:
-        values = [_read_list(elements[0], token.value) for token in tokens]
-        for token, value in zip(tokens, values, strict=True):
-            if len(value) != len(elements):
-                raise ValueError(f"{token.value!r} is no {_name(kind)}")
-        return tuple(values)
+        return tuple(_read_list(kind, token.value) for token in tokens)
 
     return read
 
 
-def _read_list(element: Any, text: str) -> tuple[Any, ...]:
-    """Elements of a list with commas; ValueError says what it should have been."""
+def _read_list(kind: Any, text: str) -> tuple[Any, ...]:
+    """A tuple from a list with commas; ValueError says what it should have been."""
+    elements = typing.get_args(kind)
     try:
-        return tuple(element(part.strip()) for part in text.split(","))
+        values = tuple(elements[0](part.strip()) for part in text.split(","))
     except ValueError as error:
-        raise ValueError(f"{text!r} cannot be read as {_name(tuple[element, ...])}") from error
+        raise ValueError(f"{text!r} cannot be read as {_name(kind)}") from error
+    if Ellipsis not in elements and len(values) != len(elements):
+        raise ValueError(f"{text!r} is no {_name(kind)}")
+    return values
 
 
 def metavar_of(info: FieldInfo) -> str:
@@ -353,10 +370,15 @@ def _message(error: CycloptsError) -> str:
         return f"unexpected argument: {' '.join(error.unused_tokens or [])}"
     if isinstance(error, MissingArgumentError) and error.argument is not None:
         name = error.argument.name
-        if not name.startswith("-"):
+        if error.keyword is None:
             return f"{name} is missing"
         if str(error).rstrip(".").endswith("requires an argument"):
             return f"{name} needs a value"
+    if isinstance(error, RepeatArgumentError):
+        name = error.token.keyword or ""
+        other = f"--{name[5:]}" if name.startswith("--no-") else f"--no-{name[2:]}"
+        if other in (error.root_input_tokens or ()):  # a switch, on and off
+            return f"{other} and {name} exclude each other"
     error.verbose = False
     text = " ".join(str(error).split())
     name = error.argument.name if error.argument is not None else ""

@@ -64,7 +64,7 @@ def demo(call: Call, terminal: Terminal) -> int:
 def reconstruct(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs reconstruct``."""
     _check_recording(call)
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     outcome = pipeline.reconstruct(job_of(call, terminal), model)
     return _show_cloud(_reported(outcome, call, terminal), model, terminal)
 
@@ -72,7 +72,7 @@ def reconstruct(call: Call, terminal: Terminal) -> int:
 def compare(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs compare``."""
     _check_recording(call)
-    models = call.get(ComparedModels).angle_models
+    models = call.get(ComparedModels).models
     outcome = pipeline.compare(job_of(call, terminal), models)
     return _show_comparison(_reported(outcome, call, terminal), terminal)
 
@@ -90,7 +90,7 @@ def sfm(call: Call, terminal: Terminal) -> int:
 
 def normals(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs normals``."""
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     outcome = pipeline.solve_normals(job_of(call, terminal, continues=True), (model,))
     found, seeds = outcome.record.result(NormalsResult, model), outcome.record.result(SeedsResult)
     text = (
@@ -103,14 +103,14 @@ def normals(call: Call, terminal: Terminal) -> int:
 
 def densify(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs densify``."""
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     outcome = pipeline.densify(job_of(call, terminal, continues=True), (model,))
     return _show_cloud(outcome, model, terminal)
 
 
 def export(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs export``."""
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     outcome = pipeline.export(job_of(call, terminal, continues=True), model)
     return _show_cloud(outcome, model, terminal)
 
@@ -118,7 +118,7 @@ def export(call: Call, terminal: Terminal) -> int:
 def batch(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs batch``."""
     arguments = call.get(BatchArguments)
-    model = call.get(ModelChoice).angle_model
+    model = call.get(ModelChoice).model
     entries = read_batch(arguments.list_file, call.options(), model)
     with terminal.stage("captures", len(entries)) as progress:
 
@@ -163,9 +163,8 @@ def _check_recording(call: Call) -> None:
 def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> Job:
     """The job; one that goes on takes the options of the run in OUT where none are given."""
     arguments, run_options = call.get(JobArguments), call.get(RunOptions)
-    recorded = None
+    recorded, run_folder = None, RunFolder(arguments.out)
     if run_options.resume or continues:
-        run_folder = RunFolder(arguments.out)
         recorded = read_options(run_folder)
         # A reference that failed gives way to the one that is given in its stead.
         named = any(option.startswith("reference.") for option in call.given)
@@ -174,7 +173,7 @@ def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> Job:
     return Job(
         capture=arguments.capture,
         out=arguments.out,
-        options=call.options(recorded),
+        options=call.options(recorded, str(run_folder.run_file)),
         run_options=run_options,
         monitor=terminal,
         command_line=call.command_line,

@@ -177,7 +177,7 @@ def reconstruct_surface(
     seeds : points of the surface.
     surroundings : (N, 3), sparse points beside it.
     masks_given : the maps' regions are the user's masks.
-    tilt_aware : as :func:`polmvs.normals.rows.gather_rows`.
+    tilt_aware : as :func:`polmvs.surface.surface_view.surface_view`, and of the rows' weights.
     min_views : that must bear out a part.
     tolerances : of the refinement.
     on_progress : called with 1 after each step.

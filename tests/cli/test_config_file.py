@@ -73,6 +73,10 @@ def test_earlier_stages_may_be_in_the_file_of_a_stage(config) -> None:
         ("[capture]\npattern = 90\n", "pattern cannot be 90: Expected array, got int."),
         ("[capture]\npattern = [0, 90]\n", "pattern cannot be [0, 90]: Expected array of length 4"),
         ("[capture]\ngamma = 20\n", "[capture] gamma must lie in 0.1 to 10, not 20."),
+        (
+            "[capture]\nkind = 'foo'\n",
+            "[capture] kind must be one of mosaic, angles, stokes, aolp,",
+        ),
         ("[sfm]\nseed = 1.5\n", "[sfm] seed cannot be 1.5: Expected int, got float."),
         ("[capture]\ngamma = 1\ngamma = 1\n", "(at line 3, column 10): gamma = 1)"),
         ("[capture]\ngamma = 1\n[capture]\n", "(at line 3, column 9): [capture])"),
@@ -87,6 +91,14 @@ def test_config_file_is_read_strictly(cli, config, tmp_path: Path, text: str, me
     assert err.startswith(f"polmvs sfm: error: {path}: ")
     assert message in err
     assert err.count("\n") == 1
+
+
+def test_a_message_of_a_file_names_keys_alone(cli, config, tmp_path: Path) -> None:
+    path = config("[propagation]\nspacing_px = 0.3\n")
+    status, _, err = cli("reconstruct", tmp_path, tmp_path / "out", "--config", path)
+    assert status == 2
+    reason = "must be as long as [propagation] step_px or longer, not 0.3."
+    assert err == f"polmvs reconstruct: error: {path}: [propagation] spacing_px {reason}\n"
 
 
 def test_a_flag_in_place_of_a_wrong_value_of_the_file(cli, config, tmp_path: Path) -> None:

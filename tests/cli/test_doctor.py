@@ -1,6 +1,8 @@
 """``polmvs doctor`` on this machine, which can run the other tests."""
 
 import json
+import re
+import sys
 from importlib import metadata
 
 import pytest
@@ -37,3 +39,11 @@ def test_a_missing_package() -> None:
     finding = doctor.package("nosuchmodule", "nosuchpackage")
     assert not finding.works
     assert "pip install nosuchpackage" in finding.text
+
+
+def test_without_what_checks_options(cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It says so itself, and does not fail by it."""
+    monkeypatch.setitem(sys.modules, "msgspec", None)
+    status, out, err = cli("doctor")
+    assert (status, err) == (1, "")
+    assert re.search(r"^! msgspec +fails \(ModuleNotFoundError", out, re.MULTILINE)

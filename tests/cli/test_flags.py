@@ -155,7 +155,7 @@ def test_defaults_are_those_of_the_options() -> None:
     given = call("compare", "capture", "out")
     assert given.options() == Options()
     assert given.get(RunOptions) == RunOptions()
-    assert given.get(ComparedModels).angle_models == COMPARED_MODELS
+    assert given.get(ComparedModels).models == COMPARED_MODELS
     assert COMPARED_MODELS[:2] == (AngleModel.OPA, AngleModel.PPA)
 
 
@@ -193,15 +193,22 @@ def test_flags_may_stand_before_arguments() -> None:
         (("reconstruct",), "CAPTURE is missing"),
         (("reconstruct", "c"), "OUT is missing"),
         (("reconstruct", "c", "o", "more"), "unexpected argument: more"),
-        (("evaluate", "c.ply", "--gt", "g"), "--sparse"),
+        (("evaluate", "c.ply", "--gt", "g"), "error: --sparse is missing (see"),
         (("sfm", "c", "o", "--gama", "1"), "unknown option: --gama. Did you mean --gamma?"),
         (("sfm", "c", "o", "--stride-px", "1"), "unknown option: --stride-px"),
         (("sfm", "c", "o", "--gamma"), "--gamma needs a value"),
-        (("evaluate", "c", "--gt", "x"), "--sparse needs a value"),
+        (("evaluate", "c", "--gt", "x", "--sparse"), "error: --sparse needs a value (see"),
+        (("sfm", "c", "o", "--workers", "1.9"), "--workers: '1.9' cannot be read as INT"),
+        (("sfm", "c", "o", "--seed", "0x10"), "--seed: '0x10' cannot be read as INT"),
+        (("normals", "c", "o", "--window-px", "17.6"), "--window-px: '17.6' cannot be read as INT"),
+        (("densify", "c", "o", "--min-views", "-1.5"), "--min-views: '-1.5' cannot be read as INT"),
+        (("densify", "c", "o", "--stride-px=2.5"), "--stride-px: '2.5' cannot be read as INT"),
         (("sfm", "c", "o", "--gamma", "high"), "--gamma: unable to convert"),
         (("sfm", "c", "o", "--gamma", "1", "--gamma", "1"), "--gamma specified multiple times"),
         (("sfm", "c", "o", "--gamma=1", "--gamma=2"), "--gamma specified multiple times"),
         (("sfm", "c", "o", "--resume", "--resume"), "--resume specified multiple times"),
+        (("export", "c", "o", "--mesh", "--no-mesh"), "--mesh and --no-mesh exclude each other"),
+        (("export", "c", "o", "--no-mesh", "--mesh"), "--no-mesh and --mesh exclude each other"),
         (("sfm", "c", "o", "--intrinsics", "1,1,1,1", "--intrinsics", "1,1,1,1"), "--intrinsics"),
         (("sfm", "c", "o", "--intrinsics", "400,x,1,1"), "cannot be read as NUMBER,..."),
         (("sfm", "c", "o", "--scale", "a", "b"), "--scale requires 3"),
@@ -225,6 +232,7 @@ def test_usage_errors_are_one_line(cli, arguments: tuple[str, ...], message: str
     [
         (("--intrinsics", "400,400,200"), "--intrinsics needs four positive numbers fx,fy,cx,cy"),
         (("--intrinsics", "400,-400,200,150"), "--intrinsics needs four"),
+        (("--intrinsics", "-1,1,2,3"), "--intrinsics needs four positive numbers fx,fy,cx,cy"),
         (("--intrinsics", "1,inf,1,1"), "--intrinsics must be a finite number, not 1,inf,1,1."),
         (("--pattern", "0,45,90,90"), "--pattern needs each of 0, 45, 90, 135 once"),
         (("--gamma", "0"), "--gamma must lie in 0.1 to 10, not 0."),
@@ -272,5 +280,5 @@ def test_usage_error_names_program_and_command() -> None:
 
 
 def test_messages_name_flags_where_the_library_names_options() -> None:
-    text = "Give `run.overwrite` or `fusion.workspace`; not `a.b` nor `plane.angle_model`."
+    text = "Give `run.overwrite` or `fusion.workspace`; not `a.b` nor `plane.model`."
     assert in_flags(text) == "Give --overwrite or --workspace; not a.b nor --model."

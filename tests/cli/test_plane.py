@@ -60,7 +60,7 @@ def test_normal_and_residuals(cli, mosaic) -> None:
 
 def test_the_command_prints_what_the_library_gives(cli, mosaic) -> None:
     options = PlaneOptions(
-        angle_model=AngleModel.TILTED,
+        model=AngleModel.TILTED,
         estimator=Estimator.ALGEBRAIC,
         intrinsics=(110.0, 110.0, 80.0, 60.0),
     )
@@ -72,7 +72,7 @@ def test_the_command_prints_what_the_library_gives(cli, mosaic) -> None:
 def test_options_from_a_file(cli, mosaic, tmp_path) -> None:
     config = tmp_path / "plane.toml"
     config.write_text(
-        "[plane]\nangle_model = 'tilted'\nintrinsics = [110, 110, 80, 60]\n[capture]\ngamma = 1\n"
+        "[plane]\nmodel = 'tilted'\nintrinsics = [110, 110, 80, 60]\n[capture]\ngamma = 1\n"
     )
     flags = ("--model", "tilted", INTRINSICS)
     assert plane(cli, mosaic[0], "--config", config) == plane(cli, mosaic[0], *flags)
@@ -112,8 +112,9 @@ def test_mask_and_polygon_say_where(cli, mosaic, tmp_path) -> None:
         (["--polygon", "1,1", "5", "3,3"], 2, "--polygon: '5' is no NUMBER,NUMBER"),
         (["--polygon", "1,1", "3,1", "3,3"], 1, "only 3 pixels have a DoLP"),
         (["--polygon", "1,1", "3,1", "3,3", "--mask", "m"], 2, "--polygon and --mask exclude"),
+        (["--polygon", "nan,1", "3,1", "3,3"], 2, "--polygon must be a finite number, not nan,1"),
         (["--mask", "nowhere.png"], 1, "no such file"),
-        (["--pattern", "0,45,90"], 2, "--pattern needs each of 0, 45, 90, 135"),
+        (["--pattern", "0,45,90"], 2, "--pattern: '0,45,90' is no INT,INT,INT,INT"),
         (["--pattern", "0,45.5,90,135"], 2, "--pattern: '0,45.5,90,135' cannot be read as INT"),
         (["--gamma", "0"], 2, "--gamma must lie in 0.1 to 10, not 0"),
         (["--min-dolp", "1.5"], 2, "--min-dolp must lie in 0 to 1"),

@@ -147,8 +147,7 @@ def measure_planes(
     found = None
     if options.find_planes:
         found = tuple(
-            _figures(plane.estimate, plane.mask)
-            for plane in view.planes(options.angle_model, camera)
+            _figures(plane.estimate, plane.mask) for plane in view.planes(options.model, camera)
         )
     return PlaneMeasurement(
         image=image,
@@ -156,11 +155,11 @@ def measure_planes(
         height=camera.height,
         intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
         intrinsics_from=source,
-        angle_model=options.angle_model,
+        angle_model=options.model,
         light=options.light,
         estimator=options.estimator,
         min_dolp=options.min_dolp,
-        plane=_figures(planes[options.angle_model]),
+        plane=_figures(planes[options.model]),
         residuals={
             model: Residual(rmse_deg=plane.rmse_deg, median_deg=plane.median_deg)
             for model, plane in planes.items()
