@@ -75,16 +75,13 @@ class Call:
     tables: tuple[type[OptionGroup], ...] = ()
     command_line: list[str] = field(default_factory=list)
 
-    def get(
-        self, cls: type[Group], recorded: Mapping[str, Any] | None = None, record: str = ""
-    ) -> Group:
+    def get(self, cls: type[Group], recorded: Mapping[str, Any] | None = None) -> Group:
         """A group of options from, each before the next: flags, the file, an earlier run, defaults.
 
         Parameters
         ----------
         cls : the group.
-        recorded : of an earlier run, in terms of JSON, by field.
-        record : file of those, for messages.
+        recorded : of an earlier run, in terms of JSON, by field; checked.
 
         Raises
         ------
@@ -97,7 +94,7 @@ class Call:
             if info.path in self.given
         }
         file = self.file.get(cls.group, {}) if cls.in_files else {}
-        before = values_from_plain(cls, recorded or {}, record)
+        before = values_from_plain(cls, recorded or {})
         try:
             return cls(**{**before, **file, **flags})
         except OptionError as error:
@@ -106,19 +103,16 @@ class Call:
                 raise in_table(error, str(self.given["file.config"])) from error
             raise
 
-    def options(self, recorded: Mapping[str, Any] | None = None, record: str = "") -> Options:
+    def options(self, recorded: Mapping[str, Any] | None = None) -> Options:
         """Options of all stages, in the same order of precedence.
 
         Parameters
         ----------
-        recorded : those of an earlier run, in terms of JSON, by group and field.
-        record : file of those, for messages.
+        recorded : those of an earlier run, in terms of JSON, by group and field; checked.
         """
         before = recorded or {}
-        made: dict[str, Any] = {
-            name: self.get(cls, before.get(name), record)
-            for name, cls in groups_of(Options).items()
-        }
+        groups = groups_of(Options)
+        made: dict[str, Any] = {name: self.get(c, before.get(name)) for name, c in groups.items()}
         return Options(**made)
 
     @cached_property

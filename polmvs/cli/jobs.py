@@ -173,7 +173,7 @@ def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> Job:
     return Job(
         capture=arguments.capture,
         out=arguments.out,
-        options=call.options(recorded, str(run_folder.run_file)),
+        options=call.options(recorded),
         run_options=run_options,
         monitor=terminal,
         command_line=call.command_line,

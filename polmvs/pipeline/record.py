@@ -194,7 +194,7 @@ def read_options(run_folder: RunFolder) -> Mapping[str, Any]:
     if not isinstance(options, dict):
         raise _no_record(run_folder, "it has no options")
     try:
-        options_from_plain(options)
+        options_from_plain(options, RUN_FILE)
     except OptionError as error:
         raise _no_record(run_folder, error) from error
     return options if content["stages"] else {}

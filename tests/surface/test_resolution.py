@@ -17,7 +17,6 @@ from polmvs.synthetic.surfaces import Sphere
 
 SCALES = (1, 2, 4)  # 306x256, 612x512, 1224x1024
 BALL = Sphere(center=np.zeros(3), radius=0.16)
-DISTANCE = 0.6  # of cameras around it, which it is 51, 101 and 203 px in radius for
 NOISE = 1e-3 / np.sqrt(2)  # of intensities, full scales: 1e-3 of s1 and s2, as the maps state
 
 
@@ -33,9 +32,7 @@ def camera_at(scale):
 
 
 def maps_at(scale):
-    views = ring_of_views(
-        4, camera_at(scale), target=np.zeros(3), distance=DISTANCE, elevation_deg=65
-    )
+    views = ring_of_views(4, camera_at(scale), target=np.zeros(3), distance=0.6, elevation_deg=65)
     return [phase_map_of(render_view(v, BALL, s0=0.2, background=0.6)) for v in views]
 
 
@@ -79,10 +76,13 @@ def test_resolution_does_not_change_the_shape(dense, scale):
 
 
 def noisy_maps_around(scale):
-    """Maps with a sensor's noise of eight views around the ball, at two heights."""
+    """Maps with a sensor's noise of eight views around the ball, at two heights.
+
+    Its radius is 30, 61 and 122 px in them.
+    """
     views = [
-        *ring_of_views(8, camera_at(scale), distance=DISTANCE, elevation_deg=15)[::2],
-        *ring_of_views(8, camera_at(scale), distance=DISTANCE, elevation_deg=50)[1::2],
+        *ring_of_views(8, camera_at(scale), distance=1.0, elevation_deg=15)[::2],
+        *ring_of_views(8, camera_at(scale), distance=1.0, elevation_deg=50)[1::2],
     ]
     rng, maps = np.random.default_rng(0), []
     for view in views:
