@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
@@ -29,6 +30,17 @@ def cauchy_weights(squares: Floats, scale: float | Floats = CAUCHY_SCALE) -> Flo
     scale : of the loss, deviations; broadcasts.
     """
     return np.asarray(1.0 / (1.0 + squares / np.square(scale)))
+
+
+def geman_mcclure_weights(residuals: Array, square: float | Array) -> Array:
+    """Weights of least squares that stand for a loss of Geman and McClure (1985), 1 at 0.
+
+    Parameters
+    ----------
+    residuals : in any unit.
+    square : of the loss's width, in that unit's square; broadcasts.
+    """
+    return np.asarray((square / (square + residuals**2)) ** 2)
 
 
 def annealed_scales(

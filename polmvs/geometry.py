@@ -39,6 +39,13 @@ def unit_or_zero(vectors: NDArray[Float]) -> NDArray[Float]:
     return np.asarray(vectors / np.maximum(lengths(vectors)[..., None], 1e-300))
 
 
+def points_on_rays(
+    center: NDArray[np.floating], rays: NDArray[np.floating], ranges: NDArray[np.floating]
+) -> Array:
+    """Points ``(..., 3)`` at distances ``(...)`` from a centre along unit rays ``(..., 3)``."""
+    return np.asarray(center + ranges[..., None] * rays, np.float64)
+
+
 def nearest_rotation(matrix: Array) -> Array | None:
     """The rotation ``(3, 3)`` nearest to a matrix that is one up to a text file's rounding.
 

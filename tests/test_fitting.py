@@ -5,6 +5,7 @@ from polmvs.fitting import (
     CAUCHY_SCALE,
     annealed_scales,
     cauchy_weights,
+    geman_mcclure_weights,
     like_most,
     robust_deviation,
 )
@@ -18,6 +19,18 @@ def test_cauchy_weights_are_the_slope_of_the_loss():
 
     slope = (loss(z + step) - loss(z - step)) / (2 * step)
     np.testing.assert_allclose(cauchy_weights(z**2) * z, slope, atol=1e-8)
+
+
+def test_geman_mcclure_weights_are_the_slope_of_the_loss():
+    residuals, square, step = np.linspace(0.1, 30, 100), 2.5, 1e-5
+
+    def loss(r):  # half the square near 0, half the width's square far away
+        return 0.5 * square * r**2 / (square + r**2)
+
+    slope = (loss(residuals + step) - loss(residuals - step)) / (2 * step)
+    weights = geman_mcclure_weights(residuals, square)
+    np.testing.assert_allclose(weights * residuals, slope, rtol=1e-4)
+    assert geman_mcclure_weights(np.zeros(1), square) == 1
 
 
 def test_the_cauchy_mean_of_normal_data_is_95_percent_efficient():

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera, in_frame, in_image
-from polmvs.geometry import RigidTransform
+from polmvs.geometry import RigidTransform, points_on_rays
 from polmvs.scene import Tracks, View, find_name, match_names, short_list
 
 CAMERA = PinholeCamera(width=40, height=30, fx=50, fy=60, cx=20, cy=15)
@@ -21,6 +21,8 @@ def test_points_along_rays_project_back_and_lie_at_their_distance(view):
     xy = np.random.default_rng(0).uniform([0, 0], [40, 30], (2, 4, 2))
     ranges = np.linspace(1, 8, 8).reshape(2, 4)
     points = view.points_at(xy, ranges)
+    along = points_on_rays(view.center_in_world, view.rays_in_world(xy), ranges)
+    np.testing.assert_allclose(points, along, atol=1e-12)
     np.testing.assert_allclose(view.project(points), xy, rtol=1e-9)
     np.testing.assert_allclose(view.ranges(points), ranges, rtol=1e-12)
     np.testing.assert_allclose(

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from polmvs.camera import PinholeCamera, pixel_centers, xy_from_opencv
 from polmvs.config import CaptureOptions
 from polmvs.errors import DataError
-from polmvs.geometry import RigidTransform, nearest_rotation
+from polmvs.geometry import RigidTransform, nearest_rotation, points_on_rays
 from polmvs.io.images import read_bytes
 from polmvs.io.raw_formats import read_npy
 from polmvs.scene import View, stem_of
@@ -73,7 +73,7 @@ class BoardTruth:
         center = view.center_in_world
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (self.offset - center @ self.normal) / (world_rays @ self.normal)
-            points = center + world_rays * distance[..., None]
+            points = points_on_rays(center, world_rays, distance)
             inside = (distance > 0) & self._inside(points)
         return np.where(inside, distance * rays[..., 2], np.nan).astype(np.float32)
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel
-from polmvs.geometry import lengths
+from polmvs.geometry import lengths, points_on_rays
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
 from polmvs.normals.tracks import MAX_ROWS, normals_under, tracks_on_parts
@@ -291,7 +291,7 @@ def _place_pixels(maps: Sequence[PhaseMap], points: Array, t: LightTolerances) -
         first = one.distances[most.argmax(axis=0)]
         last = one.distances[len(most) - 1 - most[::-1].argmax(axis=0)]
         for slot, share in enumerate(np.linspace(0, 1, t.num_ranges)):
-            placed.append(one.center + (first ** (1 - share) * last**share)[:, None] * one.rays)
+            placed.append(points_on_rays(one.center, one.rays, first ** (1 - share) * last**share))
             owner.append(begin + slot * one.num_parts + one.part)
             view.append(np.full(len(one.rays), index))
         begin += t.num_ranges * one.num_parts
@@ -325,7 +325,7 @@ class _ChosenPixels:
 
     def places(self) -> Array:
         """Points (S, N, 3), world, at all distances of all rays."""
-        return self.center + self.distances[:, None, None] * self.rays
+        return points_on_rays(self.center, self.rays, self.distances[:, None])
 
 
 def _choose_pixels(phase_map: PhaseMap, points: Array, t: LightTolerances) -> _ChosenPixels:

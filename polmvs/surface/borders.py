@@ -18,6 +18,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
+from polmvs.fitting import geman_mcclure_weights, robust_deviation
 from polmvs.geometry import dots, lengths, unit_or_zero
 
 Array = NDArray[np.float64]
@@ -175,8 +176,8 @@ def _straightened(
     moved, turned = np.zeros(num), 1.0
     while turned > LEAST_TURN:
         off = moved - step
-        sigma = max(1.4826 * float(np.median(np.abs(off[used]))), tol.sigma)
-        certain = weight / sigma**2 / (1 + (off / (tol.sigmas * sigma)) ** 2) ** 2
+        sigma = max(robust_deviation(off[used]), tol.sigma)
+        certain = weight / sigma**2 * geman_mcclure_weights(off, (tol.sigmas * sigma) ** 2)
         certain = np.where(is_free, certain + 1e-6, tol.sigma**-4)
         now = np.stack([one @ moved for one in by_move], axis=1) + given
         amount = np.sqrt((now**2).sum(axis=1) + turned**2)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.geometry import points_on_rays
 from polmvs.scene import MIN_FACING_COSINE, View
 from polmvs.surface.dense_view import find_dense_view, store_dense_view
 from polmvs.surface.fusion import FusedCloud
@@ -93,7 +94,7 @@ def _widen(view: View, folder: Path, sigma_of: Callable[[Array, Array, Array], A
         return
     known = dense.known
     rays = view.rays_in_world(dense.lattice_xy()[known])
-    points = view.center_in_world + rays * dense.range_map[known][:, None]
+    points = points_on_rays(view.center_in_world, rays, dense.range_map[known])
     normals = np.asarray(dense.normals_in_world[known], np.float64)
     sigma = np.array(dense.sigma)
     sigma[known] = np.hypot(sigma[known], sigma_of(points, rays, normals))

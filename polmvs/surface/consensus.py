@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import depth_buffer, in_image, sample_image
+from polmvs.geometry import points_on_rays
 from polmvs.normals.rows import OCCLUSION_TOLERANCE
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
@@ -70,7 +71,7 @@ def sight(
         (N, 3), distances (N,) and unit normals (N, 3), world frame.
     """
     view = phase_map.view
-    points = center + distance[:, None] * rays
+    points = points_on_rays(center, rays, distance)
     in_cam = view.cam_from_world * points
     own_range = np.linalg.norm(in_cam, axis=-1)
     xy = view.camera.project(in_cam)
@@ -83,7 +84,7 @@ def sight(
     # element's own plane would lie outside of every convex surface.
     nearest_xy = (np.floor(np.nan_to_num(lattice_xy)) + 0.5) * dense.stride_px
     other_rays = view.rays_in_world(nearest_xy)
-    elements = view.center_in_world + seen[:, None] * other_rays
+    elements = points_on_rays(view.center_in_world, other_rays, seen)
     slant = (rays * seen_normals).sum(-1)
     mean = seen_normals + normals
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -125,7 +126,7 @@ def surface_of_others(
         rotation = other.cam_from_world.rotation
         samples = view_samples(result, other.camera.rays(result.lattice_xy()) @ rotation)
         parts.append(
-            other.center_in_world + np.exp(samples.log_range)[:, None] * samples.rays_in_world
+            points_on_rays(other.center_in_world, samples.rays_in_world, np.exp(samples.log_range))
         )
         normals.append(samples.normals)
     points = np.concatenate(parts)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
 from polmvs.config import FusionOptions, PropagationOptions
-from polmvs.geometry import unit_or_zero
+from polmvs.geometry import points_on_rays, unit_or_zero
 from polmvs.neighbors import are_usual, point_spacings, voxel_of_each
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.phase_map import PhaseMap
@@ -174,7 +174,7 @@ def _confirm(
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     keep = (votes >= options.min_views) & (conflicts <= votes)
     cloud = FusedCloud(
-        points=center + (place / total)[:, None] * rays,
+        points=points_on_rays(center, rays, place / total),
         normals=normal,
         intensity=sample_image(phase_map.intensity, xy),
         num_views=votes,

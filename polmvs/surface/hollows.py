@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from polmvs.camera import in_frame, sample_image
+from polmvs.fitting import robust_deviation
 from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import KEYPOINT_SIGMA_PX, MIN_VIEWS, Seeds
@@ -375,7 +376,7 @@ def _hollow(
 
     wall = (beside - outside_of(insides[0]))[border]
     thickness = float(np.median(wall))
-    sigma = 1.4826 * float(np.median(np.abs(wall - thickness)))
+    sigma = robust_deviation(wall - thickness)
     if thickness <= 1 or sigma > max(tol.thickness_spread * thickness, 1.0):
         return None
     free = -np.asarray(beside, np.float64)

@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, PropagationOptions
+from polmvs.geometry import points_on_rays
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.parallel import OnProgress, Workers, no_progress
@@ -320,7 +321,7 @@ def relax(
     """
     center = maps[0].view.center_in_world
     surface = nodes.surface
-    points = center + np.exp(surface.log_range)[:, None] * surface.rays_in_world
+    points = points_on_rays(center, surface.rays_in_world, np.exp(surface.log_range))
     unknown = ~np.isfinite(surface.log_range)
     points[unknown] = center  # anywhere
     range_maps = [d.range_map if d is not None else None for d in dense]

@@ -31,6 +31,7 @@ from scipy.spatial import Delaunay, cKDTree
 
 from polmvs.camera import in_frame, sample_image
 from polmvs.config import AngleModel, default_num_workers
+from polmvs.fitting import geman_mcclure_weights, robust_deviation
 from polmvs.io.arrays import kept_array
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.normals.tracks import SeedTolerances
@@ -473,7 +474,7 @@ def border_of_steps(
             shown = is_own & np.all(seen & (values[..., 3] == 1), axis=1)  # and no printed mark
             if shown.any():
                 slope = step_slope(values[shown, :, 0]) / SPACING
-                steepness[shown] += slope / max(1.4826 * float(np.median(slope)), face_tol.dark)
+                steepness[shown] += slope / max(robust_deviation(slope), face_tol.dark)
                 num_views += shown
         found, height = nearest_steps(
             steepness / np.maximum(num_views[:, None], 1), along, 1.0, tol
@@ -868,7 +869,7 @@ def _steps(values: Image, shown: Mask, tol: OffsetTolerances) -> Image:
         return total
     for channel in np.moveaxis(values, -1, 0):
         step = np.hypot(*np.gradient(channel))
-        scale = max(1.4826 * float(np.median(step[well])), tol.dark)
+        scale = max(robust_deviation(step[well]), tol.dark)
         total = np.maximum(total, np.where(well, step / scale, 0)).astype(np.float32)
     return total
 
@@ -975,7 +976,7 @@ def _walk(jump: Array, tol: OffsetTolerances) -> tuple[sparse.csr_array, Array]:
     """Chances of a step between neighbouring cells ``(H W, H W)``, and their sums."""
     steps = [_steps_between(jump, *direction) for direction in BESIDE]
     tails, heads, between = (np.concatenate(part) for part in zip(*steps, strict=True))
-    weight = 1 / (1 + (between / tol.line_steps) ** 2) ** 2
+    weight = geman_mcclure_weights(between, tol.line_steps**2)
     pairs = (np.concatenate([tails, heads]), np.concatenate([heads, tails]))
     both = np.concatenate([weight, weight])
     adjacency = sparse.coo_array((both, pairs), shape=(jump.size, jump.size)).tocsr()

@@ -21,8 +21,8 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from polmvs.camera import sample_image
 from polmvs.config import AngleModel, default_num_workers
-from polmvs.fitting import CAUCHY_SCALE, annealed_scales, robust_deviation
-from polmvs.geometry import dots, lengths, unit_or_zero
+from polmvs.fitting import CAUCHY_SCALE, annealed_scales, geman_mcclure_weights, robust_deviation
+from polmvs.geometry import dots, lengths, points_on_rays, unit_or_zero
 from polmvs.normals.estimator import smallest_eigenvectors
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.scene import MIN_VIEWS
@@ -570,7 +570,7 @@ def unexplained_shares(
         rays = certain_rays(view, stride_px)
         hits = scene.cast(view.center, rays)
         hit = hits.face >= 0
-        points = view.center + hits.distance[hit, None] * rays[hit]
+        points = points_on_rays(view.center, rays[hit], hits.distance[hit])
         found = phase_rows(view, angle_model, points)
         square = (dots(found.rows, mesh.face_normals[hits.face[hit]]) / row_sigma) ** 2
         loss = np.ones(len(rays))
@@ -871,7 +871,7 @@ def _add_phases(
             centers = mesh.centers.take(face, axis=0)
             slope = _row_slope(view, given.angle_model, centers, normals, seen.rows, reach)
             jacobian += along[face] * np.clip(slope, -steepest, steepest)[:, None]
-        weight = np.maximum(_loss_weights(residual, loss_scale**2 * seen.variance), agreed)
+        weight = np.maximum(geman_mcclure_weights(residual, loss_scale**2 * seen.variance), agreed)
         weight *= share[face] / seen.variance
         blocks[face] += np.einsum("ni,nj->nij", weight[:, None] * jacobian, jacobian)
         gradient[face] += (weight * residual)[:, None] * jacobian
@@ -881,11 +881,6 @@ def _add_phases(
     equations.add_blocks(mesh.faces, blocks, gradient)
     everything, is_mirrored = np.concatenate(residuals), np.concatenate(mirrored)
     return is_seen, RowSigma.shown_by(everything, is_mirrored, given.tol.row_sigma)
-
-
-def _loss_weights(residual: Array, square: Array | float) -> Array:
-    """Weights of residuals under a loss of Geman and McClure, given its width squared."""
-    return np.asarray((square / (square + residual**2)) ** 2)
 
 
 def _agreed_weights(
@@ -908,7 +903,7 @@ def _agreed_weights(
     sheet on its narrow sides, so that it grew until the outlines drew it down.
     """
     scale, num_faces = tol.levels[-1].loss_scale, len(centers)
-    weights = [_loss_weights(rows.residual, scale**2 * rows.variance) for rows in seen]
+    weights = [geman_mcclure_weights(rows.residual, scale**2 * rows.variance) for rows in seen]
     doubted = np.zeros(num_faces, np.bool_)
     for rows, weight in zip(seen, weights, strict=True):
         doubted[rows.face[weight < tol.agreement]] = True
@@ -955,13 +950,13 @@ def _agreement(
     """
     x, y, z = rows.T
     products = np.array([x * x, y * y, z * z, x * y, x * z, y * z]) / variance
-    weight = np.ones(len(rows))
+    weight: Array = np.ones(len(rows))
     for width in annealed_scales(5, last=scale):
         sums = np.array([np.bincount(place, weight * product, num) for product in products])
         total = np.maximum(np.bincount(place, weight, num), 1e-300)
         values, normals = smallest_eigenvectors(sums)
         residual = np.einsum("ni,in->n", rows, normals[:, place])
-        weight = _loss_weights(residual, width**2 * variance)
+        weight = geman_mcclure_weights(residual, width**2 * variance)
     agree = np.bincount(place, weight, num) / np.bincount(place, minlength=num)
     return weight, np.where(values[1] > scale**2 * total, agree, 0)
 
@@ -1194,7 +1189,7 @@ def _add_rims(
     slope = np.zeros(equations.num)
     scale = max(3 * tol.place_sigma_px, 0.5 * level.rim_gate_px) ** 2
     for rim in rims:
-        weight = rim.length_px * _loss_weights(rim.residual, scale)
+        weight = rim.length_px * geman_mcclure_weights(rim.residual, scale)
         # An outline crosses an area over which errors are alike along the root of its pixels.
         weight *= np.sqrt(tol.phase_correlation) / sigma**2
         equations.add(rim.vertices, rim.jacobian, rim.residual, weight)
@@ -1224,7 +1219,7 @@ def _add_points(
     along = dots(mesh.vertex_normals[mesh.faces[face]], normals[near][:, None])
     jacobian = barycentric[near] * along
     scale = np.maximum(4 * sigma, 0.1 * gate_px * footprint) ** 2
-    weights = tol.point_weight(len(given.views)) * _loss_weights(residual, scale) / sigma**2
+    weights = tol.point_weight(len(given.views)) * geman_mcclure_weights(residual, scale) / sigma**2
     equations.add(mesh.faces[face], jacobian, residual, weights)
 
 
@@ -1245,7 +1240,7 @@ def _smoothness(
     data = entries.data * dots(normals.take(rows, axis=0), normals.take(cols, axis=0)) / edge
     change = sparse.coo_array((data, (rows, cols)), shape=laplacian.shape).tocsr()
     residual = curvature - target
-    weight = 1 / (1 + (residual / (5 * tol.smoothness)) ** 2) ** 2 / tol.smoothness**2
+    weight = geman_mcclure_weights(residual, (5 * tol.smoothness) ** 2) / tol.smoothness**2
     weight[sharp] = 0.0
     factor = sparse.csr_array(change.T @ sparse.diags_array(np.sqrt(weight)))
     matrix = sparse.csr_array(factor @ factor.T)

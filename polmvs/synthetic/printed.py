@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.camera import Camera, sample_image
+from polmvs.geometry import points_on_rays
 from polmvs.scene import View
 from polmvs.synthetic.captures import (
     SyntheticView,
@@ -145,7 +146,7 @@ def _print_seen(view: View, scene: PrintedScene, xy: Array) -> tuple[Mask, Array
     on_print, normals = scene.surroundings.intersect(center, rays)
     is_part = on_part < on_print
     distance = np.minimum(on_part, on_print)
-    points = center + np.where(np.isfinite(distance), distance, 0)[..., None] * rays
+    points = points_on_rays(center, rays, np.where(np.isfinite(distance), distance, 0))
     labelled = np.zeros(is_part.shape, np.bool_)
     tree = cKDTree(np.asarray(scene.labels, np.float64).reshape(-1, 3))
     labelled[is_part] = np.isfinite(
