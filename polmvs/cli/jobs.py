@@ -163,8 +163,9 @@ def _check_recording(call: Call) -> None:
 def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> Job:
     """The job; one that goes on takes the options of the run in OUT where none are given."""
     arguments, run_options = call.get(JobArguments), call.get(RunOptions)
-    recorded, run_folder = None, RunFolder(arguments.out)
+    recorded = None
     if run_options.resume or continues:
+        run_folder = RunFolder(arguments.out)
         recorded = read_options(run_folder)
         # A reference that failed gives way to the one that is given in its stead.
         named = any(option.startswith("reference.") for option in call.given)

@@ -217,9 +217,9 @@ class Run(StageInput):
             angle_model=spec.angle_model,
             reads=_names(spec.reads),
             wrote={
-                path.as_posix(): num_files(self.run_folder.root / path)
+                path.as_posix(): number
                 for path in spec.writes
-                if (self.run_folder.root / path).exists()
+                if (number := num_files(self.run_folder.root / path))
             },
             options=plain_options(self.options, spec.decides),
             inputs=self._inputs(spec),
@@ -237,8 +237,10 @@ class Run(StageInput):
 
     def _is_redone(self, spec: StageSpec, finished: StageRecord) -> bool:
         """Whether a finished stage was made from others than now, and is one to be done again."""
+        if not spec.is_redone:
+            return False
         now = (plain_options(self.options, spec.decides), self._inputs(spec), _names(spec.reads))
-        return spec.is_redone and (finished.options, finished.inputs, finished.reads) != now
+        return (finished.options, finished.inputs, finished.reads) != now
 
     def _inputs(self, spec: StageSpec) -> dict[str, str]:
         """Digests of what the options name that decide a stage's result, by path of the option.
@@ -246,10 +248,11 @@ class Run(StageInput):
         Not of ``fusion.workspace``, in which a run may write (``export.in_place``).
         """
         named, decides = inputs_of(self.options), plain_options(self.options, spec.decides)
-        named.pop("fusion.workspace", None)
-        for path in named.keys() & decides.keys() - self._digests.keys():
-            self._digests[path] = digest_of(named[path])
-        return {path: self._digests[path] for path in sorted(named.keys() & decides.keys())}
+        used = sorted((named.keys() & decides.keys()) - {"fusion.workspace"})
+        for path in used:
+            if path not in self._digests:
+                self._digests[path] = digest_of(named[path])
+        return {path: self._digests[path] for path in used}
 
     def forget(self, names: Collection[str]) -> None:
         """Have stages done again, and all that are made from their files; their files go.
