@@ -115,6 +115,9 @@ def phase_map_of(
         phase = phase + noise * (rng or np.random.default_rng(0)).standard_normal(phase.shape)
     precision = np.where(inside, 1 / PHASE_SIGMA**2, 0)
     samples = np.dstack([DOLP * np.cos(2 * phase), DOLP * np.sin(2 * phase), precision])
+    # Specular light, on an unpolarized background.
+    measured = np.where(inside[..., None], -samples[..., :2], 0)
+    variance = np.full(inside.shape, 4 * DOLP**2 * PHASE_SIGMA**2)
     return PhaseMap(
         view=view,
         region=Region(inside, inside, np.zeros_like(inside)),
@@ -122,6 +125,7 @@ def phase_map_of(
         intensity=np.where(inside, 0.1, 0.6).astype(np.float32),
         diffuse=np.zeros_like(inside),
         lowest_dolp=np.full(inside.shape, round(255 * DOLP), np.uint8),
+        polarization=np.dstack([measured, variance, 0 * variance]).astype(np.float32),
     )
 
 

@@ -64,6 +64,10 @@ class PhaseMap:
     diffuse : (H, W) bool, pixels whose light is diffuse-dominant; the others' is specular.
     lowest_dolp : (H, W) uint8, lowest DoLP of single pixels next to each pixel, in 1/255: what
         is printed on a surface is less polarised than it, what is mirrored in it is not.
+    polarization : (H, W, 4) float32: ``s1 / s0`` and ``s2 / s0`` of each pixel as measured, inside
+        and outside of the region, and the variance of either: what neighbouring pixels do not
+        share, and what they do (gains, lossy compression). Both are inf where a pixel is clipped
+        or dark.
     folder : where the arrays are stored, if they are.
     tilted : the samples are corrected for tilted polarizers (:func:`as_tilted`).
     """
@@ -74,6 +78,7 @@ class PhaseMap:
     intensity: Image
     diffuse: Mask
     lowest_dolp: NDArray[np.uint8]
+    polarization: Image
     folder: Path | None = None
     tilted: bool = False
 
@@ -125,6 +130,11 @@ class StoredPhaseMap(PhaseMap):
     def lowest_dolp(self) -> NDArray[np.uint8]:
         """See :class:`PhaseMap`."""
         return self._array(f"{self.view.name}.dolp.npy", np.unsignedinteger)
+
+    @property
+    def polarization(self) -> Image:
+        """See :class:`PhaseMap`."""
+        return self._array(f"{self.view.name}.polarization.npy", np.floating)
 
     @property
     def region(self) -> Region:
@@ -217,7 +227,22 @@ def build_phase_map(
     diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
     intensity = np.asarray(stokes.s0, np.float32)
     lowest = _lowest_dolp(np.dstack([stokes.s0, stokes.s1, stokes.s2]), tolerances=t)
-    return PhaseMap(view, region, samples, intensity, diffuse, lowest)
+    polarization = measured_polarization(stokes)
+    return PhaseMap(view, region, samples, intensity, diffuse, lowest, polarization)
+
+
+def measured_polarization(stokes: Stokes) -> Image:
+    """Normalised Stokes parameters of all pixels (H, W, 4) with their variances.
+
+    No light is chosen. See ``polarization`` of :class:`PhaseMap`.
+    """
+    known = stokes.valid & (stokes.s0 > 0)
+    s0 = np.where(known, stokes.s0, np.float32(1))
+    whole, lossy = np.square(stokes.sigma / s0), np.square(stokes.lossy_sigma / s0)
+    shared = lossy + stokes.gain_sigma**2
+    channels = np.dstack([stokes.s1 / s0, stokes.s2 / s0, np.maximum(whole - lossy, 0), shared])
+    nothing = np.array([0, 0, np.inf, np.inf], np.float32)
+    return np.where(known[..., None], channels, nothing).astype(np.float32)
 
 
 def _lowest_dolp(stokes: Image, *, tolerances: PhaseTolerances) -> NDArray[np.uint8]:
@@ -273,6 +298,7 @@ def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:
     save_array(folder / f"{name}.intensity.npy", phase_map.intensity)
     save_array(folder / f"{name}.region.npy", flags.astype(np.uint8))
     save_array(folder / f"{name}.dolp.npy", phase_map.lowest_dolp)
+    save_array(folder / f"{name}.polarization.npy", phase_map.polarization)
     return open_phase_map(phase_map.view, folder, tilted=phase_map.tilted)
 
 
@@ -293,6 +319,7 @@ def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMa
     size = (view.camera.height, view.camera.width)
     shapes = (samples.shape[:2], stored.intensity.shape, stored.flags.shape)
     fits = all(shape == size for shape in (*shapes, stored.lowest_dolp.shape))
+    fits &= stored.polarization.shape == (*size, 4)
     if not fits or samples.shape[2:] != (3,):
         reason = "has another size than its camera; give `run.overwrite`."
         raise DataError(folder / view.name, reason)

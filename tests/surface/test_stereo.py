@@ -62,7 +62,8 @@ def map_of(view, inside=None, texture=TEXTURE):
     none = np.zeros(size, bool)
     region = Region(none if inside is None else inside, none, none)
     samples = np.zeros((*size, 3), np.float32)
-    return PhaseMap(view, region, samples, intensity, none, np.zeros(size, np.uint8))
+    polarization = np.zeros((*size, 4), np.float32)
+    return PhaseMap(view, region, samples, intensity, none, np.zeros(size, np.uint8), polarization)
 
 
 def plane_points(num=200, side=0.35):

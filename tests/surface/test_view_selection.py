@@ -21,7 +21,10 @@ def maps_of(views):
     region = Region(inside, inside, ~inside)
     samples = np.zeros((*inside.shape, 3), np.float32)
     dolp = np.zeros(inside.shape, np.uint8)
-    return [PhaseMap(v, region, samples, samples[..., 0], ~inside, dolp) for v in views]
+    polarization = np.zeros((*inside.shape, 4), np.float32)
+    return [
+        PhaseMap(v, region, samples, samples[..., 0], ~inside, dolp, polarization) for v in views
+    ]
 
 
 def seeds_at(center, num=20):
