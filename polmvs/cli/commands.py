@@ -31,6 +31,14 @@ from polmvs.config import (
     default_num_workers,
     option,
 )
+from polmvs.simulation.options import (
+    LightingOptions,
+    ObjectOptions,
+    PathOptions,
+    RenderingOptions,
+    SceneryOptions,
+    SensorOptions,
+)
 
 ABOUT = "Dense clouds of glossy, textureless surfaces from polarization cameras."
 DEMO_OUT = Path("polmvs-demo")
@@ -185,6 +193,19 @@ class ExperimentRun(OptionGroup, group="run", in_files=False):
     workers: int = option(default_num_workers(), "processes to share the views among", least=1)
 
 
+@dataclass(frozen=True, kw_only=True)
+class SimulateArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    mesh: str = option(
+        MISSING,
+        "PLY, OBJ, STL or GLB file of the object, or a built-in shape: plane, sphere, ellipsoid, "
+        "dome, box (on a plate), mug, vase, knot",
+        positional=True,
+    )
+    out: Path = option(MISSING, "folder of the capture", positional=True)
+
+
 class CalibrationKind(StrEnum):
     """What is calibrated."""
 
@@ -248,6 +269,14 @@ TO_POSES = (CaptureOptions, SfmOptions, ReferenceOptions)
 TO_NORMALS = (*TO_POSES, RegionOptions, NormalOptions)
 TO_CLOUD = (*TO_NORMALS, PropagationOptions, FusionOptions)
 SHOWN = (ReportChoice, RecordingOptions)
+SIMULATION = (
+    ObjectOptions,
+    LightingOptions,
+    SceneryOptions,
+    PathOptions,
+    SensorOptions,
+    RenderingOptions,
+)
 EXECUTION = (RunOptions, FileOptions, TerminalOptions)
 
 COMMANDS = (
@@ -376,6 +405,12 @@ COMMANDS = (
         "of a planar region from one view; tracks: normals of surface points from K views; "
         "contours: contours traced from seeds on the part's edge. The model 'tilted' presumes a "
         "lens that is not telecentric on the image side.",
+    ),
+    Command(
+        name="simulate",
+        help_text="rendered capture of a mesh with ground truth: any material, light, path, camera",
+        run="polmvs.cli.simulation:simulate",
+        groups=(SimulateArguments, *SIMULATION, FileOptions, TerminalOptions),
     ),
     Command(
         name="doctor",

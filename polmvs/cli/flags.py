@@ -39,6 +39,14 @@ from polmvs.config import (
     groups_of,
     show_value,
 )
+from polmvs.simulation.options import (
+    LightingOptions,
+    ObjectOptions,
+    PathOptions,
+    RenderingOptions,
+    SceneryOptions,
+    SensorOptions,
+)
 
 _NAMED_IN_MESSAGES: tuple[type[OptionGroup], ...] = (
     *groups_of(Options).values(),
@@ -48,6 +56,12 @@ _NAMED_IN_MESSAGES: tuple[type[OptionGroup], ...] = (
     FileOptions,
     RecordingOptions,
     TerminalOptions,
+    ObjectOptions,
+    LightingOptions,
+    SceneryOptions,
+    PathOptions,
+    SensorOptions,
+    RenderingOptions,
 )
 
 HELP_ALL = "--help-all"

@@ -15,6 +15,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
 from polmvs.camera import Camera, sample_image
@@ -184,14 +185,14 @@ def _sample_periodic(image: NDArray[np.float32], xy: Array) -> NDArray[np.float3
 @lru_cache(maxsize=2)  # of a process: a scene comes anew with each view
 def _print_levels(seed: int) -> list[NDArray[np.float32]]:
     """The print, and its means over 2, 4, 8, ... texels a side."""
-    levels = [_random_print(1024, np.random.default_rng(seed))]
+    levels = [random_print(1024, np.random.default_rng(seed))]
     while levels[-1].shape[0] > 4:
         side = levels[-1].shape[0] // 2
         levels.append(levels[-1].reshape(side, 2, side, 2).mean(axis=(1, 3)))
     return levels
 
 
-def _random_print(side: int, rng: np.random.Generator) -> NDArray[np.float32]:
+def random_print(side: int, rng: np.random.Generator) -> NDArray[np.float32]:
     """Blocks of random brightness of every size from 4 to 64 texels, smoothed at their own."""
     total = np.zeros((side, side))
     for exponent in range(2, 7):
@@ -199,8 +200,7 @@ def _random_print(side: int, rng: np.random.Generator) -> NDArray[np.float32]:
         blocks = rng.uniform(-1, 1, (side // size, side // size))
         layer = np.kron(blocks, np.ones((size, size)))
         for axis in (0, 1):  # a box of its own size leaves no edges that lie on a lattice
-            shifted = [np.roll(layer, shift, axis) for shift in range(-size // 2, size // 2)]
-            layer = np.mean(shifted, axis=0)
+            layer = uniform_filter1d(layer, size, axis, mode="wrap", origin=-1)
         total += layer
     low, high = np.percentile(total, [2, 98])
     share = np.clip((total - low) / (high - low), 0, 1)

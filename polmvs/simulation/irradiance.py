@@ -1,0 +1,198 @@
+"""Irradiance that enters the diffuse base at every vertex, by Mitsuba's path tracer.
+
+The base under a dielectric receives ``E = int L T(theta) / T(0) cos(theta) dw``, T Fresnel's
+transmittance; a matte surface the same with T = 1. Light is gathered at some of the vertices,
+spread over surface and orientation, by emitter and hemisphere samples weighted against each other
+(the balance heuristic), on one low-discrepancy set of directions shifted at random for each; the
+others are interpolated.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from polmvs.simulation.materials import transmittance
+from polmvs.simulation.scene import MitsubaScene
+
+Array = NDArray[np.float64]
+
+CHUNK = 1 << 21  # paths at a time: about 100 MB
+NORMAL_WEIGHT = 1.0  # a right angle between normals counts as 1.4 spacings
+NEIGHBORS = 6
+
+
+def bake(scene: MitsubaScene, *, bounces: int, samples: int, spacing: float, seed: int) -> None:
+    """Fill in the irradiance of all vertices.
+
+    Parameters
+    ----------
+    bounces : reflections that light is followed over.
+    samples : directions at each place.
+    spacing : between the places of the object, metres.
+    seed : of the directions.
+    """
+    material = scene.description.material
+    mi = scene.renderer.mi
+    meshes = [scene.description.part, *(s.mesh for s in scene.description.surroundings)]
+    for index, (shape, mesh) in enumerate(zip(scene.shapes, meshes, strict=True)):
+        is_part = index == 0
+        if is_part and material.metal is not None:
+            continue
+        vertices, normals = mesh.vertices, mesh.normals
+        chosen = _representatives(vertices, normals, spacing) if is_part else slice(None)
+        ior = material.ior if is_part else None
+        gathered = _gather(
+            scene, vertices[chosen], normals[chosen], ior, bounces, samples, seed + index
+        )
+        if is_part:
+            values = _spread(
+                vertices[chosen], normals[chosen], gathered, vertices, normals, spacing
+            )
+        else:
+            values = gathered
+        parameters = mi.traverse(shape)
+        parameters["vertex_irradiance"] = np.asarray(values, np.float32)
+        parameters.update()
+
+
+def _representatives(vertices: Array, normals: Array, spacing: float) -> NDArray[np.int64]:
+    """Indices of vertices, one of each cell in space that faces about the same way."""
+    cells = np.concatenate([np.floor(vertices / spacing), np.rint(1.2 * normals)], axis=1)
+    _, first = np.unique(cells.astype(np.int64), axis=0, return_index=True)
+    return np.asarray(first, np.int64)
+
+
+def _spread(
+    places: Array,
+    place_normals: Array,
+    values: Array,
+    vertices: Array,
+    normals: Array,
+    spacing: float,
+) -> Array:
+    """Values at vertices, interpolated from places near them that face the same way."""
+    tree = cKDTree(np.concatenate([places / spacing, NORMAL_WEIGHT * place_normals], axis=1))
+    wanted = np.concatenate([vertices / spacing, NORMAL_WEIGHT * normals], axis=1)
+    num = min(NEIGHBORS, len(places))
+    distance, index = tree.query(wanted, k=num)
+    distance, index = distance.reshape(-1, num), index.reshape(-1, num)
+    weights = np.exp(-0.5 * np.square(distance / 0.8)) + 1e-9
+    return np.asarray((weights * values[index]).sum(axis=1) / weights.sum(axis=1))
+
+
+def _gather(
+    scene: MitsubaScene,
+    points: Array,
+    normals: Array,
+    ior: float | None,
+    bounces: int,
+    samples: int,
+    seed: int,
+) -> Array:
+    """Irradiance (N,) at points with their normals."""
+    per_chunk = max(1, CHUNK // samples)
+    parts = [
+        _gather_chunk(
+            scene,
+            points[start : start + per_chunk],
+            normals[start : start + per_chunk],
+            ior,
+            bounces,
+            samples,
+            seed * 7919 + start,
+        )
+        for start in range(0, len(points), per_chunk)
+    ]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _gather_chunk(
+    scene: MitsubaScene,
+    points: Array,
+    normals: Array,
+    ior: float | None,
+    bounces: int,
+    samples: int,
+    seed: int,
+) -> Array:
+    mi, dr = scene.renderer.mi, scene.renderer.dr
+    num = len(points) * samples
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed & 0x7FFFFFFF, num)
+    index = dr.arange(mi.UInt32, num)
+    site, step = index // samples, index % samples
+    offset = 1e-4 * float(np.ptp(scene.description.part.vertices, axis=0).max())
+
+    def at_site(values: Array) -> Any:
+        columns = [mi.Float(np.ascontiguousarray(values[:, k], np.float32)) for k in range(3)]
+        return mi.Vector3f(*(dr.gather(mi.Float, column, site) for column in columns))
+
+    normal = at_site(normals)
+    origin = mi.Point3f(at_site(points + offset * normals))
+    shifts = np.random.default_rng(seed).uniform(size=(len(points), 4)).astype(np.float32)
+    frame = mi.Frame3f(normal)
+
+    def stratified(first: int) -> Any:
+        # Roberts' sequence: additive, of the plastic number.
+        values = []
+        for k, step_size in enumerate((0.7548776662466927, 0.5698402909980532)):
+            shift = dr.gather(mi.Float, mi.Float(shifts[:, first + k].copy()), site)
+            value = mi.Float(step) * step_size + shift
+            values.append(value - dr.floor(value))
+        return mi.Point2f(*values)
+
+    def entering(cosine: Any) -> Any:
+        if ior is None:
+            return mi.Float(1.0)
+        refracted = dr.sqrt(1 - (1 - cosine * cosine) / ior**2)
+        across = dr.square((cosine - ior * refracted) / (cosine + ior * refracted))
+        along = dr.square((ior * cosine - refracted) / (ior * cosine + refracted))
+        normal_incidence = float(transmittance(np.array(1.0), complex(ior)))
+        return (1 - 0.5 * (across + along)) / normal_incidence
+
+    def brightness(value: Any) -> Any:
+        # Of unpolarized light: the first element of Mueller's matrix, its mean over wavelengths.
+        return dr.mean(value[0, 0])
+
+    # Samples of the hemisphere: light from surfaces, and that of the sky with its share.
+    local = mi.warp.square_to_cosine_hemisphere(stratified(0))
+    cosine = local.z
+    ray = mi.Ray3f(origin, frame.to_world(local))
+    if scene.description.colour:
+        ray.wavelengths = mi.Float(_SPREAD_NM)
+    hit = scene.scene.ray_intersect(ray)
+    density = cosine / dr.pi
+    emitter = hit.emitter(scene.scene)
+    has_emitter = dr.neq(emitter, None) if hasattr(dr, "neq") else emitter != None  # noqa: E711
+    start = dr.zeros(mi.Interaction3f, num)
+    start.p, start.n, start.wavelengths = origin, normal, ray.wavelengths
+    emitted = brightness(emitter.eval(hit, has_emitter))
+    record = mi.DirectionSample3f(scene.scene, hit, start)
+    of_emitter = scene.scene.pdf_emitter_direction(start, record, has_emitter)
+    emitted *= density / (density + of_emitter)
+    indirect = mi.Float(0.0)
+    if bounces > 1:
+        path = mi.load_dict(
+            {"type": "path", "max_depth": bounces, "rr_depth": 64, "hide_emitters": True}
+        )
+        found, _, _ = path.sample(
+            scene.scene, sampler, mi.RayDifferential3f(ray), None, hit.is_valid() & ~has_emitter
+        )
+        indirect = dr.select(hit.is_valid() & ~has_emitter, brightness(found), 0.0)
+    total = dr.pi * entering(cosine) * (dr.select(has_emitter, emitted, 0.0) + indirect)
+    # Samples of the emitters, with theirs.
+    towards, weight = scene.scene.sample_emitter_direction(start, stratified(2), True)
+    cosine = dr.dot(towards.d, normal)
+    lit = (cosine > 0) & (towards.pdf > 0)
+    share = towards.pdf / (towards.pdf + cosine / dr.pi)
+    direct = brightness(weight) * cosine * entering(dr.maximum(cosine, 1e-6)) * share
+    total += dr.select(lit, direct, 0.0)
+    summed = dr.block_reduce(dr.ReduceOp.Add, total, samples)
+    return np.asarray(summed, np.float64) / samples
+
+
+_SPREAD_NM = (450.0, 520.0, 580.0, 640.0)

@@ -1,0 +1,108 @@
+"""Printed marks on the object: where SfM finds sparse points on a part without texture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.geometry import unit
+from polmvs.io.clouds import Mesh
+
+Array = NDArray[np.float64]
+
+PRINT_CELLS = 8  # along a mark's side
+CELL_TEXELS = 8
+CANDIDATES = 4000
+LOWEST = -0.3  # z of a mark's normal: what faces further down is seen by few views
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Marks:
+    """Round prints under the gloss of the surface.
+
+    Attributes
+    ----------
+    centers, axes : (M, 3) and (M, 3, 3), world; rows of the axes are the print's x and y and the
+        surface's normal.
+    radius : metres.
+    print_atlas : (N, M N) float32, albedo, one print beside the other.
+    """
+
+    centers: Array
+    axes: Array
+    radius: float
+    print_atlas: NDArray[np.float32]
+
+
+def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
+    """Marks spread evenly over what of a surface faces the sky or sideways.
+
+    Parameters
+    ----------
+    mesh : of the object, metres.
+    number : of marks.
+    diameter : of a mark, metres.
+    seed : of their places and prints.
+    """
+    rng = np.random.default_rng(seed)
+    points, normals = _on_surface(mesh, rng)
+    usable = normals[:, 2] > LOWEST
+    usable &= points[:, 2] > 0.5 * diameter
+    if not usable.any():
+        usable = normals[:, 2] > LOWEST
+    points, normals = points[usable], normals[usable]
+    chosen = _far_apart(points, normals, number if len(points) else 0, rng)
+    axes = [_axes(normals[index], rng.uniform(0, 2 * np.pi)) for index in chosen]
+    prints = [_print(rng) for _ in chosen]
+    side = PRINT_CELLS * CELL_TEXELS
+    return Marks(
+        centers=points[chosen].reshape(-1, 3),
+        axes=np.array(axes, np.float64).reshape(-1, 3, 3),
+        radius=0.5 * diameter,
+        print_atlas=np.concatenate([np.zeros((side, 0), np.float32), *prints], axis=1),
+    )
+
+
+def _on_surface(mesh: Mesh, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Random points of a mesh, evenly by area, with their normals."""
+    corners = mesh.vertices[mesh.triangles]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    chosen = rng.choice(len(area), size=CANDIDATES, p=area / area.sum())
+    first, second = rng.uniform(size=(2, CANDIDATES, 1))
+    root = np.sqrt(first)
+    weights = np.concatenate([1 - root, root * (1 - second), root * second], axis=1)
+    points = np.einsum("nk,nkd->nd", weights, corners[chosen])
+    normals = np.einsum("nk,nkd->nd", weights, mesh.normals[mesh.triangles[chosen]])
+    return points, unit(normals)
+
+
+def _far_apart(points: Array, normals: Array, number: int, rng: np.random.Generator) -> list[int]:
+    """Indices of points each as far from those before it as can be, normals counted as well."""
+    if not number:
+        return []
+    size = float(np.ptp(points, axis=0).max())
+    places = np.concatenate([points / size, 0.15 * normals], axis=1)
+    chosen = [int(rng.integers(len(points)))]
+    nearest = np.linalg.norm(places - places[chosen[0]], axis=1)
+    while len(chosen) < number:
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    return chosen
+
+
+def _axes(normal: Array, turn: float) -> Array:
+    side = np.eye(3)[int(np.abs(normal).argmin())]
+    x = unit(side - (side @ normal) * normal)
+    y = np.cross(normal, x)
+    cos, sin = np.cos(turn), np.sin(turn)
+    return np.stack([cos * x + sin * y, cos * y - sin * x, normal])
+
+
+def _print(rng: np.random.Generator) -> NDArray[np.float32]:
+    """A random pattern of cells in a light border."""
+    cells = rng.choice([0.05, 0.3, 0.6, 0.85], size=(PRINT_CELLS, PRINT_CELLS))
+    return np.asarray(np.kron(cells, np.ones((CELL_TEXELS, CELL_TEXELS))), np.float32)

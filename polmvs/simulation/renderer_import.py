@@ -1,0 +1,117 @@
+"""The only place that imports Mitsuba: which variant runs here, and what to install for one.
+
+Mitsuba's variants that compute many rays at once compile themselves with LLVM, a library of the
+system. Where it is not found in the usual folders, the scalar variant serves, which is slower.
+"""
+
+from __future__ import annotations
+
+import glob
+import logging
+import os
+import re
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+from polmvs.errors import OptionError
+
+logger = logging.getLogger(__name__)
+
+INSTALL = "Mitsuba is not installed; install the extra: pip install 'polmvs[simulate]'."
+INSTALL_LLVM = (
+    "LLVM's library was not found, so that the slow scalar renderer is used. Install it (Debian "
+    "and Ubuntu: apt install libllvm19; Fedora: dnf install llvm-libs; conda: libllvm19; macOS: "
+    "brew install llvm), or name it by the environment variable DRJIT_LIBLLVM_PATH."
+)
+LLVM_FOLDERS = (
+    "/usr/lib/*-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/lib/llvm-*/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm/lib",
+    "/usr/local/opt/llvm/lib",
+)
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """Mitsuba with its variant set.
+
+    Attributes
+    ----------
+    mi, dr : the modules ``mitsuba`` and ``drjit``.
+    variant : name of the variant.
+    """
+
+    mi: Any
+    dr: Any
+    variant: str
+
+    @property
+    def is_scalar(self) -> bool:
+        """Whether rays are computed one at a time."""
+        return self.variant.startswith("scalar")
+
+
+def import_renderer(*, colour: bool = False, variant: str | None = None) -> Renderer:
+    """Mitsuba in the fastest polarized variant that runs here.
+
+    Parameters
+    ----------
+    colour : spectra instead of one brightness.
+    variant : to use this one and no other.
+
+    Raises
+    ------
+    OptionError
+        Mitsuba is not installed, or it does not have the variant.
+    """
+    llvm = find_llvm()
+    if llvm is not None:
+        os.environ.setdefault("DRJIT_LIBLLVM_PATH", llvm)
+    try:
+        import drjit
+        import mitsuba
+    except ImportError as error:
+        raise OptionError(INSTALL) from error
+    mi: Any = mitsuba
+    dr: Any = drjit
+    chosen = variant or _best(dr, has_llvm=llvm is not None, colour=colour)
+    if chosen not in mi.variants():
+        raise OptionError(
+            f"must be one of {', '.join(v for v in mi.variants() if 'polarized' in v)}, not "
+            f"{chosen}.",
+            field="rendering.variant",
+        )
+    mi.set_variant(chosen)
+    mi.set_log_level(mi.LogLevel.Error)
+    return Renderer(mi, dr, chosen)
+
+
+def find_llvm() -> str | None:
+    """Path of the newest library of LLVM in the usual folders; None where there is none."""
+    given = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if given:
+        return given if os.path.exists(given) else None
+    folders = (*LLVM_FOLDERS, os.path.join(sys.prefix, "lib"))
+    names = ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")
+    found = [path for folder in folders for name in names for path in glob.glob(f"{folder}/{name}")]
+    return max(found, key=_version, default=None)
+
+
+def _version(path: str) -> tuple[int, ...]:
+    """Numbers of a library's name."""
+    return tuple(map(int, re.findall(r"\d+", os.path.basename(path)))) or (0,)
+
+
+def _best(dr: Any, *, has_llvm: bool, colour: bool) -> str:
+    """The fastest variant that runs here."""
+    kind = "spectral" if colour else "mono"
+    if dr.has_backend(dr.JitBackend.CUDA):
+        return f"cuda_ad_{kind}_polarized"
+    if has_llvm and dr.has_backend(dr.JitBackend.LLVM):
+        return f"llvm_ad_{kind}_polarized"
+    logger.warning(INSTALL_LLVM)
+    return "scalar_spectral_polarized"

@@ -1,0 +1,154 @@
+"""What lies about the object: a table with printed clutter, or a calibration board.
+
+SfM needs features that stand still about a part that has none. Everything here is matte: its light
+is unpolarized and the same from every side.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.geometry import unit
+from polmvs.io.clouds import Mesh
+from polmvs.simulation.options import Scenery, SceneryOptions
+from polmvs.synthetic.printed import random_print
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+# All lengths in sizes of the object.
+TABLE_SIDE = 5.0
+TURNTABLE_RADIUS = 1.3
+TABLE_CELLS = 96  # along a side; those in the middle are four times as narrow as at the border
+NUM_BLOCKS = 9
+BLOCK_RING = (0.78, 1.3)
+PRINT_SIDE = 2048  # texels of the table's print: 2.4 mm of an object of a metre
+BLOCK_PRINT_SIDE = 256
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Surrounding:
+    """A matte printed surface.
+
+    Attributes
+    ----------
+    mesh : metres, world; fine enough for the light on it to be linear in its triangles.
+    uv : (V, 2) float32, places of the vertices on the print, 0 to 1, v downwards.
+    print : (H, W) float32, albedo.
+    """
+
+    mesh: Mesh
+    uv: NDArray[np.float32]
+    print: Image
+
+
+def surroundings(
+    options: SceneryOptions, size: float, radius: float, seed: int
+) -> list[Surrounding]:
+    """What lies about an object on the plane z = 0.
+
+    Parameters
+    ----------
+    size : largest side of the object, metres.
+    radius : of the circle about the origin that the object stands in, metres.
+    seed : of the prints and places.
+    """
+    if options.surroundings is Scenery.NOTHING:
+        return []
+    rng = np.random.default_rng(seed)
+    return [_table(size, rng, round_=options.turntable), *_blocks(size, radius, rng, options)]
+
+
+def _table(size: float, rng: np.random.Generator, *, round_: bool) -> Surrounding:
+    steps = np.linspace(-1, 1, TABLE_CELLS + 1)
+    places = np.sinh(2 * steps) / np.sinh(2)
+    if round_:  # rays from the middle, so that the border is a circle
+        angle = np.linspace(0, 2 * np.pi, 2 * TABLE_CELLS + 1)
+        radius = np.linspace(0, 1, TABLE_CELLS // 2 + 1)
+        unit_xy = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        half = TURNTABLE_RADIUS * size
+        rows, cols = TABLE_CELLS // 2, 2 * TABLE_CELLS
+    else:
+        unit_xy = np.stack(np.meshgrid(places, places), axis=-1)
+        half = 0.5 * TABLE_SIDE * size
+        rows = cols = TABLE_CELLS
+    unit_xy = unit_xy.reshape(-1, 2)
+    points = np.column_stack([half * unit_xy, np.zeros(len(unit_xy))])
+    index = np.arange((rows + 1) * (cols + 1)).reshape(rows + 1, cols + 1)
+    a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
+    c, d = index[1:, 1:].ravel(), index[1:, :-1].ravel()
+    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    if round_:
+        triangles = triangles[:, ::-1]
+    normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape).copy()
+    # The print's texels are of one size whatever the table's.
+    share = half / (0.5 * TABLE_SIDE * size)
+    uv = 0.5 + 0.5 * share * unit_xy
+    mesh = Mesh(points, normals, np.ascontiguousarray(triangles, np.int32))
+    return Surrounding(mesh=mesh, uv=uv.astype(np.float32), print=random_print(PRINT_SIDE, rng))
+
+
+def _blocks(
+    size: float, radius: float, rng: np.random.Generator, options: SceneryOptions
+) -> list[Surrounding]:
+    """Printed boxes in a ring about the object, which they do not touch."""
+    found = []
+    for index in range(NUM_BLOCKS):
+        sides = size * rng.uniform([0.14, 0.12, 0.06], [0.3, 0.24, 0.26])
+        turn = rng.uniform(0, np.pi)
+        azimuth = 2 * np.pi * (index + rng.uniform(-0.25, 0.25)) / NUM_BLOCKS
+        nearest = radius + 0.5 * float(np.hypot(*sides[:2]))
+        low, high = BLOCK_RING
+        if options.turntable:
+            high = TURNTABLE_RADIUS - 0.2
+        away = max(nearest + 0.05 * size, size * rng.uniform(low, high))
+        center = away * np.array([math.cos(azimuth), math.sin(azimuth)])
+        found.append(_block(sides, turn, center, random_print(BLOCK_PRINT_SIDE, rng)))
+    return found
+
+
+def _block(sides: Array, turn: float, center: Array, texture: Image) -> Surrounding:
+    """A box that stands on the table; its faces share one print, each a part of it."""
+    half = 0.5 * sides
+    cells = 6
+    points: list[Array] = []
+    normals: list[Array] = []
+    uvs: list[Array] = []
+    triangles: list[NDArray[np.int64]] = []
+    steps = np.linspace(-1, 1, cells + 1)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
+    c, d = index[1:, 1:].ravel(), index[1:, :-1].ravel()
+    quad = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    rotation = np.array(
+        [[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]]
+    )
+    longest = float(sides.max())
+    for face, (first, second, outwards) in enumerate(
+        (
+            ([1, 0, 0], [0, 1, 0], [0, 0, 1]),
+            ([0, 1, 0], [0, 0, 1], [1, 0, 0]),
+            ([0, 0, 1], [0, 1, 0], [-1, 0, 0]),
+            ([0, 0, 1], [1, 0, 0], [0, 1, 0]),
+            ([1, 0, 0], [0, 0, 1], [0, -1, 0]),
+        )
+    ):
+        local = (grid @ np.array([first, second]) + outwards) * half
+        start = len(points) * len(grid)
+        points.append(local @ rotation.T + [*center, half[2]])
+        normals.append(np.broadcast_to(rotation @ np.array(outwards, np.float64), local.shape))
+        extent = np.array([np.abs(first) @ sides, np.abs(second) @ sides]) / longest / 3
+        corner = np.array([face % 3, face // 3]) / 3
+        uvs.append(corner + (0.5 * grid + 0.5) * extent)
+        triangles.append(quad + start)
+    mesh = Mesh(
+        np.concatenate(points),
+        unit(np.concatenate(normals)),
+        np.concatenate(triangles).astype(np.int32),
+    )
+    return Surrounding(mesh=mesh, uv=np.concatenate(uvs).astype(np.float32), print=texture)

@@ -1,0 +1,308 @@
+"""From rays to Stokes vectors: specular reflections are followed, diffuse light is looked up.
+
+A ray collects, at each surface that it meets, what its diffuse base sends out (the baked
+irradiance times the albedo, polarized by leaving the interface) and goes on along a sampled
+specular reflection, whose Mueller matrix it carries; the sky ends it. Stokes vectors come out in
+the basis of the ray's transverse plane that is the image's x and upward y turned by the shortest
+rotation from the optical axis to the ray (as in :mod:`polmvs.polarization.angle_models`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.geometry import RigidTransform
+from polmvs.simulation.scene import MitsubaScene
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+CHUNK_RAYS = 1 << 21  # at a time: about 300 MB
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lens:
+    """Where the rays of a file's samples go, and how they are blurred.
+
+    Attributes
+    ----------
+    corners : (H + 1, W + 1, 2) float32, ``(x / z, y / z)`` of the rays through the corners of the
+        samples, camera frame; between them rays are interpolated.
+    aperture : radius, metres; 0 of a pinhole.
+    focus : distance of the plane in focus, metres.
+    motion : (3,), metres that the camera moves during an exposure, camera frame.
+    """
+
+    corners: NDArray[np.float32]
+    aperture: float = 0.0
+    focus: float = 1.0
+    motion: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of samples."""
+        rows, cols = self.corners.shape[:2]
+        return rows - 1, cols - 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Traced:
+    """Sums over the rays of N samples of a file.
+
+    Attributes
+    ----------
+    stokes : (N, 3), s0, s1, s2 of all light.
+    diffuse : (N, 2), s1, s2 of the part's own diffuse light alone.
+    squares : (N,), of the light behind the sample's own polarizer.
+    """
+
+    stokes: Array
+    diffuse: Array
+    squares: Array
+
+
+def trace(
+    scene: MitsubaScene,
+    lens: Lens,
+    cam_from_world: RigidTransform,
+    samples: NDArray[np.int64],
+    angles: NDArray[np.float32],
+    rays: int,
+    *,
+    bounces: int,
+    seed: int,
+    wavelengths: NDArray[np.float32] | None = None,
+) -> Traced:
+    """Send rays through samples of a file, evenly spread over each sample's area.
+
+    Parameters
+    ----------
+    samples : (N,), flat indices of samples, row by row.
+    angles : (N,), of each one's polarizer, rad.
+    rays : of each sample.
+    bounces : reflections that are followed.
+    seed : of all that is random.
+    wavelengths : (N, 4), nm, that each sample's rays have; None without colours.
+    """
+    per_chunk = max(1, CHUNK_RAYS // rays)
+    parts = []
+    for start in range(0, len(samples), per_chunk):
+        part = np.s_[start : start + per_chunk]
+        colours = None if wavelengths is None else wavelengths[part]
+        parts.append(
+            _trace_chunk(
+                scene,
+                lens,
+                cam_from_world,
+                samples[part],
+                angles[part],
+                rays,
+                bounces,
+                (seed * 1_000_003 + start) & 0x7FFFFFFF,
+                colours,
+            )
+        )
+    return Traced(
+        stokes=np.concatenate([p.stokes for p in parts]),
+        diffuse=np.concatenate([p.diffuse for p in parts]),
+        squares=np.concatenate([p.squares for p in parts]),
+    )
+
+
+def _trace_chunk(
+    scene: MitsubaScene,
+    lens: Lens,
+    cam_from_world: RigidTransform,
+    samples: NDArray[np.int64],
+    angles: NDArray[np.float32],
+    rays: int,
+    bounces: int,
+    seed: int,
+    wavelengths: NDArray[np.float32] | None,
+) -> Traced:
+    mi, dr = scene.renderer.mi, scene.renderer.dr
+    num = len(samples) * rays
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, num)
+    index = dr.arange(mi.UInt32, num)
+    site = index // rays
+    sample = dr.gather(mi.UInt32, mi.UInt32(samples.astype(np.uint32)), site)
+    direction_in_cam, offset_in_cam = _camera_rays(scene, lens, sample, index % rays, rays, sampler)
+    rotation = cam_from_world.rotation.T
+    center = cam_from_world.inverse().translation
+    direction = _rotated(mi, rotation, direction_in_cam)
+    offset = _rotated(mi, rotation, offset_in_cam)
+    ray = mi.Ray3f(mi.Point3f(*map(float, center)) + offset, direction)
+    if wavelengths is not None:
+        ray.wavelengths = type(ray.wavelengths)(
+            *(
+                dr.gather(mi.Float, mi.Float(np.ascontiguousarray(wavelengths[:, k])), site)
+                for k in range(4)
+            )
+        )
+    total, diffuse = _follow(scene, ray, sampler, bounces)
+    # Mitsuba's basis, turned to that of the image; angles count anticlockwise as displayed.
+    along, up = _image_basis(mi, direction_in_cam)
+    basis = mi.mueller.stokes_basis(-direction)
+    cos = dr.dot(basis, _rotated(mi, rotation, along))
+    sin = dr.dot(basis, _rotated(mi, rotation, up))
+    cos2, sin2 = cos * cos - sin * sin, 2 * sin * cos
+
+    def turned(s1: Any, s2: Any) -> tuple[Any, Any]:
+        return cos2 * s1 - sin2 * s2, sin2 * s1 + cos2 * s2
+
+    s1, s2 = turned(total[1], total[2])
+    d1, d2 = turned(diffuse[0], diffuse[1])
+    angle = dr.gather(mi.Float, mi.Float(angles), site)
+    behind = 0.5 * (total[0] + dr.cos(2 * angle) * s1 + dr.sin(2 * angle) * s2)
+    sums = [
+        dr.block_reduce(dr.ReduceOp.Add, value, rays)
+        for value in (total[0], s1, s2, d1, d2, behind * behind)
+    ]
+    dr.eval(sums)
+    columns = [np.asarray(value, np.float64) for value in sums]
+    return Traced(
+        stokes=np.stack(columns[:3], axis=1),
+        diffuse=np.stack(columns[3:5], axis=1),
+        squares=columns[5],
+    )
+
+
+def _camera_rays(
+    scene: MitsubaScene, lens: Lens, sample: Any, step: Any, rays: int, sampler: Any
+) -> tuple[Any, Any]:
+    """Unit directions and starts relative to the camera's centre, camera frame."""
+    mi, dr = scene.renderer.mi, scene.renderer.dr
+    _, width = lens.shape
+    corners = mi.Float(np.ascontiguousarray(lens.corners, np.float32).ravel())
+    row, col = sample // width, sample % width
+    # Strata of the sample's area, and within one at random.
+    across, down = sampler.next_1d(), sampler.next_1d()
+    side = int(np.sqrt(rays))
+    if side * side == rays and side > 1:
+        across = (mi.Float(step % side) + across) / side
+        down = (mi.Float(step // side) + down) / side
+
+    def corner(rows: int, cols: int) -> Any:
+        place = 2 * ((row + rows) * (width + 1) + col + cols)
+        return mi.Point2f(
+            dr.gather(mi.Float, corners, place), dr.gather(mi.Float, corners, place + 1)
+        )
+
+    upper = (1 - across) * corner(0, 0) + across * corner(0, 1)
+    lower = (1 - across) * corner(1, 0) + across * corner(1, 1)
+    plane = (1 - down) * upper + down * lower
+    direction = mi.Vector3f(plane.x, plane.y, 1.0)
+    offset = mi.Vector3f(0.0)
+    if lens.aperture > 0:
+        disc = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
+        offset = mi.Vector3f(lens.aperture * disc.x, lens.aperture * disc.y, 0.0)
+        direction = lens.focus * direction - offset
+    if any(lens.motion):
+        offset = offset + (sampler.next_1d() - 0.5) * mi.Vector3f(*map(float, lens.motion))
+    return dr.normalize(direction), offset
+
+
+def _follow(scene: MitsubaScene, ray: Any, sampler: Any, bounces: int) -> tuple[Any, Any]:
+    """Stokes parameters of all light, and s1, s2 of the part's diffuse light, Mitsuba's basis."""
+    mi, dr = scene.renderer.mi, scene.renderer.dr
+    specular = mi.BSDFContext()
+    specular.type_mask = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.DeltaReflection
+    matte = mi.BSDFContext()
+    matte.type_mask = mi.BSDFFlags.DiffuseReflection
+    upright = mi.Vector3f(0.0, 0.0, 1.0)
+    part = mi.ShapePtr(scene.part)
+
+    def gathered(light: Any, radiance: Any, lit: Any) -> Any:
+        # Unpolarized light through what was met so far; its mean over wavelengths.
+        return dr.select(
+            lit, mi.Vector3f(*(dr.mean(light[k, 0] * radiance) for k in range(3))), 0.0
+        )
+
+    def proceeds(active: Any, *_: Any) -> Any:
+        return active
+
+    # A loop of Dr.Jit: rays that end do not wait for the others.
+    def follow(
+        active: Any, bounce: Any, ray: Any, sampler: Any, throughput: Any, total: Any, diffuse: Any
+    ) -> tuple[Any, ...]:
+        hit = scene.scene.ray_intersect(ray, active)
+        emitter = hit.emitter(scene.scene, active)
+        shining = active & (emitter != None)  # noqa: E711  (of each ray)
+        total = total + gathered(throughput, emitter.eval(hit, shining)[0, 0], shining)
+        active = active & hit.is_valid() & ~shining
+        is_part = active & (hit.shape == part)
+        irradiance = hit.shape.eval_attribute_1("vertex_irradiance", hit, active)
+        surface = hit.bsdf(ray)
+        others = active & ~is_part
+        lambertian = surface.eval(matte, hit, upright, others)
+        total = total + gathered(throughput @ lambertian, irradiance, others)
+        if scene.base is not None:
+            leaving = scene.base.eval(matte, hit, upright, is_part)
+            leaving = hit.to_world_mueller(leaving, -upright, hit.wi)
+            albedo = _albedo(scene, hit, is_part)
+            own = gathered(throughput @ leaving, irradiance * albedo, is_part)
+            total = total + own
+            diffuse = dr.select(bounce == 0, mi.Vector2f(own.y, own.z), diffuse)
+        active = is_part & (bounce < bounces)
+        reflected, weight = surface.sample(
+            specular, hit, sampler.next_1d(active), sampler.next_2d(active), active
+        )
+        weight = hit.to_world_mueller(weight, -reflected.wo, hit.wi)
+        active = active & (reflected.pdf > 0)
+        throughput = throughput @ weight
+        ray = hit.spawn_ray(hit.to_world(reflected.wo))
+        return active, bounce + 1, ray, sampler, throughput, total, diffuse
+
+    state = (
+        mi.Bool(True),
+        mi.UInt32(0),
+        ray,
+        sampler,
+        mi.Spectrum(1.0),
+        mi.Vector3f(0.0),
+        mi.Vector2f(0.0),
+    )
+    *_, total, diffuse = dr.while_loop(state, proceeds, follow)
+    return total, diffuse
+
+
+def _albedo(scene: MitsubaScene, hit: Any, active: Any) -> Any:
+    """Of the object's base: the material's, the mesh's colours, or that of a printed mark."""
+    mi, dr = scene.renderer.mi, scene.renderer.dr
+    albedo = scene.albedo.eval(hit, active)
+    marks = scene.description.marks
+    number = len(marks.centers)
+    if not number:
+        return albedo
+    place = mi.Point2f(0.0)
+    marked = mi.Bool(False)
+    for index, (center, axes) in enumerate(zip(marks.centers, marks.axes, strict=True)):
+        away = hit.p - mi.Point3f(*map(float, center))
+        x, y, normal = (mi.Vector3f(*map(float, axis)) for axis in axes)
+        local = mi.Point2f(dr.dot(away, x), dr.dot(away, y)) / marks.radius
+        inside = (dr.squared_norm(local) < 1) & (dr.dot(hit.n, normal) > 0.3)
+        inside &= dr.abs(dr.dot(away, normal)) < marks.radius
+        marked |= inside
+        place = dr.select(
+            inside, mi.Point2f((index + 0.5 + 0.5 * local.x) / number, 0.5 + 0.5 * local.y), place
+        )
+    printed = scene.mark_prints.eval(place)[0]
+    return dr.select(marked, type(albedo)(printed), albedo)
+
+
+def _rotated(mi: Any, rotation: Array, vector: Any) -> Any:
+    rows = [mi.Vector3f(*map(float, row)) for row in rotation]
+    return mi.Vector3f(*(row.x * vector.x + row.y * vector.y + row.z * vector.z for row in rows))
+
+
+def _image_basis(mi: Any, ray: Any) -> tuple[Any, Any]:
+    """The image's x and upward y, turned by the shortest rotation from the axis to the ray."""
+    scale = 1 / (1 + ray.z)
+    along = mi.Vector3f(1 - ray.x * ray.x * scale, -ray.x * ray.y * scale, -ray.x)
+    up = mi.Vector3f(ray.x * ray.y * scale, -(1 - ray.y * ray.y * scale), ray.y)
+    return along, up
