@@ -38,6 +38,7 @@ from polmvs.simulation.options import (
     RenderingOptions,
     SceneryOptions,
     SensorOptions,
+    SimulationRun,
 )
 
 ABOUT = "Dense clouds of glossy, textureless surfaces from polarization cameras."
@@ -410,7 +411,7 @@ COMMANDS = (
         name="simulate",
         help_text="rendered capture of a mesh with ground truth: any material, light, path, camera",
         run="polmvs.cli.simulation:simulate",
-        groups=(SimulateArguments, *SIMULATION, FileOptions, TerminalOptions),
+        groups=(SimulateArguments, *SIMULATION, SimulationRun, FileOptions, TerminalOptions),
     ),
     Command(
         name="doctor",

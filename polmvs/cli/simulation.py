@@ -13,6 +13,7 @@ from polmvs.simulation.options import (
     RenderingOptions,
     SceneryOptions,
     SensorOptions,
+    SimulationRun,
 )
 
 
@@ -27,7 +28,13 @@ def simulate(call: Call, terminal: Terminal) -> int:
         sensor=call.get(SensorOptions),
         rendering=call.get(RenderingOptions),
     )
-    with terminal.stage("simulate", simulation.path.views) as on_progress:
-        num = simulate_capture(arguments.mesh, arguments.out, simulation, on_progress=on_progress)
-    terminal.show(f"{arguments.out}: {num} views", {"out": arguments.out, "views": num})
+    with terminal.stage("simulate", None) as on_progress:
+        made = simulate_capture(
+            arguments.mesh,
+            arguments.out,
+            simulation,
+            call.get(SimulationRun),
+            on_progress=on_progress,
+        )
+    terminal.show("\n".join(made.lines), made)
     return 0

@@ -1,49 +1,79 @@
-"""Render a whole capture with its ground truth."""
+"""A rendered capture: folders that ``polmvs reconstruct`` and ``compare --gt`` read.
+
+``OUT/raw/`` the files of the sensor, ``OUT/camera.txt`` its intrinsics for ``--camera``,
+``OUT/capture.toml`` what its samples mean for ``--config``, ``OUT/masks/`` if they are wanted,
+``OUT/gt/`` the ground truth (:mod:`polmvs.simulation.truth`) with the mesh, ``OUT/simulation.json``
+all options and what followed from them. A view's first file in ``raw/`` is its last to be written:
+what has one is finished, and ``resume`` goes on after it.
+"""
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, field
+import logging
+import shutil
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.geometry import lengths
-from polmvs.io.ground_truth import DEPTH_UNIT_M
+from polmvs._version import __version__
+from polmvs.config import to_plain
+from polmvs.errors import DataError, OptionError, as_data_error
+from polmvs.geometry import RigidTransform
+from polmvs.io.clouds import Mesh, write_mesh
 from polmvs.io.images import write_bytes, write_png
-from polmvs.io.intrinsics import Intrinsics, write_intrinsics
+from polmvs.io.intrinsics import write_intrinsics
+from polmvs.io.typed_json import parse_json, write_json
 from polmvs.parallel import OnProgress, no_progress
-from polmvs.scene import View, stem_of
+from polmvs.polarization.mosaic import ANGLES_DEG
+from polmvs.scene import View, short_list, stem_of
+from polmvs.simulation.camera_model import (
+    camera_of,
+    lens_of,
+    object_distance,
+    pinhole_of,
+    polarization_intrinsics,
+)
 from polmvs.simulation.camera_path import camera_views
 from polmvs.simulation.irradiance import bake
 from polmvs.simulation.lights import environment
 from polmvs.simulation.marks import marks_on
 from polmvs.simulation.materials import material_of
-from polmvs.simulation.mesh_input import object_mesh
+from polmvs.simulation.mesh_input import ObjectMesh, object_mesh
 from polmvs.simulation.options import (
     LightingOptions,
+    LightName,
     ObjectOptions,
     PathOptions,
     RenderingOptions,
     SceneryOptions,
+    SensorKind,
     SensorOptions,
+    SimulationRun,
 )
-from polmvs.simulation.renderer_import import import_renderer
+from polmvs.simulation.picture import Picture, expose_picture, render_picture
+from polmvs.simulation.renderer_import import Renderer, import_renderer
 from polmvs.simulation.scene import MitsubaScene, SceneDescription, build_scene
-from polmvs.simulation.sensor import (
-    Channels,
-    draw_channels,
-    expose,
-    polarizer_images,
-    sample_angles,
-    sample_centers,
-)
+from polmvs.simulation.sensor import Channels, draw_channels, stated_sigma
 from polmvs.simulation.surroundings import surroundings
-from polmvs.simulation.transport import Lens, trace
+from polmvs.simulation.truth import true_maps, write_cameras, write_truth
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+
+RECORD = "simulation.json"
+FILLED = 0.8  # of the image's smaller side by the object's circumscribed sphere
+METERED_VIEWS = 4  # that the exposure is taken from
+METERED_STEP = 13  # samples between two that are metered; coprime with the mosaic's cell
+METERED_PERCENTILE, METERED_LEVEL = 99.0, 0.85  # of the light, and its level in full scales
+CHECKED_SIDE = 96  # px of the images in which the views are checked before they are rendered
+MIN_SEEN = 50  # px of them that must show the object: 0.5 %
+PLACES = 30  # spacing of baked light on the object, of its size
+FIXED_DIRECTIONS, MOVING_DIRECTIONS = 512, 128  # of baked light that holds for all views, or one
+PREVIEW_VIEWS, PREVIEW_SCALE = 2, 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,135 +87,441 @@ class Simulation:
     sensor: SensorOptions = field(default_factory=SensorOptions)
     rendering: RenderingOptions = field(default_factory=RenderingOptions)
 
+    def for_preview(self) -> Simulation:
+        """Two views at a quarter of the size."""
+        cell = 4 if self.sensor.colour is not None else 2
+        width, height = (
+            max(16, side // PREVIEW_SCALE // cell * cell) for side in self.sensor.image_size
+        )
+        return replace(
+            self,
+            path=replace(self.path, views=min(self.path.views, PREVIEW_VIEWS)),
+            sensor=replace(self.sensor, image_size=(width, height)),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedView:
+    """What is known of a finished view.
+
+    Attributes
+    ----------
+    rays : of a sample of the file, mean.
+    noise : median over the samples of the rendering's noise over the sensor's.
+    noisier : share of the samples whose rendering is noisier than it should be.
+    """
+
+    rays: float
+    noise: float
+    noisier: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedCapture:
+    """A finished capture.
+
+    Attributes
+    ----------
+    folder : of it.
+    views : by name, those that this call rendered.
+    num_views : of the whole capture.
+    exposure : full scales for each unit of radiance.
+    variant : Mitsuba's.
+    """
+
+    folder: Path
+    views: dict[str, SimulatedView]
+    num_views: int
+    exposure: float
+    variant: str
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """For people."""
+        lines = [
+            f"{self.folder}: {self.num_views} views, raw/, gt/, camera.txt; Mitsuba {self.variant}"
+        ]
+        if self.views:
+            rays = np.mean([view.rays for view in self.views.values()])
+            noise = np.median([view.noise for view in self.views.values()])
+            noisier = np.mean([view.noisier for view in self.views.values()])
+            lines.append(
+                f"{rays:.0f} rays a sample; noise of the rendering {noise:.2f} of the sensor's "
+                f"(median), above the limit in {100 * noisier:.1f} % of the samples"
+            )
+        lines.append(
+            f"next: polmvs reconstruct {self.folder} RUN --camera {self.folder / 'camera.txt'} "
+            f"--config {self.folder / 'capture.toml'}"
+        )
+        return tuple(lines)
+
 
 def simulate_capture(
-    mesh: str, out: Path, simulation: Simulation, *, on_progress: OnProgress = no_progress
-) -> int:
-    """Render a capture; the number of its views."""
-    options = simulation
-    part = object_mesh(mesh, options.object)
-    low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
-    size = float((high - low).max())
-    radius = float(lengths(part.vertices[:, :2] @ np.eye(2, 3)).max())
-    seed = options.rendering.seed
-    width, height = options.sensor.image_size
-    focal = 0.5 * width / np.tan(np.radians(options.sensor.field_of_view / 2))
-    camera = PinholeCamera(
-        width=width // 2,
-        height=height // 2,
-        fx=focal / 2,
-        fy=focal / 2,
-        cx=width / 4,
-        cy=height / 4,
+    mesh: str | Path | Mesh,
+    out: Path,
+    simulation: Simulation,
+    run: SimulationRun | None = None,
+    *,
+    on_progress: OnProgress = no_progress,
+) -> SimulatedCapture:
+    """Render a capture.
+
+    Parameters
+    ----------
+    mesh : file of the object or name of a built-in shape.
+    out : folder of the capture.
+    simulation : what is rendered.
+    run : whether an earlier capture is replaced or gone on with.
+    on_progress : told of each view.
+
+    Raises
+    ------
+    DataError, OptionError
+        A file is unusable, options contradict each other, or a view sees nothing.
+    """
+    run = run or SimulationRun()
+    options = simulation.for_preview() if simulation.rendering.preview else simulation
+    plan = _Plan.make(mesh, options)
+    renderer = import_renderer(
+        colour=options.sensor.colour is not None, variant=options.rendering.variant
     )
-    target = 0.5 * (low + high)
-    reach = 0.5 * float(np.linalg.norm(high - low))
-    distance = options.path.distance or reach / np.sin(
-        np.arctan(0.8 * 0.5 * camera.height / camera.fy)
-    )
-    views = camera_views(options.path, camera, target, distance, seed)
-    renderer = import_renderer(variant=options.rendering.variant)
-    description = SceneDescription(
-        part=part,
-        material=material_of(options.object),
-        vertex_albedo=None,
-        marks=marks_on(part, options.object.marks, options.object.mark_size * size, seed),
-        surroundings=surroundings(options.scenery, size, radius, seed),
-        environment=environment(options.lighting),
-        colour=False,
-    )
-    scene = build_scene(renderer, description)
-    bake(scene, bounces=options.lighting.bounces, samples=256, spacing=size / 30, seed=seed)
-    raw, gt = out / "raw", out / "gt"
-    raw.mkdir(parents=True, exist_ok=True)
-    gt.mkdir(exist_ok=True)
-    channels = draw_channels(options.sensor, seed)
-    exposure = 1.0
-    images = {
-        view.name: {
-            "K": camera.K.tolist(),
-            "cam_from_world": np.column_stack(
-                [view.cam_from_world.rotation, view.cam_from_world.translation]
-            ).tolist(),
-        }
-        for view in views
-    }
-    content = {"width": camera.width, "height": camera.height, "images": images}
-    write_bytes(gt / "cameras.json", json.dumps(content, indent=1).encode())
-    intrinsics = Intrinsics(
-        model="PINHOLE",
-        width=camera.width,
-        height=camera.height,
-        params=(camera.fx, camera.fy, camera.cx, camera.cy),
-    )
-    write_intrinsics(out / "camera.txt", intrinsics)
-    for index, view in enumerate(views):
-        _write_view(scene, view, options, channels, exposure, raw, gt, index)
+    record = {"version": __version__, "mesh": plan.mesh.source, **to_plain(asdict(options))}
+    finished = _open_folder(out, record, run)
+    studio = _Studio(renderer, plan)
+    studio.check_views()
+    exposure = options.sensor.exposure or studio.metered_exposure()
+    _write_head(out, plan, {**record, "exposure": exposure, "channels": asdict(plan.channels)})
+    found: dict[str, SimulatedView] = {}
+    for index, view in enumerate(plan.views):
+        if view.name not in finished:
+            found[view.name] = _write_view(out, studio, index, exposure)
         on_progress(1)
-    return len(views)
+    write_cameras(out / "gt", plan.views)  # what makes the truth complete
+    return SimulatedCapture(
+        folder=out,
+        views=found,
+        num_views=len(plan.views),
+        exposure=exposure,
+        variant=renderer.variant,
+    )
 
 
-def _write_view(
-    scene: MitsubaScene,
-    view: View,
-    options: Simulation,
-    channels: Channels,
-    exposure: float,
-    raw: Path,
-    gt: Path,
-    index: int,
-) -> None:
-    camera = view.camera
-    rows, cols = 2 * camera.height, 2 * camera.width
-    grid = 0.5 * np.stack(np.meshgrid(np.arange(cols + 1), np.arange(rows + 1)), axis=-1)
-    rays = camera.rays(grid)
-    lens = Lens(corners=(rays[..., :2] / rays[..., 2:]).astype(np.float32))
-    which = sample_angles(options.sensor, (rows, cols))
-    angles = np.radians(np.array(channels.angles_deg))[which].ravel().astype(np.float32)
-    num = 16
-    traced = trace(
-        scene,
-        lens,
-        view.cam_from_world,
-        np.arange(rows * cols),
-        angles,
-        num,
-        bounces=options.lighting.bounces,
-        seed=options.rendering.seed * 100_003 + index,
-    )
-    stokes = (traced.stokes / num).reshape(rows, cols, 3)
-    centers = sample_centers(camera, options.sensor.sensor)
-    light = polarizer_images(
-        stokes,
-        camera.rays(centers),
-        np.array(channels.angles_deg)[which],
-        options.sensor.optics,
-        channels.diattenuation,
-    )
-    light = light * np.array(channels.gains)[which]
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Plan:
+    """All that is decided before anything is rendered."""
+
+    options: Simulation
+    mesh: ObjectMesh
+    size: float
+    target: Array
+    views: list[View]
+    description: SceneDescription
+    channels: Channels
+
+    @classmethod
+    def make(cls, source: str | Path | Mesh, options: Simulation) -> _Plan:
+        """Read what is given, and place everything.
+
+        Raises
+        ------
+        DataError, OptionError
+            It cannot be used.
+        """
+        _require_compatible(options)
+        material = material_of(options.object)
+        sky = environment(options.lighting)
+        intrinsics = polarization_intrinsics(options.sensor)
+        camera = camera_of(intrinsics)
+        mesh = object_mesh(source, options.object)
+        vertices = mesh.mesh.vertices
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        size = float((high - low).max())
+        target = 0.5 * (low + high)
+        seed = options.rendering.seed
+        pinhole = pinhole_of(camera)
+        half_field = np.arctan(
+            0.5 * FILLED * min(camera.height / pinhole.fy, camera.width / pinhole.fx)
+        )
+        reach = float(np.linalg.norm(vertices - target, axis=1).max())
+        distance = options.path.distance or reach / float(np.sin(half_field))
+        description = SceneDescription(
+            part=mesh.mesh,
+            material=material,
+            vertex_albedo=None if options.object.albedo is not None else mesh.vertex_albedo,
+            marks=marks_on(mesh.mesh, options.object.marks, options.object.mark_size * size, seed),
+            surroundings=surroundings(
+                options.scenery,
+                size,
+                float(np.linalg.norm(vertices[:, :2], axis=1).max()),
+                seed,
+            ),
+            environment=sky,
+            colour=options.sensor.colour is not None,
+        )
+        return cls(
+            options=options,
+            mesh=mesh,
+            size=size,
+            target=target,
+            views=camera_views(options.path, camera, target, distance, seed),
+            description=description,
+            channels=draw_channels(options.sensor, seed),
+        )
+
+
+class _Studio:
+    """The scene with its light, built anew for each view only where the light moves with it."""
+
+    def __init__(self, renderer: Renderer, plan: _Plan) -> None:
+        self.renderer, self.plan = renderer, plan
+        options = plan.options
+        self.moves = options.scenery.turntable or options.lighting.light is LightName.RING
+        self._fixed: MitsubaScene | None = None
+        self._dark: MitsubaScene | None = None
+
+    def scene(self, view: View) -> MitsubaScene:
+        """The scene as it is lit in a view."""
+        if not self.moves:
+            if self._fixed is None:
+                self._fixed = self._lit(FIXED_DIRECTIONS, 0.0, None)
+            return self._fixed
+        options = self.plan.options
+        turn = 0.0
+        if options.scenery.turntable:
+            # Camera and light stand still together: the light turns with the camera.
+            x, y = (view.center_in_world - self.plan.target)[:2]
+            turn = float(np.arctan2(y, x))
+        ring = None
+        if options.lighting.light is LightName.RING:
+            ring = (view.cam_from_world, object_distance(view, self.plan.target))
+        return self._lit(MOVING_DIRECTIONS, turn, ring)
+
+    def _lit(
+        self, directions: int, turn: float, ring: tuple[RigidTransform, float] | None
+    ) -> MitsubaScene:
+        scene = build_scene(self.renderer, self.plan.description, turn=turn, ring=ring)
+        bake(
+            scene,
+            bounces=self.plan.options.lighting.bounces,
+            samples=directions,
+            spacing=self.plan.size / PLACES,
+            seed=self.plan.options.rendering.seed,
+        )
+        return scene
+
+    def check_views(self) -> None:
+        """Refuse cameras in the object, and those that see nothing of it.
+
+        Raises
+        ------
+        OptionError
+            Which they are.
+        """
+        scene = build_scene(self.renderer, self.plan.description)
+        inside, blind = [], []
+        for view in self.plan.views:
+            pinhole = pinhole_of(view.camera)
+            scale = CHECKED_SIDE / max(pinhole.width, pinhole.height)
+            small = replace(
+                pinhole,
+                width=max(8, round(pinhole.width * scale)),
+                height=max(8, round(pinhole.height * scale)),
+                fx=pinhole.fx * scale,
+                fy=pinhole.fy * scale,
+                cx=pinhole.cx * scale,
+                cy=pinhole.cy * scale,
+            )
+            checked = replace(view, camera=small)
+            _, normals, mask = true_maps(scene, checked)
+            away = (normals * _rays(small)).sum(axis=-1) > 0
+            if mask.sum() < MIN_SEEN:
+                blind.append(view.name)
+            elif (away & mask).sum() > 0.5 * mask.sum():
+                inside.append(view.name)
+        for names, what in (
+            (inside, "look at the object from inside"),
+            (blind, "see nothing of it"),
+        ):
+            if names:
+                raise OptionError(
+                    f"{short_list(names)} {what}; change `path.distance`, `path.elevation` or "
+                    "`path.cameras`."
+                )
+
+    def metered_exposure(self) -> float:
+        """Full scales for each unit of radiance that suit all views."""
+        plan = self.plan
+        step = max(1, len(plan.views) // METERED_VIEWS)
+        levels = []
+        for index in range(0, len(plan.views), step):
+            picture, chosen = self._metered(index)
+            stokes = picture.stokes.reshape(-1, 3)[chosen]
+            levels.append(0.5 * (stokes[:, 0] + np.hypot(stokes[:, 1], stokes[:, 2])))
+        level = float(np.percentile(np.concatenate(levels), METERED_PERCENTILE))
+        if not level > 0:
+            raise OptionError(
+                "is too dark to expose for; give `sensor.exposure`.", field="lighting.light"
+            )
+        return float(f"{(METERED_LEVEL - plan.options.sensor.black_level) / level:.4g}")
+
+    def _metered(self, index: int) -> tuple[Picture, NDArray[np.int64]]:
+        plan = self.plan
+        view = plan.views[index]
+        lens = self._lens(view, index)
+        chosen = np.arange(0, lens.shape[0] * lens.shape[1], METERED_STEP)
+        picture = render_picture(
+            self.scene(view),
+            view,
+            lens,
+            plan.options.sensor,
+            plan.options.rendering,
+            plan.channels,
+            np.inf,
+            bounces=plan.options.lighting.bounces,
+            seed=self._seed(index),
+            only=chosen,
+        )
+        return picture, chosen
+
+    def render(self, scene: MitsubaScene, index: int, exposure: float) -> Picture:
+        """One view."""
+        plan = self.plan
+        view = plan.views[index]
+        return render_picture(
+            scene,
+            view,
+            self._lens(view, index),
+            plan.options.sensor,
+            plan.options.rendering,
+            plan.channels,
+            exposure,
+            bounces=plan.options.lighting.bounces,
+            seed=self._seed(index),
+        )
+
+    def _lens(self, view: View, index: int) -> Any:
+        distance = object_distance(view, self.plan.target)
+        return lens_of(self.plan.options.sensor, view.camera, distance, self._seed(index))
+
+    def _seed(self, index: int) -> int:
+        return self.plan.options.rendering.seed * 100_003 + index
+
+
+def _rays(camera: Any) -> Array:
+    from polmvs.camera import pixel_centers
+
+    return np.asarray(camera.rays(pixel_centers(camera.width, camera.height)))
+
+
+def _require_compatible(options: Simulation) -> None:
+    """Refuse options of two groups that contradict each other."""
+    even = options.lighting.light in (LightName.EVEN, LightName.RING)
+    if even and options.lighting.contrast is not None:
+        raise OptionError(
+            f"is of a light that varies, and {options.lighting.light} does not.",
+            field="lighting.contrast",
+        )
+
+
+def _open_folder(out: Path, record: dict[str, Any], run: SimulationRun) -> set[str]:
+    """Make the folder ready; names of the views that are finished in it.
+
+    Raises
+    ------
+    DataError, OptionError
+        It holds something else.
+    """
+    if out.exists() and not out.is_dir():
+        raise DataError(out, "exists and is no folder. Choose another name.")
+    old = out / RECORD
+    if not out.exists() or not any(out.iterdir()):
+        return set()
+    if not old.is_file():
+        raise DataError(
+            out, f"exists and is no simulated capture (it has no {RECORD}). Choose another folder."
+        )
+    if run.overwrite:
+        with as_data_error(out, "removed"):
+            shutil.rmtree(out)
+        return set()
+    if not run.resume:
+        raise OptionError(
+            f"{out}: exists. Give `run.resume` to go on with it or `run.overwrite` to replace it."
+        )
+    try:
+        earlier = parse_json(old.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(old, "cannot be read. Give `run.overwrite`.") from error
+    wanted = to_plain(record)
+    changed = [
+        f"{group}.{name}" if isinstance(wanted[group], dict) else group
+        for group in wanted
+        for name in (wanted[group] if isinstance(wanted[group], dict) else (group,))
+        if _entry(earlier, group, name) != _entry(wanted, group, name)
+    ]
+    if changed:
+        raise OptionError(
+            f"{out}: was begun with other options ({', '.join(changed[:5])}). Give the same, "
+            "another folder, or `run.overwrite`."
+        )
+    return {path.name for path in (out / "raw").glob("*.png")} | {
+        path.name.replace(f"_{ANGLES_DEG[0]:03d}.png", ".png")
+        for path in (out / "raw").glob("*.png")
+    }
+
+
+def _entry(record: Any, group: str, name: str) -> Any:
+    value = record.get(group) if isinstance(record, dict) else None
+    return value.get(name) if isinstance(value, dict) else value
+
+
+def _write_head(out: Path, plan: _Plan, record: dict[str, Any]) -> None:
+    """What a capture has beside its views."""
+    options = plan.options
+    with as_data_error(out, "written"):
+        for folder in (out / "raw", out / "gt"):
+            folder.mkdir(parents=True, exist_ok=True)
+        if options.rendering.masks:
+            (out / "masks").mkdir(exist_ok=True)
+    intrinsics = polarization_intrinsics(options.sensor)
+    write_intrinsics(out / "camera.txt", intrinsics, "of the polarization images")
+    write_bytes(out / "capture.toml", _capture_table(options.sensor).encode())
+    write_mesh(out / "gt" / "mesh.ply", plan.mesh.mesh)
+    write_json(out / RECORD, record)
+
+
+def _capture_table(sensor: SensorOptions) -> str:
+    """The table of options that the capture's files need."""
+    lines = ["[capture]"]
+    if sensor.sensor is SensorKind.MOSAIC:
+        lines.append(f"pattern = {list(sensor.pattern)}")
+    lines.append(f"full_scale = {float(2**sensor.bits - 1)}")
+    if sensor.colour is not None:
+        lines.append(f'bayer = "{sensor.colour}"')
+    return "\n".join(lines) + "\n"
+
+
+def _write_view(out: Path, studio: _Studio, index: int, exposure: float) -> SimulatedView:
+    """Render one view and write its files, that of the sensor last."""
+    plan = studio.plan
+    options, view = plan.options, plan.views[index]
+    scene = studio.scene(view)
+    picture = studio.render(scene, index, exposure)
+    maps = true_maps(scene, view)
+    write_truth(out / "gt", view, maps, picture)
+    if options.rendering.masks:
+        write_png(out / "masks" / view.name, np.where(maps[2], 255, 0).astype(np.uint8))
     rng = np.random.default_rng([options.rendering.seed, 3, index])
-    write_png(raw / view.name, expose(light, options.sensor, exposure, rng))
-    _write_truth(scene, view, gt)
-
-
-def _write_truth(scene: MitsubaScene, view: View, gt: Path) -> None:
-    mi = scene.renderer.mi
-    camera = view.camera
-    xy = pixel_centers(camera.width, camera.height).reshape(-1, 2)
-    rays = view.rays_in_world(xy).astype(np.float32)
-    d = mi.Vector3f(*(mi.Float(rays[:, k].copy()) for k in range(3)))
-    hit = scene.scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(float, view.center_in_world)), d))
-    valid = np.asarray(hit.is_valid())
-    mask = (np.asarray(hit.shape == mi.ShapePtr(scene.part)) & valid).reshape(
-        camera.height, camera.width
+    files = expose_picture(picture, view, options.sensor, plan.channels, exposure, rng)
+    names = [view.name]
+    if options.sensor.sensor is SensorKind.FILTER:
+        names = [f"{stem_of(view.name)}_{angle:03d}.png" for angle in ANGLES_DEG]
+    for name, image in reversed(list(zip(names, files, strict=True))):
+        write_png(out / "raw" / name, image)
+    light = 0.5 * picture.stokes[..., 0]
+    ratio = picture.sigma / stated_sigma(light, options.sensor, exposure)
+    return SimulatedView(
+        rays=float(picture.rays.mean()),
+        noise=float(np.median(ratio)),
+        noisier=float((ratio > 1.5 * options.rendering.noise).mean()),
     )
-    depth = np.where(valid, np.asarray(hit.t, np.float64) * camera.rays(xy)[:, 2], 0)
-    normals = np.stack([np.asarray(c, np.float64) for c in hit.sh_frame.n], axis=1)
-    normals = (normals @ view.cam_from_world.rotation.T).reshape(camera.height, camera.width, 3)
-    stem = gt / stem_of(view.name)
-    encoded = np.rint(depth / DEPTH_UNIT_M).reshape(camera.height, camera.width)
-    encoded = np.where(encoded <= np.iinfo(np.uint16).max, encoded, 0)
-    write_png(f"{stem}_depth.png", encoded.astype(np.uint16))
-    write_png(f"{stem}_mask.png", np.where(mask, 255, 0).astype(np.uint8))
-    coded = np.rint((np.where(mask[..., None], normals, 0) + 1) * 32767.5)
-    write_png(f"{stem}_normal.png", coded.astype(np.uint16)[..., ::-1].copy())

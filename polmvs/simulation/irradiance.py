@@ -122,7 +122,7 @@ def _gather_chunk(
     mi, dr = scene.renderer.mi, scene.renderer.dr
     num = len(points) * samples
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed & 0x7FFFFFFF, num)
+    sampler.seed(dr.opaque(mi.UInt32, seed & 0x7FFFFFFF), num)
     index = dr.arange(mi.UInt32, num)
     site, step = index // samples, index % samples
     offset = 1e-4 * float(np.ptp(scene.description.part.vertices, axis=0).max())

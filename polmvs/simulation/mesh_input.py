@@ -1,18 +1,267 @@
-"""The object's mesh: a built-in shape or a file, in metres, standing on the plane z = 0."""
+"""The object's mesh: a built-in shape or a file, in metres, standing on the plane z = 0.
+
+Light follows the normals of a mesh, the truth its triangles: normals that are interpolated over
+coarse triangles make a capture whose shading belongs to another surface than its depths. So a file
+is rendered with the normals of its facets, or as a subdivision surface (Loop's) so fine that facets
+and normals agree to a fraction of a millimetre, which is measured and said.
+"""
 
 from __future__ import annotations
 
-from polmvs.errors import DataError
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.errors import DataError, OptionError
+from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
-from polmvs.simulation.options import ObjectOptions
+from polmvs.simulation.options import Facets, ObjectOptions
 from polmvs.synthetic.shapes import named_shape, shape_names
 
-DEFAULT_SIZE = 0.2
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+DEFAULT_SIZE = 0.2  # metres
+SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
+METRIC_SUFFIXES = (".glb", ".gltf")  # whose format says metres
+MAX_TRIANGLES = 4_000_000  # 1.2 GB in the renderer
+FINE_TRIANGLES = 200_000  # a subdivision goes on to that many at most
+FINE_SAG = 2e-4  # of the size, between facets and their normals: 40 um at 0.2 m
+LARGEST_M, SMALLEST_M = 20.0, 0.002  # beyond which a file's unit is doubted
 
 
-def object_mesh(mesh: str, options: ObjectOptions) -> Mesh:
-    """The object, metres, on the plane z = 0 over the origin."""
-    if mesh in shape_names():
-        shape = named_shape(mesh)
-        return Mesh(shape.vertices * (options.size or DEFAULT_SIZE), shape.normals, shape.triangles)
-    raise DataError(mesh, f"no such file, nor a shape; shapes are {', '.join(shape_names())}.")
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectMesh:
+    """The object.
+
+    Attributes
+    ----------
+    source : its file or name.
+    mesh : metres, on the plane z = 0 over the origin; its normals are those that light follows.
+    vertex_albedo : (V, 3) float32, linear, of a file with colours; else None.
+    sag : largest distance between facets and the surface that their normals belong to, metres.
+    """
+
+    source: str
+    mesh: Mesh
+    vertex_albedo: NDArray[np.float32] | None = None
+    sag: float = 0.0
+
+
+def object_mesh(source: str | Path | Mesh, options: ObjectOptions) -> ObjectMesh:
+    """The object of a file, a built-in shape's name, or arrays in metres.
+
+    Raises
+    ------
+    DataError
+        The file is missing, unreadable, has no faces or far too many, or no size.
+    OptionError
+        An option is for another kind of object.
+    """
+    if isinstance(source, Mesh):
+        return _placed("a mesh", source, None, options, 1.0)
+    if str(source) in shape_names():
+        if options.unit is not None:
+            raise OptionError("is of a file; give `object.size`.", field="object.unit")
+        shape = named_shape(str(source))
+        size = options.size or DEFAULT_SIZE
+        mesh = Mesh(shape.vertices * size, shape.normals, shape.triangles)
+        return ObjectMesh(source=str(source), mesh=mesh, sag=surface_sag(mesh))
+    path = Path(source)
+    if not path.is_file():
+        shapes = ", ".join(shape_names())
+        raise DataError(path, f"no such file, and no built-in shape; these are {shapes}.")
+    if path.suffix.lower() not in SUFFIXES:
+        raise DataError(path, f"is no mesh that is read; give {', '.join(SUFFIXES)}.")
+    vertices, triangles, colours = _read(path)
+    mesh, colours = _surface(path, vertices, triangles, colours, options)
+    unit_m = options.unit if options.unit is not None else _unit_of(path, mesh, options)
+    return _placed(str(path), mesh, colours, options, unit_m)
+
+
+def surface_sag(mesh: Mesh) -> float:
+    """Largest distance between facets and the surface that interpolated normals belong to, metres.
+
+    Along an edge whose normals turn by an angle t about it the surface bulges by ``l tan(t / 2) /
+    4`` from the chord of length l (a circle's arc).
+    """
+    edges = mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    first, second = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]]
+    length = np.linalg.norm(second - first, axis=1)
+    along = (second - first) / np.maximum(length, 1e-300)[:, None]
+    tilt = (along * (mesh.normals[edges[:, 1]] - mesh.normals[edges[:, 0]])).sum(axis=1)
+    turn = 2 * np.arcsin(np.clip(0.5 * np.abs(tilt), 0, 1))
+    return float((length * np.tan(0.5 * turn) / 4).max(initial=0.0))
+
+
+def _read(path: Path) -> tuple[Array, NDArray[np.int64], NDArray[np.float32] | None]:
+    """Vertices, triangles and linear colours of a file, in its unit."""
+    trimesh = _import_trimesh()
+    try:
+        loaded = trimesh.load(path, force="mesh", process=False)
+        vertices = np.asarray(loaded.vertices, np.float64)
+        triangles = np.asarray(getattr(loaded, "faces", np.zeros((0, 3))), np.int64)
+    except Exception as error:  # whatever a reader stumbles over
+        reason = " ".join(str(error).split())[:120]
+        raise DataError(path, f"cannot be read as a mesh ({reason}). Export it again.") from error
+    if len(triangles) == 0:
+        raise DataError(path, "has no faces: a cloud of points cannot be rendered. Mesh it first.")
+    if len(triangles) > MAX_TRIANGLES:
+        raise DataError(
+            path, f"has {len(triangles):,} faces, over {MAX_TRIANGLES:,}; simplify it first."
+        )
+    if not np.isfinite(vertices).all() or triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise DataError(path, "has vertices that are not finite, or faces without them.")
+    return vertices, triangles, _colours(loaded, len(vertices))
+
+
+def _colours(loaded: Any, num: int) -> NDArray[np.float32] | None:
+    """Linear colours of the vertices, from their own or from a texture; None without any."""
+    visual = getattr(loaded, "visual", None)
+    if visual is None or not getattr(visual, "defined", False):
+        return None
+    try:
+        if visual.kind == "texture":
+            visual = visual.to_color()
+        colours = np.asarray(visual.vertex_colors, np.float64)[:, :3] / 255
+    except Exception:  # an image that is missing or damaged: the material's own colour serves
+        logger.warning("the mesh's texture cannot be read; it is rendered without")
+        return None
+    if colours.shape != (num, 3):
+        return None
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
+
+
+def _surface(
+    path: Path,
+    vertices: Array,
+    triangles: NDArray[np.int64],
+    colours: NDArray[np.float32] | None,
+    options: ObjectOptions,
+) -> tuple[Mesh, NDArray[np.float32] | None]:
+    """The surface that is rendered: flat facets, or smooth between them."""
+    trimesh = _import_trimesh()
+    mesh = trimesh.Trimesh(vertices, triangles, process=False)
+    mesh.merge_vertices(merge_norm=True, merge_tex=True)
+    keep = mesh.nondegenerate_faces() & mesh.unique_faces()
+    mesh.update_faces(keep)
+    if len(mesh.faces) == 0:
+        raise DataError(path, "has no face with an area.")
+    _warn_of_topology(path, mesh)
+    if not mesh.is_winding_consistent or (mesh.is_watertight and mesh.volume < 0):
+        trimesh.repair.fix_normals(mesh, multibody=True)
+    if options.facets is Facets.SMOOTH:
+        return _subdivided(path, mesh, vertices, colours)
+    corners = np.asarray(mesh.vertices)[mesh.faces]
+    normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    kept = None
+    if colours is not None:
+        kept = _nearest(vertices, colours, corners.reshape(-1, 3))
+    flat = Mesh(
+        corners.reshape(-1, 3).copy(),
+        np.repeat(normals, 3, axis=0),
+        np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3),
+    )
+    return flat, kept
+
+
+def _subdivided(
+    path: Path, mesh: Any, vertices: Array, colours: NDArray[np.float32] | None
+) -> tuple[Mesh, NDArray[np.float32] | None]:
+    """Loop's subdivision until facets and normals agree, or the triangles are many."""
+    size = float(np.ptp(np.asarray(mesh.vertices), axis=0).max())
+    while True:
+        smooth = Mesh(
+            np.asarray(mesh.vertices, np.float64),
+            unit(np.asarray(mesh.vertex_normals, np.float64)),
+            np.asarray(mesh.faces, np.int32),
+        )
+        sag = surface_sag(smooth)
+        if sag <= FINE_SAG * size or 4 * len(mesh.faces) > FINE_TRIANGLES:
+            break
+        mesh = mesh.subdivide_loop(iterations=1)
+    kept = None if colours is None else _nearest(vertices, colours, smooth.vertices)
+    if not np.isfinite(smooth.normals).all():
+        raise DataError(path, "has vertices without a normal; give `object.facets` flat.")
+    return smooth, kept
+
+
+def _nearest(vertices: Array, colours: NDArray[np.float32], places: Array) -> NDArray[np.float32]:
+    from scipy.spatial import cKDTree
+
+    return np.asarray(colours[cKDTree(vertices).query(places)[1]], np.float32)
+
+
+def _warn_of_topology(path: Path, mesh: Any) -> None:
+    if mesh.is_watertight:
+        return
+    _, counts = np.unique(np.asarray(mesh.edges_sorted), axis=0, return_counts=True)
+    faults = []
+    if (counts == 1).any():
+        faults.append("holes, through which its inside is black")
+    if (counts > 2).any():
+        faults.append(f"{int((counts > 2).sum()):,} edges of more than two faces")
+    if faults:
+        logger.warning("%s: the mesh has %s", path, " and ".join(faults))
+
+
+def _unit_of(path: Path, mesh: Mesh, options: ObjectOptions) -> float:
+    """Metres of a file's unit."""
+    if options.size is not None or path.suffix.lower() in METRIC_SUFFIXES:
+        return 1.0
+    size = float(np.ptp(mesh.vertices, axis=0).max())
+    if SMALLEST_M <= size <= LARGEST_M:
+        return 1.0
+    if SMALLEST_M <= 1e-3 * size <= LARGEST_M:
+        logger.warning(
+            "%s: is %.3g units large, taken as millimetres; say otherwise by --unit or --size",
+            path,
+            size,
+        )
+        return 1e-3
+    raise DataError(path, f"is {size:.3g} units large; give `object.size` or `object.unit`.")
+
+
+def _placed(
+    source: str,
+    mesh: Mesh,
+    colours: NDArray[np.float32] | None,
+    options: ObjectOptions,
+    unit_m: float,
+) -> ObjectMesh:
+    """In metres, its lowest point on the plane z = 0, its middle over the origin."""
+    if options.size is not None and options.unit is not None:
+        raise OptionError("and `object.unit` exclude each other.", field="object.size")
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    extent = float((high - low).max())
+    if not extent > 0:
+        raise DataError(source, "has no size.")
+    scale = unit_m if options.size is None else options.size / extent
+    origin = np.array([*(0.5 * (low + high))[:2], low[2]])
+    placed = Mesh((mesh.vertices - origin) * scale, mesh.normals, mesh.triangles)
+    sag = surface_sag(placed)
+    logger.info(
+        "%s: %s triangles, %.4g m; facets and normals differ by %.3g mm at most",
+        source,
+        f"{len(mesh.triangles):,}",
+        extent * scale,
+        1e3 * sag,
+    )
+    return ObjectMesh(source=source, mesh=placed, vertex_albedo=colours, sag=sag)
+
+
+def _import_trimesh() -> Any:
+    try:
+        import trimesh
+    except ImportError as error:
+        raise OptionError(
+            "trimesh is not installed, which reads meshes; install the extra: pip install "
+            "'polmvs[simulate]'."
+        ) from error
+    return trimesh

@@ -294,6 +294,20 @@ class RenderingOptions(OptionGroup, group="rendering"):
     max_samples: int = option(256, "rays of a sample of the file at most", least=1, most=65536)
     seed: int = option(0, "of paths, marks, textures and noise", least=0)
     preview: bool = option(False, "two views at a quarter of the size")
+    masks: bool = option(False, "write OUT/masks as well, for `region.mask`")
     variant: str | None = option(
         None, "Mitsuba's variant; by default the fastest that runs here", metavar="NAME"
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationRun(OptionGroup, group="run", in_files=False):
+    """How it is carried out; nothing here changes its result."""
+
+    overwrite: bool = option(False, "replace an earlier simulated capture in OUT")
+    resume: bool = option(False, "go on with the capture in OUT after its last finished view")
+
+    def check(self) -> None:
+        """Not both."""
+        both = self.overwrite and self.resume
+        self.require(not both, "overwrite", "and `run.resume` exclude each other")

@@ -21,6 +21,9 @@ from polmvs.simulation.scene import MitsubaScene
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
+STRATA = 4  # of a sample's area along each side; third differences need four
+MIN_CHUNK_RAYS = 1 << 15
+RAYS = STRATA * STRATA  # of a sample in one pass
 CHUNK_RAYS = 1 << 21  # at a time: about 300 MB
 
 
@@ -51,18 +54,18 @@ class Lens:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Traced:
-    """Sums over the rays of N samples of a file.
+    """Means over the rays of N samples of a file.
 
     Attributes
     ----------
     stokes : (N, 3), s0, s1, s2 of all light.
     diffuse : (N, 2), s1, s2 of the part's own diffuse light alone.
-    squares : (N,), of the light behind the sample's own polarizer.
+    variance : (N,), of one ray in its stratum, of the light behind the sample's own polarizer.
     """
 
     stokes: Array
     diffuse: Array
-    squares: Array
+    variance: Array
 
 
 def trace(
@@ -71,24 +74,22 @@ def trace(
     cam_from_world: RigidTransform,
     samples: NDArray[np.int64],
     angles: NDArray[np.float32],
-    rays: int,
     *,
     bounces: int,
     seed: int,
     wavelengths: NDArray[np.float32] | None = None,
 ) -> Traced:
-    """Send rays through samples of a file, evenly spread over each sample's area.
+    """Send ``RAYS`` rays through each of some samples of a file, evenly spread over its area.
 
     Parameters
     ----------
     samples : (N,), flat indices of samples, row by row.
     angles : (N,), of each one's polarizer, rad.
-    rays : of each sample.
     bounces : reflections that are followed.
     seed : of all that is random.
     wavelengths : (N, 4), nm, that each sample's rays have; None without colours.
     """
-    per_chunk = max(1, CHUNK_RAYS // rays)
+    per_chunk = CHUNK_RAYS // RAYS
     parts = []
     for start in range(0, len(samples), per_chunk):
         part = np.s_[start : start + per_chunk]
@@ -100,7 +101,6 @@ def trace(
                 cam_from_world,
                 samples[part],
                 angles[part],
-                rays,
                 bounces,
                 (seed * 1_000_003 + start) & 0x7FFFFFFF,
                 colours,
@@ -109,7 +109,7 @@ def trace(
     return Traced(
         stokes=np.concatenate([p.stokes for p in parts]),
         diffuse=np.concatenate([p.diffuse for p in parts]),
-        squares=np.concatenate([p.squares for p in parts]),
+        variance=np.concatenate([p.variance for p in parts]),
     )
 
 
@@ -119,24 +119,31 @@ def _trace_chunk(
     cam_from_world: RigidTransform,
     samples: NDArray[np.int64],
     angles: NDArray[np.float32],
-    rays: int,
     bounces: int,
     seed: int,
     wavelengths: NDArray[np.float32] | None,
 ) -> Traced:
     mi, dr = scene.renderer.mi, scene.renderer.dr
-    num = len(samples) * rays
+    # Kernels are compiled for a number of rays: there are few of these, and they are kept.
+    num_samples = len(samples)
+    padding = max(MIN_CHUNK_RAYS // RAYS, 1 << (num_samples - 1).bit_length()) - num_samples
+    samples, angles = np.pad(samples, (0, padding)), np.pad(angles, (0, padding))
+    if wavelengths is not None:
+        wavelengths = np.pad(wavelengths, ((0, padding), (0, 0)), mode="edge")
+    num = len(samples) * RAYS
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, num)
+    sampler.seed(dr.opaque(mi.UInt32, seed), num)
     index = dr.arange(mi.UInt32, num)
-    site = index // rays
+    site = index // RAYS
     sample = dr.gather(mi.UInt32, mi.UInt32(samples.astype(np.uint32)), site)
-    direction_in_cam, offset_in_cam = _camera_rays(scene, lens, sample, index % rays, rays, sampler)
-    rotation = cam_from_world.rotation.T
-    center = cam_from_world.inverse().translation
+    direction_in_cam, offset_in_cam = _camera_rays(scene, lens, sample, index % RAYS, sampler)
+    world_from_cam = cam_from_world.inverse()
+    # Numbers that change with the view are no literals: a kernel would be compiled for each.
+    rotation = [_opaque(scene, row) for row in world_from_cam.rotation]
+    center = _opaque(scene, world_from_cam.translation)
     direction = _rotated(mi, rotation, direction_in_cam)
     offset = _rotated(mi, rotation, offset_in_cam)
-    ray = mi.Ray3f(mi.Point3f(*map(float, center)) + offset, direction)
+    ray = mi.Ray3f(mi.Point3f(center) + offset, direction)
     if wavelengths is not None:
         ray.wavelengths = type(ray.wavelengths)(
             *(
@@ -159,21 +166,26 @@ def _trace_chunk(
     d1, d2 = turned(diffuse[0], diffuse[1])
     angle = dr.gather(mi.Float, mi.Float(angles), site)
     behind = 0.5 * (total[0] + dr.cos(2 * angle) * s1 + dr.sin(2 * angle) * s2)
+    dr.eval(behind, total, s1, s2, d1, d2)
+    # Third differences along a row of strata: a gradient across the sample is no noise.
+    first = index - index % STRATA
+    row = [dr.gather(mi.Float, behind, first + k) for k in range(STRATA)]
+    differences = dr.square(row[0] - 3 * row[1] + 3 * row[2] - row[3]) / 20
     sums = [
-        dr.block_reduce(dr.ReduceOp.Add, value, rays)
-        for value in (total[0], s1, s2, d1, d2, behind * behind)
+        dr.block_reduce(dr.ReduceOp.Add, value, RAYS)
+        for value in (total[0], s1, s2, d1, d2, differences)
     ]
     dr.eval(sums)
-    columns = [np.asarray(value, np.float64) for value in sums]
+    columns = [np.asarray(value, np.float64)[:num_samples] / RAYS for value in sums]
     return Traced(
         stokes=np.stack(columns[:3], axis=1),
         diffuse=np.stack(columns[3:5], axis=1),
-        squares=columns[5],
+        variance=columns[5],
     )
 
 
 def _camera_rays(
-    scene: MitsubaScene, lens: Lens, sample: Any, step: Any, rays: int, sampler: Any
+    scene: MitsubaScene, lens: Lens, sample: Any, step: Any, sampler: Any
 ) -> tuple[Any, Any]:
     """Unit directions and starts relative to the camera's centre, camera frame."""
     mi, dr = scene.renderer.mi, scene.renderer.dr
@@ -182,10 +194,8 @@ def _camera_rays(
     row, col = sample // width, sample % width
     # Strata of the sample's area, and within one at random.
     across, down = sampler.next_1d(), sampler.next_1d()
-    side = int(np.sqrt(rays))
-    if side * side == rays and side > 1:
-        across = (mi.Float(step % side) + across) / side
-        down = (mi.Float(step // side) + down) / side
+    across = (mi.Float(step % STRATA) + across) / STRATA
+    down = (mi.Float(step // STRATA) + down) / STRATA
 
     def corner(rows: int, cols: int) -> Any:
         place = 2 * ((row + rows) * (width + 1) + col + cols)
@@ -203,7 +213,7 @@ def _camera_rays(
         offset = mi.Vector3f(lens.aperture * disc.x, lens.aperture * disc.y, 0.0)
         direction = lens.focus * direction - offset
     if any(lens.motion):
-        offset = offset + (sampler.next_1d() - 0.5) * mi.Vector3f(*map(float, lens.motion))
+        offset = offset + (sampler.next_1d() - 0.5) * _opaque(scene, lens.motion)
     return dr.normalize(direction), offset
 
 
@@ -295,8 +305,13 @@ def _albedo(scene: MitsubaScene, hit: Any, active: Any) -> Any:
     return dr.select(marked, type(albedo)(printed), albedo)
 
 
-def _rotated(mi: Any, rotation: Array, vector: Any) -> Any:
-    rows = [mi.Vector3f(*map(float, row)) for row in rotation]
+def _opaque(scene: MitsubaScene, values: Array | tuple[float, ...]) -> Any:
+    vector = scene.renderer.mi.Vector3f(*map(float, values))
+    scene.renderer.dr.make_opaque(vector)
+    return vector
+
+
+def _rotated(mi: Any, rows: list[Any], vector: Any) -> Any:
     return mi.Vector3f(*(row.x * vector.x + row.y * vector.y + row.z * vector.z for row in rows))
 
 

@@ -1,0 +1,108 @@
+"""Ground truth of a rendered view, in the layout that ``--gt`` reads, and what lies beside it.
+
+Beside depth, normals and mask: ``STEM_light.png``, which light dominates the polarization of a
+pixel of the part (255 specular, 128 diffuse, 0 not the part), and ``STEM_stokes.npy``, (3, H, W)
+float32, the light itself without the sensor: s0, s1, s2 in units of radiance, in the transverse
+plane of each pixel's ray (see :mod:`polmvs.simulation.transport`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import pixel_centers
+from polmvs.io.arrays import save_array
+from polmvs.io.ground_truth import DEPTH_UNIT_M
+from polmvs.io.images import write_png
+from polmvs.io.typed_json import write_json
+from polmvs.scene import View, stem_of
+from polmvs.simulation.camera_model import pinhole_of
+from polmvs.simulation.picture import Picture
+from polmvs.simulation.scene import MitsubaScene
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SPECULAR, DIFFUSE = 255, 128
+
+
+def true_maps(scene: MitsubaScene, view: View) -> tuple[Array, Array, Mask]:
+    """Depth (H, W), 0 of nothing; normals (H, W, 3), camera frame; mask of the part."""
+    mi = scene.renderer.mi
+    camera = view.camera
+    xy = pixel_centers(camera.width, camera.height)
+    flat = view.rays_in_world(xy).reshape(-1, 3).astype(np.float32)
+    directions = mi.Vector3f(*(mi.Float(np.ascontiguousarray(flat[:, k])) for k in range(3)))
+    origin = mi.Point3f(*map(float, view.center_in_world))
+    scene.renderer.dr.make_opaque(origin)
+    hit = scene.scene.ray_intersect(mi.Ray3f(origin, directions))
+    valid = np.asarray(hit.is_valid())
+    shape = camera.height, camera.width
+    mask = (np.asarray(hit.shape == mi.ShapePtr(scene.part)) & valid).reshape(shape)
+    distance = np.where(valid, np.asarray(hit.t, np.float64), 0).reshape(shape)
+    world = np.stack([np.asarray(one, np.float64) for one in hit.sh_frame.n], axis=-1)
+    normals = (world @ view.cam_from_world.rotation.T).reshape(*shape, 3)
+    return distance * camera.rays(xy)[..., 2], normals, mask
+
+
+def write_truth(
+    folder: Path, view: View, maps: tuple[Array, Array, Mask], picture: Picture
+) -> None:
+    """Write one view's truth.
+
+    Raises
+    ------
+    DataError
+        The system refuses.
+    """
+    depth, normals, mask = maps
+    stem = folder / stem_of(view.name)
+    encoded = np.rint(depth / DEPTH_UNIT_M)
+    encoded = np.where(encoded <= np.iinfo(np.uint16).max, encoded, 0)  # too far: unknown
+    write_png(f"{stem}_depth.png", encoded.astype(np.uint16))
+    write_png(f"{stem}_mask.png", np.where(mask, 255, 0).astype(np.uint8))
+    coded = np.rint((np.where(mask[..., None], normals, 0) + 1) * 32767.5)
+    write_png(f"{stem}_normal.png", np.ascontiguousarray(coded.astype(np.uint16)[..., ::-1]))
+    stokes, diffuse = (_at_pixels(image, mask.shape) for image in (picture.stokes, picture.diffuse))
+    others = stokes[..., 1:] - diffuse
+    dominant = np.where(
+        np.linalg.norm(others, axis=-1) > np.linalg.norm(diffuse, axis=-1), SPECULAR, DIFFUSE
+    )
+    write_png(f"{stem}_light.png", np.where(mask, dominant, 0).astype(np.uint8))
+    channels_first = np.ascontiguousarray(np.moveaxis(stokes, -1, 0), np.float32)
+    save_array(Path(f"{stem}_stokes.npy"), channels_first)
+
+
+def write_cameras(folder: Path, views: Sequence[View]) -> None:
+    """Write ``cameras.json``: of a distorted lens the camera without distortion, and its rays.
+
+    Raises
+    ------
+    DataError
+        The system refuses.
+    """
+    images: dict[str, Any] = {}
+    for view in views:
+        pose = view.cam_from_world
+        images[view.name] = {
+            "K": pinhole_of(view.camera).K.tolist(),
+            "cam_from_world": np.column_stack([pose.rotation, pose.translation]).tolist(),
+        }
+    camera = views[0].camera
+    write_json(
+        folder / "cameras.json",
+        {"width": camera.width, "height": camera.height, "images": images},
+    )
+
+
+def _at_pixels(image: Array, shape: tuple[int, ...]) -> Array:
+    """Means over the file's samples of each pixel of the polarization image."""
+    if image.shape[:2] == shape:
+        return image
+    rows, cols = shape
+    return np.asarray(image.reshape(rows, 2, cols, 2, -1).mean(axis=(1, 3)))
