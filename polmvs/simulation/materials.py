@@ -134,7 +134,8 @@ def specular_dolp(cos_incidence: Array, index: complex) -> Array:
 def diffuse_dolp(cos_emergence: Array, index: complex) -> Array:
     """Degree of polarization of unpolarized light that leaves a dielectric."""
     across, along = fresnel(cos_emergence, index)
-    return np.asarray((across - along) / (2 - across - along))
+    with np.errstate(invalid="ignore"):  # nothing leaves at grazing emergence
+        return np.asarray((across - along) / (2 - across - along))
 
 
 def bsdf_of(material: Material, *, colour: bool) -> dict[str, Any]:

@@ -139,7 +139,7 @@ class LightingOptions(OptionGroup, group="lighting"):
         most=1e6,
     )
     bounces: int = option(
-        4,
+        8,
         "reflections that light is followed over, the diffuse ones of the surroundings included",
         least=1,
         most=32,
@@ -291,7 +291,7 @@ class RenderingOptions(OptionGroup, group="rendering"):
     noise: float = option(
         0.5, "of the rendering itself, at most this share of the sensor's own", above=0, most=10
     )
-    max_samples: int = option(256, "rays of a sample of the file at most", least=1, most=65536)
+    max_samples: int = option(128, "rays of a sample of the file at most", least=1, most=65536)
     seed: int = option(0, "of paths, marks, textures and noise", least=0)
     preview: bool = option(False, "two views at a quarter of the size")
     masks: bool = option(False, "write OUT/masks as well, for `region.mask`")

@@ -1,0 +1,140 @@
+"""One trial: render a capture, reconstruct it from its images alone, and measure the result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from polmvs.config import (
+    AngleModel,
+    CaptureOptions,
+    EvaluationOptions,
+    Options,
+    RunOptions,
+    SfmOptions,
+)
+from polmvs.errors import PolmvsError
+from polmvs.evaluation.tables import format_table
+from polmvs.io.clouds import Mesh
+from polmvs.pipeline.jobs import compare
+from polmvs.pipeline.runner import Job
+from polmvs.simulation.capture import Simulation, simulate_capture
+from polmvs.simulation.options import SimulationRun
+
+MODEL = AngleModel.PPA
+HEADER = (
+    "",
+    "views",
+    "posed",
+    "points",
+    "completeness 1 mm, %",
+    "F 1 mm, %",
+    "F 2 mm, %",
+    "normals, median deg",
+    "s",
+    "",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """What came of one capture.
+
+    Attributes
+    ----------
+    name : of it.
+    views, posed : number of views, and of those that SfM found.
+    points : of the cloud's surface.
+    completeness, f_score : at 1 and 2 mm, shares; NaN where nothing was measured.
+    normal_median_deg : error of the cloud's normals.
+    seconds : of the reconstruction.
+    message : why there is no result; empty where there is one.
+    """
+
+    name: str
+    views: int
+    posed: int = 0
+    points: int = 0
+    completeness: tuple[float, float] = (0.0, 0.0)
+    f_score: tuple[float, float] = (0.0, 0.0)
+    normal_median_deg: float = float("nan")
+    seconds: float = 0.0
+    message: str = ""
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Of a row of the table."""
+        return (
+            self.name,
+            str(self.views),
+            str(self.posed),
+            f"{self.points:,}",
+            f"{100 * self.completeness[0]:.1f}",
+            f"{100 * self.f_score[0]:.1f}",
+            f"{100 * self.f_score[1]:.1f}",
+            f"{self.normal_median_deg:.2f}",
+            f"{self.seconds:.0f}",
+            self.message,
+        )
+
+
+def run_trial(
+    name: str,
+    mesh: str | Path | Mesh,
+    folder: Path,
+    simulation: Simulation,
+    *,
+    workers: int = 1,
+) -> Trial:
+    """Render a capture into a folder, reconstruct it and measure it; a failure is a result.
+
+    Parameters
+    ----------
+    folder : of the capture and the run, ``capture`` and ``run``; both are resumed.
+    """
+    capture, run = folder / "capture", folder / "run"
+    made = simulate_capture(mesh, capture, simulation, SimulationRun(resume=True))
+    begun = time.perf_counter()
+    sensor = simulation.sensor
+    options = Options(
+        capture=CaptureOptions(
+            pattern=sensor.pattern, full_scale=float(2**sensor.bits - 1), bayer=sensor.colour
+        ),
+        sfm=SfmOptions(camera=capture / "camera.txt"),
+        evaluation=EvaluationOptions(gt=capture / "gt"),
+    )
+    job = Job(
+        capture=capture,
+        out=run,
+        options=options,
+        run_options=RunOptions(workers=workers, overwrite=run.exists()),
+    )
+    trial = Trial(name=name, views=made.num_views)
+    try:
+        outcome = compare(job, (MODEL,))
+    except PolmvsError as error:
+        return replace(
+            trial, seconds=time.perf_counter() - begun, message=" ".join(str(error).split())[:160]
+        )
+    trial = replace(trial, seconds=time.perf_counter() - begun)
+    comparison = outcome.comparison
+    assert comparison is not None
+    figures = comparison.models[MODEL]
+    trial = replace(trial, posed=comparison.sparse.num_views, message=outcome.empty or "")
+    if figures.truth is None:
+        return trial
+    cloud = figures.truth.cloud
+    return replace(
+        trial,
+        points=cloud.num_on_part,
+        completeness=(cloud.completeness[0], cloud.completeness[1]),
+        f_score=(cloud.f_score[0], cloud.f_score[1]),
+        normal_median_deg=cloud.normal_median_deg,
+    )
+
+
+def trial_table(trials: Sequence[Trial], first: str = "capture") -> str:
+    """A row for each trial, in Markdown."""
+    return format_table((first, *HEADER[1:]), [trial.cells for trial in trials])

@@ -1,0 +1,230 @@
+"""Light on planes and spheres under an even sky against the closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion
+
+from polmvs.camera import PinholeCamera, pixel_centers
+from polmvs.config import AngleModel
+from polmvs.io.clouds import Mesh
+from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.mosaic import ANGLES_DEG
+from polmvs.scene import View
+from polmvs.simulation.irradiance import bake
+from polmvs.simulation.lights import environment
+from polmvs.simulation.marks import marks_on
+from polmvs.simulation.materials import (
+    Material,
+    diffuse_dolp,
+    fresnel,
+    specular_dolp,
+    transmittance,
+)
+from polmvs.simulation.options import LightingOptions, LightName, Metal, Optics
+from polmvs.simulation.renderer_import import Renderer
+from polmvs.simulation.scene import MitsubaScene, SceneDescription, build_scene
+from polmvs.simulation.sensor import polarizer_images
+from polmvs.simulation.transport import Lens, trace
+from polmvs.simulation.truth import true_maps
+from polmvs.synthetic.captures import look_at, render_view, rolled
+from polmvs.synthetic.shapes import named_shape
+from polmvs.synthetic.surfaces import Plane, Sphere
+
+SIDE = 64  # px
+CAMERA = PinholeCamera(width=SIDE, height=SIDE, fx=56.0, fy=56.0, cx=30.0, cy=33.0)
+SMOOTH = 0.004  # roughness; slopes of 0.2 degrees
+GLOSS = Material(roughness=SMOOTH, ior=1.5)
+
+
+def view_of(distance: float = 0.22, elevation_deg: float = 35.0) -> View:
+    """A rolled camera above the shape's middle, which fills a field of 60 degrees."""
+    up, target = np.radians(elevation_deg), np.array([0.0, 0.0, 0.1])
+    away = distance * np.array([np.cos(up) * 0.6, np.cos(up) * 0.8, np.sin(up)])
+    pose = rolled(look_at(target + away, target), 0.4)
+    return View(name="000.png", camera=CAMERA, cam_from_world=pose)
+
+
+def lit_scene(
+    renderer: Renderer, mesh: Mesh, material: Material, *, samples: int = 2048
+) -> MitsubaScene:
+    """A shape alone under an even sky."""
+    description = SceneDescription(
+        part=mesh,
+        material=material,
+        vertex_albedo=None,
+        marks=marks_on(mesh, 0, 0.01, 0),
+        surroundings=[],
+        environment=environment(LightingOptions(light=LightName.EVEN)),
+        colour=False,
+    )
+    scene = build_scene(renderer, description)
+    bake(scene, bounces=1, samples=samples, spacing=0.05, seed=0)
+    return scene
+
+
+def scaled(name: str, size: float = 0.2) -> Mesh:
+    shape = named_shape(name)
+    return Mesh(shape.vertices * size, shape.normals, shape.triangles)
+
+
+def stokes_of(scene: MitsubaScene, view: View) -> np.ndarray:
+    """(H, W, 3), in the rays' transverse planes, of small samples about the pixels' centres."""
+    centers = pixel_centers(SIDE, SIDE).reshape(-1, 1, 2)
+    # One cell of four corners for each pixel: a tenth of it, so that edges and curvature are none.
+    rays = view.camera.rays(np.concatenate([centers - 0.05, centers + 0.05], axis=1))
+    low, high = np.moveaxis(rays[..., :2] / rays[..., 2:], 1, 0)
+    grid = np.empty((2 * len(low), 2, 2))
+    grid[0::2, 0], grid[0::2, 1] = low, np.stack([high[:, 0], low[:, 1]], 1)
+    grid[1::2, 0], grid[1::2, 1] = np.stack([low[:, 0], high[:, 1]], 1), high
+    found = trace(
+        scene,
+        Lens(corners=grid.astype(np.float32)),
+        view.cam_from_world,
+        np.arange(0, 2 * len(low) - 1, 2),
+        np.zeros(len(low), np.float32),
+        bounces=2,
+        seed=1,
+    )
+    return found.stokes.reshape(SIDE, SIDE, 3)
+
+
+def inner(scene: MitsubaScene, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """True normals, and the pixels within the shape whose neighbours are on the same face."""
+    _, normals, mask = true_maps(scene, view)
+    upright = normals @ view.cam_from_world.rotation[:, 2]
+    flat = mask & (
+        upright > 0.99 if upright[mask].max() - np.median(upright[mask]) < 1e-3 else mask
+    )
+    return normals, binary_erosion(flat, iterations=2)
+
+
+def cosines(view: View, normals: np.ndarray) -> np.ndarray:
+    return -(normals * view.camera.rays(pixel_centers(SIDE, SIDE))).sum(axis=-1)
+
+
+def axial_error(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Difference of angles modulo pi, degrees."""
+    return np.degrees(np.abs((first - second + np.pi / 2) % np.pi - np.pi / 2))
+
+
+@pytest.mark.parametrize("shape", ["sphere", "plane"])
+def test_specular_light_is_that_of_fresnel(renderer, shape):
+    view = view_of(0.22 if shape == "sphere" else 0.3)
+    scene = lit_scene(renderer, scaled(shape), GLOSS, samples=16)
+    stokes = stokes_of(scene, view)
+    normals, mask = inner(scene, view)
+    cos = cosines(view, normals)
+    use = mask & (cos > 0.15) & (cos < 0.97)
+    assert use.sum() > 300
+    across, along = fresnel(cos, 1.5)
+    dolp = np.hypot(stokes[..., 1], stokes[..., 2]) / stokes[..., 0]
+    # Roughness, and float32 of Mitsuba.
+    np.testing.assert_allclose(stokes[use][:, 0], 0.5 * (across + along)[use], rtol=0.03)
+    np.testing.assert_allclose(dolp[use], specular_dolp(cos, 1.5)[use], atol=0.02)
+
+
+@pytest.mark.parametrize("optics", list(Optics))
+@pytest.mark.parametrize("shape", ["sphere", "plane"])
+def test_light_behind_polarizers_is_that_of_the_closed_form(renderer, shape, optics):
+    view = view_of(0.22 if shape == "sphere" else 0.3)
+    surface = Sphere((0.0, 0.0, 0.1), 0.1)
+    if shape == "plane":
+        surface = Plane((0.0, 0.0, 0.004), (0, 0, 1), (0.1, 0.075))
+    exact = render_view(view, surface, sensor="tilted", s0=1.0)
+    scene = lit_scene(renderer, scaled(shape), GLOSS, samples=16)
+    stokes = stokes_of(scene, view)
+    rays = view.camera.rays(pixel_centers(SIDE, SIDE))
+    images = (
+        np.stack(
+            [
+                polarizer_images(stokes, rays, np.full((SIDE, SIDE), float(angle)), optics, 1.0)
+                for angle in ANGLES_DEG
+            ]
+        )
+        / stokes[..., 0]
+    )
+    cos = cosines(view, exact.normals_in_cam)
+    _, mask = inner(scene, view)
+    use = mask & exact.mask & (cos > 0.2) & (cos < 0.95)
+    error = np.abs(images - exact.intensities)[:, use]
+    if optics is Optics.TILTED:
+        assert np.percentile(error, 99) < 0.006
+    else:  # the other optics are another sensor
+        assert np.percentile(error, 99) > 0.012
+
+
+def test_phase_of_both_lights(renderer):
+    view = view_of()
+    dark = lit_scene(renderer, scaled("sphere"), GLOSS)
+    bright = lit_scene(renderer, scaled("sphere"), replace(GLOSS, albedo=(1.0,) * 3))
+    _, normals, mask = true_maps(dark, view)
+    rays = view.camera.rays(pixel_centers(SIDE, SIDE))
+    specular = stokes_of(dark, view)
+    diffuse = stokes_of(bright, view) - specular  # the same rays
+    cos = cosines(view, normals)
+    use = mask & (cos > 0.25) & (cos < 0.9)
+    phase = phase_from_normal(AngleModel.PPA, normals, rays)
+    off_axis = rays[..., 2] < np.cos(np.radians(12))
+    for stokes, turn, dolp in (
+        (specular, np.pi / 2, specular_dolp(cos, 1.5)),
+        (diffuse, 0.0, diffuse_dolp(cos, 1.5)),
+    ):
+        aolp = 0.5 * np.arctan2(stokes[..., 2], stokes[..., 1])
+        error = axial_error(aolp + turn, phase)
+        # In the transverse plane's own basis; its projection on the image turns it off the axis.
+        assert np.median(error[use & ~off_axis]) < 0.6
+        assert np.median(error[use]) < 2.0
+        found = np.hypot(stokes[..., 1], stokes[..., 2])[use] / stokes[..., 0][use]
+        assert np.abs(found - dolp[use]).max() < 0.03
+
+
+def test_diffuse_light_is_what_enters_and_leaves(renderer):
+    view = view_of()
+    dark = lit_scene(renderer, scaled("sphere"), GLOSS)
+    bright = lit_scene(renderer, scaled("sphere"), replace(GLOSS, albedo=(0.5,) * 3))
+    _, normals, mask = true_maps(dark, view)
+    diffuse = (stokes_of(bright, view) - stokes_of(dark, view))[..., 0]
+    cos = cosines(view, normals)
+    use = mask & (cos > 0.25)
+    # All that enters an even sky's hemisphere: twice the integral of T cos over the cosine.
+    grid = (np.arange(2000) + 0.5) / 2000
+    entering = 2 * (transmittance(grid, 1.5) * grid).mean()
+    # What leaves is spread over the solid angle that refraction makes n^2 times as large.
+    leaving = 0.5 * entering * transmittance(cos, 1.5)
+    ratio = diffuse[use] / leaving[use]
+    assert np.ptp(np.percentile(ratio, [2, 98])) < 0.03
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
+
+
+def test_metal_reflects_by_its_complex_index(renderer):
+    view = view_of()
+    metal = Material(roughness=SMOOTH, metal=Metal.CHROMIUM)
+    scene = lit_scene(renderer, scaled("sphere"), metal, samples=16)
+    stokes = stokes_of(scene, view)
+    _, normals, mask = true_maps(scene, view)
+    cos = cosines(view, normals)
+    use = mask & (cos > 0.2) & (cos < 0.97)
+    dolp = np.hypot(stokes[..., 1], stokes[..., 2]) / stokes[..., 0]
+    np.testing.assert_allclose(dolp[use], specular_dolp(cos, metal.index)[use], atol=0.02)
+
+
+def test_sky_alone_is_unpolarized(renderer):
+    # The sky's own light, seen past the shape and through several reflections' worth of passes.
+    for light in (LightName.STUDIO, LightName.OVERCAST, LightName.SOFTBOX):
+        description = SceneDescription(
+            part=scaled("sphere", 0.02),
+            material=GLOSS,
+            vertex_albedo=None,
+            marks=marks_on(scaled("sphere"), 0, 0.01, 0),
+            surroundings=[],
+            environment=environment(LightingOptions(light=light)),
+            colour=False,
+        )
+        scene = build_scene(renderer, description)
+        view = view_of(1.0)
+        stokes = stokes_of(scene, view)
+        _, _, mask = true_maps(scene, view)
+        assert (stokes[~mask][:, 0] > 0).all()
+        assert np.abs(stokes[~mask][:, 1:]).max() < 1e-6
