@@ -70,6 +70,48 @@ def read_gray(path: PathArg) -> NDArray[np.uint8]:
     return np.asarray(gray, np.uint8)
 
 
+def read_radiance(path: PathArg) -> NDArray[np.float32]:
+    """Read an image of radiances (.hdr, .exr, .tif), ``(H, W, 3)`` float32, red green blue.
+
+    Raises
+    ------
+    DataError
+        The file is missing, truncated or no image of floats, or EXR lacks its package.
+    """
+    if Path(path).suffix.lower() == ".exr":
+        return _read_exr(path)
+    image = decode_image(path, read_bytes(path))
+    if image.dtype != np.float32:
+        raise DataError(path, "is no image of radiances; give .hdr, .exr or a .tif of floats.")
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, axis=-1)
+    return np.ascontiguousarray(image[..., 2::-1], np.float32)
+
+
+def _read_exr(path: PathArg) -> NDArray[np.float32]:
+    data = read_bytes(path)  # names what is missing
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise DataError(
+            path, "needs OpenEXR; install the extra: pip install 'polmvs[exr]'."
+        ) from error
+    try:
+        with OpenEXR.File(str(path)) as file:
+            channels = {name: np.asarray(c.pixels) for name, c in file.channels().items()}
+    except Exception as error:  # whatever the library stumbles over
+        raise DataError(path, f"is damaged: no OpenEXR of {len(data)} bytes. {BROKEN}") from error
+    packed = channels.get("RGB", channels.get("RGBA"))
+    if packed is not None:
+        return np.ascontiguousarray(packed[..., :3], np.float32)
+    grey = channels.get("Y")
+    if grey is not None:
+        channels = dict.fromkeys("RGB", grey)
+    if not set("RGB") <= set(channels):
+        raise DataError(path, f"has channels {', '.join(channels)}, not R, G, B or Y.")
+    return np.ascontiguousarray(np.stack([channels[c] for c in "RGB"], -1), np.float32)
+
+
 def write_png(path: PathArg, image: NDArray[Any]) -> None:
     """Write a PNG whole or not at all, whatever the suffix of its name.
 

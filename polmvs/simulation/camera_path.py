@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from polmvs.camera import Camera
-from polmvs.scene import View
+from polmvs.colmap.models import read_views as read_model_views
+from polmvs.errors import DataError, as_data_error
+from polmvs.geometry import RigidTransform
+from polmvs.scene import View, stem_of
 from polmvs.simulation.options import PathName, PathOptions
 from polmvs.synthetic.captures import direction, look_at, rolled
 
@@ -26,7 +32,14 @@ def camera_views(
     target : (3,), what the cameras look at, metres, world.
     distance : from it, metres.
     seed : of random places and rolls.
+
+    Raises
+    ------
+    DataError
+        A file of poses is unusable.
     """
+    if options.cameras is not None:
+        return given_views(options.cameras, camera)
     rng = np.random.default_rng([seed, 2])
     num = options.views
     low, high = np.radians(options.elevation)
@@ -61,3 +74,52 @@ def camera_views(
         pose = rolled(look_at(center, target, up), rolls[index])
         views.append(View(name=f"{index:0{digits}d}.png", camera=camera, cam_from_world=pose))
     return views
+
+
+def given_views(path: Path, camera: Camera) -> list[View]:
+    """Views of given poses, metres, sorted by name, all by one camera.
+
+    Parameters
+    ----------
+    path : folder of a COLMAP model, or a text file with lines ``name qw qx qy qz tx ty tz``.
+
+    Raises
+    ------
+    DataError
+        It is missing, malformed, or has a name twice.
+    """
+    if path.is_dir():
+        found = {view.name: view.cam_from_world for view in read_model_views(path)}
+    else:
+        found = _read_trajectory(path)
+    views = {}
+    for name, pose in found.items():
+        stored = f"{stem_of(name)}.png"
+        if stored in views:
+            raise DataError(path, f"has two poses of {stored}.")
+        views[stored] = View(name=stored, camera=camera, cam_from_world=pose)
+    return [views[name] for name in sorted(views)]
+
+
+def _read_trajectory(path: Path) -> dict[str, RigidTransform]:
+    with as_data_error(path, "read"):
+        data = path.read_bytes()
+    poses: dict[str, RigidTransform] = {}
+    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            w, x, y, z, *translation = map(float, words[1:])
+        except ValueError:
+            translation = []
+        norm = np.sqrt(w * w + x * x + y * y + z * z) if translation else np.nan
+        if len(translation) != 3 or not np.isfinite([norm, *translation]).all() or norm < 1e-6:
+            raise DataError(path, f"line {number} needs: name qw qx qy qz tx ty tz.")
+        rotation = Rotation.from_quat(np.array([x, y, z, w]) / norm).as_matrix()
+        if words[0] in poses:
+            raise DataError(path, f"has two poses of {words[0]}.")
+        poses[words[0]] = RigidTransform(rotation, np.array(translation))
+    if not poses:
+        raise DataError(path, "has no poses; lines are: name qw qx qy qz tx ty tz.")
+    return poses

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.simulation.materials import transmittance
-from polmvs.simulation.scene import MitsubaScene
+from polmvs.simulation.scene import SPREAD_NM, MitsubaScene
 
 Array = NDArray[np.float64]
 
@@ -163,7 +163,7 @@ def _gather_chunk(
     cosine = local.z
     ray = mi.Ray3f(origin, frame.to_world(local))
     if scene.description.colour:
-        ray.wavelengths = mi.Float(_SPREAD_NM)
+        ray.wavelengths = type(ray.wavelengths)(*SPREAD_NM)
     hit = scene.scene.ray_intersect(ray)
     density = cosine / dr.pi
     emitter = hit.emitter(scene.scene)
@@ -193,6 +193,3 @@ def _gather_chunk(
     total += dr.select(lit, direct, 0.0)
     summed = dr.block_reduce(dr.ReduceOp.Add, total, samples)
     return np.asarray(summed, np.float64) / samples
-
-
-_SPREAD_NM = (450.0, 520.0, 580.0, 640.0)

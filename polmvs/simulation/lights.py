@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError, OptionError
+from polmvs.io.images import read_radiance
 from polmvs.simulation.options import LightingOptions, LightName
 
 Array = NDArray[np.float32]
@@ -127,4 +128,13 @@ def _with_contrast(image: Array, contrast: float) -> Array:
 
 
 def _read(path: Path) -> Array:
-    raise DataError(path, "is no image of an environment.")
+    """An equirectangular image of a file, its first column along the world's x."""
+    image = read_radiance(path)
+    if image.shape[1] != 2 * image.shape[0] or image.shape[0] < 2:
+        raise DataError(
+            path,
+            f"is {image.shape[1]}x{image.shape[0]} px; an environment is twice as wide as high.",
+        )
+    if not np.isfinite(image).all() or image.min() < 0 or not image.max() > 0:
+        raise DataError(path, "has radiances that are negative, not finite, or all 0.")
+    return image

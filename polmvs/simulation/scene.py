@@ -23,6 +23,8 @@ from polmvs.simulation.surroundings import Surrounding
 
 Array = NDArray[np.float64]
 
+# Of the baked irradiance of a colour sensor, which is their mean: its own spectrum is the sky's.
+SPREAD_NM = (450.0, 520.0, 580.0, 640.0)
 RING_IRRADIANCE = 2.0  # at the camera's distance, facing it
 
 
@@ -64,6 +66,7 @@ class MitsubaScene:
     base : the object's material with a diffuse base of albedo 1; None of conductors.
     albedo : texture of the object's base; None of conductors.
     mark_prints : Mitsuba's texture of the marks' prints; None without marks.
+    illuminant : texture of the spectrum of white light, D65; None without colours.
     """
 
     renderer: Renderer
@@ -74,6 +77,7 @@ class MitsubaScene:
     base: Any
     albedo: Any
     mark_prints: Any
+    illuminant: Any = None
 
 
 def build_scene(
@@ -107,7 +111,7 @@ def build_scene(
     shapes = [part]
     for index, surrounding in enumerate(description.surroundings):
         bitmap = mi.Bitmap(np.repeat(surrounding.print[..., None], 3, -1))
-        texture = {"type": "bitmap", "bitmap": bitmap, "raw": True}
+        texture = {"type": "bitmap", "bitmap": bitmap, "raw": not description.colour}
         matte = mi.load_dict({"type": "twosided", "b": {"type": "diffuse", "reflectance": texture}})
         shape = _shape(renderer, surrounding.mesh, matte, surrounding.uv)
         parts[f"surrounding{index}"] = shape
@@ -131,6 +135,7 @@ def build_scene(
         base=unit_base,
         albedo=albedo,
         mark_prints=prints,
+        illuminant=mi.load_dict({"type": "d65"}) if description.colour else None,
     )
 
 

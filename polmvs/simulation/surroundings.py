@@ -7,8 +7,9 @@ is unpolarized and the same from every side.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +29,10 @@ NUM_BLOCKS = 9
 BLOCK_RING = (0.78, 1.3)
 PRINT_SIDE = 2048  # texels of the table's print: 2.4 mm of an object of a metre
 BLOCK_PRINT_SIDE = 256
+BOARD_MARKERS = 15  # along each side; 225 of the 250 of the dictionary
+BOARD_TEXELS = 2250
+MARKER_SHARE = 0.72  # of a cell: 108 of 150 texels
+WHITE, BLACK = 0.8, 0.04  # albedo of paper and ink
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,7 +65,36 @@ def surroundings(
     if options.surroundings is Scenery.NOTHING:
         return []
     rng = np.random.default_rng(seed)
+    if options.surroundings is Scenery.BOARD:
+        table = _table(size, rng, round_=options.turntable)
+        return [replace(table, print=marker_board(BOARD_MARKERS, BOARD_TEXELS))]
     return [_table(size, rng, round_=options.turntable), *_blocks(size, radius, rng, options)]
+
+
+def board_marker_side(size: float) -> float:
+    """Side of the black square of a marker of the board, metres; ``reference.aruco`` takes it."""
+    return TABLE_SIDE * size / BOARD_MARKERS * MARKER_SHARE
+
+
+def marker_board(markers: int, texels: int) -> Image:
+    """A square grid of ArUco markers (DICT_4X4_250), black on white paper, all different.
+
+    Parameters
+    ----------
+    markers : along each side.
+    texels : of the print along each side.
+    """
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+    cell = texels // markers
+    side = round(cell * MARKER_SHARE / 6) * 6  # 4 bits and the border
+    margin = (cell - side) // 2
+    board = np.full((markers * cell, markers * cell), WHITE, np.float32)
+    for index in range(markers * markers):
+        drawn = cv2.aruco.generateImageMarker(dictionary, index, side)
+        row, col = divmod(index, markers)
+        top, left = row * cell + margin, col * cell + margin
+        board[top : top + side, left : left + side] = np.where(drawn > 0, WHITE, BLACK)
+    return board
 
 
 def _table(size: float, rng: np.random.Generator, *, round_: bool) -> Surrounding:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.geometry import RigidTransform
-from polmvs.simulation.scene import MitsubaScene
+from polmvs.simulation.scene import SPREAD_NM, MitsubaScene
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -247,6 +247,8 @@ def _follow(scene: MitsubaScene, ray: Any, sampler: Any, bounces: int) -> tuple[
         active = active & hit.is_valid() & ~shining
         is_part = active & (hit.shape == part)
         irradiance = hit.shape.eval_attribute_1("vertex_irradiance", hit, active)
+        if scene.illuminant is not None:
+            irradiance = irradiance * _relative_illuminant(scene, hit, active)
         surface = hit.bsdf(ray)
         others = active & ~is_part
         lambertian = surface.eval(matte, hit, upright, others)
@@ -279,6 +281,14 @@ def _follow(scene: MitsubaScene, ray: Any, sampler: Any, bounces: int) -> tuple[
     )
     *_, total, diffuse = dr.while_loop(state, proceeds, follow)
     return total, diffuse
+
+
+def _relative_illuminant(scene: MitsubaScene, hit: Any, active: Any) -> Any:
+    """White light's spectrum over its mean at the wavelengths of the baked irradiance."""
+    mi, dr = scene.renderer.mi, scene.renderer.dr
+    baked = dr.zeros(mi.SurfaceInteraction3f)
+    baked.wavelengths = type(hit.wavelengths)(*SPREAD_NM)
+    return scene.illuminant.eval(hit, active) / dr.mean(scene.illuminant.eval(baked))
 
 
 def _albedo(scene: MitsubaScene, hit: Any, active: Any) -> Any:
