@@ -22,7 +22,6 @@ from polmvs.config import OptionGroup, option
 from polmvs.errors import PolmvsError
 from polmvs.io.images import write_bytes
 from polmvs.io.typed_json import from_json, parse_json, write_json
-from polmvs.simulation.capture import Simulation
 from polmvs.simulation.options import (
     LightingOptions,
     LightName,
@@ -31,6 +30,7 @@ from polmvs.simulation.options import (
     PathOptions,
     RenderingOptions,
     SensorOptions,
+    Simulation,
 )
 from polmvs.simulation.trial import Trial, run_trial, trial_table
 

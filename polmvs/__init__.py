@@ -32,6 +32,7 @@ Importing this is light and changes nothing; what a function needs is imported w
     result = polmvs.reconstruct("capture", "out", model="ppa")
     result.point_cloud(), result.mesh(), result.depth_map("003.png"), result.metrics
     print(polmvs.compare("capture", "out2", gt="capture/gt").table())
+    polmvs.simulate("part.stl", "capture", material="black-plastic", light="overcast", views=16)
 """
 
 # pycolmap >= 4.1 exports its own deflate symbols: imported before zlib it makes PNG and npz
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
         plane_normal,
         read_stokes,
         reconstruct,
+        simulate,
         track_normals,
     )
     from polmvs.camera import PinholeCamera
@@ -74,6 +76,7 @@ __all__ = [
     "plane_normal",
     "read_stokes",
     "reconstruct",
+    "simulate",
     "track_normals",
 ]
 

@@ -36,8 +36,10 @@ from polmvs.config import (
     options_from_plain,
 )
 from polmvs.errors import DataError, OptionError
-from polmvs.io.clouds import Cloud, mesh_to_open3d, read_cloud, read_mesh, to_open3d
+from polmvs.io.clouds import Cloud, Mesh, mesh_to_open3d, read_cloud, read_mesh, to_open3d
+from polmvs.parallel import OnProgress, no_progress
 from polmvs.scene import find_name
+from polmvs.simulation.options import LightName, MaterialName, Simulation, SimulationRun
 
 if TYPE_CHECKING:  # heavy
     import open3d
@@ -51,6 +53,7 @@ if TYPE_CHECKING:  # heavy
     from polmvs.pipeline.runner import Monitor
     from polmvs.polarization.stokes import Stokes
     from polmvs.scene import SparseModel, View
+    from polmvs.simulation.capture import SimulatedCapture
     from polmvs.surface.dense_view import DenseView
 
 PathArg = str | PathLike[str]
@@ -58,6 +61,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 T = TypeVar("T")
+Groups = TypeVar("Groups", Options, Simulation)
 Group = TypeVar("Group", bound=OptionGroup)
 
 logger = logging.getLogger(__name__)
@@ -555,6 +559,49 @@ def compare(
     return _run_result(outcome.run_folder.root, chosen)
 
 
+def simulate(
+    mesh: PathArg | Mesh,
+    out: PathArg,
+    *,
+    material: MaterialName | str | None = None,
+    light: LightName | str | None = None,
+    cameras: PathArg | None = None,
+    options: Simulation | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    on_progress: OnProgress = no_progress,
+    **changes: Any,
+) -> SimulatedCapture:
+    """Render a capture of a mesh with its ground truth.
+
+    Parameters
+    ----------
+    mesh : PLY, OBJ, STL or GLB file, a built-in shape's name, or a mesh in metres.
+    out : folder of the capture.
+    material, light : presets.
+    cameras : COLMAP model or file of poses in metres, instead of a path.
+    options : all options; defaults where None.
+    overwrite, resume : what is done where there is an earlier capture in ``out``.
+    on_progress : called with 1 after each view.
+    **changes : single options by their names, as on the command line: ``views=20``.
+
+    Raises
+    ------
+    DataError
+        The mesh or another file is unusable, or the folder holds something else.
+    OptionError
+        An option is unusable, or Mitsuba is not installed.
+    """
+    from polmvs.simulation.capture import simulate_capture
+
+    named = {"material": material, "light": light, "cameras": cameras}
+    given = {name: value for name, value in named.items() if value is not None}
+    run = SimulationRun(overwrite=overwrite, resume=resume)
+    source = mesh if isinstance(mesh, Mesh) else str(mesh)
+    chosen = _with_changes(_given(Simulation, options), {**given, **changes})
+    return simulate_capture(source, Path(out), chosen, run, on_progress=on_progress)
+
+
 def open_run(folder: PathArg) -> RunResult:
     """The results of an earlier run.
 
@@ -647,10 +694,14 @@ def change_options(options: Options | None, changes: Mapping[str, Any]) -> Optio
     OptionError
         A name is unknown, or a value is unusable.
     """
-    options = _given(Options, options)
+    return _with_changes(_given(Options, options), changes)
+
+
+def _with_changes(options: Groups, changes: Mapping[str, Any]) -> Groups:
+    """Groups of options with some of them changed."""
     group_of = {
         info.name: group
-        for group, cls in groups_of(Options).items()
+        for group, cls in groups_of(type(options)).items()
         for info in describe_fields(cls)
     }
     by_group: dict[str, dict[str, Any]] = {}
@@ -658,7 +709,9 @@ def change_options(options: Options | None, changes: Mapping[str, Any]) -> Optio
         if name not in group_of:
             raise _unknown(name, group_of)
         by_group.setdefault(group_of[name], {})[name] = value
-    changed = {group: _changed(getattr(options, group), new) for group, new in by_group.items()}
+    changed: dict[str, Any] = {
+        group: _changed(getattr(options, group), new) for group, new in by_group.items()
+    }
     return replace(options, **changed)
 
 

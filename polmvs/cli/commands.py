@@ -35,6 +35,7 @@ from polmvs.simulation.options import (
     LightingOptions,
     ObjectOptions,
     PathOptions,
+    PlanOptions,
     RenderingOptions,
     SceneryOptions,
     SensorOptions,
@@ -205,6 +206,16 @@ class SimulateArguments(OptionGroup, group="arguments", in_files=False):
         positional=True,
     )
     out: Path = option(MISSING, "folder of the capture", positional=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    mesh: str = option(MISSING, "as of 'polmvs simulate'", positional=True)
+    out: Path = option(
+        Path("polmvs-plan"), "folder of plan.md, plan.png and the trials", positional=True
+    )
 
 
 class CalibrationKind(StrEnum):
@@ -412,6 +423,14 @@ COMMANDS = (
         help_text="rendered capture of a mesh with ground truth: any material, light, path, camera",
         run="polmvs.cli.simulation:simulate",
         groups=(SimulateArguments, *SIMULATION, SimulationRun, FileOptions, TerminalOptions),
+    ),
+    Command(
+        name="plan",
+        help_text="how many views under which light a part needs, from small simulations of it",
+        run="polmvs.cli.simulation:plan",
+        groups=(PlanArguments, PlanOptions, *SIMULATION, FileOptions, TerminalOptions),
+        more="The light, number of views and image size of the single simulations are those of "
+        "the group 'plan'. Finished trials are kept in OUT and not done again.",
     ),
     Command(
         name="doctor",

@@ -1,26 +1,61 @@
-"""``polmvs simulate``: a rendered capture of a mesh."""
+"""``polmvs simulate`` and ``polmvs plan``: rendered captures of a mesh, and what they tell."""
 
 from __future__ import annotations
 
 from polmvs.cli.call import Call
-from polmvs.cli.commands import SimulateArguments
+from polmvs.cli.commands import PlanArguments, SimulateArguments
 from polmvs.cli.terminal import Terminal
-from polmvs.simulation.capture import Simulation, simulate_capture
+from polmvs.simulation.capture import simulate_capture
 from polmvs.simulation.options import (
     LightingOptions,
     ObjectOptions,
     PathOptions,
+    PlanOptions,
     RenderingOptions,
     SceneryOptions,
     SensorOptions,
+    Simulation,
     SimulationRun,
 )
+from polmvs.simulation.planning import PLOT_FILE, TABLE_FILE, make_plan
 
 
 def simulate(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs simulate``."""
     arguments = call.get(SimulateArguments)
-    simulation = Simulation(
+    options = _simulation(call)
+    known = options.path.cameras is None
+    num_views = (
+        options.for_preview().path.views if options.rendering.preview else options.path.views
+    )
+    with terminal.stage("simulate", num_views if known else None) as on_progress:
+        made = simulate_capture(
+            arguments.mesh,
+            arguments.out,
+            options,
+            call.get(SimulationRun),
+            on_progress=on_progress,
+        )
+    terminal.show("\n".join(made.lines), made)
+    return 0
+
+
+def plan(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs plan``."""
+    arguments, options = call.get(PlanArguments), call.get(PlanOptions)
+    num = len(options.lights) * len(options.view_counts)
+    with terminal.stage("trials", num) as on_progress:
+        made = make_plan(
+            arguments.mesh, arguments.out, _simulation(call), options, on_progress=on_progress
+        )
+    text = f"{made.table()}\n{made.recommendation}\n{made.folder}: {TABLE_FILE}, {PLOT_FILE}"
+    terminal.show(text, made)
+    return 0
+
+
+def _simulation(call: Call) -> Simulation:
+    """All options of what is rendered."""
+    return Simulation(
         object=call.get(ObjectOptions),
         lighting=call.get(LightingOptions),
         scenery=call.get(SceneryOptions),
@@ -28,13 +63,3 @@ def simulate(call: Call, terminal: Terminal) -> int:
         sensor=call.get(SensorOptions),
         rendering=call.get(RenderingOptions),
     )
-    with terminal.stage("simulate", None) as on_progress:
-        made = simulate_capture(
-            arguments.mesh,
-            arguments.out,
-            simulation,
-            call.get(SimulationRun),
-            on_progress=on_progress,
-        )
-    terminal.show("\n".join(made.lines), made)
-    return 0

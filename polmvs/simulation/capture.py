@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,14 +43,10 @@ from polmvs.simulation.marks import marks_on
 from polmvs.simulation.materials import material_of
 from polmvs.simulation.mesh_input import ObjectMesh, object_mesh
 from polmvs.simulation.options import (
-    LightingOptions,
     LightName,
-    ObjectOptions,
-    PathOptions,
-    RenderingOptions,
-    SceneryOptions,
     SensorKind,
     SensorOptions,
+    Simulation,
     SimulationRun,
 )
 from polmvs.simulation.picture import Picture, expose_picture, render_picture
@@ -73,31 +69,6 @@ CHECKED_SIDE = 96  # px of the images in which the views are checked before they
 MIN_SEEN = 50  # px of them that must show the object: 0.5 %
 PLACES = 30  # spacing of baked light on the object, of its size
 FIXED_DIRECTIONS, MOVING_DIRECTIONS = 512, 128  # of baked light that holds for all views, or one
-PREVIEW_VIEWS, PREVIEW_SCALE = 2, 4
-
-
-@dataclass(frozen=True, kw_only=True)
-class Simulation:
-    """All options of a simulated capture."""
-
-    object: ObjectOptions = field(default_factory=ObjectOptions)
-    lighting: LightingOptions = field(default_factory=LightingOptions)
-    scenery: SceneryOptions = field(default_factory=SceneryOptions)
-    path: PathOptions = field(default_factory=PathOptions)
-    sensor: SensorOptions = field(default_factory=SensorOptions)
-    rendering: RenderingOptions = field(default_factory=RenderingOptions)
-
-    def for_preview(self) -> Simulation:
-        """Two views at a quarter of the size."""
-        cell = 4 if self.sensor.colour is not None else 2
-        width, height = (
-            max(16, side // PREVIEW_SCALE // cell * cell) for side in self.sensor.image_size
-        )
-        return replace(
-            self,
-            path=replace(self.path, views=min(self.path.views, PREVIEW_VIEWS)),
-            sensor=replace(self.sensor, image_size=(width, height)),
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 
 from polmvs.config import BayerOrder, CaptureOptions, OptionGroup, option
+
+PREVIEW_VIEWS, PREVIEW_SCALE = 2, 4
 
 
 class MaterialName(StrEnum):
@@ -298,6 +300,50 @@ class RenderingOptions(OptionGroup, group="rendering"):
     variant: str | None = option(
         None, "Mitsuba's variant; by default the fastest that runs here", metavar="NAME"
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """All options of a simulated capture."""
+
+    object: ObjectOptions = field(default_factory=ObjectOptions)
+    lighting: LightingOptions = field(default_factory=LightingOptions)
+    scenery: SceneryOptions = field(default_factory=SceneryOptions)
+    path: PathOptions = field(default_factory=PathOptions)
+    sensor: SensorOptions = field(default_factory=SensorOptions)
+    rendering: RenderingOptions = field(default_factory=RenderingOptions)
+
+    def for_preview(self) -> Simulation:
+        """Two views at a quarter of the size."""
+        cell = 4 if self.sensor.colour is not None else 2
+        width, height = (
+            max(16, side // PREVIEW_SCALE // cell * cell) for side in self.sensor.image_size
+        )
+        return replace(
+            self,
+            path=replace(self.path, views=min(self.path.views, PREVIEW_VIEWS)),
+            sensor=replace(self.sensor, image_size=(width, height)),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions(OptionGroup, group="plan"):
+    """What is tried."""
+
+    view_counts: tuple[int, ...] = option((8, 12, 20), "numbers of views", least=3, most=1000)
+    lights: tuple[LightName, ...] = option(
+        (LightName.OVERCAST, LightName.STUDIO), "presets of light", metavar="LIGHT,..."
+    )
+    plan_size: tuple[int, int] = option(
+        (612, 512), "of the files, px", least=64, most=16384, metavar="WIDTH,HEIGHT"
+    )
+    keep: bool = option(False, "keep the captures and runs")
+
+    def check(self) -> None:
+        """Presets alone."""
+        presets = bool(self.lights) and LightName.FILE not in self.lights
+        self.require(presets, "lights", "must be presets", self.lights)
+        self.require(bool(self.view_counts), "view_counts", "needs a number")
 
 
 @dataclass(frozen=True, kw_only=True)

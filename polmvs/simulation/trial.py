@@ -20,8 +20,8 @@ from polmvs.evaluation.tables import format_table
 from polmvs.io.clouds import Mesh
 from polmvs.pipeline.jobs import compare
 from polmvs.pipeline.runner import Job
-from polmvs.simulation.capture import Simulation, simulate_capture
-from polmvs.simulation.options import SimulationRun
+from polmvs.simulation.capture import simulate_capture
+from polmvs.simulation.options import Simulation, SimulationRun
 
 MODEL = AngleModel.PPA
 HEADER = (
