@@ -4,7 +4,9 @@ The layout is that of ``gt/`` in the bundled capture: ``cameras.json`` with ``wi
 and, for each image, ``K`` of the half-size polarization image (COLMAP's pixel convention) and
 ``cam_from_world`` (3x4, metres); beside it ``STEM_depth.png`` (uint16, 20 um, 0 = nothing),
 ``STEM_normal.png`` (16-bit RGB, camera frame, ``n = value / 32767.5 - 1``) and ``STEM_mask.png``
-(not 0 on the part).
+(not 0 on the part). Of images with distortion the maps are of the same pixels, ``K`` is the camera
+without its distortion, and ``plane_xy.npy``, (H, W, 2), has ``(x / z, y / z)`` of the rays through
+the pixels' centres.
 """
 
 from __future__ import annotations
@@ -19,8 +21,9 @@ from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.errors import DataError
-from polmvs.geometry import RigidTransform, nearest_rotation
+from polmvs.geometry import RigidTransform, nearest_rotation, unit
 from polmvs.io.images import PNG_SIGNATURE, decode_image, read_bytes
+from polmvs.io.raw_formats import read_npy
 from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import in_cells_beside, voxel_representatives
 from polmvs.scene import View, find_name, stem_of
@@ -74,6 +77,23 @@ class GroundTruth:
     def cameras(self) -> Path:
         """File of the cameras, for messages."""
         return self.folder / "cameras.json"
+
+    def rays(self, name: str) -> Array:
+        """Unit rays ``(H, W, 3)`` through the pixels' centres, camera frame.
+
+        Raises
+        ------
+        DataError
+            The file of the rays of a distorted lens is of another size.
+        """
+        camera = self.views[name].camera
+        path = self.folder / "plane_xy.npy"
+        if not path.is_file():
+            return camera.rays(pixel_centers(camera.width, camera.height))
+        plane = read_npy(path, read_bytes(path))
+        if plane.shape != (camera.height, camera.width, 2) or not np.isfinite(plane).all():
+            raise DataError(path, f"holds no rays of {camera.width}x{camera.height} px; {_REMEDY}.")
+        return unit(np.concatenate([plane, np.ones((*plane.shape[:2], 1))], axis=-1))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -266,8 +286,9 @@ def _back_project(
     view = truth.views[name]
     depth, mask = truth.depth(name).astype(np.float64), truth.mask(name)
     wanted = np.isfinite(depth) & (mask & _is_smooth(depth) if part else ~mask)
-    xy = pixel_centers(view.camera.width, view.camera.height)[wanted]
-    points = view.points_at(xy, depth[wanted] / view.camera.rays(xy)[..., 2])
+    rays = truth.rays(name)[wanted]
+    in_cam = rays * (depth[wanted] / rays[..., 2])[:, None]
+    points = np.asarray(view.cam_from_world.inverse() * in_cam, np.float64)
     if not part:
         return points, np.zeros((0, 3), np.float32)
     normals = truth.normals(name)[wanted] @ view.cam_from_world.rotation.astype(np.float32)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs._version import __version__
+from polmvs.camera import Camera, pixel_centers
 from polmvs.config import to_plain
 from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.geometry import RigidTransform
@@ -68,7 +69,7 @@ METERED_PERCENTILE, METERED_LEVEL = 99.0, 0.85  # of the light, and its level in
 CHECKED_SIDE = 96  # px of the images in which the views are checked before they are rendered
 MIN_SEEN = 50  # px of them that must show the object: 0.5 %
 PLACES = 30  # spacing of baked light on the object, of its size
-FIXED_DIRECTIONS, MOVING_DIRECTIONS = 512, 128  # of baked light that holds for all views, or one
+MOVING_SHARE = 4  # by which directions are fewer where light is baked for each view
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,15 +249,14 @@ class _Studio:
         options = plan.options
         self.moves = options.scenery.turntable or options.lighting.light is LightName.RING
         self._fixed: MitsubaScene | None = None
-        self._dark: MitsubaScene | None = None
 
     def scene(self, view: View) -> MitsubaScene:
         """The scene as it is lit in a view."""
+        options = self.plan.options
         if not self.moves:
             if self._fixed is None:
-                self._fixed = self._lit(FIXED_DIRECTIONS, 0.0, None)
+                self._fixed = self._lit(options.rendering.directions, 0.0, None)
             return self._fixed
-        options = self.plan.options
         turn = 0.0
         if options.scenery.turntable:
             # Camera and light stand still together: the light turns with the camera.
@@ -265,7 +265,7 @@ class _Studio:
         ring = None
         if options.lighting.light is LightName.RING:
             ring = (view.cam_from_world, object_distance(view, self.plan.target))
-        return self._lit(MOVING_DIRECTIONS, turn, ring)
+        return self._lit(max(4, options.rendering.directions // MOVING_SHARE), turn, ring)
 
     def _lit(
         self, directions: int, turn: float, ring: tuple[RigidTransform, float] | None
@@ -378,9 +378,7 @@ class _Studio:
         return self.plan.options.rendering.seed * 100_003 + index
 
 
-def _rays(camera: Any) -> Array:
-    from polmvs.camera import pixel_centers
-
+def _rays(camera: Camera) -> Array:
     return np.asarray(camera.rays(pixel_centers(camera.width, camera.height)))
 
 

@@ -294,6 +294,13 @@ class RenderingOptions(OptionGroup, group="rendering"):
         0.5, "of the rendering itself, at most this share of the sensor's own", above=0, most=10
     )
     max_samples: int = option(128, "rays of a sample of the file at most", least=1, most=65536)
+    directions: int = option(
+        512,
+        "in which light is gathered at each place of a diffuse surface; a quarter of it for each "
+        "view where the light moves",
+        least=4,
+        most=1 << 20,
+    )
     seed: int = option(0, "of paths, marks, textures and noise", least=0)
     preview: bool = option(False, "two views at a quarter of the size")
     masks: bool = option(False, "write OUT/masks as well, for `region.mask`")

@@ -1,7 +1,8 @@
-"""How many views, and under which light: a few small simulations of a part, and a recommendation."""
+"""How many views under which light a part needs, from a few small simulations of it."""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import shutil
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from pathlib import Path
 from polmvs.errors import OptionError
 from polmvs.evaluation.tables import format_table
 from polmvs.io.images import write_bytes
-from polmvs.io.typed_json import from_json, parse_json, write_json
+from polmvs.io.typed_json import from_json, json_bytes, parse_json, write_json
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.simulation.options import LightName, PlanOptions, Simulation
 from polmvs.simulation.trial import HEADER, Trial, run_trial
@@ -120,13 +121,14 @@ def _trial(
     light: LightName,
     views: int,
 ) -> PlannedTrial:
-    place = folder / f"{light}_{views:03d}"
     asked = replace(
         simulation,
         lighting=replace(simulation.lighting, light=light),
         path=replace(simulation.path, views=views),
         sensor=replace(simulation.sensor, image_size=options.plan_size),
     )
+    digest = hashlib.sha256(json_bytes([mesh, asked])).hexdigest()[:8]
+    place = folder / f"{light}_{views:03d}_{digest}"  # of other options it is another
     stored = place / "trial.json"
     if stored.is_file():
         trial = from_json(Trial, parse_json(stored.read_text(encoding="utf-8")))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -97,6 +98,11 @@ def marker_board(markers: int, texels: int) -> Image:
     return board
 
 
+@lru_cache(maxsize=16)  # several captures of a process have the same
+def _print(side: int, seed: int) -> Image:
+    return random_print(side, np.random.default_rng(seed))
+
+
 def _table(size: float, rng: np.random.Generator, *, round_: bool) -> Surrounding:
     steps = np.linspace(-1, 1, TABLE_CELLS + 1)
     places = np.sinh(2 * steps) / np.sinh(2)
@@ -123,7 +129,9 @@ def _table(size: float, rng: np.random.Generator, *, round_: bool) -> Surroundin
     share = half / (0.5 * TABLE_SIDE * size)
     uv = 0.5 + 0.5 * share * unit_xy
     mesh = Mesh(points, normals, np.ascontiguousarray(triangles, np.int32))
-    return Surrounding(mesh=mesh, uv=uv.astype(np.float32), print=random_print(PRINT_SIDE, rng))
+    return Surrounding(
+        mesh=mesh, uv=uv.astype(np.float32), print=_print(PRINT_SIDE, int(rng.integers(1 << 31)))
+    )
 
 
 def _blocks(
@@ -141,7 +149,9 @@ def _blocks(
             high = TURNTABLE_RADIUS - 0.2
         away = max(nearest + 0.05 * size, size * rng.uniform(low, high))
         center = away * np.array([math.cos(azimuth), math.sin(azimuth)])
-        found.append(_block(sides, turn, center, random_print(BLOCK_PRINT_SIDE, rng)))
+        found.append(
+            _block(sides, turn, center, _print(BLOCK_PRINT_SIDE, int(rng.integers(1 << 31))))
+        )
     return found
 
 

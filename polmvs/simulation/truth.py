@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import pixel_centers
+from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.io.arrays import save_array
 from polmvs.io.ground_truth import DEPTH_UNIT_M
 from polmvs.io.images import write_png
@@ -94,6 +94,9 @@ def write_cameras(folder: Path, views: Sequence[View]) -> None:
             "cam_from_world": np.column_stack([pose.rotation, pose.translation]).tolist(),
         }
     camera = views[0].camera
+    if not isinstance(camera, PinholeCamera):
+        rays = camera.rays(pixel_centers(camera.width, camera.height))
+        save_array(folder / "plane_xy.npy", np.asarray(rays[..., :2] / rays[..., 2:], np.float32))
     write_json(
         folder / "cameras.json",
         {"width": camera.width, "height": camera.height, "images": images},

@@ -91,11 +91,11 @@ def _box_on_plate() -> Mesh:
 def _mug() -> Mesh:
     """A mug with a wall, a rounded lip and a handle."""
     outer, wall, height, base = 0.36, 0.035, 0.78, 0.05
-    lip = np.linspace(0.0, np.pi, 17)
+    lip = np.linspace(0.0, np.pi, 49)
     radius = 0.5 * wall
     middle = outer - radius
     profile = [(0.0, 0.0), (outer - 0.03, 0.0)]
-    foot = np.linspace(-0.5 * np.pi, 0.0, 9)
+    foot = np.linspace(-0.5 * np.pi, 0.0, 33)
     profile += [(outer - 0.03 + 0.03 * math.cos(a), 0.03 + 0.03 * math.sin(a)) for a in foot]
     profile += [(outer, z) for z in np.linspace(0.05, height - radius, 12)]
     profile += [
@@ -103,7 +103,7 @@ def _mug() -> Mesh:
     ]
     inner, floor_round = outer - wall, 0.06
     profile += [(inner, z) for z in np.linspace(height - radius, base + floor_round, 12)]
-    turn = np.linspace(0.0, -0.5 * np.pi, 13)
+    turn = np.linspace(0.0, -0.5 * np.pi, 33)
     profile += [
         (inner - floor_round + floor_round * math.cos(a), base + floor_round * (1 + math.sin(a)))
         for a in turn
@@ -202,7 +202,8 @@ def _lathe(profile: Array, segments: int) -> Mesh:
     cuts = [*(np.flatnonzero(bends < math.cos(math.radians(30))) + 1), len(profile) - 1]
     for cut in cuts:
         part = profile[start : cut + 1]
-        slope = directions[start:cut, :2]
+        # By length: where a line meets an arc, the line's direction is the tangent.
+        slope = np.diff(part, axis=0)
         mean = np.concatenate([slope[:1], slope[:-1] + slope[1:], slope[-1:]])
         pieces.append(_lathe_smooth(part, mean, segments))
         start = cut
