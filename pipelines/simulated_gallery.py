@@ -32,6 +32,7 @@ from polmvs.simulation.options import (
     ObjectOptions,
     PathName,
     PathOptions,
+    RenderingOptions,
     SensorOptions,
     Simulation,
     SimulationRun,
@@ -79,6 +80,7 @@ def _row(arguments: Arguments, light: LightName, material: MaterialName) -> Pict
         lighting=LightingOptions(light=light),
         path=PathOptions(path=PathName.ARC, views=1, elevation=(38, 38), azimuth=(-35, -35)),
         sensor=SensorOptions(image_size=arguments.image_size, field_of_view=45),
+        rendering=RenderingOptions(max_samples=64, directions=128),
     )
     simulate_capture(arguments.shape, folder, simulation, SimulationRun(resume=True))
     capture = open_capture(folder, CaptureOptions(full_scale=255))

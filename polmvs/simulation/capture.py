@@ -271,6 +271,8 @@ class _Studio:
         self, directions: int, turn: float, ring: tuple[RigidTransform, float] | None
     ) -> MitsubaScene:
         scene = build_scene(self.renderer, self.plan.description, turn=turn, ring=ring)
+        if self.renderer.is_scalar:  # its path tracer finds the light anew for each ray
+            return scene
         bake(
             scene,
             bounces=self.plan.options.lighting.bounces,

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 CHUNK = 1 << 21  # paths at a time: about 100 MB
 NORMAL_WEIGHT = 1.0  # a right angle between normals counts as 1.4 spacings
-NEIGHBORS = 6
+NEIGHBORS = 16
 
 
 def bake(scene: MitsubaScene, *, bounces: int, samples: int, spacing: float, seed: int) -> None:
@@ -80,7 +80,7 @@ def _spread(
     num = min(NEIGHBORS, len(places))
     distance, index = tree.query(wanted, k=num)
     distance, index = distance.reshape(-1, num), index.reshape(-1, num)
-    weights = np.exp(-0.5 * np.square(distance / 0.8)) + 1e-9
+    weights = np.exp(-0.5 * np.square(distance)) + 1e-9
     return np.asarray((weights * values[index]).sum(axis=1) / weights.sum(axis=1))
 
 

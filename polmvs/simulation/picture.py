@@ -11,6 +11,7 @@ from polmvs.config import BayerOrder
 from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.scene import View
 from polmvs.simulation.options import RenderingOptions, SensorKind, SensorOptions
+from polmvs.simulation.scalar import render_stokes
 from polmvs.simulation.scene import MitsubaScene
 from polmvs.simulation.sensor import (
     Channels,
@@ -70,6 +71,9 @@ def render_picture(
     """
     rows, cols = lens.shape
     num = rows * cols
+    if scene.renderer.is_scalar:
+        rays = rendering.max_samples if np.isfinite(exposure) else RAYS
+        return _scalar_picture(scene, view, lens, sensor, rays, bounces, seed)
     which = _which_angle(sensor, (rows, cols)).ravel()
     angles = np.radians(np.array(channels.angles_deg))[which].astype(np.float32)
     stokes, diffuse = np.zeros((num, 3)), np.zeros((num, 2))
@@ -108,6 +112,31 @@ def render_picture(
         diffuse=(diffuse * share[:, None]).reshape(rows, cols, 2),
         sigma=np.sqrt(variance * share**2 / RAYS).reshape(rows, cols),
         rays=(RAYS * passes).reshape(rows, cols),
+    )
+
+
+def _scalar_picture(
+    scene: MitsubaScene,
+    view: View,
+    lens: Lens,
+    sensor: SensorOptions,
+    rays: int,
+    bounces: int,
+    seed: int,
+) -> Picture:
+    """A view rendered one ray at a time, the same number for each sample."""
+    stokes, sigma = render_stokes(scene, view, lens, rays=rays, bounces=bounces, seed=seed)
+    shape = lens.shape
+    if sensor.colour is None:
+        chosen = stokes[:, :, 0]
+    else:
+        filters = _filter_of(sensor.colour, shape)
+        chosen = np.take_along_axis(stokes, filters[..., None, None], axis=2)[:, :, 0]
+    return Picture(
+        stokes=chosen,
+        diffuse=np.zeros((*shape, 2)),
+        sigma=0.5 * sigma,
+        rays=np.full(shape, rays, np.int64),
     )
 
 

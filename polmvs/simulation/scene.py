@@ -111,7 +111,7 @@ def build_scene(
     shapes = [part]
     for index, surrounding in enumerate(description.surroundings):
         bitmap = mi.Bitmap(np.repeat(surrounding.print[..., None], 3, -1))
-        texture = {"type": "bitmap", "bitmap": bitmap, "raw": not description.colour}
+        texture = {"type": "bitmap", "bitmap": bitmap, "raw": "mono" in renderer.variant}
         matte = mi.load_dict({"type": "twosided", "b": {"type": "diffuse", "reflectance": texture}})
         shape = _shape(renderer, surrounding.mesh, matte, surrounding.uv)
         parts[f"surrounding{index}"] = shape

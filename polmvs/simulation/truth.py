@@ -33,21 +33,47 @@ SPECULAR, DIFFUSE = 255, 128
 
 def true_maps(scene: MitsubaScene, view: View) -> tuple[Array, Array, Mask]:
     """Depth (H, W), 0 of nothing; normals (H, W, 3), camera frame; mask of the part."""
-    mi = scene.renderer.mi
     camera = view.camera
     xy = pixel_centers(camera.width, camera.height)
-    flat = view.rays_in_world(xy).reshape(-1, 3).astype(np.float32)
-    directions = mi.Vector3f(*(mi.Float(np.ascontiguousarray(flat[:, k])) for k in range(3)))
-    origin = mi.Point3f(*map(float, view.center_in_world))
+    rays = view.rays_in_world(xy).reshape(-1, 3).astype(np.float32)
+    shape = camera.height, camera.width
+    cast = _cast_one_by_one if scene.renderer.is_scalar else _cast
+    flat_distance, world, flat_mask = cast(scene, view.center_in_world, rays)
+    distance, mask = flat_distance.reshape(shape), flat_mask.reshape(shape)
+    normals = (world @ view.cam_from_world.rotation.T).reshape(*shape, 3)
+    return distance * camera.rays(xy)[..., 2], normals, mask
+
+
+def _cast(
+    scene: MitsubaScene, center: Array, rays: NDArray[np.float32]
+) -> tuple[Array, Array, Mask]:
+    """Distance (N,), 0 of nothing, normal (N, 3) and whether it is the part, of rays (N, 3)."""
+    mi = scene.renderer.mi
+    directions = mi.Vector3f(*(mi.Float(np.ascontiguousarray(rays[:, k])) for k in range(3)))
+    origin = mi.Point3f(*map(float, center))
     scene.renderer.dr.make_opaque(origin)
     hit = scene.scene.ray_intersect(mi.Ray3f(origin, directions))
     valid = np.asarray(hit.is_valid())
-    shape = camera.height, camera.width
-    mask = (np.asarray(hit.shape == mi.ShapePtr(scene.part)) & valid).reshape(shape)
-    distance = np.where(valid, np.asarray(hit.t, np.float64), 0).reshape(shape)
-    world = np.stack([np.asarray(one, np.float64) for one in hit.sh_frame.n], axis=-1)
-    normals = (world @ view.cam_from_world.rotation.T).reshape(*shape, 3)
-    return distance * camera.rays(xy)[..., 2], normals, mask
+    mask = np.asarray(hit.shape == mi.ShapePtr(scene.part)) & valid
+    normals = np.stack([np.asarray(one, np.float64) for one in hit.sh_frame.n], axis=-1)
+    return np.where(valid, np.asarray(hit.t, np.float64), 0), normals, mask
+
+
+def _cast_one_by_one(
+    scene: MitsubaScene, center: Array, rays: NDArray[np.float32]
+) -> tuple[Array, Array, Mask]:
+    """As :func:`_cast`, without LLVM."""
+    mi = scene.renderer.mi
+    distance, normals = np.zeros(len(rays)), np.zeros((len(rays), 3))
+    mask = np.zeros(len(rays), np.bool_)
+    origin = mi.Point3f(center.tolist())
+    for index, ray in enumerate(rays.tolist()):
+        hit = scene.scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(ray)))
+        if hit.is_valid():
+            distance[index] = hit.t
+            normals[index] = np.array(hit.sh_frame.n).ravel()
+            mask[index] = hit.shape == scene.part
+    return distance, normals, mask
 
 
 def write_truth(

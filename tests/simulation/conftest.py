@@ -3,7 +3,7 @@ import pytest
 from polmvs.simulation.renderer_import import Renderer, import_renderer
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def renderer() -> Renderer:
     """Mitsuba, or a reason to skip."""
     pytest.importorskip("mitsuba", reason="Mitsuba is not installed (extra 'simulate')")

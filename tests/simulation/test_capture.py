@@ -5,6 +5,7 @@ import os
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
 import polmvs
 from polmvs.camera import pixel_centers
@@ -204,3 +205,29 @@ def test_command_line_and_preview(renderer, tmp_path, capsys):
     content = json.loads(capsys.readouterr().out)
     assert content["num_views"] == 2
     assert (open_ground_truth(out).views["000.png"].camera.width) == 40
+
+
+def test_scalar_renderer_agrees(renderer, tmp_path):
+    """Mitsuba's own path tracer, which bakes nothing, gives the same light."""
+    options = {"image_size": (48, 40), "views": 1, "marks": 0, "material": "black-plastic"}
+    options |= {"light": "studio", "roughness": 0.1}
+    try:
+        polmvs.simulate(
+            "dome",
+            tmp_path / "scalar",
+            variant="scalar_spectral_polarized",
+            max_samples=64,
+            **options,
+        )
+    finally:
+        renderer.mi.set_variant(renderer.variant)
+    polmvs.simulate("dome", tmp_path / "jit", directions=64, max_samples=64, **options)
+    slow, quick = (np.load(tmp_path / n / "gt" / "000_stokes.npy") for n in ("scalar", "jit"))
+    mask = binary_erosion(open_ground_truth(tmp_path / "jit").mask("000.png"))
+    assert mask.sum() > 60
+    for index in range(3):
+        assert np.corrcoef(slow[index][mask], quick[index][mask])[0, 1] > 0.97
+        scale = np.abs(quick[index][mask]).mean()
+        assert np.abs(slow[index] - quick[index])[mask].mean() < 0.15 * scale
+    assert slow[0][mask].mean() == pytest.approx(quick[0][mask].mean(), rel=0.02)
+    assert slow[0][~mask].mean() == pytest.approx(quick[0][~mask].mean(), rel=0.03)
