@@ -38,13 +38,13 @@ class Picture:
     Attributes
     ----------
     stokes : (H, W, 3), mean over each sample's area, in the rays' transverse planes.
-    diffuse : (H, W, 2), s1, s2 of the part's own diffuse light.
+    diffuse : (H, W, 2), s1, s2 of the part's own diffuse light; None where it is not known apart.
     sigma : (H, W), standard deviation of the rendering behind the sample's polarizer.
     rays : (H, W), of each sample.
     """
 
     stokes: Array
-    diffuse: Array
+    diffuse: Array | None
     sigma: Array
     rays: NDArray[np.int64]
 
@@ -134,7 +134,7 @@ def _scalar_picture(
         chosen = np.take_along_axis(stokes, filters[..., None, None], axis=2)[:, :, 0]
     return Picture(
         stokes=chosen,
-        diffuse=np.zeros((*shape, 2)),
+        diffuse=None,
         sigma=0.5 * sigma,
         rays=np.full(shape, rays, np.int64),
     )

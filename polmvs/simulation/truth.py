@@ -94,12 +94,12 @@ def write_truth(
     write_png(f"{stem}_mask.png", np.where(mask, 255, 0).astype(np.uint8))
     coded = np.rint((np.where(mask[..., None], normals, 0) + 1) * 32767.5)
     write_png(f"{stem}_normal.png", np.ascontiguousarray(coded.astype(np.uint16)[..., ::-1]))
-    stokes, diffuse = (_at_pixels(image, mask.shape) for image in (picture.stokes, picture.diffuse))
-    others = stokes[..., 1:] - diffuse
-    dominant = np.where(
-        np.linalg.norm(others, axis=-1) > np.linalg.norm(diffuse, axis=-1), SPECULAR, DIFFUSE
-    )
-    write_png(f"{stem}_light.png", np.where(mask, dominant, 0).astype(np.uint8))
+    stokes = _at_pixels(picture.stokes, mask.shape)
+    if picture.diffuse is not None:
+        diffuse = _at_pixels(picture.diffuse, mask.shape)
+        others = np.linalg.norm(stokes[..., 1:] - diffuse, axis=-1)
+        dominant = np.where(others > np.linalg.norm(diffuse, axis=-1), SPECULAR, DIFFUSE)
+        write_png(f"{stem}_light.png", np.where(mask, dominant, 0).astype(np.uint8))
     channels_first = np.ascontiguousarray(np.moveaxis(stokes, -1, 0), np.float32)
     save_array(Path(f"{stem}_stokes.npy"), channels_first)
 
