@@ -128,6 +128,8 @@ def test_help_and_usage_errors_import_nothing_heavy(arguments: list[str]) -> Non
         "polmvs.config",
         "polmvs.errors",
         "polmvs.cli",
+        "polmvs.simulation",
+        "polmvs.simulation.options",
         *(f"polmvs.cli.{name}" for name in ("call", "commands", "flags", "running")),
     }
 
