@@ -220,7 +220,8 @@ def _unit_of(path: Path, mesh: Mesh, options: ObjectOptions) -> float:
         return 1.0
     if SMALLEST_M <= 1e-3 * size <= LARGEST_M:
         logger.warning(
-            "%s: is %.3g units large, taken as millimetres; say otherwise by --unit or --size",
+            "%s: is %.3g units large, taken as millimetres; `object.unit` or `object.size` say "
+            "otherwise",
             path,
             size,
         )
