@@ -46,7 +46,7 @@ def inspect(call: Call, terminal: Terminal) -> int:
         "views": inspection.views,
         "warnings": inspection.warnings,
     }
-    terminal.show(in_flags("\n".join(lines)), content)
+    terminal.show([in_flags(line) for line in lines], content)
     return 0
 
 
@@ -82,7 +82,7 @@ def calibrate(call: Call, terminal: Terminal) -> int:
         "diattenuations": stored.diattenuations,
         "residual": response.residual,
     }
-    terminal.show("\n".join(lines), content)
+    terminal.show(lines, content)
     return 0
 
 
@@ -106,5 +106,5 @@ def _camera(call: Call, terminal: Terminal, folder: Path, out: Path) -> int:
         found.intrinsics.line,
         f"{out}: give it as --camera {out}",
     ]
-    terminal.show("\n".join(lines), found)
+    terminal.show(lines, found)
     return 0

@@ -27,7 +27,7 @@ def mesh(call: Call, terminal: Terminal) -> int:
     write_mesh(arguments.mesh, made)
     num_triangles = len(made.triangles)
     terminal.show(
-        f"{arguments.mesh}: {num_triangles:,} triangles",
+        [f"{arguments.mesh}: {num_triangles:,} triangles"],
         {"mesh": arguments.mesh, "num_triangles": num_triangles},
     )
     return 0

@@ -21,7 +21,7 @@ from polmvs.cli.commands import (
 from polmvs.cli.flags import in_flags
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
-from polmvs.errors import PolmvsError
+from polmvs.errors import PolmvsError, printable
 from polmvs.evaluation.tables import best_fit_lines
 from polmvs.evaluation.trust import Trust
 from polmvs.io.ground_truth import open_ground_truth
@@ -84,7 +84,7 @@ def sfm(call: Call, terminal: Terminal) -> int:
     text = (
         f"{outcome.run_folder.sparse}: {_views(outcome)} have a pose, {num_tracks:,} sparse points"
     )
-    terminal.show(text, _content(outcome, terminal))
+    terminal.show([text], _content(outcome, terminal))
     return 0
 
 
@@ -97,7 +97,7 @@ def normals(call: Call, terminal: Terminal) -> int:
         f"{outcome.run_folder.sparse_cloud(model)}: {found.num_normals:,} of "
         f"{found.num_tracks:,} sparse points have a normal, {seeds.num_seeds:,} are seeds"
     )
-    terminal.show(text, _content(outcome, terminal))
+    terminal.show([text], _content(outcome, terminal))
     return 0
 
 
@@ -129,10 +129,11 @@ def batch(call: Call, terminal: Terminal) -> int:
 
         rows = run_batch(entries, arguments.out, call.get(RunOptions), show)
     states = [row.state for row in rows]
-    text = f"{in_flags(batch_table(rows))}\n{arguments.out / TABLE_FILE}: " + ", ".join(
+    last = f"{arguments.out / TABLE_FILE}: " + ", ".join(
         f"{states.count(state)} {state}" for state in State if state in states
     )
-    terminal.show(text, {"out": arguments.out, "captures": rows})
+    lines = [*in_flags(batch_table(rows)).splitlines(), last]
+    terminal.show(lines, {"out": arguments.out, "captures": rows})
     if State.FAILED in states:
         return PolmvsError.exit_status
     return EMPTY_STATUS if State.EMPTY in states else 0
@@ -198,7 +199,7 @@ def _show_cloud(outcome: pipeline.JobOutcome, model: AngleModel, terminal: Termi
     trust = outcome.record.find(Trust, model)
     if trust is not None and cloud.num_points:
         lines += map(str, trust.figures())
-    terminal.show(in_flags("\n".join(lines)), _content(outcome, terminal))
+    terminal.show([in_flags(line) for line in lines], _content(outcome, terminal))
     return _status(outcome, terminal)
 
 
@@ -207,8 +208,8 @@ def _show_comparison(outcome: pipeline.JobOutcome, terminal: Terminal) -> int:
     assert comparison is not None
     clouds = ", ".join(f"{model}.ply" for model in comparison.models)
     last = f"{outcome.run_folder.root}: {clouds}, metrics.json, summary.md; {_views(outcome)}"
-    lines = [comparison.table(), *best_fit_lines(comparison), last]
-    terminal.show("\n".join(lines), {**_content(outcome, terminal), "metrics": comparison})
+    lines = [*comparison.table().splitlines(), *best_fit_lines(comparison), last]
+    terminal.show(lines, {**_content(outcome, terminal), "metrics": comparison})
     return _status(outcome, terminal)
 
 
@@ -232,5 +233,5 @@ def _status(outcome: pipeline.JobOutcome, terminal: Terminal) -> int:
     if outcome.empty is None:
         return 0
     terminal.repeat_warnings()
-    print(f"polmvs: {in_flags(outcome.empty)}", file=sys.stderr)
+    print(f"polmvs: {printable(in_flags(outcome.empty))}", file=sys.stderr)
     return EMPTY_STATUS

@@ -14,7 +14,7 @@ from typing import Any
 from polmvs.cli import INTERRUPTED, interrupts
 from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.flags import Command, UsageError, in_flags, parse
-from polmvs.errors import OptionError, PolmvsError
+from polmvs.errors import OptionError, PolmvsError, printable
 
 logger = logging.getLogger(__name__)
 
@@ -144,4 +144,4 @@ def _complain(terminal: Any, prog: str, message: str) -> None:
 
 
 def _print(prog: str, line: str) -> None:
-    print(f"{prog}: {line}", file=sys.stderr)
+    print(f"{prog}: {printable(line)}", file=sys.stderr)

@@ -38,6 +38,7 @@ from polmvs.io.images import write_bytes
 from polmvs.io.typed_json import write_json
 from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import JobOutcome, reconstruct
+from polmvs.pipeline.log_format import LogFormatter
 from polmvs.pipeline.run_folder import RunFolder, has_content
 from polmvs.pipeline.runner import Job, NoMonitor
 from polmvs.pipeline.stages.densify import DensifyResult
@@ -46,7 +47,6 @@ from polmvs.pipeline.stages.poses import PosesResult
 logger = logging.getLogger(__name__)
 
 TABLE_FILE, JSON_FILE = "batch.md", "batch.json"
-LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 LOST = "its worker was lost: out of memory? Give `run.workers` 1, or workers more memory."
 
 
@@ -241,7 +241,7 @@ class _LogMonitor(NoMonitor):
     def opened(self, run_folder: RunFolder) -> None:
         """Begin."""
         self.handler = logging.FileHandler(run_folder.log, encoding="utf-8")
-        self.handler.setFormatter(logging.Formatter(LOG_FORMAT))
+        self.handler.setFormatter(LogFormatter())
         logging.getLogger("polmvs").addHandler(self.handler)
 
     def close(self) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import CaptureKind, RegionOptions, Resolution
+from polmvs.errors import printable
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.capture import Capture, intensity_image_8bit
 from polmvs.polarization.stokes import Stokes
@@ -108,9 +109,9 @@ class Inspection:
             f"{'DoLP':>6} {'sigma AoLP':>10} {'edge':>7}"
         )
         rows = [
-            f"{v.name[-24:]:<24} {100 * v.median_intensity:>7.1f} % {100 * v.saturated:>6.1f} % "
-            f"{100 * v.dark:>5.1f} % {100 * v.polarized:>7.1f} % {v.median_dolp:>6.3f} "
-            f"{v.sigma_aolp_deg:>6.2f} deg {v.edge_px:>4.1f} px"
+            f"{printable(v.name)[-24:]:<24} {100 * v.median_intensity:>7.1f} % "
+            f"{100 * v.saturated:>6.1f} % {100 * v.dark:>5.1f} % {100 * v.polarized:>7.1f} % "
+            f"{v.median_dolp:>6.3f} {v.sigma_aolp_deg:>6.2f} deg {v.edge_px:>4.1f} px"
             for v in self.views
         ]
         size = f"polarization images of {self.capture.width}x{self.capture.height} px"
