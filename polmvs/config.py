@@ -27,6 +27,7 @@ from typing import Any, ClassVar, TypeVar
 
 from polmvs.errors import OptionError
 
+MAX_PIXELS = 1 << 27  # of an image: four times the largest polarization sensors, a guess
 MAX_DEFAULT_WORKERS = 8  # each holds a few hundred MB
 
 T = TypeVar("T")
@@ -361,6 +362,12 @@ class CaptureOptions(OptionGroup, group="capture"):
     height: int | None = option(None, "height of .raw and .bin dumps, px", least=1, below=1 << 16)
     packing: Packing | None = option(
         None, "how dumps hold their samples; by default told by their length where only one fits"
+    )
+
+    max_pixels: int = option(
+        MAX_PIXELS,
+        "most pixels of an image, as its header says; a larger one is refused before it is decoded",
+        least=1,
     )
 
     def check(self) -> None:

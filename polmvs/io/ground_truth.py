@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation, unit
-from polmvs.io.images import PNG_SIGNATURE, decode_image, read_bytes
+from polmvs.io.image_size import PNG_SIGNATURE
+from polmvs.io.images import decode_image, read_bytes
+from polmvs.io.plain_files import read_text
 from polmvs.io.raw_formats import read_npy
 from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import in_cells_beside, voxel_representatives
@@ -214,7 +216,7 @@ def _read_png(path: Path) -> NDArray[np.generic]:
 def read_views(path: Path) -> dict[str, View]:
     """Views by image name of a ``cameras.json``; DataError where it is malformed."""
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(read_text(path))
     except (OSError, ValueError) as error:
         raise DataError(path, f"cannot be read as JSON ({error}); {_REMEDY}.") from error
     try:

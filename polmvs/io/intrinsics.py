@@ -19,6 +19,7 @@ import yaml
 from polmvs.camera import PinholeCamera, xy_from_opencv
 from polmvs.errors import DataError, as_data_error
 from polmvs.io.images import write_bytes
+from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import parse_json
 
 # Parameters that scale with the image come first; all others are distortion.
@@ -120,7 +121,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
         with as_data_error(path, "read"):
             if path.stat().st_size > MAX_BYTES:
                 raise DataError(path, "is too large for a calibration file.")
-            text = path.read_text(encoding="utf-8")
+            text = read_text(path)
     except ValueError as error:
         raise DataError(
             path, "is no text file; give YAML, JSON or a COLMAP camera line."

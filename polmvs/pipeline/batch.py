@@ -35,6 +35,7 @@ from polmvs.config import (
 from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.images import write_bytes
+from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import write_json
 from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import JobOutcome, reconstruct
@@ -126,7 +127,7 @@ def read_batch(
         A key or value is unusable, or a name is there twice.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, "utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8"
         raise DataError(path, f"is no readable list of captures ({reason}).") from error

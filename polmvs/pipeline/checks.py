@@ -17,6 +17,7 @@ from polmvs.config import Options, ReferenceOptions, SfmOptions, get_option, opt
 from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.images import read_mask
+from polmvs.io.plain_files import open_plain
 from polmvs.pipeline.record import CaptureIdentity, Record
 from polmvs.pipeline.run_folder import RunFolder, files_in
 from polmvs.pipeline.stages.images import image_names
@@ -54,7 +55,7 @@ def digest_of(path: Path) -> str:
     with as_data_error(path, "read"):
         for file in [path] if path.is_file() else sorted(files_in(path)):
             digest.update(file.relative_to(path).as_posix().encode(errors="surrogateescape"))
-            with file.open("rb") as stream:
+            with open_plain(file) as stream:
                 digest.update(file_digest(stream, blake2b).digest())
     return digest.hexdigest()
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from polmvs.config import AngleModel
 from polmvs.errors import DataError
+from polmvs.io.plain_files import read_text
 from polmvs.io.temporary import remove_temporary, temporary_path
 
 RUN_FILE = "run.json"
@@ -259,7 +260,7 @@ def _require_own_workspace(folder: Path) -> None:
     if not marker.is_file():
         raise DataError(folder, NOT_OURS)
     try:
-        written = {*marker.read_text(encoding="utf-8").splitlines(), DENSE_MARKER}
+        written = {*read_text(marker).splitlines(), DENSE_MARKER}
     except (OSError, ValueError) as error:
         raise DataError(
             marker, f"cannot be read ({error}). Move {folder} out of the way."

@@ -235,7 +235,7 @@ class Capture:
 
     def _read(self, path: Path) -> NDArray[Any]:
         """Samples of the size and type that the capture was opened with."""
-        raw = read_raw(path, _dump_size(self.options))
+        raw = read_raw(path, _dump_size(self.options), max_pixels=self.options.max_pixels)
         if raw.header != self.header and self.files.kind is not CaptureKind.AOLP:
             raise DataError(path, "has changed since the run began. Start the run again.")
         return raw.samples
@@ -561,9 +561,9 @@ def _survey(
     for view in files.views:
         for role, paths in enumerate(view.files):
             for path in paths:
-                header, raw = probe_raw(path, _dump_size(options)), None
+                header, raw = probe_raw(path, max_pixels=options.max_pixels), None
                 if header is None or header.dtype != "uint8" or path in looked_at:
-                    raw = read_raw(path, _dump_size(options))
+                    raw = read_raw(path, _dump_size(options), max_pixels=options.max_pixels)
                     header = raw.header
                 _require_usable(files.kind, path, header, options)
                 if first is None:
