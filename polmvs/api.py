@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
-from os import PathLike
+from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -647,6 +647,9 @@ def _job(
     from polmvs.pipeline.run_folder import RunFolder
     from polmvs.pipeline.runner import Job
 
+    for name, path in (("capture", capture), ("out", out)):
+        if not fspath(path):  # which would be the current directory
+            raise ValueError(f"{name}={path!r} is no path.")
     if resume and options is None:  # those of the run, as the command line does
         options = options_from_plain(read_options(RunFolder(Path(out))), str(out))
     return Job(

@@ -21,6 +21,10 @@ MAX_QUOTED = 120  # of these, of words that are a file's or another library's
 _ACTED_ON = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
+# What polmvs.io.temporary puts before the name that a file is to have in the end.
+_UNFINISHED = re.compile(r"\.polmvs-[0-9a-f]{16}-\d+-\d+-")
+
+
 def printable(text: object, *, keep: str = "") -> str:
     r"""Text as it may be shown: what a terminal would act on is written out, as in ``\x1b[31m``.
 
@@ -30,6 +34,11 @@ def printable(text: object, *, keep: str = "") -> str:
     keep : characters that stay, such as a newline where the text has lines.
     """
     return _ACTED_ON.sub(lambda found: _written_out(found[0], keep), str(text))
+
+
+def final_name(path: object) -> str:
+    """A path with the names that a user knows, in place of those of unfinished files."""
+    return _UNFINISHED.sub("", str(path))
 
 
 def _written_out(character: str, keep: str) -> str:
@@ -54,7 +63,9 @@ class DataError(PolmvsError):
     """
 
     def __init__(self, path: str | PathLike[str], reason: str) -> None:
-        super().__init__(f"{printable(path)}: {_short(printable(reason, keep=_LAYOUT))}")
+        super().__init__(
+            f"{printable(final_name(path))}: {_short(printable(reason, keep=_LAYOUT))}"
+        )
         self.path = path
         self.reason = reason
 

@@ -333,3 +333,9 @@ def test_normals_of_sparse_points(demo_run: Path, demo_capture: Path, as_object:
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.1
     assert len(found.point_cloud().points) == found.valid.sum()
     assert not found.normals[~found.valid].any() or np.isnan(found.normals[~found.valid]).all()
+
+
+def test_an_empty_path_is_not_the_current_directory(demo_capture) -> None:
+    for paths in ((demo_capture, ""), ("", "out")):
+        with pytest.raises(ValueError, match="is no path"):
+            polmvs.reconstruct(*paths)

@@ -291,6 +291,8 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
             kind, place = elements[0], inspect.Parameter.VAR_POSITIONAL
     elif kind is int:
         common["converter"] = _read_integer
+    if kind in (Path, Path | None):
+        common["converter"] = _read_path
     elif _is_list(kind):
         common |= {"converter": _several(elements[0]), "n_tokens": 1, "consume_multiple": True}
     elif elements and not _is_mixed(kind):
@@ -328,6 +330,14 @@ def _read_integer(_: Any, tokens: Sequence[Token]) -> int:
         return int(text)
     except ValueError as error:
         raise ValueError(f"{text!r} cannot be read as {_name(int)}") from error
+
+
+def _read_path(_: Any, tokens: Sequence[Token]) -> Path:
+    """Reads a path; an empty one would be the current directory."""
+    text = tokens[0].value
+    if not text:
+        raise ValueError("'' is no path; the current directory is '.'")
+    return Path(text)
 
 
 def _one_list(kind: Any) -> Callable[[Any, Sequence[Token]], tuple[Any, ...]]:

@@ -14,7 +14,7 @@ from typing import Any
 from polmvs.cli import INTERRUPTED, interrupts
 from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.flags import Command, UsageError, in_flags, parse
-from polmvs.errors import OptionError, PolmvsError, printable
+from polmvs.errors import OptionError, PolmvsError, final_name, printable
 
 logger = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
         return 1
     except OSError as error:
         _trace(logging.DEBUG)
-        place = f"{error.filename}: " if error.filename else ""
+        place = f"{final_name(error.filename)}: " if error.filename else ""
         _complain(terminal, prog, f"error: {place}{error.strerror or error}.")
         return 1
     except ImportError as error:  # of a package, or of a library of the system that it needs

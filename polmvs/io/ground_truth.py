@@ -30,6 +30,8 @@ from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import in_cells_beside, voxel_representatives
 from polmvs.scene import View, find_name, stem_of
 
+MAX_SIDE = 1 << 16  # px
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -222,9 +224,9 @@ def read_views(path: Path) -> dict[str, View]:
     try:
         width, height = int(content["width"]), int(content["height"])
         images = dict(content["images"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(path, f"needs integer width, height and images; {_REMEDY}.") from error
-    if not images or min(width, height) <= 0:
+    if not images or min(width, height) <= 0 or max(width, height) > MAX_SIDE:
         raise DataError(path, f"lists no image or no size; {_REMEDY}.")
     return {name: _parse_view(path, name, entry, width, height) for name, entry in images.items()}
 
