@@ -652,9 +652,15 @@ class RunOptions(OptionGroup, group="run", in_files=False):
         None,
         "address of a dask.distributed scheduler, such as tcp://10.0.0.1:8786, whose workers share "
         "the views instead of processes here; they must have the same versions, and CAPTURE and "
-        "OUT on storage that they see under the same path",
+        "OUT on storage that they see under the same path. Scheduler and workers are trusted: what "
+        "they send is run here, and what is sent there is run there",
         metavar="ADDRESS",
     )
+    tls_ca: Path | None = option(
+        None, "certificate (PEM) that those of a scheduler at tls://... are signed by"
+    )
+    tls_cert: Path | None = option(None, "certificate of this program for the scheduler (PEM)")
+    tls_key: Path | None = option(None, "key of that certificate (PEM)")
     memory: float | None = option(
         None,
         "GB of memory for this process and those that share the views with it: fewer of them and "
@@ -666,6 +672,10 @@ class RunOptions(OptionGroup, group="run", in_files=False):
         """Not both."""
         both = self.overwrite and self.resume
         self.require(not both, "overwrite", "and `run.resume` exclude each other")
+        given = [path is not None for path in (self.tls_ca, self.tls_cert, self.tls_key)]
+        self.require(all(given) == any(given), "tls_ca", "needs `run.tls_cert` and `run.tls_key`")
+        encrypted = self.scheduler is not None and self.scheduler.startswith("tls://")
+        self.require(encrypted or not any(given), "tls_ca", "needs `run.scheduler` at tls://...")
 
 
 @dataclass(frozen=True, kw_only=True)

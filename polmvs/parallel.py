@@ -22,10 +22,13 @@ from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 from polmvs.safe_path import safe_path
 from polmvs.threads import keep_to_one_core
+
+if TYPE_CHECKING:
+    from polmvs.cluster import TlsFiles
 
 T = TypeVar("T")
 OnProgress: TypeAlias = Callable[[int], None]  # called with the steps done since the last call
@@ -82,12 +85,16 @@ class Workers:
 
     @classmethod
     def of_cluster(
-        cls, address: str, storage: Sequence[Path] = (), sources: Sequence[Path] = ()
+        cls,
+        address: str,
+        storage: Sequence[Path] = (),
+        sources: Sequence[Path] = (),
+        tls: TlsFiles | None = None,
     ) -> Workers:
         """The workers of a Dask scheduler; see :class:`polmvs.cluster.Cluster`."""
         from polmvs.cluster import Cluster
 
-        cluster = Cluster(address, storage, sources)
+        cluster = Cluster(address, storage, sources, tls=tls)
         return cls(cluster.num_threads, cluster)
 
     def map(self, function: Callable[..., T], *iterables: Any) -> Iterator[T]:

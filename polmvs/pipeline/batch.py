@@ -19,6 +19,7 @@ from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
 
+from polmvs.cluster import TlsFiles
 from polmvs.config import (
     AngleModel,
     FieldInfo,
@@ -190,10 +191,11 @@ def run_batch(
             )
     with as_data_error(out, "made"):
         out.mkdir(parents=True, exist_ok=True)
-    each = replace(run_options, workers=1, scheduler=None)
+    each = replace(run_options, workers=1, scheduler=None, tls_ca=None, tls_cert=None, tls_key=None)
     if run_options.scheduler is not None:
         captures = [entry.capture for entry in entries]
-        workers = Workers.of_cluster(run_options.scheduler, [out], captures)
+        tls = TlsFiles.of(run_options)
+        workers = Workers.of_cluster(run_options.scheduler, [out], captures, tls)
     else:
         num_beside = min(run_options.workers, len(entries))
         each = replace(each, workers=run_options.workers // num_beside)

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
+from polmvs.cluster import TlsFiles
 from polmvs.colmap.cameras import quiet_colmap
 from polmvs.config import (
     AngleModel,
@@ -435,7 +436,8 @@ def _workers(job: Job, plan: MemoryPlan) -> Workers:
         return Workers(plan.num_workers)
     existing = next(folder for folder in (job.out, *job.out.parents) if folder.is_dir())
     sources = [path for path in (job.capture, *inputs_of(job.options).values()) if path.exists()]
-    return Workers.of_cluster(job.run_options.scheduler, [existing], sources)
+    tls = TlsFiles.of(job.run_options)
+    return Workers.of_cluster(job.run_options.scheduler, [existing], sources, tls)
 
 
 def load_record(run_folder: RunFolder) -> Record:
