@@ -3,12 +3,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenes import board_scene, tracks_at
+from scipy.spatial.transform import Rotation
 
 from polmvs.config import AngleModel, Estimator, NormalOptions
-from polmvs.normals.rows import gather_rows
-from polmvs.normals.tracks import dolp_shares, seen_shares, select_seeds, track_normals, window_map
+from polmvs.normals.rows import Rows, gather_rows
+from polmvs.normals.tracks import (
+    dolp_shares,
+    normals_from_rows,
+    seen_shares,
+    select_seeds,
+    track_normals,
+    window_map,
+)
 from polmvs.polarization.phase_map import open_phase_map, store_phase_map
-from polmvs.scene import point_sigmas
+from polmvs.scene import Tracks, point_sigmas
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +169,76 @@ def test_what_is_polarised_like_the_surface_about_it_is_no_mark(scene):
     assert np.nanmax(dolp_shares(tracks, marked(scene.maps))) == 0
     nowhere = tracks_at(scene, points + np.array([0.5, 0.0, 0.0]))
     assert np.isnan(dolp_shares(nowhere, scene.maps)).all()
+
+
+class Rowset:
+    """Rows of one point with a known normal, from views in given directions."""
+
+    def __init__(self, normal, towards, sigma) -> None:
+        rays = -np.asarray(towards, np.float64).T  # (3, K), from the cameras
+        rays /= np.linalg.norm(rays, axis=0)
+        rows = np.cross(np.asarray(normal, np.float64), rays.T)
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        self.rows = Rows(
+            rows=rows.T[..., None].astype(np.float32),
+            rays=rays[..., None].astype(np.float32),
+            sigma=np.full((len(towards), 1), sigma, np.float32),
+        )
+
+    def spoiled(self, view: int) -> Rows:
+        """One row turned by 40 degrees about its ray."""
+        rows = self.rows.rows.copy()
+        ray = self.rows.rays[:, view, 0]
+        turn = Rotation.from_rotvec(np.radians(40) * ray).as_matrix()
+        rows[:, view, 0] = turn @ rows[:, view, 0]
+        return replace(self.rows, rows=rows)
+
+
+UP = np.array([0.0, 0.0, 1.0])
+AROUND = [[1.0, 0, 1], [0, 1.0, 1], [-1.0, 0.3, 1], [0.2, -1.0, 1]]
+BEHIND = [0.5, 0.4, -1.0]
+
+
+def one_track(matched: list[int]) -> Tracks:
+    return Tracks(
+        point3D_ids=np.array([1]),
+        points_in_world=np.zeros((1, 3)),
+        colors=np.zeros((1, 3), np.uint8),
+        errors=np.zeros(1),
+        obs_track=np.zeros(len(matched), np.int64),
+        obs_view=np.array(matched, np.int64),
+        obs_xy=np.zeros((len(matched), 2)),
+    )
+
+
+@pytest.mark.parametrize("estimator", list(Estimator))
+def test_views_that_a_point_faces_away_from_do_not_count(estimator) -> None:
+    """They see something else there; their row is wrong, and is left out unless it matched."""
+    some = Rowset(UP, [*AROUND, BEHIND], 0.01)
+    found = normals_from_rows(one_track([0, 1, 2]), some.spoiled(4), estimator)
+    assert errors_deg(found.normals, UP)[0] < 0.05
+    assert found.num_rows[0] == 4
+    assert found.row_weights[4, 0] == 0
+
+
+@pytest.mark.parametrize("estimator", list(Estimator))
+def test_views_that_did_not_match_a_point_count_as_well(estimator) -> None:
+    """Of two that matched and two that face it, all four are used, and each narrows the normal."""
+    rows = Rowset(UP, AROUND, 0.01).rows
+    both = normals_from_rows(one_track([0, 1, 2, 3]), rows, estimator)
+    some = normals_from_rows(one_track([0, 1]), rows, estimator)
+    assert some.num_rows[0] == both.num_rows[0] == 4
+    assert some.sigma_deg[0] == pytest.approx(both.sigma_deg[0], rel=1e-4)
+    assert (some.row_weights[:, 0] > 0).all()
+
+
+def test_a_view_that_did_not_match_is_asked_only_once_the_normal_is_known() -> None:
+    """The first estimate is of those that matched: a wrong row beside them cannot turn it away."""
+    wrong = Rowset(UP, [*AROUND, BEHIND, [-0.6, 0.2, -1.0], [0.1, -0.7, -1.0]], 1e-3)
+    rows = Rowset(np.array([0.9, 0.0, -0.5]), [*AROUND, *([BEHIND] * 3)], 1e-3).rows.rows.copy()
+    rows[:, :4] = wrong.rows.rows[:, :4]
+    found = normals_from_rows(
+        one_track([0, 1, 2, 3]), replace(wrong.rows, rows=rows), Estimator.ROBUST
+    )
+    assert errors_deg(found.normals, UP)[0] < 0.05
+    assert found.num_rows[0] == 4
