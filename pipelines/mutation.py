@@ -90,11 +90,11 @@ def faults_of(path: Path, source: str) -> Iterator[Fault]:
         match node:
             case ast.BinOp(left, operator, right) if not _is_of_types(node):
                 yield from between(left, right, operator)
-            case ast.Compare(left, operators, comparators):
-                for first, operator, second in zip(
-                    [left, *comparators], operators, comparators, strict=False
+            case ast.Compare(left, comparisons, others):
+                for first, comparison, second in zip(
+                    [left, *others], comparisons, others, strict=False
                 ):
-                    yield from between(first, second, operator)
+                    yield from between(first, second, comparison)
             case ast.BoolOp(operator, values):
                 for first, second in pairwise(values):
                     yield from between(first, second, operator)

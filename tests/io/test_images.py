@@ -7,6 +7,7 @@ import pytest
 
 from polmvs.errors import DataError
 from polmvs.io.images import write_bytes, write_png
+from polmvs.io.raw_formats import read_raw
 
 
 @pytest.mark.parametrize("write", [lambda path: write_bytes(path, b"new"), None], ids=["b", "png"])
@@ -30,3 +31,15 @@ def test_what_is_cut_short_leaves_the_older_file(
     monkeypatch.undo()
     write_bytes(target, b"new")
     assert target.read_bytes() == b"new"
+
+
+@pytest.mark.parametrize(
+    ("largest", "bits"), [(1023, 10), (4095, 12), (65535, None), (255, None), (1000, None), (15, 4)]
+)
+def test_a_pgm_says_of_how_many_bits_it_is(tmp_path: Path, largest: int, bits: int | None) -> None:
+    depth = np.dtype(">u2" if largest > 255 else np.uint8)
+    samples = np.full((2, 3), largest, depth)
+    (tmp_path / "a.pgm").write_bytes(f"P5\n3 2\n{largest}\n".encode() + samples.tobytes())
+    found = read_raw(tmp_path / "a.pgm")
+    assert found.declared_bits == bits
+    np.testing.assert_array_equal(found.samples, samples)
