@@ -36,7 +36,7 @@ def simulate(call: Call, terminal: Terminal) -> int:
             call.get(SimulationRun),
             on_progress=on_progress,
         )
-    terminal.show("\n".join(made.lines), made)
+    terminal.show(made.lines, made)
     return 0
 
 

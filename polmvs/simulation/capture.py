@@ -26,6 +26,7 @@ from polmvs.geometry import RigidTransform
 from polmvs.io.clouds import Mesh, write_mesh
 from polmvs.io.images import write_bytes, write_png
 from polmvs.io.intrinsics import write_intrinsics
+from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import parse_json, write_json
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.mosaic import ANGLES_DEG
@@ -420,7 +421,7 @@ def _open_folder(out: Path, record: dict[str, Any], run: SimulationRun) -> set[s
             f"{out}: exists. Give `run.resume` to go on with it or `run.overwrite` to replace it."
         )
     try:
-        earlier = parse_json(old.read_text(encoding="utf-8"))
+        earlier = parse_json(read_text(old))
     except (OSError, ValueError) as error:
         raise DataError(old, "cannot be read. Give `run.overwrite`.") from error
     wanted = to_plain(record)
