@@ -282,6 +282,9 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
         common["name"] = (info.flag, "-v") if info.flag == "--verbose" else info.flag
     if info.kind is not bool:
         common["metavar"] = metavar_of(info)
+    if isinstance(info.kind, type) and issubclass(info.kind, StrEnum):
+        # cyclopts would read members by their names, with a hyphen between digit and letter.
+        common["name_transform"] = str.lower
     kind: Any = info.kind
     place: Any = inspect.Parameter.KEYWORD_ONLY
     elements = typing.get_args(kind) if typing.get_origin(kind) is tuple else ()

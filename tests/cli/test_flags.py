@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+from dataclasses import MISSING
+from enum import StrEnum
 from pathlib import Path
 
 import pytest
@@ -35,6 +37,33 @@ def call(*arguments: object) -> Call:
 @pytest.fixture
 def wide(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
+
+
+# Values
+
+
+CHOICES = [
+    (command, info, value)
+    for command in COMMANDS
+    for cls in command.groups
+    for info in describe_fields(cls)
+    if isinstance(info.kind, type) and issubclass(info.kind, StrEnum) and not info.positional
+    for value in info.kind
+]
+
+
+@pytest.mark.parametrize(
+    ("command", "info", "value"), {(i.path, v): (c, i, v) for c, i, v in CHOICES}.values()
+)
+def test_every_choice_is_written_as_the_help_names_it(command, info, value) -> None:
+    needed = [
+        next(iter(other.kind)) if issubclass(other.kind, StrEnum) else "x"
+        for cls in command.groups
+        for other in describe_fields(cls)
+        if other.positional and other.default is MISSING and isinstance(other.kind, type)
+    ]
+    given = call(command.name, *needed, info.flag, str(value)).given
+    assert given[info.path] is value
 
 
 # Help
