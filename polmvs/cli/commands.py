@@ -163,7 +163,7 @@ class MeshArguments(OptionGroup, group="arguments", in_files=False):
     """Arguments."""
 
     cloud: Path = option(MISSING, "PLY file of points with normals", positional=True)
-    mesh: Path = option(MISSING, "PLY file of the mesh", positional=True)
+    mesh: Path = option(MISSING, "file of the mesh: .ply, .obj, .stl or .glb", positional=True)
     overwrite: bool = option(False, "replace an existing MESH")
 
 

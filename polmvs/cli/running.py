@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
@@ -67,15 +65,7 @@ def _function(command: Command) -> Callable[[Call, Any], int]:
         return command.run
     module, _, name = command.run.partition(":")
     function: Callable[[Call, Any], int] = getattr(import_module(module), name)
-    keep_sigterm()
     return function
-
-
-def keep_sigterm() -> None:
-    """Take SIGTERM back from COLMAP's log, which takes it when it is imported."""
-    handler = signal.getsignal(signal.SIGTERM)
-    if handler is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, handler)
 
 
 def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 from polmvs.cli.call import TerminalOptions
 from polmvs.cli.flags import in_flags
-from polmvs.cli.running import keep_sigterm
 from polmvs.config import to_plain
 from polmvs.errors import DataError
 from polmvs.parallel import OnProgress, no_progress
@@ -154,7 +153,6 @@ class Terminal:
 
     def opened(self, run_folder: RunFolder) -> None:
         """Log into the output folder from now on."""
-        keep_sigterm()
         self.log = run_folder.log
         try:
             handler = _LogFileHandler(run_folder.log, encoding="utf-8")

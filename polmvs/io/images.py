@@ -125,12 +125,17 @@ def write_png(path: PathArg, image: NDArray[Any]) -> None:
     DataError
         The system refuses, e.g. a full disk or a read-only folder.
     """
+    write_bytes(path, encode_png(image))
+
+
+def encode_png(image: NDArray[Any]) -> bytes:
+    """An image as :func:`write_png` takes it, as the bytes of a PNG."""
     if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or image.size == 0:
         raise ValueError(f"{image.dtype=}, {image.shape=} but expected a uint8 or uint16 image.")
-    encoded, data = cv2.imencode(".png", image)
+    encoded, data = cv2.imencode(".png", np.ascontiguousarray(image))
     if not encoded:
         raise ValueError(f"OpenCV cannot encode {image.shape=} as PNG.")
-    write_bytes(path, data.tobytes())
+    return bytes(data.tobytes())
 
 
 def write_bytes(path: PathArg, data: bytes) -> None:

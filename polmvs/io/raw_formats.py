@@ -36,6 +36,8 @@ MAX_PIXELS = 1 << 28  # of one file; the largest polarization sensors have 2^25
 PNG_GRAY = 0  # colour type of a monochrome PNG without alpha
 UPRIGHT = 1  # orientation tag of an image that is stored as it is shown
 TIFF_BITS, TIFF_COMPRESSION, TIFF_ORIENTATION = 258, 259, 274
+TIFF_SUBFILE, TIFF_REDUCED = 254, 1  # tag of what an image is for; bit of one that is a preview
+MAX_TIFF_PAGES = 1 << 16
 TIFF_JPEG = (6, 7)
 # Order of an 8x8 block's coefficients in a JPEG file, as (row, column).
 _ZIGZAG = sorted(
@@ -351,6 +353,13 @@ def _read_pgm(path: PathArg, data: bytes) -> RawImage:
 
 def _read_tiff(path: PathArg, data: bytes) -> RawImage:
     """A TIFF as stored: its orientation is read, and hidden from OpenCV, which would apply it."""
+    pages = _tiff_pages(data)
+    if pages > 1:
+        raise DataError(
+            path,
+            f"holds {pages} images; one in a file is read. Store each in a file of its own, those "
+            "of polarizer angles named by them (NAME_000.tif, NAME_045.tif, ...).",
+        )
     tags = _tiff_tags(data)
     orientation, at = tags.get(TIFF_ORIENTATION, (UPRIGHT, 0))
     if at and orientation != UPRIGHT:
@@ -385,6 +394,27 @@ def _tiff_tags(data: bytes) -> dict[int, tuple[int, int]]:
     except struct.error:
         pass  # OpenCV names the damage
     return tags
+
+
+def _tiff_pages(data: bytes) -> int:
+    """Images in a TIFF's chain, previews not counted; 1 where the chain is damaged."""
+    order = "<" if data[:2] == b"II" else ">"
+    seen: set[int] = set()
+    pages = 0
+    try:
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        while start and start not in seen and len(seen) < MAX_TIFF_PAGES:
+            seen.add(start)
+            (num,) = struct.unpack_from(f"{order}H", data, start)
+            purpose = 0
+            for at in range(start + 2, start + 2 + 12 * num, 12):
+                if struct.unpack_from(f"{order}H", data, at) == (TIFF_SUBFILE,):
+                    (purpose,) = struct.unpack_from(f"{order}I", data, at + 8)
+            pages += not purpose & TIFF_REDUCED
+            (start,) = struct.unpack_from(f"{order}I", data, start + 2 + 12 * num)
+    except struct.error:
+        return 1  # OpenCV names the damage
+    return pages
 
 
 def _luminance_steps(path: PathArg, data: bytes) -> NDArray[np.float64]:

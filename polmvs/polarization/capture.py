@@ -602,6 +602,12 @@ def _require_usable(
 ) -> None:
     """A file may hold what the capture's kind says."""
     if kind is CaptureKind.MOSAIC:
+        if header.dtype == "float32" and (header.channels in (3, 4) or header.height in (3, 4)):
+            raise DataError(
+                path,
+                "holds three or more planes of floats, as Stokes images do. Give `capture.kind` "
+                "stokes.",
+            )
         if header.channels != 1:
             raise DataError(
                 path,
@@ -620,7 +626,7 @@ def _require_usable(
                 path, "has float32 samples; export the raw mosaic as 8- or 16-bit integers."
             )
     if kind is CaptureKind.STOKES and header.dtype != "float32":
-        raise DataError(path, f"has {header.dtype} samples; Stokes images are floats.")
+        raise DataError(path, f"has {header.dtype} samples; files of kind stokes hold floats.")
 
 
 def _require_same(first_path: Path, first: RawHeader, path: Path, header: RawHeader) -> None:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import trimesh
 from dense_scenes import fuse
 from helpers import content_of, cut_after, record_of, refused, result_of, stages_of
 from scipy.spatial import cKDTree
@@ -22,7 +23,7 @@ from polmvs.colmap.dense_workspace import (
 from polmvs.colmap.maps import DepthNormals, read_depth_map, write_depth_map
 from polmvs.colmap.models import read_model, write_model
 from polmvs.geometry import SimilarityTransform
-from polmvs.io.clouds import read_cloud, read_mesh, write_cloud
+from polmvs.io.clouds import Cloud, read_cloud, read_mesh, write_cloud
 from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
 from polmvs.pipeline.run_folder import DENSE_MARKER
 from polmvs.poses.metric_frame import transform_model
@@ -254,6 +255,20 @@ def test_mesh_command(run: Path, tmp_path: Path, cli) -> None:
     assert target.read_text() == "mine"
     assert cli("mesh", tmp_path / "ppa.ply", target, "--overwrite")[0] == 0
     assert len(read_mesh(target).triangles) > 1000
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".glb"])
+def test_mesh_writes_what_the_name_says(tmp_path: Path, cli, suffix: str) -> None:
+    angle = np.random.default_rng(0).normal(size=(3000, 3))
+    sphere = angle / np.linalg.norm(angle, axis=1, keepdims=True)
+    write_cloud(tmp_path / "c.ply", Cloud(points=sphere, normals=sphere))
+    status, text, _ = cli("mesh", tmp_path / "c.ply", tmp_path / f"part{suffix}")
+    assert status == 0
+    found = trimesh.load(tmp_path / f"part{suffix}", force="mesh")
+    assert f"{len(found.faces):,} triangles" in text
+    assert not (tmp_path / f"part{suffix}").read_bytes().startswith(b"ply")
+    err = refused(cli("mesh", tmp_path / "c.ply", tmp_path / "part.step"), 2)
+    assert "part.step: is no name of a mesh" in err
 
 
 def test_mesh_of_what_is_no_cloud(tmp_path: Path, cli) -> None:

@@ -96,7 +96,6 @@ class Opened:
         )
         return colors, covered
 
-
     def evenly_coloured(self, pane: str) -> set[tuple[int, int, int]]:
         """Colours of a pane's pixels in the midst of others alike: no edge, no ground."""
         self.settle()
