@@ -95,7 +95,7 @@ class BatchArguments(OptionGroup, group="arguments", in_files=False):
 
     list_file: Path = option(
         MISSING,
-        "TOML or CSV file of captures: 'capture' is a folder, 'name' that of its results, 'model' "
+        "TOML or CSV file of captures: 'folder' is that of one, 'name' that of its results, 'model' "
         "as the flag; options as tables in TOML ([[captures]], [captures.sfm]), as columns in CSV "
         "(sfm.intrinsics); flags are for what it leaves open",
         positional=True,

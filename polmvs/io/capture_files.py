@@ -14,8 +14,9 @@ Stokes parameter (``s0 s1 s2``), by map (``aolp dolp image``), or by view (``lef
 names are given as a template (```capture.naming```).
 
 Files with all three Stokes images each, arrays (H, W, 3), look like mosaics: ```capture.kind```
-says so. Numbers of frames look like angles. So an ending counts as an angle only if the whole set is one
-that polarizers are used at (``ANGLE_SETS``); any other needs the template or ```capture.kind```.
+says so. Numbers of frames look like angles. So an ending counts as an angle only if the whole set
+is one that polarizers are used at (``ANGLE_SETS``); any other needs the template or
+```capture.kind```.
 """
 
 from __future__ import annotations
