@@ -354,6 +354,11 @@ class CaptureOptions(OptionGroup, group="capture"):
     zero_deg: float = option(
         0.0, "direction that angles are counted from, degrees anticlockwise from +x as displayed"
     )
+    equalize: bool = option(
+        False,
+        "images of a view behind different polarizer angles differ in exposure: divide them by the "
+        "gains that unpolarised places show",
+    )
     calibration: Path | None = option(
         None, "TOML file of 'polmvs calibrate polarizers': gains, angles, dark frame, flat field"
     )

@@ -45,6 +45,8 @@ def inspect(call: Call, terminal: Terminal) -> int:
         "white": inspection.white,
         "views": inspection.views,
         "warnings": inspection.warnings,
+        "obstacles": inspection.obstacles,
+        "verdict": inspection.verdict,
     }
     terminal.show(in_flags("\n".join(lines)), content)
     return 0

@@ -95,9 +95,9 @@ class BatchArguments(OptionGroup, group="arguments", in_files=False):
 
     list_file: Path = option(
         MISSING,
-        "TOML or CSV file of captures: 'folder' is that of one, 'name' that of its results, 'model' "
-        "as the flag; options as tables in TOML ([[captures]], [captures.sfm]), as columns in CSV "
-        "(sfm.intrinsics); flags are for what it leaves open",
+        "TOML or CSV file of captures: 'folder' is that of one, 'name' that of its results, "
+        "'model' as the flag; options as tables in TOML ([[captures]], [captures.sfm]), as "
+        "columns in CSV (sfm.intrinsics); flags are for what it leaves open",
         positional=True,
         metavar="LIST",
     )

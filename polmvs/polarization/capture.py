@@ -31,6 +31,7 @@ from polmvs.io.raw_formats import (
     probe_raw,
     read_raw,
 )
+from polmvs.polarization.angle_gains import AngleGains, find_angle_gains
 from polmvs.polarization.bit_depth import CONTAINER_BITS, LevelCounts, Levels, decide_levels
 from polmvs.polarization.calibration import PolarizerCalibration, read_calibration
 from polmvs.polarization.exposures import merge_exposures
@@ -91,6 +92,7 @@ class Capture:
     lossy_steps : (64,) steps of the JPEG that the samples were, row by row; None if none.
     orientations : TIFF orientations that occur; the samples are as stored.
     pattern_check, linearity_check : of a monochrome mosaic's pattern and gamma; None for others.
+    angle_gains : of the views that were looked at, of an ``ANGLES`` capture; empty for others.
     """
 
     folder: Path
@@ -105,6 +107,7 @@ class Capture:
     orientations: tuple[int, ...] = (UPRIGHT,)
     pattern_check: PatternCheck | None = None
     linearity_check: LinearityCheck | None = None
+    angle_gains: tuple[AngleGains, ...] = ()
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -171,7 +174,27 @@ class Capture:
             )
         if self.linearity_check is not None and self.linearity_check.fits is False:
             lines.append(self.linearity_check.message)
+        if self.unequal_exposure is not None and not self.options.equalize:
+            lines.append(self.unequal_exposure)
         return tuple(lines)
+
+    @property
+    def unequal_exposure(self) -> str | None:
+        """What to say of polarizer angles that differ in exposure; None where they do not."""
+        differing = [found for found in self.angle_gains if found.differ]
+        if not differing:
+            return None
+        worst = max(differing, key=lambda found: found.ratio)
+        gains = ", ".join(
+            f"{angle:g} deg {gain / max(worst.gains):.2g}"
+            for angle, gain in zip(self.files.angles_deg, worst.gains, strict=True)
+        )
+        return (
+            f"the images of a view differ in exposure by up to a factor of {worst.ratio:.1f} "
+            f"({gains}), in {len(differing)} of {len(self.angle_gains)} views looked at: automatic "
+            "exposure, or a filter turned by hand? Record them at one exposure, or give "
+            "`capture.equalize`, which divides them by the gains found over unpolarised places"
+        )
 
     def load(self, name: str) -> Stokes:
         """Read a view and turn it into Stokes images ``(height, width)``.
@@ -300,15 +323,36 @@ class Capture:
             gains_known=True,
         )
 
-    def _from_angles(self, view: ViewFiles) -> Stokes:
+    def _angle_stack(self, view: ViewFiles) -> tuple[Image, Mask]:
+        """Linear images (K, H, W) or (K, H, W, 3) of a view, and where any of them is clipped."""
         linear, clipped = [], []
         for paths in view.files:
             image, raw, threshold = self._linear(paths)
             linear.append(image)
             clipped.append(raw >= threshold)
         stack, spoiled = np.stack(linear), np.logical_or.reduce(clipped)
-        if spoiled.ndim == 3:
-            spoiled = spoiled.any(axis=-1)
+        return stack, spoiled.any(axis=-1) if spoiled.ndim == 3 else spoiled
+
+    def find_gains(self, name: str) -> AngleGains:
+        """Gains between the images of a view of an ``ANGLES`` capture.
+
+        Raises
+        ------
+        DataError
+            As :meth:`load`.
+        """
+        return self._gains_of(*self._angle_stack(self._view(name)))
+
+    def _gains_of(self, stack: Image, spoiled: Mask) -> AngleGains:
+        gray = stack if stack.ndim == 3 else stack.mean(axis=-1)
+        usable = ~spoiled & (gray.min(axis=0) >= self.options.darkness)
+        return find_angle_gains(gray, self.files.angles_deg, usable)
+
+    def _from_angles(self, view: ViewFiles) -> Stokes:
+        stack, spoiled = self._angle_stack(view)
+        if self.options.equalize:
+            gains = np.array(self._gains_of(stack, spoiled).gains, np.float32)
+            stack = stack / gains.reshape(-1, *(1,) * (stack.ndim - 1))
         planes = [stack] if stack.ndim == 3 else [stack[..., c] for c in range(stack.shape[3])]
         return self._one_colour(
             [
@@ -494,6 +538,10 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
         pattern_check=_check_pattern(files, options, levels, sampled),
         linearity_check=_check_linearity(files, options, levels, sampled),
     )
+    if files.kind is CaptureKind.ANGLES:
+        looked_at = np.linspace(0, len(files.views) - 1, min(CHECKED_IMAGES, len(files.views)))
+        gains = tuple(capture.find_gains(capture.names[int(k)]) for k in looked_at)
+        capture = replace(capture, angle_gains=gains)
     for warning in capture.warnings:
         logger.warning("%s: %s.", files.folder, warning)
     logger.info("%s: %s", files.folder, "; ".join(capture.notes))
@@ -536,6 +584,11 @@ def _dump_size(options: CaptureOptions) -> DumpSize:
 
 def _require_fitting_options(files: CaptureFiles, options: CaptureOptions) -> None:
     """Options that say nothing of this kind of files are not ignored."""
+    if options.equalize and files.kind is not CaptureKind.ANGLES:
+        raise OptionError(
+            f"is of an image for each polarizer angle; {files.folder} holds {files.kind} images.",
+            field="capture.equalize",
+        )
     if files.kind is CaptureKind.MOSAIC:
         return
     defaults = CaptureOptions()

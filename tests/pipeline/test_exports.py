@@ -22,10 +22,12 @@ from polmvs.colmap.dense_workspace import (
 )
 from polmvs.colmap.maps import DepthNormals, read_depth_map, write_depth_map
 from polmvs.colmap.models import read_model, write_model
+from polmvs.config import FusionOptions, Method, PropagationOptions
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.clouds import Cloud, read_cloud, read_mesh, write_cloud
 from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
 from polmvs.pipeline.run_folder import DENSE_MARKER
+from polmvs.pipeline.stages.densify import unused_options
 from polmvs.poses.metric_frame import transform_model
 from polmvs.scene import PointKind
 from polmvs.surface.kept_depth import kept_cloud
@@ -279,6 +281,37 @@ def test_mesh_of_what_is_no_cloud(tmp_path: Path, cli) -> None:
 
 
 # Options of the cloud
+
+
+@pytest.mark.parametrize(
+    ("method", "given", "fusion", "words"),
+    [
+        (Method.SURFACE, {"bending": 0.01}, {}, "`propagation.bending` is not used by the method"),
+        (Method.SURFACE, {"stride_px": 3}, {}, "stride_px` spaces the views' depth maps alone"),
+        (Method.SURFACE, {}, {"max_range_difference_px": 3}, "not used by the method surface"),
+        (Method.INTEGRATE, {"step_px": 1, "spacing_px": 7}, {}, "`propagation.spacing_px` are not"),
+        (Method.INTEGRATE, {}, {"voxel": 0.1, "voxel_px": 1}, "not used where `fusion.voxel` is"),
+    ],
+)
+def test_options_without_use_are_named(method, given, fusion, words) -> None:
+    said = unused_options(method, PropagationOptions(**given), FusionOptions(**fusion))
+    assert len(said) == 1
+    assert words in said[0]
+
+
+@pytest.mark.parametrize("method", Method)
+def test_options_of_use_are_not_named(method) -> None:
+    assert unused_options(method, PropagationOptions(), FusionOptions()) == []
+    every = PropagationOptions(num_rounds=3, max_neighbors=4, stride_px=3, bending=0)
+    if method is not Method.SURFACE:
+        assert unused_options(method, every, FusionOptions(voxel=0.1)) == []
+
+
+def test_an_option_without_use_is_said(go_on: Continue, run: Path) -> None:
+    out = go_on("sparse_cloud_ppa", "densify", "--max-neighbors", 7)
+    stage = next(s for s in record_of(out)["stages"] if s["name"] == "densify_ppa")
+    assert "`propagation.max_neighbors` is not used by the method surface." in stage["warnings"]
+    assert (out / "ppa.ply").read_bytes() == (run / "ppa.ply").read_bytes()
 
 
 def test_voxel_in_metres_thins_and_there_are_no_surroundings(

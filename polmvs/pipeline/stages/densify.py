@@ -6,7 +6,7 @@ The cloud holds the polarised surfaces and their surroundings, told apart by the
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
@@ -55,6 +55,21 @@ from polmvs.surface.surroundings import SparseSurroundings, sparse_surroundings,
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T", bound=np.generic)
+
+# Options that a method makes no use of.
+_OF_CONTOURS = ("propagation.contour", "propagation.step_px", "propagation.spacing_px")
+UNUSED: Mapping[Method, tuple[str, ...]] = {
+    Method.SURFACE: (
+        *_OF_CONTOURS,
+        "propagation.num_rounds",
+        "propagation.bending",
+        "propagation.max_neighbors",
+        "fusion.max_range_difference_px",
+        "fusion.max_normal_difference_deg",
+    ),
+    Method.INTEGRATE: _OF_CONTOURS,
+    Method.CONTOUR: (),
+}
 
 FINEST_SPACING_PX = 0.25  # of points that are not to be merged, in footprints of a pixel
 
@@ -176,12 +191,39 @@ def densify(
         )
         replace_folder(new_views, views)
     write_cloud(cloud, _join_clouds(surface, around))
+    for sentence in unused_options(method, propagation, fusion):
+        logger.warning("%s.", sentence)
     return DensifyResult(
         num_points=len(surface.points),
         num_surroundings=len(around.points),
         method=method,
         tilt_share=tilt_share,
     )
+
+
+def unused_options(
+    method: Method, propagation: PropagationOptions, fusion: FusionOptions
+) -> list[str]:
+    """Sentences on options that are not the defaults and that a method makes no use of."""
+    groups = {"propagation": propagation, "fusion": fusion}
+
+    def is_given(path: str) -> bool:
+        group, _, name = path.partition(".")
+        return bool(getattr(groups[group], name) != getattr(type(groups[group]), name))
+
+    given = [f"`{path}`" for path in UNUSED[method] if is_given(path)]
+    sentences = []
+    if given:
+        are = "is" if len(given) == 1 else "are"
+        sentences.append(f"{', '.join(given)} {are} not used by the method {method}")
+    if method is Method.SURFACE and is_given("propagation.stride_px"):
+        sentences.append(
+            "`propagation.stride_px` spaces the views' depth maps alone by the method surface; its "
+            "cloud is thinned by `fusion.voxel_px` or `fusion.voxel`"
+        )
+    if fusion.voxel is not None and is_given("fusion.voxel_px"):
+        sentences.append("`fusion.voxel_px` is not used where `fusion.voxel` is given")
+    return sentences
 
 
 def _global_surface(

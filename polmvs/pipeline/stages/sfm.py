@@ -91,6 +91,8 @@ def find_model(
         No model comes out, or the options do not fit the images.
     """
     options = options or SfmOptions()
+    if options.camera_model != SfmOptions.camera_model and (options.intrinsics or options.camera):
+        logger.warning("`sfm.camera_model` is not used where the camera is given.")
     loading: list[Thread] = []
 
     def on_step(name: str) -> None:
