@@ -236,6 +236,14 @@ class InspectArguments(OptionGroup, group="arguments", in_files=False):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ImportArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    folder: Path = option(MISSING, "folder of one object or scene", positional=True, metavar="SET")
+    out: Path = option(MISSING, "folder to make", positional=True)
+
+
+@dataclass(frozen=True, kw_only=True)
 class CalibrateArguments(OptionGroup, group="arguments", in_files=False):
     """Arguments."""
 
@@ -385,6 +393,13 @@ COMMANDS = (
         help_text="what a capture's files are, how they are exposed, and pictures of them",
         run="polmvs.cli.captures:inspect",
         groups=(InspectArguments, CaptureOptions, FileOptions, TerminalOptions),
+    ),
+    Command(
+        name="import",
+        help_text="make a public set with cameras (ppa4p3d, PISR, PANDORA, NeRSP, SMVP3D, MVAS, "
+        "NeuS, TransPIR) ready for 'reconstruct', which does it by itself as well",
+        run="polmvs.cli.captures:import_set",
+        groups=(ImportArguments, CaptureOptions, FileOptions, TerminalOptions),
     ),
     Command(
         name="calibrate",

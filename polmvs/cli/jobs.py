@@ -27,6 +27,7 @@ from polmvs.evaluation.trust import Trust
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.pipeline import jobs as pipeline
 from polmvs.pipeline.batch import TABLE_FILE, BatchRow, State, batch_table, read_batch, run_batch
+from polmvs.pipeline.data_set_import import as_capture
 from polmvs.pipeline.record import is_finished, read_options
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import Job
@@ -171,10 +172,11 @@ def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> Job:
         named = any(option.startswith("reference.") for option in call.given)
         if named and not is_finished(run_folder, "poses"):
             recorded = {name: group for name, group in recorded.items() if name != "reference"}
+    capture, options = as_capture(arguments.capture, arguments.out, call.options(recorded))
     return Job(
-        capture=arguments.capture,
+        capture=capture,
         out=arguments.out,
-        options=call.options(recorded),
+        options=options,
         run_options=run_options,
         monitor=terminal,
         command_line=call.command_line,

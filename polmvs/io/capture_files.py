@@ -59,7 +59,7 @@ MAX_FILES = 200_000
 MAX_NAME_BYTES = 255 - 24  # the limit of file systems, less room for the endings of results
 NOT_VIEWS = frozenset({"gt", "mask", "masks", "sparse", "cams", "stereo"})  # folders beside views
 
-_OF_ANGLE = r"(?i:I|P|pol|polarizer|angle)?_?"  # words before an angle
+_OF_ANGLE = r"(?i:I|P|pol|polarizer|angle)?[_-]?"  # words before an angle
 _END = r"\.(?P<suffix>[A-Za-z0-9]+)"
 _ANGLE = r"(?P<angle>\d{1,3}(?:\.\d+)?)"
 _EXPOSURE = r"(?:[_-](?:exp|t)?(?P<exposure>\d+(?:\.\d+)?)(?P<unit>us|ms|s))?"

@@ -114,7 +114,7 @@ class Inspection:
 
     @property
     def verdict(self) -> str:
-        """One sentence: will it do?"""
+        """One sentence on whether it will do."""
         if self.obstacles:
             return f"This capture will not do, because {'; and '.join(self.obstacles)}."
         if self.warnings:
