@@ -126,6 +126,24 @@ class Packing(StrEnum):
     MONO12PACKED = "mono12packed"
 
 
+class ExportFormat(StrEnum):
+    """As what a finished run is exported."""
+
+    PLY = "ply"
+    OBJ = "obj"
+    STL = "stl"
+    GLB = "glb"
+    CLOUD_PLY = "cloud-ply"
+    XYZ = "xyz"
+    LAS = "las"
+    LAZ = "laz"
+    NERFSTUDIO = "nerfstudio"
+    NEUS = "neus"
+    METASHAPE = "metashape"
+    REALITYSCAN = "realityscan"
+    BUNDLER = "bundler"
+
+
 class CaptureKind(StrEnum):
     """What the files of a capture hold."""
 
@@ -417,6 +435,11 @@ class SfmOptions(OptionGroup, group="sfm"):
         "are many",
     )
     seed: int = option(0, "random seed of SfM")
+    without: tuple[str, ...] = option(
+        (),
+        "images to take out of the model; a run adds those whose pose its surface contradicts",
+        metavar="NAME,...",
+    )
 
     def check(self) -> None:
         """Four positive numbers, or a file; nothing for an SfM that is not run."""

@@ -18,6 +18,7 @@ from polmvs.config import (
     EvaluationOptions,
     Experiment,
     ExperimentOptions,
+    ExportFormat,
     ExportOptions,
     FusionOptions,
     NormalOptions,
@@ -165,6 +166,40 @@ class MeshArguments(OptionGroup, group="arguments", in_files=False):
     cloud: Path = option(MISSING, "PLY file of points with normals", positional=True)
     mesh: Path = option(MISSING, "file of the mesh: .ply, .obj, .stl or .glb", positional=True)
     overwrite: bool = option(False, "replace an existing MESH")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    run: Path = option(MISSING, "folder of a finished run", positional=True)
+    target: Path = option(MISSING, "file to write, of posed images a folder", positional=True)
+    overwrite: bool = option(False, "replace an existing TARGET")
+    format: ExportFormat | None = option(
+        None, "by default told by the end of TARGET's name, .ply a mesh"
+    )
+    model: AngleModel | None = option(
+        None, "whose surface; by default that of PPA, else of the only cloud"
+    )
+    texture: bool = option(
+        False, "a texture instead of a colour for each vertex; obj and glb (extra 'texture')"
+    )
+    texture_px: int | None = option(
+        None,
+        "sides of the texture, px; by default a texel is as large as a pixel on the part",
+        least=64,
+        most=16384,
+    )
+    colors: bool = option(
+        True, "colours of a mesh, from the views that see a place best, without highlights"
+    )
+    part: bool = option(False, "of a cloud the polarised surface alone, without its surroundings")
+
+    def check(self) -> None:
+        """A texture has colours, and a size is one of a texture."""
+        self.require(self.colors or not self.texture, "texture", "needs `arguments.colors`")
+        sized = self.texture or self.texture_px is None
+        self.require(sized, "texture_px", "is of a texture; give `arguments.texture`")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -352,11 +387,21 @@ COMMANDS = (
         earlier=TO_NORMALS,
     ),
     Command(
-        name="export",
+        name="finish",
         help_text="mesh and COLMAP dense workspace, after 'densify'",
-        run="polmvs.cli.jobs:export",
+        run="polmvs.cli.jobs:finish",
         groups=(JobArguments, ModelChoice, ExportOptions, *EXECUTION),
         earlier=TO_CLOUD,
+    ),
+    Command(
+        name="export",
+        help_text="mesh, cloud or posed images of a finished run as other programs read them",
+        run="polmvs.cli.exports:export",
+        groups=(ExportArguments, TerminalOptions),
+        more="Formats: meshes ply, obj (with its .mtl), stl, glb; clouds cloud-ply, xyz, las, laz; "
+        "posed images, each in a folder: nerfstudio (transforms.json, for gsplat as well), neus "
+        "(cameras.npz, for IDR as well), metashape, realityscan, bundler. OpenMVS and COLMAP read "
+        "OUT/dense as it is.",
     ),
     Command(
         name="mesh",

@@ -284,7 +284,7 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
         common["metavar"] = metavar_of(info)
     if isinstance(info.kind, type) and issubclass(info.kind, StrEnum):
         # cyclopts would read members by their names, with a hyphen between digit and letter.
-        common["name_transform"] = str.lower
+        common["name_transform"] = _choice_of_member
     kind: Any = info.kind
     place: Any = inspect.Parameter.KEYWORD_ONLY
     elements = typing.get_args(kind) if typing.get_origin(kind) is tuple else ()
@@ -310,6 +310,10 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
         # Where pydantic happens to be loaded, cyclopts has it check the default as well.
         annotation=Annotated[kind | None if has_default else kind, Parameter(**common)],
     )
+
+
+def _choice_of_member(name: str) -> str:
+    return name.lower().replace("_", "-")
 
 
 def _is_mixed(kind: Any) -> bool:

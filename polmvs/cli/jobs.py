@@ -109,10 +109,10 @@ def densify(call: Call, terminal: Terminal) -> int:
     return _show_cloud(outcome, model, terminal)
 
 
-def export(call: Call, terminal: Terminal) -> int:
-    """Run ``polmvs export``."""
+def finish(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs finish``."""
     model = call.get(ModelChoice).model
-    outcome = pipeline.export(job_of(call, terminal, continues=True), model)
+    outcome = pipeline.finish(job_of(call, terminal, continues=True), model)
     return _show_cloud(outcome, model, terminal)
 
 

@@ -23,6 +23,7 @@ from polmvs.config import (
     Options,
     RunOptions,
     plain_options,
+    replace_option,
     show_value,
     to_plain,
     with_absolute_paths,
@@ -263,6 +264,20 @@ class Run(StageInput):
             A folder of theirs holds files that no run wrote; nothing is deleted.
         """
         self._delete(with_dependent(names, self.table))
+
+    def take_out(self, names: Sequence[str], reasons: Sequence[str]) -> None:
+        """Take images out of the model: what was made with them is done again without.
+
+        Parameters
+        ----------
+        names : of the images.
+        reasons : sentences for the record.
+        """
+        without = tuple(dict.fromkeys((*self.options.sfm.without, *names)))
+        self.options = replace_option(self.options, "sfm.without", without)
+        self.record.options = to_plain(self.options)
+        self.record.notes = (*self.record.notes, *reasons)
+        self.forget(["poses"])
 
     def _delete(self, stale: Sequence[StageSpec], remembered: StageRecord | None = None) -> None:
         """Delete the files of stages, and what is recorded of them but for what is remembered."""

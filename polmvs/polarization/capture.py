@@ -120,6 +120,15 @@ class Capture:
         return tuple(view.name for view in self.files.views)
 
     @property
+    def has_colors(self) -> bool:
+        """Whether its files are those of a colour camera."""
+        return self.options.bayer is not None or (
+            self.files.kind is not CaptureKind.AOLP
+            and self.header.channels == 3
+            and not (self.files.kind is CaptureKind.STOKES and len(self.files.views[0].files) == 1)
+        )
+
+    @property
     def bit_depth(self) -> int:
         """Of the samples; 0 for floats."""
         return self.levels.bit_depth

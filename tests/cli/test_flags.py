@@ -112,7 +112,7 @@ def test_help_names_every_option_with_its_default(cli, command) -> None:
     [
         ("normals", "--window-px", "--gamma"),
         ("densify", "--stride-px", "--min-dolp"),
-        ("export", "--in-place", "--stride-px"),
+        ("finish", "--in-place", "--stride-px"),
     ],
 )
 def test_help_of_a_stage_lists_its_own_options(cli, command: str, own: str, earlier: str) -> None:
@@ -238,8 +238,8 @@ def test_flags_may_stand_before_arguments() -> None:
         (("sfm", "c", "o", "--gamma", "1", "--gamma", "1"), "--gamma specified multiple times"),
         (("sfm", "c", "o", "--gamma=1", "--gamma=2"), "--gamma specified multiple times"),
         (("sfm", "c", "o", "--resume", "--resume"), "--resume specified multiple times"),
-        (("export", "c", "o", "--mesh", "--no-mesh"), "--mesh and --no-mesh exclude each other"),
-        (("export", "c", "o", "--no-mesh", "--mesh"), "--no-mesh and --mesh exclude each other"),
+        (("finish", "c", "o", "--mesh", "--no-mesh"), "--mesh and --no-mesh exclude each other"),
+        (("finish", "c", "o", "--no-mesh", "--mesh"), "--no-mesh and --mesh exclude each other"),
         (("sfm", "c", "o", "--intrinsics", "1,1,1,1", "--intrinsics", "1,1,1,1"), "--intrinsics"),
         (("sfm", "c", "o", "--intrinsics", "400,x,1,1"), "cannot be read as NUMBER,..."),
         (("sfm", "c", "o", "--scale", "a", "b"), "--scale requires 3"),

@@ -212,23 +212,23 @@ def test_no_mesh_and_no_colmap(go_on: Continue) -> None:
 
 
 def test_export_alone(go_on: Continue, run: Path, demo_capture: Path, cli) -> None:
-    out = go_on("densify_ppa", "export")
+    out = go_on("densify_ppa", "finish")
     assert (out / "ppa_mesh.ply").read_bytes() == (run / "ppa_mesh.ply").read_bytes()
     assert content_of(out / "dense" / "stereo") == content_of(run / "dense" / "stereo")
-    refused_again = refused(cli("export", demo_capture, out), 2)
+    refused_again = refused(cli("finish", demo_capture, out), 2)
     assert "is finished. Give --overwrite" in refused_again
     (out / "dense" / "stereo" / "fusion.cfg").write_text("")
-    assert cli("export", demo_capture, out, "--overwrite")[0] == 0
+    assert cli("finish", demo_capture, out, "--overwrite")[0] == 0
     assert content_of(out / "dense") == content_of(run / "dense")
 
 
 def test_export_before_the_cloud(run: Path, demo_capture: Path, tmp_path: Path, cli) -> None:
     out = stopped(run, tmp_path / "out", "sparse_cloud_ppa")
-    err = refused(cli("export", demo_capture, out))
+    err = refused(cli("finish", demo_capture, out))
     assert "Run 'polmvs densify' first" in err
 
 
-@pytest.mark.parametrize("command", ["export", "densify", "reconstruct"])
+@pytest.mark.parametrize("command", ["finish", "densify", "reconstruct"])
 def test_users_file_in_the_workspace_is_not_deleted(
     run: Path, demo_capture: Path, tmp_path: Path, cli, command: str
 ) -> None:
@@ -465,7 +465,7 @@ def test_in_place_changes_the_workspace_and_keeps_a_backup(
     assert cli("densify", demo_capture, out, *flags, *QUICK, "--overwrite")[0] == 0
     assert not (out / "dense").exists()
     before = content_of(own)
-    status, text, err = cli("export", demo_capture, out, *flags, "--in-place")
+    status, text, err = cli("finish", demo_capture, out, *flags, "--in-place")
     assert (status, err) == (0, "")
     assert f"{own}: COLMAP dense workspace" in text
     assert not (out / "dense").exists()

@@ -85,12 +85,14 @@ class DensifyResult:
     method : by which the points were made: the views one by one where there is no surface from all.
     tilt_share : of the turn by tilted polarizers that the surface of all views took back; None by
         the other methods.
+    left_out : names of views that contradict the surface of all others, which is made without them.
     """
 
     num_points: int
     num_surroundings: int
     method: Method
     tilt_share: float | None
+    left_out: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.num_points:,} points, and {self.num_surroundings:,} of the surroundings"
@@ -163,11 +165,11 @@ def densify(
                 on_progress=on_progress,
             )
         if found is not None:
-            fused, presumed, tilt_share = found
+            fused, presumed, tilt_share, left_out = found
         else:
             if method is Method.SURFACE:
                 method = Method.INTEGRATE
-            presumed, tilt_share = np.zeros(0, np.bool_), None
+            presumed, tilt_share, left_out = np.zeros(0, np.bool_), None, ()
             fused = _dense_surface(
                 model,
                 phase_maps,
@@ -198,6 +200,7 @@ def densify(
         num_surroundings=len(around.points),
         method=method,
         tilt_share=tilt_share,
+        left_out=left_out,
     )
 
 
@@ -239,8 +242,10 @@ def _global_surface(
     tilt_aware: bool,
     masks_given: bool,
     on_progress: OnProgress,
-) -> tuple[FusedCloud, NDArray[np.bool_], float] | None:
-    """The surface of all views, which of its points are presumed, and its share of the tilt.
+) -> tuple[FusedCloud, NDArray[np.bool_], float, tuple[str, ...]] | None:
+    """The surface of all views, what of it is presumed, its tilt, and the views left out.
+
+    The second is of its points, the third the share of the turn by tilted polarizers.
 
     Its mesh and its depth in each view go to ``views``, what it is made from meanwhile to ``kept``,
     a new folder. None where silhouettes do not bound the objects.
@@ -284,7 +289,8 @@ def _global_surface(
         faces = mesh.faces.astype(np.int32)
         whole = Mesh(vertices=mesh.vertices, normals=mesh.vertex_normals, triangles=faces)
         write_mesh(views / SURFACE_LEVELS.format(number=number), whole)
-    return *points, surface.tilt_share
+    names = tuple(phase_map.view.name for phase_map in compress(maps, surface.left_out))
+    return *points, surface.tilt_share, names
 
 
 def _dense_surface(
