@@ -1,8 +1,11 @@
 """Mesh, COLMAP workspace and surroundings of the bundled capture, as a user gets them."""
 
+import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -41,6 +44,8 @@ QUICK = ("--method", "integrate")
 
 # Runs a command on a copy of the finished run that was cut short, and gives the copy.
 Continue = Callable[..., Path]
+# Image coordinates of points of the world.
+Projection = Callable[[np.ndarray], np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -586,3 +591,200 @@ def test_images_of_another_capture(
     assert content_of(own) == before
     assert not (out / "ppa.ply").exists()
     assert stages_of(out)[-1] == "sparse_cloud_ppa"
+
+
+# Files of other programs
+
+
+def projected_nerfstudio(folder: Path) -> dict[int, Projection]:
+    content = json.loads((folder / "transforms.json").read_text())
+
+    def of(frame: dict) -> Projection:
+        from_world = np.linalg.inv(np.array(frame["transform_matrix"]))
+
+        def project(points: np.ndarray) -> np.ndarray:
+            x, y, z = (points @ from_world[:3, :3].T + from_world[:3, 3]).T
+            u = frame["fl_x"] * x / -z + frame["cx"]
+            return np.column_stack([u, frame["fl_y"] * -y / -z + frame["cy"]])
+
+        return project
+
+    return {number: of(frame) for number, frame in enumerate(content["frames"])}
+
+
+def projected_neus(folder: Path) -> dict[int, Projection]:
+    content = np.load(folder / "cameras_sphere.npz")
+
+    def of(number: int) -> Projection:
+        def project(points: np.ndarray) -> np.ndarray:
+            unit = np.linalg.inv(content[f"scale_mat_{number}"])
+            inside = points @ unit[:3, :3].T + unit[:3, 3]
+            matrix = content[f"world_mat_{number}"] @ content[f"scale_mat_{number}"]
+            h = inside @ matrix[:3, :3].T + matrix[:3, 3]
+            return h[:, :2] / h[:, 2:] + 0.5
+
+        return project
+
+    return {number: of(number) for number in range(len(content.files) // 2)}
+
+
+def projected_metashape(folder: Path) -> dict[int, Projection]:
+    chunk = ElementTree.parse(folder / "cameras.xml").getroot().find("chunk")
+    sensors = {s.get("id"): s.find("calibration") for s in chunk.find("sensors")}
+
+    def of(camera: ElementTree.Element) -> Projection:
+        from_world = np.linalg.inv(
+            np.array(camera.find("transform").text.split(), float).reshape(4, 4)
+        )
+        found = sensors[camera.get("sensor_id")]
+        f, cx, cy, b1 = (float(found.find(name).text) for name in ("f", "cx", "cy", "b1"))
+        width, height = (float(found.find("resolution").get(k)) for k in ("width", "height"))
+
+        def project(points: np.ndarray) -> np.ndarray:
+            x, y, z = (points @ from_world[:3, :3].T + from_world[:3, 3]).T
+            u = 0.5 * width + cx + f * x / z + b1 * x / z
+            return np.column_stack([u, 0.5 * height + cy + f * y / z])
+
+        return project
+
+    return {number: of(camera) for number, camera in enumerate(chunk.find("cameras"))}
+
+
+def projected_realityscan(folder: Path) -> dict[int, Projection]:
+    space = "{http://www.capturingreality.com/ns/xcr/1.1#}"
+
+    def of(path: Path) -> Projection:
+        root = ElementTree.parse(path).getroot()
+        told = next(e for e in root.iter() if e.tag.endswith("Description"))
+        rotation = np.array(told.find(f"{space}Rotation").text.split(), float).reshape(3, 3)
+        center = np.array(told.find(f"{space}Position").text.split(), float)
+        height, width = cv2.imread(str(path.with_suffix(".png"))).shape[:2]
+        size = max(width, height)
+        focal = float(told.get(f"{space}FocalLength35mm")) / 36 * size
+        u0 = 0.5 * width + size * float(told.get(f"{space}PrincipalPointU"))
+        v0 = 0.5 * height + size * float(told.get(f"{space}PrincipalPointV"))
+        ratio = float(told.get(f"{space}AspectRatio"))
+
+        def project(points: np.ndarray) -> np.ndarray:
+            x, y, z = ((points - center) @ rotation.T).T
+            return np.column_stack([focal * x / z + u0, ratio * focal * y / z + v0])
+
+        return project
+
+    return {n: of(path) for n, path in enumerate(sorted((folder / "images").glob("*.xmp")))}
+
+
+PROJECTED = {
+    "nerfstudio": projected_nerfstudio,
+    "neus": projected_neus,
+    "metashape": projected_metashape,
+    "realityscan": projected_realityscan,
+}
+
+
+@pytest.mark.parametrize("form", PROJECTED)
+def test_posed_images_project_the_points_where_they_were_seen(
+    run: Path, tmp_path: Path, cli, form: str
+) -> None:
+    """By each format's own conventions."""
+    status, text, err = cli("export", run, tmp_path / "x", "--format", form)
+    assert (status, err) == (0, "")
+    assert "10 posed images" in text
+    workspace = open_dense_workspace(run / "dense")
+    tracks, seen = workspace.tracks, PROJECTED[form](tmp_path / "x")
+    assert len(seen) == len(workspace.views)
+    for number, project in seen.items():
+        own = np.flatnonzero(tracks.obs_view == number)
+        found = project(tracks.points_in_world[tracks.obs_track[own]])
+        off = np.linalg.norm(found - tracks.obs_xy[own], axis=1)
+        assert np.median(off) < 0.5  # reprojection errors of SfM; half a pixel off would be 0.7
+    assert "exists" in refused(cli("export", run, tmp_path / "x", "--format", form), 2)
+
+
+def test_nerfstudio_has_depths_normals_masks_and_a_cloud(run: Path, tmp_path: Path, cli) -> None:
+    assert cli("export", run, tmp_path / "x", "--format", "nerfstudio")[0] == 0
+    content = json.loads((tmp_path / "x" / "transforms.json").read_text())
+    item = open_dense_workspace(run / "dense").views[0]
+    maps, frame = item.load_maps(), content["frames"][0]
+    depth = np.load(tmp_path / "x" / frame["depth_file_path"])
+    np.testing.assert_allclose(1e-3 * depth, maps.depth, rtol=1e-6)  # nerfstudio's own factor
+    normals = cv2.imread(str(tmp_path / "x" / frame["normal_file_path"]))[..., ::-1] / 127.5 - 1
+    known = maps.depth > 0
+    assert np.abs(normals - maps.normals)[known].max() < 0.01
+    mask = cv2.imread(str(tmp_path / "x" / frame["mask_path"]), cv2.IMREAD_UNCHANGED) > 0
+    assert mask[known].mean() > 0.9
+    assert 0.05 < mask.mean() < 0.6
+    assert len(read_cloud(tmp_path / "x" / content["ply_file_path"]).points) > 1000
+    assert cv2.imread(str(tmp_path / "x" / frame["file_path"])).shape[:2] == depth.shape
+
+
+def test_bundler_states_each_keypoint_where_it_projects(run: Path, tmp_path: Path, cli) -> None:
+    assert cli("export", run, tmp_path / "x", "--format", "bundler")[0] == 0
+    words = iter((tmp_path / "x" / "bundle.out").read_text().split("\n", 1)[1].split())
+
+    def take(number: int) -> np.ndarray:
+        return np.array([float(next(words)) for _ in range(number)])
+
+    num_cameras, num_points = map(int, take(2))
+    cameras = [(take(3), take(9).reshape(3, 3), take(3)) for _ in range(num_cameras)]
+    off = []
+    for _ in range(num_points):
+        point, _ = take(3), take(3)
+        for _ in range(int(take(1)[0])):
+            number, _, x, y = take(4)
+            (focal, *_), rotation, translation = cameras[int(number)]
+            p = rotation @ point + translation
+            assert p[2] < 0
+            off.append(np.hypot(*(-focal * p[:2] / p[2] - (x, y))))
+    assert next(words, None) is None
+    assert num_points > 100
+    assert np.median(off) < 0.5
+    names = (tmp_path / "x" / "list.txt").read_text().split()
+    assert all((tmp_path / "x" / name).is_file() for name in names)
+
+
+def test_meshes_have_colours_or_a_texture(run: Path, tmp_path: Path, cli) -> None:
+    expected = read_mesh(run / "ppa_mesh.ply")
+    status, text, err = cli("export", run, tmp_path / "part.ply")
+    assert (status, err) == (0, "")
+    assert f"{len(expected.triangles):,} triangles" in text
+    coloured = read_mesh(tmp_path / "part.ply")
+    top = np.abs(coloured.vertices[:, 2] - BOARD_HEIGHT_M) < TOLERANCE_M
+    # Black lacquer, whose reflections are polarised, with some printed marks.
+    assert np.median(coloured.colors[top]) < 0.5 * np.median(expected.colors[top])
+    assert coloured.colors[top].max() > 100
+    flags = ("--texture", "--texture-px", 256)
+    status, text, err = cli("export", run, tmp_path / "part.obj", *flags)
+    assert (status, err) == (0, "")
+    assert {p.name for p in tmp_path.glob("part.*")} == {
+        "part.ply", "part.obj", "part.mtl", "part.png"
+    }  # fmt: skip
+    found = trimesh.load(tmp_path / "part.obj", force="mesh", process=False)
+    assert len(found.faces) == len(expected.triangles)
+    assert found.visual.material.image.size == (256, 256)
+    np.testing.assert_allclose(found.bounds, [expected.vertices.min(0), expected.vertices.max(0)])
+
+
+@pytest.mark.parametrize(
+    ("target", "flags", "words"),
+    [
+        ("part", (), "its name says no format"),
+        ("part.obj", ("--format", "stl"), "of a file of stl ends in .stl".replace(".", r"\.")),
+        ("part.stl", ("--texture",), "--texture cannot be held by stl"),
+        ("part.obj", ("--texture", "--no-colors"), "--texture needs --colors"),
+        ("part.obj", ("--texture-px", 256), "--texture-px is of a texture; give --texture"),
+        ("c.xyz", ("--texture",), "--texture is of a mesh"),
+        ("part.obj", ("--model", "opa"), "--model is opa; .* has ppa"),
+    ],
+)
+def test_exports_that_cannot_be(run: Path, tmp_path: Path, cli, target, flags, words) -> None:
+    assert re.search(words, refused(cli("export", run, tmp_path / target, *flags), 2))
+    assert not list(tmp_path.iterdir())
+
+
+def test_clouds_of_the_part_alone(run: Path, tmp_path: Path, cli) -> None:
+    assert cli("export", run, tmp_path / "c.xyz", "--part")[0] == 0
+    assert len(np.loadtxt(tmp_path / "c.xyz")) == len(surface_of(read_cloud(run / "ppa.ply")))
+    assert cli("export", run, tmp_path / "c.ply", "--format", "cloud-ply")[0] == 0
+    whole, there = (read_cloud(p) for p in (tmp_path / "c.ply", run / "ppa.ply"))
+    np.testing.assert_array_equal(whole.points, there.points)
