@@ -159,6 +159,51 @@ class EvaluateArguments(OptionGroup, group="arguments", in_files=False):
     )
 
 
+class LengthUnit(StrEnum):
+    """Of a reference's coordinates."""
+
+    UM = "um"
+    MM = "mm"
+    CM = "cm"
+    M = "m"
+    INCH = "inch"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviationArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    result: Path = option(MISSING, "folder of a finished run, or PLY of a cloud", positional=True)
+    reference: Path = option(
+        MISSING,
+        "mesh of the part (STL, OBJ, GLB, PLY), a scan (PLY with normals), or another run",
+        positional=True,
+    )
+    out: Path | None = option(
+        None, "new folder for a coloured cloud, a picture, a histogram and the figures as JSON"
+    )
+    unit: LengthUnit | None = option(
+        None, "of the reference; by default that in which it is as large as the result"
+    )
+    aligned: bool = option(
+        False, "the result lies in the reference's frame; without it, it is laid"
+    )
+    metric: bool = option(
+        False, "the result is in metres, where nothing says so: a cloud, or a run with metric poses"
+    )
+    tolerance: float | None = option(
+        None,
+        "distance that is allowed either way, mm; the exit status is 4 where it is not kept",
+        above=0,
+    )
+    least_share: float = option(
+        0.99, "share of the points that must keep to the tolerance", above=0, most=1
+    )
+    model: AngleModel | None = option(
+        None, "whose surface of a run; by default that of PPA, else of the only cloud"
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class MeshArguments(OptionGroup, group="arguments", in_files=False):
     """Arguments."""
@@ -365,6 +410,13 @@ COMMANDS = (
         help_text="measure a cloud against ground truth",
         run="polmvs.cli.clouds:evaluate",
         groups=(EvaluateArguments, TerminalOptions),
+    ),
+    Command(
+        name="deviation",
+        help_text="how far a part is from its drawing, a scan or another run of it, and whether "
+        "that is within a tolerance",
+        run="polmvs.cli.deviations:deviation",
+        groups=(DeviationArguments, TerminalOptions),
     ),
     Command(
         name="sfm",

@@ -113,7 +113,7 @@ def export_run(
         The run lacks what is asked for, the target exists, or a library is missing.
     """
     record = load_record(run_folder)
-    model = _model_of(run_folder, dense_models(record), model)
+    model = surface_of(run_folder, dense_models(record), model)
     if texture and form not in MESHES:
         raise OptionError("is of a mesh.", field="arguments.texture")
     if texture and not MESH_FORMATS[f".{form}"].texture:
@@ -124,7 +124,7 @@ def export_run(
         raise OptionError(f"{target}: exists. Give `arguments.overwrite` to replace it.")
     if form in CLOUDS:
         cloud = read_cloud(run_folder.cloud(model))
-        cloud = _of_part(cloud) if part else cloud
+        cloud = part_of(cloud) if part else cloud
         write_cloud_file(target, cloud, CLOUDS[form])
         return Exported(files=(target,), num_points=len(cloud.points))
     if form not in MESHES:
@@ -149,9 +149,16 @@ def export_run(
     )
 
 
-def _model_of(
+def surface_of(
     run_folder: RunFolder, there: tuple[AngleModel, ...], model: AngleModel | None
 ) -> AngleModel:
+    """The angle model whose surface is asked for, of those that are there.
+
+    Raises
+    ------
+    DataError, OptionError
+        There is none, or not that.
+    """
     if not there:
         raise DataError(run_folder.root, "has no dense cloud. Run 'polmvs densify' first.")
     if model is None:
@@ -169,7 +176,8 @@ def _existing(path: Path, what: str) -> Path:
     return path
 
 
-def _of_part(cloud: Cloud) -> Cloud:
+def part_of(cloud: Cloud) -> Cloud:
+    """The points of a cloud that lie on the part, without its surroundings."""
     kinds = cloud.scalars.get("kind")
     if kinds is None:
         return cloud

@@ -19,7 +19,7 @@ def cloud() -> Cloud:
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(500, 3))
     return Cloud(
-        points=rng.normal(size=(500, 3)) + [1e3, -5, 0],
+        points=rng.normal(size=(500, 3)) + np.array([1e3, -5, 0]),
         normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
         colors=rng.integers(0, 256, (500, 3)).astype(np.uint8),
         scalars={"sigma": rng.uniform(size=500).astype(np.float32)},

@@ -751,8 +751,8 @@ def test_meshes_have_colours_or_a_texture(run: Path, tmp_path: Path, cli) -> Non
     coloured = read_mesh(tmp_path / "part.ply")
     top = np.abs(coloured.vertices[:, 2] - BOARD_HEIGHT_M) < TOLERANCE_M
     # Black lacquer, whose reflections are polarised, with some printed marks.
-    assert np.median(coloured.colors[top]) < 0.5 * np.median(expected.colors[top])
-    assert coloured.colors[top].max() > 100
+    assert np.median(coloured.colors[top]) < 80
+    assert coloured.colors[top].max() > 150
     flags = ("--texture", "--texture-px", 256)
     status, text, err = cli("export", run, tmp_path / "part.obj", *flags)
     assert (status, err) == (0, "")
