@@ -435,6 +435,11 @@ class SfmOptions(OptionGroup, group="sfm"):
         "are many",
     )
     seed: int = option(0, "random seed of SfM")
+    static_background: bool = option(
+        True,
+        "find a background that stands still while the part turns on a table, and leave its "
+        "features out",
+    )
     without: tuple[str, ...] = option(
         (),
         "images to take out of the model; a run adds those whose pose its surface contradicts",
