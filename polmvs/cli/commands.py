@@ -239,6 +239,11 @@ class ExportArguments(OptionGroup, group="arguments", in_files=False):
         True, "colours of a mesh, from the views that see a place best, without highlights"
     )
     part: bool = option(False, "of a cloud the polarised surface alone, without its surroundings")
+    box: tuple[float, float, float, float, float, float] | None = option(
+        None,
+        "two opposite corners, in the frame and unit of the model: what lies outside is left out",
+        metavar="X,Y,Z,X,Y,Z",
+    )
 
     def check(self) -> None:
         """A texture has colours, and a size is one of a texture."""

@@ -22,6 +22,7 @@ def export(call: Call, terminal: Terminal) -> int:
         texture_px=given.texture_px,
         colors=given.colors,
         part=given.part,
+        box=given.box,
         overwrite=given.overwrite,
     )
     what = [

@@ -31,6 +31,7 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 CLOUDS = {
     ExportFormat.CLOUD_PLY: "ply",
@@ -93,6 +94,7 @@ def export_run(
     texture_px: int | None = None,
     colors: bool = True,
     part: bool = False,
+    box: tuple[float, float, float, float, float, float] | None = None,
     overwrite: bool = False,
 ) -> Exported:
     """Write a mesh, a cloud or posed images of a finished run.
@@ -105,6 +107,7 @@ def export_run(
     texture_px : sides of the texture; by default a texel has the size of a pixel on the part.
     colors : of a mesh: without, it has none.
     part : of a cloud: the polarised surface alone, without its surroundings.
+    box : two opposite corners, world; of a mesh or cloud what lies within.
     overwrite : replace what is there.
 
     Raises
@@ -114,6 +117,8 @@ def export_run(
     """
     record = load_record(run_folder)
     model = surface_of(run_folder, dense_models(record), model)
+    if box is not None and form not in (*MESHES, *CLOUDS):
+        raise OptionError("is of a mesh or a cloud.", field="arguments.box")
     if texture and form not in MESHES:
         raise OptionError("is of a mesh.", field="arguments.texture")
     if texture and not MESH_FORMATS[f".{form}"].texture:
@@ -125,12 +130,18 @@ def export_run(
     if form in CLOUDS:
         cloud = read_cloud(run_folder.cloud(model))
         cloud = part_of(cloud) if part else cloud
+        if box is not None:
+            cloud = cloud.only(within_box(cloud.points, box))
         write_cloud_file(target, cloud, CLOUDS[form])
         return Exported(files=(target,), num_points=len(cloud.points))
     if form not in MESHES:
         return _export_cameras(run_folder, model, target, form, overwrite=overwrite)
     mesh_format_of(target)
     mesh = read_mesh(_existing(run_folder.mesh(model), "mesh"))
+    if box is not None:
+        mesh = cropped_mesh(mesh, within_box(mesh.vertices, box))
+        if not len(mesh.triangles):
+            raise OptionError("holds nothing of the mesh.", field="arguments.box")
     painted: Texture | None = None
     if MESH_FORMATS[f".{form}"].colors and colors:
         painter = _Painter(run_folder, mesh)
@@ -146,6 +157,27 @@ def export_run(
         num_points=len(mesh.vertices),
         num_triangles=len(mesh.triangles),
         texture_px=0 if painted is None else painted.image.shape[0],
+    )
+
+
+def within_box(points: Array, box: tuple[float, float, float, float, float, float]) -> Mask:
+    """Which points (N, 3) lie between two opposite corners, whichever is which."""
+    corners = np.reshape(box, (2, 3))
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    return np.asarray(((points >= low) & (points <= high)).all(axis=1), np.bool_)
+
+
+def cropped_mesh(mesh: Mesh, kept: Mask) -> Mesh:
+    """The triangles of which all three vertices are kept, and their vertices."""
+    triangles = mesh.triangles[kept[mesh.triangles].all(axis=1)]
+    used = np.unique(triangles)
+    index = np.zeros(len(mesh.vertices), np.int32)
+    index[used] = np.arange(len(used))
+    return Mesh(
+        vertices=mesh.vertices[used],
+        normals=mesh.normals[used],
+        triangles=index[triangles],
+        colors=None if mesh.colors is None else mesh.colors[used],
     )
 
 

@@ -782,6 +782,23 @@ def test_exports_that_cannot_be(run: Path, tmp_path: Path, cli, target, flags, w
     assert not list(tmp_path.iterdir())
 
 
+def test_a_box_cuts_meshes_and_clouds(run: Path, tmp_path: Path, cli) -> None:
+    whole = read_mesh(run / "ppa_mesh.ply")
+    low, high = whole.vertices.min(axis=0), whole.vertices.max(axis=0)
+    middle = 0.5 * (low + high)
+    box = ",".join(map(str, (*high, *(middle[0], *low[1:]))))  # its half of larger x
+    assert cli("export", run, tmp_path / "half.stl", "--box", box)[0] == 0
+    found = trimesh.load(tmp_path / "half.stl", force="mesh")
+    assert 0.4 < len(found.faces) / len(whole.triangles) < 0.6
+    assert found.bounds[0][0] >= middle[0] - 1e-6
+    assert cli("export", run, tmp_path / "half.xyz", "--part", "--box", box)[0] == 0
+    assert np.loadtxt(tmp_path / "half.xyz")[:, 0].min() >= middle[0] - 1e-6
+    err = refused(cli("export", run, tmp_path / "no.stl", "--box", "90,90,90,91,91,91"), 2)
+    assert "--box holds nothing of the mesh" in err
+    err = refused(cli("export", run, tmp_path / "n", "--format", "neus", "--box", box), 2)
+    assert "--box is of a mesh or a cloud" in err
+
+
 def test_clouds_of_the_part_alone(run: Path, tmp_path: Path, cli) -> None:
     assert cli("export", run, tmp_path / "c.xyz", "--part")[0] == 0
     assert len(np.loadtxt(tmp_path / "c.xyz")) == len(surface_of(read_cloud(run / "ppa.ply")))
