@@ -21,7 +21,7 @@ from polmvs.errors import DataError, OptionError
 from polmvs.io.data_sets import read_data_set, recognise_data_set
 from polmvs.io.images import write_png
 from polmvs.io.intrinsics import write_intrinsics
-from polmvs.pipeline.data_set_import import import_data_set
+from polmvs.pipeline.data_set_import import ImportedSet, import_data_set
 from polmvs.polarization.calibration import write_calibration
 from polmvs.polarization.calibration_frames import calibrate_polarizers
 from polmvs.polarization.capture import intensity_image_8bit, open_capture
@@ -80,7 +80,7 @@ def import_set(call: Call, terminal: Terminal) -> int:
     lines = [f"{given.out}: {num_views} views of {imported.data_set.kind}"]
     if imported.num_points is not None:
         lines.append(f"{imported.sparse}: given poses, {imported.num_points:,} points")
-    words = ["polmvs", "reconstruct", *imported.arguments()]
+    words = ["polmvs", "reconstruct", *_arguments_of(imported)]
     lines.append(shlex.join(words))
     content = {
         "kind": imported.data_set.kind,
@@ -90,6 +90,18 @@ def import_set(call: Call, terminal: Terminal) -> int:
     }
     terminal.show("\n".join(lines), content)
     return 0
+
+
+def _arguments_of(imported: ImportedSet) -> list[str]:
+    """What to call ``polmvs reconstruct`` with."""
+    words = [str(imported.capture), "RUN", "--config", str(imported.options_file)]
+    if imported.sparse is not None:
+        words += ["--sparse", str(imported.sparse)]
+    if imported.masks is not None:
+        words += ["--mask", str(imported.masks)]
+    if imported.light is not None:
+        words += ["--light", str(imported.light)]
+    return words
 
 
 def calibrate(call: Call, terminal: Terminal) -> int:

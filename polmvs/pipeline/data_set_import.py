@@ -53,12 +53,12 @@ class ImportedSet:
     Attributes
     ----------
     data_set : as it was read.
-    capture : folder to give as CAPTURE.
-    options_file : TOML file to give as ``--config``.
-    sparse : COLMAP model to give as ``--sparse``.
-    masks : folder to give as ``--mask``.
+    capture : folder to read the images from.
+    options_file : TOML file of the capture's options.
+    sparse : COLMAP model, for ``sfm.sparse``.
+    masks : folder, for ``region.mask``.
     num_points : of the model where it was triangulated here.
-    light : to give as ``--light``.
+    light : for ``region.light``.
     options : of the capture, as the file has them.
     """
 
@@ -70,17 +70,6 @@ class ImportedSet:
     num_points: int | None
     light: Light | None
     options: CaptureOptions
-
-    def arguments(self) -> list[str]:
-        """What to call ``polmvs reconstruct`` with."""
-        words = [str(self.capture), "RUN", "--config", str(self.options_file)]
-        if self.sparse is not None:
-            words += ["--sparse", str(self.sparse)]
-        if self.masks is not None:
-            words += ["--mask", str(self.masks)]
-        if self.light is not None:
-            words += ["--light", str(self.light)]
-        return words
 
 
 def import_data_set(folder: Path, out: Path, options: CaptureOptions | None = None) -> ImportedSet:
