@@ -31,7 +31,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import i0e, log_ndtr
 
 from polmvs.config import Light
 from polmvs.polarization.fresnel import fresnel_dolp
@@ -41,6 +40,7 @@ Array = NDArray[np.float64]
 
 TABLE_SIZE = 512  # steps of the cosine that bounds are tabulated at
 NUM_IORS = 7
+LOGISTIC_SCALE = 1.702  # of a logistic distribution that comes nearest to the normal one (Camilli)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,6 +168,21 @@ def residual_variance(
     return np.asarray(sin2 * turn_variance + normal_variance)
 
 
+def row_precisions(shares: LightShares, variances: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+    """Weights (...) of the squares of the two residuals in a fit of the normal.
+
+    The residuals' squares sum to ``sin^2(theta)``, whatever the plane: what both labels share draws
+    to the ray and tells nothing of it, so that a label counts by how much it exceeds the other.
+
+    Parameters
+    ----------
+    shares : of the observations.
+    variances : of the specular and of the diffuse residual (:func:`residual_variance`).
+    """
+    excess = shares.specular - shares.diffuse
+    return np.maximum(excess, 0) / variances[0], np.maximum(-excess, 0) / variances[1]
+
+
 def angle_log_density(
     residual: Floats, turn_variance: Floats, sin2: Floats, normal_variance: Floats | float = 0.0
 ) -> Floats:
@@ -175,8 +190,20 @@ def angle_log_density(
     variance = residual_variance(turn_variance, sin2, normal_variance)
     known = np.isfinite(variance)
     safe = np.where(known, variance, 1)
-    density = -0.5 * np.square(residual) / safe - np.log(i0e(0.25 * sin2 / safe))
+    density = -0.5 * np.square(residual) / safe - _log_bessel(0.25 * sin2 / safe)
     return np.where(known, density, 0)
+
+
+def _log_bessel(x: Floats) -> Floats:
+    """``log(exp(-x) I0(x))`` (...), x >= 0, within 0.0025, many times faster than SciPy's.
+
+    Olivares et al., A simple and accurate approximation for the modified Bessel functions of zeroth
+    order, J. Phys.: Conf. Ser. 1043 (2018).
+    """
+    x2 = np.square(x)
+    rational = (1 + 0.24273 * x2) / (1 + 0.43023 * x2)
+    even = 0.5 + 0.5 * np.exp(-2 * x)
+    return np.asarray(np.log(even * rational) - 0.25 * np.log1p(0.25 * x2))
 
 
 def dolp_log_evidence(
@@ -200,7 +227,8 @@ def dolp_log_evidence(
     variance = dolp_variance + spread + slope * normal_variance
     finite = np.isfinite(variance)
     sigma = np.sqrt(np.where(finite, variance, 1))
-    return np.where(finite, log_ndtr((bound - dolp) / sigma), 0)
+    # The normal distribution's integral by a logistic one, within 0.01, whose tail is longer.
+    return np.where(finite, -np.logaddexp(0, LOGISTIC_SCALE * (dolp - bound) / sigma), 0)
 
 
 @lru_cache(maxsize=8)

@@ -10,6 +10,7 @@ from polmvs.polarization.light_mixture import (
     dolp_log_evidence,
     light_shares,
     phase_variance,
+    row_precisions,
 )
 
 RAY = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
@@ -53,7 +54,7 @@ def test_unpolarised_light_tells_nothing():
     found = shares(normal_at(1.0), 0.005)
     t = LightMixtureTolerances()
     assert found.neither == pytest.approx(t.neither_share, abs=2e-3)
-    assert found.specular == pytest.approx(found.diffuse, abs=1e-3)
+    assert found.specular == pytest.approx(found.diffuse, abs=5e-3)
     assert abs(found.log_likelihood) < 1e-3
 
 
@@ -71,7 +72,7 @@ def test_the_density_of_an_angle_integrates_to_one():
     sin = np.sin(0.6)
     for variance, of_normal in ((1e-3, 0.0), (0.2, 0.0), (5.0, 0.0), (1e-3, 0.1)):
         density = np.exp(angle_log_density(sin * np.sin(turns), variance, sin**2, of_normal))
-        assert density.mean() == pytest.approx(1, rel=1e-3)
+        assert density.mean() == pytest.approx(1, rel=4e-3)
 
 
 def test_dolp_above_fresnels_bound_is_specular():
@@ -118,3 +119,13 @@ def test_missing_observations_count_for_nothing():
     found = light_shares((nan, nan), (inf, inf), np.full(2, 0.5), np.zeros(2), inf)
     assert np.isfinite(np.array(found)).all()
     assert np.allclose(found.log_likelihood, 0)
+
+
+def test_an_observation_of_no_label_draws_nowhere():
+    """Its two residuals' squares sum to the same whatever the normal: no weight is left."""
+    variance = phase_variance(np.array(0.02), np.array(NOISE**2))
+    found = row_precisions(shares(normal_at(1.0), 0.02, turn=np.pi / 4), (variance, variance))
+    assert max(found) < 0.05 / variance
+    specular, diffuse = row_precisions(shares(normal_at(1.0), 0.1), (variance, variance))
+    assert specular > 0.9 / variance
+    assert diffuse == 0
