@@ -8,7 +8,7 @@ projected point, in every view that sees it, not only in the views that matched 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import overload
 
@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
-from polmvs.config import AngleModel, Estimator, NormalOptions
+from polmvs.config import AngleModel, Estimator, Light, NormalOptions
 from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
-from polmvs.normals.rows import Reading, Rows, gather_rows, gather_rows_under
+from polmvs.normals.mixture_estimator import MixtureEstimate, solve_mixture
+from polmvs.normals.observations import Observations, gather_observations
+from polmvs.normals.rows import Reading, Rows, gather_rows_under
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
 
@@ -102,9 +104,10 @@ def track_normals(
     tracks: Tracks,
     maps: Sequence[PhaseMap],
     options: NormalOptions,
+    light: Light | None = None,
     *,
     max_rows: int = MAX_ROWS,
-) -> NormalEstimate:
+) -> MixtureEstimate:
     """Normals of all tracks (paper, eq. coeff_2), many at a time; one map is held at a time.
 
     Parameters
@@ -113,38 +116,42 @@ def track_normals(
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps of the views.
     options : window, estimator and weights.
+    light : of everything, where it is known; else each observation has its own.
     max_rows : of tracks and views together, that are solved at a time.
     """
-    # A track on no region of its own views has no normal; one stands for all others.
-    own = np.zeros(len(tracks.points_in_world), bool)
-    for phase_map, here in zip(maps, tracks.of_views(len(maps)), strict=True):
-        seen = tracks.obs_track[here]
-        xy = phase_map.view.project(tracks.points_in_world[seen])
-        own[seen[sample_image(phase_map.region.inside.astype(np.float32), xy) > 0]] = True
-    solved = own.copy()
-    solved[np.flatnonzero(~own)[:1]] = True
-    source = np.cumsum(solved) - 1
-    source[~own] = source[np.flatnonzero(~own)[:1]]
-    windows = window_maps(maps, options.window_px)
-    estimates = [
-        normals_from_rows(
-            some,
-            gather_rows(
-                angle_model, some.points_in_world, windows, tilt_aware=options.tilt_aware_weights
-            ),
-            options.estimator,
+    prior = {None: 0.5, Light.SPECULAR: 1.0, Light.DIFFUSE: 0.0}[light]
+    estimates = []
+    for some in in_tiles(tracks, len(maps), max_rows):
+        found = gather_observations(
+            angle_model,
+            some.points_in_world,
+            maps,
+            window_px=options.window_px,
+            tilt_aware=options.tilt_aware_weights,
         )
-        for some in in_tiles(some_tracks(tracks, solved), len(maps), max_rows)
-    ]
+        matched = np.zeros((len(maps), len(some.points_in_world)), bool)
+        matched[some.obs_view, some.obs_track] = True
+        estimate = solve_mixture(found, matched, prior_specular=prior)
+        if options.estimator is Estimator.ALGEBRAIC:
+            estimate = _algebraic(found, estimate)
+        estimates.append(estimate)
     joined = {
         field.name: np.concatenate([getattr(one, field.name) for one in estimates], axis=axis)
-        for field in fields(NormalEstimate)
-        for axis in [1 if field.name == "row_weights" else 0]  # it has views before tracks
+        for field in fields(MixtureEstimate)
+        # These have views before tracks.
+        for axis in [1 if field.name in ("row_weights", "labels") else 0]
     }
-    weights = joined.pop("row_weights")[:, source]
-    return NormalEstimate(
-        **{name: values[source] for name, values in joined.items()}, row_weights=weights
-    )
+    return MixtureEstimate(**joined)
+
+
+def _algebraic(found: Observations, estimate: MixtureEstimate) -> MixtureEstimate:
+    """The paper's estimator on rows whose light is told: their eigenvector, all alike."""
+    diffuse = estimate.labels < 0
+    rows = np.where(diffuse, found.rows[1], found.rows[0])
+    variance = np.where(diffuse, found.turn_variances[1], found.turn_variances[0])
+    sigma = np.where(estimate.labels != 0, np.sqrt(variance), np.inf)
+    solved = solve_normals(rows, found.rays, sigma, robust=False)
+    return replace(estimate, **{f.name: getattr(solved, f.name) for f in fields(NormalEstimate)})
 
 
 def normals_under(

@@ -167,6 +167,7 @@ def _solve_normals(model: AngleModel, run: StageInput) -> normals.NormalsResult:
         folder.maps(model),
         folder.track_normals(model),
         run.options.normals,
+        run.options.region.light,
         max_rows=run.max_rows,
     )
 

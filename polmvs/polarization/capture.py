@@ -35,10 +35,11 @@ from polmvs.polarization.bit_depth import CONTAINER_BITS, LevelCounts, Levels, d
 from polmvs.polarization.calibration import PolarizerCalibration, read_calibration
 from polmvs.polarization.exposures import merge_exposures
 from polmvs.polarization.linearity import LinearityCheck, check_linearity
-from polmvs.polarization.lossy import BLOCK, find_quantization, lossy_variance
+from polmvs.polarization.lossy import BLOCK, find_quantization, lossy_mean_variance, lossy_variance
 from polmvs.polarization.mosaic import (
     clipped_cells,
     linearize,
+    noise_area_px,
     split_colour_mosaic,
     split_mosaic,
     split_mosaic_full,
@@ -195,6 +196,11 @@ class Capture:
         mosaic = self.files.kind is CaptureKind.MOSAIC
         if self.lossy_steps is not None and not (mosaic and options.resolution is Resolution.HALF):
             stokes = replace(stokes, lossy_block_px=float(BLOCK))
+        if mosaic:
+            area = noise_area_px(
+                colour=options.bayer is not None, full=options.resolution is Resolution.FULL
+            )
+            stokes = replace(stokes, noise_area_px=area)
         return turned_axes(stokes, zero_deg=options.zero_deg, clockwise=options.clockwise)
 
     def load_mosaic(self, name: str) -> Image:
@@ -318,7 +324,6 @@ class Capture:
                     spoiled,
                     darkness=self.options.darkness,
                     quantum=self._quantum,
-                    # Of neighbouring samples, in a mosaic; here rounding errs in each image alone.
                     lossy_variance=self._lossy_variance,
                 )
                 for plane in planes
@@ -396,7 +401,11 @@ class Capture:
         if self.lossy_steps is None:
             return 0.0
         steps = np.array(self.lossy_steps).reshape(8, 8)
-        return lossy_variance(steps, scale=self._quantum)
+        if self.files.kind is CaptureKind.MOSAIC:
+            return lossy_variance(steps, scale=self._quantum)
+        return lossy_mean_variance(
+            steps, ideal_analyzers(self.files.angles_deg), scale=self._quantum
+        )
 
     def _intensity_samples(self, view: ViewFiles) -> NDArray[np.float32]:
         """Intensity s0 of evenly spread cells of one image, ``(N,)``."""

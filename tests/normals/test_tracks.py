@@ -34,7 +34,7 @@ def test_ppa_recovers_the_normals_of_a_perspective_view_and_opa_does_not(scene, 
     opa = track_normals(AngleModel.OPA, tracks, scene.maps, options)
     assert ppa.valid.all()
     assert errors_deg(ppa.normals, truth).mean() < 0.4
-    assert errors_deg(opa.normals, truth).mean() > 3
+    assert np.nanmean(errors_deg(opa.normals, truth)) > 3
     assert (ppa.num_rows >= 3).all()
 
 

@@ -120,6 +120,7 @@ def test_sparse_normals_carry_their_quality(demo_run: Path) -> None:
     tracks = read_cloud(demo_run / "normals.ply")
     assert len(tracks.points) == len(read_model(demo_run / "sparse").tracks.point3D_ids)
     names = {"sigma_deg", "num_views", "residual", "conditioning", "valid", "seed"}
+    names |= {"specular", "diffuse", "dolp"}
     assert set(tracks.scalars) == names
     assert tracks.normals is not None
     valid = tracks.scalars["valid"] > 0

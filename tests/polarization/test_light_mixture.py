@@ -53,9 +53,9 @@ def test_each_light_is_told_by_its_plane():
 def test_unpolarised_light_tells_nothing():
     found = shares(normal_at(1.0), 0.005)
     t = LightMixtureTolerances()
-    assert found.neither == pytest.approx(t.neither_share, abs=2e-3)
+    assert found.neither == pytest.approx(t.neither_share, abs=5e-3)
     assert found.specular == pytest.approx(found.diffuse, abs=5e-3)
-    assert abs(found.log_likelihood) < 1e-3
+    assert abs(found.log_likelihood) < 0.02
 
 
 def test_variance_grows_without_bound_as_dolp_falls_to_the_noise():
