@@ -12,12 +12,13 @@ by the observations, the refinement by views times points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.fitting import MEDIAN_OF_NORMAL
 from polmvs.normals.estimator import NormalEstimate, smallest_eigenvectors
 from polmvs.normals.observations import Observations
 from polmvs.polarization.light_mixture import (
@@ -52,6 +53,11 @@ class MixtureTolerances:
     apart : rad, that modes lie apart. Guess: as wide as the likelihood of a few rows.
     num_rounds : of refinement; the normal's own error shrinks over the first ones. Guess.
     prior_rows : rows of stated noise that a point's own scatter is weighed against. Guess.
+    correlation : of the errors of a point's rows: marks and reflections about it, gains and the
+        model are the same for all views. Measured: see ``docs``.
+    clear_turn : rad, deviation of rows that tell how far rows are off. Guess.
+    min_scale_rows : of a point that tells so, and of all. Guess.
+    prior_scale_rows : that a view's own rows are weighed against. Guess.
     min_rows : of a normal, sums of labels' certainty. Derived: two planes of incidence meet.
     min_explained : share of the observations of views that surely see the point, that one of the
         two kinds of light explains. Derived: the majority.
@@ -68,6 +74,10 @@ class MixtureTolerances:
     apart: float = 0.35
     num_rounds: int = 6
     prior_rows: float = 6.0
+    correlation: float = 0.3
+    clear_turn: float = 0.3
+    min_scale_rows: int = 5
+    prior_scale_rows: float = 20.0
     min_rows: float = 1.9
     min_explained: float = 0.5
     max_noise_ratio: float = 3.0
@@ -99,11 +109,26 @@ class MixtureEstimate(NormalEstimate):
     log_likelihood: Array
 
 
+@dataclass(frozen=True)
+class RowScales:
+    """Deviations of the rows of a capture over the stated ones.
+
+    Attributes
+    ----------
+    of_views : (K,), at least 1: a view whose pose or image is wrong counts for less.
+    overall : at most 1: of all rows, where they err less than is stated.
+    """
+
+    of_views: Array
+    overall: float = 1.0
+
+
 def solve_mixture(
     observations: Observations,
     matched: Mask,
     *,
     prior_specular: float = 0.5,
+    scales: RowScales | None = None,
     tolerances: MixtureTolerances = MixtureTolerances(),
 ) -> MixtureEstimate:
     """Normals of N points from K observations each, whose light is open.
@@ -114,9 +139,14 @@ def solve_mixture(
     matched : (K, N) bool, views that surely see the point. Others are asked once a normal is known
         that faces them.
     prior_specular : 0.5; 1 or 0 where the light of everything is known.
+    scales : of the rows' deviations; as stated where None. See :func:`row_scales`.
     tolerances : of this step.
     """
     t = tolerances
+    scales = scales or RowScales(np.ones(len(matched)))
+    stated = observations.turn_variances
+    scaled = np.asarray(stated * np.square(scales.of_views)[:, None], stated.dtype)
+    observations = replace(observations, turn_variances=scaled)
     problem = _Problem(observations, matched, prior_specular, t)
     starts = problem.best_directions()
     num_points = matched.shape[1]
@@ -136,7 +166,47 @@ def solve_mixture(
         weights[index] *= ~(earlier > np.cos(0.5 * t.apart)).any(axis=0)
     weights *= angles > 0.5 * t.apart
     elsewhere = (weights * np.square(angles)).sum(axis=0) / (1 + weights.sum(axis=0))
-    return problem.described(problem.weighed(chosen), elsewhere)
+    return problem.described(problem.weighed(chosen), elsewhere, scales.overall)
+
+
+def row_scales(
+    observations: Observations,
+    matched: Mask,
+    estimate: MixtureEstimate,
+    *,
+    tolerances: MixtureTolerances = MixtureTolerances(),
+) -> RowScales:
+    """How far the rows of views are off normals, over what is stated: of each view, and of all.
+
+    Parameters
+    ----------
+    observations, matched : of some points, as :func:`solve_mixture` takes them.
+    estimate : their normals, solved without scales.
+    """
+    t = tolerances
+    normals = np.nan_to_num(estimate.normals).T.astype(np.float32)
+    cosines = -np.einsum("ikn,in->kn", observations.rays, normals)
+    sin2 = np.maximum(1 - np.square(cosines), t.light.min_sine**2)
+    residuals = np.einsum("likn,in->lkn", observations.rows, normals)
+    turns = observations.turn_variances
+    with np.errstate(invalid="ignore"):
+        squares = np.nanmin(
+            np.nan_to_num(np.square(residuals) / (turns * sin2), nan=np.inf), axis=0
+        )
+    # A row that says nothing is off nothing; two rows of each point are always met.
+    num_rows = (np.abs(estimate.labels) > 0.5).sum(axis=0)
+    clear = matched & estimate.valid & (num_rows >= t.min_scale_rows)
+    clear &= (turns[0] < t.clear_turn**2) & (cosines > MIN_FACING_COSINE)
+    squares = np.where(clear, squares, 0) * (num_rows / np.maximum(num_rows - 2.0, 1.0))
+    if clear.sum() < t.prior_scale_rows:
+        return RowScales(np.ones(len(matched)))
+    overall = float(np.median(squares[clear])) / MEDIAN_OF_NORMAL**2
+    of_views = np.full(len(matched), overall)
+    for k in np.flatnonzero(clear.any(axis=1)):
+        own = squares[k, clear[k]]
+        share = len(own) / (len(own) + t.prior_scale_rows)
+        of_views[k] += share * (float(np.median(own)) / MEDIAN_OF_NORMAL**2 - overall)
+    return RowScales(np.sqrt(np.maximum(of_views, 1)), float(np.sqrt(min(overall, 1))))
 
 
 @dataclass(frozen=True)
@@ -276,8 +346,14 @@ class _Problem:
         ]
         return np.array(sums)
 
-    def described(self, mode: _Mode, elsewhere: Array) -> MixtureEstimate:
-        """The estimate of a mode; ``elsewhere`` (N,) is the variance by other modes, rad^2."""
+    def described(self, mode: _Mode, elsewhere: Array, overall: float) -> MixtureEstimate:
+        """The estimate of a mode.
+
+        Parameters
+        ----------
+        elsewhere : (N,), the variance by other modes, rad^2.
+        overall : deviation of the rows over the stated one.
+        """
         t, precisions = self.t, mode.precisions
         moments = self._moments(precisions)
         eigenvalues = smallest_eigenvectors(moments)[0]
@@ -288,9 +364,14 @@ class _Problem:
         certain = np.abs(mode.shares.specular - mode.shares.diffuse) * mode.counted
         num_certain = certain.sum(axis=0, dtype=np.float64)
         # Rows that scatter more than their noise make the normal less certain.
-        scatter = (squares + t.prior_rows) / (np.maximum(num_certain - 2, 0) + t.prior_rows)
+        squares_of_scale = squares / overall**2
+        scatter = squares_of_scale + t.prior_rows
+        scatter /= np.maximum(num_certain - 2, 0) + t.prior_rows
+        # What rows of a point have in common is not averaged out.
+        factor = np.maximum(scatter, 1) * overall**2
+        factor *= 1 + t.correlation * np.maximum(num_certain - 1, 0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            variance = np.maximum(scatter, 1) * middle / np.square(spread) + elsewhere
+            variance = factor * middle / np.square(spread) + elsewhere
             conditioning = np.sqrt(np.maximum(eigenvalues[1], 0) / eigenvalues[2])
             residual = np.sqrt(squares / total)
             sigma_deg = np.degrees(np.sqrt(variance))

@@ -7,6 +7,7 @@ projected point, in every view that sees it, not only in the views that matched 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -20,15 +21,18 @@ from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, Estimator, Light, NormalOptions
 from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
-from polmvs.normals.mixture_estimator import MixtureEstimate, solve_mixture
+from polmvs.normals.mixture_estimator import MixtureEstimate, row_scales, solve_mixture
 from polmvs.normals.observations import Observations, gather_observations
 from polmvs.normals.rows import Reading, Rows, gather_rows_under
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
 
+logger = logging.getLogger(__name__)
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+MAX_SCALE_POINTS = 600  # that tell how far rows are off. Guess: more cost time only
 MAX_ROWS = MemoryNeeds.max_rows  # of points and views together, at a time, without a budget
 # A region's border is that uncertain, by marks and smoothing: points nearer to it may lie on the
 # background. Guess.
@@ -37,7 +41,7 @@ BORDER_MARGIN_PX = 3
 
 @dataclass(frozen=True, kw_only=True)
 class SeedTolerances:
-    """Which tracks are seeds: on the polarised surface, their phases explained by one normal.
+    """Which tracks are seeds: their phases explained by one normal.
 
     Attributes
     ----------
@@ -45,13 +49,16 @@ class SeedTolerances:
         its point faces, to show the surface at its place. Guess.
     max_dolp_share : of a mark's DoLP in that of the surface about it. Guess.
     clear_dolp : of the surface, for the comparison to tell. Guess.
-    max_sigma_deg : of the normal, and of its angle to the planes of incidence. Guess.
+    max_sigma_deg : of the normal. Guess.
+    min_on_region : seeds on strongly polarised regions, beside which others are surroundings.
+        Derived: three points make a plane.
     """
 
     min_inside_share: float = 0.8
     max_dolp_share: float = 0.85
     clear_dolp: float = 0.15
-    max_sigma_deg: float = 3.0
+    max_sigma_deg: float = 5.0
+    min_on_region: int = 3
 
 
 def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
@@ -120,8 +127,8 @@ def track_normals(
     max_rows : of tracks and views together, that are solved at a time.
     """
     prior = {None: 0.5, Light.SPECULAR: 1.0, Light.DIFFUSE: 0.0}[light]
-    estimates = []
-    for some in in_tiles(tracks, len(maps), max_rows):
+
+    def observed(some: Tracks) -> tuple[Observations, Mask]:
         found = gather_observations(
             angle_model,
             some.points_in_world,
@@ -131,7 +138,21 @@ def track_normals(
         )
         matched = np.zeros((len(maps), len(some.points_in_world)), bool)
         matched[some.obs_view, some.obs_track] = True
-        estimate = solve_mixture(found, matched, prior_specular=prior)
+        return found, matched
+
+    # Some of the points first: how far the rows of each view are off.
+    num_points = len(tracks.points_in_world)
+    chosen = np.zeros(num_points, bool)
+    limit = min(MAX_SCALE_POINTS, max(1, max_rows // max(len(maps), 1)))
+    chosen[np.linspace(0, num_points - 1, min(num_points, limit)).round().astype(np.int64)] = True
+    found, matched = observed(some_tracks(tracks, chosen))
+    first = solve_mixture(found, matched, prior_specular=prior)
+    scales = row_scales(found, matched, first)
+    logger.debug("rows err by %s of what is stated", np.round(scales.of_views, 2))
+    estimates = []
+    for some in in_tiles(tracks, len(maps), max_rows):
+        found, matched = observed(some)
+        estimate = solve_mixture(found, matched, prior_specular=prior, scales=scales)
         if options.estimator is Estimator.ALGEBRAIC:
             estimate = _algebraic(found, estimate)
         estimates.append(estimate)
@@ -264,7 +285,10 @@ def select_seeds(
     *,
     tolerances: SeedTolerances = SeedTolerances(),
 ) -> tuple[Seeds, Mask]:
-    """Tracks that lie on the polarised surface and whose normal explains their phases.
+    """Tracks whose normal explains what all views measure of them.
+
+    Where some of them lie on regions that are polarised strongly, these are what is wanted, and the
+    others its surroundings; else all are.
 
     A glossy surface mirrors its surroundings, and on a flat one their mirror images make tracks
     as good as any, behind the surface. They give themselves away: seen from aside they leave the
@@ -274,19 +298,19 @@ def select_seeds(
     -------
     The seeds, and which tracks ``(T,)`` they are.
     """
+    t = tolerances
     good = (
-        estimate.valid
-        & (estimate.num_rows >= MIN_VIEWS)
-        & (estimate.sigma_deg < tolerances.max_sigma_deg)
-        & (estimate.residual < np.sin(np.radians(tolerances.max_sigma_deg)))
+        estimate.valid & (estimate.num_rows >= MIN_VIEWS) & (estimate.sigma_deg < t.max_sigma_deg)
     )
-    # The dearest question last, of those that are left: all points are asked of all views.
     some = some_tracks(tracks, good)
-    good[good] = (inside_shares(some, maps) >= tolerances.min_inside_share) & ~(
-        dolp_shares(some, maps, tolerances=tolerances) > tolerances.max_dolp_share
-    )
-    points, normals = tracks.points_in_world[good], estimate.normals[good]
-    good[good] = seen_shares(points, normals, maps) >= tolerances.min_inside_share
+    good[good] = ~(dolp_shares(some, maps, tolerances=t) > t.max_dolp_share)
+    # The dearest question last, of those that are left: all points are asked of all views.
+    on_region = good.copy()
+    on_region[good] = inside_shares(some_tracks(tracks, good), maps) >= t.min_inside_share
+    points, normals = tracks.points_in_world[on_region], estimate.normals[on_region]
+    on_region[on_region] = seen_shares(points, normals, maps) >= t.min_inside_share
+    if on_region.sum() >= t.min_on_region:
+        good = on_region
     some = some_tracks(tracks, good)
     sigma = point_sigmas(some, [m.view for m in maps])
     return Seeds(some.points_in_world, estimate.normals[good], sigma), good

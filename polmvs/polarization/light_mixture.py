@@ -61,7 +61,7 @@ class LightMixtureTolerances:
     min_sine : of theta. Seen frontally a surface has no plane of incidence. Guess.
     """
 
-    neither_share: float = 0.05
+    neither_share: float = 0.15
     min_ior: float = 1.4
     max_ior: float = 1.7
     dolp_margin: float = 0.02
