@@ -58,7 +58,8 @@ class MixtureTolerances:
     clear_turn : rad, deviation of rows that tell how far rows are off. Guess.
     min_scale_rows : of a point that tells so, and of all. Guess.
     prior_scale_rows : that a view's own rows are weighed against. Guess.
-    min_rows : of a normal, sums of labels' certainty. Derived: two planes of incidence meet.
+    min_rows : of a normal, sum of their labels' certainty. Derived: two planes of incidence meet,
+        neither quite certain.
     min_explained : share of the observations of views that surely see the point, that one of the
         two kinds of light explains. Derived: the majority.
     max_noise_ratio : of the noise in the spread of the rows, in its deviations. Derived: chance of
@@ -78,7 +79,7 @@ class MixtureTolerances:
     clear_turn: float = 0.3
     min_scale_rows: int = 5
     prior_scale_rows: float = 20.0
-    min_rows: float = 1.9
+    min_rows: float = 1.5
     min_explained: float = 0.5
     max_noise_ratio: float = 3.0
     max_sigma_deg: float = 15.0
@@ -425,9 +426,10 @@ def _middle_directions(moments: Array, normals: Array, middle: Array) -> Array:
     largest = np.linalg.norm(shifted, axis=1).argmax(axis=0)
     # What is left of a row is perpendicular to that direction, and so is the normal.
     row = np.take_along_axis(shifted, largest[None, None], axis=0)[0]
+    row = row / np.maximum(np.abs(row).max(axis=0), 1e-300)  # whose square may be too small
     along = np.cross(normals, row, axis=0)
     length = np.linalg.norm(along, axis=0)
-    return np.asarray(along / np.maximum(length, 1e-300))
+    return np.asarray(along / np.maximum(length, 1e-12))
 
 
 @lru_cache(maxsize=2)

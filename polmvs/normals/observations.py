@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
 from polmvs.config import AngleModel, Light
+from polmvs.normals.rows import AS_MEASURED, Reading
 from polmvs.polarization.angle_models import (
     correct_polarization,
     phase_sign,
@@ -30,6 +31,7 @@ Image = NDArray[np.float32]
 
 LIGHTS = (Light.SPECULAR, Light.DIFFUSE)  # order of the first axis
 LOCAL_SHARE = 6  # a pixel's phase is judged in a neighbourhood of this part of the window. Guess.
+NUM_VARYING = 9  # neighbourhoods of a window, 3 x 3, that vary of their own. Guess.
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ def gather_observations(
     *,
     window_px: int,
     tilt_aware: bool = True,
+    reading: Reading = AS_MEASURED,
 ) -> Observations:
     """Observations of points in all views that show their place; one map is held at a time.
 
@@ -72,6 +75,7 @@ def gather_observations(
     window_px : side of the window about each point.
     tilt_aware : add to a row's variance what OPA and PPA leave out; see
         :func:`polmvs.normals.rows.gather_rows_under`.
+    reading : what becomes of ``(s1, s2)``.
     """
     points = np.asarray(points_in_world, np.float64)
     num_views, num_points = len(maps), len(points)
@@ -91,7 +95,7 @@ def gather_observations(
         found.rays[:, k] = (ray @ rotation).T
         sampled = sample_image(window_polarization(phase_map.polarization, window_px), xy)
         seen = np.flatnonzero((sampled[:, 3] > 0) & in_image(view.camera, xy))
-        p, ray = sampled[seen, :2], ray[seen]
+        p, ray = sampled[seen, :2] @ np.array(reading, np.float32).T, ray[seen]
         variance = sampled[seen, 2] + sampled[seen, 3]
         dolp = np.hypot(p[:, 0], p[:, 1])
         found.dolp[k, seen], found.dolp_variance[k, seen] = np.minimum(dolp, 1), variance
@@ -164,10 +168,14 @@ def window_polarization(polarization: Image, window_px: int) -> Image:
     local = phase_variance(np.hypot(near[..., 0], near[..., 1]), near_variance)
     with np.errstate(divide="ignore"):
         weight = np.where(known, 1 / local, 0).astype(np.float32)
-    del near, near_variance, local
     total = box(weight, window_px)
     safe = np.maximum(total, 1e-9)
     mean = box(values[..., :2] * weight[..., None], window_px, -np.inf) / safe[..., None]
     variance = box(np.square(weight) * own, window_px) / np.square(safe) / window_px**2
+    # What varies over the window, by its shape or by what is on it: the mean of so many
+    # neighbourhoods errs by that, too.
+    square = np.square(near[..., :2]).sum(axis=-1)
+    spread = box(square * weight, window_px) / safe - np.square(mean).sum(axis=-1)
+    variance = np.maximum(variance, 0.5 * spread / NUM_VARYING)
     common = np.where(total > 0, np.maximum(box(weight * shared, window_px) / safe, 1e-12), 0)
     return np.dstack([mean, variance, common]).astype(np.float32)

@@ -8,10 +8,8 @@ projected point, in every view that sees it, not only in the views that matched 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
-from typing import overload
 
 import cv2
 import numpy as np
@@ -23,9 +21,9 @@ from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.mixture_estimator import MixtureEstimate, row_scales, solve_mixture
 from polmvs.normals.observations import Observations, gather_observations
-from polmvs.normals.rows import Reading, Rows, gather_rows_under
+from polmvs.normals.rows import AS_MEASURED, Reading
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
+from polmvs.scene import MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
 
 logger = logging.getLogger(__name__)
 
@@ -61,49 +59,33 @@ class SeedTolerances:
     min_on_region: int = 3
 
 
-def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
-    """Average the phase over a window of reliable pixels about every pixel (axially)."""
-    axial, precision = phase_map.samples[..., :2], phase_map.samples[..., 2]
-    weight = precision * phase_map.region.reliable
-    size = (window_px, window_px)
-    share = cv2.boxFilter(weight, -1, size, borderType=cv2.BORDER_CONSTANT)
-    mean = cv2.boxFilter(axial * weight[..., None], -1, size, borderType=cv2.BORDER_CONSTANT)
-    mean = mean / np.maximum(share, 1e-9)[..., None]
-    # The window's own precision where it is full, less where few of its pixels count.
-    samples = np.dstack([mean, np.where(phase_map.region.inside, share, 0)])
-    return phase_map.changed(samples=samples.astype(np.float32))
+def observe(
+    angle_model: AngleModel,
+    tracks: Tracks,
+    maps: Sequence[PhaseMap],
+    options: NormalOptions,
+    reading: Reading = AS_MEASURED,
+) -> tuple[Observations, Mask]:
+    """What all views measure of tracks, and which views (K, T) surely see them: they match."""
+    found = gather_observations(
+        angle_model,
+        tracks.points_in_world,
+        maps,
+        window_px=options.window_px,
+        tilt_aware=options.tilt_aware_weights,
+        reading=reading,
+    )
+    matched = np.zeros((len(maps), len(tracks.points_in_world)), bool)
+    matched[tracks.obs_view, tracks.obs_track] = True
+    return found, matched
 
 
-class DerivedMaps(Sequence[PhaseMap]):
-    """Phase maps made of others, each when it is asked for: none is held.
-
-    Parameters
-    ----------
-    maps : of the views.
-    derive : makes one of them.
-    """
-
-    def __init__(self, maps: Sequence[PhaseMap], derive: Callable[[PhaseMap], PhaseMap]) -> None:
-        self.maps, self.derive = maps, derive
-
-    def __len__(self) -> int:
-        return len(self.maps)
-
-    @overload
-    def __getitem__(self, index: int) -> PhaseMap: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> DerivedMaps: ...
-
-    def __getitem__(self, index: int | slice) -> PhaseMap | DerivedMaps:
-        if isinstance(index, slice):
-            return DerivedMaps(self.maps[index], self.derive)
-        return self.derive(self.maps[index])
-
-
-def window_maps(maps: Sequence[PhaseMap], window_px: int) -> DerivedMaps:
-    """Maps averaged by :func:`window_map`, each when it is asked for."""
-    return DerivedMaps(maps, partial(window_map, window_px=window_px))
+def evenly_chosen(num_points: int, limit: int) -> Mask:
+    """Of points (N,) some that are spread evenly over them, ``limit`` at most."""
+    chosen = np.zeros(num_points, bool)
+    limit = min(num_points, limit)
+    chosen[np.linspace(0, num_points - 1, limit).round().astype(np.int64)] = True
+    return chosen
 
 
 def track_normals(
@@ -128,30 +110,16 @@ def track_normals(
     """
     prior = {None: 0.5, Light.SPECULAR: 1.0, Light.DIFFUSE: 0.0}[light]
 
-    def observed(some: Tracks) -> tuple[Observations, Mask]:
-        found = gather_observations(
-            angle_model,
-            some.points_in_world,
-            maps,
-            window_px=options.window_px,
-            tilt_aware=options.tilt_aware_weights,
-        )
-        matched = np.zeros((len(maps), len(some.points_in_world)), bool)
-        matched[some.obs_view, some.obs_track] = True
-        return found, matched
-
     # Some of the points first: how far the rows of each view are off.
-    num_points = len(tracks.points_in_world)
-    chosen = np.zeros(num_points, bool)
     limit = min(MAX_SCALE_POINTS, max(1, max_rows // max(len(maps), 1)))
-    chosen[np.linspace(0, num_points - 1, min(num_points, limit)).round().astype(np.int64)] = True
-    found, matched = observed(some_tracks(tracks, chosen))
+    chosen = evenly_chosen(len(tracks.points_in_world), limit)
+    found, matched = observe(angle_model, some_tracks(tracks, chosen), maps, options)
     first = solve_mixture(found, matched, prior_specular=prior)
     scales = row_scales(found, matched, first)
     logger.debug("rows err by %s of what is stated", np.round(scales.of_views, 2))
     estimates = []
     for some in in_tiles(tracks, len(maps), max_rows):
-        found, matched = observed(some)
+        found, matched = observe(angle_model, some, maps, options)
         estimate = solve_mixture(found, matched, prior_specular=prior, scales=scales)
         if options.estimator is Estimator.ALGEBRAIC:
             estimate = _algebraic(found, estimate)
@@ -175,44 +143,12 @@ def _algebraic(found: Observations, estimate: MixtureEstimate) -> MixtureEstimat
     return replace(estimate, **{f.name: getattr(solved, f.name) for f in fields(NormalEstimate)})
 
 
-def normals_under(
-    readings: Sequence[Reading], tracks: Tracks, maps: Sequence[PhaseMap], *, max_rows: int
-) -> Iterator[Iterator[NormalEstimate]]:
-    """Normals under PPA of the tracks, so many at a time, under each reading of the phases.
-
-    Parameters are those of :func:`polmvs.normals.rows.gather_rows_under` and
-    :func:`track_normals`.
-    """
-    options = NormalOptions()
-    windows = window_maps(maps, options.window_px)  # on a mark itself light is mixed
-    for some in in_tiles(tracks, len(maps), max_rows):
-        of_readings = gather_rows_under(readings, AngleModel.PPA, some.points_in_world, windows)
-        yield (normals_from_rows(some, rows, options.estimator) for rows in of_readings)
-
-
 def in_tiles(tracks: Tracks, num_views: int, max_rows: int) -> Iterator[Tracks]:
     """The tracks in order, so many at a time that their rows in all views are ``max_rows``."""
     num = max(1, max_rows // max(num_views, 1))
     index = np.arange(len(tracks.points_in_world))
     for start in range(0, max(len(index), 1), num):
         yield some_tracks(tracks, (index >= start) & (index < start + num))
-
-
-def normals_from_rows(tracks: Tracks, rows: Rows, estimator: Estimator) -> NormalEstimate:
-    """Normals of tracks in one batch, from rows of averaged phases (:func:`window_map`).
-
-    First from the views that matched the point, which surely see it, then from every view that
-    faces it.
-    """
-    matched = np.zeros(rows.sigma.shape, bool)
-    matched[tracks.obs_view, tracks.obs_track] = True
-    robust = estimator is Estimator.ROBUST
-    own_sigma = np.where(matched, rows.sigma, np.inf)
-    own = solve_normals(rows.rows, rows.rays, own_sigma, robust=robust)
-    cosine = np.einsum("ikn,ni->kn", rows.rays, np.nan_to_num(own.normals))
-    facing = cosine < -MIN_FACING_COSINE
-    sigma = np.where(matched | facing, rows.sigma, np.inf)
-    return solve_normals(rows.rows, rows.rays, sigma, robust=robust, initial_normals=own.normals.T)
 
 
 def tracks_on_parts(tracks: Tracks, maps: Sequence[PhaseMap]) -> Tracks:
