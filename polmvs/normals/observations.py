@@ -28,6 +28,7 @@ from polmvs.scene import MIN_DISTANCE
 
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
+Array = NDArray[np.float64]
 
 LIGHTS = (Light.SPECULAR, Light.DIFFUSE)  # order of the first axis
 LOCAL_SHARE = 6  # a pixel's phase is judged in a neighbourhood of this part of the window. Guess.
@@ -152,30 +153,34 @@ def window_polarization(polarization: Image, window_px: int) -> Image:
     polarization : as in :class:`polmvs.polarization.phase_map.PhaseMap`.
     """
     known = np.isfinite(polarization[..., 2])
-    values = np.where(known[..., None], polarization, 0)
+    # Running sums in single precision leave errors of the size of what varies.
+    values = np.where(known[..., None], polarization, 0).astype(np.float64)
     own, shared = values[..., 2], values[..., 3]
 
-    def box(image: Image, side: int, lowest: float = 0.0) -> Image:
-        # Running sums leave less than nothing where they should be zero.
+    def box(image: Array, side: int) -> Array:
         blurred = cv2.blur(image, (side, side), borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(np.maximum(blurred, lowest), np.float32)
+        return np.asarray(blurred, np.float64)
 
     # Of the phase in a small neighbourhood, so that single pixels' noise makes no weight.
     side = max(1, round(window_px / LOCAL_SHARE)) | 1
-    count = np.maximum(box(known.astype(np.float32), side), 1e-6)
-    near = box(values, side, -1.0) / count[..., None]
+    count = np.maximum(box(known.astype(np.float64), side), 1e-6)
+    near = box(values, side) / count[..., None]
     near_variance = near[..., 2] / (count * side**2) + near[..., 3]
     local = phase_variance(np.hypot(near[..., 0], near[..., 1]), near_variance)
     with np.errstate(divide="ignore"):
-        weight = np.where(known, 1 / local, 0).astype(np.float32)
+        weight = np.where(known, 1 / local, 0)
     total = box(weight, window_px)
     safe = np.maximum(total, 1e-9)
-    mean = box(values[..., :2] * weight[..., None], window_px, -np.inf) / safe[..., None]
+
+    def mean(image: Array) -> Array:
+        weights = weight if image.ndim == 2 else weight[..., None]
+        return box(image * weights, window_px) / (safe if image.ndim == 2 else safe[..., None])
+
     variance = box(np.square(weight) * own, window_px) / np.square(safe) / window_px**2
     # What varies over the window, by its shape or by what is on it: the mean of so many
     # neighbourhoods errs by that, too.
     square = np.square(near[..., :2]).sum(axis=-1)
-    spread = box(square * weight, window_px) / safe - np.square(mean).sum(axis=-1)
+    spread = mean(square) - np.square(mean(near[..., :2])).sum(axis=-1)
     variance = np.maximum(variance, 0.5 * spread / NUM_VARYING)
-    common = np.where(total > 0, np.maximum(box(weight * shared, window_px) / safe, 1e-12), 0)
-    return np.dstack([mean, variance, common]).astype(np.float32)
+    common = np.where(total > 1e-6, np.maximum(mean(shared), 1e-12), 0)
+    return np.dstack([mean(values[..., :2]), variance, common]).astype(np.float32)

@@ -352,6 +352,31 @@ def test_a_jpeg_is_recognised_and_its_noise_covers_the_error(
     assert np.median(widened) < 6 * np.median(rms)
 
 
+@pytest.mark.parametrize("quality", [60, 85])
+def test_jpegs_of_single_polarizers_state_the_error_of_a_block(tmp_path, quality):
+    """Means of 8x8 px err by what is stated; that of the pixels is in the rest of the noise."""
+    rng = np.random.default_rng(quality)
+    rows, cols = np.mgrid[:256, :320]
+    s0 = 90 + 30 * np.sin(rows / 37) + 25 * np.cos(cols / 51)
+    for angle in (0, 45, 90, 135):
+        samples = s0 * (1 + 0.1 * np.cos(2 * np.radians(angle) - cols / 300))
+        samples = np.clip(np.rint(samples + rng.normal(0, 1.5, s0.shape)), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"a_{angle}.png"), samples)
+        quality_of = [cv2.IMWRITE_JPEG_QUALITY, quality]
+        (tmp_path / "jpeg").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "jpeg" / f"a_{angle}.jpg"), samples, quality_of)
+    folders = {"png": tmp_path, "jpg": tmp_path / "jpeg"}
+    images = [
+        open_capture(folder, CaptureOptions(naming=f"{{view}}_{{angle}}.{suffix}"))
+        for suffix, folder in folders.items()
+    ]
+    clean, lossy = (capture.load(capture.names[0]) for capture in images)
+    assert clean.lossy_sigma == 0
+    error = np.stack([lossy.s1 - clean.s1, lossy.s2 - clean.s2])
+    blocks = error.reshape(2, 32, 8, 40, 8).mean(axis=(2, 4))
+    assert lossy.lossy_sigma == pytest.approx(blocks.std(), rel=0.5)
+
+
 def test_no_capture_is_called_lossy_by_mistake(demo_capture):
     assert open_capture(demo_capture).lossy_steps is None
 
