@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_estimator import errors_deg, simulate, tangents_of, unit
 
-from polmvs.normals.mixture_estimator import row_scales, solve_mixture
+from polmvs.normals.mixture_estimator import MixtureTolerances, row_scales, solve_mixture
 from polmvs.normals.observations import Observations
 from polmvs.polarization.light_mixture import phase_variance
 
@@ -105,12 +105,37 @@ def test_centres_on_a_line_in_a_plane_with_the_normal_leave_it_open():
     rng = np.random.default_rng(2)
     normals = unit(rng.standard_normal((3, 60)))
     across = tangents_of(normals)[0]
-    zenith = np.radians(np.linspace(15, 60, 9))[:, None]
+    zenith = np.radians(np.linspace(4, 20, 9))[:, None]
     rays = -np.cos(zenith) * normals[:, None] - np.sin(zenith) * across[:, None]
     rows = unit(np.cross(rays, normals[:, None], axis=0))
-    found = observe(rows, rays, dolp=0.2, noise=0.01, rng=rng)
+    found = observe(rows, rays, dolp=0.03, noise=0.001, rng=rng)
     estimate = solve_mixture(found, everyone(found), prior_specular=1.0)
     assert estimate.valid.mean() < 0.05
+
+
+def test_what_most_views_contradict_is_no_normal():
+    """Five of twelve planes meet in a normal, the others anywhere."""
+    rows, rays, _, rng = scene(12, 60)
+    wrong = np.arange(12)[:, None] >= 5
+    turn = np.where(wrong, rng.uniform(0.35, 1.2, rows.shape[1:]), 0)
+    turned = np.cos(turn) * rows + np.sin(turn) * np.cross(rays, rows, axis=0)
+    found = observe(turned, rays, dolp=0.3, noise=0.002)
+    assert solve_mixture(found, everyone(found)).valid.mean() < 0.1
+
+
+def test_labels_that_may_be_otherwise_make_a_normal_unsure():
+    """Two planes meet in four normals, as either may be of either light."""
+    rows, rays, _, _ = scene(2, 60)
+    found = observe(rows, rays, dolp=0.03, noise=0.0005)
+    loose = MixtureTolerances(max_sigma_deg=1e3, min_rows=0.0)
+    sigmas = [
+        np.nanmedian(
+            solve_mixture(found, everyone(found), prior_specular=prior, tolerances=loose).sigma_deg
+        )
+        for prior in (0.5, 1.0)
+    ]
+    assert sigmas[0] > 20
+    assert sigmas[0] > 1.5 * sigmas[1]
 
 
 def test_stated_deviations_cover_the_errors():

@@ -37,6 +37,18 @@ def test_rows_of_either_light_are_those_of_the_model(scenes, sensor, light):
     assert np.median(residuals[1 - light][counted]) > 0.3
 
 
+@pytest.mark.parametrize("light", [0, 1])
+def test_tilted_rows_take_back_what_ppa_leaves_out(scenes, light):
+    scene = scenes["tilted"] if light == 0 else board_scene(6, sensor="tilted", light="diffuse")
+    points, truth = scene.surface_points(30)
+    medians = []
+    for model in (AngleModel.TILTED, AngleModel.PPA):
+        found = gather_observations(model, points, scene.maps, window_px=WINDOW)
+        residuals = np.abs(np.einsum("ikn,ni->kn", found.rows[light], truth))
+        medians.append(np.median(residuals[np.isfinite(found.turn_variances[0])]))
+    assert medians[0] < 0.5 * medians[1]
+
+
 def test_a_mark_in_the_window_hardly_counts():
     """Half of it unpolarised and bright, so of less noise: the phase is that of the rest."""
     image = flat(0.5, 0.01)
