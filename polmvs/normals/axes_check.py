@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from polmvs.config import AngleModel, CaptureKind, CaptureOptions, NormalOptions
 from polmvs.fitting import BEYOND_CHANCE
 from polmvs.normals.mixture_estimator import solve_mixture
+from polmvs.normals.observations import gather_observations_under
 from polmvs.normals.rows import AS_MEASURED, Reading
-from polmvs.normals.tracks import evenly_chosen, observe, tracks_on_parts
+from polmvs.normals.tracks import evenly_chosen, matched_views, tracks_on_parts
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
 
@@ -107,14 +108,16 @@ def check_axes(
     on_parts = tracks_on_parts(tracks, maps)
     chosen = evenly_chosen(len(on_parts.points_in_world), t.max_points)
     some, options = some_tracks(on_parts, chosen), NormalOptions()
-    likelihoods = []
-    for reading in (AS_MEASURED, *CHANGES):
-        both = []
-        for light in (reading, _other_light(reading)):  # which a quarter turn of angles exchanges
-            found, matched = observe(AngleModel.PPA, some, maps, options, light)
-            num_rows = (matched & np.isfinite(found.turn_variances[0])).sum(axis=0)
-            both.append(solve_mixture(found, matched).log_likelihood / np.maximum(num_rows, 1))
-        likelihoods.append(np.maximum(*both))
+    # Under either light, which a quarter turn of all angles exchanges.
+    readings = [r for way in (AS_MEASURED, *CHANGES) for r in (way, _other_light(way))]
+    observed = gather_observations_under(
+        readings, AngleModel.PPA, some.points_in_world, maps, window_px=options.window_px
+    )
+    matched = matched_views(some, len(maps))
+    num_rows = (matched & np.isfinite(observed[0].turn_variances[0])).sum(axis=0)
+    found = np.stack([solve_mixture(one, matched).log_likelihood for one in observed])
+    found /= np.maximum(num_rows, 1)
+    likelihoods = np.maximum(found[::2], found[1::2])  # (ways to count, N), of a row
     given, *changed = likelihoods
     # What no way to count explains has no say.
     voting = (num_rows >= t.min_rows) & (np.max(likelihoods, axis=0) > t.min_gain)

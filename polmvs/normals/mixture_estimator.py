@@ -243,13 +243,8 @@ class _Problem:
         """The problem of some of the points."""
         if len(points) == self.matched.shape[1]:
             return self
-        found = Observations(
-            self.rows[..., points],
-            self.rays[..., points],
-            self.turns[..., points],
-            self.dolp[:, points],
-            self.dolp_variance[:, points],
-        )
+        stated = (self.rows, self.rays, self.turns, self.dolp, self.dolp_variance)
+        found = Observations(*stated).some(points)
         return _Problem(found, self.matched[:, points], self.prior_specular, self.t)
 
     def best_directions(self) -> list[tuple[Array, Floats]]:

@@ -7,7 +7,8 @@ counts by the inverse variance of its phase, and each window by its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import cv2
 import numpy as np
@@ -56,6 +57,11 @@ class Observations:
     dolp: NDArray[np.float32]
     dolp_variance: NDArray[np.float32]
 
+    def some(self, points: NDArray[Any]) -> Observations:
+        """Those of some of the points."""
+        parts = (getattr(self, field.name)[..., points] for field in fields(Observations))
+        return Observations(*parts)
+
 
 def gather_observations(
     angle_model: AngleModel,
@@ -64,28 +70,57 @@ def gather_observations(
     *,
     window_px: int,
     tilt_aware: bool = True,
-    reading: Reading = AS_MEASURED,
 ) -> Observations:
     """Observations of points in all views that show their place; one map is held at a time.
 
+    Parameters are those of :func:`gather_observations_under`.
+    """
+    (found,) = gather_observations_under(
+        (AS_MEASURED,),
+        angle_model,
+        points_in_world,
+        maps,
+        window_px=window_px,
+        tilt_aware=tilt_aware,
+    )
+    return found
+
+
+def gather_observations_under(
+    readings: Sequence[Reading],
+    angle_model: AngleModel,
+    points_in_world: Floats,
+    maps: Sequence[PhaseMap],
+    *,
+    window_px: int,
+    tilt_aware: bool = True,
+) -> tuple[Observations, ...]:
+    """Observations of points under several readings of the same angles, the maps asked once.
+
     Parameters
     ----------
+    readings : what becomes of ``(s1, s2)``, for each result.
     angle_model : whose planes of incidence.
     points_in_world : (N, 3).
-    maps : K phase maps, of PPA.
+    maps : K phase maps.
     window_px : side of the window about each point.
     tilt_aware : add to a row's variance what OPA and PPA leave out; see
         :func:`polmvs.normals.rows.gather_rows_under`.
-    reading : what becomes of ``(s1, s2)``.
     """
     points = np.asarray(points_in_world, np.float64)
-    num_views, num_points = len(maps), len(points)
-    found = Observations(
-        rows=np.full((2, 3, num_views, num_points), np.nan, np.float32),
-        rays=np.zeros((3, num_views, num_points), np.float32),
-        turn_variances=np.full((2, num_views, num_points), np.inf, np.float32),
-        dolp=np.zeros((num_views, num_points), np.float32),
-        dolp_variance=np.full((num_views, num_points), np.inf, np.float32),
+    shape = len(maps), len(points)
+    rays = np.zeros((3, *shape), np.float32)
+    dolps = np.zeros(shape, np.float32)
+    dolp_variances = np.full(shape, np.inf, np.float32)
+    gathered = tuple(
+        Observations(
+            rows=np.full((2, 3, *shape), np.nan, np.float32),
+            rays=rays,
+            turn_variances=np.full((2, *shape), np.inf, np.float32),
+            dolp=dolps,
+            dolp_variance=dolp_variances,
+        )
+        for _ in readings
     )
     for k, phase_map in enumerate(maps):
         view = phase_map.view
@@ -93,19 +128,21 @@ def gather_observations(
         ray = in_cam / np.maximum(np.linalg.norm(in_cam, axis=-1), MIN_DISTANCE)[:, None]
         xy = view.camera.project(in_cam)
         rotation = view.cam_from_world.rotation.astype(np.float32)
-        found.rays[:, k] = (ray @ rotation).T
+        rays[:, k] = (ray @ rotation).T
         sampled = sample_image(window_polarization(phase_map.polarization, window_px), xy)
         seen = np.flatnonzero((sampled[:, 3] > 0) & in_image(view.camera, xy))
-        p, ray = sampled[seen, :2] @ np.array(reading, np.float32).T, ray[seen]
+        p, ray = sampled[seen, :2], ray[seen]
         variance = sampled[seen, 2] + sampled[seen, 3]
         dolp = np.hypot(p[:, 0], p[:, 1])
-        found.dolp[k, seen], found.dolp_variance[k, seen] = np.minimum(dolp, 1), variance
+        dolps[k, seen], dolp_variances[k, seen] = np.minimum(dolp, 1), variance
         of_phase = phase_variance(dolp, variance)
-        for index, light in enumerate(LIGHTS):
-            row, turn_variance = _row(angle_model, light, p, ray, of_phase, tilt_aware=tilt_aware)
-            found.rows[index][:, k, seen] = (row @ rotation).T
-            found.turn_variances[index, k, seen] = turn_variance
-    return found
+        for reading, found in zip(readings, gathered, strict=True):
+            read = p @ np.array(reading, np.float32).T
+            for index, light in enumerate(LIGHTS):
+                row, turned = _row(angle_model, light, read, ray, of_phase, tilt_aware=tilt_aware)
+                found.rows[index][:, k, seen] = (row @ rotation).T
+                found.turn_variances[index, k, seen] = turned
+    return gathered
 
 
 def _row(

@@ -21,7 +21,6 @@ from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.mixture_estimator import MixtureEstimate, row_scales, solve_mixture
 from polmvs.normals.observations import Observations, gather_observations
-from polmvs.normals.rows import AS_MEASURED, Reading
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
 
@@ -60,11 +59,7 @@ class SeedTolerances:
 
 
 def observe(
-    angle_model: AngleModel,
-    tracks: Tracks,
-    maps: Sequence[PhaseMap],
-    options: NormalOptions,
-    reading: Reading = AS_MEASURED,
+    angle_model: AngleModel, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
 ) -> tuple[Observations, Mask]:
     """What all views measure of tracks, and which views (K, T) surely see them: they match."""
     found = gather_observations(
@@ -73,11 +68,15 @@ def observe(
         maps,
         window_px=options.window_px,
         tilt_aware=options.tilt_aware_weights,
-        reading=reading,
     )
-    matched = np.zeros((len(maps), len(tracks.points_in_world)), bool)
+    return found, matched_views(tracks, len(maps))
+
+
+def matched_views(tracks: Tracks, num_views: int) -> Mask:
+    """Which views (K, T) match each track."""
+    matched = np.zeros((num_views, len(tracks.points_in_world)), bool)
     matched[tracks.obs_view, tracks.obs_track] = True
-    return found, matched
+    return matched
 
 
 def evenly_chosen(num_points: int, limit: int) -> Mask:
@@ -113,13 +112,18 @@ def track_normals(
     # Some of the points first: how far the rows of each view are off.
     limit = min(MAX_SCALE_POINTS, max(1, max_rows // max(len(maps), 1)))
     chosen = evenly_chosen(len(tracks.points_in_world), limit)
-    found, matched = observe(angle_model, some_tracks(tracks, chosen), maps, options)
+    tiles = list(in_tiles(tracks, len(maps), max_rows))
+    observed = observe(angle_model, tracks, maps, options) if len(tiles) == 1 else None
+    if observed is None:
+        found, matched = observe(angle_model, some_tracks(tracks, chosen), maps, options)
+    else:
+        found, matched = observed[0].some(chosen), observed[1][:, chosen]
     first = solve_mixture(found, matched, prior_specular=prior)
     scales = row_scales(found, matched, first)
     logger.debug("rows err by %s of what is stated", np.round(scales.of_views, 2))
     estimates = []
-    for some in in_tiles(tracks, len(maps), max_rows):
-        found, matched = observe(angle_model, some, maps, options)
+    for some in tiles:
+        found, matched = observed or observe(angle_model, some, maps, options)
         estimate = solve_mixture(found, matched, prior_specular=prior, scales=scales)
         if options.estimator is Estimator.ALGEBRAIC:
             estimate = _algebraic(found, estimate)

@@ -25,6 +25,7 @@ Nothing here knows of views, points or meshes: arrays of any one shape go in and
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -139,24 +140,27 @@ def light_shares(
     t = tolerances
     cosines = np.asarray(cosines)
     sin2 = np.maximum(1 - np.square(cosines), t.min_sine**2)
+    # Single precision stays so: NumPy's own numbers of double precision would widen all.
+    prior = np.asarray(prior_specular, np.result_type(cosines, dolp))
+    log_neither, log_either = math.log(t.neither_share), math.log1p(-t.neither_share)
     with np.errstate(divide="ignore"):
-        priors = np.log(prior_specular), np.log1p(-np.asarray(prior_specular))
+        priors = np.log(prior), np.log1p(-prior)
     parts = []
-    for light, prior, residual, turn in zip(
+    for light, log_prior, residual, turn in zip(
         (Light.SPECULAR, Light.DIFFUSE), priors, residuals, turn_variances, strict=True
     ):
         density = angle_log_density(residual, turn, sin2, normal_variance)
         bound = dolp_log_evidence(
             light, dolp, dolp_variance, cosines, normal_variance=normal_variance, tolerances=t
         )
-        parts.append(density + bound + prior + np.log1p(-t.neither_share))
+        parts.append(density + bound + log_prior + log_either)
     specular, diffuse = parts
     either = np.logaddexp(specular, diffuse)
-    total = np.logaddexp(either, np.log(t.neither_share))
+    total = np.logaddexp(either, np.asarray(log_neither, either.dtype))
     return LightShares(
         specular=np.exp(specular - total),
         diffuse=np.exp(diffuse - total),
-        neither=np.exp(np.log(t.neither_share) - total),
+        neither=np.exp(log_neither - total),
         log_likelihood=total,
     )
 
@@ -191,7 +195,7 @@ def angle_log_density(
     known = np.isfinite(variance)
     safe = np.where(known, variance, 1)
     density = -0.5 * np.square(residual) / safe - _log_bessel(0.25 * sin2 / safe)
-    return np.where(known, density, 0)
+    return np.where(known, density, np.zeros_like(density))
 
 
 def _log_bessel(x: Floats) -> Floats:
@@ -228,7 +232,8 @@ def dolp_log_evidence(
     finite = np.isfinite(variance)
     sigma = np.sqrt(np.where(finite, variance, 1))
     # The normal distribution's integral by a logistic one, within 0.01, whose tail is longer.
-    return np.where(finite, -np.logaddexp(0, LOGISTIC_SCALE * (dolp - bound) / sigma), 0)
+    excess = np.asarray(LOGISTIC_SCALE * (dolp - bound) / sigma)
+    return np.where(finite, -np.logaddexp(np.zeros_like(excess), excess), np.zeros_like(excess))
 
 
 @lru_cache(maxsize=8)
