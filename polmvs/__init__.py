@@ -28,6 +28,7 @@ Use
 Importing this is light and changes nothing; what a function needs is imported when it is used::
 
     stokes = polmvs.read_stokes("frame.png")              # .aolp, .dolp, .phase(), .sigma_aolp
+    picture = polmvs.aolp_colors(polmvs.read_stokes(array))  # of a frame that a camera's SDK gives
     normal = polmvs.plane_normal(stokes, (fx, fy, cx, cy))
     result = polmvs.reconstruct("capture", "out", model="ppa")
     result.point_cloud(), result.mesh(), result.depth_map("003.png"), result.metrics
@@ -48,7 +49,9 @@ if TYPE_CHECKING:
         Reconstruction,
         RunResult,
         TrackNormals,
+        aolp_colors,
         compare,
+        dolp_colors,
         open_run,
         plane_normal,
         read_stokes,
@@ -71,7 +74,9 @@ __all__ = [
     "RunResult",
     "TrackNormals",
     "__version__",
+    "aolp_colors",
     "compare",
+    "dolp_colors",
     "open_run",
     "plane_normal",
     "read_stokes",

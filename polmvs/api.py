@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cached_property
-from os import PathLike
+from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -36,7 +36,9 @@ from polmvs.config import (
     options_from_plain,
 )
 from polmvs.errors import DataError, OptionError
+from polmvs.io.array_captures import Frame, Frames, are_frames, write_frames
 from polmvs.io.clouds import Cloud, Mesh, mesh_to_open3d, read_cloud, read_mesh, to_open3d
+from polmvs.io.folders import new_folder
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.scene import find_name
 from polmvs.simulation.options import LightName, MaterialName, Simulation, SimulationRun
@@ -70,12 +72,15 @@ logger = logging.getLogger(__name__)
 # One image
 
 
-def read_stokes(path: PathArg, *, options: CaptureOptions | None = None, **changes: Any) -> Stokes:
+def read_stokes(
+    image: PathArg | Frame, *, options: CaptureOptions | None = None, **changes: Any
+) -> Stokes:
     """Stokes images of one raw image, with their noise.
 
     Parameters
     ----------
-    path : raw mosaic of a polarization camera.
+    image : raw mosaic of a polarization camera, a file or an array (H, W) as its SDK gives it; or
+        a dictionary of images by polarizer angle in degrees, or Stokes images (3, H, W).
     options : how it is read; defaults where None.
     **changes : single options by name instead, such as ``pattern=(90, 45, 135, 0)``.
 
@@ -92,8 +97,44 @@ def read_stokes(path: PathArg, *, options: CaptureOptions | None = None, **chang
         An option is unusable or unknown.
     """
     from polmvs.normals.single_view.pixels import load_stokes
+    from polmvs.polarization.capture import open_capture
 
-    return load_stokes(Path(path), _changed(_given(CaptureOptions, options), changes))
+    chosen = _changed(_given(CaptureOptions, options), changes)
+    if isinstance(image, str | PathLike):
+        return load_stokes(Path(image), chosen)
+    with tempfile.TemporaryDirectory() as folder:
+        kind = write_frames({"frame": image}, Path(folder))
+        capture = open_capture(folder, replace(chosen, kind=kind))
+        return capture.load(capture.names[0])
+
+
+def aolp_colors(stokes: Stokes, *, hue: bool = False) -> NDArray[np.uint8]:
+    """The angle of linear polarization as colours, fainter where the degree is under 0.5.
+
+    Parameters
+    ----------
+    stokes : from :func:`read_stokes`.
+    hue : the colours of the rainbow on black, as cameras' viewers and ``polmvs inspect`` show it;
+        else those of the report: twice round the wheel, evenly for the eye, on grey.
+
+    Returns
+    -------
+    (H, W, 3) uint8, red, green, blue.
+    """
+    from polmvs.polarization.inspection import SHOWN_DOLP, aolp_picture
+    from polmvs.report.pictures import angle_picture
+
+    if hue:
+        return np.ascontiguousarray(aolp_picture(stokes)[..., ::-1])
+    aolp = np.where(stokes.valid, stokes.aolp, np.nan)
+    return angle_picture(aolp, strength=stokes.dolp / SHOWN_DOLP)
+
+
+def dolp_colors(stokes: Stokes) -> NDArray[np.uint8]:
+    """The degree of linear polarization, 0 to 1, as colours (H, W, 3) uint8, as in the report."""
+    from polmvs.report.pictures import scalar_picture
+
+    return scalar_picture(np.where(stokes.valid, stokes.dolp, np.nan), 0, 1)
 
 
 def plane_normal(
@@ -478,7 +519,7 @@ class RunResult:
 
 
 def reconstruct(
-    capture: PathArg,
+    capture: PathArg | Frames,
     out: PathArg,
     model: AngleModel | str = AngleModel.PPA,
     *,
@@ -494,7 +535,8 @@ def reconstruct(
 
     Parameters
     ----------
-    capture : folder of the raw images.
+    capture : folder of the raw images; or frames as :func:`read_stokes` takes them, by name or in
+        order, which are kept beside the run, in ``OUT_frames``.
     out : run folder, a new one.
     model : angle model.
     options : of all stages; defaults where None.
@@ -521,7 +563,7 @@ def reconstruct(
 
 
 def compare(
-    capture: PathArg,
+    capture: PathArg | Frames,
     out: PathArg,
     models: AngleModel | str | Sequence[AngleModel | str] = COMPARED_MODELS,
     *,
@@ -633,7 +675,7 @@ def _warn_if_empty(why: str | None) -> None:
 
 
 def _job(
-    capture: PathArg,
+    capture: PathArg | Frames,
     out: PathArg,
     options: Options | None,
     changes: Mapping[str, Any],
@@ -643,19 +685,47 @@ def _job(
     scheduler: str | None,
     monitor: Monitor | None,
 ) -> Any:
+    from polmvs.pipeline.data_set_import import as_capture
     from polmvs.pipeline.record import read_options
     from polmvs.pipeline.run_folder import RunFolder
     from polmvs.pipeline.runner import Job
 
+    for name, path in (("capture", capture), ("out", out)):
+        if isinstance(path, str | PathLike) and not fspath(
+            path
+        ):  # which would be the current directory
+            raise ValueError(f"{name}={path!r} is no path.")
     if resume and options is None:  # those of the run, as the command line does
         options = options_from_plain(read_options(RunFolder(Path(out))), str(out))
+    chosen = change_options(options, changes)
+    if not isinstance(capture, str | PathLike):
+        capture, chosen = _kept_frames(capture, Path(out), chosen, overwrite=overwrite)
+    place, chosen = as_capture(Path(capture), Path(out), chosen)
     return Job(
-        capture=Path(capture),
+        capture=place,
         out=Path(out),
-        options=change_options(options, changes),
+        options=chosen,
         run_options=_run_options(workers, overwrite=overwrite, resume=resume, scheduler=scheduler),
         monitor=monitor,
     )
+
+
+def _kept_frames(
+    frames: Frames, out: Path, options: Options, *, overwrite: bool
+) -> tuple[Path, Options]:
+    """Frames as a capture beside a run, and the options that it is read with.
+
+    Frames that are there are replaced by ``overwrite`` alone: a run that goes on has the same.
+    """
+    if not are_frames(frames):
+        raise OptionError("needs a folder, or frames by name or in order.", field="capture")
+    folder = out.absolute().with_name(f"{out.name}_frames")
+    with tempfile.TemporaryDirectory() as checked:  # before anything is replaced
+        kind = write_frames(frames, Path(checked))
+    if overwrite or not folder.exists():
+        with new_folder(folder, overwrite=overwrite) as new:
+            write_frames(frames, new)
+    return folder, replace(options, capture=replace(options.capture, kind=kind))
 
 
 def _run_options(workers: int | None, **given: Any) -> RunOptions:

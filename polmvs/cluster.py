@@ -5,6 +5,11 @@ under the same paths and run the same versions. All of that is checked before wo
 workers are Dask's to replace; what a lost scheduler has forgotten is submitted again to the one
 that follows it at the same address. Tasks are safe to repeat: each depends on its arguments alone
 and writes its files whole.
+
+Tasks and results are pickled, as Dask does with all that it moves: whoever runs the scheduler or a
+worker can run code in this program, and whoever reaches the scheduler can run code on the workers.
+An address ``tcp://`` is for a network of which all machines are trusted; ``tls://`` asks both sides
+for certificates.
 """
 
 from __future__ import annotations
@@ -18,9 +23,11 @@ from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
+from ssl import SSLError
 from typing import Any
 
 from polmvs._version import __version__
+from polmvs.config import RunOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.threads import keep_to_one_core
 
@@ -46,6 +53,28 @@ class ClusterPatience:
     max_losses: int = 5
 
 
+@dataclass(frozen=True, kw_only=True)
+class TlsFiles:
+    """What this program shows to a scheduler at ``tls://``, and asks of it. PEM files.
+
+    Attributes
+    ----------
+    ca : certificate that all others are signed by.
+    cert, key : of this program.
+    """
+
+    ca: Path
+    cert: Path
+    key: Path
+
+    @classmethod
+    def of(cls, options: RunOptions) -> TlsFiles | None:
+        """Those of a run; without any Dask's own configuration holds."""
+        if options.tls_ca is None or options.tls_cert is None or options.tls_key is None:
+            return None
+        return cls(ca=options.tls_ca, cert=options.tls_cert, key=options.tls_key)
+
+
 class Cluster:
     """A connection to a scheduler.
 
@@ -54,6 +83,7 @@ class Cluster:
     address : of the scheduler, such as ``tcp://10.0.0.1:8786``.
     storage : folders that every worker must see under the same path; written to for a moment.
     sources : files and folders that every worker must be able to read.
+    tls : of an encrypted connection; None for what Dask's own configuration says.
     patience : see there.
 
     Raises
@@ -71,11 +101,13 @@ class Cluster:
         storage: Sequence[Path] = (),
         sources: Sequence[Path] = (),
         *,
+        tls: TlsFiles | None = None,
         patience: ClusterPatience = ClusterPatience(),
     ) -> None:
         self.address = address
         self.patience = patience
-        self._client = _connect(address, patience)
+        self._tls = tls
+        self._client = _connect(address, tls, patience)
         try:
             self._check_workers()
             for folder in storage:
@@ -156,7 +188,7 @@ class Cluster:
             try:
                 if self._client.status != "running":
                     self._client.close(timeout=1)
-                    self._client = _connect(self.address, self.patience)
+                    self._client = _connect(self.address, self._tls, self.patience)
                 self._client.wait_for_workers(1, timeout=self.patience.workers_s)
                 return
             except (DataError, OSError, TimeoutError):
@@ -247,15 +279,39 @@ def installed_versions(packages: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def _connect(address: str, patience: ClusterPatience) -> Any:
+def _connect(address: str, tls: TlsFiles | None, patience: ClusterPatience) -> Any:
     try:
         from distributed import Client
+        from distributed.security import Security
     except ImportError as error:
         raise OptionError(
             "needs dask.distributed: pip install 'polmvs[dask]'.", field="run.scheduler"
         ) from error
+    security = None
+    if tls is not None:
+        for path in (tls.ca, tls.cert, tls.key):
+            if not path.is_file():
+                raise DataError(path, "no such file; a certificate or key in PEM is expected.")
+        security = Security(
+            require_encryption=True,
+            tls_ca_file=str(tls.ca),
+            tls_client_cert=str(tls.cert),
+            tls_client_key=str(tls.key),
+        )
     try:
-        return Client(address, timeout=patience.connect_s, set_as_default=False)
+        return Client(address, timeout=patience.connect_s, set_as_default=False, security=security)
+    except SSLError as error:
+        raise DataError(
+            address, f"the certificates do not fit: {error.reason or error}. Check `run.tls_ca`."
+        ) from error
+    except TypeError as error:  # what Dask says of certificates that are missing
+        if not address.startswith("tls://"):
+            raise
+        raise DataError(
+            address,
+            "needs certificates. Give `run.tls_ca`, `run.tls_cert` and `run.tls_key`, or name them "
+            "in Dask's configuration.",
+        ) from error
     except (OSError, TimeoutError, ValueError) as error:
         raise DataError(
             address,

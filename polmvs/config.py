@@ -27,6 +27,7 @@ from typing import Any, ClassVar, TypeVar
 
 from polmvs.errors import OptionError
 
+MAX_PIXELS = 1 << 27  # of an image: four times the largest polarization sensors, a guess
 MAX_DEFAULT_WORKERS = 8  # each holds a few hundred MB
 
 T = TypeVar("T")
@@ -124,6 +125,24 @@ class Packing(StrEnum):
     MONO12P = "mono12p"
     MONO10PACKED = "mono10packed"
     MONO12PACKED = "mono12packed"
+
+
+class ExportFormat(StrEnum):
+    """As what a finished run is exported."""
+
+    PLY = "ply"
+    OBJ = "obj"
+    STL = "stl"
+    GLB = "glb"
+    CLOUD_PLY = "cloud-ply"
+    XYZ = "xyz"
+    LAS = "las"
+    LAZ = "laz"
+    NERFSTUDIO = "nerfstudio"
+    NEUS = "neus"
+    METASHAPE = "metashape"
+    REALITYSCAN = "realityscan"
+    BUNDLER = "bundler"
 
 
 class CaptureKind(StrEnum):
@@ -354,6 +373,11 @@ class CaptureOptions(OptionGroup, group="capture"):
     zero_deg: float = option(
         0.0, "direction that angles are counted from, degrees anticlockwise from +x as displayed"
     )
+    equalize: bool = option(
+        False,
+        "images of a view behind different polarizer angles differ in exposure: divide them by the "
+        "gains that unpolarised places show",
+    )
     calibration: Path | None = option(
         None, "TOML file of 'polmvs calibrate polarizers': gains, angles, dark frame, flat field"
     )
@@ -361,6 +385,12 @@ class CaptureOptions(OptionGroup, group="capture"):
     height: int | None = option(None, "height of .raw and .bin dumps, px", least=1, below=1 << 16)
     packing: Packing | None = option(
         None, "how dumps hold their samples; by default told by their length where only one fits"
+    )
+
+    max_pixels: int = option(
+        MAX_PIXELS,
+        "most pixels of an image, as its header says; a larger one is refused before it is decoded",
+        least=1,
     )
 
     def check(self) -> None:
@@ -412,6 +442,16 @@ class SfmOptions(OptionGroup, group="sfm"):
         "are many",
     )
     seed: int = option(0, "random seed of SfM")
+    static_background: bool = option(
+        True,
+        "find a background that stands still while the part turns on a table, and leave its "
+        "features out",
+    )
+    without: tuple[str, ...] = option(
+        (),
+        "images to take out of the model; a run adds those whose pose its surface contradicts",
+        metavar="NAME,...",
+    )
 
     def check(self) -> None:
         """Four positive numbers, or a file; nothing for an SfM that is not run."""
@@ -645,9 +685,15 @@ class RunOptions(OptionGroup, group="run", in_files=False):
         None,
         "address of a dask.distributed scheduler, such as tcp://10.0.0.1:8786, whose workers share "
         "the views instead of processes here; they must have the same versions, and CAPTURE and "
-        "OUT on storage that they see under the same path",
+        "OUT on storage that they see under the same path. Scheduler and workers are trusted: what "
+        "they send is run here, and what is sent there is run there",
         metavar="ADDRESS",
     )
+    tls_ca: Path | None = option(
+        None, "certificate (PEM) that those of a scheduler at tls://... are signed by"
+    )
+    tls_cert: Path | None = option(None, "certificate of this program for the scheduler (PEM)")
+    tls_key: Path | None = option(None, "key of that certificate (PEM)")
     memory: float | None = option(
         None,
         "GB of memory for this process and those that share the views with it: fewer of them and "
@@ -659,6 +705,10 @@ class RunOptions(OptionGroup, group="run", in_files=False):
         """Not both."""
         both = self.overwrite and self.resume
         self.require(not both, "overwrite", "and `run.resume` exclude each other")
+        given = [path is not None for path in (self.tls_ca, self.tls_cert, self.tls_key)]
+        self.require(all(given) == any(given), "tls_ca", "needs `run.tls_cert` and `run.tls_key`")
+        encrypted = self.scheduler is not None and self.scheduler.startswith("tls://")
+        self.require(encrypted or not any(given), "tls_ca", "needs `run.scheduler` at tls://...")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,13 +6,43 @@ command line puts the flag in its place, a notebook sees the field.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from os import PathLike
 from typing import ClassVar
 
 MAX_REASON = 1000  # characters
+_LAYOUT = "\n\t"
 MAX_QUOTED = 120  # of these, of words that are a file's or another library's
+
+# What a terminal acts on: controls of both sets, ends of lines, changes of writing direction; and
+# halves of characters, which stand for bytes of a name that is not UTF-8.
+_ACTED_ON = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+# What polmvs.io.temporary puts before the name that a file is to have in the end.
+_UNFINISHED = re.compile(r"\.polmvs-[0-9a-f]{16}-\d+-\d+-")
+
+
+def printable(text: object, *, keep: str = "") -> str:
+    r"""Text as it may be shown: what a terminal would act on is written out, as in ``\x1b[31m``.
+
+    Parameters
+    ----------
+    text : such as a path; names of files may hold anything.
+    keep : characters that stay, such as a newline where the text has lines.
+    """
+    return _ACTED_ON.sub(lambda found: _written_out(found[0], keep), str(text))
+
+
+def final_name(path: object) -> str:
+    """A path with the names that a user knows, in place of those of unfinished files."""
+    return _UNFINISHED.sub("", str(path))
+
+
+def _written_out(character: str, keep: str) -> str:
+    return character if character in keep else character.encode("unicode_escape").decode()
 
 
 class PolmvsError(Exception):
@@ -33,7 +63,9 @@ class DataError(PolmvsError):
     """
 
     def __init__(self, path: str | PathLike[str], reason: str) -> None:
-        super().__init__(f"{path}: {_short(reason)}")
+        super().__init__(
+            f"{printable(final_name(path))}: {_short(printable(reason, keep=_LAYOUT))}"
+        )
         self.path = path
         self.reason = reason
 
@@ -58,7 +90,7 @@ class OptionError(PolmvsError):
     exit_status: ClassVar[int] = 2
 
     def __init__(self, reason: str, *, field: str | None = None) -> None:
-        text = _short(reason)
+        text = _short(printable(reason))
         super().__init__(f"`{field}` {text}" if field is not None else text)
         self.reason = reason
         self.field = field

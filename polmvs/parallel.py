@@ -22,9 +22,13 @@ from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
+from polmvs.safe_path import safe_path
 from polmvs.threads import keep_to_one_core
+
+if TYPE_CHECKING:
+    from polmvs.cluster import TlsFiles
 
 T = TypeVar("T")
 OnProgress: TypeAlias = Callable[[int], None]  # called with the steps done since the last call
@@ -81,12 +85,16 @@ class Workers:
 
     @classmethod
     def of_cluster(
-        cls, address: str, storage: Sequence[Path] = (), sources: Sequence[Path] = ()
+        cls,
+        address: str,
+        storage: Sequence[Path] = (),
+        sources: Sequence[Path] = (),
+        tls: TlsFiles | None = None,
     ) -> Workers:
         """The workers of a Dask scheduler; see :class:`polmvs.cluster.Cluster`."""
         from polmvs.cluster import Cluster
 
-        cluster = Cluster(address, storage, sources)
+        cluster = Cluster(address, storage, sources, tls=tls)
         return cls(cluster.num_threads, cluster)
 
     def map(self, function: Callable[..., T], *iterables: Any) -> Iterator[T]:
@@ -166,10 +174,11 @@ class _Processes:
     def submit(self, function: Callable[..., T], task: tuple[Any, ...]) -> Future[T]:
         """Start the processes, if there are none, and queue a task."""
         if self._pool is None:
-            self._pool = ProcessPoolExecutor(
-                self.num, mp_context=get_context("spawn"), initializer=_start_worker
-            )
-        with _signals_held_back():
+            with safe_path():  # it starts a process that keeps account of semaphores
+                self._pool = ProcessPoolExecutor(
+                    self.num, mp_context=get_context("spawn"), initializer=_start_worker
+                )
+        with _signals_held_back(), safe_path():
             try:
                 return self._pool.submit(function, *task)
             except BrokenProcessPool as error:  # by one of the tasks before, as is told of them
@@ -194,7 +203,8 @@ def _signals_held_back() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    resource_tracker.ensure_running()  # it unblocks SIGINT when it is started
+    with safe_path():
+        resource_tracker.ensure_running()  # it unblocks SIGINT when it is started
     arrived: list[int] = []
     before = {n: signal.signal(n, lambda n, _: arrived.append(n)) for n in HELD_BACK}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if POSIX else set()

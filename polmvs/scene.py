@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from itertools import pairwise
+from itertools import compress, pairwise
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -217,6 +217,37 @@ class SparseModel:
     views: tuple[View, ...]
     tracks: Tracks
     unregistered: tuple[str, ...]
+
+
+def without_views(model: SparseModel, names: Collection[str]) -> tuple[SparseModel, Mask, Mask]:
+    """A model without some of its views, and without points that less than two others see.
+
+    Parameters
+    ----------
+    names : of views to take out; they count as not registered.
+
+    Returns
+    -------
+    The model; which views (V,) and which tracks (T,) it has of the former one.
+    """
+    kept = np.array([view.name not in names for view in model.views], np.bool_)
+    tracks = model.tracks
+    seen = kept[tracks.obs_view]
+    index = np.cumsum(kept) - 1
+    fewer = replace(
+        tracks,
+        obs_track=tracks.obs_track[seen],
+        obs_view=index[tracks.obs_view[seen]],
+        obs_xy=tracks.obs_xy[seen],
+    )
+    enough = np.bincount(fewer.obs_track, minlength=len(tracks.point3D_ids)) >= 2
+    out = [view.name for view in model.views if view.name in names]
+    changed = SparseModel(
+        views=tuple(compress(model.views, kept)),
+        tracks=some_tracks(fewer, enough),
+        unregistered=tuple(sorted((*model.unregistered, *out))),
+    )
+    return changed, kept, enough
 
 
 class PointKind(IntEnum):

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from typing import IO, Any, TypeVar
 
 from polmvs.errors import PolmvsError
+from polmvs.safe_path import safe_environment
 
 T = TypeVar("T")
 
@@ -72,11 +73,11 @@ def run_separately(
     with (
         tempfile.TemporaryFile() as complaints,
         subprocess.Popen(
-            [sys.executable, "-c", CODE],
+            [sys.executable, "-P", "-c", CODE],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=complaints,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            env={**safe_environment(), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         ) as process,
     ):
         try:

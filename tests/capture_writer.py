@@ -294,6 +294,7 @@ FORMATS: dict[str, Callable[[Path, Mosaics], Written]] = {
     "dump, mono10packed": dump(Packing.MONO10PACKED, 10),
     "dump, mono12packed": dump(Packing.MONO12PACKED, 12),
     "angles by ending": four_images("{stem}_{angle:03d}.png"),
+    "angles by words": four_images("{stem}-POL{angle}deg.png"),
     "angles by folder": four_images("pol{angle:03d}/{stem}.png"),
     "angles by view": four_images("{stem}/I{angle}.png"),
     "angles by template": four_images("{angle}deg-{stem}.tif", naming="{angle}deg-{view}.tif"),

@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from capture_writer import stokes_of
+from capture_writer import PATTERN, split_mosaic, stokes_of
 
 from polmvs.colmap.models import reconstruction_of_views, write_reconstruction
 from polmvs.scene import View
@@ -138,3 +138,43 @@ def mvas(root, source):
     save_masks(root / "mask", source, stems)
     save_sparse(root / "sparse" / "0", source, stems)
     return stems
+
+
+def neus(root, source, mosaics=False):
+    """Four images a view, or mosaics whose cameras are of their size; cameras by number."""
+    (root / "raw").mkdir(parents=True)
+    content = {}
+    for index, (stem, (share, view, _)) in enumerate(source.items()):
+        matrix = world_mat(view)
+        if mosaics:
+            # u' = 2 u + 0.5 where u counts from the centre of the first pixel.
+            matrix = np.array([[2, 0, 0.5, 0], [0, 2, 0.5, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ matrix
+            cv2.imwrite(str(root / "raw" / f"{stem}.png"), np.rint(65535 * share).astype(np.uint16))
+        else:
+            save_angles(root / "raw" / (stem + "_{angle}.png"), share)
+        content |= {f"world_mat_{index}": matrix, f"scale_mat_{index}": np.eye(4)}
+    np.savez(root / "cameras_sphere.npz", **content)
+    save_masks(root / "masks", source, list(source))
+    return list(source)
+
+
+def save_angles(template, share):
+    for angle, image in zip((0, 45, 90, 135), split_mosaic(share, PATTERN), strict=True):
+        path = str(template).format(angle=f"{angle:02d}")
+        assert cv2.imwrite(path, np.rint(65535 * np.clip(image, 0, 1)).astype(np.uint16))
+
+
+def transpir(root, source):
+    for angle in ("00", "45", "90", "135"):
+        (root / f"I-{angle}").mkdir(parents=True)
+    (root / "I-sum").mkdir()
+    content = {}
+    for index, (stem, (share, view, _)) in enumerate(source.items()):
+        save_angles(str(root / "I-{angle}" / f"{stem}.png"), share)
+        (root / "I-sum" / f"{stem}.png").write_bytes((root / "I-00" / f"{stem}.png").read_bytes())
+        content |= {f"world_mat_{index}": world_mat(view), f"scale_mat_{index}": np.eye(4)}
+    np.savez(root / "cameras_new.npz", **content)
+    (root / "masks").mkdir()
+    for stem, (_, _, mask) in source.items():
+        cv2.imwrite(str(root / "masks" / f"{stem}_pseudo.png"), 255 * mask.astype(np.uint8))
+    return list(source)

@@ -1,6 +1,6 @@
 """Small analytic scenes that several test files share."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -81,3 +81,14 @@ def tracks_at(scene, points, views=None):
         obs_view=np.array([k for _, k in obs], np.int64),
         obs_xy=np.array(xy).reshape(-1, 2),
     )
+
+
+def seen_tracks(scene, points, normals):
+    """Tracks of points as the views that face them observe them."""
+    tracks = tracks_at(scene, points)
+    kept = np.zeros(len(tracks.obs_track), bool)
+    for k, view in enumerate(scene.views):
+        here = tracks.obs_view == k
+        kept[here] = view.faces(points, normals)[tracks.obs_track[here]]
+    observed = {name: getattr(tracks, name)[kept] for name in ("obs_track", "obs_view", "obs_xy")}
+    return replace(tracks, **observed)

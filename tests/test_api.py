@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import open3d
 import pycolmap
@@ -333,3 +334,72 @@ def test_normals_of_sparse_points(demo_run: Path, demo_capture: Path, as_object:
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.1
     assert len(found.point_cloud().points) == found.valid.sum()
     assert not found.normals[~found.valid].any() or np.isnan(found.normals[~found.valid]).all()
+
+
+def test_an_empty_path_is_not_the_current_directory(demo_capture) -> None:
+    for paths in ((demo_capture, ""), ("", "out")):
+        with pytest.raises(ValueError, match="is no path"):
+            polmvs.reconstruct(*paths)
+
+
+# Arrays instead of files
+
+
+def mosaic_of(demo_capture, stem="003"):
+    return cv2.imread(str(demo_capture / "raw" / f"{stem}.png"), cv2.IMREAD_UNCHANGED)
+
+
+def test_stokes_of_an_array_are_those_of_its_file(demo_capture):
+    array = mosaic_of(demo_capture)
+    of_file = polmvs.read_stokes(demo_capture / "raw" / "003.png")
+    of_array = polmvs.read_stokes(array)
+    for name in ("s0", "s1", "s2", "valid"):
+        np.testing.assert_array_equal(getattr(of_array, name), getattr(of_file, name))
+    by_angle = {
+        90: array[::2, ::2],
+        45: array[::2, 1::2],
+        135: array[1::2, ::2],
+        0: array[1::2, 1::2],
+    }
+    split = polmvs.read_stokes(by_angle)
+    strong = of_file.valid & (of_file.dolp > 0.5)
+    # Of samples that lie half a pixel apart, not brought to one place.
+    assert np.median(np.abs(split.dolp - of_file.dolp)[strong]) < 0.05
+    given = polmvs.read_stokes(
+        np.stack([of_file.s0, of_file.s1, of_file.s2]).astype(np.float32), full_scale=1.0
+    )
+    np.testing.assert_allclose(given.s1, of_file.s1, atol=1e-6)
+    for wrong in (np.zeros(5), np.zeros((4, 4, 2), np.uint8), {0: "a"}):
+        with pytest.raises(polmvs.OptionError, match="frame"):
+            polmvs.read_stokes(wrong)
+
+
+def test_colours_of_angles(demo_capture):
+    stokes = polmvs.read_stokes(mosaic_of(demo_capture))
+    even, hue = polmvs.aolp_colors(stokes), polmvs.aolp_colors(stokes, hue=True)
+    for picture in (even, hue, polmvs.dolp_colors(stokes)):
+        assert picture.shape == (*stokes.shape, 3)
+        assert picture.dtype == np.uint8
+    # Hue: red is along x, and cyan across it.
+    across = stokes.valid & (stokes.dolp > 0.5) & (np.abs(np.degrees(stokes.aolp) - 90) < 5)
+    assert across.sum() > 20
+    assert (hue[across][:, 0] < 60).all()
+    assert (hue[across][:, 1:] > 150).all()
+    faint = stokes.valid & (stokes.dolp < 0.02)
+    assert np.median(np.abs(even[faint].astype(int) - 236)) < 12  # the grey of no angle
+
+
+def test_frames_in_memory_become_a_run(demo_capture, tmp_path):
+    stems = ("000", "002", "004", "006", "008")
+    frames = {f"left {stem}": mosaic_of(demo_capture, stem) for stem in stems}
+    result = polmvs.reconstruct(
+        frames, tmp_path / "out", intrinsics=INTRINSICS, method="integrate", stride_px=8,
+        mesh=False, colmap=False,
+    )  # fmt: skip
+    assert sorted(p.name for p in (tmp_path / "out_frames").iterdir()) == [
+        f"left {stem}.npy" for stem in stems
+    ]
+    assert result.record.images == tuple(f"left {stem}.png" for stem in stems)
+    with pytest.raises(polmvs.OptionError, match="holds angles images, the first one mosaic"):
+        polmvs.reconstruct([np.zeros((8, 8)), {0: np.zeros((4, 4))}], tmp_path / "b")
+    assert not (tmp_path / "b_frames").exists()

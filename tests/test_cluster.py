@@ -1,6 +1,8 @@
 """Work on a Dask cluster: the same results as here, and one clear line where it cannot be."""
 
 import os
+import shutil
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -11,8 +13,9 @@ from helpers import content_of
 
 import polmvs
 import polmvs.cluster
-from polmvs.cluster import Cluster, ClusterPatience
+from polmvs.cluster import Cluster, ClusterPatience, TlsFiles
 from polmvs.colmap.models import write_model
+from polmvs.config import RunOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.parallel import Workers
 from polmvs.pipeline.stages.images import write_images
@@ -24,7 +27,7 @@ distributed = pytest.importorskip("distributed")
 QUICK = ClusterPatience(connect_s=2, workers_s=1, return_s=20)
 
 
-def local_cluster(num_workers: int = 2, port: int = 0):
+def local_cluster(num_workers: int = 2, port: int = 0, **options):
     return distributed.LocalCluster(
         n_workers=num_workers,
         threads_per_worker=1,
@@ -32,6 +35,7 @@ def local_cluster(num_workers: int = 2, port: int = 0):
         dashboard_address=":0",
         worker_dashboard_address=None,
         silence_logs=50,
+        **options,
     )
 
 
@@ -173,7 +177,7 @@ def test_commands_on_a_cluster(cli, address, tmp_path) -> None:
         second = cli("normals", tmp_path / "capture", out, "--resume", *where)
         assert (first[0], second[0]) == (0, 0), first[2] + second[2]
         content.append(content_of(out / "images") | content_of(out / "maps"))
-    assert len(content[0]) == 4 * 5
+    assert len(content[0]) == 4 * 6
     assert content[0] == content[1]
 
 
@@ -182,6 +186,66 @@ def test_python_takes_the_address(demo_capture, tmp_path) -> None:
         with pytest.raises(DataError, match="nonsense://x: no Dask scheduler answers"):
             call(demo_capture, tmp_path / "out", scheduler="nonsense://x")
     assert not (tmp_path / "out").exists()
+
+
+def pem_files(folder: Path, name: str, *, signed_by: str | None = None) -> TlsFiles:
+    """A certificate and its key, signed by another one or by itself."""
+    key, cert, asked = (folder / f"{name}.{end}" for end in ("key", "pem", "csr"))
+    make = ["openssl", "req", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-subj"]
+    if signed_by is None:
+        calls = [[*make, f"/CN={name}", "-x509", "-days", "2", "-out", cert]]
+    else:
+        ca = ["-CA", folder / f"{signed_by}.pem", "-CAkey", folder / f"{signed_by}.key"]
+        signing = ["openssl", "x509", "-req", "-in", asked, *ca, "-CAcreateserial", "-days", "2"]
+        calls = [[*make, f"/CN={name}", "-out", asked], [*signing, "-out", cert]]
+    for call in calls:
+        subprocess.run(call, check=True, capture_output=True)
+    return TlsFiles(ca=folder / f"{signed_by or name}.pem", cert=cert, key=key)
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
+def test_encrypted_connections(tmp_path) -> None:
+    """Certificates of both sides are asked for; others of the same name do not do."""
+    pem_files(tmp_path, "ca")
+    own = pem_files(tmp_path, "own", signed_by="ca")
+    pem_files(tmp_path, "other")
+    foreign = pem_files(tmp_path, "foreign", signed_by="other")
+    security = distributed.security.Security(
+        require_encryption=True,
+        tls_ca_file=str(own.ca),
+        **{
+            f"tls_{who}_{what}": str(getattr(own, what))
+            for who in ("scheduler", "worker", "client")
+            for what in ("cert", "key")
+        },
+    )
+    with local_cluster(1, protocol="tls://", security=security) as cluster:
+        address = cluster.scheduler_address
+        assert address.startswith("tls://")
+        with Workers.of_cluster(address, tls=own) as workers:
+            assert list(workers.map(pow, [2, 3], [3, 2])) == [8, 9]
+        for wrong in (foreign, None):
+            with pytest.raises(DataError, match=address):
+                Cluster(address, tls=wrong, patience=QUICK)
+        gone = TlsFiles(ca=own.ca, cert=own.cert, key=tmp_path / "none.key")
+        with pytest.raises(DataError, match=r"none\.key: no such file"):
+            Cluster(address, tls=gone, patience=QUICK)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"tls_ca": "a"}, "`run.tls_ca` needs `run.tls_cert` and `run.tls_key`"),
+        ({"tls_ca": "a", "tls_cert": "b", "tls_key": "c"}, "needs `run.scheduler` at tls://"),
+        (
+            {"tls_ca": "a", "tls_cert": "b", "tls_key": "c", "scheduler": "tcp://x"},
+            "needs `run.scheduler` at tls://",
+        ),
+    ],
+)
+def test_certificates_that_would_be_ignored_are_refused(given, said: str) -> None:
+    with pytest.raises(OptionError, match=said):
+        RunOptions(**{name: Path(v) if "tls" in name else v for name, v in given.items()})
 
 
 # Last, as the workers may not be back at once

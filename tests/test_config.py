@@ -132,7 +132,7 @@ def test_every_range_holds_its_default() -> None:
 def test_paths() -> None:
     assert option_paths()[:2] == ("capture.pattern", "capture.gamma")
     assert option_paths()[-1] == "evaluation.gt"
-    assert option_paths(SfmOptions)[-1] == "sfm.seed"
+    assert option_paths(SfmOptions)[-1] == "sfm.without"
     options = replace_option(Options(), "sfm.seed", 7)
     assert get_option(options, "sfm.seed") == 7
     assert replace_option(options, "sfm.seed", 0) == Options()

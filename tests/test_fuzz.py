@@ -1,7 +1,7 @@
 """Damaged files of every kind: each ends well or in an error that names the file.
 
 In a process of its own, so that a crash of the interpreter is a failure of the test. A run with
-other seeds: ``python tests/fuzzing/fuzz.py FOLDER SEED ROUNDS [KIND ...]``.
+other seeds: ``python tests/fuzzing/fuzz.py FOLDER SEED ROUNDS [KIND ...]``; CI runs it for minutes.
 """
 
 import subprocess

@@ -140,9 +140,11 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
     """
     import tomllib  # not for --help
 
+    from polmvs.io.plain_files import read_text
+
     try:
         with as_data_error(path, "read"):
-            text = path.read_text(encoding="utf-8")
+            text = read_text(path)
     except UnicodeDecodeError as error:
         raise OptionError(f"{path}: is no TOML file (not UTF-8).") from error
     try:

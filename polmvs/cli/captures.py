@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from polmvs.cli.call import Call, require_new
@@ -9,6 +10,7 @@ from polmvs.cli.commands import (
     BoardOptions,
     CalibrateArguments,
     CalibrationKind,
+    ImportArguments,
     InspectArguments,
     PolarizerFrames,
 )
@@ -16,8 +18,10 @@ from polmvs.cli.flags import in_flags
 from polmvs.cli.terminal import Terminal
 from polmvs.config import CaptureOptions
 from polmvs.errors import DataError, OptionError
+from polmvs.io.data_sets import read_data_set, recognise_data_set
 from polmvs.io.images import write_png
 from polmvs.io.intrinsics import write_intrinsics
+from polmvs.pipeline.data_set_import import ImportedSet, import_data_set
 from polmvs.polarization.calibration import write_calibration
 from polmvs.polarization.calibration_frames import calibrate_polarizers
 from polmvs.polarization.capture import intensity_image_8bit, open_capture
@@ -30,24 +34,74 @@ def inspect(call: Call, terminal: Terminal) -> int:
     arguments = call.get(InspectArguments)
     if arguments.sheet is not None and arguments.sheet.is_dir():
         raise OptionError("is a folder; name a PNG file.", field="arguments.sheet")
-    capture = open_capture(arguments.capture, call.get(CaptureOptions))
+    folder, options, notes = arguments.capture, call.get(CaptureOptions), []
+    if folder.is_dir() and recognise_data_set(folder) is not None:
+        data_set = read_data_set(folder, options)
+        cameras = f"{len(data_set.cameras)} cameras" if data_set.cameras else "a COLMAP model"
+        masks = f" and {len(data_set.masks)} masks" if data_set.masks else ""
+        notes.append(
+            f"a set in the layout of {data_set.kind}, with {cameras}{masks}, which 'polmvs "
+            "reconstruct' uses"
+        )
+        if data_set.capture is None:
+            raise DataError(
+                folder,
+                f"is a set in the layout of {data_set.kind}, whose images are converted first: "
+                "run 'polmvs import', and inspect the capture/ that it makes.",
+            )
+        folder, options = data_set.capture, data_set.options
+    capture = open_capture(folder, options)
     with terminal.stage("inspect", len(capture.names)) as on_progress:
         inspection = inspect_capture(capture, on_progress=on_progress)
-    lines = list(inspection.lines)
+    lines = [*notes, *inspection.lines]
     if arguments.sheet is not None:
         write_png(arguments.sheet, contact_sheet(capture, in_flags))
         lines.append(f"{arguments.sheet}: contact sheet")
     content = {
-        "notes": capture.notes,
+        "notes": (*notes, *capture.notes),
         "levels": capture.levels,
         "pattern_check": capture.pattern_check,
         "linearity_check": capture.linearity_check,
         "white": inspection.white,
         "views": inspection.views,
         "warnings": inspection.warnings,
+        "obstacles": inspection.obstacles,
+        "verdict": inspection.verdict,
     }
-    terminal.show(in_flags("\n".join(lines)), content)
+    terminal.show([in_flags(line) for line in lines], content)
     return 0
+
+
+def import_set(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs import``."""
+    given = call.get(ImportArguments)
+    imported = import_data_set(given.folder, given.out, call.get(CaptureOptions))
+    num_views = len(imported.data_set.names)
+    lines = [f"{given.out}: {num_views} views of {imported.data_set.kind}"]
+    if imported.num_points is not None:
+        lines.append(f"{imported.sparse}: given poses, {imported.num_points:,} points")
+    words = ["polmvs", "reconstruct", *_arguments_of(imported)]
+    lines.append(shlex.join(words))
+    content = {
+        "kind": imported.data_set.kind,
+        "num_views": num_views,
+        "points": imported.num_points,
+        "command": words,
+    }
+    terminal.show("\n".join(lines), content)
+    return 0
+
+
+def _arguments_of(imported: ImportedSet) -> list[str]:
+    """What to call ``polmvs reconstruct`` with."""
+    words = [str(imported.capture), "RUN", "--config", str(imported.options_file)]
+    if imported.sparse is not None:
+        words += ["--sparse", str(imported.sparse)]
+    if imported.masks is not None:
+        words += ["--mask", str(imported.masks)]
+    if imported.light is not None:
+        words += ["--light", str(imported.light)]
+    return words
 
 
 def calibrate(call: Call, terminal: Terminal) -> int:
@@ -82,7 +136,7 @@ def calibrate(call: Call, terminal: Terminal) -> int:
         "diattenuations": stored.diattenuations,
         "residual": response.residual,
     }
-    terminal.show("\n".join(lines), content)
+    terminal.show(lines, content)
     return 0
 
 
@@ -106,5 +160,5 @@ def _camera(call: Call, terminal: Terminal, folder: Path, out: Path) -> int:
         found.intrinsics.line,
         f"{out}: give it as --camera {out}",
     ]
-    terminal.show("\n".join(lines), found)
+    terminal.show(lines, found)
     return 0

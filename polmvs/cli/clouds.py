@@ -7,7 +7,8 @@ from polmvs.cli.commands import EvaluateArguments, MeshArguments
 from polmvs.cli.terminal import Terminal
 from polmvs.evaluation.comparison import evaluate_file
 from polmvs.evaluation.tables import evaluation_text
-from polmvs.io.clouds import read_cloud, write_mesh
+from polmvs.io.clouds import read_cloud
+from polmvs.io.mesh_files import mesh_format_of, write_mesh_file
 from polmvs.surface.poisson import poisson_mesh
 
 
@@ -22,12 +23,13 @@ def evaluate(call: Call, terminal: Terminal) -> int:
 def mesh(call: Call, terminal: Terminal) -> int:
     """Run ``polmvs mesh``."""
     arguments = call.get(MeshArguments)
+    mesh_format_of(arguments.mesh)  # before the work
     require_new(arguments.mesh, overwrite=arguments.overwrite)
     made = poisson_mesh(read_cloud(arguments.cloud), source=arguments.cloud)
-    write_mesh(arguments.mesh, made)
+    write_mesh_file(arguments.mesh, made)
     num_triangles = len(made.triangles)
     terminal.show(
-        f"{arguments.mesh}: {num_triangles:,} triangles",
+        [f"{arguments.mesh}: {num_triangles:,} triangles"],
         {"mesh": arguments.mesh, "num_triangles": num_triangles},
     )
     return 0

@@ -18,6 +18,7 @@ from polmvs.config import (
     EvaluationOptions,
     Experiment,
     ExperimentOptions,
+    ExportFormat,
     ExportOptions,
     FusionOptions,
     NormalOptions,
@@ -95,9 +96,9 @@ class BatchArguments(OptionGroup, group="arguments", in_files=False):
 
     list_file: Path = option(
         MISSING,
-        "TOML or CSV file of captures: 'capture' is a folder, 'name' that of its results, 'model' "
-        "as the flag; options as tables in TOML ([[captures]], [captures.sfm]), as columns in CSV "
-        "(sfm.intrinsics); flags are for what it leaves open",
+        "TOML or CSV file of captures: 'folder' is that of one, 'name' that of its results, "
+        "'model' as the flag; options as tables in TOML ([[captures]], [captures.sfm]), as "
+        "columns in CSV (sfm.intrinsics); flags are for what it leaves open",
         positional=True,
         metavar="LIST",
     )
@@ -158,13 +159,97 @@ class EvaluateArguments(OptionGroup, group="arguments", in_files=False):
     )
 
 
+class LengthUnit(StrEnum):
+    """Of a reference's coordinates."""
+
+    UM = "um"
+    MM = "mm"
+    CM = "cm"
+    M = "m"
+    INCH = "inch"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviationArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    result: Path = option(MISSING, "folder of a finished run, or PLY of a cloud", positional=True)
+    reference: Path = option(
+        MISSING,
+        "mesh of the part (STL, OBJ, GLB, PLY), a scan (PLY with normals), or another run",
+        positional=True,
+    )
+    out: Path | None = option(
+        None, "new folder for a coloured cloud, a picture, a histogram and the figures as JSON"
+    )
+    unit: LengthUnit | None = option(
+        None, "of the reference; by default that in which it is as large as the result"
+    )
+    aligned: bool = option(
+        False, "the result lies in the reference's frame; without it, it is laid"
+    )
+    metric: bool = option(
+        False, "the result is in metres, where nothing says so: a cloud, or a run with metric poses"
+    )
+    tolerance: float | None = option(
+        None,
+        "distance that is allowed either way, mm; the exit status is 4 where it is not kept",
+        above=0,
+    )
+    least_share: float = option(
+        0.99, "share of the points that must keep to the tolerance", above=0, most=1
+    )
+    model: AngleModel | None = option(
+        None, "whose surface of a run; by default that of PPA, else of the only cloud"
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class MeshArguments(OptionGroup, group="arguments", in_files=False):
     """Arguments."""
 
     cloud: Path = option(MISSING, "PLY file of points with normals", positional=True)
-    mesh: Path = option(MISSING, "PLY file of the mesh", positional=True)
+    mesh: Path = option(MISSING, "file of the mesh: .ply, .obj, .stl or .glb", positional=True)
     overwrite: bool = option(False, "replace an existing MESH")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    run: Path = option(MISSING, "folder of a finished run", positional=True)
+    target: Path = option(MISSING, "file to write, of posed images a folder", positional=True)
+    overwrite: bool = option(False, "replace an existing TARGET")
+    format: ExportFormat | None = option(
+        None, "by default told by the end of TARGET's name, .ply a mesh"
+    )
+    model: AngleModel | None = option(
+        None, "whose surface; by default that of PPA, else of the only cloud"
+    )
+    texture: bool = option(
+        False, "a texture instead of a colour for each vertex; obj and glb (extra 'texture')"
+    )
+    texture_px: int | None = option(
+        None,
+        "sides of the texture, px; by default a texel is as large as a pixel on the part",
+        least=64,
+        most=16384,
+    )
+    colors: bool = option(
+        True, "colours of a mesh, from the views that see a place best, without highlights"
+    )
+    part: bool = option(False, "of a cloud the polarised surface alone, without its surroundings")
+    box: tuple[float, float, float, float, float, float] | None = option(
+        None,
+        "two opposite corners, in the frame and unit of the model: what lies outside is left out",
+        metavar="X,Y,Z,X,Y,Z",
+    )
+
+    def check(self) -> None:
+        """A texture has colours, and a size is one of a texture."""
+        self.require(self.colors or not self.texture, "texture", "needs `arguments.colors`")
+        sized = self.texture or self.texture_px is None
+        self.require(sized, "texture_px", "is of a texture; give `arguments.texture`")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,6 +318,14 @@ class InspectArguments(OptionGroup, group="arguments", in_files=False):
     sheet: Path | None = option(
         None, "PNG to write: intensity, AoLP and DoLP of up to eight views", metavar="PNG"
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportArguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    folder: Path = option(MISSING, "folder of one object or scene", positional=True, metavar="SET")
+    out: Path = option(MISSING, "folder to make", positional=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -324,6 +417,13 @@ COMMANDS = (
         groups=(EvaluateArguments, TerminalOptions),
     ),
     Command(
+        name="deviation",
+        help_text="how far a part is from its drawing, a scan or another run of it, and whether "
+        "that is within a tolerance",
+        run="polmvs.cli.deviations:deviation",
+        groups=(DeviationArguments, TerminalOptions),
+    ),
+    Command(
         name="sfm",
         help_text="the first stages alone: images and poses",
         run="polmvs.cli.jobs:sfm",
@@ -344,11 +444,21 @@ COMMANDS = (
         earlier=TO_NORMALS,
     ),
     Command(
-        name="export",
+        name="finish",
         help_text="mesh and COLMAP dense workspace, after 'densify'",
-        run="polmvs.cli.jobs:export",
+        run="polmvs.cli.jobs:finish",
         groups=(JobArguments, ModelChoice, ExportOptions, *EXECUTION),
         earlier=TO_CLOUD,
+    ),
+    Command(
+        name="export",
+        help_text="mesh, cloud or posed images of a finished run as other programs read them",
+        run="polmvs.cli.exports:export",
+        groups=(ExportArguments, TerminalOptions),
+        more="Formats: meshes ply, obj (with its .mtl), stl, glb; clouds cloud-ply, xyz, las, laz; "
+        "posed images, each in a folder: nerfstudio (transforms.json, for gsplat as well), neus "
+        "(cameras.npz, for IDR as well), metashape, realityscan, bundler. OpenMVS and COLMAP read "
+        "OUT/dense as it is.",
     ),
     Command(
         name="mesh",
@@ -385,6 +495,13 @@ COMMANDS = (
         help_text="what a capture's files are, how they are exposed, and pictures of them",
         run="polmvs.cli.captures:inspect",
         groups=(InspectArguments, CaptureOptions, FileOptions, TerminalOptions),
+    ),
+    Command(
+        name="import",
+        help_text="make a public set with cameras (ppa4p3d, PISR, PANDORA, NeRSP, SMVP3D, MVAS, "
+        "NeuS, TransPIR) ready for 'reconstruct', which does it by itself as well",
+        run="polmvs.cli.captures:import_set",
+        groups=(ImportArguments, CaptureOptions, FileOptions, TerminalOptions),
     ),
     Command(
         name="calibrate",

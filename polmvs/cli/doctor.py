@@ -76,7 +76,7 @@ def doctor(call: Call, terminal: Terminal) -> int:
         for finding in findings
     ]
     last = "all works" if works else "what is marked ! does not work"
-    terminal.show("\n".join([*lines, last]), {"works": works, "findings": findings})
+    terminal.show([*lines, last], {"works": works, "findings": findings})
     return 0 if works else 1
 
 

@@ -29,5 +29,5 @@ def experiment(call: Call, terminal: Terminal) -> int:
     ):
         report = run_experiment(name, scene, options, workers, on_progress)
     write_report(out, report)
-    terminal.show(f"{report.text}\n{out / name}.json", report.content)
+    terminal.show([*report.text.splitlines(), f"{out / name}.json"], report.content)
     return 0

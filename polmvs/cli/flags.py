@@ -282,6 +282,9 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
         common["name"] = (info.flag, "-v") if info.flag == "--verbose" else info.flag
     if info.kind is not bool:
         common["metavar"] = metavar_of(info)
+    if isinstance(info.kind, type) and issubclass(info.kind, StrEnum):
+        # cyclopts would read members by their names, with a hyphen between digit and letter.
+        common["name_transform"] = _choice_of_member
     kind: Any = info.kind
     place: Any = inspect.Parameter.KEYWORD_ONLY
     elements = typing.get_args(kind) if typing.get_origin(kind) is tuple else ()
@@ -291,6 +294,8 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
             kind, place = elements[0], inspect.Parameter.VAR_POSITIONAL
     elif kind is int:
         common["converter"] = _read_integer
+    if kind in (Path, Path | None):
+        common["converter"] = _read_path
     elif _is_list(kind):
         common |= {"converter": _several(elements[0]), "n_tokens": 1, "consume_multiple": True}
     elif elements and not _is_mixed(kind):
@@ -307,6 +312,10 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
         # Where pydantic happens to be loaded, cyclopts has it check the default as well.
         annotation=Annotated[kind | None if has_default else kind, Parameter(**common)],
     )
+
+
+def _choice_of_member(name: str) -> str:
+    return name.lower().replace("_", "-")
 
 
 def _is_mixed(kind: Any) -> bool:
@@ -328,6 +337,14 @@ def _read_integer(_: Any, tokens: Sequence[Token]) -> int:
         return int(text)
     except ValueError as error:
         raise ValueError(f"{text!r} cannot be read as {_name(int)}") from error
+
+
+def _read_path(_: Any, tokens: Sequence[Token]) -> Path:
+    """Reads a path; an empty one would be the current directory."""
+    text = tokens[0].value
+    if not text:
+        raise ValueError("'' is no path; the current directory is '.'")
+    return Path(text)
 
 
 def _one_list(kind: Any) -> Callable[[Any, Sequence[Token]], tuple[Any, ...]]:

@@ -21,12 +21,13 @@ from polmvs.cli.commands import (
 from polmvs.cli.flags import in_flags
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
-from polmvs.errors import PolmvsError
+from polmvs.errors import PolmvsError, printable
 from polmvs.evaluation.tables import best_fit_lines
 from polmvs.evaluation.trust import Trust
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.pipeline import jobs as pipeline
 from polmvs.pipeline.batch import TABLE_FILE, BatchRow, State, batch_table, read_batch, run_batch
+from polmvs.pipeline.data_set_import import as_capture
 from polmvs.pipeline.record import is_finished, read_options
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import Job
@@ -84,7 +85,7 @@ def sfm(call: Call, terminal: Terminal) -> int:
     text = (
         f"{outcome.run_folder.sparse}: {_views(outcome)} have a pose, {num_tracks:,} sparse points"
     )
-    terminal.show(text, _content(outcome, terminal))
+    terminal.show([text], _content(outcome, terminal))
     return 0
 
 
@@ -97,7 +98,7 @@ def normals(call: Call, terminal: Terminal) -> int:
         f"{outcome.run_folder.sparse_cloud(model)}: {found.num_normals:,} of "
         f"{found.num_tracks:,} sparse points have a normal, {seeds.num_seeds:,} are seeds"
     )
-    terminal.show(text, _content(outcome, terminal))
+    terminal.show([text], _content(outcome, terminal))
     return 0
 
 
@@ -108,10 +109,10 @@ def densify(call: Call, terminal: Terminal) -> int:
     return _show_cloud(outcome, model, terminal)
 
 
-def export(call: Call, terminal: Terminal) -> int:
-    """Run ``polmvs export``."""
+def finish(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs finish``."""
     model = call.get(ModelChoice).model
-    outcome = pipeline.export(job_of(call, terminal, continues=True), model)
+    outcome = pipeline.finish(job_of(call, terminal, continues=True), model)
     return _show_cloud(outcome, model, terminal)
 
 
@@ -129,10 +130,11 @@ def batch(call: Call, terminal: Terminal) -> int:
 
         rows = run_batch(entries, arguments.out, call.get(RunOptions), show)
     states = [row.state for row in rows]
-    text = f"{in_flags(batch_table(rows))}\n{arguments.out / TABLE_FILE}: " + ", ".join(
+    last = f"{arguments.out / TABLE_FILE}: " + ", ".join(
         f"{states.count(state)} {state}" for state in State if state in states
     )
-    terminal.show(text, {"out": arguments.out, "captures": rows})
+    lines = [*in_flags(batch_table(rows)).splitlines(), last]
+    terminal.show(lines, {"out": arguments.out, "captures": rows})
     if State.FAILED in states:
         return PolmvsError.exit_status
     return EMPTY_STATUS if State.EMPTY in states else 0
@@ -171,10 +173,11 @@ def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> Job:
         named = any(option.startswith("reference.") for option in call.given)
         if named and not is_finished(run_folder, "poses"):
             recorded = {name: group for name, group in recorded.items() if name != "reference"}
+    capture, options = as_capture(arguments.capture, arguments.out, call.options(recorded))
     return Job(
-        capture=arguments.capture,
+        capture=capture,
         out=arguments.out,
-        options=call.options(recorded),
+        options=options,
         run_options=run_options,
         monitor=terminal,
         command_line=call.command_line,
@@ -198,7 +201,7 @@ def _show_cloud(outcome: pipeline.JobOutcome, model: AngleModel, terminal: Termi
     trust = outcome.record.find(Trust, model)
     if trust is not None and cloud.num_points:
         lines += map(str, trust.figures())
-    terminal.show(in_flags("\n".join(lines)), _content(outcome, terminal))
+    terminal.show([in_flags(line) for line in lines], _content(outcome, terminal))
     return _status(outcome, terminal)
 
 
@@ -207,8 +210,8 @@ def _show_comparison(outcome: pipeline.JobOutcome, terminal: Terminal) -> int:
     assert comparison is not None
     clouds = ", ".join(f"{model}.ply" for model in comparison.models)
     last = f"{outcome.run_folder.root}: {clouds}, metrics.json, summary.md; {_views(outcome)}"
-    lines = [comparison.table(), *best_fit_lines(comparison), last]
-    terminal.show("\n".join(lines), {**_content(outcome, terminal), "metrics": comparison})
+    lines = [*comparison.table().splitlines(), *best_fit_lines(comparison), last]
+    terminal.show(lines, {**_content(outcome, terminal), "metrics": comparison})
     return _status(outcome, terminal)
 
 
@@ -232,5 +235,5 @@ def _status(outcome: pipeline.JobOutcome, terminal: Terminal) -> int:
     if outcome.empty is None:
         return 0
     terminal.repeat_warnings()
-    print(f"polmvs: {in_flags(outcome.empty)}", file=sys.stderr)
+    print(f"polmvs: {printable(in_flags(outcome.empty))}", file=sys.stderr)
     return EMPTY_STATUS

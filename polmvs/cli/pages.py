@@ -38,7 +38,7 @@ def report(call: Call, terminal: Terminal) -> int:
     if recording is not None:
         make_recording(folder, recording, terminal)
         shown["recording"] = str(recording)
-    terminal.show("\n".join(shown.values()), shown)
+    terminal.show(list(shown.values()), shown)
     return 0
 
 
@@ -75,11 +75,11 @@ def view(call: Call, terminal: Terminal) -> int:
     if not files:
         raise DataError(folder.root, "has no cloud to show. Run 'polmvs densify' first.")
     if _shown(files):
-        terminal.show("\n".join(map(str, files)), {"shown": files})
+        terminal.show(list(map(str, files)), {"shown": files})
         return 0
     page = folder.report if folder.report.is_file() else make_report(folder, terminal)
     terminal.show(
-        f"there is no display here to open a window on; {page} shows the same in a browser",
+        [f"there is no display here to open a window on; {page} shows the same in a browser"],
         {"report": page},
     )
     return 0
@@ -123,7 +123,7 @@ def render(call: Call, terminal: Terminal) -> int:
         plain=arguments.plain,
     )
     write_png(arguments.picture, np.ascontiguousarray(sheet[..., ::-1]))  # OpenCV counts BGR
-    terminal.show(str(arguments.picture), {"picture": arguments.picture})
+    terminal.show([str(arguments.picture)], {"picture": arguments.picture})
     return 0
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
@@ -14,7 +12,7 @@ from typing import Any
 from polmvs.cli import INTERRUPTED, interrupts
 from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.flags import Command, UsageError, in_flags, parse
-from polmvs.errors import OptionError, PolmvsError
+from polmvs.errors import OptionError, PolmvsError, final_name, printable
 
 logger = logging.getLogger(__name__)
 
@@ -67,15 +65,7 @@ def _function(command: Command) -> Callable[[Call, Any], int]:
         return command.run
     module, _, name = command.run.partition(":")
     function: Callable[[Call, Any], int] = getattr(import_module(module), name)
-    keep_sigterm()
     return function
-
-
-def keep_sigterm() -> None:
-    """Take SIGTERM back from COLMAP's log, which takes it when it is imported."""
-    handler = signal.getsignal(signal.SIGTERM)
-    if handler is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, handler)
 
 
 def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
@@ -95,7 +85,7 @@ def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
         return 1
     except OSError as error:
         _trace(logging.DEBUG)
-        place = f"{error.filename}: " if error.filename else ""
+        place = f"{final_name(error.filename)}: " if error.filename else ""
         _complain(terminal, prog, f"error: {place}{error.strerror or error}.")
         return 1
     except ImportError as error:  # of a package, or of a library of the system that it needs
@@ -144,4 +134,4 @@ def _complain(terminal: Any, prog: str, message: str) -> None:
 
 
 def _print(prog: str, line: str) -> None:
-    print(f"{prog}: {line}", file=sys.stderr)
+    print(f"{prog}: {printable(line)}", file=sys.stderr)

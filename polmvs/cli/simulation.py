@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 from polmvs.cli.call import Call
 from polmvs.cli.commands import PlanArguments, SimulateArguments
 from polmvs.cli.terminal import Terminal
@@ -36,7 +38,9 @@ def simulate(call: Call, terminal: Terminal) -> int:
             call.get(SimulationRun),
             on_progress=on_progress,
         )
-    terminal.show("\n".join(made.lines), made)
+    camera, config = made.folder / "camera.txt", made.folder / "capture.toml"
+    words = ["polmvs", "reconstruct", made.folder, "RUN", "--camera", camera, "--config", config]
+    terminal.show([*made.lines, f"next: {shlex.join(map(str, words))}"], made)
     return 0
 
 

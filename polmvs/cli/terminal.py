@@ -6,7 +6,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import TextIOWrapper
@@ -16,17 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 from polmvs.cli.call import TerminalOptions
 from polmvs.cli.flags import in_flags
-from polmvs.cli.running import keep_sigterm
 from polmvs.config import to_plain
-from polmvs.errors import DataError
+from polmvs.errors import DataError, printable
 from polmvs.parallel import OnProgress, no_progress
+from polmvs.pipeline.log_format import LogFormatter
 
 if TYPE_CHECKING:  # heavy
     from rich.console import Console
 
     from polmvs.pipeline.run_folder import RunFolder
-
-LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 package_logger = logging.getLogger("polmvs")
 
@@ -122,6 +120,7 @@ class Terminal:
         """A line on stderr, which does not break the progress bar."""
         if self._silent:
             return
+        text = printable(text)
         if self._console is not None:
             self._console.print(text, markup=False, highlight=False, soft_wrap=True)
         else:
@@ -142,26 +141,30 @@ class Terminal:
                 self.say(f"  {text}")
         self._unrepeated = []
 
-    def show(self, text: str, content: Any) -> None:
+    def show(self, text: str | Sequence[str], content: Any) -> None:
         """The result of the command, on stdout.
 
         Parameters
         ----------
-        text : for people.
+        text : for people; a text keeps its lines, of several each is one, whatever names it holds.
         content : the same for machines: a dataclass, or what JSON can hold.
         """
-        print(json.dumps(to_plain(content), indent=1) if self.options.json else text)
+        if self.options.json:
+            print(json.dumps(to_plain(content), indent=1))
+        elif isinstance(text, str):
+            print(printable(text, keep="\n"))
+        else:
+            print("\n".join(map(printable, text)))
 
     def opened(self, run_folder: RunFolder) -> None:
         """Log into the output folder from now on."""
-        keep_sigterm()
         self.log = run_folder.log
         try:
             handler = _LogFileHandler(run_folder.log, encoding="utf-8")
         except OSError as error:
             reason = f"cannot be written: {error.strerror or error}."
             raise DataError(run_folder.log, reason) from error
-        handler.setFormatter(logging.Formatter(LOG_FORMAT))
+        handler.setFormatter(LogFormatter())
         self._add(handler)
 
     @contextmanager

@@ -90,7 +90,7 @@ def camera_uncertainty(
     center = np.array([camera.width / 2, camera.height / 2])
     freed = not np.array_equal(np.asarray(camera.params)[point], center)
     estimated = names if freed else [i for i in names if i not in point]
-    covariance = _parameter_covariance(reconstruction, camera, estimated, freed, tolerances)
+    covariance = parameter_covariance(reconstruction, camera, estimated, freed, tolerances)
     if covariance is None:
         return None
     modes = []
@@ -129,7 +129,7 @@ def pose_uncertainty(
     if reconstruction.num_reg_images() > tolerances.max_views:
         return None
     images = registered(reconstruction)
-    adjuster = _adjuster(reconstruction, tolerances, free=False, free_point=False)
+    adjuster = adjuster_of(reconstruction, tolerances, free=False, free_point=False)
     options = pycolmap.BACovarianceOptions()
     options.params = pycolmap.BACovarianceOptionsParams.POSES
     found = pycolmap.estimate_ba_covariance(options, reconstruction, adjuster)
@@ -205,12 +205,12 @@ def _mode(
     moved_camera = next(iter(moved.cameras.values()))
     before = moved_camera.mean_focal_length()
     moved_camera.params = moved_camera.params + step
-    _adjuster(moved, t, free=free, free_point=False).solve()
+    adjuster_of(moved, t, free=free, free_point=False).solve()
     change = moved_camera.mean_focal_length() - before
     return _displacements(reconstruction, moved), float(change)
 
 
-def _parameter_covariance(
+def parameter_covariance(
     reconstruction: pycolmap.Reconstruction,
     camera: pycolmap.Camera,
     estimated: list[int],
@@ -218,7 +218,7 @@ def _parameter_covariance(
     t: CameraTolerances,
 ) -> Array | None:
     """Covariance of the estimated parameters of the camera, in their units; None if it has none."""
-    adjuster = _adjuster(reconstruction, t, free=True, free_point=freed)
+    adjuster = adjuster_of(reconstruction, t, free=True, free_point=freed)
     found = pycolmap.estimate_ba_covariance(
         pycolmap.BACovarianceOptions(), reconstruction, adjuster
     )
@@ -238,13 +238,14 @@ def _principal_steps(covariance: Array) -> Array:
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0))).T * scale, np.float64)
 
 
-def _adjuster(
+def adjuster_of(
     reconstruction: pycolmap.Reconstruction,
     t: CameraTolerances,
     *,
     free: bool,
     free_point: bool,
 ) -> pycolmap.CeresBundleAdjuster:
+    """An adjuster of all images: of the camera too, and of its principal point, where free."""
     bundle, config = bundle_of(
         reconstruction, t.loss_scale_px, free_intrinsics=free, free_principal_point=free_point
     )

@@ -31,7 +31,7 @@ from polmvs.colmap.dense_workspace import (
 )
 from polmvs.colmap.maps import DepthNormals
 from polmvs.errors import DataError, OptionError, as_data_error
-from polmvs.io.folders import new_folder
+from polmvs.io.folders import new_folder, resolved
 
 # Depth and normals of an image in the workspace's pixels by name, None for none.
 FillLoader = Callable[[str], DepthNormals | None]
@@ -96,8 +96,8 @@ def fill_workspace(
             staged = scratch / STEREO
             _write_filled(source, staged, load_fill)
             return _swap_in(staged, source.stereo)
-    folder = source.folder.resolve()
-    if folder == Path(target).resolve() or folder in Path(target).resolve().parents:
+    folder, place = resolved(source.folder), resolved(Path(target))
+    if folder == place or folder in place.parents:
         raise OptionError(f"{target} lies in the workspace; choose another folder or in_place.")
     with new_folder(target) as root:
         for name in (IMAGES, SPARSE, STEREO):

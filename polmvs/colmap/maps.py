@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import re
 from os import PathLike
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +24,7 @@ from polmvs.camera import PinholeCamera
 from polmvs.errors import DataError, as_data_error
 from polmvs.geometry import dots, lengths
 from polmvs.io.images import write_bytes
+from polmvs.io.plain_files import open_plain
 
 Image = NDArray[np.float32]
 PathArg = str | PathLike[str]
@@ -191,7 +191,7 @@ def _check(path: PathArg, camera: PinholeCamera, kind: str) -> None:
 def _read_header(path: PathArg) -> tuple[tuple[int, int, int], int, int]:
     """Width, height and channels; where the samples start; length of the file in bytes."""
     try:
-        with Path(path).open("rb") as file:
+        with open_plain(path) as file:
             head = file.read(HEADER_BYTES)
             num_bytes = file.seek(0, 2)
     except FileNotFoundError as error:

@@ -35,6 +35,7 @@ from polmvs.colmap.cameras import (
 from polmvs.errors import MAX_QUOTED, DataError, as_data_error
 from polmvs.geometry import RigidTransform, nearest_rotation
 from polmvs.io.folders import new_folder, require_unicode
+from polmvs.io.plain_files import open_plain, require_plain
 from polmvs.scene import MAX_COORDINATE, SparseModel, Tracks, View, match_names, short_list
 
 PathArg = str | PathLike[str]
@@ -134,6 +135,10 @@ def read_reconstruction(path: PathArg) -> pycolmap.Reconstruction:
 
 
 def _open(folder: Path) -> pycolmap.Reconstruction:
+    for path in folder.iterdir():
+        if path.stem in (*MODEL_FILES, "rigs", "frames"):
+            with as_data_error(path, "read"):
+                require_plain(path)
     if _model_suffix(folder) == ".bin":
         check_binary_model(folder)
     with quiet_colmap():
@@ -553,7 +558,7 @@ def _check_file(path: Path, record_end: Reader) -> None:
 def _mapped(path: Path) -> Iterator[mmap.mmap]:
     """The bytes of a file."""
     with (
-        path.open("rb") as file,
+        open_plain(path) as file,
         mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
     ):
         yield data

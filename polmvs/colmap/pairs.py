@@ -23,6 +23,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from polmvs.config import PairChoice
 from polmvs.errors import DataError
+from polmvs.io.plain_files import read_text
 from polmvs.scene import find_name, short_list
 
 logger = logging.getLogger(__name__)
@@ -117,7 +118,7 @@ def read_pairs(path: Path, names: Sequence[str]) -> Pairs:
         nothing to match.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8"
         raise DataError(path, f"is no readable list of pairs ({reason}).") from error

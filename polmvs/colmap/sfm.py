@@ -39,6 +39,7 @@ from polmvs.colmap.models import (
     write_reconstruction,
 )
 from polmvs.colmap.pairs import choose_pairs, read_pairs
+from polmvs.colmap.static_features import take_out_static
 from polmvs.colmap.thinning import thin_database
 from polmvs.config import Mapper, SfmOptions
 from polmvs.errors import DataError, OptionError
@@ -156,6 +157,14 @@ def run_sfm(
         on_step("features")
         if given is None:
             _extract_features(database, image_folder, names, reader, options)
+            static = take_out_static(database) if options.static_background else None
+            if static is not None:
+                logger.warning(
+                    "a background stands still while the part turns: its features, %.0f %% of all, "
+                    "are left out. The poses are those of a camera that moves about the part; with "
+                    "`sfm.static_background` off all features are used.",
+                    100 * static,
+                )
         else:
             _take_database(given, database, reader, width, height, options)
         on_step("matching")

@@ -24,6 +24,7 @@ from polmvs.evaluation.truth_errors import (
 )
 from polmvs.io.clouds import Cloud, read_cloud
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
+from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import from_json, parse_json
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import Capture
@@ -260,7 +261,7 @@ def read_comparison(path: Path) -> Comparison:
         It is missing, no such file, or of another version.
     """
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(read_text(path))
         found = content.get("schema_version", 1)
         if found != SCHEMA_VERSION:
             raise DataError(

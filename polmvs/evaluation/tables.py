@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from polmvs.config import AngleModel
+from polmvs.errors import printable
 from polmvs.evaluation.metrics import AngleStats, CloudMetrics
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ NONE = "-"
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in Markdown, aligned for the eye; the first column is text, the others numbers."""
-    cells = [list(header), *[list(row) for row in rows]]
+    cells = [[printable(cell) for cell in row] for row in (header, *rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
     lines = [_line(row, widths) for row in cells]
     rule = ["-" * widths[0], *["-" * (width - 1) + ":" for width in widths[1:]]]

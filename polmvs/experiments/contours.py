@@ -32,6 +32,7 @@ from polmvs.experiments.data import (
 )
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.io.layouts import BoardTruth
+from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import nearest_points
 from polmvs.normals.estimator import solve_normals
@@ -433,7 +434,7 @@ def open_surface(truth: Truth) -> TrueSurface:
     scene_path = truth.folder / "scene.json"
     if scene_path.is_file():
         try:
-            surface = parse_json(scene_path.read_text(encoding="utf-8"))["surface"]
+            surface = parse_json(read_text(scene_path))["surface"]
             if surface["type"] == "plane":
                 return _plane(surface["normal"], surface["offset"])
         except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from polmvs.colmap.models import match_model_to_capture, read_model
 from polmvs.config import AngleModel, CaptureOptions, ExperimentOptions, Light, RegionOptions
 from polmvs.errors import DataError, OptionError
+from polmvs.io.folders import resolved
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.images import read_mask
 from polmvs.io.layouts import AUTHOR_OPTIONS, BoardTruth, is_author_layout, read_author_truth
@@ -336,7 +337,7 @@ def open_experiment(
 
 def _open_data(folder: Path, gt: Path | None, options: CaptureOptions) -> tuple[Capture, Truth]:
     if is_author_layout(folder):
-        if gt is not None and gt.resolve() != folder.resolve():
+        if gt is not None and resolved(gt) != resolved(folder):
             raise OptionError(
                 f"is {gt}, but {folder} brings its own truth. Leave it out.", field="experiment.gt"
             )
@@ -397,7 +398,7 @@ def require_apart(out: Path, capture: Path) -> None:
         It is a file.
     """
     places = [capture, *(capture / name for name in ("raw", "images", "cams", "gt"))]
-    if out.resolve() in [place.resolve() for place in places if place.exists()]:
+    if resolved(out) in [resolved(place) for place in places if place.exists()]:
         raise OptionError(f"{out}: OUT is a folder of the capture. Give another OUT.")
     if out.exists() and not out.is_dir():
         raise DataError(out, "is a file; OUT must be a folder.")

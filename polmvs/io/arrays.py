@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.io.images import write_bytes
+from polmvs.io.plain_files import require_plain
 
 MADE_AGAIN = "Delete it and give `run.resume`; what is gone is made again."
 
@@ -66,6 +67,7 @@ def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:
         If the file is missing, damaged or of another type.
     """
     try:
+        require_plain(path)
         stamp = path.stat().st_mtime_ns
         array = _map_array(path, stamp)
     except Exception as error:  # the header goes through Python's own parser

@@ -3,7 +3,8 @@
 Images directly in the folder, or in its ``raw`` where it has none, are raw mosaics, one a view,
 unless *all* their names end in
 
-- polarizer angles, the same set for every view: ``a_000 a_045 a_090 a_135``, ``a_0 a_60 a_120``;
+- polarizer angles, the same set for every view: ``a_000 a_045 a_090 a_135``, ``a_0 a_60 a_120``,
+  ``a-POL45deg``, ``a_I90``;
 - ``_s0 _s1 _s2``: Stokes images;
 - ``_aolp _dolp`` (``_aop _dop``) and ``_intensity`` (``_s0``): the three maps;
 - and before the suffix an exposure time, ``a_8ms`` or ``a_045_500us``: exposures of one view.
@@ -12,8 +13,10 @@ A folder without images may hold them in folders by angle (``pol000 pol045``, ``
 Stokes parameter (``s0 s1 s2``), by map (``aolp dolp image``), or by view (``left/I0.png``). Other
 names are given as a template (```capture.naming```).
 
-Numbers of frames look like angles. So an ending counts as an angle only if the whole set is one
-that polarizers are used at (``ANGLE_SETS``); any other needs the template or ```capture.kind```.
+Files with all three Stokes images each, arrays (H, W, 3), look like mosaics: ```capture.kind```
+says so. Numbers of frames look like angles. So an ending counts as an angle only if the whole set
+is one that polarizers are used at (``ANGLE_SETS``); any other needs the template or
+```capture.kind```.
 """
 
 from __future__ import annotations
@@ -56,6 +59,7 @@ MAX_FILES = 200_000
 MAX_NAME_BYTES = 255 - 24  # the limit of file systems, less room for the endings of results
 NOT_VIEWS = frozenset({"gt", "mask", "masks", "sparse", "cams", "stereo"})  # folders beside views
 
+_OF_ANGLE = r"(?i:I|P|pol|polarizer|angle)?[_-]?"  # words before an angle
 _END = r"\.(?P<suffix>[A-Za-z0-9]+)"
 _ANGLE = r"(?P<angle>\d{1,3}(?:\.\d+)?)"
 _EXPOSURE = r"(?:[_-](?:exp|t)?(?P<exposure>\d+(?:\.\d+)?)(?P<unit>us|ms|s))?"
@@ -63,7 +67,7 @@ _VIEW = r"(?P<view>[^/]+?)"
 _MAP = r"(?P<map>aolp|aop|dolp|dop|intensity|image|s0)"
 # Names within one folder, most specific first. That of mosaics fits every name.
 _FLAT = (
-    (CaptureKind.ANGLES, rf"{_VIEW}[_-](?:I|pol|p)?{_ANGLE}(?:deg)?{_EXPOSURE}{_END}"),
+    (CaptureKind.ANGLES, rf"{_VIEW}[_-]{_OF_ANGLE}{_ANGLE}(?i:deg)?{_EXPOSURE}{_END}"),
     (CaptureKind.STOKES, rf"{_VIEW}[_-](?P<stokes>[sS][012]){_END}"),
     (CaptureKind.AOLP, rf"{_VIEW}[_-]{_MAP}{_END}"),
     (CaptureKind.MOSAIC, rf"{_VIEW}{_EXPOSURE}{_END}"),
@@ -72,8 +76,8 @@ _FLAT = (
 _FOLDERS = (
     (CaptureKind.STOKES, rf"(?:images_)?(?P<stokes>[sS][012])/{_VIEW}{_END}"),
     (CaptureKind.AOLP, rf"{_MAP}/{_VIEW}{_END}"),
-    (CaptureKind.ANGLES, rf"(?:I|pol|angle)?_?{_ANGLE}/{_VIEW}{_EXPOSURE}{_END}"),
-    (CaptureKind.ANGLES, rf"{_VIEW}/(?:I|pol|angle)?_?{_ANGLE}(?:deg)?{_EXPOSURE}{_END}"),
+    (CaptureKind.ANGLES, rf"{_OF_ANGLE}{_ANGLE}(?i:deg)?/{_VIEW}{_EXPOSURE}{_END}"),
+    (CaptureKind.ANGLES, rf"{_VIEW}/{_OF_ANGLE}{_ANGLE}(?i:deg)?{_EXPOSURE}{_END}"),
 )
 _TOKENS = {
     "view": r"(?P<view>.+?)",
@@ -197,6 +201,8 @@ def _flat(
             # Names of mosaics are any; the others count if all files have them.
             if named and len(named) == len(files) and _is_complete(its_kind, named):
                 return _assemble(folder, its_kind, named)
+    if kind is CaptureKind.STOKES:  # all three in each file
+        return _assemble(folder, kind, _match(place, files, rf"{_VIEW}{_END}"))
     raise DataError(
         place,
         f"its files' names are not those of a capture of kind {kind}. Say by `capture.naming` how "

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.errors import DataError, PolmvsError
+from polmvs.errors import DataError, PolmvsError, as_data_error
 from polmvs.io.open3d_import import import_open3d
 from polmvs.io.ply import read_ply, read_ply_header, write_ply
 from polmvs.scene import MAX_COORDINATE
@@ -277,6 +277,42 @@ def write_mesh(path: str | Path, mesh: Mesh) -> None:
     if mesh.colors is not None:
         columns |= dict(zip(COLORS, mesh.colors.T, strict=True))
     write_ply(Path(path), columns, mesh.triangles)
+
+
+FOREIGN_MESHES = frozenset({".stl", ".obj", ".glb", ".gltf", ".off"})
+
+
+def read_any_mesh(path: str | Path) -> Mesh:
+    """Read a mesh of another program: STL, OBJ, GLB, OFF, or PLY; corners at one place are joined.
+
+    Raises
+    ------
+    DataError
+        The file is missing, of none of these types, damaged, or holds no faces.
+    """
+    source = Path(path)
+    if source.suffix.lower() == ".ply":
+        return read_mesh(source)
+    if source.suffix.lower() not in FOREIGN_MESHES:
+        raise DataError(source, f"is no mesh: .ply, {', '.join(sorted(FOREIGN_MESHES))} are read.")
+    with as_data_error(source, "read"):
+        empty = source.stat().st_size == 0
+    o3d = import_open3d()
+    quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
+    with quiet, _unprinted():
+        found = o3d.geometry.TriangleMesh() if empty else o3d.io.read_triangle_mesh(str(source))
+    if not len(found.triangles):
+        raise DataError(source, "holds no faces that can be read. Export it again.")
+    found.remove_duplicated_vertices()
+    found.compute_vertex_normals()
+    vertices = np.array(found.vertices, np.float64)
+    if not (np.abs(vertices) <= MAX_COORDINATE).all():
+        raise DataError(source, "has vertices that are not finite. Export it again.")
+    return Mesh(
+        vertices=vertices,
+        normals=np.array(found.vertex_normals, np.float64),
+        triangles=np.array(found.triangles, np.int32),
+    )
 
 
 def read_mesh(path: str | Path) -> Mesh:

@@ -6,14 +6,19 @@
                       ``intrinsics.npz``, ``cameras_sphere.npz``, ``gamma<value>.txt``
 ``PANDORA``           ``images_stokes/NAME_{s0,s0p1,s0p2}.hdr`` with s1 = s0p1 - s0, s2 = s0p2 - s0,
                       or ``images_raw/`` dumps of Mono12p; ``mask/``; ``sparse/0``
-``NeRSP``             ``s0/ s1/ s2/`` arrays; ``cameras.npz``; masks in the alpha of
-                      ``input_azimuth_maps/``
+``NeRSP``, SMVP3D     ``s0/ s1/ s2/`` arrays; ``cameras.npz``; masks in the alpha of
+                      ``input_azimuth_maps/``, or in ``mask/``
+``NeuS``              cameras as below beside any capture: mosaics, an image for each polarizer
+                      angle (``raw/NAME_045.png``), Stokes images; ``mask/`` or ``masks/``
+``TransPIR``          ``I-00/ I-45/ I-90/ I-135/``, or ``s0/ s1/ s2/`` with ``I-sum/``;
+                      ``cameras_new.npz``; ``masks/NAME_pseudo.png``
 ``MVAS``              ``input_azimuth_maps/`` (16 bit, pi a full scale, clockwise), ``mask/`` or
                       alpha, ``sparse/0``
 ====================  ===========================================================================
 
-``cameras.npz`` and ``cameras_sphere.npz`` are those of IDR and NeuS: ``world_mat_<i or name>`` is
-the projection ``K [R t]`` (4x4), pixels counted from the centre of the first.
+``cameras.npz``, ``cameras_sphere.npz`` and ``cameras_new.npz`` are those of IDR and NeuS:
+``world_mat_<i or name>`` is the projection ``K [R t]`` (4x4), pixels counted from the centre of the
+first.
 
 A set is described by :class:`DataSet`; what is not in a form that a capture is read from (PANDORA's
 images, azimuth maps) is converted to Stokes images by :func:`load_converted`.
@@ -22,8 +27,9 @@ images, azimuth maps) is converted to Stokes images by :func:`load_converted`.
 from __future__ import annotations
 
 import re
+import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,18 +39,31 @@ from numpy.typing import NDArray
 from scipy.linalg import rq
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import BayerOrder, CaptureKind, CaptureOptions, Light, Packing
+from polmvs.config import (
+    BayerOrder,
+    CaptureKind,
+    CaptureOptions,
+    Light,
+    Packing,
+    Resolution,
+    describe_fields,
+)
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation
+from polmvs.io.capture_files import find_capture
 from polmvs.io.images import decode_image, read_bytes
 from polmvs.io.intrinsics import Intrinsics, from_opencv_matrix
 from polmvs.io.layouts import is_author_layout, read_author_views
-from polmvs.io.raw_formats import read_raw
+from polmvs.io.plain_files import open_plain
+from polmvs.io.raw_formats import read_npy, read_raw
+from polmvs.scene import stem_of
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+BAYER = BayerOrder.RGGB  # of raw colour mosaics, where nothing else is given
+CAMERA_FILES = ("cameras.npz", "cameras_sphere.npz", "cameras_new.npz")
 PANDORA_SIZE = (2448, 2048)  # of its dumps, px
 MAX_NPZ_BYTES = 1 << 28
 
@@ -57,6 +76,8 @@ class DataSetKind(StrEnum):
     PANDORA = "PANDORA"
     NERSP = "NeRSP"
     MVAS = "MVAS"
+    TRANSPIR = "TransPIR"
+    NEUS = "NeuS"
 
 
 class PosedImage(NamedTuple):
@@ -111,24 +132,29 @@ def recognise_data_set(folder: Path) -> DataSetKind | None:
 
     if is_author_layout(folder):
         return DataSetKind.PPA4P3D
-    if has("cameras_sphere.npz") and (has("raw") or has("aop", "dop")):
+    pisr = has("cameras_sphere.npz", "intrinsics.npz")
+    if pisr and (has("raw") or has("aop", "dop")):
         return DataSetKind.PISR
     if has("images_stokes") or has("images_raw", "sparse"):
         return DataSetKind.PANDORA
-    if has("s0", "s1", "s2"):
+    posed = any(has(name) for name in CAMERA_FILES)
+    if has("cameras_new.npz", "I-sum") and (has("I-00") or has("s0")):
+        return DataSetKind.TRANSPIR
+    if has("s0", "s1", "s2") and (posed or has("input_azimuth_maps")):
         return DataSetKind.NERSP
     if has("input_azimuth_maps"):
         return DataSetKind.MVAS
-    return None
+    return DataSetKind.NEUS if posed else None
 
 
-def read_data_set(folder: Path, bayer: BayerOrder = BayerOrder.RGGB) -> DataSet:
+def read_data_set(folder: Path, options: CaptureOptions | None = None) -> DataSet:
     """Describe a public set.
 
     Parameters
     ----------
     folder : of one object or scene.
-    bayer : colours of raw colour mosaics, which no set says.
+    options : what is not the default goes before what the set's layout says; ``bayer``, the
+        colours of raw colour mosaics, no set says: by default RGGB.
 
     Raises
     ------
@@ -144,11 +170,23 @@ def read_data_set(folder: Path, bayer: BayerOrder = BayerOrder.RGGB) -> DataSet:
         DataSetKind.PANDORA: _read_pandora,
         DataSetKind.NERSP: _read_nersp,
         DataSetKind.MVAS: _read_mvas,
+        DataSetKind.TRANSPIR: _read_neus,
+        DataSetKind.NEUS: _read_neus,
     }
     if kind is None:
         known = ", ".join(DataSetKind)
         raise DataError(folder, f"has the layout of no set that is known ({known}).")
-    return readers[kind](folder, bayer)
+    given = options or CaptureOptions()
+    found = readers[kind](folder, given)
+    return replace(found, options=_overridden(found.options, given))
+
+
+def _overridden(options: CaptureOptions, given: CaptureOptions) -> CaptureOptions:
+    """Options with those of others that are not the defaults."""
+    default = CaptureOptions()
+    names = [info.name for info in describe_fields(CaptureOptions)]
+    changed = {n: getattr(given, n) for n in names if getattr(given, n) != getattr(default, n)}
+    return replace(options, **changed)
 
 
 def load_converted(data_set: DataSet, stem: str) -> tuple[Image, Image, Image]:
@@ -192,7 +230,7 @@ def read_set_mask(path: Path) -> Mask:
     return np.asarray((image != 0).any(axis=-1))
 
 
-def _read_ppa4p3d(folder: Path, bayer: BayerOrder) -> DataSet:
+def _read_ppa4p3d(folder: Path, given: CaptureOptions) -> DataSet:
     images = _files(folder / "images", (".png",))
     width, height = _size_of(next(iter(images.values())))
     cameras = []
@@ -217,7 +255,7 @@ def _read_ppa4p3d(folder: Path, bayer: BayerOrder) -> DataSet:
     )
 
 
-def _read_pisr(folder: Path, bayer: BayerOrder) -> DataSet:
+def _read_pisr(folder: Path, given: CaptureOptions) -> DataSet:
     raw = (folder / "raw").is_dir()
     images = _files(folder / ("raw" if raw else "aop"), (".npy",))
     gamma = 1.0
@@ -243,7 +281,7 @@ def _read_pisr(folder: Path, bayer: BayerOrder) -> DataSet:
     ]
     options = CaptureOptions(kind=CaptureKind.AOLP)
     if raw:
-        options = CaptureOptions(gamma=gamma, bayer=bayer, full_scale=4095)
+        options = CaptureOptions(gamma=gamma, bayer=given.bayer or BAYER, full_scale=4095)
     return DataSet(
         kind=DataSetKind.PISR,
         folder=folder,
@@ -255,7 +293,7 @@ def _read_pisr(folder: Path, bayer: BayerOrder) -> DataSet:
     )
 
 
-def _read_pandora(folder: Path, bayer: BayerOrder) -> DataSet:
+def _read_pandora(folder: Path, given: CaptureOptions) -> DataSet:
     stokes = (folder / "images_stokes").is_dir()
     if stokes:
         found = _files(folder / "images_stokes", (".hdr", ".exr"))
@@ -271,8 +309,8 @@ def _read_pandora(folder: Path, bayer: BayerOrder) -> DataSet:
     options = CaptureOptions(full_scale=1.0)
     if not stokes:
         options = CaptureOptions(
-            width=PANDORA_SIZE[0], height=PANDORA_SIZE[1], packing=Packing.MONO12P, bayer=bayer,
-            full_scale=4095,
+            width=PANDORA_SIZE[0], height=PANDORA_SIZE[1], packing=Packing.MONO12P,
+            bayer=given.bayer or BAYER, full_scale=4095,
         )  # fmt: skip
     return DataSet(
         kind=DataSetKind.PANDORA,
@@ -285,7 +323,7 @@ def _read_pandora(folder: Path, bayer: BayerOrder) -> DataSet:
     )
 
 
-def _read_nersp(folder: Path, bayer: BayerOrder) -> DataSet:
+def _read_nersp(folder: Path, given: CaptureOptions) -> DataSet:
     images = _files(folder / "s0", (".npy",))
     width, height = _size_of(next(iter(images.values())))
     return DataSet(
@@ -294,13 +332,50 @@ def _read_nersp(folder: Path, bayer: BayerOrder) -> DataSet:
         capture=folder,
         options=CaptureOptions(kind=CaptureKind.STOKES),
         names=tuple(images),
-        cameras=_read_world_mats(folder / "cameras.npz", tuple(images), width, height),
-        masks=_files(folder / "input_azimuth_maps", (".png",), needed=False)
-        or _files(folder / "mask", (".png",), needed=False),
+        cameras=_read_world_mats(_camera_file(folder), tuple(images), width, height),
+        masks=_files(folder / "input_azimuth_maps", (".png",), needed=False) or _masks_of(folder),
     )
 
 
-def _read_mvas(folder: Path, bayer: BayerOrder) -> DataSet:
+def _read_neus(folder: Path, given: CaptureOptions) -> DataSet:
+    """Cameras of IDR and NeuS beside any capture."""
+    stokes = all((folder / name).is_dir() for name in ("s0", "s1", "s2"))
+    kind = given.kind or (CaptureKind.STOKES if stokes else None)
+    files = find_capture(folder, kind=kind, naming=given.naming, angles=given.angles)
+    stems = tuple(stem_of(view.name) for view in files.views)
+    width, height = _size_of(files.paths[0])
+    if files.kind is CaptureKind.MOSAIC and given.resolution is Resolution.HALF:
+        width, height = width // 2, height // 2
+    cameras = _read_world_mats(_camera_file(folder), stems, width, height)
+    masks = _masks_of(folder)
+    return DataSet(
+        kind=recognise_data_set(folder) or DataSetKind.NEUS,
+        folder=folder,
+        capture=folder,
+        options=CaptureOptions(kind=files.kind),
+        names=stems,
+        cameras=cameras,
+        # Some sets have masks of a few images only.
+        masks=masks if set(stems) <= masks.keys() else {},
+    )
+
+
+def _camera_file(folder: Path) -> Path:
+    """The first of the files of cameras that a set has; the first name where it has none."""
+    places = [folder / name for name in CAMERA_FILES]
+    return next((place for place in places if place.is_file()), places[0])
+
+
+def _masks_of(folder: Path) -> dict[str, Path]:
+    """Masks by the stem of their image, which a word may follow: ``000_pseudo.png``."""
+    for name in ("mask", "masks"):
+        found = _files(folder / name, (".png",), needed=False)
+        if found:
+            return {re.sub(r"_(pseudo|mask)$", "", stem): path for stem, path in found.items()}
+    return {}
+
+
+def _read_mvas(folder: Path, given: CaptureOptions) -> DataSet:
     images = _files(folder / "input_azimuth_maps", (".png",))
     masks = _files(folder / "mask", (".png",), needed=False)
     return DataSet(
@@ -375,10 +450,17 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
         The file is missing, damaged or too large.
     """
     try:
-        if path.stat().st_size > MAX_NPZ_BYTES:
-            raise DataError(path, "is too large for cameras.")
-        with np.load(path, allow_pickle=False) as content:
-            return {name: content[name] for name in content.files}
+        with open_plain(path) as file, zipfile.ZipFile(file) as content:
+            members = content.infolist()
+            # What a member says of its size is all that is read of it.
+            if sum(member.file_size for member in members) > MAX_NPZ_BYTES:
+                raise DataError(path, "is too large for cameras.")
+            return {
+                member.filename.removesuffix(".npy"): read_npy(path, content.read(member))
+                for member in members
+            }
+    except DataError:
+        raise
     except OSError as error:
         raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
     except Exception as error:  # zipfile and NumPy's header parser raise many kinds
@@ -398,7 +480,8 @@ def _read_world_mats(
             raise DataError(path, f"has no {keys[0]} and no {keys[1]}.")
         try:
             matrix, pose = _decompose(_matrix(content[key], (4, 4), (3, 4))[:3])
-            intrinsics = from_opencv_matrix(_without_skew(matrix), [], width, height)
+            matrix = _at_size(_without_skew(matrix), width, height)
+            intrinsics = from_opencv_matrix(matrix, [], width, height)
         except ValueError as error:
             raise DataError(path, f"{key} is no camera: {error}.") from error
         cameras.append(PosedImage(f"{stem}.png", intrinsics, pose))
@@ -418,6 +501,22 @@ def _decompose(projection: Array) -> tuple[Array, RigidTransform]:
         raise ValueError("it holds no rotation")
     translation = np.linalg.solve(matrix, scaled[:, 3])
     return matrix / matrix[2, 2], RigidTransform(nearest, translation)
+
+
+def _at_size(matrix: Array, width: int, height: int) -> Array:
+    """A calibration matrix, pixels counted from the centre of the first, of images of a size.
+
+    One that is of the mosaics, whose sides are twice as long, has its principal point at the
+    images' lower right corner.
+    """
+    center = matrix[:2, 2] + 0.5
+    middle = 0.5 * np.array([width, height])
+    if np.linalg.norm(0.5 * center - middle) >= np.linalg.norm(center - middle):
+        return matrix
+    halved = 0.5 * matrix
+    halved[:2, 2] = 0.5 * center - 0.5
+    halved[2] = matrix[2]
+    return halved
 
 
 def _without_skew(matrix: Array) -> Array:

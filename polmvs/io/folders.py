@@ -28,6 +28,20 @@ def require_unicode(path: str | PathLike[str]) -> None:
         ) from error
 
 
+def resolved(path: Path) -> Path:
+    """A path without links.
+
+    Raises
+    ------
+    DataError
+        Its links lead in a circle.
+    """
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError) as error:  # the latter of Python 3.12 and earlier
+        raise DataError(path, "is a link that leads in a circle. Give another path.") from error
+
+
 @contextmanager
 def new_folder(folder: str | PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
     """A temporary folder beside a new one, which takes its name when all went well, else goes.

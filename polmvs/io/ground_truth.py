@@ -22,11 +22,15 @@ from numpy.typing import NDArray
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation, unit
-from polmvs.io.images import PNG_SIGNATURE, decode_image, read_bytes
+from polmvs.io.image_size import PNG_SIGNATURE
+from polmvs.io.images import decode_image, read_bytes
+from polmvs.io.plain_files import read_text
 from polmvs.io.raw_formats import read_npy
 from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import in_cells_beside, voxel_representatives
 from polmvs.scene import View, find_name, stem_of
+
+MAX_SIDE = 1 << 16  # px
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -214,15 +218,15 @@ def _read_png(path: Path) -> NDArray[np.generic]:
 def read_views(path: Path) -> dict[str, View]:
     """Views by image name of a ``cameras.json``; DataError where it is malformed."""
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        content = parse_json(read_text(path))
     except (OSError, ValueError) as error:
         raise DataError(path, f"cannot be read as JSON ({error}); {_REMEDY}.") from error
     try:
         width, height = int(content["width"]), int(content["height"])
         images = dict(content["images"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(path, f"needs integer width, height and images; {_REMEDY}.") from error
-    if not images or min(width, height) <= 0:
+    if not images or min(width, height) <= 0 or max(width, height) > MAX_SIDE:
         raise DataError(path, f"lists no image or no size; {_REMEDY}.")
     return {name: _parse_view(path, name, entry, width, height) for name, entry in images.items()}
 

@@ -13,7 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.config import MAX_PIXELS
 from polmvs.errors import DataError, as_data_error
+from polmvs.io.image_size import (
+    BROKEN,
+    PNG_SIGNATURE,
+    SCALE_DOWN,
+    declared_size,
+    require_size,
+)
+from polmvs.io.plain_files import open_plain
 from polmvs.io.temporary import remove_temporary, temporary_path
 
 PathArg: TypeAlias = str | PathLike[str]
@@ -21,8 +30,6 @@ PathArg: TypeAlias = str | PathLike[str]
 SILENT = 0  # OpenCV's log level
 PNG_CHANNELS = {2: 3, 4: 2, 6: 4}  # by colour type; 1 of all others
 DEFLATE_RATIO = 1032  # by which zlib compresses at the very best
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-BROKEN = "Copy it again from the camera or take it out of the folder."
 
 
 def read_mask(path: PathArg, shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -42,7 +49,7 @@ def read_mask(path: PathArg, shape: tuple[int, int]) -> NDArray[np.bool_]:
     DataError
         The file is missing, truncated, no image or of another size.
     """
-    image = decode_image(path, read_bytes(path))
+    image = decode_image(path, read_bytes(path), max_pixels=max(shape[0] * shape[1], MAX_PIXELS))
     height, width = image.shape[:2]
     if (height, width) != tuple(shape):
         raise DataError(
@@ -125,12 +132,17 @@ def write_png(path: PathArg, image: NDArray[Any]) -> None:
     DataError
         The system refuses, e.g. a full disk or a read-only folder.
     """
+    write_bytes(path, encode_png(image))
+
+
+def encode_png(image: NDArray[Any]) -> bytes:
+    """An image as :func:`write_png` takes it, as the bytes of a PNG."""
     if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or image.size == 0:
         raise ValueError(f"{image.dtype=}, {image.shape=} but expected a uint8 or uint16 image.")
-    encoded, data = cv2.imencode(".png", image)
+    encoded, data = cv2.imencode(".png", np.ascontiguousarray(image))
     if not encoded:
         raise ValueError(f"OpenCV cannot encode {image.shape=} as PNG.")
-    write_bytes(path, data.tobytes())
+    return bytes(data.tobytes())
 
 
 def write_bytes(path: PathArg, data: bytes) -> None:
@@ -154,10 +166,21 @@ def write_bytes(path: PathArg, data: bytes) -> None:
         remove_temporary(temporary)
 
 
-def read_bytes(path: PathArg) -> bytes:
-    """A file's content, or a ``DataError`` with the system's reason."""
+def read_bytes(path: PathArg, most: int | None = None) -> bytes:
+    """The content of a plain file, or a ``DataError`` with the system's reason.
+
+    Parameters
+    ----------
+    most : bytes that it may have.
+    """
     try:
-        data = Path(path).read_bytes()
+        with open_plain(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if most is not None and size > most:
+                raise DataError(
+                    path, f"has {size / 1e9:.1f} GB; the limit is {most / 1e9:.1f} GB. {SCALE_DOWN}"
+                )
+            data = file.read()
     except FileNotFoundError as error:
         raise DataError(path, "no such file.") from error
     except OSError as error:
@@ -173,10 +196,19 @@ def _set_log_level(level: int) -> int:
     return int(setter(level))
 
 
-def decode_image(path: PathArg, data: bytes) -> NDArray[Any]:
-    """Pixels of an encoded image, unchanged; OpenCV's own complaints are kept off the terminal."""
+def decode_image(
+    path: PathArg, data: bytes, *, max_pixels: int = MAX_PIXELS, remedy: str = SCALE_DOWN
+) -> NDArray[Any]:
+    """Pixels of an encoded image, unchanged; OpenCV's own complaints are kept off the terminal.
+
+    Parameters
+    ----------
+    max_pixels : that its header may declare.
+    remedy : what to do about one that declares more, a sentence.
+    """
     if data.startswith(PNG_SIGNATURE):
         check_png(path, data)
+    require_size(path, declared_size(path, data), max_pixels=max_pixels, remedy=remedy)
     level = _set_log_level(SILENT)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)

@@ -17,8 +17,9 @@ import numpy as np
 import yaml
 
 from polmvs.camera import PinholeCamera, xy_from_opencv
-from polmvs.errors import DataError, as_data_error
+from polmvs.errors import MAX_QUOTED, DataError, as_data_error
 from polmvs.io.images import write_bytes
+from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import parse_json
 
 # Parameters that scale with the image come first; all others are distortion.
@@ -37,6 +38,7 @@ COLMAP_MODELS = {
 LENGTHS = frozenset({"f", "fx", "fy", "cx", "cy"})
 MAX_ASPECT_CHANGE = 0.01  # of the image's sides, before a file is of another crop (rounding)
 MAX_BYTES = 1 << 20
+MAX_DEPTH = 4  # of lists in a matrix
 _MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "K", "intrinsic_matrix", "Camera_Matrix", "mtx")
 _DISTORTION_KEYS = (
     "distortion_coefficients", "dist_coeffs", "distCoeffs", "distortion_coeffs", "D", "dist",
@@ -120,7 +122,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
         with as_data_error(path, "read"):
             if path.stat().st_size > MAX_BYTES:
                 raise DataError(path, "is too large for a calibration file.")
-            text = path.read_text(encoding="utf-8")
+            text = read_text(path)
     except ValueError as error:
         raise DataError(
             path, "is no text file; give YAML, JSON or a COLMAP camera line."
@@ -130,7 +132,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
     content = _parse(path, text)
     if not isinstance(content, Mapping):
         raise DataError(path, "holds no camera: no OpenCV, ROS, Kalibr or COLMAP calibration.")
-    cameras = [value for key, value in content.items() if str(key).startswith("cam")]
+    cameras = [v for key, v in content.items() if isinstance(key, str) and key.startswith("cam")]
     kalibr = [c for c in cameras if isinstance(c, Mapping) and "intrinsics" in c]
     if kalibr:
         return _from_kalibr(path, kalibr[0])
@@ -238,7 +240,7 @@ def _from_colmap(path: Path, text: str) -> Intrinsics:
 
 def _from_kalibr(path: Path, camera: Mapping[str, Any]) -> Intrinsics:
     """The first camera of a camchain."""
-    model, lens = camera.get("camera_model"), camera.get("distortion_model", "none")
+    model, lens = _word(camera, "camera_model"), _word(camera, "distortion_model") or "none"
     try:
         if model != "pinhole":
             raise ValueError(f"its camera model {model!r} is none of COLMAP's")
@@ -252,7 +254,7 @@ def _from_kalibr(path: Path, camera: Mapping[str, Any]) -> Intrinsics:
         if lens not in ("radtan", "equidistant", "none"):
             raise ValueError(f"its distortion model {lens!r} is none of COLMAP's")
         return from_opencv_matrix(matrix, k, width, height, fisheye=lens == "equidistant")
-    except (ValueError, TypeError, KeyError, IndexError) as error:
+    except (ValueError, TypeError, KeyError, IndexError, OverflowError) as error:
         raise DataError(path, f"its Kalibr camera cannot be used: {error}.") from error
 
 
@@ -270,13 +272,19 @@ def _from_opencv(path: Path, content: Mapping[str, Any]) -> Intrinsics:
             width, height = int(size[0]), int(size[1])
         else:
             width, height = int(_first(content, _WIDTH_KEYS)), int(_first(content, _HEIGHT_KEYS))
-        lens = str(content.get("distortion_model", content.get("camera_model", "")))
+        lens = _word(content, "distortion_model") or _word(content, "camera_model")
         rows = [matrix[:3], matrix[3:6], matrix[6:]]
         fisheye = lens in ("equidistant", "fisheye")
         return from_opencv_matrix(rows, distortion, width, height, fisheye=fisheye)
     except (ValueError, TypeError, KeyError, IndexError, OverflowError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise DataError(path, f"holds no camera that can be used: {reason}.") from error
+
+
+def _word(content: Mapping[str, Any], key: str) -> str:
+    """A text; nothing else is shown, as YAML's aliases can make little text of any length."""
+    value = content.get(key)
+    return value[:MAX_QUOTED] if isinstance(value, str) else ""
 
 
 def _first(content: Mapping[str, Any], keys: tuple[str, ...]) -> Any:
@@ -286,13 +294,15 @@ def _first(content: Mapping[str, Any], keys: tuple[str, ...]) -> Any:
     raise KeyError(keys[0])
 
 
-def _numbers(value: Any) -> list[float]:
+def _numbers(value: Any, depth: int = 0) -> list[float]:
     """Numbers of a matrix: nested lists, or a mapping with ``data``."""
     if isinstance(value, Mapping):
         value = value["data"]
+    if depth > MAX_DEPTH:  # YAML's may hold themselves
+        raise ValueError("its matrix is nested too deeply")
     flat: list[float] = []
     for item in value:
-        flat.extend(_numbers(item) if isinstance(item, list) else [float(item)])
+        flat.extend(_numbers(item, depth + 1) if isinstance(item, list) else [float(item)])
         if len(flat) > 64:
             raise ValueError("its matrix has too many numbers")
     return flat

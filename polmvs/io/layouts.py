@@ -28,6 +28,7 @@ from polmvs.config import CaptureOptions
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation, points_on_rays
 from polmvs.io.images import read_bytes
+from polmvs.io.plain_files import read_text
 from polmvs.io.raw_formats import read_npy
 from polmvs.scene import View, stem_of
 
@@ -168,7 +169,7 @@ def read_camera_text(path: Path, name: str, width: int, height: int) -> View:
         The file is missing or malformed.
     """
     try:
-        words = path.read_text(encoding="ascii").split()
+        words = read_text(path, "ascii").split()
     except (OSError, ValueError) as error:
         raise DataError(
             path, f"no readable camera file ({error}); each image needs one."

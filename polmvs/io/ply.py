@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from polmvs.errors import MAX_QUOTED, DataError, as_data_error
 from polmvs.io.images import read_bytes, write_bytes
+from polmvs.io.plain_files import open_plain
 
 MAX_HEADER_BYTES = 1 << 16
 TYPES = {
@@ -117,7 +118,7 @@ def read_ply_header(path: Path) -> PlyHeader:
         The file is missing, no PLY, or too short for what it promises.
     """
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             head = file.read(MAX_HEADER_BYTES)
             size = file.seek(0, 2)
     except FileNotFoundError as error:

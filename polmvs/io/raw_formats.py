@@ -20,9 +20,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Packing
+from polmvs.config import MAX_PIXELS, Packing
 from polmvs.errors import DataError, OptionError
-from polmvs.io.images import BROKEN, PNG_SIGNATURE, PathArg, check_png, decode_image, read_bytes
+from polmvs.io.image_size import (
+    BIG_TIFF_SIGNATURES,
+    BROKEN,
+    BYTES_OF_PIXEL,
+    PNG_SIGNATURE,
+    SCALE_DOWN,
+    TIFF_SIGNATURES,
+    ImageSize,
+    declared_size,
+    require_size,
+)
+from polmvs.io.images import PathArg, check_png, decode_image, read_bytes
 
 DUMP_SUFFIXES = frozenset({".raw", ".bin"})
 LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg"})
@@ -32,10 +43,13 @@ SUFFIXES = frozenset(
     | FLOAT_SUFFIXES
 )
 MAX_DIMS = 8  # of an array
-MAX_PIXELS = 1 << 28  # of one file; the largest polarization sensors have 2^25
+RAISE_LIMIT = "Give `capture.max_pixels` if it is the right file."
+MAX_HEADER_BYTES = 1 << 20  # beside the samples
 PNG_GRAY = 0  # colour type of a monochrome PNG without alpha
 UPRIGHT = 1  # orientation tag of an image that is stored as it is shown
 TIFF_BITS, TIFF_COMPRESSION, TIFF_ORIENTATION = 258, 259, 274
+TIFF_SUBFILE, TIFF_REDUCED = 254, 1  # tag of what an image is for; bit of one that is a preview
+MAX_TIFF_PAGES = 1 << 16
 TIFF_JPEG = (6, 7)
 # Order of an 8x8 block's coefficients in a JPEG file, as (row, column).
 _ZIGZAG = sorted(
@@ -107,40 +121,66 @@ class RawHeader(NamedTuple):
     dtype: str
 
 
-def read_raw(path: PathArg, dump: DumpSize | None = None) -> RawImage:
+class _Limit(NamedTuple):
+    """What a file may declare, and what to do about one that declares more."""
+
+    max_pixels: int
+    remedy: str
+
+    @property
+    def most_bytes(self) -> int:
+        """Of the file; none that is read needs more than its samples and a header."""
+        return BYTES_OF_PIXEL * self.max_pixels + MAX_HEADER_BYTES
+
+
+def _limit(max_pixels: int | None) -> _Limit:
+    if max_pixels is None:
+        return _Limit(MAX_PIXELS, SCALE_DOWN)
+    return _Limit(max_pixels, RAISE_LIMIT)
+
+
+def read_raw(
+    path: PathArg, dump: DumpSize | None = None, *, max_pixels: int | None = None
+) -> RawImage:
     """Read an image's samples unchanged.
 
     Parameters
     ----------
     path : a file with one of ``SUFFIXES``; its content decides where it has a signature.
     dump : size and packing of a ``.raw`` or ``.bin`` file.
+    max_pixels : that a file of a capture may have; None for files that are none of a capture's.
 
     Raises
     ------
     DataError
-        The file is missing, damaged, or of a type that holds no intensities.
+        The file is missing, damaged, too large, or of a type that holds no intensities.
     OptionError
         A dump's size or packing is not given and does not follow from its length.
     """
     suffix = Path(path).suffix.lower()
-    data = read_bytes(path)
+    limit = _limit(max_pixels)
+    data = read_bytes(path, limit.most_bytes)
     if suffix in DUMP_SUFFIXES:
         return RawImage(unpack(path, data, dump if dump is not None else DumpSize()))
     if data.startswith(b"\x93NUMPY"):
-        return RawImage(_as_samples(path, read_npy(path, data)))
+        values = read_npy(path, data)
+        height, width = (*values.shape, 1, 1)[:2]
+        require_size(path, ImageSize(width, height, values.nbytes), **limit._asdict())
+        return RawImage(_as_samples(path, values))
     if data.startswith(b"v/1\x01"):
-        return RawImage(_as_samples(path, _read_exr(path)))
+        return RawImage(_as_samples(path, _read_exr(path, limit)))
     if data[:2] == b"P5":
+        require_size(path, declared_size(path, data), **limit._asdict())
         return _read_pgm(path, data)
-    if data[:4] in (b"II*\0", b"MM\0*"):
-        return _read_tiff(path, data)
-    samples = _colour_last(path, decode_image(path, data))
+    if data[:4] in (*TIFF_SIGNATURES, *BIG_TIFF_SIGNATURES):
+        return _read_tiff(path, data, limit)
+    samples = _colour_last(path, decode_image(path, data, **limit._asdict()))
     if data[:2] == b"\xff\xd8":
         return RawImage(samples, quantization=_luminance_steps(path, data), lossy=True)
     return RawImage(samples)
 
 
-def probe_raw(path: PathArg, dump: DumpSize | None = None) -> RawHeader | None:
+def probe_raw(path: PathArg, *, max_pixels: int | None = None) -> RawHeader | None:
     """Size and type of a monochrome PNG without decoding it; None of all other files.
 
     Its checksums are verified, so that it will decode later.
@@ -148,14 +188,16 @@ def probe_raw(path: PathArg, dump: DumpSize | None = None) -> RawHeader | None:
     Raises
     ------
     DataError
-        The file is missing, or a damaged PNG.
+        The file is missing, or a damaged or too large PNG.
     """
+    limit = _limit(max_pixels)
     if Path(path).suffix.lower() != ".png":
         return None
-    data = read_bytes(path)
+    data = read_bytes(path, limit.most_bytes)
     if not data.startswith(PNG_SIGNATURE):
         return None
     check_png(path, data)
+    require_size(path, declared_size(path, data), **limit._asdict())
     width, height, bit_depth, colour_type = struct.unpack_from(">IIBB", data, 16)
     if colour_type != PNG_GRAY or bit_depth not in (8, 16):
         return None
@@ -296,7 +338,7 @@ def read_npy(path: PathArg, data: bytes) -> NDArray[Any]:
     return flat.reshape(shape, order="F" if fortran else "C")
 
 
-def _read_exr(path: PathArg) -> NDArray[Any]:
+def _read_exr(path: PathArg, limit: _Limit) -> NDArray[Any]:
     """The image of an OpenEXR file: its only channel, or red, green and blue."""
     try:
         import OpenEXR
@@ -304,6 +346,13 @@ def _read_exr(path: PathArg) -> NDArray[Any]:
         raise DataError(
             path, "is an OpenEXR file. Install its library: pip install 'polmvs[exr]'."
         ) from error
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            declared = [_size_of_part(part) for part in file.parts]
+    except Exception as error:
+        raise DataError(path, f"is no readable OpenEXR file. {BROKEN}") from error
+    for size in declared:
+        require_size(path, size, **limit._asdict())
     try:
         with OpenEXR.File(str(path)) as file:
             channels = {name: np.array(c.pixels) for name, c in file.channels().items()}
@@ -317,6 +366,16 @@ def _read_exr(path: PathArg) -> NDArray[Any]:
     if "Y" in channels:
         return channels["Y"]
     raise DataError(path, f"has the channels {', '.join(sorted(channels))}; one or RGB is read.")
+
+
+def _size_of_part(part: Any) -> ImageSize:
+    """What the header of a part of an OpenEXR file declares, four bytes a sample; whole tiles."""
+    low, high = part.header["dataWindow"]
+    width, height = (int(high[axis]) - int(low[axis]) + 1 for axis in (0, 1))
+    tile = part.header.get("tiles")
+    if tile is not None:
+        width, height = max(width, int(tile.xSize)), max(height, int(tile.ySize))
+    return ImageSize(width, height, 4 * width * height * max(len(part.header["channels"]), 1))
 
 
 def _read_pgm(path: PathArg, data: bytes) -> RawImage:
@@ -349,8 +408,15 @@ def _read_pgm(path: PathArg, data: bytes) -> RawImage:
     return RawImage(samples, declared_bits=bits if whole else None)
 
 
-def _read_tiff(path: PathArg, data: bytes) -> RawImage:
+def _read_tiff(path: PathArg, data: bytes, limit: _Limit) -> RawImage:
     """A TIFF as stored: its orientation is read, and hidden from OpenCV, which would apply it."""
+    pages = _tiff_pages(data)
+    if pages > 1:
+        raise DataError(
+            path,
+            f"holds {pages} images; one in a file is read. Store each in a file of its own, those "
+            "of polarizer angles named by them (NAME_000.tif, NAME_045.tif, ...).",
+        )
     tags = _tiff_tags(data)
     orientation, at = tags.get(TIFF_ORIENTATION, (UPRIGHT, 0))
     if at and orientation != UPRIGHT:
@@ -358,7 +424,7 @@ def _read_tiff(path: PathArg, data: bytes) -> RawImage:
         patched = bytearray(data)
         struct.pack_into(order, patched, at, UPRIGHT)
         data = bytes(patched)
-    samples = _colour_last(path, decode_image(path, data))
+    samples = _colour_last(path, decode_image(path, data, **limit._asdict()))
     bits = tags.get(TIFF_BITS, (0, 0))[0]
     lossy = tags.get(TIFF_COMPRESSION, (1, 0))[0] in TIFF_JPEG
     odd = samples.dtype.kind == "u" and 8 < bits < 8 * samples.itemsize
@@ -385,6 +451,27 @@ def _tiff_tags(data: bytes) -> dict[int, tuple[int, int]]:
     except struct.error:
         pass  # OpenCV names the damage
     return tags
+
+
+def _tiff_pages(data: bytes) -> int:
+    """Images in a TIFF's chain, previews not counted; 1 where the chain is damaged."""
+    order = "<" if data[:2] == b"II" else ">"
+    seen: set[int] = set()
+    pages = 0
+    try:
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        while start and start not in seen and len(seen) < MAX_TIFF_PAGES:
+            seen.add(start)
+            (num,) = struct.unpack_from(f"{order}H", data, start)
+            purpose = 0
+            for at in range(start + 2, start + 2 + 12 * num, 12):
+                if struct.unpack_from(f"{order}H", data, at) == (TIFF_SUBFILE,):
+                    (purpose,) = struct.unpack_from(f"{order}I", data, at + 8)
+            pages += not purpose & TIFF_REDUCED
+            (start,) = struct.unpack_from(f"{order}I", data, start + 2 + 12 * num)
+    except struct.error:
+        return 1  # OpenCV names the damage
+    return pages
 
 
 def _luminance_steps(path: PathArg, data: bytes) -> NDArray[np.float64]:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import secrets
 import shutil
+from collections.abc import Collection
 from pathlib import Path
 
 TOKEN = secrets.token_hex(8)
@@ -18,6 +20,7 @@ SHOWN = (
     24  # characters of the final name that a temporary one ends in, so that it never is too long
 )
 
+_NAME = re.compile(re.escape(PREFIX) + r"([0-9a-f]{16})-\d{1,10}-\d{1,10}-(.+)", re.DOTALL)
 _numbers = itertools.count()
 
 
@@ -27,9 +30,15 @@ def temporary_path(target: Path) -> Path:
     return target.with_name(f"{PREFIX}{TOKEN}-{number}-{target.name[-SHOWN:]}")
 
 
-def is_temporary(path: Path, token: str) -> bool:
-    """Whether a name is one that the process with this token gave."""
-    return path.name.startswith(f"{PREFIX}{token}-")
+def is_temporary(path: Path, token: str, names: Collection[str]) -> bool:
+    """Whether a name is one that the process with this token gave to what would have one of these.
+
+    A file that lists tokens may be forged: what it can name is no more than this.
+    """
+    found = _NAME.fullmatch(path.name)
+    if found is None or found[1] != token:
+        return False
+    return any(found[2] == name[-SHOWN:] for name in names)
 
 
 def remove_temporary(path: Path) -> None:

@@ -14,20 +14,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import CaptureKind, CaptureOptions
+from polmvs.config import AngleModel, CaptureKind, CaptureOptions, NormalOptions
 from polmvs.fitting import BEYOND_CHANCE
-from polmvs.normals.estimator import NormalEstimate
-from polmvs.normals.light import row_costs
+from polmvs.normals.mixture_estimator import solve_mixture
+from polmvs.normals.observations import gather_observations_under
 from polmvs.normals.rows import AS_MEASURED, Reading
-from polmvs.normals.tracks import MAX_ROWS, normals_under, tracks_on_parts
+from polmvs.normals.tracks import evenly_chosen, matched_views, tracks_on_parts
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import Tracks
+from polmvs.scene import Tracks, some_tracks
 
 Array = NDArray[np.float64]
 
 MIRRORED: Reading = ((1, 0), (0, -1))
 TURNED: Reading = ((0, 1), (-1, 0))  # by 45 degrees
 TURNED_MIRRORED: Reading = ((0, 1), (1, 0))
+CHANGES = (MIRRORED, TURNED, TURNED_MIRRORED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,7 @@ class VoteTolerances:
 
     Attributes
     ----------
+    max_points : that are asked about angles. Guess: more cost time only.
     min_rows : of a point that votes on angles. Derived: three rows fix a normal and leave one to
         tell.
     min_votes : points. Guess.
@@ -44,6 +46,7 @@ class VoteTolerances:
         hundredths.
     """
 
+    max_points: int = 400
     min_rows: int = 4
     min_votes: int = 8
     min_share: float = 0.7
@@ -99,25 +102,29 @@ def check_axes(
     Parameters
     ----------
     tracks : sparse points; ``obs_view`` counts in ``maps``.
-    maps : phase maps built under either kind of light, one for all.
+    maps : phase maps of the views.
     """
-    t, on_parts = tolerances, tracks_on_parts(tracks, maps)
-    others = (MIRRORED, TURNED, TURNED_MIRRORED)
-    every = [
-        reading for change in (AS_MEASURED, *others) for reading in (change, _other_light(change))
-    ]
-    of_tiles = [
-        [_row_cost(estimate, t) for estimate in estimates]
-        for estimates in normals_under(every, on_parts, maps, max_rows=MAX_ROWS)
-    ]
-    costs = np.concatenate(of_tiles, axis=1)  # (readings, N)
-    # Of each point (N,): mean cost of a row, under the better kind of light.
-    given, *changed = np.minimum(costs[::2], costs[1::2])
-    best = AxesCheck(num_votes=int(np.isfinite(given).sum()), share=0.0, change=None)
+    t = tolerances
+    on_parts = tracks_on_parts(tracks, maps)
+    chosen = evenly_chosen(len(on_parts.points_in_world), t.max_points)
+    some, options = some_tracks(on_parts, chosen), NormalOptions()
+    # Under either light, which a quarter turn of all angles exchanges.
+    readings = [r for way in (AS_MEASURED, *CHANGES) for r in (way, _other_light(way))]
+    observed = gather_observations_under(
+        readings, AngleModel.PPA, some.points_in_world, maps, window_px=options.window_px
+    )
+    matched = matched_views(some, len(maps))
+    num_rows = (matched & np.isfinite(observed[0].turn_variances[0])).sum(axis=0)
+    found = np.stack([solve_mixture(one, matched).log_likelihood for one in observed])
+    found /= np.maximum(num_rows, 1)
+    likelihoods = np.maximum(found[::2], found[1::2])  # (ways to count, N), of a row
+    given, *changed = likelihoods
+    # What no way to count explains has no say.
+    voting = (num_rows >= t.min_rows) & (np.max(likelihoods, axis=0) > t.min_gain)
+    best = AxesCheck(num_votes=int(voting.sum()), share=0.0, change=None)
     most = t.min_gain
-    for change, cost in zip(others, changed, strict=True):
-        votes = given - cost
-        votes = votes[np.isfinite(votes)]
+    for change, likelihood in zip(CHANGES, changed, strict=True):
+        votes = (likelihood - given)[voting]
         if is_clear(votes, t) and votes.mean() > most:
             share = float(np.mean(votes > 0))
             best, most = AxesCheck(num_votes=len(votes), share=share, change=change), votes.mean()
@@ -165,11 +172,3 @@ def changed_pattern(
 def _other_light(reading: Reading) -> Reading:
     (a, b), (c, d) = reading
     return (-a, -b), (-c, -d)
-
-
-def _row_cost(estimate: NormalEstimate, t: VoteTolerances) -> Array:
-    """Mean Cauchy cost of a point's rows (N,); NaN where too few are given."""
-    given = estimate.row_weights > 0
-    count = given.sum(axis=0)
-    mean = np.where(given, row_costs(estimate), 0).sum(axis=0) / np.maximum(count, 1)
-    return np.where(count >= t.min_rows, mean, np.nan)

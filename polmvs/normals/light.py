@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
-from polmvs.config import AngleModel
+from polmvs.config import AngleModel, NormalOptions
 from polmvs.geometry import lengths, points_on_rays
 from polmvs.normals.estimator import NormalEstimate, solve_normals
+from polmvs.normals.mixture_estimator import solve_mixture
 from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
-from polmvs.normals.tracks import MAX_ROWS, normals_under, tracks_on_parts
+from polmvs.normals.tracks import MAX_ROWS, in_tiles, observe, tracks_on_parts
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS, Tracks
 
@@ -125,12 +126,22 @@ def track_votes(
     *,
     max_rows: int = MAX_ROWS,
 ) -> tuple[Array, Mask]:
-    """As :func:`specular_votes` of all tracks, for the light of the maps over the other."""
+    """Log-likelihood of specular over diffuse light for each track, and which tracks have a say.
+
+    Parameters
+    ----------
+    tracks : sparse points; ``obs_view`` counts in ``maps``.
+    maps : phase maps, whatever light they were built for.
+    """
+    t = tolerances or LightTolerances()
     votes, voting = [], []
-    for as_built, as_other in normals_under(LIGHTS, tracks, maps, max_rows=max_rows):
-        of_some = specular_votes(as_built, as_other, tolerances)
-        votes.append(of_some[0])
-        voting.append(of_some[1])
+    for some in in_tiles(tracks, len(maps), max_rows):
+        found, matched = observe(AngleModel.PPA, some, maps, NormalOptions())
+        specular, diffuse = (solve_mixture(found, matched, prior_specular=p) for p in (1.0, 0.0))
+        votes.append(specular.log_likelihood - diffuse.log_likelihood)
+        enough = np.maximum(specular.num_rows, diffuse.num_rows) >= t.min_rows
+        # Under the wrong kind of light the rows often leave no normal at all.
+        voting.append((specular.valid | diffuse.valid) & enough)
     return np.concatenate(votes), np.concatenate(voting)
 
 
@@ -367,24 +378,6 @@ def _costs_of_both(
     """Costs (K, N) of the rows under either light, and which rows count under both."""
     costs = [row_costs(estimate, max_cost=max_cost) for estimate in (specular, diffuse)]
     return costs, np.asarray((specular.row_weights > 0) & (diffuse.row_weights > 0))
-
-
-def specular_votes(
-    specular: NormalEstimate, diffuse: NormalEstimate, tolerances: LightTolerances | None = None
-) -> tuple[Array, Mask]:
-    """Log-likelihood of specular over diffuse light for each track, and which tracks have a say.
-
-    Parameters
-    ----------
-    specular, diffuse : normals of the same tracks from rows under either assumption.
-    tolerances : see there.
-    """
-    t = tolerances or LightTolerances()
-    costs, compared = _costs_of_both(specular, diffuse, t.max_row_cost)
-    votes = ((costs[1] - costs[0]) * compared).sum(axis=0)
-    enough = np.maximum(specular.num_rows, diffuse.num_rows) >= t.min_rows
-    # Under the wrong kind of light the rows often leave no normal at all.
-    return np.asarray(votes, np.float64), (specular.valid | diffuse.valid) & enough
 
 
 def _dolp_votes(maps: Sequence[PhaseMap], t: LightTolerances) -> float:

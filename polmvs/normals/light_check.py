@@ -50,10 +50,10 @@ def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> Light
     Parameters
     ----------
     tracks : sparse points; ``obs_view`` counts in ``maps``.
-    maps : phase maps built under the given light.
+    maps : phase maps of the views.
     """
     votes, voting = track_votes(tracks_on_parts(tracks, maps), maps)
-    votes = votes[voting]
+    votes = votes[voting] if given is Light.SPECULAR else -votes[voting]
     num = len(votes)
     contradicted = is_clear(-votes, VoteTolerances())
     share = float(np.mean(votes < 0)) if num else 0.0

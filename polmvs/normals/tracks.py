@@ -7,26 +7,29 @@ projected point, in every view that sees it, not only in the views that matched 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
-from functools import partial
-from typing import overload
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
-from polmvs.config import AngleModel, Estimator, NormalOptions
+from polmvs.config import AngleModel, Estimator, Light, NormalOptions
 from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
-from polmvs.normals.rows import Reading, Rows, gather_rows, gather_rows_under
+from polmvs.normals.mixture_estimator import MixtureEstimate, row_scales, solve_mixture
+from polmvs.normals.observations import Observations, gather_observations
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
+from polmvs.scene import MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+MAX_SCALE_POINTS = 600  # that tell how far rows are off. Guess: more cost time only
 MAX_ROWS = MemoryNeeds.max_rows  # of points and views together, at a time, without a budget
 # A region's border is that uncertain, by marks and smoothing: points nearer to it may lie on the
 # background. Guess.
@@ -35,7 +38,7 @@ BORDER_MARGIN_PX = 3
 
 @dataclass(frozen=True, kw_only=True)
 class SeedTolerances:
-    """Which tracks are seeds: on the polarised surface, their phases explained by one normal.
+    """Which tracks are seeds: their phases explained by one normal.
 
     Attributes
     ----------
@@ -43,58 +46,45 @@ class SeedTolerances:
         its point faces, to show the surface at its place. Guess.
     max_dolp_share : of a mark's DoLP in that of the surface about it. Guess.
     clear_dolp : of the surface, for the comparison to tell. Guess.
-    max_sigma_deg : of the normal, and of its angle to the planes of incidence. Guess.
+    max_sigma_deg : of the normal. Guess.
+    min_on_region : seeds on strongly polarised regions, beside which others are surroundings.
+        Derived: three points make a plane.
     """
 
     min_inside_share: float = 0.8
     max_dolp_share: float = 0.85
     clear_dolp: float = 0.15
-    max_sigma_deg: float = 3.0
+    max_sigma_deg: float = 5.0
+    min_on_region: int = 3
 
 
-def window_map(phase_map: PhaseMap, window_px: int) -> PhaseMap:
-    """Average the phase over a window of reliable pixels about every pixel (axially)."""
-    axial, precision = phase_map.samples[..., :2], phase_map.samples[..., 2]
-    weight = precision * phase_map.region.reliable
-    size = (window_px, window_px)
-    share = cv2.boxFilter(weight, -1, size, borderType=cv2.BORDER_CONSTANT)
-    mean = cv2.boxFilter(axial * weight[..., None], -1, size, borderType=cv2.BORDER_CONSTANT)
-    mean = mean / np.maximum(share, 1e-9)[..., None]
-    # The window's own precision where it is full, less where few of its pixels count.
-    samples = np.dstack([mean, np.where(phase_map.region.inside, share, 0)])
-    return phase_map.changed(samples=samples.astype(np.float32))
+def observe(
+    angle_model: AngleModel, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
+) -> tuple[Observations, Mask]:
+    """What all views measure of tracks, and which views (K, T) surely see them: they match."""
+    found = gather_observations(
+        angle_model,
+        tracks.points_in_world,
+        maps,
+        window_px=options.window_px,
+        tilt_aware=options.tilt_aware_weights,
+    )
+    return found, matched_views(tracks, len(maps))
 
 
-class DerivedMaps(Sequence[PhaseMap]):
-    """Phase maps made of others, each when it is asked for: none is held.
-
-    Parameters
-    ----------
-    maps : of the views.
-    derive : makes one of them.
-    """
-
-    def __init__(self, maps: Sequence[PhaseMap], derive: Callable[[PhaseMap], PhaseMap]) -> None:
-        self.maps, self.derive = maps, derive
-
-    def __len__(self) -> int:
-        return len(self.maps)
-
-    @overload
-    def __getitem__(self, index: int) -> PhaseMap: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> DerivedMaps: ...
-
-    def __getitem__(self, index: int | slice) -> PhaseMap | DerivedMaps:
-        if isinstance(index, slice):
-            return DerivedMaps(self.maps[index], self.derive)
-        return self.derive(self.maps[index])
+def matched_views(tracks: Tracks, num_views: int) -> Mask:
+    """Which views (K, T) match each track."""
+    matched = np.zeros((num_views, len(tracks.points_in_world)), bool)
+    matched[tracks.obs_view, tracks.obs_track] = True
+    return matched
 
 
-def window_maps(maps: Sequence[PhaseMap], window_px: int) -> DerivedMaps:
-    """Maps averaged by :func:`window_map`, each when it is asked for."""
-    return DerivedMaps(maps, partial(window_map, window_px=window_px))
+def evenly_chosen(num_points: int, limit: int) -> Mask:
+    """Of points (N,) some that are spread evenly over them, ``limit`` at most."""
+    chosen = np.zeros(num_points, bool)
+    limit = min(num_points, limit)
+    chosen[np.linspace(0, num_points - 1, limit).round().astype(np.int64)] = True
+    return chosen
 
 
 def track_normals(
@@ -102,9 +92,10 @@ def track_normals(
     tracks: Tracks,
     maps: Sequence[PhaseMap],
     options: NormalOptions,
+    light: Light | None = None,
     *,
     max_rows: int = MAX_ROWS,
-) -> NormalEstimate:
+) -> MixtureEstimate:
     """Normals of all tracks (paper, eq. coeff_2), many at a time; one map is held at a time.
 
     Parameters
@@ -113,53 +104,47 @@ def track_normals(
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps of the views.
     options : window, estimator and weights.
+    light : of everything, where it is known; else each observation has its own.
     max_rows : of tracks and views together, that are solved at a time.
     """
-    # A track on no region of its own views has no normal; one stands for all others.
-    own = np.zeros(len(tracks.points_in_world), bool)
-    for phase_map, here in zip(maps, tracks.of_views(len(maps)), strict=True):
-        seen = tracks.obs_track[here]
-        xy = phase_map.view.project(tracks.points_in_world[seen])
-        own[seen[sample_image(phase_map.region.inside.astype(np.float32), xy) > 0]] = True
-    solved = own.copy()
-    solved[np.flatnonzero(~own)[:1]] = True
-    source = np.cumsum(solved) - 1
-    source[~own] = source[np.flatnonzero(~own)[:1]]
-    windows = window_maps(maps, options.window_px)
-    estimates = [
-        normals_from_rows(
-            some,
-            gather_rows(
-                angle_model, some.points_in_world, windows, tilt_aware=options.tilt_aware_weights
-            ),
-            options.estimator,
-        )
-        for some in in_tiles(some_tracks(tracks, solved), len(maps), max_rows)
-    ]
+    prior = {None: 0.5, Light.SPECULAR: 1.0, Light.DIFFUSE: 0.0}[light]
+
+    # Some of the points first: how far the rows of each view are off.
+    limit = min(MAX_SCALE_POINTS, max(1, max_rows // max(len(maps), 1)))
+    chosen = evenly_chosen(len(tracks.points_in_world), limit)
+    tiles = list(in_tiles(tracks, len(maps), max_rows))
+    observed = observe(angle_model, tracks, maps, options) if len(tiles) == 1 else None
+    if observed is None:
+        found, matched = observe(angle_model, some_tracks(tracks, chosen), maps, options)
+    else:
+        found, matched = observed[0].some(chosen), observed[1][:, chosen]
+    first = solve_mixture(found, matched, prior_specular=prior)
+    scales = row_scales(found, matched, first)
+    logger.debug("rows err by %s of what is stated", np.round(scales.of_views, 2))
+    estimates = []
+    for some in tiles:
+        found, matched = observed or observe(angle_model, some, maps, options)
+        estimate = solve_mixture(found, matched, prior_specular=prior, scales=scales)
+        if options.estimator is Estimator.ALGEBRAIC:
+            estimate = _algebraic(found, estimate)
+        estimates.append(estimate)
     joined = {
         field.name: np.concatenate([getattr(one, field.name) for one in estimates], axis=axis)
-        for field in fields(NormalEstimate)
-        for axis in [1 if field.name == "row_weights" else 0]  # it has views before tracks
+        for field in fields(MixtureEstimate)
+        # These have views before tracks.
+        for axis in [1 if field.name in ("row_weights", "labels") else 0]
     }
-    weights = joined.pop("row_weights")[:, source]
-    return NormalEstimate(
-        **{name: values[source] for name, values in joined.items()}, row_weights=weights
-    )
+    return MixtureEstimate(**joined)
 
 
-def normals_under(
-    readings: Sequence[Reading], tracks: Tracks, maps: Sequence[PhaseMap], *, max_rows: int
-) -> Iterator[Iterator[NormalEstimate]]:
-    """Normals under PPA of the tracks, so many at a time, under each reading of the phases.
-
-    Parameters are those of :func:`polmvs.normals.rows.gather_rows_under` and
-    :func:`track_normals`.
-    """
-    options = NormalOptions()
-    windows = window_maps(maps, options.window_px)  # on a mark itself light is mixed
-    for some in in_tiles(tracks, len(maps), max_rows):
-        of_readings = gather_rows_under(readings, AngleModel.PPA, some.points_in_world, windows)
-        yield (normals_from_rows(some, rows, options.estimator) for rows in of_readings)
+def _algebraic(found: Observations, estimate: MixtureEstimate) -> MixtureEstimate:
+    """The paper's estimator on rows whose light is told: their eigenvector, all alike."""
+    diffuse = estimate.labels < 0
+    rows = np.where(diffuse, found.rows[1], found.rows[0])
+    variance = np.where(diffuse, found.turn_variances[1], found.turn_variances[0])
+    sigma = np.where(estimate.labels != 0, np.sqrt(variance), np.inf)
+    solved = solve_normals(rows, found.rays, sigma, robust=False)
+    return replace(estimate, **{f.name: getattr(solved, f.name) for f in fields(NormalEstimate)})
 
 
 def in_tiles(tracks: Tracks, num_views: int, max_rows: int) -> Iterator[Tracks]:
@@ -168,23 +153,6 @@ def in_tiles(tracks: Tracks, num_views: int, max_rows: int) -> Iterator[Tracks]:
     index = np.arange(len(tracks.points_in_world))
     for start in range(0, max(len(index), 1), num):
         yield some_tracks(tracks, (index >= start) & (index < start + num))
-
-
-def normals_from_rows(tracks: Tracks, rows: Rows, estimator: Estimator) -> NormalEstimate:
-    """Normals of tracks in one batch, from rows of averaged phases (:func:`window_map`).
-
-    First from the views that matched the point, which surely see it, then from every view that
-    faces it.
-    """
-    matched = np.zeros(rows.sigma.shape, bool)
-    matched[tracks.obs_view, tracks.obs_track] = True
-    robust = estimator is Estimator.ROBUST
-    own_sigma = np.where(matched, rows.sigma, np.inf)
-    own = solve_normals(rows.rows, rows.rays, own_sigma, robust=robust)
-    cosine = np.einsum("ikn,ni->kn", rows.rays, np.nan_to_num(own.normals))
-    facing = cosine < -MIN_FACING_COSINE
-    sigma = np.where(matched | facing, rows.sigma, np.inf)
-    return solve_normals(rows.rows, rows.rays, sigma, robust=robust, initial_normals=own.normals.T)
 
 
 def tracks_on_parts(tracks: Tracks, maps: Sequence[PhaseMap]) -> Tracks:
@@ -257,7 +225,10 @@ def select_seeds(
     *,
     tolerances: SeedTolerances = SeedTolerances(),
 ) -> tuple[Seeds, Mask]:
-    """Tracks that lie on the polarised surface and whose normal explains their phases.
+    """Tracks whose normal explains what all views measure of them.
+
+    Where some of them lie on regions that are polarised strongly, these are what is wanted, and the
+    others its surroundings; else all are.
 
     A glossy surface mirrors its surroundings, and on a flat one their mirror images make tracks
     as good as any, behind the surface. They give themselves away: seen from aside they leave the
@@ -267,19 +238,19 @@ def select_seeds(
     -------
     The seeds, and which tracks ``(T,)`` they are.
     """
+    t = tolerances
     good = (
-        estimate.valid
-        & (estimate.num_rows >= MIN_VIEWS)
-        & (estimate.sigma_deg < tolerances.max_sigma_deg)
-        & (estimate.residual < np.sin(np.radians(tolerances.max_sigma_deg)))
+        estimate.valid & (estimate.num_rows >= MIN_VIEWS) & (estimate.sigma_deg < t.max_sigma_deg)
     )
-    # The dearest question last, of those that are left: all points are asked of all views.
     some = some_tracks(tracks, good)
-    good[good] = (inside_shares(some, maps) >= tolerances.min_inside_share) & ~(
-        dolp_shares(some, maps, tolerances=tolerances) > tolerances.max_dolp_share
-    )
-    points, normals = tracks.points_in_world[good], estimate.normals[good]
-    good[good] = seen_shares(points, normals, maps) >= tolerances.min_inside_share
+    good[good] = ~(dolp_shares(some, maps, tolerances=t) > t.max_dolp_share)
+    # The dearest question last, of those that are left: all points are asked of all views.
+    on_region = good.copy()
+    on_region[good] = inside_shares(some_tracks(tracks, good), maps) >= t.min_inside_share
+    points, normals = tracks.points_in_world[on_region], estimate.normals[on_region]
+    on_region[on_region] = seen_shares(points, normals, maps) >= t.min_inside_share
+    if on_region.sum() >= t.min_on_region:
+        good = on_region
     some = some_tracks(tracks, good)
     sigma = point_sigmas(some, [m.view for m in maps])
     return Seeds(some.points_in_world, estimate.normals[good], sigma), good

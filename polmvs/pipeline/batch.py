@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import logging
 import os
+import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
@@ -19,6 +20,7 @@ from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
 
+from polmvs.cluster import TlsFiles
 from polmvs.config import (
     AngleModel,
     FieldInfo,
@@ -35,9 +37,11 @@ from polmvs.config import (
 from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.images import write_bytes
-from polmvs.io.typed_json import write_json
+from polmvs.io.plain_files import read_text
+from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import JobOutcome, reconstruct
+from polmvs.pipeline.log_format import LogFormatter
 from polmvs.pipeline.run_folder import RunFolder, has_content
 from polmvs.pipeline.runner import Job, NoMonitor
 from polmvs.pipeline.stages.densify import DensifyResult
@@ -45,8 +49,8 @@ from polmvs.pipeline.stages.poses import PosesResult
 
 logger = logging.getLogger(__name__)
 
+FOLDER = ("folder", "capture")  # names of the column of a capture's folder
 TABLE_FILE, JSON_FILE = "batch.md", "batch.json"
-LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 LOST = "its worker was lost: out of memory? Give `run.workers` 1, or workers more memory."
 
 
@@ -108,10 +112,11 @@ def read_batch(
 ) -> tuple[BatchEntry, ...]:
     """Captures of a list, a TOML or CSV file; paths in it are relative to its folder.
 
-    TOML: a table ``[[captures]]`` for each, with ``capture``, the folder, ``name``, by default
+    TOML: a table ``[[captures]]`` for each, with ``folder`` of the capture, ``name``, by default
     that of the folder, ``model``, and tables of options by group. CSV: a line for each under a
-    header with ``capture`` and as needed ``name``, ``model`` and options as ``group.name``; an
-    empty cell is one that is not there.
+    header with ``folder`` and as needed ``name``, ``model`` and options as ``group.name``; an
+    empty cell is one that is not there. The folder may be called ``capture`` too where no option
+    of that group is given, whose name it is.
 
     Parameters
     ----------
@@ -126,7 +131,7 @@ def read_batch(
         A key or value is unusable, or a name is there twice.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, "utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8"
         raise DataError(path, f"is no readable list of captures ({reason}).") from error
@@ -142,6 +147,11 @@ def read_batch(
     ]
     seen: dict[str, str] = {}
     for entry in entries:
+        if entry.name.casefold() in (TABLE_FILE, JSON_FILE):
+            raise OptionError(
+                f"{path}: a capture cannot be named {entry.name!r}, as a file in OUT is; give it "
+                "another `name`."
+            )
         if entry.name.casefold() in seen:  # some systems do not tell them apart
             raise OptionError(f"{path}: two captures are named {entry.name!r}; give `name`s.")
         seen[entry.name.casefold()] = entry.name
@@ -163,6 +173,8 @@ def run_batch(
 ) -> list[BatchRow]:
     """Reconstruct captures, each into ``OUT/NAME``; ``OUT/batch.md`` and ``.json`` grow with them.
 
+    Captures that an earlier list brought to OUT keep their rows there.
+
     Parameters
     ----------
     entries : from :func:`read_batch`.
@@ -177,9 +189,14 @@ def run_batch(
         A capture's folder in OUT holds something, and neither ``overwrite`` nor ``resume`` is
         given.
     DataError
-        OUT cannot be made, or the cluster is unusable.
+        OUT cannot be made, its ``batch.json`` is none of a batch, or the cluster is unusable.
+
+    Returns
+    -------
+    The rows of these captures.
     """
     out = out.absolute()
+    earlier = _earlier_rows(out, entries)
     for entry in entries:
         folder = out / entry.name
         if has_content(folder) and not (run_options.overwrite or run_options.resume):
@@ -189,10 +206,11 @@ def run_batch(
             )
     with as_data_error(out, "made"):
         out.mkdir(parents=True, exist_ok=True)
-    each = replace(run_options, workers=1, scheduler=None)
+    each = replace(run_options, workers=1, scheduler=None, tls_ca=None, tls_cert=None, tls_key=None)
     if run_options.scheduler is not None:
         captures = [entry.capture for entry in entries]
-        workers = Workers.of_cluster(run_options.scheduler, [out], captures)
+        tls = TlsFiles.of(run_options)
+        workers = Workers.of_cluster(run_options.scheduler, [out], captures, tls)
     else:
         num_beside = min(run_options.workers, len(entries))
         each = replace(each, workers=run_options.workers // num_beside)
@@ -203,8 +221,9 @@ def run_batch(
         try:
             for entry, outcome in zip(entries, outcomes, strict=True):
                 rows.append(_row_of(entry, outcome))
-                write_json(out / JSON_FILE, rows)
-                write_bytes(out / TABLE_FILE, f"{batch_table(rows)}\n".encode())
+                everything = [*earlier, *rows]
+                write_json(out / JSON_FILE, everything)
+                write_bytes(out / TABLE_FILE, f"{batch_table(everything)}\n".encode())
                 on_done(rows[-1])
         except BaseException:  # Ctrl-C: captures take long, and go on with `run.resume`
             for child in active_children():
@@ -232,6 +251,20 @@ def batch_table(rows: Sequence[BatchRow]) -> str:
     return format_table(header, cells)
 
 
+def _earlier_rows(out: Path, entries: Sequence[BatchEntry]) -> list[BatchRow]:
+    """Rows of captures in OUT that are not of this list."""
+    path = out / JSON_FILE
+    if not path.is_file():
+        return []
+    try:
+        content = parse_json(path.read_text(encoding="utf-8"))
+        rows = from_json(tuple[BatchRow, ...], content)
+    except (OSError, ValueError) as error:
+        raise DataError(path, f"is no table of a batch ({error}). Give another OUT.") from error
+    names = {entry.name.casefold() for entry in entries}
+    return [row for row in rows if row.name.casefold() not in names and (out / row.name).is_dir()]
+
+
 class _LogMonitor(NoMonitor):
     """Writes what happens into the run's log."""
 
@@ -241,7 +274,7 @@ class _LogMonitor(NoMonitor):
     def opened(self, run_folder: RunFolder) -> None:
         """Begin."""
         self.handler = logging.FileHandler(run_folder.log, encoding="utf-8")
-        self.handler.setFormatter(logging.Formatter(LOG_FORMAT))
+        self.handler.setFormatter(LogFormatter())
         logging.getLogger("polmvs").addHandler(self.handler)
 
     def close(self) -> None:
@@ -320,7 +353,10 @@ def _toml_tables(path: Path, text: str) -> list[tuple[str, dict[str, Any]]]:
     except RecursionError as error:
         raise DataError(path, "is no TOML file (it is nested too deeply).") from error
     except ValueError as error:  # of the parser, or an integer of thousands of digits
-        raise DataError(path, f"is no TOML file ({error}).") from error
+        hint = ""
+        if re.search(r"^\s*\[captures\.capture\]", text, re.MULTILINE):
+            hint = " Name the folder of a capture 'folder' where it has a table [captures.capture]."
+        raise DataError(path, f"is no TOML file ({error}).{hint}") from error
     listed = content.pop("captures", [])
     if content or not isinstance(listed, list) or not all(isinstance(t, dict) for t in listed):
         found = next(iter(content), "captures")
@@ -333,11 +369,11 @@ def _csv_tables(path: Path, text: str) -> list[tuple[str, dict[str, Any]]]:
     infos = {
         info.path: info for cls in groups_of(Options).values() for info in describe_fields(cls)
     }
-    known = {"capture", "name", "model", *infos}
+    known = {*FOLDER, "name", "model", *infos}
     for column in reader.fieldnames or ():
         if column not in known:
             raise OptionError(
-                f"{path}: unknown column {column!r}; columns are capture, name, model, and options "
+                f"{path}: unknown column {column!r}; columns are folder, name, model, and options "
                 "as group.name such as sfm.intrinsics."
             )
     tables = []
@@ -350,7 +386,11 @@ def _csv_tables(path: Path, text: str) -> list[tuple[str, dict[str, Any]]]:
             if not cell:
                 continue
             group, _, name = column.partition(".")
-            if not name:
+            if column in FOLDER:
+                if "folder" in table:
+                    raise OptionError(f"{path}: {where}: names its folder twice.")
+                table["folder"] = cell
+            elif not name:
                 table[column] = cell
             else:
                 value = _value_of(infos[column], cell, f"{path}: {where}")
@@ -382,9 +422,11 @@ def _entry(
 ) -> BatchEntry:
     """A capture of a list from its table."""
     table = dict(table)
-    capture, name, model = (table.pop(key, None) for key in ("capture", "name", "model"))
+    if "folder" not in table and isinstance(table.get("capture"), str):
+        table["folder"] = table.pop("capture")
+    capture, name, model = (table.pop(key, None) for key in ("folder", "name", "model"))
     if not isinstance(capture, str):
-        raise OptionError(f"{where}: needs a 'capture', the folder of one.")
+        raise OptionError(f"{where}: needs a 'folder', that of a capture.")
     folder = Path(os.path.normpath(base / capture))
     name = folder.name if name is None else name
     if not isinstance(name, str) or Path(name).name != name or name in ("", ".", ".."):

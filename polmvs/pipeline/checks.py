@@ -15,8 +15,10 @@ from polmvs.colmap.pairs import read_pairs
 from polmvs.colmap.sfm import check_camera, check_intrinsics
 from polmvs.config import Options, ReferenceOptions, SfmOptions, get_option, option_paths
 from polmvs.errors import DataError, OptionError, as_data_error
+from polmvs.io.folders import resolved
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.images import read_mask
+from polmvs.io.plain_files import open_plain
 from polmvs.pipeline.record import CaptureIdentity, Record
 from polmvs.pipeline.run_folder import RunFolder, files_in
 from polmvs.pipeline.stages.images import image_names
@@ -54,7 +56,7 @@ def digest_of(path: Path) -> str:
     with as_data_error(path, "read"):
         for file in [path] if path.is_file() else sorted(files_in(path)):
             digest.update(file.relative_to(path).as_posix().encode(errors="surrogateescape"))
-            with file.open("rb") as stream:
+            with open_plain(file) as stream:
                 digest.update(file_digest(stream, blake2b).digest())
     return digest.hexdigest()
 
@@ -75,13 +77,13 @@ def require_apart(
     OptionError
         The run folder is the capture's, or the input lies where results go.
     """
-    root = run_folder.root.resolve()
-    if root in (capture.resolve(), (capture / "raw").resolve()):
+    root = resolved(run_folder.root)
+    if root in (resolved(capture), resolved(capture / "raw")):
         raise OptionError(f"{run_folder.root}: OUT is the capture's own folder. Give another OUT.")
     places = [root / name for name in written]
     for path in (capture, *others):
-        for resolved in _real_places(path):
-            if any(resolved == place or place in resolved.parents for place in places):
+        for real in _real_places(path):
+            if any(real == place or place in real.parents for place in places):
                 raise OptionError(f"{path}: lies where OUT's results go. Give another OUT.")
 
 

@@ -1,7 +1,12 @@
-"""A public set made ready for ``reconstruct``: images, a COLMAP model of its poses, masks."""
+"""A public set made ready for ``reconstruct``: images, a COLMAP model of its poses, masks.
+
+:func:`import_data_set` does it; :func:`as_capture` is what ``reconstruct`` and ``inspect`` call
+with any folder, sets or not.
+"""
 
 from __future__ import annotations
 
+import logging
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,16 +15,35 @@ import numpy as np
 
 from polmvs.colmap.cameras import ColmapCamera
 from polmvs.colmap.sfm import triangulate_views
-from polmvs.config import BayerOrder, CaptureKind, CaptureOptions, Light, to_plain
-from polmvs.errors import DataError, OptionError
+from polmvs.config import CaptureKind, CaptureOptions, Light, Options, to_plain
+from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.arrays import save_array
-from polmvs.io.data_sets import DataSet, load_converted, read_data_set, read_set_mask
+from polmvs.io.data_sets import (
+    DataSet,
+    DataSetKind,
+    load_converted,
+    read_data_set,
+    read_set_mask,
+    recognise_data_set,
+)
 from polmvs.io.images import write_bytes, write_png
+from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.pipeline.stages.images import image_names, write_images
 from polmvs.polarization.capture import Capture, open_capture
 from polmvs.scene import View, stem_of
 
+logger = logging.getLogger(__name__)
+
+IMPORT_FILE = "import.json"  # that a folder is an import, and of what
 SAME_CAMERA = 1e-6  # relative difference by the rounding of a set's matrices
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Made:
+    """What a folder of an import was made from."""
+
+    folder: Path
+    kind: DataSetKind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,12 +53,13 @@ class ImportedSet:
     Attributes
     ----------
     data_set : as it was read.
-    capture : folder to give as CAPTURE.
-    options_file : TOML file to give as ``--config``.
-    sparse : COLMAP model to give as ``--sparse``.
-    masks : folder to give as ``--mask``.
+    capture : folder to read the images from.
+    options_file : TOML file of the capture's options.
+    sparse : COLMAP model, for ``sfm.sparse``.
+    masks : folder, for ``region.mask``.
     num_points : of the model where it was triangulated here.
-    light : to give as ``--light``.
+    light : for ``region.light``.
+    options : of the capture, as the file has them.
     """
 
     data_set: DataSet
@@ -44,16 +69,17 @@ class ImportedSet:
     masks: Path | None
     num_points: int | None
     light: Light | None
+    options: CaptureOptions
 
 
-def import_data_set(folder: Path, out: Path, *, bayer: BayerOrder = BayerOrder.RGGB) -> ImportedSet:
+def import_data_set(folder: Path, out: Path, options: CaptureOptions | None = None) -> ImportedSet:
     """Read a public set and write what ``reconstruct`` takes beside it.
 
     Parameters
     ----------
     folder : the set, which is not changed; images that a capture is read from stay there.
     out : folder to make.
-    bayer : colours of raw colour mosaics.
+    options : of the capture; what is not the default goes before what the set's layout says.
 
     Raises
     ------
@@ -64,46 +90,106 @@ def import_data_set(folder: Path, out: Path, *, bayer: BayerOrder = BayerOrder.R
     """
     if out.exists():
         raise OptionError(f"{out}: exists. Give another folder.")
-    data_set = read_data_set(folder, bayer)
-    out.mkdir(parents=True)
+    data_set = read_data_set(folder, options)
+    with as_data_error(out, "made"):
+        out.mkdir(parents=True)
     try:
-        return _import(data_set, out)
+        imported = _import(data_set, out)
+        write_json(out / IMPORT_FILE, _Made(folder=folder.absolute(), kind=data_set.kind))
+        return imported
     except BaseException:
         shutil.rmtree(out, ignore_errors=True)
         raise
 
 
-def _import(data_set: DataSet, out: Path) -> ImportedSet:
-    options, place = data_set.options, data_set.capture
-    if place is None:
-        place = out / "capture"
-        _convert(data_set, place)
+def as_capture(folder: Path, out: Path, options: Options) -> tuple[Path, Options]:
+    """A capture and its options; of a public set those of its import, which is made or found.
+
+    Parameters
+    ----------
+    folder : a capture, or a public set.
+    out : of the run; the import lies beside it, ``OUT_import``.
+    options : as the user gave them. Where they give poses, the set's own are left alone.
+
+    Raises
+    ------
+    DataError
+        The set is incomplete, or what lies at ``OUT_import`` is no import of it.
+    """
+    kind = recognise_data_set(folder) if folder.is_dir() else None
+    place = out.absolute().with_name(f"{out.name}_import")
+    given = options.sfm.sparse
+    # A run that goes on has the import's model from its record.
+    of_import = given is not None and place in given.absolute().parents
+    if kind is None or (given is not None and not of_import):
+        return folder, options
+    if place.exists():
+        imported = _found_import(folder, place, options.capture)
+    else:
+        imported = import_data_set(folder, place, options.capture)
+    logger.warning(
+        "%s is a set in the layout of %s: its cameras%s are used; the import is %s.",
+        folder,
+        kind,
+        " and masks" if imported.masks is not None else "",
+        place,
+    )
+    region = options.region
+    if region.mask is None and imported.masks is not None:
+        region = replace(region, mask=imported.masks)
+    if region.light is None and imported.light is not None:
+        region = replace(region, light=imported.light)
+    sfm = replace(options.sfm, sparse=imported.sparse)
+    changed = replace(options, capture=imported.options, sfm=sfm, region=region)
+    return imported.capture, changed
+
+
+def _found_import(folder: Path, place: Path, options: CaptureOptions) -> ImportedSet:
+    """An import that is there, if it is of this set."""
+    path = place / IMPORT_FILE
+    try:
+        made = from_json(_Made, parse_json(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise DataError(place, f"is in the way of the import of {folder}: remove it.") from error
+    data_set = read_data_set(folder, options)
+    if made.folder != folder.absolute() or made.kind is not data_set.kind:
+        raise DataError(place, f"is the import of {made.folder}, not of {folder}: remove it.")
+    return _described(data_set, place, None)
+
+
+def _described(data_set: DataSet, out: Path, num_points: int | None) -> ImportedSet:
+    """What an import in a folder comes to."""
+    options = data_set.options
+    if data_set.capture is None:
         options = replace(options, kind=CaptureKind.STOKES)
+    return ImportedSet(
+        data_set=data_set,
+        capture=data_set.capture or out / "capture",
+        options_file=out / "capture.toml",
+        sparse=out / "sparse" if data_set.cameras else data_set.sparse,
+        masks=out / "masks" if data_set.masks else None,
+        num_points=num_points,
+        light=data_set.light,
+        options=options,
+    )
+
+
+def _import(data_set: DataSet, out: Path) -> ImportedSet:
+    planned = _described(data_set, out, None)
+    options, place = planned.options, planned.capture
+    if data_set.capture is None:
+        _convert(data_set, place)
     capture = open_capture(place, options)
     missing = {stem_of(name) for name in image_names(capture)} ^ set(data_set.names)
     if missing:
         raise DataError(data_set.folder, f"the image {min(missing)!r} is not whole.")
-    sparse, num_points = data_set.sparse, None
-    if data_set.cameras:
-        sparse = out / "sparse"
-        num_points = _triangulate(data_set, capture, out)
-    masks = None
-    if data_set.masks:
-        masks = out / "masks"
-        masks.mkdir()
+    num_points = _triangulate(data_set, capture, out) if data_set.cameras else None
+    if planned.masks is not None:
+        planned.masks.mkdir()
         for stem in data_set.names:
-            _write_mask(data_set, stem, masks, capture)
-    options_file = out / "capture.toml"
-    write_bytes(options_file, _toml(options).encode())
-    return ImportedSet(
-        data_set=data_set,
-        capture=place,
-        options_file=options_file,
-        sparse=sparse,
-        masks=masks,
-        num_points=num_points,
-        light=data_set.light,
-    )
+            _write_mask(data_set, stem, planned.masks, capture)
+    write_bytes(planned.options_file, _toml(options).encode())
+    return replace(planned, num_points=num_points)
 
 
 def _convert(data_set: DataSet, place: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from polmvs.pipeline.runner import Job, Run, load_record, open_run
 from polmvs.pipeline.stage_table import (
     COMPARE,
     DENSIFY,
-    EXPORT,
+    FINISH,
     NORMALS,
     SFM,
     StageSpec,
@@ -29,9 +30,12 @@ from polmvs.pipeline.stages.maps import MapsResult
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
 from polmvs.polarization.capture import open_capture
-from polmvs.scene import MIN_VIEWS
+from polmvs.scene import MIN_VIEWS, short_list
+
+logger = logging.getLogger(__name__)
 
 MIN_SFM_IMAGES = 2
+MAX_REJECTIONS = 2  # rounds in which views are taken out of the model
 
 NO_REGION = (
     "no polarised region: no view shows a surface with polarised light. Lower `region.min_dolp`, "
@@ -79,9 +83,10 @@ def reconstruct(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
         The input is unusable or a stage fails; finished stages stay in the run folder.
     """
     job = _with_poses_of_workspace(job)
-    last = _of_models((NORMALS, DENSIFY, EXPORT), (model,), stage_table())
+    last = _of_models((NORMALS, DENSIFY, FINISH), (model,), stage_table())
     with _open(job, last) as run:
         _do_all(run, last)
+        _take_out_rejected(run, last, (model,))
         return _close(run, (model,))
 
 
@@ -98,6 +103,7 @@ def compare(job: Job, models: Sequence[AngleModel] = COMPARED_MODELS) -> JobOutc
     last = _of_models((NORMALS, DENSIFY, COMPARE), models, table)
     with _open(job, last, table=table) as run:
         _do_all(run, last)
+        _take_out_rejected(run, last, models)
         outcome = _close(run, models)
     return replace(outcome, comparison=read_comparison(outcome.run_folder.metrics))
 
@@ -120,9 +126,9 @@ def densify(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> JobOu
     return _do_alone(job, DENSIFY, models, models)
 
 
-def export(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
+def finish(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
     """Mesh and COLMAP workspace of a folder that has a dense cloud."""
-    return _do_alone(job, EXPORT, (model,), (model,))
+    return _do_alone(job, FINISH, (model,), (model,))
 
 
 def measure(run_folder: RunFolder, models: Sequence[AngleModel]) -> Comparison:
@@ -220,6 +226,34 @@ def _do_all(run: Run, last: Sequence[StageSpec]) -> None:
     wanted = [spec.name for spec in last if spec.is_wanted(run.options)]
     for spec in with_needed(wanted, run.table):
         run.do(spec)
+
+
+def _take_out_rejected(run: Run, last: Sequence[StageSpec], models: Sequence[AngleModel]) -> None:
+    """Take views whose pose the surface contradicts out of the model, and do all of it again.
+
+    PPA's surface is asked, else that of tilted polarizers: what OPA leaves out contradicts sound
+    views.
+    """
+    judge = next((m for m in (AngleModel.PPA, AngleModel.TILTED) if m in models), None)
+    for _ in range(MAX_REJECTIONS):
+        if judge is None or not run.is_finished(_densify_of(run, judge)):
+            return
+        rejected = run.record.result(DensifyResult, judge).left_out
+        if not rejected or run.num_views - len(rejected) < MIN_VIEWS:
+            return
+        said = run.record.stage(_densify_of(run, judge).name)
+        assert said is not None
+        reasons = [text for text in said.warnings if any(name in text for name in rejected)]
+        run.take_out(rejected, reasons)
+        logger.warning(
+            "%s: taken out of the model, and all that follows is done again without.",
+            short_list(rejected),
+        )
+        _do_all(run, last)
+
+
+def _densify_of(run: Run, model: AngleModel) -> StageSpec:
+    return next(s for s in run.table if s.command == DENSIFY and s.angle_model is model)
 
 
 def _close(run: Run, models: Sequence[AngleModel]) -> JobOutcome:

@@ -12,6 +12,7 @@ from polmvs._version import __version__
 from polmvs.cluster import PACKAGES, installed_versions
 from polmvs.config import AngleModel, options_from_plain
 from polmvs.errors import DataError, OptionError
+from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
 
@@ -21,7 +22,8 @@ R = TypeVar("R")
 # 1: the first releases, which did not name it. 2: stages with their results. 3: SfM as a stage of
 # its own, trust, notes on the capture. 4: seeds are sparse points alone. 5: what stages wrote.
 # 6: covariances of the poses. 7: what tells the content of the input, number of files.
-SCHEMA_VERSION = 7
+# 8: views that a surface leaves out.
+SCHEMA_VERSION = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,7 +245,7 @@ def _read_current(run_folder: RunFolder) -> dict[str, Any]:
 
 def _read_content(run_folder: RunFolder) -> dict[str, Any]:
     try:
-        content = parse_json(run_folder.run_file.read_text(encoding="utf-8"))
+        content = parse_json(read_text(run_folder.run_file))
     except FileNotFoundError as error:
         raise DataError(
             run_folder.root, f"holds no run of polmvs ({RUN_FILE} is missing)."

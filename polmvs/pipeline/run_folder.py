@@ -15,6 +15,7 @@ from pathlib import Path
 
 from polmvs.config import AngleModel
 from polmvs.errors import DataError
+from polmvs.io.plain_files import read_text
 from polmvs.io.temporary import remove_temporary, temporary_path
 
 RUN_FILE = "run.json"
@@ -138,6 +139,22 @@ FOLDER_FILES = {
     },
     **{HERE.views(model).name: _SURFACES for model in AngleModel},
 }
+# Names of all that a run may write in its folder itself.
+ROOT_NAMES = frozenset(
+    path.parts[0]
+    for path in (
+        *(HERE.images, HERE.sfm, HERE.sparse, HERE.seeds, HERE.metrics, HERE.summary),
+        *(HERE.report, HERE.run_file, HERE.log),
+        *(
+            path
+            for model in AngleModel
+            for path in (
+                *(HERE.maps(model), HERE.sparse_cloud(model), HERE.cloud(model)),
+                *(HERE.views(model), HERE.mesh(model), HERE.dense(model)),
+            )
+        ),
+    )
+)
 # In these, files named IMAGE.part.npy as well; images are known by name from the record.
 FOLDERS_BY_IMAGE = frozenset(
     name for model in AngleModel for name in (HERE.maps(model).name, HERE.views(model).name)
@@ -259,7 +276,7 @@ def _require_own_workspace(folder: Path) -> None:
     if not marker.is_file():
         raise DataError(folder, NOT_OURS)
     try:
-        written = {*marker.read_text(encoding="utf-8").splitlines(), DENSE_MARKER}
+        written = {*read_text(marker).splitlines(), DENSE_MARKER}
     except (OSError, ValueError) as error:
         raise DataError(
             marker, f"cannot be read ({error}). Move {folder} out of the way."

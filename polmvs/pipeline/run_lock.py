@@ -13,14 +13,16 @@ import errno
 import logging
 import os
 import re
+import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from polmvs.errors import DataError, as_data_error
+from polmvs.io.plain_files import open_plain
 from polmvs.io.temporary import TOKEN, is_temporary, remove_temporary
-from polmvs.pipeline.run_folder import HERE
+from polmvs.pipeline.run_folder import FOLDER_FILES, HERE, ROOT_NAMES
 
 if sys.platform == "win32":
     import msvcrt
@@ -32,7 +34,8 @@ logger = logging.getLogger(__name__)
 LOCK_FILE = ".polmvs-lock"
 MAX_BYTES = 1 << 16
 _LINE = re.compile(r"([0-9a-f]{16}) (\d{1,10})")  # token and number of a process
-_PLACES = (Path(), HERE.seeds.parent)  # folders in which a run gives temporary names
+# Folders in which a run gives temporary names, and what that is to be named in the end.
+_PLACES = {Path(): ROOT_NAMES, HERE.seeds.parent: FOLDER_FILES[HERE.seeds.parent.name]}
 _HELD_ELSEWHERE = (errno.EWOULDBLOCK, errno.EACCES)
 
 
@@ -76,7 +79,11 @@ def left_over_names(root: Path) -> frozenset[str]:
     if not path.is_file() or path.is_symlink():
         return frozenset()
     tokens = _read(path)
-    found = [entry.name for entry in root.iterdir() if any(is_temporary(entry, t) for t in tokens)]
+    found = [
+        entry.name
+        for entry in root.iterdir()
+        if any(is_temporary(entry, token, ROOT_NAMES) for token in tokens)
+    ]
     return frozenset((LOCK_FILE, *found))
 
 
@@ -85,7 +92,10 @@ def _open_locked(path: Path) -> int:
     while True:
         with as_data_error(path, "written"):
             flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
-            descriptor = os.open(path, flags, 0o666)
+            descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise DataError(path, "was not written by polmvs. Move it out of the way.")
         try:
             _lock(descriptor)
         except OSError as error:
@@ -131,7 +141,7 @@ def _read(path: Path) -> dict[str, int]:
         The file is not one that a run wrote.
     """
     try:
-        with as_data_error(path, "read"), path.open("rb") as file:
+        with as_data_error(path, "read"), open_plain(path) as file:
             text = file.read(MAX_BYTES).decode("ascii")
     except ValueError as error:
         raise DataError(path, "was not written by polmvs. Move it out of the way.") from error
@@ -155,12 +165,12 @@ def _write(descriptor: int, path: Path, tokens: dict[str, int]) -> None:
 def _remove_left_over(root: Path, tokens: set[str]) -> set[str]:
     """Remove what carries one of these tokens; the tokens of what could not be removed."""
     left = set()
-    for place in _PLACES:
+    for place, names in _PLACES.items():
         folder = root / place
         if folder.is_symlink() and place != Path():
             continue
         for path in list(folder.iterdir()) if folder.is_dir() else []:
-            token = next((token for token in tokens if is_temporary(path, token)), None)
+            token = next((token for token in tokens if is_temporary(path, token, names)), None)
             if token is not None:
                 remove_temporary(path)
                 if os.path.lexists(path):

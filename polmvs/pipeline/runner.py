@@ -17,12 +17,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
+from polmvs.cluster import TlsFiles
 from polmvs.colmap.cameras import quiet_colmap
 from polmvs.config import (
     AngleModel,
     Options,
     RunOptions,
     plain_options,
+    replace_option,
     show_value,
     to_plain,
     with_absolute_paths,
@@ -264,6 +266,20 @@ class Run(StageInput):
         """
         self._delete(with_dependent(names, self.table))
 
+    def take_out(self, names: Sequence[str], reasons: Sequence[str]) -> None:
+        """Take images out of the model: what was made with them is done again without.
+
+        Parameters
+        ----------
+        names : of the images.
+        reasons : sentences for the record.
+        """
+        without = tuple(dict.fromkeys((*self.options.sfm.without, *names)))
+        self.options = replace_option(self.options, "sfm.without", without)
+        self.record.options = to_plain(self.options)
+        self.record.notes = (*self.record.notes, *reasons)
+        self.forget(["poses"])
+
     def _delete(self, stale: Sequence[StageSpec], remembered: StageRecord | None = None) -> None:
         """Delete the files of stages, and what is recorded of them but for what is remembered."""
         paths = [self.run_folder.root / path for spec in stale for path in spec.writes]
@@ -435,7 +451,8 @@ def _workers(job: Job, plan: MemoryPlan) -> Workers:
         return Workers(plan.num_workers)
     existing = next(folder for folder in (job.out, *job.out.parents) if folder.is_dir())
     sources = [path for path in (job.capture, *inputs_of(job.options).values()) if path.exists()]
-    return Workers.of_cluster(job.run_options.scheduler, [existing], sources)
+    tls = TlsFiles.of(job.run_options)
+    return Workers.of_cluster(job.run_options.scheduler, [existing], sources, tls)
 
 
 def load_record(run_folder: RunFolder) -> Record:

@@ -16,7 +16,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from polmvs.config import AngleModel, Options
+from polmvs.config import AngleModel, Options, SfmOptions, option_paths
 from polmvs.evaluation.comparison import SparseFigures
 from polmvs.evaluation.trust import Trust
 from polmvs.memory import MemoryNeeds
@@ -41,7 +41,8 @@ from polmvs.polarization.capture import Capture
 from polmvs.scene import SparseModel
 
 # Commands that do stages alone, by the stage; ``compare`` has no command for its own alone.
-SFM, NORMALS, DENSIFY, EXPORT, COMPARE = "sfm", "normals", "densify", "export", "compare"
+SFM, NORMALS, DENSIFY, FINISH, COMPARE = "sfm", "normals", "densify", "finish", "compare"
+WITHOUT = "sfm.without"
 TILT_AWARE = "normals.tilt_aware_weights"
 
 
@@ -133,6 +134,7 @@ def _place_model(run: StageInput) -> poses.PosesResult:
         folder.camera_modes,
         folder.pose_covariances,
         run.options.reference,
+        run.options.sfm.without,
     )
 
 
@@ -167,6 +169,7 @@ def _solve_normals(model: AngleModel, run: StageInput) -> normals.NormalsResult:
         folder.maps(model),
         folder.track_normals(model),
         run.options.normals,
+        run.options.region.light,
         max_rows=run.max_rows,
     )
 
@@ -204,6 +207,7 @@ def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
         propagation=run.options.propagation,
         fusion=run.options.fusion,
         tilt_aware=run.options.normals.tilt_aware_weights,
+        light=run.options.region.light,
         masks_given=run.options.region.mask is not None,
         workers=run.workers,
         on_progress=run.on_progress,
@@ -286,7 +290,7 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             command=SFM,
             reads=(HERE.images,),
             writes=(HERE.sfm,),
-            decides=("sfm",),
+            decides=tuple(path for path in option_paths(SfmOptions) if path != WITHOUT),
             work=_find_model,
             result=sfm.SfmResult,
             num_steps=lambda run: None if run.given_model else sfm.NUM_SFM_STEPS,
@@ -296,7 +300,7 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             command=SFM,
             reads=(HERE.images, HERE.sfm),
             writes=(HERE.sparse, HERE.camera_modes, HERE.pose_covariances),
-            decides=("reference",),
+            decides=("reference", WITHOUT),
             work=_place_model,
             result=poses.PosesResult,
         ),
@@ -364,7 +368,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             angle_model=model,
             reads=(HERE.sparse, HERE.maps(model)),
             writes=(track_normals,),
-            decides=("normals.estimator", "normals.window_px", TILT_AWARE),
+            decides=("normals.estimator", "normals.window_px", "region.light", TILT_AWARE),
             work=partial(_solve_normals, model),
             result=normals.NormalsResult,
         ),
@@ -386,14 +390,14 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
                 *(HERE.maps(model), track_normals, HERE.seeds),
             ),
             writes=(cloud, views),
-            decides=(TILT_AWARE, "region.mask", "propagation", "fusion"),
+            decides=(TILT_AWARE, "region.mask", "region.light", "propagation", "fusion"),
             work=partial(_densify, model),
             result=densify.DensifyResult,
             num_steps=lambda run: densify.num_densify_steps(run.num_views, run.options.propagation),
         ),
         StageSpec(
             name=f"trust_{model}",
-            command=EXPORT,
+            command=FINISH,
             angle_model=model,
             reads=(HERE.sparse, HERE.maps(model), HERE.sparse_cloud(model), cloud),
             writes=(),
@@ -402,7 +406,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
         ),
         StageSpec(
             name=f"mesh_{model}",
-            command=EXPORT,
+            command=FINISH,
             angle_model=model,
             reads=(cloud, views),
             writes=(HERE.mesh(model),),
@@ -412,7 +416,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
         ),
         StageSpec(
             name=f"dense_{model}",
-            command=EXPORT,
+            command=FINISH,
             angle_model=model,
             reads=(HERE.sparse, HERE.images, cloud, views),
             writes=(HERE.dense(model),),

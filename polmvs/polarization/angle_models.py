@@ -189,7 +189,7 @@ def correct_parameters(parameters: Floats, rays_in_cam: Floats, *, diffuse: Mask
     p1, p2 = first * s1, second * s2
     along = (g1 * p1 + g2 * p2) / (q * q)  # g S1r
     total = s0 - 0.5 * (g2 * (p2 + g2 * along) / first + g1 * (p1 + g1 * along) / second)
-    return np.stack([total, *_corrected_polarization(s1, s2, rays_in_cam, diffuse)])
+    return np.stack([total, *correct_polarization(s1, s2, rays_in_cam, diffuse)])
 
 
 def correct_stokes(stokes: Stokes, rays_in_cam: Floats, *, diffuse: Mask | bool) -> Stokes:
@@ -260,7 +260,7 @@ def tilt_turn(
     """
     sign = _signs(diffuse, cos2.dtype)
     s1, s2 = sign * cos2, sign * sin2
-    t1, t2 = _corrected_polarization(s1, s2, rays_in_cam, diffuse)
+    t1, t2 = correct_polarization(s1, s2, rays_in_cam, diffuse)
     return np.asarray(0.5 * np.arctan2(s1 * t2 - s2 * t1, s1 * t1 + s2 * t2))
 
 
@@ -277,10 +277,13 @@ def _radial(rays_in_cam: Floats) -> tuple[Floats, Floats, Floats]:
     return (x * x - y * y) * inverse, -2 * x * y * inverse, 2 * z * inverse
 
 
-def _corrected_polarization(
+def correct_polarization(
     s1: Floats, s2: Floats, rays_in_cam: Floats, diffuse: Mask | bool
 ) -> tuple[Floats, Floats]:
-    """Corrected s1, s2: to the ray's transverse plane, and projected on the image plane."""
+    """Corrected s1, s2 alone (...): see :func:`correct_parameters`.
+
+    To the ray's transverse plane, and projected on the image plane.
+    """
     g1, g2, q = _radial(rays_in_cam)
     p1, p2 = (1 - g1 * g1) * s1, (1 - g2 * g2) * s2
     # S = P / q + G (G . P) / (q^2 (1 + q)), free of the radial direction, which the axis lacks.

@@ -32,6 +32,7 @@ from polmvs.config import BayerOrder, CaptureOptions
 from polmvs.errors import DataError, as_data_error
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.images import write_bytes
+from polmvs.io.plain_files import read_text
 from polmvs.polarization.mosaic import (
     ANGLES_DEG,
     split_colour_mosaic,
@@ -352,7 +353,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
     """
     try:
         with as_data_error(path, "read"):
-            content = tomllib.loads(path.read_text(encoding="utf-8"))
+            content = tomllib.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise DataError(path, "is no TOML file of a calibration.") from error
     known = {"version", "pattern", "bayer", "gains", "angles_deg", "diattenuations", "full_scale"}
@@ -412,7 +413,8 @@ def _numbers_of(
     """Four finite numbers for each of some blocks."""
     value = content.get(key, list(default) * blocks)
     good = isinstance(value, list) and len(value) == 4 * blocks
-    if not good or not all(type(v) in (int, float) and np.isfinite(v) for v in value):
+    # Integers of TOML may have any length.
+    if not good or not all(type(v) in (int, float) and -1e300 < v < 1e300 for v in value):
         each = "" if blocks == 1 else ", for each of the four 2x2 blocks"
         raise DataError(path, f"{key} needs four numbers, of the channels 0, 45, 90, 135{each}.")
     return tuple(map(float, value))

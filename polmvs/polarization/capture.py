@@ -31,14 +31,16 @@ from polmvs.io.raw_formats import (
     probe_raw,
     read_raw,
 )
+from polmvs.polarization.angle_gains import AngleGains, find_angle_gains
 from polmvs.polarization.bit_depth import CONTAINER_BITS, LevelCounts, Levels, decide_levels
 from polmvs.polarization.calibration import PolarizerCalibration, read_calibration
 from polmvs.polarization.exposures import merge_exposures
 from polmvs.polarization.linearity import LinearityCheck, check_linearity
-from polmvs.polarization.lossy import BLOCK, find_quantization, lossy_variance
+from polmvs.polarization.lossy import BLOCK, find_quantization, lossy_mean_variance, lossy_variance
 from polmvs.polarization.mosaic import (
     clipped_cells,
     linearize,
+    noise_area_px,
     split_colour_mosaic,
     split_mosaic,
     split_mosaic_full,
@@ -91,6 +93,7 @@ class Capture:
     lossy_steps : (64,) steps of the JPEG that the samples were, row by row; None if none.
     orientations : TIFF orientations that occur; the samples are as stored.
     pattern_check, linearity_check : of a monochrome mosaic's pattern and gamma; None for others.
+    angle_gains : of the views that were looked at, of an ``ANGLES`` capture; empty for others.
     """
 
     folder: Path
@@ -105,6 +108,7 @@ class Capture:
     orientations: tuple[int, ...] = (UPRIGHT,)
     pattern_check: PatternCheck | None = None
     linearity_check: LinearityCheck | None = None
+    angle_gains: tuple[AngleGains, ...] = ()
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -115,6 +119,15 @@ class Capture:
     def names(self) -> tuple[str, ...]:
         """Names of the views: of single mosaics their file names."""
         return tuple(view.name for view in self.files.views)
+
+    @property
+    def has_colors(self) -> bool:
+        """Whether its files are those of a colour camera."""
+        return self.options.bayer is not None or (
+            self.files.kind is not CaptureKind.AOLP
+            and self.header.channels == 3
+            and not (self.files.kind is CaptureKind.STOKES and len(self.files.views[0].files) == 1)
+        )
 
     @property
     def bit_depth(self) -> int:
@@ -171,7 +184,27 @@ class Capture:
             )
         if self.linearity_check is not None and self.linearity_check.fits is False:
             lines.append(self.linearity_check.message)
+        if self.unequal_exposure is not None and not self.options.equalize:
+            lines.append(self.unequal_exposure)
         return tuple(lines)
+
+    @property
+    def unequal_exposure(self) -> str | None:
+        """What to say of polarizer angles that differ in exposure; None where they do not."""
+        differing = [found for found in self.angle_gains if found.differ]
+        if not differing:
+            return None
+        worst = max(differing, key=lambda found: found.ratio)
+        gains = ", ".join(
+            f"{angle:g} deg {gain / max(worst.gains):.2g}"
+            for angle, gain in zip(self.files.angles_deg, worst.gains, strict=True)
+        )
+        return (
+            f"the images of a view differ in exposure by up to a factor of {worst.ratio:.1f} "
+            f"({gains}), in {len(differing)} of {len(self.angle_gains)} views looked at: automatic "
+            "exposure, or a filter turned by hand? Record them at one exposure, or give "
+            "`capture.equalize`, which divides them by the gains found over unpolarised places"
+        )
 
     def load(self, name: str) -> Stokes:
         """Read a view and turn it into Stokes images ``(height, width)``.
@@ -195,6 +228,11 @@ class Capture:
         mosaic = self.files.kind is CaptureKind.MOSAIC
         if self.lossy_steps is not None and not (mosaic and options.resolution is Resolution.HALF):
             stokes = replace(stokes, lossy_block_px=float(BLOCK))
+        if mosaic:
+            area = noise_area_px(
+                colour=options.bayer is not None, full=options.resolution is Resolution.FULL
+            )
+            stokes = replace(stokes, noise_area_px=area)
         return turned_axes(stokes, zero_deg=options.zero_deg, clockwise=options.clockwise)
 
     def load_mosaic(self, name: str) -> Image:
@@ -235,7 +273,7 @@ class Capture:
 
     def _read(self, path: Path) -> NDArray[Any]:
         """Samples of the size and type that the capture was opened with."""
-        raw = read_raw(path, _dump_size(self.options))
+        raw = read_raw(path, _dump_size(self.options), max_pixels=self.options.max_pixels)
         if raw.header != self.header and self.files.kind is not CaptureKind.AOLP:
             raise DataError(path, "has changed since the run began. Start the run again.")
         return raw.samples
@@ -300,15 +338,36 @@ class Capture:
             gains_known=True,
         )
 
-    def _from_angles(self, view: ViewFiles) -> Stokes:
+    def _angle_stack(self, view: ViewFiles) -> tuple[Image, Mask]:
+        """Linear images (K, H, W) or (K, H, W, 3) of a view, and where any of them is clipped."""
         linear, clipped = [], []
         for paths in view.files:
             image, raw, threshold = self._linear(paths)
             linear.append(image)
             clipped.append(raw >= threshold)
         stack, spoiled = np.stack(linear), np.logical_or.reduce(clipped)
-        if spoiled.ndim == 3:
-            spoiled = spoiled.any(axis=-1)
+        return stack, spoiled.any(axis=-1) if spoiled.ndim == 3 else spoiled
+
+    def find_gains(self, name: str) -> AngleGains:
+        """Gains between the images of a view of an ``ANGLES`` capture.
+
+        Raises
+        ------
+        DataError
+            As :meth:`load`.
+        """
+        return self._gains_of(*self._angle_stack(self._view(name)))
+
+    def _gains_of(self, stack: Image, spoiled: Mask) -> AngleGains:
+        gray = stack if stack.ndim == 3 else stack.mean(axis=-1)
+        usable = ~spoiled & (gray.min(axis=0) >= self.options.darkness)
+        return find_angle_gains(gray, self.files.angles_deg, usable)
+
+    def _from_angles(self, view: ViewFiles) -> Stokes:
+        stack, spoiled = self._angle_stack(view)
+        if self.options.equalize:
+            gains = np.array(self._gains_of(stack, spoiled).gains, np.float32)
+            stack = stack / gains.reshape(-1, *(1,) * (stack.ndim - 1))
         planes = [stack] if stack.ndim == 3 else [stack[..., c] for c in range(stack.shape[3])]
         return self._one_colour(
             [
@@ -318,7 +377,6 @@ class Capture:
                     spoiled,
                     darkness=self.options.darkness,
                     quantum=self._quantum,
-                    # Of neighbouring samples, in a mosaic; here rounding errs in each image alone.
                     lossy_variance=self._lossy_variance,
                 )
                 for plane in planes
@@ -396,7 +454,11 @@ class Capture:
         if self.lossy_steps is None:
             return 0.0
         steps = np.array(self.lossy_steps).reshape(8, 8)
-        return lossy_variance(steps, scale=self._quantum)
+        if self.files.kind is CaptureKind.MOSAIC:
+            return lossy_variance(steps, scale=self._quantum)
+        return lossy_mean_variance(
+            steps, ideal_analyzers(self.files.angles_deg), scale=self._quantum
+        )
 
     def _intensity_samples(self, view: ViewFiles) -> NDArray[np.float32]:
         """Intensity s0 of evenly spread cells of one image, ``(N,)``."""
@@ -494,6 +556,10 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
         pattern_check=_check_pattern(files, options, levels, sampled),
         linearity_check=_check_linearity(files, options, levels, sampled),
     )
+    if files.kind is CaptureKind.ANGLES:
+        looked_at = np.linspace(0, len(files.views) - 1, min(CHECKED_IMAGES, len(files.views)))
+        gains = tuple(capture.find_gains(capture.names[int(k)]) for k in looked_at)
+        capture = replace(capture, angle_gains=gains)
     for warning in capture.warnings:
         logger.warning("%s: %s.", files.folder, warning)
     logger.info("%s: %s", files.folder, "; ".join(capture.notes))
@@ -536,6 +602,11 @@ def _dump_size(options: CaptureOptions) -> DumpSize:
 
 def _require_fitting_options(files: CaptureFiles, options: CaptureOptions) -> None:
     """Options that say nothing of this kind of files are not ignored."""
+    if options.equalize and files.kind is not CaptureKind.ANGLES:
+        raise OptionError(
+            f"is of an image for each polarizer angle; {files.folder} holds {files.kind} images.",
+            field="capture.equalize",
+        )
     if files.kind is CaptureKind.MOSAIC:
         return
     defaults = CaptureOptions()
@@ -561,9 +632,9 @@ def _survey(
     for view in files.views:
         for role, paths in enumerate(view.files):
             for path in paths:
-                header, raw = probe_raw(path, _dump_size(options)), None
+                header, raw = probe_raw(path, max_pixels=options.max_pixels), None
                 if header is None or header.dtype != "uint8" or path in looked_at:
-                    raw = read_raw(path, _dump_size(options))
+                    raw = read_raw(path, _dump_size(options), max_pixels=options.max_pixels)
                     header = raw.header
                 _require_usable(files.kind, path, header, options)
                 if first is None:
@@ -602,6 +673,12 @@ def _require_usable(
 ) -> None:
     """A file may hold what the capture's kind says."""
     if kind is CaptureKind.MOSAIC:
+        if header.dtype == "float32" and (header.channels in (3, 4) or header.height in (3, 4)):
+            raise DataError(
+                path,
+                "holds three or more planes of floats, as Stokes images do. Give `capture.kind` "
+                "stokes.",
+            )
         if header.channels != 1:
             raise DataError(
                 path,
@@ -620,7 +697,7 @@ def _require_usable(
                 path, "has float32 samples; export the raw mosaic as 8- or 16-bit integers."
             )
     if kind is CaptureKind.STOKES and header.dtype != "float32":
-        raise DataError(path, f"has {header.dtype} samples; Stokes images are floats.")
+        raise DataError(path, f"has {header.dtype} samples; files of kind stokes hold floats.")
 
 
 def _require_same(first_path: Path, first: RawHeader, path: Path, header: RawHeader) -> None:

@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import CaptureKind, RegionOptions, Resolution
+from polmvs.errors import printable
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.capture import Capture, intensity_image_8bit
+from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
 from polmvs.scene import short_list
 
@@ -39,7 +41,9 @@ class InspectionLimits:
 
     Attributes
     ----------
-    saturated : share of a view's pixels that are clipped.
+    saturated : share of the part's pixels that are clipped, in a view.
+    noisy_deg : deviation of the AoLP on the part, the median of the views.
+    few_views, least_views : under which a surface is carried by little, or by nothing.
     dark_white : brightest 0.5 % of the capture, share of full scale.
     polarized : share of the capture's pixels that are polarised.
     edge_px : width of the sharpest edges of a view.
@@ -48,6 +52,9 @@ class InspectionLimits:
     """
 
     saturated: float = 0.1
+    noisy_deg: float = 15.0
+    few_views: int = 10
+    least_views: int = 3
     dark_white: float = 0.2
     polarized: float = 0.01
     edge_px: float = 6.0
@@ -64,6 +71,8 @@ class ViewFigures:
     name : of the view.
     median_intensity : of s0 / 2, share of full scale.
     saturated : share of pixels that a clipped sample contributes to, or that are not finite.
+    part : share of all pixels that lie on the polarised part.
+    part_saturated : share of the part's pixels that are clipped; NaN without a part.
     dark : share of pixels under the darkness threshold.
     polarized : share of all pixels that are valid and have a DoLP of 0.1 and more.
     median_dolp : of the valid pixels.
@@ -75,6 +84,8 @@ class ViewFigures:
     name: str
     median_intensity: float
     saturated: float
+    part: float
+    part_saturated: float
     dark: float
     polarized: float
     median_dolp: float
@@ -93,29 +104,44 @@ class Inspection:
     white : s0 / 2 of the brightest 0.5 % of pixels, share of full scale.
     views : figures of each view.
     warnings : what a user should look at, one line each.
+    obstacles : for which nothing is to be had from it, as clauses.
     """
 
     capture: Capture
     white: float
     views: tuple[ViewFigures, ...]
     warnings: tuple[str, ...] = field(default=())
+    obstacles: tuple[str, ...] = field(default=())
+
+    @property
+    def verdict(self) -> str:
+        """One sentence on whether it will do."""
+        if self.obstacles:
+            return f"This capture will not do, because {'; and '.join(self.obstacles)}."
+        if self.warnings:
+            count = len(self.warnings)
+            said = "the warning" if count == 1 else f"the {count} warnings"
+            return f"This capture will do, but {said} above should be looked at."
+        return "This capture will do."
 
     @property
     def lines(self) -> tuple[str, ...]:
         """The whole in lines of text: what it is, a table of the views, warnings."""
         header = (
-            f"{'view':<24} {'intensity':>9} {'clipped':>8} {'dark':>7} {'polarised':>9} "
-            f"{'DoLP':>6} {'sigma AoLP':>10} {'edge':>7}"
+            f"{'view':<24} {'intensity':>9} {'part':>6} {'clipped':>8} {'dark':>7} "
+            f"{'polarised':>9} {'DoLP':>6} {'sigma AoLP':>10} {'edge':>7}"
         )
         rows = [
-            f"{v.name[-24:]:<24} {100 * v.median_intensity:>7.1f} % {100 * v.saturated:>6.1f} % "
-            f"{100 * v.dark:>5.1f} % {100 * v.polarized:>7.1f} % {v.median_dolp:>6.3f} "
-            f"{v.sigma_aolp_deg:>6.2f} deg {v.edge_px:>4.1f} px"
+            f"{printable(v.name)[-24:]:<24} {100 * v.median_intensity:>7.1f} % "
+            f"{100 * v.part:>4.0f} % "
+            f"{100 * v.part_saturated:>6.1f} % {100 * v.dark:>5.1f} % {100 * v.polarized:>7.1f} % "
+            f"{v.median_dolp:>6.3f} {v.sigma_aolp_deg:>6.2f} deg {v.edge_px:>4.1f} px"
             for v in self.views
         ]
         size = f"polarization images of {self.capture.width}x{self.capture.height} px"
         warned = [f"warning: {text}" for text in self.warnings]
-        return (*self.capture.notes, size, header, *rows, *warned)
+        told = "clipped: share of the part, where the light is polarised"
+        return (*self.capture.notes, size, header, *rows, told, *warned, self.verdict)
 
 
 def inspect_capture(
@@ -145,8 +171,13 @@ def inspect_capture(
             colour = _block_differences(capture, stokes)
         figures.append(_figures_of(name, stokes, capture.options.darkness))
         on_progress(1)
-    warnings = _warnings(capture, white, figures, colour, limits)
-    return Inspection(capture=capture, white=white, views=tuple(figures), warnings=tuple(warnings))
+    return Inspection(
+        capture=capture,
+        white=white,
+        views=tuple(figures),
+        warnings=tuple(_warnings(capture, white, figures, colour, limits)),
+        obstacles=tuple(_obstacles(capture, white, figures, limits)),
+    )
 
 
 def contact_sheet(capture: Capture, worded: Callable[[str], str] = str) -> Picture:
@@ -253,10 +284,14 @@ def _figures_of(name: str, stokes: Stokes, darkness: float) -> ViewFigures:
     dark = ~valid & (s0 < 2.0 * darkness)
     polarized = valid & (dolp >= RegionOptions.min_dolp)
     sigma = np.degrees(np.median(stokes.sigma_aolp[polarized])) if polarized.any() else np.nan
+    clipped = ~valid & ~dark
+    part = _part(stokes, clipped)
     return ViewFigures(
         name=name,
         median_intensity=0.5 * float(np.median(s0)),
-        saturated=float(np.mean(~valid & ~dark)),
+        saturated=float(np.mean(clipped)),
+        part=float(np.mean(part)),
+        part_saturated=float(np.mean(clipped[part])) if part.any() else float("nan"),
         dark=float(np.mean(dark)),
         polarized=float(np.mean(polarized)),
         median_dolp=float(np.median(dolp[valid])) if valid.any() else 0.0,
@@ -264,6 +299,27 @@ def _figures_of(name: str, stokes: Stokes, darkness: float) -> ViewFigures:
         gain_sigma=stokes.gain_sigma,
         edge_px=_edge_width(s0),
     )
+
+
+def _part(stokes: Stokes, clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Where light is polarised (H, W), and clipped spots more than half of whose rim is there."""
+    region = find_region(
+        stokes.s0, stokes.s1, stokes.s2, stokes.valid, min_dolp=RegionOptions.min_dolp
+    ).inside
+    count, labels = cv2.connectedComponents(clipped.astype(np.uint8), connectivity=8)
+    rim, inner = np.zeros(count), np.zeros(count)
+    for axis in (0, 1):
+        for step in (1, -1):
+            # A neighbour beyond the border of the image is the pixel itself.
+            place = np.clip(np.arange(clipped.shape[axis]) + step, 0, clipped.shape[axis] - 1)
+            outside = clipped & ~np.take(clipped, place, axis=axis)
+            rim += np.bincount(labels[outside], minlength=count)
+            inner += np.bincount(
+                labels[outside & np.take(region, place, axis=axis)], minlength=count
+            )
+    of_part = inner > 0.5 * rim
+    of_part[0] = False
+    return np.asarray(region | of_part[labels])
 
 
 def _edge_width(s0: Image) -> float:
@@ -295,6 +351,36 @@ def _block_differences(capture: Capture, stokes: Stokes) -> float:
     return max(shares) - min(shares)
 
 
+def _obstacles(
+    capture: Capture, white: float, views: Sequence[ViewFigures], limits: InspectionLimits
+) -> list[str]:
+    """Why nothing is to be had from a capture, as clauses after "because"."""
+    lines = []
+    if len(views) < limits.least_views:
+        lines.append(
+            f"it has {len(views)} view{'s' * (len(views) != 1)}: a surface takes three or more"
+        )
+    polarized = float(np.mean([v.polarized for v in views]))
+    if polarized < limits.polarized:
+        lines.append(
+            f"{100 * polarized:.1f} % of its pixels are polarised (DoLP "
+            f"{RegionOptions.min_dolp:g}); is it a polarization camera's raw format, and is the "
+            "part glossy?"
+        )
+    sigma = [v.sigma_aolp_deg for v in views if np.isfinite(v.sigma_aolp_deg)]
+    if sigma and float(np.median(sigma)) > limits.noisy_deg:
+        lines.append(
+            f"noise turns the angles by {np.median(sigma):.0f} deg (median of the polarised "
+            "pixels); expose more"
+        )
+    if capture.unequal_exposure is not None and not capture.options.equalize:
+        lines.append(
+            "the exposures of its polarizer angles differ, which looks like polarisation "
+            "everywhere; give `capture.equalize`"
+        )
+    return lines
+
+
 def _warnings(
     capture: Capture,
     white: float,
@@ -309,21 +395,16 @@ def _warnings(
             f"neighbouring cells differ by {100 * colour:.0f} % in a 2x2 rhythm, as those of a "
             "colour sensor do; give `capture.bayer`"
         )
-    spoiled = [v.name for v in views if v.saturated > limits.saturated]
+    spoiled = [v.name for v in views if v.part_saturated > limits.saturated]
     if spoiled:
         lines.append(
-            f"more than {100 * limits.saturated:.0f} % is clipped in {short_list(spoiled)}; "
-            "expose less"
+            f"more than {100 * limits.saturated:.0f} % of the part is clipped in "
+            f"{short_list(spoiled)}; expose less"
         )
     if white < limits.dark_white:
         lines.append(f"the brightest 0.5 % are at {100 * white:.0f} % of full scale; expose more")
-    polarized = float(np.mean([v.polarized for v in views]))
-    if polarized < limits.polarized:
-        lines.append(
-            f"{100 * polarized:.1f} % of the pixels are polarised (DoLP "
-            f"{RegionOptions.min_dolp:g}); is it a polarization camera's raw format, and is the "
-            "part glossy?"
-        )
+    if limits.least_views <= len(views) < limits.few_views:
+        lines.append(f"{len(views)} views carry little; record ten or more, from all around")
     blurred = [v.name for v in views if v.edge_px > limits.edge_px]
     if blurred:
         lines.append(f"no sharp edge in {short_list(blurred)}: out of focus or moved")

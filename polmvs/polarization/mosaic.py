@@ -27,6 +27,23 @@ NEAR, FAR = 0.75, 0.25
 INTERPOLATION_NOISE_GAIN: Final = (NEAR**2 + FAR**2) ** 2
 
 
+def noise_area_px(*, colour: bool = False, full: bool = False) -> float:
+    """Pixels of a polarization image that share an error, since all are interpolated.
+
+    The variance of the mean of many pixels, times their number, over the variance of one: pixels
+    for each sample that they are interpolated from, over the mean square sum of the weights.
+
+    Parameters
+    ----------
+    colour, full : of a colour mosaic; in full resolution.
+    """
+    spacing, step = (4 if colour else 2), (1 if full else 2)
+    # Places of pixels between two samples of a lattice, shares of their spacing.
+    places = (np.arange(0, spacing, step) + (0.0 if full else 0.5)) / spacing
+    along_axis = float(np.mean(places**2 + (1 - places) ** 2))
+    return float((spacing / step) ** 2 / along_axis**2)
+
+
 def linearize(raw: NDArray[Any], *, gamma: float = 1.0, full_scale: float | None = None) -> Image:
     """Raw samples in units of full scale, proportional to the light: ``(raw / full) ** (1 / g)``.
 

@@ -24,6 +24,10 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 
+MIN_SHARE = 0.02  # of a window that must count
+TINY = 1e-12  # variance of a polarization without noise, which is known all the same
+
+
 @dataclass(frozen=True, kw_only=True)
 class PhaseTolerances:
     """How phases are smoothed, and how certain they are beside their noise.
@@ -65,9 +69,9 @@ class PhaseMap:
     lowest_dolp : (H, W) uint8, lowest DoLP of single pixels next to each pixel, in 1/255: what
         is printed on a surface is less polarised than it, what is mirrored in it is not.
     polarization : (H, W, 4) float32: ``s1 / s0`` and ``s2 / s0`` of each pixel as measured, inside
-        and outside of the region, and the variance of either: what neighbouring pixels do not
-        share, and what they do (gains, lossy compression). Both are inf where a pixel is clipped
-        or dark.
+        and outside of the region, and the variance of either: that of a mean of n pixels is the
+        third channel over n (noise, of which neighbours share some, and lossy compression) plus
+        the fourth, which all pixels share (gains). Both are inf where a pixel is clipped or dark.
     folder : where the arrays are stored, if they are.
     tilted : the samples are corrected for tilted polarizers (:func:`as_tilted`).
     """
@@ -219,10 +223,13 @@ def build_phase_map(
     # A Gaussian of width w averages 4 pi w^2 independent pixels.
     blocks = 4 * np.pi * width_px**2 * share / stokes.lossy_block_px**2
     noise = np.where(use_fine, fine.variance, coarse.variance)
+    # Neighbours were interpolated from the same samples: they err together.
+    area = stokes.noise_area_px
+    noise = noise * np.maximum(area / (1 + area / (4 * np.pi * width_px**2)), 1)
     noise = noise + lossy / np.maximum(blocks, 1) + stokes.gain_sigma**2
     with np.errstate(divide="ignore"):
         variance = t.model_sigma**2 + (t.mixture_sigma**2 + noise / 4) / dolp**2
-        precision = np.where(region.inside & (share > 0.02), 1 / variance, 0)
+        precision = np.where(region.inside & (share > MIN_SHARE), 1 / variance, 0)
     samples = np.dstack([axial, precision]).astype(np.float32)
     diffuse = np.full(region.inside.shape, light is Light.DIFFUSE)
     intensity = np.asarray(stokes.s0, np.float32)
@@ -239,10 +246,37 @@ def measured_polarization(stokes: Stokes) -> Image:
     known = stokes.valid & (stokes.s0 > 0)
     s0 = np.where(known, stokes.s0, np.float32(1))
     whole, lossy = np.square(stokes.sigma / s0), np.square(stokes.lossy_sigma / s0)
-    shared = lossy + stokes.gain_sigma**2
-    channels = np.dstack([stokes.s1 / s0, stokes.s2 / s0, np.maximum(whole - lossy, 0), shared])
+    own = stokes.noise_area_px * np.maximum(whole - lossy, 0) + stokes.lossy_block_px**2 * lossy
+    shared = np.full_like(own, stokes.gain_sigma**2)
+    channels = np.dstack([stokes.s1 / s0, stokes.s2 / s0, own, shared])
     nothing = np.array([0, 0, np.inf, np.inf], np.float32)
     return np.where(known[..., None], channels, nothing).astype(np.float32)
+
+
+def smoothed_polarization(
+    polarization: Image, width_px: float, counted: Mask | None = None
+) -> Image:
+    """Polarization (H, W, 3) averaged over a Gaussian window: s1 / s0, s2 / s0, their variance.
+
+    Parameters
+    ----------
+    polarization : as of :class:`PhaseMap`.
+    width_px : of the window.
+    counted : (H, W), pixels that count; None: all.
+
+    Returns
+    -------
+    The variance is 0 where no pixel in reach counts.
+    """
+    known = np.isfinite(polarization[..., 2])
+    if counted is not None:
+        known &= counted
+    axial = np.where(known[..., None], polarization[..., :2], 0).astype(np.float32)
+    own, shared = (np.where(known, polarization[..., c], 0).astype(np.float32) for c in (2, 3))
+    found = _smoothed(axial, own, known, width_px, PhaseTolerances.ridge)
+    variance = found.variance + smooth(shared, width_px) / np.maximum(found.share, 1e-6)
+    variance = np.where(found.share > MIN_SHARE, np.maximum(variance, TINY), 0)
+    return np.dstack([found.values, variance]).astype(np.float32)
 
 
 def _lowest_dolp(stokes: Image, *, tolerances: PhaseTolerances) -> NDArray[np.uint8]:

@@ -96,6 +96,8 @@ class Stokes:
     lossy_sigma : the part of ``sigma`` that lossy compression makes, which the pixels of a block
         share.
     lossy_block_px : side of such a block, px; by default at half the resolution of the samples.
+    noise_area_px : pixels that share the rest of the noise, as interpolation makes them; see
+        :func:`polmvs.polarization.mosaic.noise_area_px`.
     """
 
     s0: Image
@@ -106,6 +108,7 @@ class Stokes:
     gain_sigma: float = 0.0
     lossy_sigma: float = 0.0
     lossy_block_px: float = BLOCK / 2
+    noise_area_px: float = 1.0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -356,8 +359,10 @@ def combine(images: list[Stokes]) -> Stokes:
         sigma=np.sqrt(variance),
         valid=valid,
         gain_sigma=float(np.sqrt(sum((w * s.gain_sigma) ** 2 for w, s in used_images))),
-        lossy_sigma=float(np.sqrt(sum((w * s.lossy_sigma) ** 2 for w, s in used_images))),
+        # A file's colours are rounded together, as one luminance.
+        lossy_sigma=float(sum(w * s.lossy_sigma for w, s in used_images)),
         lossy_block_px=images[0].lossy_block_px,
+        noise_area_px=images[0].noise_area_px,
     )
 
 

@@ -137,7 +137,7 @@ def _require_tilt(turns: list[Array]) -> None:
 def _checkerboard_finder(board: Board) -> Any:
     """A function that finds points ``(N, 3)`` of the board and their corners ``(N, 1, 2)``."""
     size = (board.cols - 1, board.rows - 1)
-    if min(size) < 2:
+    if min(size) < 3:
         raise ValueError(f"a board of {board.cols}x{board.rows} squares has too few corners.")
     grid = np.zeros((size[0] * size[1], 3))
     grid[:, :2] = board.square * np.mgrid[: size[0], : size[1]].T.reshape(-1, 2)

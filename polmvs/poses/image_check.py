@@ -112,7 +112,7 @@ def fit_to_images(
     """Compare cameras with the matches of the images' features; see there."""
     t = tolerances
     chosen = [views[k] for k in _evenly(len(views), t.max_views)]
-    sift = cv2.SIFT.create(nfeatures=t.max_features)
+    sift = _detector(t)
     found = [_features(sift, load_image(view.name)) for view in chosen]
     distances = [np.zeros(0)]
     for (first, a), (second, b) in combinations(zip(chosen, found, strict=True), 2):
@@ -145,6 +145,11 @@ def intensity_loader(capture: Capture, names: Mapping[str, str]) -> ImageLoader:
 
 def _evenly(num: int, most: int) -> list[int]:
     return sorted({round(float(k)) for k in np.linspace(0, num - 1, min(num, most))})
+
+
+def _detector(t: ImageCheckTolerances) -> cv2.SIFT:
+    """Without the quarter of a pixel by which OpenCV's enlarged image is shifted by default."""
+    return cv2.SIFT.create(nfeatures=t.max_features, enable_precise_upscale=True)
 
 
 def _features(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import SimilarityTransform, nearest_rotation
+from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import parse_json
 from polmvs.poses.alignment import (
     MIN_CAMERAS,
@@ -386,7 +387,7 @@ def read_centers(path: str | Path) -> dict[str, Array]:
             path, "is neither .json nor .txt; give known camera centres as one of both."
         )
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, "utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise DataError(path, f"cannot be read: {reason}.") from error

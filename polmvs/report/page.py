@@ -9,6 +9,7 @@ from importlib.resources import files
 from typing import Any
 
 from polmvs._version import __version__
+from polmvs.errors import printable
 from polmvs.report import pictures
 from polmvs.report.layers import Scene3D
 
@@ -111,7 +112,9 @@ def page_text(page: Page) -> str:
     """
     from jinja2 import Environment, StrictUndefined
 
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, finalize=_without_controls
+    )
     template = environment.from_string(_asset("page.html.j2"))
     return template.render(
         vars(page)
@@ -128,6 +131,11 @@ def page_text(page: Page) -> str:
             "record": json.dumps(page.record, indent=1),
         }
     )
+
+
+def _without_controls(value: Any) -> Any:
+    """What is put into the page; markup is the page's own."""
+    return printable(value, keep="\n\t") if type(value) is str else value
 
 
 def _asset(name: str) -> str:

@@ -92,6 +92,22 @@ def time_bars(stages: Sequence[tuple[str, float]]) -> str:
     return _svg(figure, "Seconds of each stage")
 
 
+def deviation_histogram(distance_mm: Floats, tolerance_mm: float | None, limit_mm: float) -> str:
+    """Histogram of signed distances from a reference, with the tolerance where there is one."""
+    figure, (axes,) = _figure(1)
+    edges = np.linspace(-2 * limit_mm, 2 * limit_mm, 81)
+    inside = np.clip(distance_mm, edges[0], edges[-1])  # what lies beyond is in the last bins
+    share = 100 * np.histogram(inside, edges)[0] / max(len(distance_mm), 1)
+    axes.stairs(share, edges, fill=True, color=COLORS[AngleModel.PPA], alpha=0.6)
+    if tolerance_mm is not None:
+        for side in (-tolerance_mm, tolerance_mm):
+            axes.axvline(side, color=COLORS[AngleModel.OPA], lw=1.2, ls=(0, (4, 2)))
+    axes.set(xlabel="distance from the reference, mm (outside positive)", ylabel="points, %")
+    return _svg(figure, "Histogram of the distances from the reference").replace(
+        "currentColor", "#555555"
+    )
+
+
 def _figure(num: int, height: float = 2.9) -> tuple[Figure, list[Axes]]:
     from matplotlib.figure import Figure
 

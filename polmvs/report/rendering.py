@@ -60,13 +60,14 @@ class Subject:
     def of(points: Floats, normals: Floats | None) -> Subject:
         """The subject that points ``(N, 3)`` make; up is where their normals look."""
         finite = np.isfinite(points).all(axis=1)
-        center = np.median(points[finite], axis=0)
+        center = np.median(points[finite], axis=0) if finite.any() else np.zeros(3)
         spread = points[finite] - center
         distance = np.linalg.norm(spread, axis=1)
-        near = distance <= 3 * np.median(distance)
-        axes = np.linalg.svd(spread[near], full_matrices=False)[2]
+        near = distance <= 3 * np.median(distance) if len(distance) else np.zeros(0, bool)
+        # Fewer than three points have three axes as well.
+        axes = np.linalg.svd(np.vstack([spread[near], np.zeros((3, 3))]), full_matrices=False)[2]
         up = axes[2]
-        if normals is not None and float(np.nanmean(normals[finite] @ up)) < 0:
+        if normals is not None and float(np.nansum(normals[finite] @ up)) < 0:
             up = -up
         radius = float(np.percentile(distance[near], 99)) if near.any() else 1.0
         return Subject(
@@ -133,12 +134,15 @@ def render_cloud(
 
 
 def mesh_points(mesh: Mesh, num: int) -> Cloud:
-    """Points spread evenly over the triangles of a mesh, with its normals and colours."""
+    """Points spread evenly over the triangles of a mesh, with its normals and colours.
+
+    Of a mesh without area they are its vertices.
+    """
     corners = mesh.vertices[mesh.triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)
-    if not len(area) or area.sum() == 0:
-        return Cloud(points=np.zeros((0, 3)), normals=np.zeros((0, 3)))
+    if not area.sum() > 0:
+        return Cloud(points=mesh.vertices, normals=mesh.normals, colors=mesh.colors)
     rng = np.random.default_rng(0)
     face = np.sort(rng.choice(len(area), num, p=area / area.sum()))
     root, other = np.sqrt(rng.random(num)), rng.random(num)

@@ -26,6 +26,7 @@ from polmvs.geometry import RigidTransform
 from polmvs.io.clouds import Mesh, write_mesh
 from polmvs.io.images import write_bytes, write_png
 from polmvs.io.intrinsics import write_intrinsics
+from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import parse_json, write_json
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.mosaic import ANGLES_DEG
@@ -121,10 +122,6 @@ class SimulatedCapture:
                 f"{rays:.0f} rays a sample; noise of the rendering {noise:.2f} of the sensor's "
                 f"(median), above the limit in {100 * noisier:.1f} % of the samples"
             )
-        lines.append(
-            f"next: polmvs reconstruct {self.folder} RUN --camera {self.folder / 'camera.txt'} "
-            f"--config {self.folder / 'capture.toml'}"
-        )
         return tuple(lines)
 
 
@@ -420,7 +417,7 @@ def _open_folder(out: Path, record: dict[str, Any], run: SimulationRun) -> set[s
             f"{out}: exists. Give `run.resume` to go on with it or `run.overwrite` to replace it."
         )
     try:
-        earlier = parse_json(old.read_text(encoding="utf-8"))
+        earlier = parse_json(read_text(old))
     except (OSError, ValueError) as error:
         raise DataError(old, "cannot be read. Give `run.overwrite`.") from error
     wanted = to_plain(record)

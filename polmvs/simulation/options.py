@@ -219,7 +219,7 @@ class SensorOptions(OptionGroup, group="sensor"):
     )
     camera_file: Path | None = option(
         None,
-        "calibrated camera instead of the above, in any of COLMAP's models: as `sfm.camera`",
+        "calibrated camera instead of the above, in any of COLMAP's models",
     )
     pattern: tuple[int, int, int, int] = option(
         CaptureOptions.pattern, "polarizer angles of a 2x2 cell in degrees, row by row"
@@ -303,7 +303,7 @@ class RenderingOptions(OptionGroup, group="rendering"):
     )
     seed: int = option(0, "of paths, marks, textures and noise", least=0)
     preview: bool = option(False, "two views at a quarter of the size")
-    masks: bool = option(False, "write OUT/masks as well, for `region.mask`")
+    masks: bool = option(False, "write OUT/masks as well, for reconstruct's masks")
     variant: str | None = option(
         None, "Mitsuba's variant; by default the fastest that runs here", metavar="NAME"
     )

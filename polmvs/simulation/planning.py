@@ -12,6 +12,7 @@ from pathlib import Path
 from polmvs.errors import OptionError
 from polmvs.evaluation.tables import format_table
 from polmvs.io.images import write_bytes
+from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import from_json, json_bytes, parse_json, write_json
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.simulation.options import LightName, PlanOptions, Simulation
@@ -131,7 +132,7 @@ def _trial(
     place = folder / f"{light}_{views:03d}_{digest}"  # of other options it is another
     stored = place / "trial.json"
     if stored.is_file():
-        trial = from_json(Trial, parse_json(stored.read_text(encoding="utf-8")))
+        trial = from_json(Trial, parse_json(read_text(stored)))
     else:
         trial = run_trial(f"{light}, {views}", mesh, place, asked)
         write_json(stored, trial)

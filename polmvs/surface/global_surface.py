@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import compress
 from pathlib import Path
 
@@ -17,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel, default_num_workers
+from polmvs.config import AngleModel, Light, default_num_workers
 from polmvs.geometry import lengths
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import MIN_VIEWS, Seeds, View
+from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, View
 from polmvs.surface.creases import (
     corner_normals,
     sharpened,
@@ -41,6 +42,7 @@ from polmvs.surface.mesh_geometry import (
     remeshed,
     sample_surface,
 )
+from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
     FaceScene,
     SteppedFaces,
@@ -48,22 +50,21 @@ from polmvs.surface.offsets import (
     find_faces,
     stepped_faces,
 )
-from polmvs.surface.refinement import (
-    KnownPoints,
-    KnownSides,
-    Refined,
-    RefinementTolerances,
-    median_residual,
-    place_deviations,
-    refine,
-    settling_step,
-    unexplained_shares,
-)
 from polmvs.surface.silhouettes import find_silhouette
+from polmvs.surface.solver import (
+    Fit,
+    Labelled,
+    Refined,
+    SolverTolerances,
+    first_fit,
+    label,
+    place_deviations,
+    polishing_step,
+    refine,
+)
 from polmvs.surface.surface_quality import (
     MAX_SHARE,
     MIN_EXPLAINED,
-    MIN_OUTLINED,
     Contradictions,
     FaceEvidence,
     face_evidence,
@@ -76,8 +77,8 @@ from polmvs.surface.surface_quality import (
     supported_faces,
 )
 from polmvs.surface.surface_view import SurfaceView, surface_view
+from polmvs.surface.terms import KnownPoints, KnownSides
 from polmvs.surface.visual_hull import (
-    HullTolerances,
     Plane,
     VisualHull,
     supporting_plane,
@@ -95,6 +96,7 @@ REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured 
 # While a mesh's edges were round, outlines drew its faces outwards by what the edges lacked: 0.2 to
 # 0.4 px. Each step takes about half of what the one before has left: measured on analytic boxes.
 SHARP_STEPS = 4
+DEVIATION_EDGE_PX = 6.0  # of the mesh that positions' uncertainty is worked out on
 NUM_FINAL_STEPS = 3  # of the progress: evidence, normals, deviations
 
 
@@ -107,6 +109,8 @@ class GlobalSurface:
     mesh : all of it, closed, parts that no view bears out included.
     supported : (F,) bool, faces that the views bear out.
     evidence : of the faces.
+    light : (3, F) means over a face's observations: probabilities of specular and of diffuse light,
+        and the degree of polarization.
     normals : (F, 3, 3) unit, from the phases, of each corner of the faces: two sides of an edge
         have their own.
     sigma_deg : (F,) standard deviation of the normal, degrees; inf where unknown.
@@ -115,13 +119,14 @@ class GlobalSurface:
     contradictions : with the data.
     presumed : (F,) bool, faces that no phase shows: walls of hollows, presumed as thick inside as
         the rim shows them.
-    tilt_share : as in :class:`polmvs.surface.refinement.Refined`.
+    tilt_share : as in :class:`polmvs.surface.observations.Looking`.
     left_out : (K,) bool, views that contradict the others; the surface is made without them.
     """
 
     mesh: TriangleMesh
     supported: Mask
     evidence: FaceEvidence
+    light: Array
     normals: Array
     sigma_deg: Array
     sigma: Array
@@ -145,13 +150,8 @@ class Undetermined:
 
 
 def num_surface_steps(num_views: int) -> int:
-    """How many steps :func:`reconstruct_surface` and the rendering of its views report.
-
-    A surface that is made once more reports none of its steps.
-    """
-    *before, last = RefinementTolerances().levels
-    refinement = 2 * sum(level.num_steps for level in before) + last.num_steps  # they go two ways
-    return refinement + NUM_FINAL_STEPS + num_views
+    """How many steps :func:`reconstruct_surface` and the rendering of its views report."""
+    return SolverTolerances().num_steps + NUM_FINAL_STEPS + num_views
 
 
 def reconstruct_surface(
@@ -161,9 +161,10 @@ def reconstruct_surface(
     surroundings: Floats,
     *,
     masks_given: bool = False,
+    light: Light | None = None,
     tilt_aware: bool = True,
     min_views: int = 2,
-    tolerances: RefinementTolerances | None = None,
+    tolerances: SolverTolerances | None = None,
     on_progress: OnProgress = no_progress,
     on_mesh: Callable[[TriangleMesh], None] | None = None,
     folder: Path | None = None,
@@ -172,14 +173,15 @@ def reconstruct_surface(
 
     Parameters
     ----------
-    angle_model : of the phase maps.
+    angle_model : of the rows.
     maps : of all views.
     seeds : points of the surface.
     surroundings : (N, 3), sparse points beside it.
     masks_given : the maps' regions are the user's masks.
-    tilt_aware : as :func:`polmvs.surface.surface_view.surface_view`, and of the rows' weights.
-    min_views : that must bear out a part.
-    tolerances : of the refinement.
+    light : that the user states; None: inferred for each observation.
+    tilt_aware : as of :class:`polmvs.surface.observations.Looking`.
+    min_views : that must support a part.
+    tolerances : of the solver.
     on_progress : called with 1 after each step.
     on_mesh : called at the end with the hull, and with the mesh after each level of its refinement.
     folder : where what is made of each view is kept meanwhile; None: in memory.
@@ -187,301 +189,227 @@ def reconstruct_surface(
 
     def look_at(phase_map: PhaseMap) -> SurfaceView:
         silhouette = find_silhouette(phase_map, mask_given=masks_given)
-        return surface_view(
-            phase_map, silhouette, angle_model, tilt_aware=tilt_aware, folder=folder
-        )
+        return surface_view(phase_map, silhouette, folder=folder)
 
     # Threads, for nearly all of it is OpenCV's; each view's depends on itself alone.
     with ThreadPoolExecutor(default_num_workers()) as pool:
         views = list(pool.map(look_at, maps))
     if reason := _no_hull(views):
         return Undetermined(reason)
-    scene = face_scene(maps, angle_model, tilt_aware=tilt_aware, folder=folder)
-    done = 0
-
-    def advance(count: int) -> None:
-        nonlocal done
-        # Steps of a surface that is given up count, up to the number announced.
-        count = min(count, num_surface_steps(0) - done)
-        done += count
-        on_progress(count)
-
-    def given_by(kept: Mask, *, is_suspicion: bool = False) -> _Given:
-        own = list(compress(views, kept))
-        return _Given(
-            all_views=views,
-            kept=kept,
-            is_suspicion=is_suspicion,
-            views=own,
-            scene=scene.of(kept),
-            seeds=seeds,
-            plane=supporting_plane(surroundings, np.array([view.center for view in own])),
-            min_views=min_views,
-            on_progress=advance,
-        )
-
-    tolerances, hull_tolerances = tolerances or RefinementTolerances(), HullTolerances()
-    given = given_by(np.ones(len(views), np.bool_))
-    hull = given.hull(hull_tolerances)
-    suspects = stand_apart(outline_mismatch(hull.mesh, views), MIN_OUTLINED)
-    if suspects.any():
-        given = given_by(~suspects, is_suspicion=True)
-        hull = given.hull(hull_tolerances)
-    attempt = _surface(given, hull, tolerances)
-    while attempt.found is None:
-        given = given_by(~attempt.odd)
-        attempt = _surface(given, given.hull(hull_tolerances), tolerances)
-    attempt.warn(given)
-    found, meshes = attempt.found, attempt.meshes
-    if tolerances.thin_levels and _uncovered_share(found) > MAX_SHARE:
-        logger.warning(
-            "%s: %.0f %% of the polarised regions stay uncovered, walls may be thin: the surface "
-            "is made once more with a finer mesh, which may take minutes.",
-            angle_model,
-            100 * _uncovered_share(found),
-        )
-        fine = replace(hull_tolerances, step_px=0.5 * hull_tolerances.step_px)
-        thin = replace(tolerances, levels=tolerances.thin_levels)
-        unheard = replace(given, is_suspicion=False, on_progress=no_progress)
-        again = _surface(unheard, unheard.hull(fine), thin)
-        if again.found is not None and _uncovered_share(again.found) < _uncovered_share(found):
-            found, meshes = again.found, again.meshes
-    advance(max(num_surface_steps(0) - done, 0))
+    centers = np.array([view.center for view in views])
+    hull = consistent_hull(views, supporting_plane(surroundings, centers))
+    if not len(hull.mesh.faces):
+        return Undetermined("the silhouettes of the views have no common object")
+    logger.info("visual hull: %d vertices.", len(hull.mesh.vertices))
+    given = _Given(
+        scene=face_scene(maps, angle_model, tilt_aware=tilt_aware, folder=folder),
+        seeds=seeds,
+        min_views=min_views,
+        on_progress=on_progress,
+    )
+    steps = given.steps(hull.mesh)
+    if steps:
+        logger.info("%d groups of planar patches that silhouettes do not part.", len(steps))
+        hull = hull.carved([group.values for group in steps])
+    hollows = _hollows(given.scene, hull.mesh, hull.footprint)
+    fit = first_fit(
+        views,
+        Looking(angle_model=angle_model, tilt_aware=tilt_aware),
+        hull.footprint,
+        known=KnownPoints(seeds.points_in_world, seeds.sigma),
+        light=light,
+        tolerances=tolerances,
+    )
+    refined = refine(
+        hull.mesh,
+        fit,
+        stands_apart=partial(stand_apart, least=MIN_EXPLAINED),
+        on_progress=on_progress,
+    )
+    _warn_of_inconsistent(angle_model, views, refined)
     if on_mesh is not None:
-        for mesh in meshes:
+        for mesh in (hull.mesh, *refined.meshes):
             on_mesh(mesh)
-    return found
+    if not len(refined.mesh.faces):
+        return Undetermined("the surface vanishes under the phases of the views")
+    given = replace(given, scene=given.scene.of(~refined.left_out))
+    # Refined walls place a cavity better than the hull's, and may hide its opening.
+    hollows = _hollows(given.scene, refined.mesh, hull.footprint, before=hollows) or hollows
+    mesh = _carved(refined.mesh, hull.mesh, steps, hollows)
+    if not len(mesh.faces):
+        return Undetermined("the surface vanishes under the cavities found in it")
+    polished = _polished(given, mesh, refined, [*steps, *hollows])
+    return _supported(given, polished, steps, hollows, refined.left_out)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Given:
-    """What a surface is made from.
+    """What a surface is made from, beside the views.
 
     Attributes
     ----------
-    all_views, kept : what the views show, and which of them ``(K,)`` are believed.
-    is_suspicion : the others are left out for their outlines alone: they may come back.
-    views, scene : of those believed.
+    scene : of the views, to look at planar patches.
     seeds, min_views : as of :func:`reconstruct_surface`.
-    plane : on which the objects stand.
     on_progress : called with the number of steps done.
     """
 
-    all_views: Sequence[SurfaceView]
-    kept: Mask
-    is_suspicion: bool
-    views: Sequence[SurfaceView]
     scene: FaceScene
     seeds: Seeds
-    plane: Plane | None
     min_views: int
     on_progress: OnProgress
 
-    @property
-    def rows(self) -> AngleModel:
-        """Of the phases' rows: those of a tilted map are those of PPA, its samples corrected."""
-        return AngleModel.OPA if self.scene.angle_model is AngleModel.OPA else AngleModel.PPA
-
-    @property
-    def known(self) -> KnownPoints:
-        """Sparse points on the surface."""
-        return KnownPoints(self.seeds.points_in_world, self.seeds.sigma)
-
-    def hull(self, tolerances: HullTolerances) -> VisualHull:
-        """The first surface."""
-        return visual_hull(self.views, self.plane, tolerances=tolerances)
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    """A surface from views that may contradict each other.
-
-    Attributes
-    ----------
-    found : None where other views are to be left out than were.
-    meshes : the hull, and the mesh after each level of its refinement.
-    unexplained : (K,) share of what each of all views shows that the first level does not explain.
-    odd : (K,) bool, which are to be left out.
-    """
-
-    found: GlobalSurface | Undetermined | None
-    meshes: list[TriangleMesh]
-    unexplained: Array
-    odd: Mask
-
-    def warn(self, given: _Given) -> None:
-        """Say which are left out, and what to look at."""
-        shares = zip(given.all_views, self.unexplained, strict=True)
-        for view, share in compress(shares, self.odd & np.isfinite(self.unexplained)):
-            logger.warning(
-                "%s: %s contradicts the other views: %.0f %% of what it shows is not explained by "
-                "a first surface (median of all: %.0f %%). It is left out; its pose, its mask "
-                "or its image may be wrong.",
-                given.scene.angle_model,
-                view.view.name,
-                100 * share,
-                100 * np.nanmedian(self.unexplained),
+    def steps(self, mesh: TriangleMesh) -> tuple[SteppedFaces, ...]:
+        """Planar patches that silhouettes do not tell apart."""
+        return tuple(
+            stepped_faces(
+                find_faces(self.seeds),
+                self.seeds,
+                self.scene,
+                signed_distance=RayScene(mesh).signed_distance,
+                first_hit=_first_hit(mesh),
             )
-
-
-def _uncovered_share(found: GlobalSurface | Undetermined) -> float:
-    """Mean share of the silhouettes that a surface does not cover; 1 without one."""
-    return 1.0 if isinstance(found, Undetermined) else found.contradictions.uncovered_share
-
-
-def _surface(given: _Given, hull: VisualHull, tolerances: RefinementTolerances) -> _Attempt:
-    """The surface that a hull is refined to."""
-    meshes: list[TriangleMesh] = []
-    unexplained, odd = np.full(len(given.kept), np.nan), ~given.kept
-
-    def attempt(found: GlobalSurface | Undetermined | None) -> _Attempt:
-        return _Attempt(found, meshes, unexplained, odd)
-
-    if not len(hull.mesh.faces):
-        return attempt(Undetermined("the polarised regions of the views have no common object"))
-    logger.info("visual hull: %d vertices.", len(hull.mesh.vertices))
-    steps = stepped_faces(
-        find_faces(given.seeds),
-        given.seeds,
-        given.scene,
-        signed_distance=RayScene(hull.mesh).signed_distance,
-        first_hit=_first_hit(hull.mesh),
-    )
-    if steps:
-        logger.info("%d groups of faces that silhouettes do not tell apart.", len(steps))
-        hull = hull.carved([group.values for group in steps])
-    meshes.append(hull.mesh)
-    hollows = _hollows(given.scene, hull.mesh, hull.footprint)
-    if hollows:
-        # Phases of what sees only itself would be dug after.
-        still = tuple(replace(level, with_slope=False) for level in tolerances.levels)
-        tolerances = replace(tolerances, levels=still)
-
-    def is_agreed(mesh: TriangleMesh) -> bool:
-        nonlocal unexplained, odd
-        meshes.append(mesh)
-        if len(meshes) == 2:  # the hull and the first level
-            # A model that leaves something out (OPA the perspective) contradicts all views.
-            shown, _ = median_residual(mesh, given.views, given.rows, tolerances)
-            unexplained = unexplained_shares(mesh, given.all_views, given.rows, shown.direct)
-            judged = given.kept | given.is_suspicion
-            odd = ~judged
-            odd[judged] = stand_apart(unexplained[judged], MIN_EXPLAINED)
-        return bool((odd == ~given.kept).all())
-
-    refined = refine(
-        hull.mesh,
-        given.views,
-        given.rows,
-        hull.footprint,
-        known=given.known,
-        tolerances=tolerances,
-        on_progress=given.on_progress,
-        go_on=is_agreed,
-    )
-    if (odd == given.kept).any():
-        return attempt(None)
-    # A refined outer wall places the inner one better than the hull's.
-    hollows = _hollows(given.scene, refined.mesh, hull.footprint, hollows) or hollows
-    carvings = [*(group.values for group in steps), *(hollow.values for hollow in hollows)]
-    mesh = refined.mesh
-    if carvings and len(mesh.faces):
-        # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
-        mesh = remeshed(
-            mesh,
-            mesh.mean_edge / REMESHED_EDGE,
-            solid=[_within(group.solid, hull.mesh, mesh.mean_edge) for group in steps],
-            free=carvings,
-            smoothing=0,
         )
-    if not len(mesh.faces):
-        return attempt(Undetermined("the surface vanishes under the phases of the views"))
-    settled = _settled(given, mesh, refined, carvings, hull.footprint, tolerances)
-    return attempt(_borne_out(given, settled, steps, hollows, hull.footprint, refined.tilt_share))
+
+
+def consistent_hull(views: Sequence[SurfaceView], plane: Plane | None) -> VisualHull:
+    """The hull whose outlines match the silhouettes best: of all views, or but for some wrong ones.
+
+    A single wrong silhouette carves the object away, and to allow for some makes a hull of few
+    views wide.
+    """
+    strict = visual_hull(views, plane, num_wrong=0)
+    if len(strict.mesh.faces):
+        mismatch = np.nan_to_num(outline_mismatch(strict.mesh, views), nan=1.0)
+        if not (mismatch > MAX_SHARE).any():
+            return strict
+    robust = visual_hull(views, plane)
+    if not len(strict.mesh.faces) or not len(robust.mesh.faces):
+        return robust
+    other = np.nan_to_num(outline_mismatch(robust.mesh, views), nan=1.0)
+    return strict if np.median(mismatch) <= np.median(other) else robust
+
+
+def _warn_of_inconsistent(
+    angle_model: AngleModel, views: Sequence[SurfaceView], refined: Refined
+) -> None:
+    """Name the views that are left out, and what to look at."""
+    shares = zip(views, refined.unexplained, strict=True)
+    for view, share in compress(shares, refined.left_out):
+        logger.warning(
+            "%s: %s contradicts the other views: %.0f %% of what it shows is not explained by "
+            "a first surface (median of all: %.0f %%). It is left out; its pose, its mask "
+            "or its image may be wrong.",
+            angle_model,
+            view.view.name,
+            100 * share,
+            100 * np.nanmedian(refined.unexplained),
+        )
+
+
+def _carved(
+    mesh: TriangleMesh,
+    hull: TriangleMesh,
+    steps: Sequence[SteppedFaces],
+    hollows: Sequence[Hollow],
+) -> TriangleMesh:
+    """A refined mesh with height steps and cavities carved, their walls sharp."""
+    if not steps and not hollows:
+        return mesh
+    # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
+    return remeshed(
+        mesh,
+        mesh.mean_edge / REMESHED_EDGE,
+        solid=[_within(group.solid, hull, mesh.mean_edge) for group in steps],
+        free=[*(group.values for group in steps), *(hollow.values for hollow in hollows)],
+        smoothing=0,
+    )
 
 
 @dataclass(frozen=True)
-class _Settled:
-    """A sharp mesh at rest.
+class _Polished:
+    """A sharp mesh that has converged.
 
     Attributes
     ----------
     mesh : with F faces.
-    views : which know what of the tilt is taken back.
+    fit : of the views.
+    labelled : its observations, with their light.
     normals : (F, 3) unit, of the sides of edges.
     sigma_deg : (F,) of the normals that the phases show.
-    row_sigma, median : of the phases' residuals, and their median.
     """
 
     mesh: TriangleMesh
-    views: Sequence[SurfaceView]
+    fit: Fit
+    labelled: Labelled
     normals: Array
     sigma_deg: Array
-    row_sigma: float
-    median: float
 
 
-def _settled(
+def _polished(
     given: _Given,
     mesh: TriangleMesh,
     refined: Refined,
-    carvings: Sequence[Callable[[Array], Floats]],
-    footprint: float,
-    tolerances: RefinementTolerances,
-) -> _Settled:
-    """A carved mesh with the sides of its edges sharp, moved until it is at rest."""
-    views = [replace(view, tilt_share=refined.tilt_share) for view in given.views]
-    shown, median = median_residual(mesh, views, given.rows, tolerances)
-    fitted = fit_normals(mesh, views, given.rows, row_sigma=shown.direct)
+    carvings: Sequence[SteppedFaces | Hollow],
+) -> _Polished:
+    """A carved mesh with the sides of its edges sharp, moved until it has converged."""
+    fit = refined.fit
+    fitted = fit_normals(mesh, label(mesh, fit))
     facing, is_wall = fitted.normals, np.zeros(len(mesh.faces), np.bool_)
     if carvings:
         to_uncarved = lengths(RayScene(refined.mesh).closest(mesh.centers)[0] - mesh.centers)
         facing, is_wall = wall_normals(
-            mesh, fitted.normals, fitted.is_fitted, carvings, to_uncarved
+            mesh,
+            fitted.normals,
+            fitted.is_fitted,
+            [carving.values for carving in carvings],
+            to_uncarved,
         )
     is_known = fitted.is_fitted | is_wall
     normals = sided_normals(mesh, facing, is_known)
     sides = KnownSides(sides_known(mesh, normals, is_known), fitted.is_fitted & ~is_wall)
 
-    def settle(mesh: TriangleMesh) -> tuple[TriangleMesh, bool]:
-        return settling_step(
-            mesh,
-            views,
-            given.rows,
-            footprint,
-            shown,
-            sides=sides,
-            known=given.known,
-            tolerances=tolerances,
-        )
+    def polish(mesh: TriangleMesh) -> tuple[TriangleMesh, bool]:
+        return polishing_step(mesh, fit, sides)
 
-    mesh = _at_rest(sharpened(mesh, normals), normals, settle, given.known, footprint)
+    sharp = _at_rest(sharpened(mesh, normals), normals, polish, fit)
     given.on_progress(1)
-    return _Settled(mesh, views, normals, fitted.sigma_deg, shown.direct, median)
+    # Detail as fine as the mesh passes for noise of the normals: phases know it from edges.
+    is_sharp = label(sharp, fit).mean_loss(sharp) <= label(mesh, fit).mean_loss(mesh)
+    logger.info("the surface is %s.", "sharpened" if is_sharp else "left as smooth as it is")
+    mesh = sharp if is_sharp else mesh
+    labelled = label(mesh, fit, min_cosine=MIN_FACING_COSINE)
+    return _Polished(mesh, fit, labelled, normals, fitted.sigma_deg)
 
 
-def _borne_out(
+def _supported(
     given: _Given,
-    settled: _Settled,
+    polished: _Polished,
     steps: Sequence[SteppedFaces],
     hollows: Sequence[Hollow],
-    footprint: float,
-    tilt_share: float,
+    left_out: Mask,
 ) -> GlobalSurface:
-    """A surface with what the views bear out of it."""
-    mesh, views, rows, known = settled.mesh, settled.views, given.rows, given.known
-    evidence = face_evidence(mesh, views, rows, row_sigma=settled.row_sigma)
+    """A surface with the part of it that the views support."""
+    mesh, fit, labelled = polished.mesh, polished.fit, polished.labelled
+    evidence = face_evidence(mesh, fit, labelled)
     supported = supported_faces(mesh, evidence, min_views=given.min_views)
     seen = evidence.num_views >= given.min_views
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     presumed = seen & ~supported & _lie_on(mesh, [hollow.values for hollow in hollows])
     supported |= presumed
     given.on_progress(1)
-    sigma = _deviations(mesh, views, rows, footprint, known)
+    sigma = _deviations(mesh, fit)
     given.on_progress(1)
-    offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, footprint)
+    known = fit.known or KnownPoints(np.zeros((0, 3)), np.zeros(0))
+    offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, fit.footprint)
+    residual, _ = labelled.residuals(mesh)
     contradictions = replace(
-        find_contradictions(mesh, evidence, supported, views, settled.median),
+        find_contradictions(
+            mesh,
+            evidence,
+            supported,
+            fit.views,
+            float(np.median(np.abs(residual))) if len(residual) else 0.0,
+        ),
         point_offset_px=offset_px,
         point_offset_sigmas=offset_sigmas,
     )
@@ -489,31 +417,31 @@ def _borne_out(
         mesh=mesh,
         supported=supported,
         evidence=evidence,
-        normals=corner_normals(mesh, settled.normals),
-        sigma_deg=settled.sigma_deg,
+        light=labelled.means(len(mesh.faces)),
+        normals=corner_normals(mesh, polished.normals),
+        sigma_deg=polished.sigma_deg,
         sigma=sigma,
-        footprint=footprint,
+        footprint=fit.footprint,
         contradictions=contradictions,
         presumed=presumed,
-        tilt_share=tilt_share,
-        left_out=~given.kept,
+        tilt_share=fit.looking.tilt_share,
+        left_out=left_out,
     )
 
 
 def _at_rest(
     sharp: TriangleMesh,
     normals: Array,
-    settle: Callable[[TriangleMesh], tuple[TriangleMesh, bool]],
-    known: KnownPoints,
-    footprint: float,
+    polish: Callable[[TriangleMesh], tuple[TriangleMesh, bool]],
+    fit: Fit,
 ) -> TriangleMesh:
-    """A sharpened mesh, moved by steps until it is at rest, unless known points deny them."""
+    """A sharpened mesh, moved by steps until it has converged, unless known points deny them."""
     mesh, is_at_rest, steps_left = sharp, False, SHARP_STEPS
     while not is_at_rest and steps_left:
-        mesh, is_at_rest = settle(mesh)
+        mesh, is_at_rest = polish(mesh)
         mesh, steps_left = sharpened(mesh, normals), steps_left - 1
         # Phases read by a model that their camera does not follow sink it, OPA's by millimetres.
-        if points_deny(mesh, sharp, known, footprint):
+        if fit.known is not None and points_deny(mesh, sharp, fit.known, fit.footprint):
             return sharp
     return mesh
 
@@ -521,9 +449,7 @@ def _at_rest(
 def _hollows(
     scene: FaceScene, mesh: TriangleMesh, footprint: float, before: Sequence[Hollow] = ()
 ) -> tuple[Hollow, ...]:
-    """Hollows of a mesh that see only themselves, ``before`` of an earlier state of it."""
-    if not len(mesh.faces):
-        return ()
+    """Cavities of a mesh that see only themselves, ``before`` of an earlier state of it."""
     faces = SurfaceFaces(
         mesh.centers,
         mesh.face_normals,
@@ -531,7 +457,7 @@ def _hollows(
         RayScene(mesh).inside_along,
         footprint,
     )
-    return find_hollows(faces, scene, before=before)
+    return tuple(find_hollows(faces, scene, before=before))
 
 
 def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:
@@ -591,18 +517,12 @@ def _border_share(mask: Mask) -> float:
     return float(border.mean())
 
 
-def _deviations(
-    mesh: TriangleMesh,
-    views: Sequence[SurfaceView],
-    angle_model: AngleModel,
-    footprint: float,
-    known: KnownPoints,
-) -> Array:
+def _deviations(mesh: TriangleMesh, fit: Fit) -> Array:
     """Deviations of the vertices, sampled on a coarser mesh if that saves time."""
-    coarse = remeshed(mesh, RefinementTolerances.levels[0].edge_px * footprint)
+    coarse = remeshed(mesh, DEVIATION_EDGE_PX * fit.footprint)
     if not len(coarse.faces):
         coarse = mesh
-    sigma = place_deviations(coarse, views, angle_model, footprint, known=known)
+    sigma = place_deviations(coarse, fit)
     _, face, barycentric = RayScene(coarse).closest(mesh.vertices)
     corners = sigma[coarse.faces[face]]
     known_corners = np.isfinite(corners)
@@ -628,10 +548,32 @@ def supported_mesh(surface: GlobalSurface) -> Mesh:
     )
 
 
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points spread over a surface.
+
+    Attributes
+    ----------
+    cloud : N points.
+    presumed : (N,) bool, those that no phase shows.
+    light : (3, N) probabilities that a view shows specular and diffuse light there, and the degree
+        of polarization: means over the views.
+    """
+
+    cloud: FusedCloud
+    presumed: Mask
+    light: Array
+
+    def scalars(self) -> dict[str, NDArray[np.float32]]:
+        """The light by the names that it has in files."""
+        names = ("specular", "diffuse", "dolp")
+        return dict(zip(names, self.light.astype(np.float32), strict=True))
+
+
 def surface_points(
     surface: GlobalSurface, maps: Sequence[PhaseMap], spacing: float, *, max_points: int = 2_000_000
-) -> tuple[FusedCloud, Mask]:
-    """Points spread evenly over what the views bear out, and which of them ``(N,)`` are presumed.
+) -> SurfacePoints:
+    """Points spread evenly over the part of a surface that the views support.
 
     Parameters
     ----------
@@ -643,7 +585,7 @@ def surface_points(
     mesh = surface.mesh
     area = float(mesh.face_areas[surface.supported].sum())
     if area <= 0:
-        return no_points(), np.zeros(0, np.bool_)
+        return SurfacePoints(no_points(), np.zeros(0, np.bool_), np.zeros((3, 0)))
     # Random places leave gaps: of three times as many, one in each voxel.
     num = int(min(max(3 * area / spacing**2, 1), 3 * max_points))
     face, barycentric = sample_surface(
@@ -661,7 +603,7 @@ def surface_points(
         sigma_deg=_finite(surface.sigma_deg[face]),
         sigma=_finite(_interpolated(surface.sigma, mesh, face, barycentric)),
     )
-    return cloud, surface.presumed[face]
+    return SurfacePoints(cloud, surface.presumed[face], surface.light[:, face])
 
 
 def _finite(values: Array) -> NDArray[np.float32]:

@@ -27,6 +27,7 @@ from polmvs.scene import KEYPOINT_SIGMA_PX, MIN_VIEWS, Seeds
 from polmvs.surface.borders import cells_beside
 from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.mesh_geometry import MAX_CELLS
+from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
     MAX_COST,
     NO_FACE,
@@ -42,7 +43,6 @@ from polmvs.surface.offsets import (
     row_losses,
     snapped_border,
 )
-from polmvs.surface.refinement import RefinementTolerances
 from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]
@@ -222,7 +222,7 @@ def _rim(
     contradict.
     """
     rows = scene.rows(surface.centers[flat.members])
-    facing = -np.einsum("ikn,i->kn", rows.rays, flat.normal) > RefinementTolerances.min_cosine
+    facing = -np.einsum("ikn,i->kn", rows.rays, flat.normal) > Looking.min_cosine
     sigma = np.where(facing, rows.sigma, np.inf)
     start = np.repeat(flat.normal[:, None], len(flat.members), axis=1)
     estimate = solve_normals(rows.rows, rows.rays, sigma, initial_normals=start)

@@ -39,9 +39,9 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
 from polmvs.surface.borders import drawn_border, smoothly_beside
 from polmvs.surface.creases import CreaseTolerances
-from polmvs.surface.refinement import RefinementTolerances
 from polmvs.surface.silhouettes import SilhouetteTolerances, nearest_steps, step_slope
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX
+from polmvs.surface.terms import TermTolerances
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -767,7 +767,7 @@ def row_losses(
     residual = (rows.rows * normals[:, None]).sum(axis=0)
     with np.errstate(invalid="ignore"):
         # Half of what a curved mesh leaves unexplained: a plane has no faults of its own.
-        floor = np.float32((0.5 * RefinementTolerances.row_sigma) ** 2)
+        floor = np.float32((0.5 * TermTolerances.row_sigma) ** 2)
         variance = (1 - cosine**2) * np.square(rows.sigma) + floor
         z2 = np.square(residual) / (variance * np.float32(tol.sigmas**2))
         loss = z2 / (1 + z2)

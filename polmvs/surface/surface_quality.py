@@ -13,28 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel
-from polmvs.fitting import robust_deviation
+from polmvs.fitting import like_most, robust_deviation
 from polmvs.geometry import dots
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS
 from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.dense_view import lattice_xy
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
-from polmvs.surface.refinement import (
-    KnownPoints,
-    RefinementTolerances,
-    RowSigma,
-    certain_rays,
-    face_rows,
-)
-from polmvs.surface.surface_view import SurfaceView, phase_rows
+from polmvs.surface.solver import Fit, Labelled, certain_rays
+from polmvs.surface.surface_view import SurfaceView
+from polmvs.surface.terms import KnownPoints
 from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
+MIN_EXCESS = 1e-3  # of one kind of light over the other, that counts at all
 MAX_SIGMAS = 3.0  # of one figure, before it is called a contradiction
 MAX_SHARE = 0.1  # of a surface or its silhouettes in contradiction. Guess
 ONE_SIDED = 1.645  # deviations of a normal distribution, which 5 % exceed
@@ -43,9 +38,6 @@ MIN_POINTS = 10  # on the surface, for their median to be one
 # eleven captures, each with the pose of one view exchanged: 0.80 and more; wrong ones under PPA had
 # 0.47 and less.
 MIN_EXPLAINED = 0.65
-# The same of its outline, by the hull, which is enough for a suspicion. Measured: 0.74 and more on
-# four captures, and with six views of `step`; its wrong one 0.40.
-MIN_OUTLINED = 0.6
 MAX_ROWS = 500_000  # faces times views at a time; bounds memory
 
 
@@ -91,10 +83,9 @@ class FaceEvidence:
 
 def face_evidence(
     mesh: TriangleMesh,
-    views: Sequence[SurfaceView],
-    angle_model: AngleModel,
+    fit: Fit,
+    labelled: Labelled,
     *,
-    row_sigma: float,
     tolerances: QualityTolerances | None = None,
 ) -> FaceEvidence:
     """Ask all views about all faces.
@@ -102,17 +93,15 @@ def face_evidence(
     Parameters
     ----------
     mesh : refined.
-    views : what each view says.
-    angle_model : of the rows.
-    row_sigma : deviation of ``m . n`` that noise does not explain.
+    fit : of the views.
+    labelled : the observations of the mesh, with their light.
     """
     tol = tolerances or QualityTolerances()
     counts = np.zeros((4, len(mesh.faces)), np.int64)
     if not len(mesh.faces):
         return FaceEvidence(*counts)
     scene = RayScene(mesh)
-    rows_tolerances = RefinementTolerances(min_cosine=MIN_FACING_COSINE)
-    for view in views:
+    for view in fit.views:
         seen, _, _ = visible_points(
             scene, view.center, mesh.centers, mesh.face_normals, min_cosine=MIN_FACING_COSINE
         )
@@ -123,16 +112,9 @@ def face_evidence(
         if view.has_outline:
             beyond = sample_image(view.silhouette.outer, xy)[:, 0] > tol.outside_px
             counts[1, seen[beyond]] += 1
-        # A place that mirrors the object is not excused: it may be wrong, and mirror it therefore.
-        equal = RowSigma(row_sigma, row_sigma)
-        rows = face_rows(mesh, scene, view, angle_model, equal, rows_tolerances)
-        residual = np.abs(rows.residual)
-        # Beyond what mixed light and facets explain, too: what tells the sides of a crease apart.
-        wrong = residual > np.maximum(
-            MAX_SIGMAS * np.sqrt(rows.variance), CreaseTolerances.like_sine
-        )
-        counts[2, rows.face] += 1
-        counts[3, rows.face[wrong]] += 1
+    face, num = labelled.observations.face, len(mesh.faces)
+    counts[2] = np.bincount(face, minlength=num)
+    counts[3] = np.bincount(face[labelled.contradicts(mesh)], minlength=num)
     return FaceEvidence(*counts)
 
 
@@ -198,13 +180,7 @@ class FaceNormals:
         return np.isfinite(self.sigma_deg)
 
 
-def fit_normals(
-    mesh: TriangleMesh,
-    views: Sequence[SurfaceView],
-    angle_model: AngleModel,
-    *,
-    row_sigma: float,
-) -> FaceNormals:
+def fit_normals(mesh: TriangleMesh, labelled: Labelled) -> FaceNormals:
     """Normals from the phases of all views at the places of the mesh, which stay.
 
     A mesh's own normals are noisier: they are differences of places. Their deviations are those
@@ -213,32 +189,33 @@ def fit_normals(
 
     Parameters
     ----------
-    mesh, views, angle_model : as in :func:`face_evidence`.
-    row_sigma : deviation of ``m . n`` that noise does not explain.
+    mesh : refined.
+    labelled : its observations, with their light.
     """
     num = len(mesh.faces)
     normals, sigma = mesh.face_normals.copy(), np.full(num, np.inf)
     chi_squared = np.zeros((num, 2))  # chi squared and degrees of freedom
     if not num:
         return FaceNormals(normals, sigma)
-    scene, centers = RayScene(mesh), mesh.centers
-    at_a_time = max(1, MAX_ROWS // len(views))
+    o, view_count = labelled.observations, labelled.num_views
+    kind, excess = labelled.kind, labelled.excess
+    index = np.arange(len(o.face))
+    chosen = o.rows[kind, index]
+    turn = np.sqrt(o.turn_variance[kind, index] / np.maximum(excess, MIN_EXCESS))
+    row_sigma = float(np.median(labelled.row_sigma[kind, index])) if len(index) else 0.0
+    at_a_time = max(1, MAX_ROWS // max(view_count, 1))
     for start in range(0, num, at_a_time):
         part = slice(start, min(start + at_a_time, num))
-        points, own = centers[part], mesh.face_normals[part]
-        shape = (len(views), len(points))
+        own = mesh.face_normals[part]
+        shape = (view_count, len(own))
         rows = np.full((3, *shape), np.nan, np.float32)
         rays = np.zeros((3, *shape), np.float32)
         turns = np.full(shape, np.inf, np.float32)
-        for index, view in enumerate(views):
-            seen, directions, _ = visible_points(
-                scene, view.center, points, own, min_cosine=RefinementTolerances.min_cosine
-            )
-            found = phase_rows(view, angle_model, points[seen])
-            known = found.precision > 0
-            rows[:, index, seen[known]] = found.rows[known].T
-            rays[:, index, seen] = directions.T
-            turns[index, seen[known]] = found.turn[known] / np.sqrt(found.precision[known])
+        here = np.flatnonzero((o.face >= part.start) & (o.face < part.stop))
+        view, face = o.view[here], o.face[here] - part.start
+        rows[:, view, face] = chosen[here].T
+        rays[:, view, face] = o.rays[here].T
+        turns[view, face] = turn[here]
         estimate = solve_normals(rows, rays, turns, initial_normals=own.T)
         cosine = np.clip((estimate.normals * own).sum(axis=1), -1, 1)
         apart = np.degrees(np.arccos(cosine))
@@ -386,6 +363,10 @@ def outline_mismatch(
 def stand_apart(unexplained: Array, least: float) -> Mask:
     """Which views a surface explains much less well than the median one.
 
+    Either by the share of what they show that is explained, or by the share that is not: a wrong
+    pose may agree with the surface by chance on most pixels, for two kinds of light are open, and
+    still leave many times more unexplained than right ones do.
+
     Parameters
     ----------
     unexplained : (K,) shares; NaN where unknown.
@@ -400,6 +381,7 @@ def stand_apart(unexplained: Array, least: float) -> Mask:
     odd = np.zeros(len(explained), np.bool_)
     if known.any():
         odd[known] = explained[known] < least * np.median(explained[known])
+        odd[known] |= ~like_most(unexplained[known], floor=MAX_SHARE)
     return odd if (~odd).sum() >= MIN_VIEWS else np.zeros_like(odd)
 
 

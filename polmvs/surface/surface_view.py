@@ -8,14 +8,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from polmvs.camera import in_frame, sample_image
-from polmvs.config import AngleModel
-from polmvs.geometry import unit_or_zero
+from polmvs.camera import in_frame
 from polmvs.io.arrays import kept_array
-from polmvs.polarization.angle_models import rows_from_axial, tilt_turn
-from polmvs.polarization.phase_map import PhaseMap, view_rays
+from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
 
 Array = NDArray[np.float64]
@@ -118,17 +115,12 @@ class SurfaceView:
     ----------
     phase_map : its phase; looked at anew each time, as it may be on disk.
     silhouette : of the objects.
-    tilt : (H, W) float32, by how much tilted polarizers would have turned the phase, rad; None
-        where that is not asked.
     has_outline : whether the silhouette may carve and pull: some pixels on it and some off it.
-    tilt_share : of that turn that is taken back: 0 for a sensor that obeys the angle model.
     """
 
     phase_map: PhaseMap
     silhouette: Silhouette
-    tilt: ArrayLike | None = None
     has_outline: bool = True
-    tilt_share: float = 0.0
 
     @property
     def view(self) -> View:
@@ -168,85 +160,20 @@ class SurfaceView:
         return np.abs(self.to_camera(points)[:, 2]) / self.view.camera.mean_focal_px
 
 
-@dataclass(frozen=True)
-class PhaseRows:
-    """Constraint rows of one view at points.
-
-    Attributes
-    ----------
-    rows : (N, 3) unit, world; 0 where the view has no phase.
-    precision : (N,) inverse variance of the phase, 1 / rad^2; 0 where it has none.
-    turn : (N,) by how much the row turns about the ray per turn of the phase.
-    tilt : (N,) by how much tilted polarizers would turn the row about the ray, rad.
-    """
-
-    rows: Array
-    precision: Array
-    turn: Array
-    tilt: Array
-
-
-def phase_rows(view: SurfaceView, angle_model: AngleModel, points: Floats) -> PhaseRows:
-    """Rows ``m`` with ``m . n = 0`` of one view at points of space.
-
-    Parameters
-    ----------
-    view : with its phase.
-    angle_model : OPA, or PPA; the samples of a tilted map are those of PPA.
-    points : (N, 3), world.
-    """
-    in_cam = view.to_camera(points)
-    xy = view.view.camera.project(in_cam)
-    rays = unit_or_zero(in_cam)
-    cos2, sin2, precision = (
-        np.asarray(column, np.float64) for column in sample_image(view.phase_map.samples, xy).T
-    )
-    tilt = np.zeros(len(xy))
-    if view.tilt is not None:
-        tilt = sample_image(np.asarray(view.tilt), xy).astype(np.float64)
-    if view.tilt_share:
-        cos, sin = np.cos(2 * view.tilt_share * tilt), np.sin(2 * view.tilt_share * tilt)
-        cos2, sin2 = cos2 * cos - sin2 * sin, sin2 * cos + cos2 * sin
-    rows = np.asarray(rows_from_axial(angle_model, cos2, sin2, rays), np.float64)
-    known = (precision > 0) & np.isfinite(rows).all(axis=1) & (rays[:, 2] > 0)
-    rows = np.where(known[:, None], rows, 0.0)
-    # d psi / d phase = (1 - (v.d)^2) / v_z, its inverse by the row's own components.
-    turn = (rows[:, 0] ** 2 + rows[:, 1] ** 2) / np.where(known, rays[:, 2], 1.0)
-    in_world = rows @ view.view.cam_from_world.rotation
-    return PhaseRows(in_world, np.where(known, precision, 0.0), turn, turn * tilt)
-
-
 def surface_view(
-    phase_map: PhaseMap,
-    silhouette: Silhouette,
-    angle_model: AngleModel,
-    *,
-    tilt_aware: bool = True,
-    folder: Path | None = None,
+    phase_map: PhaseMap, silhouette: Silhouette, *, folder: Path | None = None
 ) -> SurfaceView:
     """The record of a view from its phase map and silhouette.
 
     Parameters
     ----------
-    phase_map : corrected for tilted polarizers where ``angle_model`` is that.
+    phase_map : of the view.
     silhouette : of the objects in this view.
-    angle_model : whose rows the phase will give.
-    tilt_aware : keep by how much tilted polarizers would have turned the phases, which OPA and PPA
-        leave out, so that the share of it that all views agree on can be taken back.
     folder : where what is made here is kept; None: in memory, some 30 bytes a pixel.
     """
-    name, tilt = phase_map.view.name, None
-    if tilt_aware and angle_model is not AngleModel.TILTED:
-        samples = np.asarray(phase_map.samples)
-        known = samples[..., 2] > 0
-        diffuse = np.asarray(phase_map.diffuse)[known]
-        cos2, sin2 = samples[known, :2].T
-        turn = np.zeros(known.shape, np.float32)
-        turn[known] = tilt_turn(cos2, sin2, view_rays(phase_map.view)[known], diffuse=diffuse)
-        tilt = kept_array(turn, folder and folder / f"{name}.tilt.npy")
+    name = phase_map.view.name
     return SurfaceView(
         phase_map=phase_map,
         silhouette=silhouette if folder is None else _StoredSilhouette(silhouette, folder, name),
-        tilt=tilt,
         has_outline=bool(silhouette.certain.any() and not silhouette.possible.all()),
     )

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from polmvs.camera import Camera, pixel_centers
 from polmvs.config import CaptureOptions
 from polmvs.geometry import RigidTransform, unit
+from polmvs.polarization.fresnel import fresnel_dolp
 from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.polarization.stokes import wrap_axial
 from polmvs.scene import View
@@ -213,7 +214,7 @@ def _render(
     mask = np.isfinite(distance)
     distance = np.where(mask, distance, np.nan)
     normals = normals @ rotation.T
-    dolp = _fresnel_dolp(-(rays * normals).sum(axis=-1), light, ior)
+    dolp = fresnel_dolp(-(rays * normals).sum(axis=-1), light, ior)
     across = unit(np.cross(rays, normals))  # the light's polarisation if it is specular
     axis = across if light == "specular" else np.cross(rays, across)
     if sensor == "tilted":
@@ -242,16 +243,6 @@ def _render(
         dolp=dolp,
         intensities=intensities,
     )
-
-
-def _fresnel_dolp(cos_incidence: Array, light: str, ior: float) -> Array:
-    """Degree of polarisation of unpolarised light reflected by, or leaving, a dielectric."""
-    c = np.clip(cos_incidence, 0.0, 1.0)
-    refracted = np.sqrt(1 - (1 - c * c) / ior**2)
-    across = np.square((c - ior * refracted) / (c + ior * refracted))
-    along = np.square((ior * c - refracted) / (ior * c + refracted))
-    total = across + along
-    return np.asarray((across - along) / (total if light == "specular" else 2 - total))
 
 
 def _tilted_intensities(rays: Array, axis: Array, dolp: Array, s0: float) -> Array:

@@ -55,7 +55,7 @@ def test_values_that_fit_only_together(config) -> None:
 
 def test_earlier_stages_may_be_in_the_file_of_a_stage(config) -> None:
     path = config("[capture]\ngamma = 2\n")
-    assert options(None, "export", "c", "o", "--config", path).capture.gamma == 2
+    assert options(None, "finish", "c", "o", "--config", path).capture.gamma == 2
 
 
 @pytest.mark.parametrize(

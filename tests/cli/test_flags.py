@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+from dataclasses import MISSING
+from enum import StrEnum
 from pathlib import Path
 
 import pytest
@@ -35,6 +37,33 @@ def call(*arguments: object) -> Call:
 @pytest.fixture
 def wide(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
+
+
+# Values
+
+
+CHOICES = [
+    (command, info, value)
+    for command in COMMANDS
+    for cls in command.groups
+    for info in describe_fields(cls)
+    if isinstance(info.kind, type) and issubclass(info.kind, StrEnum) and not info.positional
+    for value in info.kind
+]
+
+
+@pytest.mark.parametrize(
+    ("command", "info", "value"), {(i.path, v): (c, i, v) for c, i, v in CHOICES}.values()
+)
+def test_every_choice_is_written_as_the_help_names_it(command, info, value) -> None:
+    needed = [
+        next(iter(other.kind)) if issubclass(other.kind, StrEnum) else "x"
+        for cls in command.groups
+        for other in describe_fields(cls)
+        if other.positional and other.default is MISSING and isinstance(other.kind, type)
+    ]
+    given = call(command.name, *needed, info.flag, str(value)).given
+    assert given[info.path] is value
 
 
 # Help
@@ -83,7 +112,7 @@ def test_help_names_every_option_with_its_default(cli, command) -> None:
     [
         ("normals", "--window-px", "--gamma"),
         ("densify", "--stride-px", "--min-dolp"),
-        ("export", "--in-place", "--stride-px"),
+        ("finish", "--in-place", "--stride-px"),
     ],
 )
 def test_help_of_a_stage_lists_its_own_options(cli, command: str, own: str, earlier: str) -> None:
@@ -209,8 +238,8 @@ def test_flags_may_stand_before_arguments() -> None:
         (("sfm", "c", "o", "--gamma", "1", "--gamma", "1"), "--gamma specified multiple times"),
         (("sfm", "c", "o", "--gamma=1", "--gamma=2"), "--gamma specified multiple times"),
         (("sfm", "c", "o", "--resume", "--resume"), "--resume specified multiple times"),
-        (("export", "c", "o", "--mesh", "--no-mesh"), "--mesh and --no-mesh exclude each other"),
-        (("export", "c", "o", "--no-mesh", "--mesh"), "--no-mesh and --mesh exclude each other"),
+        (("finish", "c", "o", "--mesh", "--no-mesh"), "--mesh and --no-mesh exclude each other"),
+        (("finish", "c", "o", "--no-mesh", "--mesh"), "--no-mesh and --mesh exclude each other"),
         (("sfm", "c", "o", "--intrinsics", "1,1,1,1", "--intrinsics", "1,1,1,1"), "--intrinsics"),
         (("sfm", "c", "o", "--intrinsics", "400,x,1,1"), "cannot be read as NUMBER,..."),
         (("sfm", "c", "o", "--scale", "a", "b"), "--scale requires 3"),

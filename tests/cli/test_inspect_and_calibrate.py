@@ -26,7 +26,8 @@ def test_inspect_says_what_a_capture_is(cli, demo_capture, tmp_path, monkeypatch
     assert status == 0
     assert "10 views, raw mosaics; files of 918x768 px, uint8" in out
     assert "fits, or a turned or mirrored one" in out
-    assert "is clipped in 001.png, 002.png" in out
+    assert "clipped in" not in out  # what is clipped is the table
+    assert out.splitlines()[-2] == "This capture will do."
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
     assert sheet.shape[1] == 6 * 326
     assert "--pattern 90,45,135,0 fits, or a turned or mirrored one" in written
@@ -34,6 +35,8 @@ def test_inspect_says_what_a_capture_is(cli, demo_capture, tmp_path, monkeypatch
     content = json.loads(out)
     assert len(content["views"]) == 10
     assert content["levels"]["full_scale"] == 255
+    assert content["verdict"] == "This capture will do."
+    assert content["views"][1]["saturated"] > 0.15 > 0.01 > content["views"][1]["part_saturated"]
 
 
 def test_inspect_warns_of_bad_captures(cli, tmp_path):
@@ -46,8 +49,65 @@ def test_inspect_warns_of_bad_captures(cli, tmp_path):
         cv2.imwrite(str(folder / f"{name}.png"), np.rint(blurred).astype(np.uint8))
     status, out, _ = cli("inspect", folder)
     assert status == 0
-    for words in ("too little polarised light", "expose more", "are polarised", "factor of"):
+    for words in ("too little polarised light", "expose more", "factor of"):
         assert words in out, words
+    assert out.splitlines()[-1].startswith("This capture will not do, because it has 2 views")
+    assert "pixels are polarised" in out.splitlines()[-1]
+
+
+def test_clipped_spots_of_the_part_count(cli, demo_capture, tmp_path):
+    """Twice the exposure: the marks and the reflected lamps on the board clip."""
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    for path in sorted((demo_capture / "raw").iterdir())[:4]:
+        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32)
+        cv2.imwrite(str(folder / path.name), np.clip(5 * raw, 0, 255).astype(np.uint8))
+    out = cli("inspect", folder)[1]
+    assert "of the part is clipped in" in out
+    assert out.splitlines()[-1].startswith("This capture will do, but the")
+
+
+def angle_images(folder, demo_capture, gains, stems=("000", "004", "008")):
+    """The demo's views as an image for each polarizer angle, each with a gain of its own."""
+    folder.mkdir()
+    for stem in stems:
+        raw = cv2.imread(str(demo_capture / "raw" / f"{stem}.png"), cv2.IMREAD_UNCHANGED)
+        sites = {90: (0, 0), 45: (0, 1), 135: (1, 0), 0: (1, 1)}
+        for angle, gain in gains.items():
+            row, col = sites[angle]
+            image = np.minimum(256.0 * gain * raw[row::2, col::2], 65535).astype(np.uint16)
+            cv2.imwrite(str(folder / f"{stem}_{angle:03d}.png"), image)
+    return folder
+
+
+EQUAL = {0: 0.5, 45: 0.5, 90: 0.5, 135: 0.5}
+UNEQUAL = {0: 0.15, 45: 0.5, 90: 0.6, 135: 0.5}
+
+
+def test_exposures_that_differ_between_angles_are_found_and_made_up_for(
+    cli, demo_capture, tmp_path
+):
+    good = angle_images(tmp_path / "good", demo_capture, EQUAL)
+    bad = angle_images(tmp_path / "bad", demo_capture, UNEQUAL)
+    status, out, _ = cli("inspect", good)
+    assert "differ in exposure" not in out
+    status, out, _ = cli("inspect", bad)
+    assert status == 0
+    assert "differ in exposure by up to a factor of 4.0 (0 deg 0.25, 45 deg 0.83, 90 deg 1" in out
+    assert "3 of 3 views" in out
+    assert "--equalize" in out.splitlines()[-1]
+    views = {
+        name: json.loads(cli("inspect", folder, "--json", *flags)[1])["views"]
+        for name, folder, flags in (
+            ("good", good, ()), ("bad", bad, ()), ("mended", bad, ("--equalize",))
+        )
+    }  # fmt: skip
+    for index in range(3):
+        polarized = {name: rows[index]["polarized"] for name, rows in views.items()}
+        assert polarized["bad"] > 0.9
+        assert polarized["mended"] == pytest.approx(polarized["good"], abs=0.04)
+    err = cli("inspect", demo_capture, "--equalize")[2]
+    assert "--equalize is of an image for each polarizer angle" in err
 
 
 def test_inspect_knows_a_colour_sensor(cli, tmp_path):

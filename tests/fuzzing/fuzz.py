@@ -1,5 +1,7 @@
 """Damage files and read them: ``fuzz.py FOLDER SEED ROUNDS [KIND ...]``.
 
+ROUNDS is a number of mutations of each kind, or minutes for all of them, as in ``3min``.
+
 Prints each mutation before it is read, so that the last line names what crashed the interpreter,
 and a traceback of each that ended neither well nor in a ``PolmvsError`` that names a file of it.
 The exit status is 1 if there was one.
@@ -12,6 +14,7 @@ import resource
 import shutil
 import signal
 import sys
+import time
 import traceback
 import warnings
 from pathlib import Path
@@ -22,7 +25,8 @@ from polmvs.colmap.cameras import quiet_colmap
 from polmvs.errors import PolmvsError
 
 MAX_SECONDS = 10
-MAX_BYTES = 1 << 30
+MAX_BYTES = 1 << 30  # that a reader may take
+MAX_RESIDENT = 4 << 30  # of the whole process
 
 
 def files_of(folder: Path) -> list[Path]:
@@ -57,8 +61,11 @@ def peak_bytes() -> int:
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def fuzz(root: Path, seed: int, rounds: int, names: list[str]) -> int:
+def fuzz(
+    root: Path, seed: int, rounds: int, names: list[str], minutes: float = float("inf")
+) -> int:
     """Number of mutations that did not end as they must."""
+    end = time.monotonic() + 60 * minutes
     from fuzzing.mutations import mutated
     from fuzzing.readers import KINDS
 
@@ -79,6 +86,8 @@ def fuzz(root: Path, seed: int, rounds: int, names: list[str]) -> int:
     num_bad = 0
     for index in range(rounds):
         for name, kind in kinds.items():
+            if time.monotonic() > end:
+                return num_bad
             folder, source = root / name, sources[name]
             rng = random.Random(f"{seed} {index} {name}")
             path = rng.choice(files_of(folder))
@@ -97,7 +106,7 @@ def fuzz(root: Path, seed: int, rounds: int, names: list[str]) -> int:
                 path.write_bytes(sound)
             else:
                 restore(source, folder)
-            if peak_bytes() > peak + MAX_BYTES:
+            if peak_bytes() > min(peak + MAX_BYTES, MAX_RESIDENT):
                 print(f"{name}: took {(peak_bytes() - peak) / 1e9:.1f} GB", file=sys.stderr)
                 num_bad, peak = num_bad + 1, peak_bytes()
     return num_bad
@@ -109,8 +118,11 @@ if __name__ == "__main__":
     warnings.simplefilter("ignore")
     place, seed_text, rounds_text, *given = sys.argv[1:]
     with quiet_colmap():
-        found = fuzz(
-            Path(place), int(seed_text), int(rounds_text), [g for g in given if g != "--keep"]
-        )
+        limit, names = rounds_text.removesuffix("min"), [g for g in given if g != "--keep"]
+        if limit == rounds_text:
+            found = fuzz(Path(place), int(seed_text), int(rounds_text), names)
+        else:
+            found = fuzz(Path(place), int(seed_text), 1 << 30, names, float(limit))
+    print(f"{peak_bytes() / 1e9:.1f} GB at most", file=sys.stderr)
     print(f"{found} bad", file=sys.stderr)
     sys.exit(found > 0)

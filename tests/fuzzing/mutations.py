@@ -13,6 +13,7 @@ FLOATS = (0.0, -0.0, 1e-320, 1e-30, 1e10, 1e30, 1e154, 1e300, -1e300, float("inf
 WORDS = (
     b"", b"0", b"-1", b"1e400", b"nan", b"inf", b"NaN", b"Infinity", b"null", b"true", b"[]", b"{}",
     b"9" * 20, b"9" * 5000, b"-" + b"9" * 5000, b"1e-400", b'"x"', b"\xff\xfe", b"0x10", b"1_0",
+    b"&a [*a]", b"*a", b".inf", b"-.inf", b"1e400,", b"\x1b[31m",
     b"[" * 5000, b'{"a":' * 5000, b"\xb2", b"../../x", b"..", b"\0",
 )  # fmt: skip
 NUMBER = re.compile(rb"[-+]?\d+(\.\d*)?([eE][-+]?\d+)?")

@@ -24,8 +24,8 @@ PAIRED = [p for p in permutations((0, 45, 90, 135)) if abs(p[0] - p[3]) == 90]
 
 def read_as(phase_map, change):
     """The map with all its phases changed."""
-    axial = phase_map.samples[..., :2] @ np.array(change, np.float32).T
-    return phase_map.changed(samples=np.dstack([axial, phase_map.samples[..., 2]]))
+    changed = phase_map.polarization[..., :2] @ np.array(change, np.float32).T
+    return phase_map.changed(polarization=np.dstack([changed, phase_map.polarization[..., 2:]]))
 
 
 def ball_scene(light: Light, sensor: str = "ppa") -> Scene:

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from scenes import Scene, board_scene, phase_map_of, tracks_at
+from scenes import Scene, board_scene, phase_map_of, seen_tracks, tracks_at
 
 from polmvs.config import Light
 from polmvs.normals.light import track_votes
 from polmvs.normals.light_check import check_light
-from polmvs.polarization.phase_map import turned
 from polmvs.synthetic.captures import render_view
 from polmvs.synthetic.surfaces import Sphere
 
@@ -28,11 +27,10 @@ def ball_scene(light: Light, sensor: str) -> Scene:
 @pytest.mark.parametrize("sensor", ["ppa", "tilted"])
 def test_only_the_wrong_light_is_contradicted(light, sensor):
     scene = ball_scene(light, sensor)
-    tracks = tracks_at(scene, scene.surface_points(40)[0])
+    tracks = seen_tracks(scene, *scene.surface_points(60))
     right = [phase_map_of(rendered, light) for rendered in scene.rendered]
     assert not check_light(tracks, right, light).contradicted
-    wrong = [turned(m, np.ones(m.region.inside.shape, bool)) for m in right]
-    found = check_light(tracks, wrong, OTHER[light])
+    found = check_light(tracks, right, OTHER[light])
     assert found.contradicted
     assert f"`region.light` {OTHER[light]} does not fit: under {light} light" in found.message
     assert f"Give `region.light` {light}, or leave it out" in found.message
@@ -41,18 +39,16 @@ def test_only_the_wrong_light_is_contradicted(light, sensor):
 def test_few_points_say_nothing():
     scene = board_scene(6)
     tracks = tracks_at(scene, scene.surface_points(5)[0])
-    wrong = [turned(m, np.ones(m.region.inside.shape, bool)) for m in scene.maps]
-    assert not check_light(tracks, wrong, Light.DIFFUSE).contradicted
+    assert not check_light(tracks, scene.maps, Light.DIFFUSE).contradicted
     nothing = tracks_at(scene, np.zeros((0, 3)))
-    assert check_light(nothing, wrong, Light.DIFFUSE).num_votes == 0
+    assert check_light(nothing, scene.maps, Light.DIFFUSE).num_votes == 0
 
 
 def test_tiles_of_points_change_nothing():
     scene = ball_scene(Light.SPECULAR, "ppa")
     tracks = tracks_at(scene, scene.surface_points(40)[0])
-    wrong = [turned(m, np.ones(m.region.inside.shape, bool)) for m in scene.maps]
-    votes, voting = track_votes(tracks, wrong)
-    in_tiles = track_votes(tracks, wrong, max_rows=7 * len(scene.maps))
+    votes, voting = track_votes(tracks, scene.maps)
+    in_tiles = track_votes(tracks, scene.maps, max_rows=7 * len(scene.maps))
     np.testing.assert_array_equal(in_tiles[0], votes)
     np.testing.assert_array_equal(in_tiles[1], voting)
     assert voting.sum() > 7

@@ -6,7 +6,7 @@ from scenes import board_scene, tracks_at
 
 from polmvs.config import AngleModel, Estimator, NormalOptions
 from polmvs.normals.rows import gather_rows
-from polmvs.normals.tracks import dolp_shares, seen_shares, select_seeds, track_normals, window_map
+from polmvs.normals.tracks import dolp_shares, seen_shares, select_seeds, track_normals
 from polmvs.polarization.phase_map import open_phase_map, store_phase_map
 from polmvs.scene import point_sigmas
 
@@ -34,7 +34,7 @@ def test_ppa_recovers_the_normals_of_a_perspective_view_and_opa_does_not(scene, 
     opa = track_normals(AngleModel.OPA, tracks, scene.maps, options)
     assert ppa.valid.all()
     assert errors_deg(ppa.normals, truth).mean() < 0.4
-    assert errors_deg(opa.normals, truth).mean() > 3
+    assert np.nanmean(errors_deg(opa.normals, truth)) > 3
     assert (ppa.num_rows >= 3).all()
 
 
@@ -105,18 +105,6 @@ def test_sigma_of_a_point_is_that_of_its_triangulation(scene):
     largest = np.sqrt(np.linalg.eigvalsh(np.cov(solved.T))[-1])
     # Off-axis pixels are nearer together than on-axis ones: a few percent.
     assert sigma == pytest.approx(largest, rel=0.15)
-
-
-def test_the_window_averages_axially_over_reliable_pixels(scene):
-    phase_map = scene.maps[0]
-    windowed = window_map(phase_map, 9)
-    inside = phase_map.region.reliable & (windowed.samples[..., 2] > 0)
-    middle = np.argwhere(inside)[len(np.argwhere(inside)) // 2]
-    r, c = middle
-    patch = np.s_[r - 4 : r + 5, c - 4 : c + 5]
-    weight = phase_map.samples[patch][..., 2] * phase_map.region.reliable[patch]
-    expected = (phase_map.samples[patch][..., :2] * weight[..., None]).sum((0, 1)) / weight.sum()
-    np.testing.assert_allclose(windowed.samples[r, c, :2], expected, rtol=1e-4)
 
 
 def test_a_stored_phase_map_comes_back_and_travels_as_its_path(scene, tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import re
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 
@@ -11,9 +12,21 @@ import pytest
 from helpers import content_of, record_of, refused
 from printed_images import INTRINSICS, write_printed_capture
 
-from polmvs.config import AngleModel, Light, Options, PropagationOptions
+from polmvs.config import (
+    AngleModel,
+    FieldInfo,
+    Light,
+    Options,
+    PropagationOptions,
+    RunOptions,
+    describe_fields,
+    get_option,
+    groups_of,
+    option_paths,
+    to_plain,
+)
 from polmvs.errors import DataError, OptionError
-from polmvs.pipeline.batch import BatchEntry, _row_of, read_batch
+from polmvs.pipeline.batch import BatchEntry, _row_of, read_batch, run_batch
 
 COARSE = ("--method", "integrate", "--stride-px", 8, "--no-mesh", "--no-colmap", "--workers", 2)
 
@@ -73,6 +86,89 @@ def test_faulty_lists_write_nothing(cli, captures, tmp_path) -> None:
     assert content_of(captures) == before
 
 
+def test_a_second_list_leaves_the_first_one_s_rows(captures, tmp_path) -> None:
+    out = tmp_path / "out"
+    options = Options()
+    first, second = (
+        BatchEntry(name=name, capture=captures / "bad", angle_model=AngleModel.PPA, options=options)
+        for name in ("one", "two")
+    )
+    run_batch([first], out, RunOptions(workers=1))
+    rows = run_batch([second], out, RunOptions(workers=1))
+    assert [row.name for row in rows] == ["two"]
+    assert [row["name"] for row in json.loads((out / "batch.json").read_text())] == ["one", "two"]
+    assert "| one " in (out / "batch.md").read_text()
+    run_batch([first], out, RunOptions(workers=1, overwrite=True))  # its row is not there twice
+    assert [row["name"] for row in json.loads((out / "batch.json").read_text())] == ["two", "one"]
+    (out / "batch.json").write_text("[1]")
+    with pytest.raises(DataError, match=r"batch\.json: is no table of a batch"):
+        run_batch([second], out, RunOptions(workers=1, overwrite=True))
+    assert (out / "batch.json").read_text() == "[1]"
+
+
+# A value of each option that is not its default, as a cell of a CSV file has it, and as it is.
+OTHERS = {
+    "capture.pattern": ("0,45,135,90", (0, 45, 135, 90)),
+    "capture.naming": ("{view}.tif", "{view}.tif"),
+    "capture.angles": ("0,60,120", (0, 60, 120)),
+    "sfm.intrinsics": ("4,5,6,7", (4, 5, 6, 7)),
+    "sfm.camera_model": ("OPENCV", "OPENCV"),
+    "sfm.without": ("a.png,b.png", ("a.png", "b.png")),
+    "sfm.pairs": ("sequential", "sequential"),
+    "reference.aruco": ("DICT_4X4_50:0.05", "DICT_4X4_50:0.05"),
+    "reference.scale": ("a,b,2", ("a", "b", 2)),
+    "normals.window_px": ("19", 19),
+    "propagation.bending": ("0.05", 0.05),
+}
+
+
+def other_value(info: FieldInfo) -> tuple[str, object]:
+    if info.path in OTHERS:
+        return OTHERS[info.path]
+    if info.kind is bool:
+        return ("no" if info.default else "yes"), not info.default
+    if issubclass(info.kind, StrEnum):
+        last = list(info.kind)[-1]
+        return last.value, last
+    if info.kind is Path:
+        return "x", Path("x")
+    low = info.range.least if info.range.above is None else info.range.above
+    value = info.kind((info.default or low or 0) + 1)
+    if value not in info.range:
+        value = 0.5 * (info.default + (info.range.most or info.range.below))
+    return (str(value) if info.kind is int else f"{value:g}"), value
+
+
+@pytest.mark.parametrize("path", option_paths())
+def test_every_option_can_be_one_capture_s(tmp_path, path: str) -> None:
+    group, name = path.split(".")
+    info = next(i for i in describe_fields(groups_of(Options)[group]) if i.name == name)
+    cell, value = other_value(info)
+    sheet = write(tmp_path, "list.csv", f'folder,name,{path}\na,first,"{cell}"\nb,,\n')
+    toml = write(
+        tmp_path,
+        "list.toml",
+        f"[[captures]]\nfolder = 'a'\nname = 'first'\n[captures.{group}]\n"
+        f"{name} = {json.dumps(to_plain(value) if info.kind is not Path else 'x')}\n"
+        "[[captures]]\nfolder = 'b'\n",
+    )
+    first, second = read_batch(sheet, Options())
+    assert get_option(second.options, path) == info.default
+    expected = tmp_path / value if isinstance(value, Path) else value
+    assert get_option(first.options, path) == expected
+    assert read_batch(toml, Options())[0] == first
+
+
+def test_the_folder_s_older_name(tmp_path) -> None:
+    path = write(tmp_path, "l.csv", "capture,capture.gamma\na,0.5\n")
+    assert read_batch(path, Options())[0].options.capture.gamma == 0.5
+    path = write(
+        tmp_path, "l.toml", "[[captures]]\ncapture = 'a'\n[captures.capture]\ngamma = 0.5\n"
+    )
+    with pytest.raises(DataError, match="Name the folder of a capture 'folder'"):
+        read_batch(path, Options())
+
+
 def write(folder: Path, name: str, text: str) -> Path:
     for capture in ("a", "b"):
         (folder / capture).mkdir(exist_ok=True)
@@ -117,7 +213,7 @@ def test_toml_and_csv_say_the_same(tmp_path) -> None:
         ("l.toml", "[[runs]]\n", "'runs' is none of its tables"),
         ("l.toml", "[[captures]\n", "is no TOML file"),
         ("l.toml", "", "lists no captures"),
-        ("l.toml", "[[captures]]\nname = 'a'\n", "capture 1: needs a 'capture'"),
+        ("l.toml", "[[captures]]\nname = 'a'\n", "capture 1: needs a 'folder'"),
         ("l.toml", "[[captures]]\ncapture = 'a'\nname = '../a'\n", "capture 1: the name '../a'"),
         ("l.toml", "[[captures]]\ncapture = 'a'\nmodel = 'x'\n", "model must be one of opa, ppa"),
         ("l.toml", "[[captures]]\ncapture = 'a'\nsfm.seeds = 1\n", r"capture 1: \[sfm\].*'seed'"),
@@ -128,8 +224,11 @@ def test_toml_and_csv_say_the_same(tmp_path) -> None:
         ("l.csv", "capture,sfm.seed\na,one\n", "line 2: sfm.seed cannot be 'one'"),
         ("l.csv", "capture,sfm.single_camera\na,maybe\n", "cannot be 'maybe'"),
         ("l.csv", "capture\na,b\n", "line 2: has more cells"),
-        ("l.csv", "name\na\n", "line 2: needs a 'capture'"),
+        ("l.csv", "name\na\n", "line 2: needs a 'folder'"),
         ("l.csv", "capture\n", "lists no captures"),
+        ("l.csv", "capture,folder\na,a\n", "names its folder twice"),
+        ("l.csv", "folder,name\na,batch.md\n", "cannot be named 'batch.md'"),
+        ("l.csv", "folder,name\na,Batch.JSON\n", "cannot be named 'Batch.JSON'"),
         ("l.txt", "a\n", "must end in .toml or .csv"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from functools import partial
 
 import cv2
 import numpy as np
@@ -10,20 +11,22 @@ from capture_writer import PATTERN, bits_of_stream, split_mosaic, stokes_of
 from data_set_writer import (
     mvas,
     nersp,
+    neus,
     pandora,
     pisr,
     pisr_maps,
     ppa4p3d,
+    transpir,
 )
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.colmap.models import read_model
-from polmvs.config import BayerOrder, CaptureKind, Light
+from polmvs.config import BayerOrder, CaptureKind, CaptureOptions, Light, Options, SfmOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform
 from polmvs.io.data_sets import DataSetKind, read_data_set, recognise_data_set
 from polmvs.io.raw_formats import read_raw
-from polmvs.pipeline.data_set_import import import_data_set
+from polmvs.pipeline.data_set_import import as_capture, import_data_set
 from polmvs.polarization.capture import open_capture
 from polmvs.polarization.stokes import axial_difference
 from polmvs.scene import View
@@ -64,6 +67,9 @@ SETS = {
     "PISR, maps": (pisr_maps, DataSetKind.PISR, 0.01),
     "PANDORA": (pandora, DataSetKind.PANDORA, 1.0),
     "NeRSP": (nersp, DataSetKind.NERSP, 0.01),
+    "NeuS": (neus, DataSetKind.NEUS, 1.0),
+    "NeuS of mosaics' cameras": (partial(neus, mosaics=True), DataSetKind.NEUS, 1.0),
+    "TransPIR": (transpir, DataSetKind.TRANSPIR, 1.0),
     "MVAS": (mvas, DataSetKind.MVAS, 0.01),
 }
 
@@ -115,6 +121,47 @@ def test_sets_are_read_as_they_are_published(tmp_path, source, name):
         assert imported.num_points > 50
 
 
+def test_reconstruct_and_inspect_know_a_set_by_themselves(tmp_path, source, cli):
+    root, out = tmp_path / "set", tmp_path / "out"
+    neus(root, source)
+    status, text, _ = cli("inspect", root)
+    assert status == 0
+    assert text.startswith("a set in the layout of NeuS, with 3 cameras and 3 masks, which")
+    capture, options = as_capture(root, out, Options())
+    assert options.sfm.sparse == tmp_path / "out_import" / "sparse"
+    assert options.region.mask == tmp_path / "out_import" / "masks"
+    made = (tmp_path / "out_import" / "import.json").stat().st_mtime_ns
+    for given in (Options(), options):  # found again, also by a run that goes on
+        assert as_capture(root, out, given) == (capture, options)
+    assert (tmp_path / "out_import" / "import.json").stat().st_mtime_ns == made
+    status, text, err = cli("sfm", root, out)
+    assert status == 0, err
+    assert "3 of 3 views have a pose" in text
+    own = Options(sfm=SfmOptions(sparse=tmp_path / "own"))  # poses that the user gives
+    assert as_capture(root, out, own) == (root, own)
+    assert as_capture(root / "raw", out, Options()) == (root / "raw", Options())
+    (tmp_path / "other_import").mkdir()
+    with pytest.raises(DataError, match="is in the way of the import"):
+        as_capture(root, tmp_path / "other", Options())
+
+
+def test_import_command(tmp_path, source, cli):
+    root, out = tmp_path / "set", tmp_path / "out"
+    neus(root, source)
+    status, text, _ = cli("import", root, out)
+    assert status == 0
+    assert text.splitlines()[0] == f"{out}: 3 views of NeuS"
+    words = ["polmvs", "reconstruct", str(root), "RUN", "--config", str(out / "capture.toml")]
+    assert text.splitlines()[2].startswith(" ".join(words))
+    status, _, err = cli("import", root, out)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "exists" in err
+    status, _, err = cli("import", root / "raw", tmp_path / "nothing")
+    assert status == 1
+    assert "no set that is known (ppa4p3d, PISR, PANDORA, NeRSP, MVAS, TransPIR, NeuS)" in err
+    assert not (tmp_path / "nothing").exists()
+
+
 def test_pandora_dumps(tmp_path, source, monkeypatch):
     monkeypatch.setattr("polmvs.io.data_sets.PANDORA_SIZE", (WIDTH, HEIGHT))
     root = tmp_path / "set"
@@ -126,7 +173,7 @@ def test_pandora_dumps(tmp_path, source, monkeypatch):
     for k, (share, _, _) in enumerate(source.values()):
         samples = np.rint(share * 4095).astype(np.uint16)
         (root / "images_raw" / f"{k + 1:02d}.raw").write_bytes(bits_of_stream(samples, 12))
-    data_set = read_data_set(root, BayerOrder.GRBG)
+    data_set = read_data_set(root, CaptureOptions(bayer=BayerOrder.GRBG))
     assert data_set.capture == root / "images_raw"
     capture = open_capture(data_set.capture, data_set.options)
     s0 = capture.load("01.raw").s0

@@ -110,7 +110,11 @@ def test_clouds_carry_normals_colours_and_scalars(demo_run: Path) -> None:
     np.testing.assert_allclose(length, cloud.scalars["kind"] == PointKind.SURFACE, atol=1e-4)
     assert cloud.colors is not None
     assert cloud.colors.std() > 0
-    assert set(cloud.scalars) == {"num_views", "sigma_deg", "sigma", "kind"}
+    light = {"specular", "diffuse", "dolp"}
+    assert set(cloud.scalars) == {"num_views", "sigma_deg", "sigma", "kind", *light}
+    on_part = cloud.scalars["kind"] == PointKind.SURFACE
+    assert np.median(cloud.scalars["specular"][on_part]) > 0.9  # black and glossy
+    assert np.isnan(cloud.scalars["specular"][~on_part]).all()
     assert cloud.scalars["num_views"].min() >= 2
     kinds = cloud.scalars["kind"]
     assert set(kinds.astype(int)) == {PointKind.SURFACE, PointKind.SPARSE}
@@ -120,6 +124,7 @@ def test_sparse_normals_carry_their_quality(demo_run: Path) -> None:
     tracks = read_cloud(demo_run / "normals.ply")
     assert len(tracks.points) == len(read_model(demo_run / "sparse").tracks.point3D_ids)
     names = {"sigma_deg", "num_views", "residual", "conditioning", "valid", "seed"}
+    names |= {"specular", "diffuse", "dolp"}
     assert set(tracks.scalars) == names
     assert tracks.normals is not None
     valid = tracks.scalars["valid"] > 0

@@ -12,8 +12,9 @@ from helpers import content_of
 from polmvs.cli.terminal import Terminal, TerminalOptions
 from polmvs.errors import DataError
 from polmvs.io.temporary import PREFIX, TOKEN, temporary_path
-from polmvs.pipeline.run_folder import RunFolder, scratch
+from polmvs.pipeline.run_folder import ROOT_NAMES, RunFolder, scratch
 from polmvs.pipeline.run_lock import LOCK_FILE, left_over_names, locked
+from polmvs.pipeline.stage_table import written_names
 
 HOLDER = """
 import sys
@@ -59,6 +60,9 @@ def test_a_killed_run_leaves_the_folder_free_and_is_cleared_away(holder, tmp_pat
         *(".something.tmp", ".env.tmpl", ".photos.tmp", f"{PREFIX}0123456789abcdef-1-0-sparse"),
         f"{PREFIX}mine",
     ]
+    token = (out / LOCK_FILE).read_text().split()[0]
+    # A list of tokens may be forged: it names nothing that this program does not make.
+    mine += [f"{PREFIX}{token}-{rest}" for rest in ("notes", "1-0-notes.txt", "1-x-sparse", "1-0-")]
     for name in mine:
         (out / name).mkdir()
         (out / name / "photo.png").write_text("mine")
@@ -131,3 +135,7 @@ def test_links_are_not_followed(tmp_path: Path) -> None:
 def test_long_names_have_short_temporary_names(tmp_path: Path) -> None:
     with scratch(tmp_path / (255 * "x")) as folder:
         assert len(folder.name) < 100
+
+
+def test_all_that_a_run_writes_may_be_left_half_done() -> None:
+    assert set(written_names()) <= ROOT_NAMES

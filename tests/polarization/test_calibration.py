@@ -191,6 +191,7 @@ def test_angles_the_wrong_way_round_are_noticed():
         ("version = 1\ngain = [1,1,1,1]", "'gain'"),
         ("version = 1\ngains = [1,1,1]", "four numbers"),
         ("version = 1\ngains = [1,1,1,nan]", "four numbers"),
+        (f"version = 1\ngains = [1,1,1,{'9' * 400}]", "four numbers"),
         ("version = 1\npattern = [0,0,90,135]", "once each"),
         ("version = 1\nangles_deg = [90,45,0,135]", "in this order"),
         ("version = 1\ndiattenuations = [1,1,1,2]", "0 to 1"),

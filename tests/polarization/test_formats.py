@@ -1,5 +1,7 @@
 """One capture in every format gives the same Stokes images within its rounding."""
 
+import struct
+
 import cv2
 import numpy as np
 import pytest
@@ -352,6 +354,31 @@ def test_a_jpeg_is_recognised_and_its_noise_covers_the_error(
     assert np.median(widened) < 6 * np.median(rms)
 
 
+@pytest.mark.parametrize("quality", [60, 85])
+def test_jpegs_of_single_polarizers_state_the_error_of_a_block(tmp_path, quality):
+    """Means of 8x8 px err by what is stated; that of the pixels is in the rest of the noise."""
+    rng = np.random.default_rng(quality)
+    rows, cols = np.mgrid[:256, :320]
+    s0 = 90 + 30 * np.sin(rows / 37) + 25 * np.cos(cols / 51)
+    for angle in (0, 45, 90, 135):
+        samples = s0 * (1 + 0.1 * np.cos(2 * np.radians(angle) - cols / 300))
+        samples = np.clip(np.rint(samples + rng.normal(0, 1.5, s0.shape)), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"a_{angle}.png"), samples)
+        quality_of = [cv2.IMWRITE_JPEG_QUALITY, quality]
+        (tmp_path / "jpeg").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "jpeg" / f"a_{angle}.jpg"), samples, quality_of)
+    folders = {"png": tmp_path, "jpg": tmp_path / "jpeg"}
+    images = [
+        open_capture(folder, CaptureOptions(naming=f"{{view}}_{{angle}}.{suffix}"))
+        for suffix, folder in folders.items()
+    ]
+    clean, lossy = (capture.load(capture.names[0]) for capture in images)
+    assert clean.lossy_sigma == 0
+    error = np.stack([lossy.s1 - clean.s1, lossy.s2 - clean.s2])
+    blocks = error.reshape(2, 32, 8, 40, 8).mean(axis=(2, 4))
+    assert lossy.lossy_sigma == pytest.approx(blocks.std(), rel=0.5)
+
+
 def test_no_capture_is_called_lossy_by_mistake(demo_capture):
     assert open_capture(demo_capture).lossy_steps is None
 
@@ -372,3 +399,49 @@ def test_tiff_samples_stay_as_stored(tmp_path, orientation, dtype):
 
 def test_split_of_the_writer_is_that_of_the_package():
     assert split_mosaic.__module__ == "polmvs.polarization.mosaic"
+
+
+# --- what would be misread ---------------------------------------------------------------------
+
+
+def four_page_tiff(page, purposes=(0, 0, 0, 0)):
+    """The bytes of a TIFF of several pages, of which some may be previews (bit 0 of tag 254)."""
+    height, width = page.shape
+    data = bytearray(b"II*\0" + struct.pack("<I", 8))
+    for number, purpose in enumerate(purposes):
+        start = len(data)
+        tags = [
+            (254, 4, purpose), (256, 4, width), (257, 4, height), (258, 3, 8), (259, 3, 1),
+            (262, 3, 1), (273, 4, start + 2 + 12 * 9 + 4), (277, 3, 1), (279, 4, page.size),
+        ]  # fmt: skip
+        data += struct.pack("<H", len(tags))
+        for tag, kind, value in tags:
+            data += struct.pack("<HHII", tag, kind, 1, value)
+        end = start + 2 + 12 * len(tags) + 4 + page.size
+        data += struct.pack("<I", end if number + 1 < len(purposes) else 0) + page.tobytes()
+    return bytes(data)
+
+
+def test_a_tiff_of_several_images_is_refused_and_says_why(tmp_path):
+    page = np.arange(64, dtype=np.uint8).reshape(8, 8)
+    path = tmp_path / "a.tif"
+    path.write_bytes(four_page_tiff(page))
+    with pytest.raises(DataError, match="holds 4 images; one in a file is read"):
+        read_raw(path)
+    path.write_bytes(four_page_tiff(page, (0, 1)))  # an image and its preview
+    np.testing.assert_array_equal(read_raw(path).samples, page)
+
+
+@pytest.mark.parametrize("shape", [(32, 32, 3), (3, 32, 32)])
+def test_an_array_of_stokes_images_is_known_for_what_it_is(tmp_path, shape):
+    rng = np.random.default_rng(0)
+    for name in "ab":
+        stokes = rng.uniform(0.0, 0.1, shape).astype(np.float32)
+        np.moveaxis(stokes, int(np.argmin(shape)), 0)[0] += 0.5
+        np.save(tmp_path / f"{name}.npy", stokes)
+    with pytest.raises(DataError, match=r"Give `capture\.kind` stokes"):
+        open_capture(tmp_path)
+    capture = open_capture(tmp_path, CaptureOptions(kind=CaptureKind.STOKES, full_scale=1.0))
+    assert capture.names == ("a.npy", "b.npy")
+    first = np.moveaxis(np.load(tmp_path / "a.npy"), int(np.argmin(shape)), 0)
+    np.testing.assert_allclose(capture.load("a.npy").s1, first[1], atol=1e-7)

@@ -1,13 +1,21 @@
 """The stated deviation of smoothed phases: what smoothing does not lessen stays in it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import Light
+from polmvs.config import BayerOrder, Light
 from polmvs.geometry import RigidTransform
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.mosaic import (
+    noise_area_px,
+    split_colour_mosaic,
+    split_mosaic,
+    split_mosaic_full,
+)
 from polmvs.polarization.phase_map import PhaseTolerances, build_phase_map
 from polmvs.polarization.region import Region
 from polmvs.polarization.stokes import axial_difference, stokes_from_intensities
@@ -83,3 +91,39 @@ def test_compression_is_shared_by_blocks(demo_capture, tmp_path):
     error = np.abs(axial_difference(phases(maps[1].samples), phases(maps[0].samples)))[known]
     sigma = 1 / np.sqrt(maps[1].samples[known][:, 2])
     assert 0.6 < np.mean(error < sigma) < 0.995  # 0.99: blocks share more than it is told
+
+
+@pytest.mark.parametrize("dolp", [0.15, 0.5])
+def test_interpolated_neighbours_are_not_independent(dolp):
+    """Noise of raw samples: the smoothed phase errs by what is stated, not by half as much more."""
+    rng = np.random.default_rng(5)
+    height, width = 128, 160
+    angles = np.tile(np.radians([[90, 45], [135, 0]]), (height, width))
+    raw = 0.3 * (1 + dolp * np.cos(2 * (angles - 0.4)))
+    raw = raw + rng.normal(0, 0.004, raw.shape)
+    images = split_mosaic(raw.astype(np.float32), (90, 45, 135, 0))
+    clipped = np.zeros((height, width), bool)
+    stokes = stokes_from_intensities(images, clipped, quantum=0.0)
+    stokes = replace(stokes, gain_sigma=0.0, noise_area_px=noise_area_px())
+    made = build_phase_map(
+        view_of(width, height), stokes, everywhere(clipped.shape), Light.DIFFUSE, tolerances=PURE
+    )
+    inner = np.s_[12:-12, 12:-12]
+    z = axial_difference(phases(made.samples), 0.4)[inner] * np.sqrt(made.samples[inner][..., 2])
+    assert np.sqrt(np.mean(z**2)) == pytest.approx(1, abs=0.12)
+
+
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("colour", [False, True])
+def test_pixels_that_share_an_error_are_counted(full, colour):
+    """White noise of a mosaic: the variance of large means against that of single pixels."""
+    raw = np.random.default_rng(6).normal(0, 1, (1024, 1024)).astype(np.float32)
+    pattern = (90, 45, 135, 0)
+    if colour:
+        image = split_colour_mosaic(raw, pattern, BayerOrder.RGGB, full=full)[0, 0]
+    else:
+        image = (split_mosaic_full if full else split_mosaic)(raw, pattern)[0]
+    side = 32 if full else 16
+    means = image.reshape(-1, side, image.shape[1] // side, side).mean(axis=(1, 3))
+    area = means.var() * side**2 / image.var()
+    assert noise_area_px(colour=colour, full=full) == pytest.approx(area, rel=0.2)

@@ -345,3 +345,25 @@ def test_mixed_phases_widen_sigma_and_mere_brightness_does_not(images, turned):
         stokes = combine([flat, flat, flat])
     edge, beside = at_edge_and_beside(stokes)
     assert edge > 3 * beside if turned else edge < 1.5 * beside
+
+
+@pytest.mark.parametrize(("noise", "share"), [(0.02, 0.8), (0.01, 0.5), (0.005, 0.2)])
+def test_colours_weigh_by_their_noise(noise: float, share: float) -> None:
+    """Two colours of one polarization: their weights are as the inverse variances."""
+    shape = (20, 24)
+
+    def colour(s1: float, sigma: float) -> Stokes:
+        full = np.full(shape, 0.5, np.float32)
+        return Stokes(
+            s0=full,
+            s1=np.full(shape, s1, np.float32),
+            s2=np.zeros(shape, np.float32),
+            sigma=np.full(shape, sigma, np.float32),
+            valid=np.ones(shape, bool),
+        )
+
+    merged = combine([colour(0.2, 0.01), colour(-0.2, noise)])
+    assert merged.s1.mean() == pytest.approx(0.2 * (2 * share - 1), abs=1e-6)
+    # The matched filter: a colour of half the polarization has half the weight.
+    weaker = combine([colour(0.2, 0.01), colour(0.1, 0.01)])
+    assert weaker.s1.mean() == pytest.approx((2 * 0.2 + 0.1) / 3, abs=1e-6)

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from polmvs.report.report import HEADLINE
@@ -94,6 +95,54 @@ class Opened:
             pane,
         )
         return colors, covered
+
+    def evenly_coloured(self, pane: str) -> set[tuple[int, int, int]]:
+        """Colours of a pane's pixels in the midst of others alike: no edge, no ground."""
+        self.settle()
+        found = self.page.evaluate(
+            """(name) => {
+              const canvas = document.querySelector(`[data-pane=${name}] canvas`);
+              const copy = document.createElement("canvas");
+              const [width, height] = [copy.width = canvas.width, copy.height = canvas.height];
+              const context = copy.getContext("2d");
+              context.drawImage(canvas, 0, 0);
+              const data = context.getImageData(0, 0, width, height).data;
+              const at = (x, y) => {
+                const i = 4 * (x + width * y);
+                return data[i] << 16 | data[i + 1] << 8 | data[i + 2];
+              };
+              const ground = at(0, 0), colors = new Set();
+              for (let y = 1; y < height - 1; y++) for (let x = 1; x < width - 1; x++) {
+                const color = at(x, y);
+                if (color !== ground && [at(x - 1, y), at(x + 1, y), at(x, y - 1), at(x, y + 1)]
+                  .every((other) => other === color)) colors.add(color);
+              }
+              return [...colors];
+            }""",
+            pane,
+        )
+        return {(color >> 16, color >> 8 & 255, color & 255) for color in found}
+
+    def legend(self) -> tuple[bool, np.ndarray]:
+        """Colours (N, 3) of the legend as the browser shows them; whether they are a bar's."""
+        bar = self.page.locator(".legend .bar")
+        if bar.count():
+            shown = bar.evaluate("e => getComputedStyle(e).backgroundImage")
+        else:
+            shown = self.page.locator(".legend .class").evaluate_all(
+                "all => all.map(e => getComputedStyle(e, '::before').backgroundColor).join()"
+            )
+        colors = re.findall(r"rgb\((\d+), (\d+), (\d+)\)", shown)
+        return bool(bar.count()), np.array(colors, np.float64).reshape(-1, 3)
+
+
+def off_the_legend(colors: set[tuple[int, int, int]], legend: np.ndarray, bar: bool) -> float:
+    """Largest difference in a component of a colour from the nearest one of the legend."""
+    if bar:
+        steps = np.linspace(0, 1, 64)[:, None, None]
+        legend = ((1 - steps) * legend[:-1] + steps * legend[1:]).reshape(-1, 3)
+    shown = np.array(sorted(colors), np.float64)
+    return float(np.abs(shown[:, None] - legend).max(axis=-1).min(axis=-1).max())
 
 
 @pytest.fixture(scope="module", params=[390, 1440])
@@ -240,3 +289,42 @@ def test_dark_mode_is_dark(browser, demo_run: Path) -> None:
     assert max(map(int, re.findall(r"\d+", color)[:3])) < 60
     assert opened.shown("left")[0] > 100
     opened.page.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_colours_in_3d_are_those_of_the_legend(browser, demo_run: Path, scheme: str) -> None:
+    opened = Opened(browser, demo_run / "report.html", 1000, scheme)
+    page = opened.page
+    layers = page.locator("[data-pane=left] select option").all_inner_texts()
+    assert len(layers) >= 3
+    for layer in layers:
+        page.select_option("[data-pane=left] select", label=layer)
+        page.wait_for_selector(f"[data-pane=left][data-layer='{layer}']")
+        for name in ("intensity", "kind", "sigma", "normal_error"):
+            page.select_option("[data-control=color]", name)
+            if page.locator("[data-pane=left] .without").is_visible():
+                continue
+            bar, legend = opened.legend()
+            assert len(legend) > 1, name  # a bar of one colour says nothing
+            colors = opened.evenly_coloured("left")
+            assert len(colors) > (1 if bar else 0), (layer, name)
+            assert off_the_legend(colors, legend, bar) <= 3, (layer, name)
+    before = opened.drawing()
+    page.check("[data-control=shaded]")
+    assert opened.drawing() != before
+    page.close()
+
+
+def test_the_legend_s_bar_ends_where_the_colours_end(opened: Opened) -> None:
+    page = opened.page
+    chosen = page.locator("[data-control=color]").input_value()
+    for name in ("intensity", "sigma"):
+        page.select_option("[data-control=color]", name)
+        channel = page.evaluate(
+            "name => JSON.parse(document.getElementById('scene').textContent).channels[name]", name
+        )
+        ends = channel.get("colors", ["#000000", "#ffffff"])
+        _, legend = opened.legend()
+        for color, end in zip(legend[[0, -1]], (ends[0], ends[-1]), strict=True):
+            assert bytes(color.astype(np.uint8)).hex() == end[1:]
+    page.select_option("[data-control=color]", chosen)

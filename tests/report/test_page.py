@@ -47,3 +47,10 @@ def test_trust_names_what_to_check(monkeypatch) -> None:
     odd = [row for row in table.rows if row[3]]
     assert [row[0] for row in odd] == ["views that agree with a point they see, %"]
     assert odd[0][1:] == ["50.00", "80 to 100", "check poses: sfm.intrinsics, sfm.sparse"]
+
+
+def test_names_are_shown_without_what_a_terminal_acts_on() -> None:
+    text = page(warnings=("view a\x1b[31m\u202eb: is <dark>",))
+    assert r"view a\x1b[31m\u202eb: is &lt;dark&gt;" in text
+    assert "\x1b" not in text
+    assert "\u202e" not in text

@@ -118,16 +118,15 @@ def test_nothing_polarised_gives_an_empty_silhouette(ball):
 
 
 def test_the_nearer_outline_counts_in_doubt():
-    from polmvs.config import AngleModel
-    from polmvs.surface.refinement import rim_residuals
     from polmvs.surface.surface_view import surface_view
+    from polmvs.surface.terms import rim_residuals
 
     ball = phase_map_of(sphere(), VIEW)
     certain = np.zeros((112, 132), bool)
     certain[30:80, 30:60] = True
     possible = certain.copy()
     possible[30:80, 60:90] = True
-    view = surface_view(ball, Silhouette(certain, possible), AngleModel.PPA)
+    view = surface_view(ball, Silhouette(certain, possible))
     xy = np.array([[62.0, 55.0], [88.0, 55.0], [58.0, 55.0]])
     residual, gradient = rim_residuals(view, xy)
     assert residual == pytest.approx([2, -2, -2], abs=0.1)

@@ -5,16 +5,13 @@ import pytest
 from analytic_objects import looking_at, phase_maps_of, ring_of_views, sphere, torus, union
 from test_mesh_geometry import euler_number
 
-from polmvs.config import AngleModel
 from polmvs.surface.surface_view import Silhouette, surface_view
 from polmvs.surface.visual_hull import HullTolerances, Plane, supporting_plane, visual_hull
 
 
 def views_of(distance, views):
     maps = phase_maps_of(distance, views)
-    return [
-        surface_view(m, Silhouette(m.region.inside, m.region.inside), AngleModel.PPA) for m in maps
-    ]
+    return [surface_view(m, Silhouette(m.region.inside, m.region.inside)) for m in maps]
 
 
 @pytest.fixture(scope="module")

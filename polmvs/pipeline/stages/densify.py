@@ -6,8 +6,8 @@ The cloud holds the polarised surfaces and their surroundings, told apart by the
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
 from typing import TypeVar
@@ -23,7 +23,7 @@ from polmvs.colmap.dense_workspace import (
 )
 from polmvs.colmap.filling import previous_backups
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, FusionOptions, Method, PropagationOptions, Surroundings
+from polmvs.config import AngleModel, FusionOptions, Light, Method, PropagationOptions, Surroundings
 from polmvs.io.clouds import Cloud, Mesh, write_cloud, write_mesh
 from polmvs.io.images import read_gray
 from polmvs.parallel import OnProgress, Workers, no_progress
@@ -40,6 +40,7 @@ from polmvs.surface.contour import propagate
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse, no_points
 from polmvs.surface.global_surface import (
+    SurfacePoints,
     Undetermined,
     num_surface_steps,
     reconstruct_surface,
@@ -56,6 +57,21 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T", bound=np.generic)
 
+# Options that a method makes no use of.
+_OF_CONTOURS = ("propagation.contour", "propagation.step_px", "propagation.spacing_px")
+UNUSED: Mapping[Method, tuple[str, ...]] = {
+    Method.SURFACE: (
+        *_OF_CONTOURS,
+        "propagation.num_rounds",
+        "propagation.bending",
+        "propagation.max_neighbors",
+        "fusion.max_range_difference_px",
+        "fusion.max_normal_difference_deg",
+    ),
+    Method.INTEGRATE: _OF_CONTOURS,
+    Method.CONTOUR: (),
+}
+
 FINEST_SPACING_PX = 0.25  # of points that are not to be merged, in footprints of a pixel
 
 
@@ -70,12 +86,14 @@ class DensifyResult:
     method : by which the points were made: the views one by one where there is no surface from all.
     tilt_share : of the turn by tilted polarizers that the surface of all views took back; None by
         the other methods.
+    left_out : names of views that contradict the surface of all others, which is made without them.
     """
 
     num_points: int
     num_surroundings: int
     method: Method
     tilt_share: float | None
+    left_out: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.num_points:,} points, and {self.num_surroundings:,} of the surroundings"
@@ -97,6 +115,7 @@ def densify(
     fusion: FusionOptions | None = None,
     tilt_aware: bool = True,
     masks_given: bool = False,
+    light: Light | None = None,
     workers: Workers | None = None,
     on_progress: OnProgress = no_progress,
 ) -> DensifyResult:
@@ -118,6 +137,7 @@ def densify(
     propagation, fusion : defaults where None.
     tilt_aware : as ``NormalOptions.tilt_aware_weights``.
     masks_given : the regions of the phase maps are the user's masks.
+    light : that the user states; None: inferred for each observation.
 
     Raises
     ------
@@ -145,14 +165,16 @@ def densify(
                 folder / "kept",
                 tilt_aware=tilt_aware,
                 masks_given=masks_given,
+                light=light,
                 on_progress=on_progress,
             )
         if found is not None:
-            fused, presumed, tilt_share = found
+            points, tilt_share, left_out = found
+            fused = points.cloud
         else:
             if method is Method.SURFACE:
                 method = Method.INTEGRATE
-            presumed, tilt_share = np.zeros(0, np.bool_), None
+            points, tilt_share, left_out = None, None, ()
             fused = _dense_surface(
                 model,
                 phase_maps,
@@ -170,18 +192,48 @@ def densify(
         modes.widen_stored([phase_map.view for phase_map in phase_maps], new_views)
         widen_by_poses(sparse_model.views, load_floats(pose_covariances), new_views)
         surface = surface_cloud(modes.widened(fused))
-        surface.scalars["kind"][: len(presumed)][presumed] = PointKind.PRESUMED
+        if points is not None:
+            surface.scalars["kind"][points.presumed] = PointKind.PRESUMED
+            surface = replace(surface, scalars={**surface.scalars, **points.scalars()})
         around = _surroundings_cloud(
             sparse, fused, phase_maps, fusion, given, folder / "around", workers=workers
         )
         replace_folder(new_views, views)
     write_cloud(cloud, _join_clouds(surface, around))
+    for sentence in unused_options(method, propagation, fusion):
+        logger.warning("%s.", sentence)
     return DensifyResult(
         num_points=len(surface.points),
         num_surroundings=len(around.points),
         method=method,
         tilt_share=tilt_share,
+        left_out=left_out,
     )
+
+
+def unused_options(
+    method: Method, propagation: PropagationOptions, fusion: FusionOptions
+) -> list[str]:
+    """Sentences on options that are not the defaults and that a method makes no use of."""
+    groups = {"propagation": propagation, "fusion": fusion}
+
+    def is_given(path: str) -> bool:
+        group, _, name = path.partition(".")
+        return bool(getattr(groups[group], name) != getattr(type(groups[group]), name))
+
+    given = [f"`{path}`" for path in UNUSED[method] if is_given(path)]
+    sentences = []
+    if given:
+        are = "is" if len(given) == 1 else "are"
+        sentences.append(f"{', '.join(given)} {are} not used by the method {method}")
+    if method is Method.SURFACE and is_given("propagation.stride_px"):
+        sentences.append(
+            "`propagation.stride_px` spaces the views' depth maps alone by the method surface; its "
+            "cloud is thinned by `fusion.voxel_px` or `fusion.voxel`"
+        )
+    if fusion.voxel is not None and is_given("fusion.voxel_px"):
+        sentences.append("`fusion.voxel_px` is not used where `fusion.voxel` is given")
+    return sentences
 
 
 def _global_surface(
@@ -196,9 +248,10 @@ def _global_surface(
     *,
     tilt_aware: bool,
     masks_given: bool,
+    light: Light | None,
     on_progress: OnProgress,
-) -> tuple[FusedCloud, NDArray[np.bool_], float] | None:
-    """The surface of all views, which of its points are presumed, and its share of the tilt.
+) -> tuple[SurfacePoints, float, tuple[str, ...]] | None:
+    """Points of the surface of all views, its share of the tilt, and the views left out.
 
     Its mesh and its depth in each view go to ``views``, what it is made from meanwhile to ``kept``,
     a new folder. None where silhouettes do not bound the objects.
@@ -211,6 +264,7 @@ def _global_surface(
         seeds,
         surroundings,
         masks_given=masks_given,
+        light=light,
         tilt_aware=tilt_aware,
         min_views=fusion.min_views,
         on_progress=on_progress,
@@ -242,7 +296,8 @@ def _global_surface(
         faces = mesh.faces.astype(np.int32)
         whole = Mesh(vertices=mesh.vertices, normals=mesh.vertex_normals, triangles=faces)
         write_mesh(views / SURFACE_LEVELS.format(number=number), whole)
-    return *points, surface.tilt_share
+    names = tuple(phase_map.view.name for phase_map in compress(maps, surface.left_out))
+    return points, surface.tilt_share, names
 
 
 def _dense_surface(
@@ -415,14 +470,19 @@ def _sparse_cloud(sparse: SparseSurroundings) -> Cloud:
 
 
 def _join_clouds(first: Cloud, second: Cloud) -> Cloud:
-    """The points of two clouds with the same columns."""
+    """The points of two clouds; scalars that one lacks are NaN there."""
     return Cloud(
         points=np.concatenate([first.points, second.points]),
         normals=_joined(first.normals, second.normals),
         colors=_joined(first.colors, second.colors),
         scalars={
-            name: np.concatenate([values, second.scalars[name]])
-            for name, values in first.scalars.items()
+            name: np.concatenate(
+                [
+                    cloud.scalars.get(name, np.full(len(cloud.points), np.nan, np.float32))
+                    for cloud in (first, second)
+                ]
+            )
+            for name in {**first.scalars, **second.scalars}
         },
     )
 

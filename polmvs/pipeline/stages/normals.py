@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, NormalOptions
+from polmvs.config import AngleModel, Light, NormalOptions
 from polmvs.io.arrays import map_array, save_array
-from polmvs.normals.estimator import NormalEstimate
+from polmvs.normals.mixture_estimator import MixtureEstimate
 from polmvs.normals.tracks import MAX_ROWS, track_normals
 from polmvs.pipeline.stages.maps import open_maps
 
-# Columns of the stored normals, a row for each track; see NormalEstimate.
+# Columns of the stored normals, a row for each track; see MixtureEstimate.
 NORMALS_TYPE = np.dtype(
     [
         ("normal", np.float64, 3),
@@ -24,6 +24,9 @@ NORMALS_TYPE = np.dtype(
         ("sigma_deg", np.float64),
         ("residual", np.float64),
         ("num_rows", np.int64),
+        ("specular", np.float64),
+        ("diffuse", np.float64),
+        ("dolp", np.float64),
     ]
 )
 
@@ -51,6 +54,7 @@ def solve_track_normals(
     maps: Path,
     target: Path,
     options: NormalOptions | None = None,
+    light: Light | None = None,
     *,
     max_rows: int = MAX_ROWS,
 ) -> NormalsResult:
@@ -62,6 +66,7 @@ def solve_track_normals(
     sparse, maps : folders of the COLMAP model and of the phase maps for ``model``.
     target : file of the normals, ``.npy`` with rows of ``NORMALS_TYPE``, one for each track.
     options : defaults where None.
+    light : of everything, where it is known.
     max_rows : of points and views together, that are solved at a time.
     """
     tracks = read_model(sparse).tracks
@@ -69,18 +74,17 @@ def solve_track_normals(
     stored = np.zeros(len(tracks.point3D_ids), NORMALS_TYPE)
     if len(stored):
         estimate = track_normals(
-            model, tracks, phase_maps, options or NormalOptions(), max_rows=max_rows
+            model, tracks, phase_maps, options or NormalOptions(), light, max_rows=max_rows
         )
-        stored["normal"], stored["valid"] = estimate.normals, estimate.valid
-        stored["conditioning"], stored["sigma_deg"] = estimate.conditioning, estimate.sigma_deg
-        stored["residual"], stored["num_rows"] = estimate.residual, estimate.num_rows
+        for name in NORMALS_TYPE.names or ():
+            stored[name] = getattr(estimate, "normals" if name == "normal" else name)
     target.parent.mkdir(exist_ok=True)
     save_array(target, stored)
     return NormalsResult(num_tracks=len(stored), num_normals=int(stored["valid"].sum()))
 
 
-def load_track_normals(source: Path) -> NormalEstimate:
-    """The normals that :func:`solve_track_normals` stored; the weights of their rows are not kept.
+def load_track_normals(source: Path) -> MixtureEstimate:
+    """The normals that :func:`solve_track_normals` stored; nothing of single rows is kept.
 
     Raises
     ------
@@ -88,12 +92,12 @@ def load_track_normals(source: Path) -> NormalEstimate:
         The file is missing or damaged.
     """
     stored: NDArray[np.void] = np.array(map_array(source, NORMALS_TYPE))
-    return NormalEstimate(
+    scalars = {name: stored[name].copy() for name in NORMALS_TYPE.names or () if name != "normal"}
+    none = np.zeros((0, len(stored)))
+    return MixtureEstimate(
         normals=np.ascontiguousarray(stored["normal"]),
-        valid=stored["valid"].copy(),
-        conditioning=stored["conditioning"].copy(),
-        sigma_deg=stored["sigma_deg"].copy(),
-        residual=stored["residual"].copy(),
-        num_rows=stored["num_rows"].copy(),
-        row_weights=np.zeros((0, len(stored))),
+        row_weights=none,
+        labels=none,
+        log_likelihood=np.full(len(stored), np.nan),
+        **scalars,
     )

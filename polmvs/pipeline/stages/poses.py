@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +12,12 @@ from scipy.linalg import block_diag
 
 from polmvs.colmap.models import read_model, write_model
 from polmvs.config import ReferenceOptions
+from polmvs.errors import OptionError
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.images import read_bytes, read_gray, write_bytes
 from polmvs.pipeline.run_folder import CAMERA_MODES, POSE_COVARIANCES, replace_folder, scratch
 from polmvs.poses.metric_frame import Frame, metric_frame, transform_model
+from polmvs.scene import match_names, without_views
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +82,7 @@ def place_model(
     camera: Path,
     poses: Path,
     reference: ReferenceOptions | None = None,
+    without: Sequence[str] = (),
 ) -> PosesResult:
     """Bring the model of SfM, or a given one, into the metric frame that is asked for.
 
@@ -92,15 +95,20 @@ def place_model(
     target : folder of the COLMAP model, whole or not at all.
     camera, poses : files for the camera's modes and the poses' covariances in the same frame.
     reference : defaults where None.
+    without : names of images to take out of the model, with or without suffix.
 
     Raises
     ------
     DataError, OptionError
-        A source of the frame is unusable; the model of SfM stays.
+        A source of the frame, or a name, is unusable; the model of SfM stays.
     """
-    model = read_model(source)
+    model, names = read_model(source), tuple(names)
     modes = load_floats(source / CAMERA_MODES)
     covariances = load_floats(source / POSE_COVARIANCES)
+    if without:
+        model, kept, points = without_views(model, _images_named(without, names))
+        modes = modes[:, points]
+        covariances = covariances[kept] if len(covariances) else covariances
     frame = metric_frame(
         model, reference or ReferenceOptions(), lambda name: read_gray(images / name)
     )
@@ -112,7 +120,7 @@ def place_model(
         both = block_diag(rotation, similarity.scale * rotation)
         covariances = both @ covariances @ both.T
     with scratch(target) as folder:
-        if frame is None:  # bit for bit what SfM wrote
+        if frame is None and not without:  # bit for bit what SfM wrote
             (folder / "sparse").mkdir()
             for file in source.glob("*.bin"):
                 write_bytes(folder / "sparse" / file.name, read_bytes(file))
@@ -128,6 +136,21 @@ def place_model(
         num_tracks=len(model.tracks.point3D_ids),
         frame=None if frame is None else _frame_result(frame),
     )
+
+
+def _images_named(given: Sequence[str], names: Sequence[str]) -> set[str]:
+    """The images that are meant.
+
+    Raises
+    ------
+    OptionError
+        There is none of a name.
+    """
+    found = match_names(given, names)
+    for name in given:
+        if name not in found:
+            raise OptionError(f"{name!r} is no image of the capture.", field="sfm.without")
+    return set(found.values())
 
 
 def load_floats(source: Path) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from polmvs.colmap.database import NoRoomError
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.sfm import NoModelError, SfmTolerances, run_sfm
 from polmvs.colmap.sfm_failure import why_no_model
+from polmvs.colmap.trial_adjustment import try_cameras
 from polmvs.config import PropagationOptions, SfmOptions
 from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.io.arrays import save_array
@@ -91,6 +92,8 @@ def find_model(
         No model comes out, or the options do not fit the images.
     """
     options = options or SfmOptions()
+    if options.camera_model != SfmOptions.camera_model and (options.intrinsics or options.camera):
+        logger.warning("`sfm.camera_model` is not used where the camera is given.")
     loading: list[Thread] = []
 
     def on_step(name: str) -> None:
@@ -123,6 +126,9 @@ def find_model(
         replace_folder(new, target)
     _warn_of_missing(model, images)
     _warn_of_few(len(model.views))
+    if options.intrinsics is not None or options.camera is not None:
+        given = "`sfm.intrinsics`" if options.intrinsics is not None else "`sfm.camera`"
+        _warn_of_cameras(target, given, "Leave it out, or give a camera that fits.")
     if found is None:
         return _result(model)
     bending = _bending(model, found.modes)
@@ -184,6 +190,8 @@ def take_model(model: SparseModel, source: Path, target: Path) -> SfmResult:
         replace_folder(folder / "sparse", target)
     _warn_of_missing(model, source)
     _warn_of_few(len(model.views))
+    remedy = "Adjust the model with its camera free, or leave `sfm.sparse` out."
+    _warn_of_cameras(target, str(source), remedy)
     return _result(model)
 
 
@@ -232,6 +240,21 @@ def _warn_of_missing(model: SparseModel, source: Path) -> None:
             num_views + num_missing,
             short_list(model.unregistered),
         )
+
+
+def _warn_of_cameras(model: Path, given: str, remedy: str) -> None:
+    """Say which cameras would fit the matches where the given ones do not."""
+    trial = try_cameras(model)
+    if trial is not None:
+        for complaint in trial.complaints:
+            logger.warning(
+                "%s: %s (%.1f px off; %.1f px with what fits). Normals follow the cameras. %s",
+                given,
+                complaint,
+                trial.error_px,
+                trial.fitting_error_px,
+                remedy,
+            )
 
 
 def _warn_of_few(num_views: int) -> None:

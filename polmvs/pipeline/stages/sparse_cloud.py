@@ -52,6 +52,9 @@ def write_sparse_cloud(
             "residual": estimate.residual,
             "conditioning": estimate.conditioning,
             "valid": estimate.valid,
+            "specular": estimate.specular,
+            "diffuse": estimate.diffuse,
+            "dolp": estimate.dolp,
             "seed": is_seed,
         },
     )

@@ -7,10 +7,12 @@ import {
   BufferAttribute,
   BufferGeometry,
   Color,
+  ColorManagement,
   DataTexture,
   DoubleSide,
   LineBasicMaterial,
   LineSegments,
+  LinearSRGBColorSpace,
   Matrix3,
   Mesh,
   PerspectiveCamera,
@@ -23,10 +25,16 @@ import {
 } from "three";
 import { TrackballControls } from "three/examples/jsm/controls/TrackballControls.js";
 
+// Colours are those of the page's legend all the way to the screen: no conversion on the way in,
+// none on the way out.
+ColorManagement.enabled = false;
+
 const TYPES = { uint8: Uint8Array, int8: Int8Array, uint16: Uint16Array, uint32: Uint32Array };
 const TURN = 0.12; // rad for each press of an arrow key
 const FIELD_DEG = 40;
 const MODES = { palette: 0, normal: 1, grey: 2 };
+const SHADING = 0.6; // how far slanted places are darkened where shading is chosen
+const LEGEND_STOPS = 33; // of a bar; between them a colour map is straight to 1 of 255
 
 const VERTEX = `
 attribute float value;
@@ -75,7 +83,8 @@ function paletteTexture(colors) {
   const bytes = new Uint8Array(256 * 4);
   for (let i = 0; i < 256; i++) {
     const color = new Color(colors[Math.min(colors.length - 1, Math.floor((i * colors.length) / 256))]);
-    bytes.set([255 * color.r, 255 * color.g, 255 * color.b, 255], 4 * i);
+    const rounded = [color.r, color.g, color.b].map((share) => Math.round(255 * share));
+    bytes.set([...rounded, 255], 4 * i);
   }
   const texture = new DataTexture(bytes, 256, 1);
   texture.needsUpdate = true;
@@ -103,7 +112,7 @@ async function buildLayer(layer, scene) {
       palette: { value: null },
       mode: { value: MODES.grey },
       pointSize: { value: 1 },
-      shading: { value: 1 },
+      shading: { value: 0 },
       isPoint: { value: !layer.triangles },
       basis: { value: new Matrix3().set(...scene.basis) },
     },
@@ -122,6 +131,7 @@ class Pane {
     this.canvas = element.querySelector("canvas");
     this.select = element.querySelector("select");
     this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: true, preserveDrawingBuffer: true });
+    this.renderer.outputColorSpace = LinearSRGBColorSpace;
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
     this.scene = new Scene();
     view.description.layers.forEach((layer, i) => this.select.add(new Option(layer.label, String(i))));
@@ -171,7 +181,7 @@ class Pane {
     this.object.geometry.setAttribute("value", values);
     uniforms.mode.value = name === "normal" ? MODES.normal : has && channel.colors ? MODES.palette : MODES.grey;
     uniforms.palette.value = has && channel.colors ? this.view.palette(name) : this.view.blank;
-    uniforms.shading.value = name === "intensity" ? 0.35 : 0.6;
+    uniforms.shading.value = this.view.shaded ? SHADING : 0;
     this.element.querySelector(".without").hidden = has;
   }
 
@@ -213,6 +223,7 @@ class View {
     this.blank = paletteTexture(["#888888"]);
     this.color = "normal_error" in this.description.channels ? "normal_error" : "normal";
     this.pointScale = 1;
+    this.shaded = false;
     this.camera = new PerspectiveCamera(FIELD_DEG, 1, 0.01 * this.description.radius, 100 * this.description.radius);
     this.frusta = new LineSegments(
       new BufferGeometry().setAttribute(
@@ -288,6 +299,11 @@ class View {
       this.panes[1].element.hidden = !event.target.checked;
       this.draw();
     });
+    at("shaded").addEventListener("change", (event) => {
+      this.shaded = event.target.checked;
+      this.panes.forEach((pane) => pane.paint());
+      this.draw();
+    });
     at("size").addEventListener("input", (event) => {
       this.pointScale = Number(event.target.value);
       this.draw();
@@ -317,7 +333,10 @@ class View {
       const [low, high] = channel.range.map((value) => `${Number(value.toPrecision(3))} ${channel.unit}`);
       const bar = document.createElement("span");
       bar.className = "bar";
-      bar.style.background = `linear-gradient(90deg, ${(channel.colors || ["#000", "#fff"]).filter((_, i) => i % 16 === 0).join(",")})`;
+      const colors = channel.colors || ["#000000", "#ffffff"];
+      const num = Math.min(LEGEND_STOPS, colors.length);
+      const stops = Array.from({ length: num }, (_, i) => colors[Math.round((i * (colors.length - 1)) / (num - 1))]);
+      bar.style.background = `linear-gradient(90deg, ${stops.join(",")})`;
       legend.append(low, bar, high);
     } else legend.append(channel.note || "");
     this.panes.forEach((pane) => pane.paint());

@@ -1,0 +1,140 @@
+"""The command that compares a part with its reference."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from polmvs.cli import OUT_OF_TOLERANCE
+from polmvs.cli.call import Call
+from polmvs.cli.commands import DeviationArguments
+from polmvs.cli.terminal import Terminal
+from polmvs.config import AngleModel
+from polmvs.errors import DataError, OptionError
+from polmvs.evaluation.deviation import Deviation, measure_deviation
+from polmvs.evaluation.registration import CloudReference, MeshReference, Reference
+from polmvs.io.clouds import Cloud, has_triangles, read_any_mesh, read_cloud, read_mesh
+from polmvs.io.folders import new_folder
+from polmvs.pipeline.export import part_of, surface_of
+from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.runner import dense_models, load_record
+from polmvs.pipeline.stages.poses import PosesResult
+from polmvs.report.deviation_files import color_limit, write_deviation
+from polmvs.surface.mesh_geometry import TriangleMesh
+
+MIN_POINTS = 100
+
+
+def deviation(call: Call, terminal: Terminal) -> int:
+    """Run ``polmvs deviation``."""
+    given = call.get(DeviationArguments)
+    if given.out is not None and given.out.exists():
+        raise OptionError(f"{given.out}: exists. Give another folder.")
+    cloud, is_metric = _result(given.result, given.model)
+    reference, unit = _reference(given.reference, given.model)
+    with terminal.stage("registration", None):
+        found = measure_deviation(
+            cloud.points,
+            _usable(cloud.normals),
+            cloud.scalars.get("sigma"),
+            reference,
+            is_metric=is_metric or given.metric,
+            unit=given.unit or unit,
+            aligned=given.aligned,
+            tolerance_mm=given.tolerance,
+            least_share=given.least_share,
+        )
+    lines = deviation_lines(found)
+    if given.out is not None:
+        with new_folder(given.out) as folder:
+            write_deviation(folder, found, color_limit(found))
+        lines.append(f"{given.out}: deviation.ply, .png, .svg, .json")
+    terminal.show("\n".join(lines), found.figures)
+    return OUT_OF_TOLERANCE if found.figures.passed is False else 0
+
+
+def deviation_lines(found: Deviation) -> list[str]:
+    """The figures in lines of text."""
+    f = found.figures
+    told = "inferred from the sizes" if f.unit_inferred else "given"
+    lines = [f"reference in {f.unit} ({told}); {f.num_points:,} points compared"]
+    if f.num_far:
+        lines.append(f"{f.num_far:,} points are none of the part and are left out")
+    if f.scale != 1:
+        lines.append(
+            f"the result has no metric scale: {f.scale:.6g} was fitted, so that its size is not "
+            "tested"
+        )
+    if f.ambiguous:
+        lines.append(
+            "the part fits about as well when it is turned: give the right place by `arguments."
+            "aligned`"
+        )
+    lines += [
+        f"mean {f.mean:+.4f} mm, standard deviation {f.standard_deviation:.4f} mm, RMS "
+        f"{f.rms:.4f} mm",
+        "percentiles: " + ", ".join(f"{p} % {v:+.3f}" for p, v in f.percentiles.items()) + " mm",
+    ]
+    if np.isfinite(f.median_sigma):
+        lines.append(
+            f"stated deviation of a distance {f.median_sigma:.4f} mm (median); "
+            f"{100 * f.significant_share:.1f} % of the points are farther off than three of theirs"
+        )
+    if f.tolerance is not None and f.share_within is not None:
+        lines.append(
+            f"{100 * f.share_within:.2f} % within {f.tolerance:g} mm, "
+            f"{100 * f.least_share:g} % are asked for: {'pass' if f.passed else 'FAIL'}"
+        )
+    return lines
+
+
+def _usable(normals: np.ndarray | None) -> np.ndarray | None:
+    """Normals of a cloud of which all have one."""
+    if normals is None or not np.isfinite(normals).all():
+        return None
+    return normals if (np.linalg.norm(normals, axis=1) > 0.5).all() else None
+
+
+def _result(path: Path, model: AngleModel | None) -> tuple[Cloud, bool]:
+    """The points to compare, and whether they are in metres."""
+    if not path.is_dir():
+        cloud = part_of(read_cloud(path))
+        is_metric = False
+    else:
+        cloud, is_metric = _surface_of_run(path, model)
+    if len(cloud.points) < MIN_POINTS:
+        raise DataError(path, f"has {len(cloud.points)} points; {MIN_POINTS} or more are needed.")
+    return cloud, is_metric
+
+
+def _surface_of_run(path: Path, model: AngleModel | None) -> tuple[Cloud, bool]:
+    run_folder = RunFolder(path)
+    record = load_record(run_folder)
+    model = surface_of(run_folder, dense_models(record), model)
+    return part_of(read_cloud(run_folder.cloud(model))), record.result(PosesResult).is_metric
+
+
+def _reference(path: Path, model: AngleModel | None) -> tuple[Reference, str | None]:
+    """The reference, and its unit where that is known."""
+    if path.is_dir():
+        run_folder = RunFolder(path)
+        models = dense_models(load_record(run_folder))
+        mesh_file = run_folder.mesh(surface_of(run_folder, models, model))
+        cloud, is_metric = _surface_of_run(path, model)
+        unit = "m" if is_metric else None
+        if mesh_file.is_file():
+            mesh = read_mesh(mesh_file)
+            return MeshReference(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64))), unit
+        return _of_cloud(path, cloud), unit
+    if path.suffix.lower() == ".ply" and not has_triangles(path):
+        return _of_cloud(path, read_cloud(path)), None
+    mesh = read_any_mesh(path)
+    return MeshReference(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64))), None
+
+
+def _of_cloud(path: Path, cloud: Cloud) -> CloudReference:
+    normals = _usable(cloud.normals)
+    if normals is None or len(cloud.points) < MIN_POINTS:
+        raise DataError(path, "is no scan to compare with: it needs points that all have normals.")
+    return CloudReference(cloud.points, normals)

@@ -1,0 +1,120 @@
+"""Features that stand still while the part turns: a background that the camera always sees alike.
+
+On a turntable part and table turn before a camera that does not move. To SfM this is a camera that
+moves about the part, but for the background, whose matches say that it stands still and are the
+more. They are told from the others by their place: the same pixel shows the same in most images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StaticTolerances:
+    """What stands still.
+
+    Attributes
+    ----------
+    num_others : images that each is compared with, evenly spread over the others. Costs time only.
+    reach_px : within which a keypoint is at the same place. Derived: three deviations of a keypoint
+        along each axis.
+    min_likeness : cosine of two descriptors of one thing. Guess.
+    min_images : share of the images compared in which a keypoint stands still, and in which a
+        background must have such keypoints. Guess.
+    min_share : of an image's keypoints, of a background. Guess: by chance it is under 1 %, and a
+        mark on the lens or a dead pixel makes a few keypoints.
+    min_count : of keypoints of a background in an image. Guess.
+    """
+
+    num_others: int = 8
+    reach_px: float = 1.5
+    min_likeness: float = 0.9
+    min_images: float = 0.5
+    min_share: float = 0.1
+    min_count: int = 30
+
+
+def take_out_static(
+    database: Path, *, tolerances: StaticTolerances = StaticTolerances()
+) -> float | None:
+    """Take features of a static background out of a database that has no matches yet.
+
+    Returns
+    -------
+    The share of the features that went, if there is such a background; None: nothing was changed.
+    """
+    content = pycolmap.Database.open(database)
+    try:
+        ids = [image.image_id for image in content.read_all_images()]
+        keypoints = [np.asarray(content.read_keypoints(number)) for number in ids]
+        found = [content.read_descriptors(number) for number in ids]
+        values = [np.asarray(one.data) for one in found]
+        still = find_static([k[:, :2] for k in keypoints], values, tolerances=tolerances)
+        if still is None:
+            return None
+        content.clear_keypoints()
+        content.clear_descriptors()
+        for number, points, features, out in zip(ids, keypoints, found, still, strict=True):
+            content.write_keypoints(number, np.ascontiguousarray(points[~out]))
+            features.data = np.ascontiguousarray(np.asarray(features.data)[~out])
+            content.write_descriptors(number, features)
+        return float(np.concatenate(still).mean())
+    finally:
+        content.close()
+
+
+def find_static(
+    places: Sequence[NDArray[np.floating]],
+    descriptors: Sequence[NDArray[np.uint8]],
+    *,
+    tolerances: StaticTolerances = StaticTolerances(),
+) -> list[Mask] | None:
+    """Which keypoints of each image stand still; None where there is no static background.
+
+    Parameters
+    ----------
+    places : (N, 2) of each image, px.
+    descriptors : (N, D) of each image.
+    """
+    num = len(places)
+    if num < 3:
+        return None
+    trees = [cKDTree(place) if len(place) else None for place in places]
+    unit = [
+        d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-12)
+        for d in (np.asarray(one, np.float32) for one in descriptors)
+    ]
+    still = []
+    for index in range(num):
+        others = [other for other in range(num) if other != index]
+        step = max(1, len(others) // tolerances.num_others)
+        chosen = others[::step][: tolerances.num_others]
+        count = np.zeros(len(places[index]), np.int64)
+        for other in chosen:
+            tree = trees[other]
+            if tree is None or not len(count):
+                continue
+            distance, nearest = tree.query(places[index], distance_upper_bound=tolerances.reach_px)
+            near = np.flatnonzero(np.isfinite(distance))
+            alike = (unit[index][near] * unit[other][nearest[near]]).sum(axis=1)
+            count[near[alike > tolerances.min_likeness]] += 1
+        still.append(count >= tolerances.min_images * len(chosen))
+    enough = [
+        out.sum() >= tolerances.min_count and out.mean() >= tolerances.min_share
+        for out in still
+        if len(out)
+    ]
+    if not enough or np.mean(enough) < tolerances.min_images:
+        return None
+    return still

@@ -1,0 +1,270 @@
+"""Which cameras would fit a model's matches better than those that were given with it.
+
+A focal length or a principal point that is wrong bends the whole model while every image fits, and
+normals with it; a pose that is wrong has all rows of its view wrong. The matches know both. They
+are adjusted once more, with focal length, principal point, poses and points free; what comes out is
+compared with what was given, in deviations of the adjustment.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from polmvs.colmap.camera_uncertainty import CameraTolerances, adjuster_of, parameter_covariance
+from polmvs.colmap.cameras import quiet_colmap
+from polmvs.colmap.models import read_reconstruction, registered
+from polmvs.colmap.sfm import bundle_of
+from polmvs.geometry import align_points, nearest_rotation
+
+Array = NDArray[np.float64]
+
+ADJUSTMENT = CameraTolerances()
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialTolerances:
+    """When given cameras are said not to fit.
+
+    Attributes
+    ----------
+    min_images, min_points : of a model that can tell. Guess.
+    max_sigmas : by which a parameter may differ from what fits. Derived: cameras err by up to 4
+        times what residuals say (see ``CameraTolerances.min_residual_px``).
+    min_focal_change : share of the focal length. Guess: a tenth of what turns normals by 3 degrees.
+    min_point_change : share of the image's width, of the principal point. Measured: 1.3 % turn
+        normals by 2.2 degrees; a guess of a third of it.
+    min_turn_deg : of a pose. Guess: half of what turns normals by about one degree.
+    min_shift : of a camera, share of its distance from the points: as far as ``min_turn_deg`` moves
+        what it sees. Derived.
+    pose_ratio : by which the keypoints of a view must lie farther from where the given cameras put
+        its points than those of the other views do; or those of most, than where fitting cameras
+        put them, for a camera that is wrong beyond doubt. Guess.
+    """
+
+    min_images: int = 3
+    min_points: int = 50
+    max_sigmas: float = 4.0
+    min_focal_change: float = 0.01
+    min_point_change: float = 0.004
+    min_turn_deg: float = 0.5
+    min_shift: float = 0.009
+    pose_ratio: float = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseChange:
+    """How a pose differs from one that fits.
+
+    Attributes
+    ----------
+    name : of the view.
+    turn_deg : between the orientations.
+    shift : between the centres, share of the distance from the points.
+    """
+
+    name: str
+    turn_deg: float
+    shift: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraTrial:
+    """What the matches say of given cameras.
+
+    Attributes
+    ----------
+    focal, fitting_focal : mean focal length that was given, and that which fits, px.
+    point, fitting_point : the principal points, px.
+    focal_sigma, point_sigma : deviations of those that fit, px.
+    camera_fits : whether both agree.
+    wrong_poses : of views whose pose does not fit while those of others do.
+    error_px, fitting_error_px : mean distances of keypoints from where points are seen.
+    """
+
+    focal: float
+    fitting_focal: float
+    focal_sigma: float
+    point: tuple[float, float]
+    fitting_point: tuple[float, float]
+    point_sigma: float
+    camera_fits: bool
+    wrong_poses: tuple[PoseChange, ...]
+    error_px: float
+    fitting_error_px: float
+
+    @property
+    def complaints(self) -> tuple[str, ...]:
+        """What does not fit and what would, a clause each."""
+        found = []
+        if not self.camera_fits:
+            x, y = self.point
+            fitting_x, fitting_y = self.fitting_point
+            found.append(
+                f"a focal length of {self.fitting_focal:.1f} +- {self.focal_sigma:.1f} px and a "
+                f"principal point of {fitting_x:.1f},{fitting_y:.1f} +- {self.point_sigma:.1f} px "
+                f"fit the matches, not the given {self.focal:.1f} px and {x:.1f},{y:.1f}"
+            )
+        found += [
+            f"the pose of {pose.name} is {pose.turn_deg:.1f} deg and {100 * pose.shift:.1f} % of "
+            "its distance from one that fits the matches"
+            for pose in self.wrong_poses
+        ]
+        return tuple(found)
+
+
+def try_cameras(
+    model: Path,
+    *,
+    tolerances: TrialTolerances = TrialTolerances(),
+    adjustment: CameraTolerances = ADJUSTMENT,
+) -> CameraTrial | None:
+    """Adjust a model's matches with its cameras free, and compare; points seen once are left out.
+
+    Parameters
+    ----------
+    model : folder of a COLMAP model whose images share a camera.
+
+    Returns
+    -------
+    None where the model cannot tell: several cameras, too few or too many views, too few points, or
+    an adjustment that leaves the camera open.
+    """
+    given = read_reconstruction(model)
+    for number, point in list(given.points3D.items()):
+        if point.track.length() < 2:
+            given.delete_point3D(number)
+    try:
+        return _compared(given, tolerances, adjustment)
+    except (ValueError, RuntimeError) as error:  # what COLMAP says of a model that it cannot adjust
+        logger.info("the cameras of %s cannot be tried: %s", model, error)
+        return None
+
+
+def _compared(
+    given: pycolmap.Reconstruction, t: TrialTolerances, adjustment: CameraTolerances
+) -> CameraTrial | None:
+    """The comparison; see :func:`try_cameras`."""
+    if (
+        len(given.cameras) != 1
+        or not t.min_images <= given.num_reg_images() <= adjustment.max_views
+        or given.num_points3D() < t.min_points
+    ):
+        return None
+    fitting, errors = copy.deepcopy(given), _errors_of_images(given)
+    # First as if nothing were an outlier: a view with a wrong pose is one as a whole. Points hold
+    # the frame, for a pose that does may be the wrong one.
+    finite = [error for error in errors.values() if np.isfinite(error)]
+    widest = 2 * max(finite, default=0.0)
+    bundle, config = bundle_of(
+        fitting,
+        max(widest, adjustment.loss_scale_px),
+        free_intrinsics=False,
+        free_principal_point=False,
+    )
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
+    with quiet_colmap():
+        pycolmap.create_default_bundle_adjuster(bundle, config, fitting).solve()
+        adjuster_of(fitting, adjustment, free=True, free_point=True).solve()
+        fitting.update_point_3d_errors()
+        camera = next(iter(fitting.cameras.values()))
+        estimated = list(range(len(camera.params)))
+        covariance = parameter_covariance(fitting, camera, estimated, True, adjustment)
+    if covariance is None or not np.isfinite(camera.params).all():
+        return None
+    before = next(iter(given.cameras.values()))
+    focal_at, point_at = camera.focal_length_idxs(), camera.principal_point_idxs()
+    sigma = np.sqrt(np.diag(covariance))
+    change = np.asarray(camera.params) - np.asarray(before.params)
+    focal_change = np.abs(change[focal_at]) / camera.mean_focal_length()
+    point_change = np.abs(change[point_at]) / camera.width
+    fitting_errors = _errors_of_images(fitting)
+    usual, usual_fitting = (float(np.median([*e.values()])) for e in (errors, fitting_errors))
+    # Most views do not see the points where they are said to be: the camera was changed since.
+    stale = usual > max(t.pose_ratio * usual_fitting, adjustment.min_residual_px)
+    certain = stale | (np.abs(change) > t.max_sigmas * sigma)
+    wrong = (certain[focal_at] & (focal_change > t.min_focal_change)).any() or (
+        certain[point_at] & (point_change > t.min_point_change)
+    ).any()
+    x, y = (float(before.params[i]) for i in point_at)
+    fitting_x, fitting_y = (float(camera.params[i]) for i in point_at)
+    return CameraTrial(
+        focal=float(before.mean_focal_length()),
+        fitting_focal=float(camera.mean_focal_length()),
+        focal_sigma=float(sigma[focal_at].mean()),
+        point=(x, y),
+        fitting_point=(fitting_x, fitting_y),
+        point_sigma=float(sigma[point_at].max()),
+        camera_fits=not wrong,
+        wrong_poses=_wrong_poses(given, fitting, errors, t),
+        error_px=float(np.mean(list(errors.values()))),
+        fitting_error_px=float(np.mean(list(fitting_errors.values()))),
+    )
+
+
+def _errors_of_images(reconstruction: pycolmap.Reconstruction) -> dict[str, float]:
+    """Median distance of each image's keypoints from where their points are seen, px."""
+    errors = {}
+    for image in registered(reconstruction):
+        observed = image.get_observation_points2D()
+        if not observed:
+            continue
+        points = np.array([reconstruction.points3D[p.point3D_id].xyz for p in observed])
+        seen = image.cam_from_world() * points
+        in_front = seen[:, 2] > 0
+        camera = reconstruction.cameras[image.camera_id]
+        places = np.full((len(points), 2), np.inf)
+        places[in_front] = camera.img_from_cam(seen[in_front])
+        xy = np.array([p.xy for p in observed])
+        errors[image.name] = float(np.median(np.linalg.norm(places - xy, axis=1)))
+    return errors
+
+
+def _wrong_poses(
+    given: pycolmap.Reconstruction,
+    fitting: pycolmap.Reconstruction,
+    errors: dict[str, float],
+    t: TrialTolerances,
+) -> tuple[PoseChange, ...]:
+    """Views with a pose that does not fit while those of most others do.
+
+    A turn, shift and scale that all have in common is one of the frame.
+    """
+    images, others = registered(given), registered(fitting)
+    rotations, fitting_rotations = (
+        np.array([image.cam_from_world().rotation.matrix() for image in some])
+        for some in (images, others)
+    )
+    worlds = np.swapaxes(fitting_rotations, 1, 2) @ rotations
+    # The elementwise median resists a few that are far off.
+    common = nearest_rotation(np.median(worlds, axis=0))
+    if common is None:
+        return ()
+    cosines = (np.einsum("kij,ij->k", worlds, common) - 1) / 2
+    turns = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    centers, fitting_centers = (
+        np.array([image.projection_center() for image in some]) for some in (images, others)
+    )
+    fits = np.array([errors.get(image.name, 0.0) for image in images])
+    usual = float(np.median(fits))
+    good = fits <= t.pose_ratio * usual
+    try:
+        back = align_points(fitting_centers[good], centers[good])
+    except ValueError:  # on one line, or too few
+        return ()
+    middle = np.median([point.xyz for point in given.points3D.values()], axis=0)
+    distances = np.linalg.norm(centers - middle, axis=1)
+    shifts = np.linalg.norm(back * fitting_centers - centers, axis=1) / distances
+    return tuple(
+        PoseChange(name=image.name, turn_deg=float(turn), shift=float(shift))
+        for image, turn, shift, fit in zip(images, turns, shifts, good, strict=True)
+        if not fit and (turn > t.min_turn_deg or shift > t.min_shift)
+    )

@@ -1,0 +1,222 @@
+"""Deviation of a part from its reference: a drawing's mesh, a scan, or another run of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.errors import OptionError
+from polmvs.evaluation.registration import IDENTITY, Reference, Registration, register
+from polmvs.geometry import SimilarityTransform, dots, lengths
+
+Array = NDArray[np.float64]
+
+UNITS_M: Mapping[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254, "um": 1e-6}
+PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
+# Of a unit that is inferred: sizes of result and reference may differ by that factor, as where a
+# part stands on its lower side. Guess; the units lie 2.5 and more apart.
+SIZE_RATIO = 1.5
+AMBIGUOUS = 1.3  # of the second-best place's mean distance to the best one's, under which both fit
+# Beyond it a point is no point of the part, but of something beside it. Share of the size. Guess.
+FAR_SHARE = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviationFigures:
+    """Distances from a reference in numbers; lengths in millimetres.
+
+    Attributes
+    ----------
+    num_points : that were compared; ``num_far`` more are none of the part.
+    mean, rms, standard_deviation : of the signed distances; positive is outside.
+    percentiles : of the signed distances, by percent.
+    median_sigma : median of the distances' stated standard deviations; NaN where none is stated.
+    significant_share : of the points farther off than three of these.
+    tolerance : that was asked for, and ``share_within`` it.
+    least_share : that must be within it, and whether that ``passed``; None without a tolerance.
+    scale : of the result that was estimated; 1 where it was given.
+    unit : of the reference, and whether it was ``unit_inferred``.
+    ambiguous : another place fits about as well: the part looks alike when it is turned.
+    """
+
+    num_points: int
+    num_far: int
+    mean: float
+    rms: float
+    standard_deviation: float
+    percentiles: dict[str, float]
+    median_sigma: float
+    significant_share: float
+    tolerance: float | None
+    share_within: float | None
+    least_share: float
+    passed: bool | None
+    scale: float
+    unit: str
+    unit_inferred: bool
+    ambiguous: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deviation:
+    """Signed distances of a result's points from a reference, in millimetres.
+
+    Attributes
+    ----------
+    index : (N,) of the points among those that were given.
+    points : (N, 3) where they lie on the reference, in its unit.
+    normals : (N, 3) of the reference there.
+    distance : (N,) positive outside.
+    sigma : (N,) standard deviation; NaN where the result states none.
+    figures : of them.
+    reference_from_result : where the result was laid.
+    """
+
+    index: NDArray[np.intp]
+    points: Array
+    normals: Array
+    distance: Array
+    sigma: Array
+    figures: DeviationFigures
+    reference_from_result: SimilarityTransform
+
+
+def infer_unit(result_m: Array, reference: Array) -> str:
+    """The unit in which a reference (M, 3) is as large as a result (N, 3) in metres.
+
+    Raises
+    ------
+    OptionError
+        There is none.
+    """
+    size_m, size = (float(np.linalg.norm(np.ptp(p, axis=0))) for p in (result_m, reference))
+    ratios = {name: size * unit / size_m for name, unit in UNITS_M.items()}
+    name = min(ratios, key=lambda key: abs(np.log(ratios[key])))
+    if not 1 / SIZE_RATIO < ratios[name] < SIZE_RATIO:
+        raise OptionError(
+            f"follows from no size: the result spans {1e3 * size_m:.4g} mm, the reference "
+            f"{size:.4g} of its unit. Give it.",
+            field="arguments.unit",
+        )
+    return name
+
+
+def measure_deviation(
+    points: Array,
+    normals: Array | None,
+    sigma: Array | None,
+    reference: Reference,
+    *,
+    is_metric: bool,
+    unit: str | None,
+    aligned: bool = False,
+    tolerance_mm: float | None = None,
+    least_share: float = 1.0,
+) -> Deviation:
+    """Distances of a result from a reference.
+
+    Parameters
+    ----------
+    points, normals, sigma : (N, 3), (N, 3) and (N,) of the result, metres where ``is_metric``.
+    reference : in its ``unit``, one of ``UNITS_M``; None: inferred, of a metric result.
+    is_metric : else the scale is estimated, and sizes are not tested.
+    aligned : the result lies in the frame of the reference.
+    tolerance_mm : distance that is allowed either way, and the ``least_share`` of the points that
+        must keep to it.
+
+    Raises
+    ------
+    OptionError
+        The unit cannot be inferred.
+    """
+    inferred = unit is None
+    if unit is None:
+        if not is_metric:
+            raise OptionError(
+                "is needed: the result has no metric scale to tell it by.", field="arguments.unit"
+            )
+        unit = infer_unit(points, reference.points)
+    metres = UNITS_M[unit]
+    to_unit = SimilarityTransform(
+        scale=1 / metres if is_metric else 1.0, rotation=np.eye(3), translation=np.zeros(3)
+    )
+    scaled = np.asarray(to_unit * points)
+    if aligned:
+        found = None
+        moved = scaled
+    else:
+        found = register(scaled, normals, reference, with_scale=not is_metric)
+        moved = np.asarray(found.reference_from_result * scaled)
+    place = IDENTITY if found is None else found.reference_from_result
+    closest, facing = reference.closest(moved)
+    distance = dots(moved - closest, facing)
+    size = float(np.linalg.norm(np.ptp(reference.points, axis=0)))
+    near = lengths(moved - closest) < FAR_SHARE * size
+    if normals is not None:
+        near &= dots(normals @ np.asarray(place.rotation).T, facing) > 0
+    to_mm = 1e3 * metres
+    own = np.full(len(points), np.nan) if sigma is None else sigma * to_unit.scale * place.scale
+    fitted = 0.0 if found is None else found.distance_sigmas(moved, facing)
+    total = to_mm * np.sqrt(np.square(own) + np.square(fitted))
+    return Deviation(
+        index=np.flatnonzero(near),
+        points=moved[near],
+        normals=facing[near],
+        distance=to_mm * distance[near],
+        sigma=total[near],
+        figures=_figures(
+            to_mm * distance[near],
+            total[near],
+            num_far=int((~near).sum()),
+            tolerance=tolerance_mm,
+            least_share=least_share,
+            scale=place.scale if not is_metric else 1.0,
+            unit=unit,
+            inferred=inferred,
+            found=found,
+        ),
+        reference_from_result=SimilarityTransform(
+            scale=place.scale * to_unit.scale,
+            rotation=place.rotation,
+            translation=place.translation,
+        ),
+    )
+
+
+def _figures(
+    distance: Array,
+    sigma: Array,
+    *,
+    num_far: int,
+    tolerance: float | None,
+    least_share: float,
+    scale: float,
+    unit: str,
+    inferred: bool,
+    found: Registration | None,
+) -> DeviationFigures:
+    known = np.isfinite(sigma)
+    within = None if tolerance is None else float(np.mean(np.abs(distance) <= tolerance))
+    return DeviationFigures(
+        num_points=len(distance),
+        num_far=num_far,
+        mean=float(distance.mean()),
+        rms=float(np.sqrt(np.mean(distance**2))),
+        standard_deviation=float(distance.std()),
+        percentiles={str(p): float(np.percentile(distance, p)) for p in PERCENTILES},
+        median_sigma=float(np.median(sigma[known])) if known.any() else float("nan"),
+        significant_share=float(np.mean((np.abs(distance) > 3 * sigma)[known]))
+        if known.any()
+        else float("nan"),
+        tolerance=tolerance,
+        share_within=within,
+        least_share=least_share,
+        passed=None if within is None else within >= least_share,
+        scale=scale,
+        unit=unit,
+        unit_inferred=inferred,
+        ambiguous=found is not None and found.runner_up < AMBIGUOUS,
+    )

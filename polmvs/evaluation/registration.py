@@ -1,0 +1,323 @@
+"""A result laid onto a reference surface: coarse from many starts, fine by robust least squares.
+
+The fine fit moves the points so that their distances along the reference's normals get small, with
+weights of Geman and McClure: a dent or a missing part is an outlier and does not pull.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations, product
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from polmvs.fitting import geman_mcclure_weights, robust_deviation
+from polmvs.geometry import SimilarityTransform, dots, lengths
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
+
+Array = NDArray[np.float64]
+
+IDENTITY = SimilarityTransform(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationTolerances:
+    """How a result is laid onto a reference.
+
+    Attributes
+    ----------
+    coarse_points, fine_points : of the result, that are looked at. They cost time only.
+    coarse_steps, fine_steps : of each start, and of the best. More move nothing by a thousandth of
+        the deviation on the captures of the tests.
+    num_kept : starts that go on after the first steps. Guess.
+    width : of the loss, standard deviations of the residuals; about that of 95 % efficiency.
+    last_width_share : of the part's size; the loss begins so wide and narrows. Guess.
+    max_scale_ratio : of an estimated scale to the one by which both are as large. Guess.
+    backward_points : of the reference, whose distances from the result count as well where the
+        scale is estimated: else the result would shrink into a flat spot of the reference.
+    """
+
+    coarse_points: int = 1500
+    fine_points: int = 20_000
+    coarse_steps: int = 12
+    fine_steps: int = 40
+    num_kept: int = 6
+    width: float = 3.0
+    last_width_share: float = 0.05
+    max_scale_ratio: float = 1.5
+    backward_points: int = 3000
+
+
+class Reference(Protocol):
+    """A surface that distances are measured to."""
+
+    @property
+    def points(self) -> Array:
+        """Places (M, 3) all over it."""
+
+    def closest(self, points: Array) -> tuple[Array, Array]:
+        """The closest places (N, 3) and the unit normals (N, 3) there."""
+
+
+class MeshReference:
+    """A mesh."""
+
+    def __init__(self, mesh: TriangleMesh) -> None:
+        self._mesh, self._scene = mesh, RayScene(mesh)
+        area = mesh.face_areas
+        rng = np.random.default_rng(0)
+        face = rng.choice(len(area), size=20_000, p=area / area.sum())
+        place = rng.dirichlet(np.ones(3), size=len(face))
+        self.points: Array = np.einsum("nk,nkd->nd", place, mesh.corners[face])
+
+    def closest(self, points: Array) -> tuple[Array, Array]:
+        """The closest places, and the normals of their faces."""
+        place, face, _ = self._scene.closest(points)
+        return place, self._mesh.face_normals[face]
+
+
+class CloudReference:
+    """A cloud with normals: between its points the surface is flat."""
+
+    def __init__(self, points: Array, normals: Array) -> None:
+        self.points, self._normals = points, normals
+        self._tree = cKDTree(points)
+
+    def closest(self, points: Array) -> tuple[Array, Array]:
+        """The closest places on the tangent plane of the nearest point."""
+        _, index = self._tree.query(points)
+        normals = self._normals[index]
+        height = dots(points - self.points[index], normals)
+        return points - height[:, None] * normals, normals
+
+
+@dataclass(frozen=True, kw_only=True)
+class Registration:
+    """Where a result lies on a reference.
+
+    Attributes
+    ----------
+    reference_from_result : the similarity; of scale 1 unless it was estimated.
+    covariance : (7, 7) of the turn (rad, about ``center``), the shift and the scale's logarithm.
+    center : (3,) of the result after it was moved.
+    rms : robust standard deviation of the distances, reference's unit.
+    runner_up : mean distance at the best other place over that at this one, by which an ambiguous
+        one is known; infinite where there was none.
+    """
+
+    reference_from_result: SimilarityTransform
+    covariance: Array
+    center: Array
+    rms: float
+    runner_up: float
+
+    def distance_sigmas(self, points: Array, normals: Array) -> Array:
+        """Standard deviations (N,) of distances that the registration leaves, at moved points."""
+        rows = _rows(points - self.center, normals)
+        return np.asarray(
+            np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", rows, self.covariance, rows), 0))
+        )
+
+
+def register(
+    points: Array,
+    normals: Array | None,
+    reference: Reference,
+    *,
+    with_scale: bool = False,
+    start: SimilarityTransform | None = None,
+    tolerances: RegistrationTolerances = RegistrationTolerances(),
+) -> Registration:
+    """Lay points onto a reference.
+
+    Parameters
+    ----------
+    points : (N, 3) of the result.
+    normals : (N, 3) unit, outwards; they keep thin parts from being taken for their other side.
+    with_scale : estimate the scale as well.
+    start : where the points lie about right; None: anywhere.
+    """
+    chosen = _some(points, normals, tolerances.fine_points)
+    few = _some(points, normals, tolerances.coarse_points)
+    size = float(np.linalg.norm(np.ptp(reference.points, axis=0)))
+    if start is not None:
+        found = [(_spread(few, reference, start), start)]
+    else:
+        found = []
+        for guess in _starts(points, reference.points, with_scale=with_scale):
+            place = _refined(few, reference, guess, with_scale, 4, size, tolerances)
+            found.append((_spread(few, reference, place), place))
+        found.sort(key=lambda pair: pair[0])
+        kept = []
+        for _, place in found[: tolerances.num_kept]:
+            place = _refined(
+                few, reference, place, with_scale, tolerances.coarse_steps, size, tolerances
+            )
+            kept.append((_spread(few, reference, place), place))
+        found = sorted(kept, key=lambda pair: pair[0])
+    best = _refined(
+        chosen, reference, found[0][1], with_scale, tolerances.fine_steps, size, tolerances
+    )
+    least = max(found[0][0], 1e-300)
+    others = [spread / least for spread, place in found[1:] if _differ(place, found[0][1])]
+    return _described(chosen, reference, best, with_scale, min(others, default=np.inf))
+
+
+def _some(points: Array, normals: Array | None, num: int) -> tuple[Array, Array | None]:
+    index = np.random.default_rng(0).permutation(len(points))[:num]
+    return points[index], None if normals is None else normals[index]
+
+
+def _starts(points: Array, target: Array, *, with_scale: bool) -> Iterator[SimilarityTransform]:
+    """Places with the middle and the main axes of both on each other, in all 24 ways."""
+    center, axes, spread = _axes(points)
+    onto, target_axes, target_spread = _axes(target)
+    scale = target_spread / spread if with_scale else 1.0
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            turned = target_axes[:, order] * np.array(signs)
+            if np.linalg.det(turned @ axes.T) > 0:
+                rotation = turned @ axes.T
+                translation = onto - scale * rotation @ center
+                yield SimilarityTransform(scale=scale, rotation=rotation, translation=translation)
+
+
+def _axes(points: Array) -> tuple[Array, Array, float]:
+    """Middle, main axes as columns, and radius of points."""
+    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    _, axes = np.linalg.eigh(np.cov(points.T))
+    # The middle of the box along these axes: it depends least on where points are dense.
+    along = (points - center) @ axes
+    center = center + axes @ (0.5 * (along.min(axis=0) + along.max(axis=0)))
+    return center, axes, float(np.sqrt(np.mean(lengths(points - center) ** 2)))
+
+
+def _residuals(
+    given: tuple[Array, Array | None], reference: Reference, place: SimilarityTransform
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Moved points, normals of the reference, distances along them, and which points count."""
+    moved = np.asarray(place * given[0])
+    closest, normals = reference.closest(moved)
+    counts = np.ones(len(moved), np.bool_)
+    if given[1] is not None:
+        counts = dots(given[1] @ np.asarray(place.rotation).T, normals) > 0
+    return moved, normals, dots(moved - closest, normals), counts
+
+
+def _spread(
+    given: tuple[Array, Array | None], reference: Reference, place: SimilarityTransform
+) -> float:
+    """Mean distance of the points, those that face the wrong way counted with the largest.
+
+    And the mean distance of the reference from them, by which a place that leaves half of it bare
+    is no better one.
+    """
+    moved = np.asarray(place * given[0])
+    closest, normals = reference.closest(moved)
+    distance = lengths(moved - closest)
+    missed = cKDTree(moved).query(reference.points[::20])[0].mean()
+    if given[1] is not None:
+        facing = dots(given[1] @ np.asarray(place.rotation).T, normals) > 0
+        distance = np.where(facing, distance, distance.max())
+    return float(distance.mean() + missed)
+
+
+def _rows(arms: Array, normals: Array) -> Array:
+    """Derivatives (N, 7) of distances by turn, shift and the scale's logarithm."""
+    return np.column_stack([np.cross(arms, normals), normals, dots(arms, normals)])
+
+
+def _refined(
+    given: tuple[Array, Array | None],
+    reference: Reference,
+    place: SimilarityTransform,
+    with_scale: bool,
+    num_steps: int,
+    size: float,
+    tolerances: RegistrationTolerances,
+) -> SimilarityTransform:
+    """A place after some steps of weighted least squares."""
+    number = 7 if with_scale else 6
+    fitting = _axes(reference.points)[2] / _axes(given[0])[2] if with_scale else 1.0
+    scales = fitting / tolerances.max_scale_ratio, fitting * tolerances.max_scale_ratio
+    for step in range(num_steps):
+        moved, normals, distance, counts = _residuals(given, reference, place)
+        if counts.sum() < 2 * number:
+            return place
+        deviation = max(robust_deviation(distance[counts]), 1e-9 * size)
+        widest = tolerances.last_width_share * size * 0.5 ** min(step, 30)
+        width = max(tolerances.width * deviation, widest if step < num_steps // 2 else 0.0)
+        weights = np.where(counts, geman_mcclure_weights(distance, width**2), 0)
+        center = moved.mean(axis=0)
+        rows = _rows(moved - center, normals)[:, :number]
+        if with_scale:
+            back = _backward(moved, center, reference, width, tolerances.backward_points)
+            share = counts.sum() / max(len(back[1]), 1)
+            rows = np.concatenate([rows, back[0]])
+            distance = np.concatenate([distance, back[1]])
+            weights = np.concatenate([weights, share * back[2]])
+        # A direction that nothing decides, as the turn of a disc, stays where it is.
+        length = np.array([size, size, size, 1, 1, 1, size][:number])
+        scaled = rows / length
+        normal = scaled.T @ (weights[:, None] * scaled)
+        normal += 1e-9 * np.trace(normal) / number * np.eye(number)
+        change = -np.linalg.solve(normal, scaled.T @ (weights * distance)) / length
+        turn = Rotation.from_rotvec(change[:3]).as_matrix()
+        factor = 1.0
+        if with_scale:
+            low, high = (limits / place.scale for limits in scales)
+            factor = float(np.clip(np.exp(change[6]), low, high))
+        place = SimilarityTransform(
+            scale=factor * place.scale,
+            rotation=turn @ np.asarray(place.rotation),
+            translation=factor * turn @ (np.asarray(place.translation) - center)
+            + center
+            + change[3:6],
+        )
+    return place
+
+
+def _backward(
+    moved: Array, center: Array, reference: Reference, width: float, num: int
+) -> tuple[Array, Array, Array]:
+    """Rows, distances and weights of places on the reference from the nearest points."""
+    places = reference.points[np.random.default_rng(1).permutation(len(reference.points))[:num]]
+    distance, nearest = cKDTree(moved).query(places)
+    towards = (moved[nearest] - places) / np.maximum(distance, 1e-300)[:, None]
+    weights = geman_mcclure_weights(distance, width**2)
+    return _rows(moved[nearest] - center, towards), distance, weights
+
+
+def _described(
+    given: tuple[Array, Array | None],
+    reference: Reference,
+    place: SimilarityTransform,
+    with_scale: bool,
+    runner_up: float,
+) -> Registration:
+    moved, normals, distance, counts = _residuals(given, reference, place)
+    deviation = robust_deviation(distance[counts])
+    weights = np.where(counts, geman_mcclure_weights(distance, (3 * deviation) ** 2 or 1e-300), 0)
+    center = moved.mean(axis=0)
+    number = 7 if with_scale else 6
+    rows = _rows(moved - center, normals)[:, :number]
+    covariance = np.zeros((7, 7))
+    covariance[:number, :number] = deviation**2 * np.linalg.pinv(rows.T @ (weights[:, None] * rows))
+    return Registration(
+        reference_from_result=place,
+        covariance=covariance,
+        center=center,
+        rms=deviation,
+        runner_up=runner_up,
+    )
+
+
+def _differ(first: SimilarityTransform, second: SimilarityTransform) -> bool:
+    """Whether two places are turned by more than 5 degrees against each other."""
+    relative = np.asarray(first.rotation) @ np.asarray(second.rotation).T
+    return bool(np.trace(relative) < 1 + 2 * np.cos(np.radians(5)))

@@ -1,0 +1,189 @@
+"""Size of an image as its header declares it, told before anything is decoded.
+
+A compressed file of a megabyte may declare an image of a terabyte. Only containers whose header is
+read here are decoded.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from math import prod
+from os import PathLike
+from typing import NamedTuple
+
+from polmvs.config import MAX_PIXELS
+from polmvs.errors import DataError
+
+BYTES_OF_PIXEL = 8  # on average, of what the limit allows: more than 16-bit colour
+BROKEN = "Copy it again from the camera or take it out of the folder."
+SCALE_DOWN = "Scale it down, or check that it is the right file."
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
+BIG_TIFF_SIGNATURES = (b"II+\0", b"MM\0+")
+_PNG_CHANNELS = {2: 3, 4: 2, 6: 4}  # by colour type; 1 of all others
+_TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
+_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277
+_TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
+# Markers of JPEG that begin a frame: all of their group but tables, and those without a length.
+_JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+_JPEG_BARE = {0x01, *range(0xD0, 0xD9)}
+
+
+class ImageSize(NamedTuple):
+    """What a header declares.
+
+    Attributes
+    ----------
+    width, height : px; of a tiled image at least those of a tile, which is decoded whole.
+    num_bytes : of the decoded samples.
+    """
+
+    width: int
+    height: int
+    num_bytes: int
+
+
+def declared_size(path: str | PathLike[str], data: bytes) -> ImageSize:
+    """Size of an encoded image by its header: PNG, TIFF, JPEG, BMP, PGM, PPM or Radiance HDR.
+
+    Raises
+    ------
+    DataError
+        It is none of these, or its header is not whole.
+    """
+    try:
+        found = _declared(data)
+    except (struct.error, ValueError, IndexError) as error:
+        raise DataError(
+            path, f"is not a readable image, or is damaged or truncated. {BROKEN}"
+        ) from error
+    if found is None:
+        raise DataError(
+            path,
+            "is not a readable image: its content is no PNG, TIFF, JPEG, BMP, PGM, PPM or HDR. "
+            f"{BROKEN}",
+        )
+    if min(found[:2]) <= 0:
+        raise DataError(path, f"is damaged: it cannot hold {found[0]}x{found[1]} px. {BROKEN}")
+    return found
+
+
+def require_size(
+    path: str | PathLike[str],
+    size: ImageSize,
+    *,
+    max_pixels: int = MAX_PIXELS,
+    remedy: str = SCALE_DOWN,
+) -> None:
+    """Refuse an image that is larger than a limit.
+
+    Parameters
+    ----------
+    max_pixels : of width times height; eight bytes each is what all samples may take.
+    remedy : what to do about it, a sentence.
+
+    Raises
+    ------
+    DataError
+        It is larger.
+    """
+    if size.width * size.height > max_pixels or size.num_bytes > BYTES_OF_PIXEL * max_pixels:
+        raise DataError(
+            path,
+            f"declares {size.width}x{size.height} px, {size.num_bytes / 1e9:.1f} GB; the limit is "
+            f"{max_pixels:,} px of {BYTES_OF_PIXEL} bytes. {remedy}",
+        )
+
+
+def _declared(data: bytes) -> ImageSize | None:
+    if data.startswith(PNG_SIGNATURE):
+        width, height, bits, colour = struct.unpack_from(">IIBB", data, 16)
+        samples = 4 if colour == 3 else _PNG_CHANNELS.get(colour, 1)  # a palette may have alpha
+        return ImageSize(width, height, width * height * samples * (2 if bits == 16 else 1))
+    if data[:4] in (*TIFF_SIGNATURES, *BIG_TIFF_SIGNATURES):
+        return _of_tiff(data)
+    if data[:2] == b"\xff\xd8":
+        return _of_jpeg(data)
+    if data[:2] == b"BM":
+        return _of_bmp(data)
+    if re.match(rb"P[1-6][\s#]", data):
+        return _of_netpbm(data)
+    if data.startswith((b"#?RADIANCE", b"#?RGBE")):
+        found = re.search(rb"^[-+]Y (\d{1,10}) [-+]X (\d{1,10})\s", data[: 1 << 16], re.MULTILINE)
+        if found is None:
+            raise ValueError("no size")
+        height, width = int(found[1]), int(found[2])
+        return ImageSize(width, height, 12 * width * height)
+    return None
+
+
+def _of_tiff(data: bytes) -> ImageSize:
+    """Of the first image."""
+    order = "<" if data[:2] == b"II" else ">"
+    big = data[:4] in BIG_TIFF_SIGNATURES
+    start = struct.unpack_from(f"{order}Q" if big else f"{order}I", data, 8 if big else 4)[0]
+    num = struct.unpack_from(f"{order}Q" if big else f"{order}H", data, start)[0]
+    first, length = (start + 8, 20) if big else (start + 2, 12)
+    room = 8 if big else 4  # bytes of a value that lies in the tag itself
+    tags: dict[int, int] = {}
+    for index in range(min(num, 4096)):
+        at = first + length * index
+        tag, kind = struct.unpack_from(f"{order}HH", data, at)
+        count = struct.unpack_from(f"{order}Q" if big else f"{order}I", data, at + 4)[0]
+        letter = _TIFF_TYPES.get(kind)
+        if letter is None or not count:
+            continue
+        value_at = at + length - room
+        if count * struct.calcsize(letter) > room:
+            value_at = struct.unpack_from(f"{order}Q" if big else f"{order}I", data, value_at)[0]
+            if value_at + struct.calcsize(letter) > len(data):
+                continue
+        tags.setdefault(tag, struct.unpack_from(order + letter, data, value_at)[0])
+    if _TIFF_WIDTH not in tags or _TIFF_HEIGHT not in tags:
+        raise ValueError("no size")
+    width = max(tags[_TIFF_WIDTH], tags.get(_TIFF_TILE_WIDTH, 0))
+    height = max(tags[_TIFF_HEIGHT], tags.get(_TIFF_TILE_HEIGHT, 0))
+    bits = max(tags.get(_TIFF_BITS, 1), 8)
+    return ImageSize(width, height, width * height * tags.get(_TIFF_SAMPLES, 1) * -(-bits // 8))
+
+
+def _of_jpeg(data: bytes) -> ImageSize:
+    position = 2
+    while True:
+        if data[position] != 0xFF:
+            raise ValueError("no marker")
+        marker = data[position + 1]
+        if marker == 0xFF:  # filling
+            position += 1
+        elif marker in _JPEG_BARE:
+            position += 2
+        elif marker in _JPEG_FRAMES:
+            height, width, channels = struct.unpack_from(">HHB", data, position + 5)
+            return ImageSize(width, height, width * height * channels)
+        else:
+            position += 2 + struct.unpack_from(">H", data, position + 2)[0]
+
+
+def _of_bmp(data: bytes) -> ImageSize:
+    (header,) = struct.unpack_from("<I", data, 14)
+    if header == 12:
+        width, height = struct.unpack_from("<HH", data, 18)
+    else:
+        width, height = struct.unpack_from("<ii", data, 18)
+    width, height = abs(width), abs(height)  # upside down
+    return ImageSize(width, height, 4 * width * height)
+
+
+def _of_netpbm(data: bytes) -> ImageSize:
+    kind = data[1:2]
+    needed = 2 if kind in b"14" else 3
+    text = re.sub(rb"#[^\n\r]*", b" ", data[2 : 1 << 16])
+    words = [int(word) for word in text.split(maxsplit=needed)[:needed] if len(word) < 12]
+    if len(words) < needed:
+        raise ValueError("header is not whole")
+    width, height = words[:2]
+    channels = 3 if kind in b"36" else 1
+    wide = 2 if needed == 3 and words[2] > 0xFF else 1
+    return ImageSize(width, height, prod((width, height, channels, wide)))

@@ -1,0 +1,321 @@
+"""What a finished run holds as files of other programs: mesh, cloud, or posed images."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.camera import pixel_centers
+from polmvs.colmap.camera_exports import CAMERA_FORMATS, CameraExport
+from polmvs.colmap.dense_workspace import open_dense_workspace
+from polmvs.colmap.models import read_model
+from polmvs.config import AngleModel, Channel, ExportFormat, options_from_plain
+from polmvs.errors import DataError, OptionError, PolmvsError
+from polmvs.io.cloud_files import write_cloud_file
+from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
+from polmvs.io.folders import new_folder
+from polmvs.io.images import read_gray
+from polmvs.io.mesh_files import MESH_FORMATS, Texture, mesh_format_of, write_mesh_file
+from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.runner import dense_models, load_record
+from polmvs.pipeline.stages.images import image_names
+from polmvs.polarization.capture import DISPLAY_GAMMA, Capture, open_capture
+from polmvs.scene import PointKind, SparseModel, View
+from polmvs.surface.coloring import paint_texture, surface_colors, texture_size
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+CLOUDS = {
+    ExportFormat.CLOUD_PLY: "ply",
+    ExportFormat.XYZ: "xyz",
+    ExportFormat.LAS: "las",
+    ExportFormat.LAZ: "laz",
+}
+MESHES = (ExportFormat.PLY, ExportFormat.OBJ, ExportFormat.STL, ExportFormat.GLB)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exported:
+    """What was written.
+
+    Attributes
+    ----------
+    files : or the folder.
+    num_points, num_triangles, num_views : of what was exported; 0 of what was not.
+    texture_px : sides of the texture; 0 without one.
+    """
+
+    files: tuple[Path, ...]
+    num_points: int = 0
+    num_triangles: int = 0
+    num_views: int = 0
+    texture_px: int = 0
+
+
+def export_format(target: Path, given: ExportFormat | None) -> ExportFormat:
+    """The format that is asked for, or that a file's name ends in.
+
+    Raises
+    ------
+    OptionError
+        The name says none, or another than is asked for.
+    """
+    suffix = target.suffix.lower()
+    if given is None:
+        named = {**{f".{f}": f for f in MESHES}, ".xyz": ExportFormat.XYZ}
+        named |= {".las": ExportFormat.LAS, ".laz": ExportFormat.LAZ}
+        if suffix not in named:
+            raise OptionError(
+                f"{target}: its name says no format. End it in {', '.join(named)}, or give "
+                f"`arguments.format`, one of {', '.join(ExportFormat)}."
+            )
+        return named[suffix]
+    expected = f".{CLOUDS.get(given, given)}"
+    if given in (*MESHES, *CLOUDS) and suffix != expected:
+        raise OptionError(f"{target}: the name of a file of {given} ends in {expected}.")
+    return given
+
+
+def export_run(
+    run_folder: RunFolder,
+    target: Path,
+    form: ExportFormat,
+    *,
+    model: AngleModel | None = None,
+    texture: bool = False,
+    texture_px: int | None = None,
+    colors: bool = True,
+    part: bool = False,
+    box: tuple[float, float, float, float, float, float] | None = None,
+    overwrite: bool = False,
+) -> Exported:
+    """Write a mesh, a cloud or posed images of a finished run.
+
+    Parameters
+    ----------
+    target : file, or folder for posed images.
+    model : whose surface; by default PPA's, else that of the only cloud.
+    texture : of a mesh: a texture instead of a colour for each vertex.
+    texture_px : sides of the texture; by default a texel has the size of a pixel on the part.
+    colors : of a mesh: without, it has none.
+    part : of a cloud: the polarised surface alone, without its surroundings.
+    box : two opposite corners, world; of a mesh or cloud what lies within.
+    overwrite : replace what is there.
+
+    Raises
+    ------
+    DataError, OptionError, PolmvsError
+        The run lacks what is asked for, the target exists, or a library is missing.
+    """
+    record = load_record(run_folder)
+    model = surface_of(run_folder, dense_models(record), model)
+    if box is not None and form not in (*MESHES, *CLOUDS):
+        raise OptionError("is of a mesh or a cloud.", field="arguments.box")
+    if texture and form not in MESHES:
+        raise OptionError("is of a mesh.", field="arguments.texture")
+    if texture and not MESH_FORMATS[f".{form}"].texture:
+        raise OptionError(
+            f"cannot be held by {form}; name an .obj or .glb.", field="arguments.texture"
+        )
+    if target.exists() and not overwrite:
+        raise OptionError(f"{target}: exists. Give `arguments.overwrite` to replace it.")
+    if form in CLOUDS:
+        cloud = read_cloud(run_folder.cloud(model))
+        cloud = part_of(cloud) if part else cloud
+        if box is not None:
+            cloud = cloud.only(within_box(cloud.points, box))
+        write_cloud_file(target, cloud, CLOUDS[form])
+        return Exported(files=(target,), num_points=len(cloud.points))
+    if form not in MESHES:
+        return _export_cameras(run_folder, model, target, form, overwrite=overwrite)
+    mesh_format_of(target)
+    mesh = read_mesh(_existing(run_folder.mesh(model), "mesh"))
+    if box is not None:
+        mesh = cropped_mesh(mesh, within_box(mesh.vertices, box))
+        if not len(mesh.triangles):
+            raise OptionError("holds nothing of the mesh.", field="arguments.box")
+    painted: Texture | None = None
+    if MESH_FORMATS[f".{form}"].colors and colors:
+        painter = _Painter(run_folder, mesh)
+        if texture:
+            mesh, painted = painter.textured(texture_px)
+        else:
+            mesh = replace(mesh, colors=painter.colors_of(mesh.vertices, mesh.normals))
+    else:
+        mesh = replace(mesh, colors=None)
+    files = write_mesh_file(target, mesh, painted)
+    return Exported(
+        files=files,
+        num_points=len(mesh.vertices),
+        num_triangles=len(mesh.triangles),
+        texture_px=0 if painted is None else painted.image.shape[0],
+    )
+
+
+def within_box(points: Array, box: tuple[float, float, float, float, float, float]) -> Mask:
+    """Which points (N, 3) lie between two opposite corners, whichever is which."""
+    corners = np.reshape(box, (2, 3))
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    return np.asarray(((points >= low) & (points <= high)).all(axis=1), np.bool_)
+
+
+def cropped_mesh(mesh: Mesh, kept: Mask) -> Mesh:
+    """The triangles of which all three vertices are kept, and their vertices."""
+    triangles = mesh.triangles[kept[mesh.triangles].all(axis=1)]
+    used = np.unique(triangles)
+    index = np.zeros(len(mesh.vertices), np.int32)
+    index[used] = np.arange(len(used))
+    return Mesh(
+        vertices=mesh.vertices[used],
+        normals=mesh.normals[used],
+        triangles=index[triangles],
+        colors=None if mesh.colors is None else mesh.colors[used],
+    )
+
+
+def surface_of(
+    run_folder: RunFolder, there: tuple[AngleModel, ...], model: AngleModel | None
+) -> AngleModel:
+    """The angle model whose surface is asked for, of those that are there.
+
+    Raises
+    ------
+    DataError, OptionError
+        There is none, or not that.
+    """
+    if not there:
+        raise DataError(run_folder.root, "has no dense cloud. Run 'polmvs densify' first.")
+    if model is None:
+        return AngleModel.PPA if AngleModel.PPA in there else there[0]
+    if model not in there:
+        raise OptionError(
+            f"is {model}; {run_folder.root} has {', '.join(there)}.", field="arguments.model"
+        )
+    return model
+
+
+def _existing(path: Path, what: str) -> Path:
+    if not path.exists():
+        raise DataError(path, f"the run has no {what}. Make it by 'polmvs finish CAPTURE OUT'.")
+    return path
+
+
+def part_of(cloud: Cloud) -> Cloud:
+    """The points of a cloud that lie on the part, without its surroundings."""
+    kinds = cloud.scalars.get("kind")
+    if kinds is None:
+        return cloud
+    return cloud.only(np.isin(kinds, (PointKind.SURFACE, PointKind.PRESUMED)))
+
+
+def _export_cameras(
+    run_folder: RunFolder, model: AngleModel, target: Path, form: ExportFormat, *, overwrite: bool
+) -> Exported:
+    workspace = open_dense_workspace(_existing(run_folder.dense(model), "COLMAP workspace"))
+    mesh = read_mesh(_existing(run_folder.mesh(model), "mesh"))
+    scene = RayScene(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64)))
+
+    def mask(view: View) -> NDArray[np.bool_]:
+        camera = view.camera
+        rays = view.rays_in_world(pixel_centers(camera.width, camera.height).reshape(-1, 2))
+        hits = scene.cast(view.center_in_world, rays)
+        return (hits.face >= 0).reshape(camera.height, camera.width)
+
+    export = CameraExport(
+        workspace=workspace,
+        cloud=read_cloud(run_folder.cloud(model)),
+        mask=mask,
+        part=mesh.vertices,
+    )
+    with new_folder(target, overwrite=overwrite) as folder:
+        CAMERA_FORMATS[form](export, folder)
+    return Exported(files=(target,), num_views=len(workspace.views))
+
+
+class _Painter:
+    """Colours of a mesh from the views of its run."""
+
+    def __init__(self, run_folder: RunFolder, mesh: Mesh) -> None:
+        self.mesh = TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64))
+        self.scene = RayScene(self.mesh)
+        self.model: SparseModel = read_model(run_folder.sparse)
+        self.images = run_folder.images
+        record = load_record(run_folder)
+        self.capture: Capture | None = None
+        if record.capture is not None:
+            options = options_from_plain(record.options, str(run_folder.run_file))
+            try:
+                self.capture = open_capture(record.capture.folder, options.capture)
+                self.raw = image_names(self.capture)
+            except PolmvsError as error:
+                logger.warning(
+                    "colours are those of the run's images, grey and with highlights: %s", error
+                )
+        self.white = 1.0 if self.capture is None else self.capture.exposure()
+
+    def colors_of(self, points: Array, normals: Array) -> NDArray[np.uint8]:
+        """Colours (N, 3) of places on the mesh."""
+        return surface_colors(
+            points, normals, self.model.views, self._load, self.scene, white=self.white
+        )
+
+    def textured(self, size_px: int | None) -> tuple[Mesh, Texture]:
+        """The mesh with a vertex for each side of a seam, and its texture."""
+        try:
+            import xatlas
+        except ImportError as error:
+            raise PolmvsError(
+                "a texture needs a library: install polmvs with its extra 'texture'."
+            ) from error
+        old = self.mesh
+        came_from, faces, uv = xatlas.parametrize(
+            np.ascontiguousarray(old.vertices - old.vertices.mean(axis=0), np.float32),
+            np.ascontiguousarray(old.faces, np.uint32),
+            np.ascontiguousarray(old.vertex_normals, np.float32),
+        )
+        # Of a vertex on a seam each side keeps the normal of the whole.
+        split = TriangleMesh(old.vertices[came_from], faces.astype(np.int64))
+        split.__dict__["vertex_normals"] = old.vertex_normals[came_from]
+        size = size_px or texture_size(old, self._texel())
+        texture = paint_texture(split, np.asarray(uv, np.float64), self.colors_of, size)
+        mesh = Mesh(
+            vertices=split.vertices,
+            normals=split.vertex_normals,
+            triangles=faces.astype(np.int32),
+        )
+        return mesh, texture
+
+    def _texel(self) -> float:
+        """Size of a pixel on the part, as the nearest views have it."""
+        center = np.median(self.mesh.vertices, axis=0)
+        sizes = [
+            float(np.linalg.norm(view.center_in_world - center)) / view.camera.mean_focal_px
+            for view in self.model.views
+        ]
+        return float(np.median(sizes))
+
+    def _load(self, view: View) -> NDArray[np.float32]:
+        """Linear intensities of a view without what is polarised; NaN where it is clipped."""
+        if self.capture is None or view.name not in self.raw:
+            gray = read_gray(self.images / view.name)
+            return np.asarray((gray / 255) ** DISPLAY_GAMMA, np.float32)
+        capture = self.capture
+        channels: tuple[Channel, ...] = (capture.options.channel,)
+        if capture.has_colors and capture.options.channel is Channel.COMBINED:
+            channels = (Channel.RED, Channel.GREEN, Channel.BLUE)
+        planes = []
+        for channel in channels:
+            one = replace(capture, options=replace(capture.options, channel=channel))
+            stokes = one.load(self.raw[view.name])
+            plane = np.maximum(stokes.s0 - np.hypot(stokes.s1, stokes.s2), 0)
+            dark = stokes.s0 < 2 * capture.options.darkness
+            planes.append(np.where(stokes.valid | dark, plane, np.nan))
+        return np.asarray(np.stack(planes, axis=-1) if len(planes) > 1 else planes[0], np.float32)

@@ -1,0 +1,28 @@
+"""Degree of linear polarization that unpolarised light has after a smooth dielectric (Fresnel)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.config import Light
+
+Floats = NDArray[np.floating]
+Array = NDArray[np.float64]
+
+
+def fresnel_dolp(cosines: Floats, light: Light | str, ior: Floats | float) -> Array:
+    """DoLP of unpolarised light that a surface mirrors, or that leaves it from inside.
+
+    Parameters
+    ----------
+    cosines : (...), of the angle between the surface's normal and the direction to the viewer.
+    light : specular or diffuse.
+    ior : refractive index, over 1; broadcasts.
+    """
+    c = np.clip(np.asarray(cosines, np.float64), 1e-6, 1.0)  # 0 / 0 at a grazing angle
+    refracted = np.sqrt(1 - (1 - c * c) / np.square(ior))
+    across = np.square((c - ior * refracted) / (c + ior * refracted))
+    along = np.square((ior * c - refracted) / (ior * c + refracted))
+    total = across + along
+    return np.asarray((across - along) / (total if light == Light.SPECULAR else 2 - total))

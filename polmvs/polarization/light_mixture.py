@@ -1,0 +1,251 @@
+r"""Which light an observation shows: specular, diffuse, or neither; a label that nobody gives.
+
+An observation is what one view measures of one place: ``p = (s1, s2) / s0``, noise of variance v in
+either. Its angle fits a normal n as specular light, ``m_s . n = 0``, or as diffuse light, ``m_d . n
+= 0``, the planes of incidence m a quarter turn apart about the ray. With psi the turn about the ray
+between plane and normal, ``m . n = sin(theta) sin(psi)``, theta the angle between normal and ray.
+
+Likelihood
+----------
+Gaussian noise of p makes psi von Mises distributed on twice the angle, ``exp(kappa cos 2 psi) / (pi
+I0(kappa))`` with ``kappa = 1 / (4 var(psi))``, and ``kappa cos 2 psi = kappa - (m . n)^2 / (2
+var(m . n))``, ``var(m . n) = sin^2(theta) var(psi)``. So a sure observation has the Gaussian of its
+residual, and the less it is polarised the more even is its density: it neither tells a normal nor a
+label. "Neither" (light reflected twice, marks, polarised surroundings) is even, ``1 / pi``.
+
+Degree of polarization
+----------------------
+Light of both kinds mixes, and they subtract: the measured DoLP lies anywhere between zero and that
+of one kind alone at this theta, which Fresnel's equations give. So a DoLP is evidence by what it
+exceeds alone: ``P(rho <= bound(theta))``, with the noise of rho, theta's own error and a refractive
+index anywhere between two limits.
+
+Nothing here knows of views, points or meshes: arrays of any one shape go in and come out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.config import Light
+from polmvs.polarization.fresnel import fresnel_dolp
+
+Floats = NDArray[np.floating]
+Array = NDArray[np.float64]
+
+TABLE_SIZE = 512  # steps of the cosine that bounds are tabulated at
+NUM_IORS = 7
+LOGISTIC_SCALE = 1.702  # of a logistic distribution that comes nearest to the normal one (Camilli)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightMixtureTolerances:
+    """What is presumed of light and surface before any phase is seen.
+
+    Attributes
+    ----------
+    neither_share : of all observations. Guess.
+    min_ior, max_ior : refractive indices of dielectrics, all alike likely between. Derived: water
+        1.33, plastics, glazes, lacquers and glass 1.45 to 1.6, dense glass 1.7.
+    dolp_margin : by which a bound may be exceeded beside noise: reflections of polarised light,
+        another model of the surface. Guess.
+    model_sigma : rad; error of the phase of strongly polarised light that noise does not explain.
+        Measured on the shared captures.
+    mixture_sigma : rad times DoLP; by which light of a second reflection turns the phase, over the
+        DoLP. Measured on the shared captures.
+    min_sine : of theta. Seen frontally a surface has no plane of incidence. Guess.
+    """
+
+    neither_share: float = 0.15
+    min_ior: float = 1.4
+    max_ior: float = 1.7
+    dolp_margin: float = 0.02
+    model_sigma: float = 0.014
+    mixture_sigma: float = 0.006
+    min_sine: float = 0.05
+
+
+class LightShares(NamedTuple):
+    """Probabilities of the three labels, which sum to one, and what they make of an observation.
+
+    Attributes
+    ----------
+    specular, diffuse, neither : (...) in [0, 1].
+    log_likelihood : (...) of the observation's angle and DoLP over that of an angle by chance: 0
+        where nothing is polarised, at least ``log(neither_share)``.
+    """
+
+    specular: Floats
+    diffuse: Floats
+    neither: Floats
+    log_likelihood: Floats
+
+
+def phase_variance(
+    dolp: Floats,
+    variance: Floats,
+    *,
+    tolerances: LightMixtureTolerances = LightMixtureTolerances(),
+) -> Floats:
+    """Variance (...) of a phase, rad^2: noise, the model's error and light of other reflections.
+
+    Infinite where the DoLP does not exceed what noise alone makes of no polarisation. (The square
+    of a measured DoLP is too large by twice the noise's variance in the mean.)
+
+    Parameters
+    ----------
+    dolp : (...), as measured.
+    variance : (...), of ``s1 / s0`` and of ``s2 / s0``.
+    """
+    t = tolerances
+    signal = np.maximum(np.square(dolp) - 2 * variance, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = t.model_sigma**2 + (t.mixture_sigma**2 + variance / 4) / signal
+    return np.where(signal > 0, found, np.inf).astype(np.result_type(dolp), copy=False)
+
+
+def light_shares(
+    residuals: tuple[Floats, Floats],
+    turn_variances: tuple[Floats, Floats],
+    cosines: Floats,
+    dolp: Floats,
+    dolp_variance: Floats,
+    *,
+    normal_variance: Floats | float = 0.0,
+    prior_specular: Floats | float = 0.5,
+    tolerances: LightMixtureTolerances = LightMixtureTolerances(),
+) -> LightShares:
+    """Probabilities of an observation's labels, given a normal.
+
+    All arrays broadcast to one shape (...).
+
+    Parameters
+    ----------
+    residuals : ``m . n`` of the specular and of the diffuse plane of incidence, m and n unit.
+    turn_variances : of either plane's turn about the ray, rad^2: :func:`phase_variance` times the
+        square of the turn per phase. Infinite where nothing is known: there residuals may be NaN.
+    cosines : of the angle theta between the normal and the direction to the viewer.
+    dolp, dolp_variance : measured, and its variance.
+    normal_variance : of the normal along either direction, rad^2; 0 where it is a hypothesis.
+    prior_specular : probability that light is specular, if it is one of the two: 1 where a user
+        says so, else that of the neighbours, say.
+    tolerances : of this step.
+    """
+    t = tolerances
+    cosines = np.asarray(cosines)
+    sin2 = np.maximum(1 - np.square(cosines), t.min_sine**2)
+    # Single precision stays so: NumPy's own numbers of double precision would widen all.
+    prior = np.asarray(prior_specular, np.result_type(cosines, dolp))
+    log_neither, log_either = math.log(t.neither_share), math.log1p(-t.neither_share)
+    with np.errstate(divide="ignore"):
+        priors = np.log(prior), np.log1p(-prior)
+    parts = []
+    for light, log_prior, residual, turn in zip(
+        (Light.SPECULAR, Light.DIFFUSE), priors, residuals, turn_variances, strict=True
+    ):
+        density = angle_log_density(residual, turn, sin2, normal_variance)
+        bound = dolp_log_evidence(
+            light, dolp, dolp_variance, cosines, normal_variance=normal_variance, tolerances=t
+        )
+        parts.append(density + bound + log_prior + log_either)
+    specular, diffuse = parts
+    either = np.logaddexp(specular, diffuse)
+    total = np.logaddexp(either, np.asarray(log_neither, either.dtype))
+    return LightShares(
+        specular=np.exp(specular - total),
+        diffuse=np.exp(diffuse - total),
+        neither=np.exp(log_neither - total),
+        log_likelihood=total,
+    )
+
+
+def residual_variance(
+    turn_variance: Floats, sin2: Floats, normal_variance: Floats | float = 0.0
+) -> Floats:
+    """Variance (...) of ``m . n``: the plane's turn about the ray, and the normal's own error."""
+    return np.asarray(sin2 * turn_variance + normal_variance)
+
+
+def row_precisions(shares: LightShares, variances: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+    """Weights (...) of the squares of the two residuals in a fit of the normal.
+
+    The residuals' squares sum to ``sin^2(theta)``, whatever the plane: what both labels share draws
+    to the ray and tells nothing of it, so that a label counts by how much it exceeds the other.
+
+    Parameters
+    ----------
+    shares : of the observations.
+    variances : of the specular and of the diffuse residual (:func:`residual_variance`).
+    """
+    excess = shares.specular - shares.diffuse
+    return np.maximum(excess, 0) / variances[0], np.maximum(-excess, 0) / variances[1]
+
+
+def angle_log_density(
+    residual: Floats, turn_variance: Floats, sin2: Floats, normal_variance: Floats | float = 0.0
+) -> Floats:
+    """Log density (...) of a plane's turn about the ray over an even one; 0 of no information."""
+    variance = residual_variance(turn_variance, sin2, normal_variance)
+    known = np.isfinite(variance)
+    safe = np.where(known, variance, 1)
+    density = -0.5 * np.square(residual) / safe - _log_bessel(0.25 * sin2 / safe)
+    return np.where(known, density, np.zeros_like(density))
+
+
+def _log_bessel(x: Floats) -> Floats:
+    """``log(exp(-x) I0(x))`` (...), x >= 0, within 0.0025, many times faster than SciPy's.
+
+    Olivares et al., A simple and accurate approximation for the modified Bessel functions of zeroth
+    order, J. Phys.: Conf. Ser. 1043 (2018).
+    """
+    x2 = np.square(x)
+    rational = (1 + 0.24273 * x2) / (1 + 0.43023 * x2)
+    even = 0.5 + 0.5 * np.exp(-2 * x)
+    return np.asarray(np.log(even * rational) - 0.25 * np.log1p(0.25 * x2))
+
+
+def dolp_log_evidence(
+    light: Light,
+    dolp: Floats,
+    dolp_variance: Floats,
+    cosines: Floats,
+    *,
+    normal_variance: Floats | float = 0.0,
+    tolerances: LightMixtureTolerances = LightMixtureTolerances(),
+) -> Floats:
+    """Log probability (...) that a measured DoLP is within what light of a kind can have.
+
+    Parameters are those of :func:`light_shares`.
+    """
+    table = _bounds(light, tolerances)
+    cosines = np.asarray(cosines)
+    # Seen from behind it is no observation at all; the bound is that at a grazing angle.
+    place = (np.clip(cosines, 0, 1) * (TABLE_SIZE - 1)).astype(np.intp)
+    bound, spread, slope = table[:, place].astype(np.result_type(dolp))
+    variance = dolp_variance + spread + slope * normal_variance
+    finite = np.isfinite(variance)
+    sigma = np.sqrt(np.where(finite, variance, 1))
+    # The normal distribution's integral by a logistic one, within 0.01, whose tail is longer.
+    excess = np.asarray(LOGISTIC_SCALE * (dolp - bound) / sigma)
+    return np.where(finite, -np.logaddexp(np.zeros_like(excess), excess), np.zeros_like(excess))
+
+
+@lru_cache(maxsize=8)
+def _bounds(light: Light, tolerances: LightMixtureTolerances) -> Array:
+    """Bound of the DoLP (3, TABLE_SIZE) by the cosine of theta.
+
+    Mean over the refractive indices, variance by them and the margin, square of the slope by theta.
+    """
+    t = tolerances
+    cosines = np.linspace(0, 1, TABLE_SIZE)
+    iors = np.linspace(t.min_ior, t.max_ior, NUM_IORS)[:, None]
+    dolp = fresnel_dolp(cosines, light, iors)
+    theta = np.arccos(cosines)
+    slope = np.gradient(dolp.mean(axis=0), theta)
+    return np.stack([dolp.mean(axis=0), dolp.var(axis=0) + t.dolp_margin**2, np.square(slope)])

@@ -1,0 +1,45 @@
+"""Processes that this program starts import nothing from the current directory.
+
+Python puts the current directory first on the path of what is started with ``-c``, as
+:mod:`multiprocessing` and :mod:`polmvs.separate` start theirs. In a capture's folder a file
+``numpy.py`` or ``polmvs.py`` would run. PYTHONSAFEPATH forbids that, in their children as well.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+VARIABLE = "PYTHONSAFEPATH"  # Python 3.11 and later
+SAFE = "1"  # any text that is not empty
+
+_lock = threading.Lock()
+_inside: list[str | None] = []  # what the variable was before each block that is open
+
+
+def safe_environment() -> dict[str, str]:
+    """The environment of this process with a safe path, for a child."""
+    return {**os.environ, VARIABLE: SAFE}
+
+
+@contextmanager
+def safe_path() -> Iterator[None]:
+    """Have processes that start meanwhile inherit a safe path; for those that take no environment.
+
+    The variable is as before when the last of the threads inside has left.
+    """
+    with _lock:
+        _inside.append(os.environ.get(VARIABLE) if not _inside else _inside[0])
+        os.environ[VARIABLE] = SAFE
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _inside.pop()
+            if not _inside:
+                if before is None:
+                    os.environ.pop(VARIABLE, None)
+                else:
+                    os.environ[VARIABLE] = before

@@ -1,0 +1,193 @@
+"""Colours of a surface from the views that see a place best, without their highlights.
+
+Of each view the unpolarised part of the light is taken, which lacks most of what is reflected, and
+of the views that see a place best their weighted median, in which a highlight that some see loses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from polmvs.camera import in_image, sample_image
+from polmvs.geometry import dots, lengths
+from polmvs.io.mesh_files import Texture
+from polmvs.scene import View
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+
+DISPLAY_GAMMA = 2.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColoringTolerances:
+    """How places take their colour.
+
+    Attributes
+    ----------
+    num_views : that a place takes its colour from, at most: those that see it best. Guess.
+    min_cosine : between normal and ray; flatter views blur. Guess: 75 degrees.
+    depth_share : of the distance, within which a hit of the ray is the place itself. Guess.
+    gutter_px : of the texture's background about its charts that is painted, for filters.
+    fill : share of a texture that its charts cover; what packing leaves. Measured: xatlas on the
+        meshes of the shared captures, 0.5 to 0.7.
+    max_size_px : of a texture.
+    """
+
+    num_views: int = 8
+    min_cosine: float = 0.26
+    depth_share: float = 0.005
+    gutter_px: int = 8
+    fill: float = 0.5
+    max_size_px: int = 8192
+
+
+def surface_colors(
+    points: Array,
+    normals: Array,
+    views: Sequence[View],
+    load: Callable[[View], NDArray[np.float32]],
+    scene: RayScene,
+    *,
+    white: float,
+    tolerances: ColoringTolerances = ColoringTolerances(),
+) -> NDArray[np.uint8]:
+    """Colours of places on a surface as a screen shows them.
+
+    Parameters
+    ----------
+    points, normals : (N, 3) world, unit normals outwards.
+    views : that may see them.
+    load : gives a view's linear intensities (H, W) or (H, W, 3), NaN where they are none.
+    scene : the surface, which hides places from views.
+    white : intensity that is shown white.
+
+    Returns
+    -------
+    (N, 3) red, green, blue. A place that no view sees has the colour of the nearest that one does;
+    mid grey where none does.
+    """
+    num = len(points)
+    weights = np.zeros((num, tolerances.num_views), np.float32)
+    values = np.zeros((num, tolerances.num_views, 3), np.float32)
+    for view in views:
+        weight, value = _seen_by(view, points, normals, load(view), scene, tolerances)
+        slot = weights.argmin(axis=1)
+        better = np.flatnonzero(weight > weights[np.arange(num), slot])
+        weights[better, slot[better]] = weight[better]
+        values[better, slot[better]] = value[better]
+    known = weights.max(axis=1, initial=0) > 0
+    linear = np.full((num, 3), 0.2 * white)
+    linear[known] = _weighted_medians(values[known], weights[known])
+    if known.any() and not known.all():
+        _, nearest = cKDTree(points[known]).query(points[~known])
+        linear[~known] = linear[known][nearest]
+    share = np.clip(linear / white, 0, 1) ** (1 / DISPLAY_GAMMA)
+    return np.asarray(np.rint(255 * share), np.uint8)
+
+
+def _seen_by(
+    view: View,
+    points: Array,
+    normals: Array,
+    image: NDArray[np.float32],
+    scene: RayScene,
+    tolerances: ColoringTolerances,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """How well a view sees places (N,), 0 where it does not, and what it sees there (N, 3)."""
+    weight = np.zeros(len(points), np.float32)
+    value = np.zeros((len(points), 3), np.float32)
+    towards = points - view.center_in_world
+    distance = lengths(towards)
+    rays = towards / np.maximum(distance, 1e-300)[:, None]
+    cosine = -dots(rays, normals)
+    chosen = np.flatnonzero(cosine > tolerances.min_cosine)
+    xy = view.project(points[chosen])
+    inside = np.isfinite(xy).all(axis=-1) & in_image(view.camera, np.nan_to_num(xy, nan=-1))
+    chosen, xy = chosen[inside], xy[inside]
+    hits = scene.cast(view.center_in_world, rays[chosen])
+    free = hits.distance > (1 - tolerances.depth_share) * distance[chosen]
+    chosen, xy = chosen[free], xy[free]
+    seen = sample_image(image, xy)
+    seen = np.repeat(seen[:, None], 3, axis=1) if seen.ndim == 1 else seen
+    good = np.isfinite(seen).all(axis=-1)
+    chosen = chosen[good]
+    value[chosen] = seen[good]
+    scale = view.camera.mean_focal_px / distance[chosen]
+    weight[chosen] = cosine[chosen] * np.square(scale) * cosine[chosen]
+    return weight, value
+
+
+def _weighted_medians(values: NDArray[np.float32], weights: NDArray[np.float32]) -> Array:
+    """Medians (N, C) of (N, K, C) values, weighted by (N, K)."""
+    order = np.argsort(values, axis=1)
+    ordered = np.take_along_axis(values, order, axis=1)
+    spread = np.take_along_axis(np.broadcast_to(weights[..., None], values.shape), order, axis=1)
+    total = np.cumsum(spread, axis=1, dtype=np.float64)
+    middle = (total < 0.5 * total[:, -1:]).sum(axis=1)
+    return np.asarray(np.take_along_axis(ordered, middle[:, None], axis=1)[:, 0], np.float64)
+
+
+def texture_size(
+    mesh: TriangleMesh, texel: float, *, tolerances: ColoringTolerances = ColoringTolerances()
+) -> int:
+    """Sides, px, of a square texture whose texels have a size on the surface; a power of two."""
+    area = float(mesh.face_areas.sum())
+    side = np.sqrt(area / tolerances.fill) / max(texel, 1e-300)
+    whole = 2 ** int(np.ceil(np.log2(max(side, 64))))
+    return int(min(whole, tolerances.max_size_px))
+
+
+def paint_texture(
+    mesh: TriangleMesh,
+    uv: Array,
+    colors_of: Callable[[Array, Array], NDArray[np.uint8]],
+    size_px: int,
+    *,
+    tolerances: ColoringTolerances = ColoringTolerances(),
+) -> Texture:
+    """A square texture of a mesh whose vertices have places in it.
+
+    Parameters
+    ----------
+    mesh : with a vertex for each side of a seam.
+    uv : (V, 2), shares of width and height, from the lower left.
+    colors_of : gives (N, 3) colours of points and normals (N, 3).
+    size_px : its sides.
+    """
+    # In the plane of the texture the mesh is looked at from above: a texel's face, and where in it.
+    flat = TriangleMesh(np.column_stack([uv, np.zeros(len(uv))]), mesh.faces)
+    axis = (np.arange(size_px) + 0.5) / size_px
+    u, v = np.meshgrid(axis, axis[::-1])
+    above = np.column_stack([u.ravel(), v.ravel(), np.ones(size_px**2)])
+    hits = RayScene(flat).cast(above, np.tile([0.0, 0.0, -1.0], (len(above), 1)))
+    covered = hits.face >= 0
+    face, place = hits.face[covered], hits.barycentric[covered]
+    points = np.einsum("nk,nkd->nd", place, mesh.corners[face])
+    normals = np.einsum("nk,nkd->nd", place, mesh.vertex_normals[mesh.faces[face]])
+    normals /= np.maximum(lengths(normals), 1e-300)[:, None]
+    image = np.zeros((size_px**2, 3), np.uint8)
+    image[covered] = colors_of(points, normals)
+    return Texture(image=_with_gutter(image, covered, size_px, tolerances.gutter_px), uv=uv)
+
+
+def _with_gutter(
+    image: NDArray[np.uint8], covered: NDArray[np.bool_], size_px: int, gutter_px: int
+) -> NDArray[np.uint8]:
+    """The image with the colours of its charts carried on about them, and their mean beyond."""
+    inside = covered.reshape(size_px, size_px)
+    grown = image.reshape(size_px, size_px, 3).copy()
+    if not inside.any():
+        return grown
+    grown[~inside] = np.rint(image[covered].mean(axis=0)).astype(np.uint8)
+    distance, (rows, cols) = ndimage.distance_transform_edt(~inside, return_indices=True)
+    near = (distance > 0) & (distance <= gutter_px)
+    grown[near] = grown[rows[near], cols[near]]
+    return grown

@@ -1,0 +1,824 @@
+"""One surface from all views: the energy of :mod:`polmvs.surface.terms`, solved coarse to fine.
+
+Each iteration observes the mesh in all views, infers the light of every observation, linearises all
+terms and solves for one displacement per vertex::
+
+    for level in levels:
+        for iteration in level:
+            observations = observe(mesh, views)
+            labels = responsibilities(observations, vote(mesh, observations))
+            mesh, tilt = solve(phases + outlines + points + smoothness)
+        scales = deviations that the residuals of each view and kind of light show
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from polmvs.config import Light, default_num_workers
+from polmvs.fitting import CAUCHY_SCALE, robust_deviation
+from polmvs.geometry import points_on_rays
+from polmvs.parallel import OnProgress, no_progress
+from polmvs.surface.creases import CreaseTolerances, crease_vertices
+from polmvs.surface.labels import (
+    LabelTolerances,
+    Vote,
+    neighbors,
+    responsibilities,
+    vote,
+)
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed
+from polmvs.surface.observations import (
+    KINDS,
+    Image,
+    Looking,
+    Observations,
+    level_image,
+    observe,
+    rows_of_both,
+)
+from polmvs.surface.surface_view import SurfaceView
+from polmvs.surface.terms import (
+    Equations,
+    KnownPoints,
+    KnownSides,
+    OutlineRows,
+    SharedError,
+    TermTolerances,
+    add_outlines,
+    add_phases,
+    add_points,
+    add_votes,
+    outline_rows,
+    shared_edges,
+    smoothness,
+    solve,
+    with_edges,
+)
+
+logger = logging.getLogger(__name__)
+
+POLISHING_STEPS = 2  # until a mesh made anew, which shrinks by some tenths of a pixel, converges
+MIN_LEVELS = 3  # of which the coarse ones can be left out
+MIN_RESIDUALS = 100  # of one view and kind of light, for a deviation of their own
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """One level of refinement.
+
+    Attributes
+    ----------
+    edge_px : edges of the mesh, in pixels' lengths at the surface.
+    num_steps : Gauss-Newton iterations at most.
+    loss_scale : of the phase rows' loss, in their standard deviations.
+    gate_px : outlines farther from a silhouette than this are not drawn to it.
+    """
+
+    edge_px: float
+    num_steps: int
+    loss_scale: float
+    gate_px: float
+
+    @property
+    def width_px(self) -> float:
+        """Of the Gaussian over which Stokes images are averaged: a fifth of an edge.
+
+        Less than 1 px leaves the mosaic's interpolation in the phases (`PhaseTolerances`).
+        """
+        return max(0.2 * self.edge_px, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverTolerances:
+    """Numbers of the solver.
+
+    Attributes
+    ----------
+    levels : coarse to fine.
+    annealing : assumed error of the mesh's normals in the labels, rad, at the first and the last
+        iteration.
+    vote_every : iterations from one vote to the next.
+    last_steps : iterations without a vote, at the end.
+    damping : deviation of a step, in edges; it holds what neither outlines nor points place.
+    unseen_damping : of a vertex that no view sees, in edges; smoothness alone would melt it. Guess.
+    remesh_after : displacement of a fiftieth of the vertices after which a mesh is made anew, in
+        edges. Guess: triangles of a mesh that moves by less stay usable.
+    converged : root mean square of displacements of what is seen that ends a level, in edges.
+    max_lost : share of the silhouettes by which a surface may cover less than its hull before it is
+        made again without coarse levels. Guess: more than the corners that edges round.
+    max_vertices : of a mesh; finer levels are left out. From the time allowed.
+    terms, labels : of these.
+    """
+
+    levels: tuple[Level, ...] = (
+        Level(edge_px=10.0, num_steps=12, loss_scale=12.0, gate_px=25.0),
+        Level(edge_px=5.0, num_steps=12, loss_scale=8.0, gate_px=8.0),
+        Level(edge_px=3.0, num_steps=8, loss_scale=6.0, gate_px=4.0),
+        Level(edge_px=2.0, num_steps=3, loss_scale=4.0, gate_px=4.0),
+    )
+    annealing: tuple[float, float] = (0.5, 0.12)
+    vote_every: int = 2
+    last_steps: int = 5
+    damping: float = 0.5
+    unseen_damping: float = 0.02
+    remesh_after: float = 2.0
+    converged: float = 0.01
+    max_lost: float = 0.05
+    max_vertices: int = 120_000
+    terms: TermTolerances = field(default_factory=TermTolerances)
+    labels: LabelTolerances = field(default_factory=LabelTolerances)
+
+    @property
+    def num_steps(self) -> int:
+        """Iterations at most."""
+        return sum(level.num_steps for level in self.levels)
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Deviations that residuals show beside noise.
+
+    Attributes
+    ----------
+    rows : (K, 2) of ``m . n``, of each view under each kind of light.
+    """
+
+    rows: Array
+
+    def of(self, observations: Observations) -> Array:
+        """Those of observations ``(2, N)``."""
+        return np.asarray(self.rows[observations.view].T)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Views and what they are fitted by.
+
+    Attributes
+    ----------
+    views : what each view shows.
+    images : the same, smoothed for the level in work.
+    looking : angle model and share of the tilt.
+    scales : of the views' rows.
+    footprint : length that a pixel covers at the surface, world units.
+    known : points of the surface.
+    light : of all observations; None: inferred for each.
+    tol : numbers.
+    """
+
+    views: Sequence[SurfaceView]
+    images: Sequence[Image]
+    looking: Looking
+    scales: Scales
+    footprint: float
+    known: KnownPoints | None
+    light: Light | None
+    tol: SolverTolerances
+
+    @property
+    def light_weights(self) -> tuple[float, float]:
+        """Prior shares of specular and of diffuse light."""
+        if self.light is None:
+            return 0.5, 0.5
+        return (1.0, 0.0) if self.light is Light.SPECULAR else (0.0, 1.0)
+
+    def at_width(self, width_px: float) -> Fit:
+        """With images smoothed over another width."""
+        with ThreadPoolExecutor(default_num_workers()) as pool:
+            images = list(pool.map(lambda view: level_image(view, width_px), self.views))
+        return replace(self, images=images)
+
+    def of(self, kept: Mask) -> Fit:
+        """Of some views (K,) alone."""
+        chosen = np.flatnonzero(kept).tolist()
+        return replace(
+            self,
+            views=[self.views[index] for index in chosen],
+            images=[self.images[index] for index in chosen] if len(self.images) else [],
+            scales=Scales(self.scales.rows[chosen]),
+        )
+
+
+def first_fit(
+    views: Sequence[SurfaceView],
+    looking: Looking,
+    footprint: float,
+    *,
+    known: KnownPoints | None = None,
+    light: Light | None = None,
+    tolerances: SolverTolerances | None = None,
+) -> Fit:
+    """What a first surface is fitted by; parameters as of :class:`Fit`."""
+    tol = tolerances or SolverTolerances()
+    rows = np.full((len(views), 2), tol.terms.row_sigma)
+    return Fit(views, [], looking, Scales(rows), footprint, known, light, tol)
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A refined surface.
+
+    Attributes
+    ----------
+    mesh : closed.
+    fit : of the views that are consistent, with the tilt's share and scales that they show.
+    left_out : (K,) bool, views that contradict the others.
+    unexplained : (K,) share of what each view shows that the first level does not explain.
+    meshes : after each level.
+    """
+
+    mesh: TriangleMesh
+    fit: Fit
+    left_out: Mask
+    unexplained: Array
+    meshes: list[TriangleMesh]
+
+
+def refine(
+    mesh: TriangleMesh,
+    fit: Fit,
+    *,
+    stands_apart: Callable[[Array], Mask] | None = None,
+    on_progress: OnProgress = no_progress,
+) -> Refined:
+    """Move a closed mesh until the views' phases and silhouettes agree with it.
+
+    What OPA and PPA leave out, the tilt of the polarizers, errs alike in all rows, so that no
+    number of them averages it out; whether the lens makes it no model can know. Its share is one
+    more unknown.
+
+    Parameters
+    ----------
+    mesh : first surface, closed.
+    fit : of all views.
+    stands_apart : tells from the unexplained shares ``(K,)`` which views contradict the others;
+        these count no longer after the first level.
+    on_progress : called with the number of iterations done.
+    """
+    tol = fit.tol
+    found = _through_levels(mesh, fit, tol.levels, stands_apart, on_progress)
+    share = covered_share(found.mesh, found.fit)
+    if share >= covered_share(mesh, found.fit) - tol.max_lost or len(tol.levels) < MIN_LEVELS:
+        return found
+    logger.info("walls are thinner than coarse edges; the surface is made again by fine ones.")
+    *coarse, fine, last = tol.levels
+    # The way is as long, and a step no longer than an edge.
+    steps = fine.num_steps + sum(level.num_steps * level.edge_px for level in coarse) / fine.edge_px
+    first = replace(coarse[0], edge_px=fine.edge_px, num_steps=round(steps))
+    again = _through_levels(mesh, fit, (first, last), stands_apart, no_progress)
+    return again if covered_share(again.mesh, again.fit) > share else found
+
+
+def _through_levels(
+    mesh: TriangleMesh,
+    fit: Fit,
+    levels: Sequence[Level],
+    stands_apart: Callable[[Array], Mask] | None,
+    on_progress: OnProgress,
+) -> Refined:
+    """The surface after some levels; parameters as of :func:`refine`."""
+    tol, done = fit.tol, 0
+    meshes: list[TriangleMesh] = []
+    total = sum(level.num_steps for level in levels)
+    left_out = np.zeros(len(fit.views), np.bool_)
+    unexplained = np.full(len(fit.views), np.nan)
+    for number, level in enumerate(levels):
+        edge = level.edge_px * fit.footprint
+        if number and 1.2 * mesh.face_areas.sum() / edge**2 > tol.max_vertices:
+            edge = float(np.sqrt(1.2 * mesh.face_areas.sum() / tol.max_vertices))
+        fit = fit.at_width(level.width_px)
+        mesh, fit = _refined_at(mesh, fit, level, edge, (done, total), on_progress)
+        done += level.num_steps
+        meshes.append(mesh)
+        if not len(mesh.faces):
+            break
+        if number == 0 and stands_apart is not None:
+            unexplained = unexplained_shares(mesh, fit)
+            left_out = stands_apart(unexplained)
+            fit = fit.of(~left_out)
+    return Refined(mesh, fit, left_out, unexplained, meshes)
+
+
+def covered_share(mesh: TriangleMesh, fit: Fit, *, stride_px: int = 4) -> float:
+    """Mean share of the certain silhouettes that a mesh covers; 1 without any."""
+    scene = RayScene(mesh) if len(mesh.faces) else None
+    shares = []
+    for view in fit.views:
+        rays = certain_rays(view, stride_px)
+        if len(rays):
+            hit = 0.0 if scene is None else float((scene.cast(view.center, rays).face >= 0).mean())
+            shares.append(hit)
+    return float(np.mean(shares)) if shares else 1.0
+
+
+def _refined_at(
+    mesh: TriangleMesh,
+    fit: Fit,
+    level: Level,
+    edge: float,
+    progress: tuple[int, int],
+    on_progress: OnProgress,
+) -> tuple[TriangleMesh, Fit]:
+    """The surface after one level, with edges of the given length.
+
+    ``progress`` are the iterations done before it, and of all levels.
+    """
+    tol, (done, total) = fit.tol, progress
+    moved, energy = np.zeros(len(mesh.vertices)), None
+    first, last = tol.annealing
+    for step in range(level.num_steps):
+        # A mesh that has moved far is uneven and may intersect itself; one that has not is
+        # left alone, for the grid rounds its creases.
+        if step == 0 or np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge:
+            mesh = remeshed(mesh, edge)
+            moved = np.zeros(len(mesh.vertices))
+        if not len(mesh.faces):
+            return mesh, fit
+        share = (done + step) / max(total - 1, 1)
+        with_vote = step % tol.vote_every == 0 and done + step < total - tol.last_steps
+        energy = linearize(
+            mesh,
+            fit,
+            edge,
+            level,
+            normal_sigma=first * (last / first) ** share,
+            with_vote=with_vote,
+            with_slope=True,
+        )
+        mesh, displacement = _step(mesh, energy, edge, tol)
+        fit = replace(fit, looking=energy.with_tilt(fit.looking, displacement))
+        moved = moved + displacement
+        free = displacement[energy.free]
+        change = float(np.sqrt(np.mean(free**2))) if len(free) else 0.0
+        logger.info(
+            "edges of %.1f px, %d vertices: moved by %.3f px; light %.0f %% specular, %.0f %% "
+            "diffuse; %.2f of the polarizers' tilt.",
+            edge / fit.footprint,
+            len(mesh.vertices),
+            change / fit.footprint,
+            *(100 * energy.light),
+            fit.looking.tilt_share,
+        )
+        on_progress(1)
+        if not with_vote and change < tol.converged * edge and step > 1:
+            on_progress(level.num_steps - step - 1)
+            break
+    assert energy is not None  # a level has an iteration
+    return mesh, replace(fit, scales=energy.scales)
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What some views say of the displacements of one mesh.
+
+    Attributes
+    ----------
+    equations : of their phases and outlines.
+    outline_slope : (V,), change of the gradient by an error of all silhouettes, per px.
+    tilt : share of the polarizers' tilt that is still to be taken back.
+    """
+
+    equations: Equations
+    outline_slope: Array
+    tilt: SharedError
+
+
+@dataclass(frozen=True)
+class Energy:
+    """The energy about one mesh, as the parts of its normal equations.
+
+    Attributes
+    ----------
+    views : what all of them say.
+    of_views : the same of some of them, by their indices.
+    points : equations of the known points.
+    smooth, pull : matrix ``(V, V)`` and gradient ``(V,)`` of the smoothness, and the matrix
+        ``(V, V)`` whose product with its own transpose is the former.
+    free : (V,) bool, vertices of faces that some view sees.
+    sharp : (V,) bool, vertices on edges between sides.
+    light : (2,) shares of the observations whose light is specular, and diffuse.
+    scales : that the rows' residuals show.
+    """
+
+    views: _Evidence
+    of_views: Callable[[Sequence[int]], _Evidence]
+    points: Equations
+    smooth: sparse.csr_array
+    pull: Array
+    smooth_factor: sparse.csr_array
+    free: Mask
+    sharp: Mask
+    light: Array
+    scales: Scales
+
+    def matrix(self) -> sparse.csr_array:
+        """Of all parts ``(V, V)``, without damping."""
+        return sparse.csr_array(self.views.equations.matrix() + self.points.matrix() + self.smooth)
+
+    def gradient(self) -> Array:
+        """Of all parts ``(V,)``."""
+        tilt = self.views.tilt
+        sums = self.views.equations.gradient + self.points.gradient + self.pull
+        return np.asarray(sums - tilt.offset() * tilt.column())
+
+    def with_tilt(self, looking: Looking, displacement: Array) -> Looking:
+        """With the share of the tilt that a solution (V,) shows."""
+        if not looking.tilt_aware:
+            return looking
+        share = looking.tilt_share + self.views.tilt.solved(displacement)
+        return replace(looking, tilt_share=float(np.clip(share, 0, 1)))
+
+
+def linearize(
+    mesh: TriangleMesh,
+    fit: Fit,
+    edge: float,
+    level: Level,
+    *,
+    normal_sigma: float,
+    with_vote: bool = False,
+    with_slope: bool = False,
+    sides: KnownSides | None = None,
+) -> Energy:
+    """The energy about a mesh.
+
+    Parameters
+    ----------
+    edge : length of its edges.
+    normal_sigma : rad, assumed error of its normals in the labels.
+    with_vote : try other normals for the labels, and turn faces towards those that win.
+    with_slope : count how a row changes as its place moves through the image. It places what no
+        outline bounds (the floor of a dish, waves).
+    sides : of a sharpened mesh, whose very outline is then held against the silhouettes.
+    """
+    views, tol = fit.views, fit.tol
+    terms = tol.terms
+    scene, edges = RayScene(mesh), shared_edges(mesh)
+    pairs = edges.faces[:, 0], edges.faces[:, 1]
+    observations = observe(
+        mesh,
+        scene,
+        views,
+        fit.images,
+        fit.looking,
+        footprint=fit.footprint if with_slope else None,
+    )
+    is_seen = np.zeros(len(mesh.faces), np.bool_)
+    is_seen[observations.face] = True
+    sharp = np.zeros(len(mesh.vertices), np.bool_)
+    if sides is not None:
+        edges = edges.only(np.all(sides.is_shown[edges.faces], axis=1))
+        sharp = crease_vertices(mesh, sides.is_shown)
+        # Edges go where their sides meet: the faces there say nothing of the sides beside them.
+        used = sides.is_fitted & ~np.any(sharp[mesh.faces], axis=1)
+        observations = observations.only(used[observations.face])
+    row_sigma = fit.scales.of(observations)
+    voted = Vote(mesh.face_normals, np.zeros(len(mesh.faces), np.bool_))
+    if with_vote:
+        voted = vote(mesh, observations, pairs, row_sigma=row_sigma, tolerances=tol.labels)
+    shares = responsibilities(
+        observations,
+        voted.normals,
+        normal_sigma=normal_sigma,
+        row_sigma=row_sigma,
+        near=neighbors(observations, pairs, len(mesh.faces)),
+        weights=fit.light_weights,
+        tolerances=tol.labels,
+    )
+    variances = observations.variances(mesh.face_normals, row_sigma)
+    face_area_px = float(mesh.face_areas.mean()) / fit.footprint**2
+    independent_area = terms.independent_px * level.width_px**2 * fit.footprint**2
+
+    def outline(view: SurfaceView) -> OutlineRows | None:
+        if not view.has_outline:
+            return None
+        return outline_rows(
+            mesh, scene, view, edges, sharp, gate_px=level.gate_px, on_outline=sides is not None
+        )
+
+    # Threads, for products of large arrays and the casting of rays let go of Python's lock.
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        outlines = list(pool.map(outline, views))
+
+    def of_views(chosen: Sequence[int]) -> _Evidence:
+        equations = Equations(len(mesh.vertices))
+        # Anything between a sensor of the angle model and a tilted polarizer may be, as little
+        # known as what else the rows share.
+        tilt = SharedError(
+            len(mesh.vertices),
+            prior=terms.phase_correlation(face_area_px),
+            expected=-fit.looking.tilt_share,
+        )
+        kept = np.isin(observations.view, chosen)
+        add_phases(
+            equations,
+            tilt,
+            mesh,
+            observations if kept.all() else observations.only(kept),
+            shares[:, kept],
+            variances[:, kept],
+            independent_area=independent_area,
+            loss_scale=level.loss_scale,
+        )
+        own = [rows for rows in (outlines[index] for index in chosen) if rows is not None]
+        slope = add_outlines(
+            equations, own, terms, face_area_px=face_area_px, gate_px=level.gate_px
+        )
+        return _Evidence(equations, slope, tilt)
+
+    everything = of_views(range(len(views)))
+    if voted.has_won.any():
+        add_votes(
+            everything.equations,
+            mesh,
+            voted.normals,
+            voted.has_won,
+            sigma=terms.vote_sigma,
+            independent_area=independent_area,
+        )
+    points = Equations(len(mesh.vertices))
+    if fit.known is not None and len(fit.known.points) and is_seen.any():
+        add_points(
+            points,
+            mesh,
+            is_seen,
+            fit.known,
+            terms,
+            num_views=len(views),
+            footprint=fit.footprint,
+            face_area_px=face_area_px,
+            gate_px=level.gate_px,
+        )
+    smooth, pull, factor = smoothness(mesh, edge, terms, sharp)
+    free = np.zeros(len(mesh.vertices), np.bool_)
+    free[mesh.faces[is_seen]] = True
+    return Energy(
+        views=everything,
+        of_views=of_views,
+        points=points,
+        smooth=smooth,
+        pull=pull,
+        smooth_factor=factor,
+        free=free,
+        sharp=sharp,
+        light=shares.mean(axis=1) if shares.size else np.zeros(2),
+        scales=_shown_scales(observations, mesh.face_normals, shares, fit),
+    )
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """Observations of a refined mesh with the light that they probably are of.
+
+    Attributes
+    ----------
+    observations : K of them.
+    shares : (2, K) probabilities of specular and of diffuse light.
+    row_sigma : (2, K) deviation of ``m . n`` beside noise.
+    num_views : of all observations.
+    """
+
+    observations: Observations
+    shares: Array
+    row_sigma: Array
+    num_views: int
+
+    @property
+    def kind(self) -> Indices:
+        """(K,) the likelier light."""
+        return np.asarray(self.shares.argmax(axis=0), np.int64)
+
+    @property
+    def excess(self) -> Array:
+        """(K,) by how much it is likelier than the other."""
+        return np.asarray(np.abs(self.shares[0] - self.shares[1]))
+
+    def residuals(self, mesh: TriangleMesh) -> tuple[Array, Array]:
+        """``m . n`` (K,) under the likelier light, and its variance (K,)."""
+        kind, index = self.kind, np.arange(len(self.observations.face))
+        residuals = self.observations.residuals(mesh.face_normals)
+        variances = self.observations.variances(mesh.face_normals, self.row_sigma)
+        return residuals[kind, index], variances[kind, index]
+
+    def contradicts(self, mesh: TriangleMesh) -> Mask:
+        """(K,) bool, beyond what noise explains, and what tells the sides of a crease apart."""
+        residual, variance = self.residuals(mesh)
+        limit = np.maximum(3 * np.sqrt(variance), CreaseTolerances.like_sine)
+        return np.asarray(np.abs(residual) > limit)
+
+    def mean_loss(self, mesh: TriangleMesh) -> float:
+        """Mean of a robust loss of the residuals, in [0, 1]: how badly the mesh fits its phases."""
+        residual, variance = self.residuals(mesh)
+        square = residual**2 / variance
+        area = mesh.face_areas[self.observations.face]
+        loss = square / (square + CAUCHY_SCALE**2)
+        return float((area * loss).sum() / max(float(area.sum()), 1e-300))
+
+    def means(self, num_faces: int) -> Array:
+        """Means (3, F) over a face's observations: of both probabilities, and of the DoLP."""
+        face = self.observations.face
+        count = np.maximum(np.bincount(face, minlength=num_faces), 1)
+        values = (*self.shares, self.observations.dolp)
+        return np.stack([np.bincount(face, value, num_faces) / count for value in values])
+
+
+def label(mesh: TriangleMesh, fit: Fit, *, min_cosine: float | None = None) -> Labelled:
+    """The observations of a refined mesh with their light.
+
+    Parameters
+    ----------
+    min_cosine : flatter sight is not counted; by default as in the refinement.
+    """
+    looking = fit.looking if min_cosine is None else replace(fit.looking, min_cosine=min_cosine)
+    edges = shared_edges(mesh)
+    pairs = edges.faces[:, 0], edges.faces[:, 1]
+    observations = observe(mesh, RayScene(mesh), fit.views, fit.images, looking)
+    row_sigma = fit.scales.of(observations)
+    shares = responsibilities(
+        observations,
+        mesh.face_normals,
+        normal_sigma=fit.tol.annealing[1],
+        row_sigma=row_sigma,
+        near=neighbors(observations, pairs, len(mesh.faces)),
+        weights=fit.light_weights,
+        tolerances=fit.tol.labels,
+    )
+    return Labelled(observations, shares, row_sigma, len(fit.views))
+
+
+def _shown_scales(observations: Observations, normals: Array, shares: Array, fit: Fit) -> Scales:
+    """Deviations of rows beside their noise, of each view under each kind of light.
+
+    Where a view has few observations of a kind, those of all views stand for it.
+    """
+    least = fit.tol.terms.row_sigma
+    residuals = observations.residuals(normals)
+    noise = observations.variances(normals, np.zeros(1))
+    found = np.full((len(fit.views), 2), least)
+    for kind in KINDS:
+        own = shares[kind] > 0.5
+
+        def deviation(chosen: Mask, kind: int = kind) -> float:
+            if chosen.sum() < MIN_RESIDUALS:
+                return np.nan
+            square = robust_deviation(residuals[kind, chosen]) ** 2
+            return float(np.sqrt(max(square - np.median(noise[kind, chosen]), least**2)))
+
+        of_all = np.nan_to_num(deviation(own), nan=least)
+        for index in range(len(fit.views)):
+            shown = deviation(own & (observations.view == index))
+            found[index, kind] = of_all if np.isnan(shown) else shown
+    return Scales(found)
+
+
+def _step(
+    mesh: TriangleMesh, energy: Energy, edge: float, tol: SolverTolerances
+) -> tuple[TriangleMesh, Array]:
+    """One Gauss-Newton step: the new mesh and the displacements ``(V,)``."""
+    damping = np.where(energy.free, tol.damping, tol.unseen_damping) * edge
+    shared = energy.views.tilt.column()
+    displacement = -solve(energy.matrix(), energy.gradient(), 1 / damping**2, shared)
+    displacement = np.clip(np.nan_to_num(displacement), -edge, edge)
+    moves = displacement[:, None] * mesh.vertex_normals
+    return mesh.moved(with_edges(mesh, moves, energy.sharp)), displacement
+
+
+def polishing_step(mesh: TriangleMesh, fit: Fit, sides: KnownSides) -> tuple[TriangleMesh, bool]:
+    """A mesh with sharp edges, one step nearer to where outlines, points and phases have it.
+
+    Parameters
+    ----------
+    mesh : sharpened; its triangles stay.
+    fit : of a refined surface.
+    sides : what is known of its faces.
+
+    Returns
+    -------
+    The mesh, and whether it has converged.
+    """
+    tol, edge = fit.tol, mesh.mean_edge
+    energy = linearize(mesh, fit, edge, tol.levels[-1], normal_sigma=tol.annealing[1], sides=sides)
+    moved, displacement = _step(mesh, energy, edge, tol)
+    free = np.abs(displacement[energy.free & ~energy.sharp])
+    return moved, not len(free) or float(np.median(free)) < 0.03 * edge
+
+
+def certain_rays(view: SurfaceView, stride_px: int) -> Array:
+    """Unit rays ``(N, 3)``, world, of every so many-th pixel of a view's certain silhouette."""
+    half = stride_px // 2
+    rows, cols = np.nonzero(view.silhouette.certain[half::stride_px, half::stride_px])
+    xy = np.stack([cols, rows], axis=1) * stride_px + half + 0.5
+    return view.view.rays_in_world(xy)
+
+
+def unexplained_shares(mesh: TriangleMesh, fit: Fit, *, stride_px: int = 4) -> Array:
+    """How little a mesh explains of each view: mean ``(K,)`` over its certain silhouette's pixels.
+
+    1 where it shows nothing, or a normal that the phase contradicts under both kinds of light by
+    far more than all views' rows show; 0 where they agree.
+    """
+    scene, shares = RayScene(mesh), np.full(len(fit.views), np.nan)
+    row_sigma = float(np.median(fit.scales.rows))
+    for index, (view, image) in enumerate(zip(fit.views, fit.images, strict=True)):
+        rays = certain_rays(view, stride_px)
+        hits = scene.cast(view.center, rays)
+        hit = np.flatnonzero(hits.face >= 0)
+        points = points_on_rays(view.center, rays[hit], hits.distance[hit])
+        looking = fit.looking
+        found = rows_of_both(
+            view,
+            image,
+            looking.angle_model,
+            points,
+            tilt_aware=looking.tilt_aware,
+            tilt_share=looking.tilt_share,
+        )
+        normals = mesh.face_normals[hits.face[hit]]
+        residuals = np.einsum("lki,ki->lk", found.rows, normals)
+        sine2 = 1 - np.einsum("ki,ki->k", rays[hit], normals) ** 2
+        with np.errstate(invalid="ignore"):
+            square = (residuals**2 / (row_sigma**2 + sine2 * found.turn_variance)).min(axis=0)
+        known = np.isfinite(found.turn_variance[0])
+        loss = np.ones(len(rays))
+        loss[hit[known]] = (square / (square + CAUCHY_SCALE**2))[known]
+        kept = hits.face < 0
+        kept[hit[known]] = True  # a pixel without a phase says nothing of the mesh
+        if kept.any():
+            shares[index] = loss[kept].mean()
+    return shares
+
+
+def place_deviations(
+    mesh: TriangleMesh,
+    fit: Fit,
+    *,
+    max_groups: int = 24,
+    num_samples: int = 12,
+    seed: int = 0,
+) -> Array:
+    """Standard deviation ``(V,)`` of the place along the normal of each vertex of a refined mesh.
+
+    What the views contribute is taken from the views: the jackknife (Tukey 1958), how far the
+    surface moves when one of them, or one of some groups of them, is left out. Whatever a view's
+    phases and outline have in common (light, pose, blur) is in it, without a guess of what. What
+    all views share is not: the share of the polarizers' tilt and the bias of the outlines are
+    added, and samples of the errors of points and smoothness, and of the views' stated noise, below
+    which few views agree by chance. Large where only smoothness carries a vertex.
+
+    Parameters
+    ----------
+    mesh, fit : as of :func:`refine`, refined.
+    max_groups : of views, to leave out.
+    num_samples : the deviation of a deviation is one over the root of twice as many.
+    seed : of the random numbers.
+    """
+    tol = fit.tol
+    num, rng, level = len(mesh.vertices), np.random.default_rng(seed), tol.levels[-1]
+    if not num:
+        return np.zeros(0)
+    edge, num_views = mesh.mean_edge, len(fit.views)
+    face_area_px = float(mesh.face_areas.mean()) / fit.footprint**2
+
+    def energy_of(mesh: TriangleMesh) -> Energy:
+        return linearize(mesh, fit, edge, level, normal_sigma=tol.annealing[1], with_slope=True)
+
+    energy = energy_of(mesh)
+    for _ in range(POLISHING_STEPS):
+        mesh, _ = _step(mesh, energy, edge, tol)
+        energy = energy_of(mesh)
+    matrix = energy.matrix()
+    # Nothing but the energy holds the surface here; what no view sees is not used.
+    loose = 1 / (np.where(energy.free, 100.0, tol.unseen_damping) * edge) ** 2
+    none = np.zeros(num)
+    rest = -solve(matrix, energy.gradient(), loose, none)
+    by_tilt = solve(matrix, energy.views.tilt.slope, loose, none)
+    # What rows share is as uncertain as their own errors would be, were they not weighted down.
+    by_tilt *= energy.views.tilt.deviation(by_tilt) * np.sqrt(
+        tol.terms.phase_correlation(face_area_px)
+    )
+    by_outlines = solve(matrix, energy.views.outline_slope, loose, none)
+    variance = by_tilt**2 + (tol.terms.outline_bias_px * by_outlines) ** 2
+    for _ in range(num_samples):
+        noise = energy.views.equations.noise(rng) + energy.smooth_factor @ rng.standard_normal(num)
+        noise += np.sqrt(tol.terms.point_weight(num_views, face_area_px)) * energy.points.noise(rng)
+        variance += solve(matrix, noise, loose, none) ** 2 / num_samples
+    num_groups = min(num_views, max_groups)
+    for first in range(num_groups):
+        # Neighbours by name are likely to see the same: each goes to a group of its own.
+        left_out = energy.of_views(range(first, num_views, num_groups)).equations
+        own = left_out.matrix()
+        change = solve(sparse.csr_array(matrix - own), left_out.gradient + own @ rest, loose, none)
+        variance += (num_groups - 1) / num_groups * change**2
+    return np.where(energy.free, np.sqrt(variance), np.inf)

@@ -1,0 +1,594 @@
+"""Terms of the energy: each linearises itself about a mesh.
+
+Over the displacements u of the vertices along their normals, and few unknowns that all views share,
+
+    E(u) = sum_o  w_o rho(r_o / sigma_o)     phases      :func:`add_phases`
+         + sum_v  rho(d_v / sigma_v)         outlines    :func:`add_outlines`
+         + sum_p  rho(h_p / sigma_p)         points      :func:`add_points`
+         + sum_i  rho(k_i / sigma_k)         smoothness  :func:`smoothness`
+
+with the residuals ``r = m . n`` of observations under the light that they probably are of
+(:mod:`polmvs.surface.labels`), distances d of the mesh's outline to the silhouettes, heights h
+above known points, and changes k of the scale-free curvature. All losses rho are robust (Geman and
+McClure 1985). One Gauss-Newton step solves the sum of all (:mod:`polmvs.surface.solver`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, cg
+
+from polmvs.camera import sample_image
+from polmvs.fitting import geman_mcclure_weights, robust_deviation
+from polmvs.geometry import dots, lengths, unit_or_zero
+from polmvs.surface.creases import CreaseTolerances
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
+from polmvs.surface.observations import KINDS, Observations
+from polmvs.surface.surface_view import SurfaceView
+
+EDGE_NOISE = 0.1  # of the sines of normals beside an edge: half of what parts its sides
+RIM_HALVINGS = 4  # of a pixel, in which a mesh's outline is looked for: to a sixteenth
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TermTolerances:
+    """Numbers of the terms.
+
+    Attributes
+    ----------
+    row_sigma : least deviation of ``m . n`` beside noise (facets, interreflection). Measured: 0.03.
+    independent_px : area over which phases err alike, px^2, where they are smoothed over 1 px;
+        smaller faces count by their area. Measured: counting each face anew costs 4 %.
+    alike_px : area over which the phases' errors are alike because the model of the light makes
+        them and not noise, px^2: outlines and points count that much more than so many rows would
+        let them. Measured on `dome`: a bias of the phases bends it by 1.5 mm with 4, by 0.7 with
+        400, by 0.4 with 1600, which dents `mug` at its sparse points.
+    alike_views : in which they are alike, too: of more views points count the more.
+    place_sigma_px : least deviation of an outline, and of a known point in pixels' lengths; an
+        outline's residuals may show a larger one. Measured: 0.3; 0.7 costs 30 % on general shapes.
+    outline_bias_px : deviation of an error of all silhouettes together, too wide or too narrow.
+        Measured on the true outlines of four captures: -0.35 to 0.04. It is part of the stated
+        deviations and not solved for.
+    smoothness : deviation of the scale-free curvature from its surroundings' mean. Measured: 0.02
+        to 0.08 alike.
+    smoothness_memory : share of the surroundings' curvature that is not resisted. Measured: 0.8.
+    vote_sigma : deviation of a face's normal from the one that its observations vote for. Measured,
+        0.03 and 0.07: a ledge beside a box lies 0.57 and 0.98 px off, a public ceramic alike.
+    """
+
+    row_sigma: float = 0.03
+    independent_px: float = 4.0
+    alike_px: float = 400.0
+    alike_views: int = 20
+    place_sigma_px: float = 0.3
+    outline_bias_px: float = 0.1
+    smoothness: float = 0.04
+    smoothness_memory: float = 0.8
+    vote_sigma: float = 0.03
+
+    def phase_correlation(self, face_area_px: float) -> float:
+        """Rows whose errors are alike, of faces of such an area, px^2."""
+        return max(self.alike_px / max(face_area_px, self.independent_px), 1.0)
+
+    def point_weight(self, num_views: int, face_area_px: float) -> float:
+        """Weight of the known points' rows, whose errors are not alike."""
+        return self.phase_correlation(face_area_px) * max(1.0, num_views / self.alike_views)
+
+
+@dataclass(frozen=True)
+class KnownPoints:
+    """Points of the surface known from elsewhere.
+
+    Attributes
+    ----------
+    points : (N, 3), world.
+    sigma : (N,), of the place, world units.
+    """
+
+    points: Array
+    sigma: Array
+
+
+@dataclass(frozen=True)
+class KnownSides:
+    """What is known of the sides of a sharpened mesh with F faces.
+
+    Attributes
+    ----------
+    is_shown : (F,) bool, faces of sides whose normal is known: edges between others are still
+        round. Their outlines do not count, and smoothness holds them.
+    is_fitted : (F,) bool, faces whose normal phases show. Those of others are no one side's, or
+        what they mirror: they push a step's walls out by up to 1.3 mm (`step`).
+    """
+
+    is_shown: Mask
+    is_fitted: Mask
+
+
+@dataclass
+class Equations:
+    """Normal equations of displacements that are being summed."""
+
+    num: int
+    gradient: Array = field(init=False)
+    _vertices: list[Indices] = field(default_factory=list)
+    _blocks: list[Array] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.gradient = np.zeros(self.num)
+
+    def add(self, vertices: Indices, jacobian: Array, residual: Array, weight: Array) -> None:
+        """Residuals ``(N,)`` that depend on three vertices ``(N, 3)`` each."""
+        blocks = weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :]
+        self.add_blocks(vertices, blocks, (weight * residual)[:, None] * jacobian)
+
+    def add_blocks(self, vertices: Indices, blocks: Array, gradient: Array) -> None:
+        """Sums ``(N, 3, 3)`` and ``(N, 3)`` of such residuals."""
+        self._vertices.append(vertices)
+        self._blocks.append(blocks)
+        self.gradient += np.bincount(vertices.ravel(), gradient.ravel(), self.num)
+
+    def noise(self, rng: np.random.Generator) -> Array:
+        """A random gradient ``(num,)`` with the matrix as its covariance."""
+        total = np.zeros(self.num)
+        for vertices, blocks in zip(self._vertices, self._blocks, strict=True):
+            values, vectors = np.linalg.eigh(blocks)
+            random = rng.standard_normal(values.shape) * np.sqrt(np.maximum(values, 0))
+            drawn = (vectors @ random[:, :, None])[..., 0]
+            total += np.bincount(vertices.ravel(), drawn.ravel(), self.num)
+        return total
+
+    def matrix(self) -> sparse.csr_array:
+        """The sum, ``(num, num)``."""
+        shape = (self.num, self.num)
+        if not self._blocks:
+            return sparse.csr_array(shape, dtype=np.float64)
+        rows = [np.repeat(vertices, 3, axis=1).ravel() for vertices in self._vertices]
+        cols = [np.tile(vertices, (1, 3)).ravel() for vertices in self._vertices]
+        data = np.concatenate([blocks.ravel() for blocks in self._blocks])
+        indices = (np.concatenate(rows), np.concatenate(cols))
+        return sparse.coo_array((data, indices), shape=shape).tocsr()
+
+
+@dataclass
+class SharedError:
+    """One unknown error that many residuals share, solved for and left out of the equations.
+
+    With residuals ``J x + r - f b`` of weights w and ``b`` of weight ``prior`` about ``expected``,
+    the equations lose ``u uT`` and their right side ``u`` times :meth:`offset`, u being
+    :meth:`column`.
+    """
+
+    num: int
+    prior: float
+    expected: float = 0.0
+    slope: Array = field(init=False)
+    _weight: float = 0.0
+    _residual: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.slope = np.zeros(self.num)
+        self._residual = self.prior * self.expected
+
+    def add(
+        self,
+        vertices: Indices,
+        jacobian: Array,
+        residual: Array,
+        weight: Array,
+        factor: Array | float = 1.0,
+    ) -> None:
+        """Residuals as in :meth:`Equations.add`, with the factors f."""
+        factor = np.broadcast_to(factor, residual.shape)
+        weighted = ((weight * factor)[:, None] * jacobian).ravel()
+        self.slope += np.bincount(vertices.ravel(), weighted, self.num)
+        self._weight += float(weight @ factor**2)
+        self._residual += float((weight * factor) @ residual)
+
+    def column(self) -> Array:
+        """The vector u ``(num,)`` of the class's text."""
+        return np.asarray(self.slope / np.sqrt(self._weight + self.prior))
+
+    def offset(self) -> float:
+        """Factor of u on the right side."""
+        return self._residual / float(np.sqrt(self._weight + self.prior))
+
+    def solved(self, displacement: Array) -> float:
+        """The error itself, given the solution ``(num,)``."""
+        return (self._residual + float(self.slope @ displacement)) / (self._weight + self.prior)
+
+    def deviation(self, response: Array) -> float:
+        """Deviation of the error itself once all is solved.
+
+        ``response`` (num,) is the solution, without the error, for ``slope`` as right side.
+        """
+        left = self._weight + self.prior - float(self.slope @ response)
+        return float(1 / np.sqrt(max(left, self.prior)))
+
+
+def normal_changes(mesh: TriangleMesh) -> Array:
+    """Change of a face's normal, ``(F, 3, 3)``, by the displacement of each vertex along its own.
+
+    The part along the normal is not taken out: residuals do that.
+    """
+    a, b, c = np.moveaxis(mesh.corners, 1, 0)
+    opposite = np.stack([c - b, a - c, b - a], axis=1)
+    crossed = np.cross(opposite, mesh.vertex_normals.take(mesh.faces, axis=0))
+    return np.asarray(crossed / np.maximum(2 * mesh.face_areas, 1e-300)[:, None, None])
+
+
+def add_phases(
+    equations: Equations,
+    tilt: SharedError,
+    mesh: TriangleMesh,
+    observations: Observations,
+    shares: Array,
+    variances: Array,
+    *,
+    independent_area: float,
+    loss_scale: float,
+) -> None:
+    """Add the rows of observations.
+
+    ``r_s^2 + r_d^2`` is about the squared sine of the angle between normal and ray: where the label
+    is undecided, both rows together would turn the normal towards the ray. What the precision of
+    one kind has beyond that of the other is what pulls.
+
+    Parameters
+    ----------
+    tilt : the share of the polarizers' tilt that is still to be taken back.
+    shares : (2, K) probabilities of both kinds of light.
+    variances : (2, K) of the residuals.
+    independent_area : over which phases err alike; smaller faces count by their area.
+    loss_scale : of the loss, in deviations.
+    """
+    o, num = observations, len(mesh.faces)
+    blocks, gradient = np.zeros((num, 9)), np.zeros((num, 3))
+    change = normal_changes(mesh)
+    along = dots(mesh.vertex_normals.take(mesh.faces, axis=0), mesh.face_normals[:, None]) / 3
+    area = np.minimum(mesh.face_areas / independent_area, 1.0)
+    residuals, tilts = o.residuals(mesh.face_normals), o.tilt_slopes(mesh.face_normals)
+    precision = shares / variances
+    excess = precision - precision[::-1]
+    for kind in KINDS:
+        some = np.flatnonzero(excess[kind] > 0)
+        face, residual = o.face[some], residuals[kind, some]
+        weight = excess[kind, some] * area[face]
+        weight *= geman_mcclure_weights(residual, loss_scale**2 * variances[kind, some])
+        across = o.rows[kind, some] - residual[:, None] * mesh.face_normals.take(face, axis=0)
+        jacobian = np.einsum("nij,nj->ni", change.take(face, axis=0), across)
+        jacobian += along[face] * o.slope[kind, some][:, None]
+        for a in range(3):
+            weighted = weight * jacobian[:, a]
+            gradient[:, a] += np.bincount(face, weighted * residual, num)
+            for b in range(3):
+                blocks[:, 3 * a + b] += np.bincount(face, weighted * jacobian[:, b], num)
+        tilt.add(mesh.faces[face], jacobian, residual, weight, -tilts[kind, some])
+    equations.add_blocks(mesh.faces, blocks.reshape(-1, 3, 3), gradient)
+
+
+def add_votes(
+    equations: Equations,
+    mesh: TriangleMesh,
+    normals: Array,
+    has_won: Mask,
+    *,
+    sigma: float,
+    independent_area: float,
+) -> None:
+    """Turn faces towards the normals ``(F, 3)`` that their observations voted for."""
+    face = np.flatnonzero(has_won)
+    target, own = normals[face], mesh.face_normals[face]
+    change = normal_changes(mesh)[face]
+    weight = np.minimum(mesh.face_areas[face] / independent_area, 1.0) / sigma**2
+    helper = np.where(np.abs(target[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    first = unit_or_zero(np.cross(target, helper))
+    for tangent in (first, np.cross(target, first)):
+        residual = dots(tangent, own)
+        jacobian = np.einsum("nij,nj->ni", change, tangent - residual[:, None] * own)
+        equations.add(mesh.faces[face], jacobian, residual, weight)
+
+
+@dataclass(frozen=True)
+class SharedEdges:
+    """Edges of a mesh with the two faces that share each.
+
+    Attributes
+    ----------
+    ends : (E, 2) vertices.
+    faces : (E, 2)
+    """
+
+    ends: Indices
+    faces: Indices
+
+    def only(self, kept: Mask) -> SharedEdges:
+        """The ``kept`` (E,) of them."""
+        return SharedEdges(self.ends[kept], self.faces[kept])
+
+
+def shared_edges(mesh: TriangleMesh) -> SharedEdges:
+    """All edges that two faces share."""
+    num = len(mesh.faces)
+    ends = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    face = np.repeat(np.arange(num), 3)
+    key = ends[:, 0] * np.int64(len(mesh.vertices)) + ends[:, 1]
+    order = np.argsort(key, kind="stable")
+    paired = np.flatnonzero(key[order][1:] == key[order][:-1])
+    first, second = order[paired], order[paired + 1]
+    return SharedEdges(ends[first], np.stack([face[first], face[second]], axis=1))
+
+
+@dataclass(frozen=True)
+class Rim:
+    """Points of a mesh on its outline against the background of one view.
+
+    Attributes
+    ----------
+    ends : (K, 2) vertices; the points lie in the middle between them.
+    faces : (K, 2) that share these edges.
+    xy : (K, 2) image coordinates of the points, or of the mesh's outline beside them.
+    length_px : (K,) of the outline that each stands for.
+    """
+
+    ends: Indices
+    faces: Indices
+    xy: Array
+    length_px: Array
+
+
+def find_rim(
+    mesh: TriangleMesh,
+    scene: RayScene,
+    view: SurfaceView,
+    edges: SharedEdges,
+    *,
+    on_outline: bool = False,
+) -> Rim:
+    """The outline of a mesh in a view: edges between faces to and fro with nothing behind them.
+
+    With ``on_outline`` each point is moved outwards to where rays begin to pass the mesh.
+    """
+    towards = view.center - mesh.centers
+    front = dots(towards, mesh.face_normals) > 0
+    turning = front[edges.faces[:, 0]] != front[edges.faces[:, 1]]
+    ends, faces = edges.ends[turning], edges.faces[turning]
+    middle = 0.5 * (mesh.vertices[ends[:, 0]] + mesh.vertices[ends[:, 1]])
+    xy, z = view.project(middle)
+    start, _ = view.project(mesh.vertices[ends[:, 0]])
+    stop, _ = view.project(mesh.vertices[ends[:, 1]])
+    length = lengths(stop - start)
+    pixel = np.abs(z) / view.view.camera.mean_focal_px
+    kept = view.in_image(xy, 3.0) & (z > 0) & np.isfinite(length)
+    ends, faces = ends[kept], faces[kept]
+    middle, xy, length, pixel = (a[kept] for a in (middle, xy, length, pixel))
+    outwards = mesh.vertex_normals[ends].sum(axis=1)
+    away = middle - view.center
+    distance = lengths(away)[:, None]
+    outwards = unit_or_zero(outwards - dots(outwards, away)[:, None] / distance**2 * away)
+    # A pixel beyond the outline there is nothing, a pixel before it the surface itself.
+    beyond = scene.cast(view.center, away + 1.0 * pixel[:, None] * outwards).distance
+    before = scene.cast(view.center, away - 1.0 * pixel[:, None] * outwards).distance
+    slack = 4 * mesh.mean_edge / distance[:, 0]
+    rim = ~np.isfinite(beyond) & (np.abs(before - 1) < slack)
+    if not on_outline:
+        return Rim(ends[rim], faces[rim], xy[rim], length[rim])
+    away, step = away[rim], (pixel[:, None] * outwards)[rim]
+    low, high = np.zeros(len(away)), np.ones(len(away))
+    for _ in range(RIM_HALVINGS):
+        middle = 0.5 * (low + high)
+        met = np.isfinite(scene.cast(view.center, away + middle[:, None] * step).distance)
+        low, high = np.where(met, middle, low), np.where(met, high, middle)
+    xy, _ = view.project(view.center + away + (0.5 * (low + high))[:, None] * step)
+    return Rim(ends[rim], faces[rim], xy, length[rim])
+
+
+def rim_residuals(view: SurfaceView, xy: Array) -> tuple[Array, Array]:
+    """Signed distance ``(K,)`` of points to the silhouette, px, and its gradient ``(K, 2)``.
+
+    Where the silhouette is in doubt the nearer of its two outlines counts.
+    """
+    inner = sample_image(view.silhouette.inner, xy).astype(np.float64)
+    if view.silhouette.is_sharp:
+        return inner[:, 0], inner[:, 1:]
+    outer = sample_image(view.silhouette.outer, xy).astype(np.float64)
+    chosen = np.where((np.abs(outer[:, 0]) < np.abs(inner[:, 0]))[:, None], outer, inner)
+    return chosen[:, 0], chosen[:, 1:]
+
+
+@dataclass(frozen=True)
+class OutlineRows:
+    """Residuals (K,) of a view's outline, px, with their vertices (K, 3) and lengths (K,)."""
+
+    vertices: Indices
+    jacobian: Array
+    residual: Array
+    length_px: Array
+
+
+def outline_rows(
+    mesh: TriangleMesh,
+    scene: RayScene,
+    view: SurfaceView,
+    edges: SharedEdges,
+    sharp: Mask,
+    *,
+    gate_px: float,
+    on_outline: bool = False,
+) -> OutlineRows:
+    """Rows of a view's outline, of points within ``gate_px`` of its silhouette."""
+    rim = find_rim(mesh, scene, view, edges, on_outline=on_outline)
+    residual, gradient = rim_residuals(view, rim.xy)
+    near = np.abs(residual) < gate_px
+    ends, residual, gradient = rim.ends[near], residual[near], gradient[near]
+    vertices, directions = outline_moves(mesh, ends, rim.faces[near], sharp)
+    jacobian = np.zeros((len(ends), 3))
+    middle = mesh.vertices[ends].mean(axis=1)
+    reach = 1e-3 * mesh.mean_edge
+    for column in (0, 1):
+        ahead, _ = view.project(middle + reach * directions[:, column])
+        behind, _ = view.project(middle - reach * directions[:, column])
+        jacobian[:, column] = dots(gradient, ahead - behind) / (2 * reach)
+    vertices = np.column_stack([vertices, vertices[:, 0]])
+    return OutlineRows(vertices, np.nan_to_num(jacobian), residual, rim.length_px[near])
+
+
+def outline_moves(
+    mesh: TriangleMesh, ends: Indices, faces: Indices, sharp: Mask
+) -> tuple[Indices, Array]:
+    """How the middles of edges move with two vertices each ``(K, 2)``: directions ``(K, 2, 3)``.
+
+    Both ends move the middle by half of their own displacements. An edge between two sides of the
+    object is where these meet: it moves with them, each along what leaves the other in its plane.
+    """
+    directions = 0.5 * mesh.vertex_normals[ends]
+    one, other = np.moveaxis(mesh.face_normals[faces], 1, 0)
+    cosine = dots(one, other)
+    # Of a fold, too, whose sides turn their backs on each other, the middle is its own.
+    apart = np.abs(cosine) < np.cos(np.radians(CreaseTolerances.crease_deg))
+    meets = np.all(sharp[ends], axis=1) & apart
+    opposite = mesh.faces[faces].sum(axis=2) - ends.sum(axis=1, keepdims=True)
+    dual = np.stack([one - cosine[:, None] * other, other - cosine[:, None] * one], axis=1)
+    dual /= np.maximum(1 - cosine**2, 1e-9)[:, None, None]
+    # A side of one row of triangles has no vertex but those of its edges.
+    along = dots(mesh.vertex_normals[opposite], mesh.face_normals[faces]) * ~sharp[opposite]
+    directions[meets] = (dual * along[..., None])[meets]
+    return np.where(meets[:, None], opposite, ends), directions
+
+
+def outline_sigma(rows: OutlineRows, tol: TermTolerances) -> float:
+    """Deviation of a view's outline that its residuals show, px."""
+    if not len(rows.residual):
+        return tol.place_sigma_px
+    centred = rows.residual - np.median(rows.residual)
+    return max(tol.place_sigma_px, robust_deviation(centred))
+
+
+def add_outlines(
+    equations: Equations,
+    rows: Sequence[OutlineRows],
+    tol: TermTolerances,
+    *,
+    face_area_px: float,
+    gate_px: float,
+) -> Array:
+    """Add the outlines of some views.
+
+    Returns how the gradient (V,) changes with an error of all of them, per px.
+    """
+    slope = np.zeros(equations.num)
+    scale = max(3 * tol.place_sigma_px, 0.5 * gate_px) ** 2
+    for own in rows:
+        weight = own.length_px * geman_mcclure_weights(own.residual, scale)
+        # An outline crosses an area over which errors are alike along the root of its pixels.
+        weight *= np.sqrt(tol.phase_correlation(face_area_px)) / outline_sigma(own, tol) ** 2
+        equations.add(own.vertices, own.jacobian, own.residual, weight)
+        change = (weight[:, None] * own.jacobian).ravel()
+        slope += np.bincount(own.vertices.ravel(), change, equations.num)
+    return slope
+
+
+def add_points(
+    equations: Equations,
+    mesh: TriangleMesh,
+    seen: Mask,
+    known: KnownPoints,
+    tol: TermTolerances,
+    *,
+    num_views: int,
+    footprint: float,
+    face_area_px: float,
+    gate_px: float,
+) -> None:
+    """Draw the faces that are ``seen`` (F,), not those behind them, to known points near them."""
+    visible = TriangleMesh(mesh.vertices, mesh.faces[seen])
+    place, face, barycentric = RayScene(visible).closest(known.points)
+    face = np.flatnonzero(seen)[face]
+    normals = mesh.face_normals[face]
+    residual = dots(place - known.points, normals)
+    sigma = np.hypot(known.sigma, tol.place_sigma_px * footprint)
+    near = lengths(place - known.points) < gate_px * footprint
+    face, residual, sigma = face[near], residual[near], sigma[near]
+    along = dots(mesh.vertex_normals[mesh.faces[face]], normals[near][:, None])
+    jacobian = barycentric[near] * along
+    scale = np.maximum(4 * sigma, 0.1 * gate_px * footprint) ** 2
+    weights = geman_mcclure_weights(residual, scale) / sigma**2
+    weights *= tol.point_weight(num_views, face_area_px)
+    equations.add(mesh.faces[face], jacobian, residual, weights)
+
+
+def smoothness(
+    mesh: TriangleMesh, edge: float, tol: TermTolerances, sharp: Mask
+) -> tuple[sparse.csr_array, Array, sparse.csr_array]:
+    """Curvature free of scale, drawn to most of its own surroundings' mean.
+
+    That of ``sharp`` (V,) vertices is what it is: to smooth an edge draws the faces beside it in.
+    """
+    normals = mesh.vertex_normals
+    laplacian = sparse.eye_array(len(mesh.vertices)) - mesh.neighbor_mean
+    curvature = dots(laplacian @ mesh.vertices, normals) / edge
+    curvature[sharp] = 0.0
+    target = tol.smoothness_memory * (mesh.neighbor_mean @ (mesh.neighbor_mean @ curvature))
+    entries = laplacian.tocoo()
+    rows, cols = entries.coords
+    data = entries.data * dots(normals.take(rows, axis=0), normals.take(cols, axis=0)) / edge
+    change = sparse.coo_array((data, (rows, cols)), shape=laplacian.shape).tocsr()
+    residual = curvature - target
+    weight = geman_mcclure_weights(residual, (5 * tol.smoothness) ** 2) / tol.smoothness**2
+    weight[sharp] = 0.0
+    factor = sparse.csr_array(change.T @ sparse.diags_array(np.sqrt(weight)))
+    matrix = sparse.csr_array(factor @ factor.T)
+    return matrix, np.asarray(factor @ (np.sqrt(weight) * residual)), factor
+
+
+def with_edges(mesh: TriangleMesh, moves: Array, sharp: Mask) -> Array:
+    """Moves ``(V, 3)`` of vertices, those of ``sharp`` ones (V,) such that their sides meet there.
+
+    A side moves as those of its vertices do that lie on no edge.
+    """
+    if not sharp.any():
+        return moves
+    free = ~sharp[mesh.faces]
+    touching = np.flatnonzero(~free.all(axis=1) & free.any(axis=1))
+    corners, free, normals = mesh.faces[touching], free[touching], mesh.face_normals[touching]
+    along = dots(moves[corners], normals[:, None]) * free
+    height = along.sum(axis=1) / free.sum(axis=1)
+    area = mesh.face_areas[touching]
+    squares = (area[:, None, None] * normals[:, :, None] * normals[:, None, :]).reshape(-1, 9)
+    incidence = mesh.incidence[touching].T
+    matrix = (incidence @ squares).reshape(-1, 3, 3)
+    right = incidence @ ((area * height)[:, None] * normals)
+    total = np.maximum(np.trace(matrix, axis1=1, axis2=2), 1e-300)
+    # Along an edge, where only noise turns the normals, nothing moves.
+    matrix += EDGE_NOISE**2 * total[:, None, None] * np.eye(3)
+    moved = moves.copy()
+    moved[sharp] = np.linalg.solve(matrix[sharp], right[sharp][..., None])[..., 0]
+    return moved
+
+
+def solve(matrix: sparse.csr_array, right: Array, damping: Array, shared: Array) -> Array:
+    """Solution of ``(matrix + diag(damping) - s sT) x = right`` by conjugate gradients.
+
+    s is ``shared`` (V,), see :class:`SharedError`.
+
+    Conditions are good: the damping bounds the smallest eigenvalue, and low frequencies were
+    solved on coarser meshes.
+    """
+    num = len(right)
+    damped = sparse.csr_array(matrix + sparse.diags_array(damping))
+    inverse = 1 / damped.diagonal()
+    precondition = LinearOperator((num, num), matvec=lambda x: inverse * x.ravel())
+    reduced = LinearOperator(
+        (num, num), matvec=lambda x: damped @ x.ravel() - (shared @ x.ravel()) * shared
+    )
+    return np.asarray(cg(reduced, right, rtol=1e-3, maxiter=300, M=precondition)[0])

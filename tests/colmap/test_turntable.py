@@ -1,0 +1,84 @@
+"""A part that turns before a background that stands still."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from printed_images import CAMERA, INTRINSICS, write_printed_images
+
+from polmvs.camera import pixel_centers
+from polmvs.colmap.sfm import run_sfm
+from polmvs.colmap.static_features import find_static
+from polmvs.config import SfmOptions
+from polmvs.poses.alignment import align_views
+from polmvs.scene import View
+
+NUM_VIEWS = 16
+TABLE_RADIUS = 0.4
+
+
+@pytest.fixture(scope="module")
+def turntable(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[View]]:
+    """Printed part and table, and a fixed textured wall wherever the table ends."""
+    folder = tmp_path_factory.mktemp("turntable")
+    views = write_printed_images(folder, NUM_VIEWS)
+    rng = np.random.default_rng(0)
+    wall = cv2.GaussianBlur(rng.uniform(0, 255, (CAMERA.height, CAMERA.width)), (0, 0), 1.5)
+    wall = np.clip(128 + 4 * (wall - wall.mean()), 0, 255)
+    for view in views:
+        rays = view.rays_in_world(pixel_centers(CAMERA.width, CAMERA.height))
+        center = view.center_in_world
+        along = -center[2] / np.minimum(rays[..., 2], -1e-9)
+        on_plane = center[:2] + along[..., None] * rays[..., :2]
+        off_table = np.linalg.norm(on_plane, axis=-1) > TABLE_RADIUS
+        image = cv2.imread(str(folder / view.name), cv2.IMREAD_UNCHANGED)
+        noisy = wall + rng.normal(0, 2, wall.shape)
+        image[off_table] = np.clip(noisy, 0, 255).astype(np.uint8)[off_table]
+        assert 0.1 < off_table.mean() < 0.9
+        cv2.imwrite(str(folder / view.name), image)
+    return folder, views
+
+
+def test_the_background_is_found_and_left_out(turntable, tmp_path: Path, caplog) -> None:
+    folder, views = turntable
+    names = [view.name for view in views]
+    options = SfmOptions(intrinsics=INTRINSICS)
+    model = run_sfm(folder, names, tmp_path / "work", tmp_path / "sparse", options)
+    assert "a background stands still" in caplog.text
+    assert len(model.views) >= NUM_VIEWS - 1
+    truth = {view.name: view for view in views}
+    similarity, _ = align_views(model.views, truth, source="test")
+    for view in model.views:
+        place = similarity * view.center_in_world
+        # A degree of the orbit: the table is small and the images are of 300 px.
+        far = np.linalg.norm(truth[view.name].center_in_world)
+        assert np.linalg.norm(place - truth[view.name].center_in_world) < 0.02 * far
+
+
+def test_a_camera_that_moves_has_no_static_background(tmp_path: Path, caplog) -> None:
+    views = write_printed_images(tmp_path, 5)
+    names = [view.name for view in views]
+    options = SfmOptions(intrinsics=INTRINSICS)
+    run_sfm(tmp_path, names, tmp_path / "work", tmp_path / "sparse", options)
+    assert "stands still" not in caplog.text
+
+
+def test_static_keypoints_are_told_by_place_and_look() -> None:
+    rng = np.random.default_rng(0)
+    wall, looks = rng.uniform(0, 500, (60, 2)), rng.uniform(0, 255, (60, 128)).astype(np.uint8)
+    places, descriptors = [], []
+    for _ in range(6):
+        places.append(np.concatenate([wall + rng.normal(0, 0.3, wall.shape),
+                                      rng.uniform(0, 500, (100, 2))]))  # fmt: skip
+        turning = rng.uniform(0, 255, (100, 128)).astype(np.uint8)
+        descriptors.append(np.concatenate([looks, turning]))
+    for out in find_static(places, descriptors):
+        assert out[:60].mean() > 0.95
+        assert out[60:].mean() < 0.05
+    moved = [place + 20 * index for index, place in enumerate(places)]
+    assert find_static(moved, descriptors) is None
+    assert find_static(places[:2], descriptors[:2]) is None
+    assert find_static([np.zeros((0, 2))] * 4, [np.zeros((0, 128), np.uint8)] * 4) is None

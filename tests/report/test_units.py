@@ -1,0 +1,50 @@
+"""Lengths on the page are in the unit that stands beside them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from polmvs.config import AngleModel
+from polmvs.geometry import SimilarityTransform
+from polmvs.io.clouds import Cloud
+from polmvs.report.report import _layers
+from polmvs.scene import PointKind
+
+
+@pytest.mark.parametrize(
+    ("is_metric", "scale", "factor", "unit"),
+    [
+        (True, None, 1000.0, "mm"),
+        (False, None, 1.0, "of the model's unit"),
+        (False, 0.25, 250.0, "mm"),  # by the truth, of which one of the model's units is 0.25 m
+    ],
+)
+def test_deviations_of_a_metric_cloud_are_millimetres(is_metric, scale, factor, unit) -> None:
+    sigma = np.full(50, 0.002)
+    cloud = Cloud(
+        points=np.random.default_rng(0).normal(size=(50, 3)),
+        normals=np.tile([0, 0, 1.0], (50, 1)),
+        scalars={"sigma": sigma, "kind": np.full(50, PointKind.SURFACE)},
+    )
+    nothing = SimpleNamespace(is_file=lambda: False)
+    given = SimpleNamespace(
+        clouds={AngleModel.PPA: cloud},
+        record=SimpleNamespace(result=lambda kind: SimpleNamespace(is_metric=is_metric)),
+        truth=None,
+        models=(AngleModel.PPA,),
+        folder=SimpleNamespace(mesh=lambda model: nothing),
+        sparse=SimpleNamespace(views=range(6)),
+    )
+    if scale is not None:
+        similarity = SimilarityTransform(scale, np.eye(3), np.zeros(3))
+        places = scale * cloud.points + [0, 0, 0.001]
+        true = SimpleNamespace(points=places, normals=np.asarray(cloud.normals))
+        given.truth = (SimpleNamespace(surface_points=lambda: true), similarity)
+    layers, channels = _layers(given)
+    assert channels["sigma"].unit == unit
+    assert channels["sigma"].high == pytest.approx(0.002 * factor)
+    np.testing.assert_allclose(layers[0].values["sigma"], 0.002 * factor)
+    if scale is not None:
+        assert channels["error"].unit == "mm"
+        np.testing.assert_allclose(layers[0].values["error"], 1.0, atol=1e-6)
