@@ -371,7 +371,7 @@ def _polished(
     def polish(mesh: TriangleMesh) -> tuple[TriangleMesh, bool]:
         return polishing_step(mesh, fit, sides)
 
-    sharp = _at_rest(sharpened(mesh, normals), normals, polish, fit)
+    sharp = _converged(sharpened(mesh, normals), normals, polish, fit)
     given.on_progress(1)
     # Detail as fine as the mesh passes for noise of the normals: phases know it from edges.
     is_sharp = label(sharp, fit).mean_loss(sharp) <= label(mesh, fit).mean_loss(mesh)
@@ -429,16 +429,16 @@ def _supported(
     )
 
 
-def _at_rest(
+def _converged(
     sharp: TriangleMesh,
     normals: Array,
     polish: Callable[[TriangleMesh], tuple[TriangleMesh, bool]],
     fit: Fit,
 ) -> TriangleMesh:
     """A sharpened mesh, moved by steps until it has converged, unless known points deny them."""
-    mesh, is_at_rest, steps_left = sharp, False, SHARP_STEPS
-    while not is_at_rest and steps_left:
-        mesh, is_at_rest = polish(mesh)
+    mesh, has_converged, steps_left = sharp, False, SHARP_STEPS
+    while not has_converged and steps_left:
+        mesh, has_converged = polish(mesh)
         mesh, steps_left = sharpened(mesh, normals), steps_left - 1
         # Phases read by a model that their camera does not follow sink it, OPA's by millimetres.
         if fit.known is not None and points_deny(mesh, sharp, fit.known, fit.footprint):

@@ -269,8 +269,8 @@ def refine(
     """
     tol = fit.tol
     found = _through_levels(mesh, fit, tol.levels, stands_apart, on_progress)
-    share = covered_share(found.mesh, found.fit)
-    if share >= covered_share(mesh, found.fit) - tol.max_lost or len(tol.levels) < MIN_LEVELS:
+    share = covered_share(found.mesh, found.fit.views)
+    if share >= covered_share(mesh, found.fit.views) - tol.max_lost or len(tol.levels) < MIN_LEVELS:
         return found
     logger.info("walls are thinner than coarse edges; the surface is made again by fine ones.")
     *coarse, fine, last = tol.levels
@@ -278,7 +278,7 @@ def refine(
     steps = fine.num_steps + sum(level.num_steps * level.edge_px for level in coarse) / fine.edge_px
     first = replace(coarse[0], edge_px=fine.edge_px, num_steps=round(steps))
     again = _through_levels(mesh, fit, (first, last), stands_apart, no_progress)
-    return again if covered_share(again.mesh, again.fit) > share else found
+    return again if covered_share(again.mesh, again.fit.views) > share else found
 
 
 def _through_levels(
@@ -311,16 +311,25 @@ def _through_levels(
     return Refined(mesh, fit, left_out, unexplained, meshes)
 
 
-def covered_share(mesh: TriangleMesh, fit: Fit, *, stride_px: int = 4) -> float:
-    """Mean share of the certain silhouettes that a mesh covers; 1 without any."""
+def covered_shares(
+    mesh: TriangleMesh, views: Sequence[SurfaceView], *, stride_px: int = 4
+) -> Array:
+    """Share ``(K,)`` of each view's certain silhouette that a mesh covers; NaN without one."""
     scene = RayScene(mesh) if len(mesh.faces) else None
-    shares = []
-    for view in fit.views:
+    shares = np.full(len(views), np.nan)
+    for index, view in enumerate(views):
         rays = certain_rays(view, stride_px)
         if len(rays):
-            hit = 0.0 if scene is None else float((scene.cast(view.center, rays).face >= 0).mean())
-            shares.append(hit)
-    return float(np.mean(shares)) if shares else 1.0
+            hit = 0.0 if scene is None else np.mean(scene.cast(view.center, rays).face >= 0)
+            shares[index] = hit
+    return shares
+
+
+def covered_share(mesh: TriangleMesh, views: Sequence[SurfaceView]) -> float:
+    """Mean of :func:`covered_shares`; 1 where no view shows a silhouette."""
+    shares = covered_shares(mesh, views)
+    known = shares[np.isfinite(shares)]
+    return float(known.mean()) if len(known) else 1.0
 
 
 def _refined_at(

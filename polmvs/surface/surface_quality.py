@@ -20,7 +20,7 @@ from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS
 from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.dense_view import lattice_xy
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
-from polmvs.surface.solver import Fit, Labelled, certain_rays
+from polmvs.surface.solver import Fit, Labelled, covered_share
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints
 from polmvs.surface.visual_hull import HullTolerances
@@ -308,7 +308,6 @@ def find_contradictions(
     phase_sine: float,
     *,
     tolerances: QualityTolerances | None = None,
-    stride_px: int = 4,
 ) -> Contradictions:
     """Hold a surface against the views.
 
@@ -318,22 +317,17 @@ def find_contradictions(
     supported : (F,) faces that are kept.
     views : what each view says.
     phase_sine : median of the absolute residuals of the phases.
-    stride_px : distance of the pixels that are asked, px.
     """
     tol = tolerances or QualityTolerances()
     area = mesh.face_areas * (evidence.num_views >= 2)
     total = max(float(area.sum()), 1e-300)
     contradicted = evidence.num_contradicting > 0.5 * evidence.num_rows
     denied = evidence.num_outside > np.maximum(tol.max_outside_share * evidence.num_views, 1.5)
-    kept = mesh.only(supported)
-    scene = RayScene(kept) if len(kept.faces) else None
-    uncovered = [_uncovered_share(scene, view, stride_px) for view in views]
-    known = [share for share in uncovered if np.isfinite(share)]
     return Contradictions(
         phase_sine=phase_sine,
         contradicted_share=float(area[contradicted].sum()) / total,
         denied_share=float(area[denied].sum()) / total,
-        uncovered_share=float(np.mean(known)) if known else 0.0,
+        uncovered_share=1 - covered_share(mesh.only(supported), views),
     )
 
 
@@ -448,11 +442,3 @@ def point_offset(
     own = max(robust_deviation(offset - middle), float(np.median(known.sigma[near])))
     noise = np.hypot(1.25 * own / np.sqrt(len(offset)), np.median(stated[near]))
     return middle / footprint, middle / max(float(noise), 1e-300)
-
-
-def _uncovered_share(scene: RayScene | None, view: SurfaceView, stride_px: int) -> float:
-    """Share of the certain silhouette where no surface is; NaN without one."""
-    rays = certain_rays(view, stride_px)
-    if not len(rays):
-        return float("nan")
-    return 1.0 if scene is None else float(np.mean(scene.cast(view.center, rays).face < 0))
