@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from os import PathLike
 from typing import ClassVar
 
-MAX_REASON = 1000  # characters
+MAX_SHOWN = 900  # characters of a name, and of a reason
 _LAYOUT = "\n\t"
 MAX_QUOTED = 120  # of these, of words that are a file's or another library's
 
@@ -64,7 +64,7 @@ class DataError(PolmvsError):
 
     def __init__(self, path: str | PathLike[str], reason: str) -> None:
         super().__init__(
-            f"{printable(final_name(path))}: {_short(printable(reason, keep=_LAYOUT))}"
+            f"{_short(printable(final_name(path)))}: {_short(printable(reason, keep=_LAYOUT))}"
         )
         self.path = path
         self.reason = reason
@@ -115,12 +115,12 @@ def as_data_error(path: str | PathLike[str], done: str) -> Iterator[None]:
         raise DataError(path, f"cannot be {done}: {error.strerror or error}.") from error
 
 
-def _short(reason: str) -> str:
-    """A reason without the middle of what it quotes, where a file has that far too long."""
-    if len(reason) <= MAX_REASON:
-        return reason
-    half = MAX_REASON // 2
-    return f"{reason[:half]} ... {reason[-half:]}"
+def _short(text: str) -> str:
+    """A text without its middle where a file names or quotes something far too long."""
+    if len(text) <= MAX_SHOWN:
+        return text
+    half = MAX_SHOWN // 2
+    return f"{text[:half]} ... {text[-half:]}"
 
 
 def _option_error(reason: str, field: str | None) -> OptionError:

@@ -327,16 +327,21 @@ class Capture:
         shape = (self.header.height, self.header.width)
         full = self.options.resolution is Resolution.FULL
         analyzers = self.calibration.analyzers(shape, full=full)
-        return stokes_by_least_squares(
-            images,
-            analyzers if colour is None else analyzers[colour],
-            clipped,
-            darkness=darkness,
-            quantum=quantum,
-            interpolated=True,
-            lossy_variance=lossy,
-            gains_known=True,
-        )
+        try:
+            return stokes_by_least_squares(
+                images,
+                analyzers if colour is None else analyzers[colour],
+                clipped,
+                darkness=darkness,
+                quantum=quantum,
+                interpolated=True,
+                lossy_variance=lossy,
+                gains_known=True,
+            )
+        except ValueError as error:
+            file = self.options.calibration
+            assert file is not None
+            raise DataError(file, f"is of no polarization camera: {error}") from error
 
     def _angle_stack(self, view: ViewFiles) -> tuple[Image, Mask]:
         """Linear images (K, H, W) or (K, H, W, 3) of a view, and where any of them is clipped."""

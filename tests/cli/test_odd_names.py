@@ -74,3 +74,15 @@ def test_text_works_in_every_locale_and_the_longest_names_do(
     assert (tmp_path / "maß" / "ppa.ply").is_file()
     maps = tmp_path / "maß" / "dense" / "stereo" / "depth_maps"
     assert len(list(maps.iterdir())) == 3
+
+
+def test_a_name_that_no_system_takes_is_shown_short(
+    cli, demo_capture: Path, tmp_path: Path
+) -> None:
+    calibration = tmp_path / "calibration.toml"
+    calibration.write_text(f'version = 1\ndark = "{"9" * 3000}"\n')
+    status, _, err = cli("inspect", demo_capture, "--calibration", calibration)
+    assert status == 1
+    assert str(tmp_path) in err
+    assert "999 ... 999" in err
+    assert len(err) < 2000

@@ -220,3 +220,12 @@ def test_calibrations_of_other_sensors_are_refused(tmp_path):
     capture = open_capture(tmp_path / "capture", CaptureOptions(calibration=path))
     with pytest.raises(DataError, match="10x10"):
         capture.load("a.png")
+
+
+def test_a_calibration_that_tells_no_polarization_is_named(tmp_path):
+    capture_of(tmp_path / "capture", faulty_sensor(SHAPE, np.random.default_rng(0)))
+    path = tmp_path / "camera.toml"
+    path.write_text("version = 1\ndiattenuations = [1e-9, 1e-9, 1e-9, 1e-9]")
+    capture = open_capture(tmp_path / "capture", CaptureOptions(calibration=path))
+    with pytest.raises(DataError, match=r"camera\.toml: is of no polarization camera"):
+        capture.load("a.png")
