@@ -72,6 +72,8 @@ class PhaseMap:
         and outside of the region, and the variance of either: that of a mean of n pixels is the
         third channel over n (noise, of which neighbours share some, and lossy compression) plus
         the fourth, which all pixels share (gains). Both are inf where a pixel is clipped or dark.
+    outline_shift : (H, W) float32 px, by how much the outline of the region lies outside of its
+        border, at each pixel that of the border's nearest place; None where it was not measured.
     folder : where the arrays are stored, if they are.
     tilted : the samples are corrected for tilted polarizers (:func:`as_tilted`).
     """
@@ -83,6 +85,7 @@ class PhaseMap:
     diffuse: Mask
     lowest_dolp: NDArray[np.uint8]
     polarization: Image
+    outline_shift: Image | None = None
     folder: Path | None = None
     tilted: bool = False
 
@@ -139,6 +142,13 @@ class StoredPhaseMap(PhaseMap):
     def polarization(self) -> Image:
         """See :class:`PhaseMap`."""
         return self._array(f"{self.view.name}.polarization.npy", np.floating)
+
+    @property
+    def outline_shift(self) -> Image | None:
+        """See :class:`PhaseMap`."""
+        name = f"{self.view.name}.outline.npy"
+        assert self.folder is not None
+        return self._array(name, np.floating) if (self.folder / name).is_file() else None
 
     @property
     def region(self) -> Region:
@@ -333,6 +343,8 @@ def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:
     save_array(folder / f"{name}.region.npy", flags.astype(np.uint8))
     save_array(folder / f"{name}.dolp.npy", phase_map.lowest_dolp)
     save_array(folder / f"{name}.polarization.npy", phase_map.polarization)
+    if phase_map.outline_shift is not None:
+        save_array(folder / f"{name}.outline.npy", phase_map.outline_shift)
     return open_phase_map(phase_map.view, folder, tilted=phase_map.tilted)
 
 

@@ -71,6 +71,8 @@ def find_silhouette(
     """
     tol = tolerances or SilhouetteTolerances()
     inside = np.asarray(phase_map.region.inside, np.bool_)
+    if (shift := phase_map.outline_shift) is not None:
+        return Silhouette(inside, inside, shift, shift)
     if mask_given or not inside.any():
         return Silhouette(inside, inside)
     scale = phase_map.view.camera.mean_focal_px / REFERENCE_FOCAL_PX

@@ -39,9 +39,12 @@ from polmvs.polarization.phase_map import (
 )
 from polmvs.polarization.region import find_region
 from polmvs.scene import MIN_VIEWS, Tracks, View
+from polmvs.surface.object_search import FoundObject, find_object
+from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
+POLARIZED_SHARE = 0.9  # of an object: then its polarized region shows it best
 MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are held together
 
 
@@ -115,6 +118,10 @@ def build_maps(
             num_inside += count
             on_progress(1)
         maps = [open_phase_map(view, folder) for view in views]
+        if options.mask is None and (found := _hidden_plane(maps, tracks)) is not None:
+            build = partial(_build_map, capture, options, folder)
+            num_inside = sum(workers.map(build, views, raw_names, found))
+            maps = [open_phase_map(view, folder) for view in views]
         num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
         if len(tracks.point3D_ids):
             # Both ask all views, so that they are tasks of their own.
@@ -209,18 +216,45 @@ def find_mask(folder: Path, image: str) -> Path:
     raise DataError(folder, f"has no mask {stem}.png or {stem}_mask.png.")
 
 
+def _hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] | None:
+    """What hides the plane beneath it, in each view; None where polarization shows it as well."""
+    points = tracks.points_in_world
+    centers = np.array([one.view.center_in_world for one in maps])
+    plane = supporting_plane(points, centers)
+    if plane is None:
+        return None
+    found = find_object(maps, plane, points)
+    if found is None:
+        return None
+    shares = [
+        (one.region.inside & hiding.mask).sum() / max(hiding.mask.sum(), 1)
+        for one, hiding in zip(maps, found, strict=True)
+    ]
+    share = float(np.median(shares))
+    logger.info("%.0f %% of what hides its support is polarized.", 100 * share)
+    return found if share < POLARIZED_SHARE else None
+
+
 def _build_map(
-    capture: Capture, options: RegionOptions, folder: Path, view: View, name: str
+    capture: Capture,
+    options: RegionOptions,
+    folder: Path,
+    view: View,
+    name: str,
+    found: FoundObject | None = None,
 ) -> int:
     """Phase map of one view; returns the number of its region's pixels."""
     stokes = capture.load(name)
-    mask = None
+    mask = None if found is None else found.mask
     if options.mask is not None:
         mask = read_mask(find_mask(options.mask, view.name), stokes.shape)
     s0, s1, s2 = stokes.s0, stokes.s1, stokes.s2
     region = find_region(s0, s1, s2, stokes.valid, min_dolp=options.min_dolp, mask=mask)
     light = options.light or Light.SPECULAR
-    store_phase_map(build_phase_map(view, stokes, region, light), folder)
+    phase_map = build_phase_map(view, stokes, region, light)
+    if found is not None:
+        phase_map = phase_map.changed(outline_shift=found.outline_shift)
+    store_phase_map(phase_map, folder)
     return int(region.inside.sum())
 
 

@@ -1,0 +1,546 @@
+"""The object in each view, found by what it hides: the surface on which it stands.
+
+Polarization does not show the outline of grey and white things. The plane beneath them does, where
+it has a texture: its image in one view is predicted from the others. What agrees with the
+prediction shows the plane, and space between it and the camera is free; what is left of the space
+above the plane is the object. Each view's outline then is where the image changes from the plane's
+prediction to the object's brightness, as in matting against a known background.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from polmvs.camera import sample_image
+from polmvs.geometry import lengths
+from polmvs.polarization.phase_map import PhaseMap
+from polmvs.scene import View
+from polmvs.surface.surface_view import signed_distance_px
+from polmvs.surface.visual_hull import Plane
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+MAX_ODDS = 4.0  # logarithm, of one pixel: whatever it shows, something else may be wrong
+LEAST_ODDS = 0.7  # of what shows the plane, on the average of neighbours: two to one
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchTolerances:
+    """Numbers of the search.
+
+    Attributes
+    ----------
+    working_px : longest side of the images that are searched; the outline is measured in full ones.
+    window_px : of the correlation with other views, working pixels.
+    num_near : other views that a view is correlated with.
+    num_others : other views that predict the plane, at most.
+    detail_px : deviation of the average that texture is told from.
+    least_share : of a pixel's texture that is the plane's in two other views. Guess.
+    wrong_share : views that may deny a place of the object wrongly; two at least must deny it.
+    seen_share : views that must see a place; the objects lie in the common field of view.
+    num_cells : of the coarse grid, along its side; the fine one has as many along the object's.
+    num_rounds : of prediction and carving; a third changes the outlines by 0.1 px.
+    core_px, blend_px : an outline's object and surroundings are averaged this far from it, and over
+        this deviation, working pixels.
+    along_px : deviation of the average along the outline, working pixels.
+    reach_px : of the search for the outline, working pixels.
+    """
+
+    working_px: int = 320
+    window_px: int = 5
+    num_near: int = 6
+    num_others: int = 12
+    detail_px: float = 2.0
+    least_share: float = 0.2
+    wrong_share: float = 0.15
+    seen_share: float = 0.6
+    num_cells: int = 72
+    num_rounds: int = 2
+    core_px: float = 2.0
+    blend_px: float = 2.5
+    along_px: float = 3.0
+    reach_px: float = 4.0
+
+
+@dataclass(frozen=True)
+class FoundObject:
+    """The object in one view.
+
+    Attributes
+    ----------
+    mask : (H, W) bool.
+    outline_shift : (H, W) float32 px, by how much the outline lies outside of the mask's border, at
+        each pixel that of the border's nearest place.
+    """
+
+    mask: Mask
+    outline_shift: Image
+
+
+def find_object(
+    maps: Sequence[PhaseMap],
+    plane: Plane,
+    points: Floats,
+    *,
+    tolerances: SearchTolerances | None = None,
+) -> list[FoundObject] | None:
+    """The object that stands on a plane, in each view.
+
+    Parameters
+    ----------
+    maps : of each view, three or more; a polarized region shows the object, not the plane.
+    plane : on which the object stands.
+    points : (N, 3), sparse points of the scene.
+
+    Returns
+    -------
+    None where the plane shows too little texture to tell what hides it.
+    """
+    tol = tolerances or SearchTolerances()
+    near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
+    shows_plane: list[Mask] = []
+    for scale in (4, 2, 1):  # what has no fine texture may have a coarse one
+        small = [_working(phase_map, plane, tol.working_px / scale) for phase_map in maps]
+        shares = _showing_plane(small, near, tol)
+        found = [
+            (share > tol.least_share) & ~view.polarized
+            for share, view in zip(shares, small, strict=True)
+        ]
+        shows_plane = [
+            here | (cv2.resize(before.astype(np.uint8), here.shape[::-1]) > 0)
+            for here, before in zip(found, shows_plane or found, strict=True)
+        ]
+    coarse = _space(small, plane, tol).carved(small, shows_plane, tol)
+    if coarse is None or coarse.ends_at_sides:
+        return None
+    cells = coarse.finer(tol)
+    masks = [coarse.mask(view) for view in small]
+    for _ in range(tol.num_rounds):
+        plates = _plates(small, masks, tol)
+        alone, together = _denied(small, plates, masks)
+        left = cells.carved(small, alone, tol, needed=1)
+        left = None if left is None else left.carved(small, together, tol)
+        if left is None:
+            return None
+        masks = [left.mask(view) for view in small]
+    plates = _plates(small, masks, tol)
+    noise = _residual(small, plates, masks)
+    return [
+        _outlined(view, mask, plate, noise, tol)
+        for view, mask, plate in zip(small, masks, plates, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class _Working:
+    """A view in working pixels.
+
+    Attributes
+    ----------
+    view : in its own pixels.
+    factor : of its own pixels to a working one.
+    log : (h, w) float32, logarithm of the intensity.
+    polarized : (h, w) bool, its polarized region.
+    on_plane : (h, w, 3), where each pixel's ray meets the plane; NaN where it does not.
+    """
+
+    view: View
+    factor: float
+    log: Image
+    polarized: Mask
+    on_plane: Array
+
+    @property
+    def center(self) -> Array:
+        return self.view.center_in_world
+
+    def project(self, points: Floats) -> Floats:
+        """Working coordinates ``(..., 2)``."""
+        return np.asarray(self.view.project(points) / self.factor)
+
+    def sees(self, xy: Floats, margin: float = 1.0) -> Mask:
+        """Whether working coordinates lie in the image."""
+        height, width = self.log.shape
+        x, y = xy[..., 0], xy[..., 1]
+        return np.asarray(
+            (x > margin) & (y > margin) & (x < width - margin) & (y < height - margin)
+        )
+
+    def pixel_at(self, distance: float) -> float:
+        """Length that a working pixel covers at a distance."""
+        return distance * self.factor / self.view.camera.mean_focal_px
+
+
+def _working(phase_map: PhaseMap, plane: Plane, longest_px: float) -> _Working:
+    view, image = phase_map.view, np.asarray(phase_map.intensity, np.float32)
+    inside = phase_map.region.inside.astype(np.float32)
+    factor = max(max(image.shape) / longest_px, 1.0)
+    size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1 else image
+    lowest = 1e-3 * max(float(np.percentile(small, 99)), 1e-12)
+    log = np.log(np.maximum(cv2.GaussianBlur(small, (0, 0), 0.5), lowest)).astype(np.float32)
+    xy = np.stack(np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5), axis=-1)
+    rays = view.rays_in_world(xy * factor)
+    center = view.center_in_world
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ranges = (plane.offset - center @ plane.normal) / (rays @ plane.normal)
+    ranges = np.where(ranges > 0, ranges, np.nan)
+    polarized = cv2.resize(inside, size, interpolation=cv2.INTER_AREA) > 0.5
+    return _Working(view, factor, log, polarized, center + ranges[..., None] * rays)
+
+
+def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
+    """The other views, nearest first."""
+    distances = lengths(np.array([view.center - views[index].center for view in views]))
+    order = np.argsort(distances, kind="stable")
+    return np.asarray(order[order != index])
+
+
+def _showing_plane(views: Sequence[_Working], points: Floats, tol: SearchTolerances) -> list[Image]:
+    """Share (h, w) of each view's texture that is the plane's, as two other views see it too."""
+    details = [view.log - cv2.GaussianBlur(view.log, (0, 0), tol.detail_px) for view in views]
+    correlations, variances, unexplained = [], [], []
+    for index, view in enumerate(views):
+        best = np.full((2, *view.log.shape), -1, np.float32)
+        for other in _nearest(views, index)[: tol.num_near]:
+            xy = views[other].project(view.on_plane)
+            value = _correlation(details[index], sample_image(details[other], xy), tol.window_px)
+            seen = np.where(views[other].sees(xy), value, -1).astype(np.float32)
+            best = np.sort(np.concatenate([best, seen[None]]), axis=0)[1:]
+        correlations.append(np.clip(best[0], 0, 1))
+        variances.append(_local_variance(details[index], tol.window_px))
+        xy = view.project(points)
+        left = np.asarray(variances[-1] * (1 - correlations[-1] ** 2), np.float32)
+        unexplained.append(sample_image(left, xy[view.sees(xy)]))
+    noise = 3 * float(np.median(np.concatenate(unexplained)))
+    # A window at an outline on the plane shows the outline, within the object as well.
+    size = 2 * round(0.5 * tol.window_px + tol.detail_px) - 1
+    kernel = np.ones((size, size), np.uint8)
+    return [
+        np.asarray(cv2.erode(value * variance / (variance + noise), kernel), np.float32)
+        for value, variance in zip(correlations, variances, strict=True)
+    ]
+
+
+def _local_variance(image: Image, window_px: int) -> Image:
+    window = (window_px, window_px)
+    mean = cv2.blur(image, window)
+    return np.asarray(np.maximum(cv2.blur(image * image, window) - mean * mean, 0), np.float32)
+
+
+def _correlation(a: Image, b: Image, window_px: int) -> Image:
+    """Normalised correlation of two images in the windows of all pixels."""
+    window = (window_px, window_px)
+    covariance = cv2.blur(a * b, window) - cv2.blur(a, window) * cv2.blur(b, window)
+    spread = _local_variance(a, window_px) * _local_variance(b, window_px)
+    return np.asarray(covariance / np.sqrt(np.maximum(spread, 1e-12)), np.float32)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Space on a grid, and which cells of it may hold the object.
+
+    Attributes
+    ----------
+    origin : (3,), centre of the first cell.
+    axes : (3, 3), rows are the steps of the grid.
+    held : (X, Y, Z) bool.
+    """
+
+    origin: Array
+    axes: Array
+    held: Mask
+
+    def centers(self) -> Array:
+        """Centres ``(N, 3)`` of the cells that are held."""
+        return np.asarray(self.origin + np.argwhere(self.held) @ self.axes)
+
+    def carved(
+        self,
+        views: Sequence[_Working],
+        free: Sequence[Mask],
+        tol: SearchTolerances,
+        *,
+        needed: int | None = None,
+    ) -> _Cells | None:
+        """Without the cells that some views see through; what is left of the middle one's part.
+
+        Returns
+        -------
+        None where nothing is left.
+        """
+        points = self.centers()
+        num_free, num_seen = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+        for view, pixels in zip(views, free, strict=True):
+            xy = view.project(points)
+            seen = view.sees(xy, 0.5)
+            num_seen += seen
+            num_free += seen & (sample_image(pixels.astype(np.float32), xy, nearest=True) > 0)
+        if needed is None:
+            needed = max(2, round(tol.wrong_share * len(views)))
+        held = np.zeros_like(self.held)
+        held[self.held] = (num_free < needed) & (num_seen >= tol.seen_share * len(views))
+        parts, num = ndimage.label(held)
+        if not num:
+            return None
+        # The middle of the grid lies where the cameras look: the part that has most about it.
+        x, y, _ = np.meshgrid(*(np.linspace(-1, 1, n) for n in held.shape), indexing="ij")
+        nearness = ndimage.sum(np.exp(-8 * (x * x + y * y)), parts, np.arange(num + 1))
+        nearness[0] = 0
+        return replace(self, held=np.asarray(parts == np.argmax(nearness)))
+
+    @property
+    def ends_at_sides(self) -> bool:
+        """Whether what is held goes on where the grid ends."""
+        held = self.held
+        sides = (held[0], held[-1], held[:, 0], held[:, -1], held[:, :, -1])
+        return any(side.any() for side in sides)
+
+    def finer(self, tol: SearchTolerances) -> _Cells:
+        """The part that is held with a cell around it, on a finer grid."""
+        inside = np.argwhere(self.held)
+        low, high = inside.min(axis=0) - 1.0, inside.max(axis=0) + 1.0
+        # The plane bounds the grid below.
+        low[2] = max(low[2], -0.5)
+        step = float(np.prod(high - low) ** (1 / 3)) / tol.num_cells
+        counts = np.maximum(np.ceil((high - low) / step).astype(int), 1)
+        grid = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1)
+        old = np.clip(np.round(low + (grid + 0.5) * step).astype(int), 0, None)
+        old = np.minimum(old, np.array(self.held.shape) - 1)
+        near = ndimage.binary_dilation(self.held, np.ones((3, 3, 3), bool))
+        origin = self.origin + (low + 0.5 * step) @ self.axes
+        return _Cells(origin, step * self.axes, near[old[..., 0], old[..., 1], old[..., 2]])
+
+    def mask(self, view: _Working) -> Mask:
+        """What the cells cover in a view."""
+        points = self.centers()
+        xy = view.project(points)
+        pixels = np.zeros(view.log.shape, np.uint8)
+        columns, rows = xy[view.sees(xy, 0.5)].astype(int).T
+        pixels[rows, columns] = 1
+        cell = float(lengths(self.axes).max())
+        width = cell / view.pixel_at(float(np.median(view.view.ranges(points))))
+        size = 2 * int(np.ceil(width)) + 1
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        return np.asarray(cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, kernel) > 0)
+
+
+def _space(views: Sequence[_Working], plane: Plane, tol: SearchTolerances) -> _Cells:
+    """Cells over the plane about the point where the cameras look, as far as most views reach."""
+    matrix, right = np.zeros((3, 3)), np.zeros(3)
+    for view in views:
+        camera = view.view.camera
+        ray = view.view.rays_in_world(np.array([0.5 * camera.width, 0.5 * camera.height]))
+        across = np.eye(3) - np.outer(ray, ray)
+        matrix, right = matrix + across, right + across @ view.center
+    middle = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    foot = middle - plane.height(middle) * plane.normal
+    reach = float(
+        np.median(
+            [
+                0.5 * min(view.log.shape) * view.pixel_at(float(lengths(view.center - foot)))
+                for view in views
+            ]
+        )
+    )
+    along = np.cross(plane.normal, np.eye(3)[np.argmin(np.abs(plane.normal))])
+    along /= lengths(along)
+    step = 2 * reach / tol.num_cells
+    axes = step * np.stack([along, np.cross(plane.normal, along), plane.normal])
+    shape = (tol.num_cells, tol.num_cells, max(round(0.75 * tol.num_cells), 1))
+    origin = foot - 0.5 * (tol.num_cells - 1) * (axes[0] + axes[1]) + 0.5 * axes[2]
+    return _Cells(origin, axes, np.ones(shape, bool))
+
+
+@dataclass(frozen=True)
+class _Plate:
+    """What a view would show of the plane if nothing stood on it.
+
+    Attributes
+    ----------
+    log : (h, w) float32, logarithm of the intensity; NaN where no two other views see the plane.
+    deviation : (h, w) float32, of the views that see it.
+    """
+
+    log: Image
+    deviation: Image
+
+
+def _plates(
+    views: Sequence[_Working], masks: Sequence[Mask], tol: SearchTolerances
+) -> list[_Plate]:
+    """The plane in each view, as the others see it beside the object."""
+    free = [
+        (cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0).astype(np.float32)
+        for mask in masks
+    ]
+    plates = []
+    for index, view in enumerate(views):
+        order = _nearest(views, index)
+        # Half of them near, which see the plane alike; half from all around, which see behind.
+        half = tol.num_others // 2
+        far = order[half:]
+        spread = (
+            far[np.unique(np.linspace(0, len(far) - 1, half).round().astype(int))]
+            if len(far)
+            else far
+        )
+        stack = []
+        for other in (*order[:half], *spread):
+            xy = views[other].project(view.on_plane)
+            seen = views[other].sees(xy) & (sample_image(free[other], xy) >= 1)
+            stack.append(np.where(seen, sample_image(views[other].log, xy), np.nan))
+        log = _median(np.array(stack, np.float32))
+        deviation = 1.4826 * _median(np.abs(np.array(stack, np.float32) - log))
+        plates.append(_Plate(log, np.nan_to_num(deviation)))
+    return plates
+
+
+def _median(stack: Image) -> Image:
+    """Median over the finite ones of a stack (n, h, w); NaN where they are fewer than two."""
+    num = np.isfinite(stack).sum(axis=0)
+    ordered = np.sort(stack, axis=0)  # NaN last
+    low, high = np.maximum(num - 1, 0) // 2, num // 2
+    middle = [
+        np.take_along_axis(ordered, k[None], axis=0)[0]
+        for k in (low, np.minimum(high, len(stack) - 1))
+    ]
+    return np.where(num >= 2, 0.5 * (middle[0] + middle[1]), np.nan).astype(np.float32)
+
+
+def _residual(views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequence[Mask]) -> float:
+    """Standard deviation of the views from the plane's prediction, beside the object."""
+    left = []
+    for view, plate, mask in zip(views, plates, masks, strict=True):
+        beside = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) == 0
+        left.append((view.log - plate.log)[beside & np.isfinite(plate.log)])
+    return float(1.4826 * np.median(np.abs(np.concatenate(left))))
+
+
+def _denied(
+    views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequence[Mask]
+) -> tuple[list[Mask], list[Mask]]:
+    """Where each view shows the plane rather than something of any brightness.
+
+    Returns
+    -------
+    Where all about a pixel shows it, so that no chance likeness is possible, and where single
+    pixels do.
+    """
+    noise = _residual(views, plates, masks)
+    spread = np.mean([np.diff(np.percentile(view.log, (1, 99)))[0] for view in views])
+    found: tuple[list[Mask], list[Mask]] = ([], [])
+    for view, plate in zip(views, plates, strict=True):
+        sigma = np.hypot(plate.deviation, noise)
+        known = np.isfinite(plate.log)
+        residual = np.where(known, view.log - plate.log, 0)
+        odds = np.log(spread / (np.sqrt(2 * np.pi) * sigma)) - 0.5 * (residual / sigma) ** 2
+        odds = np.where(known, np.clip(odds, -MAX_ODDS, MAX_ODDS), 0).astype(np.float32)
+        for masks_of, width, least in zip(found, (2.5, 0.8), (0.95, 0.3), strict=True):
+            total = cv2.GaussianBlur(odds, (0, 0), width)
+            share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), width)
+            shows_plane = (share > least) & (total > LEAST_ODDS * share)
+            masks_of.append(np.asarray(shows_plane & ~view.polarized))
+    return found
+
+
+def _outlined(
+    view: _Working, mask: Mask, plate: _Plate, noise: float, tol: SearchTolerances
+) -> FoundObject:
+    """The object in a view's own pixels, with the place of its outline between them.
+
+    Along a line across the outline the share of the object in what a pixel shows (its alpha, from
+    the plane's prediction to the object's brightness) falls from 1 to 0; its sum is the outline's
+    place whatever the blur.
+    """
+    distance = signed_distance_px(mask)
+    border = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    rows, columns = np.nonzero(border)
+    size = (view.view.camera.width, view.view.camera.height)
+    full = cv2.resize(distance, size, interpolation=cv2.INTER_LINEAR) * view.factor
+    if len(rows) < 10:
+        return FoundObject(full < 0, np.zeros_like(full))
+    smooth_distance = cv2.GaussianBlur(distance, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
+    slopes = [cv2.Sobel(smooth_distance, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)]
+    outwards = np.stack(slopes, axis=-1)[rows, columns]
+    outwards = outwards / np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-6)
+    image, predicted = np.exp(view.log), np.exp(plate.log)  # a pixel's light is a sum
+    inner = _trend(image, distance, distance < -tol.core_px, tol.blend_px)
+    outer, _, outer_variance = _trend(image, distance, distance > tol.core_px, tol.blend_px)
+    known = np.isfinite(predicted)
+    behind = np.where(known, predicted, outer).astype(np.float32)
+    relative = plate.deviation**2 + noise**2
+    variance = np.where(known, relative * predicted**2, outer_variance).astype(np.float32)
+    step = 0.25
+    along = np.arange(-tol.reach_px, tol.reach_px + step, step)
+    onto = (
+        np.stack([columns + 0.5, rows + 0.5], axis=1) - outwards * distance[rows, columns][:, None]
+    )
+    places = onto[:, None] + outwards[:, None] * along[:, None]
+    # Shading goes on to the outline: the object's brightness there is that of its trend.
+    level, slope, own_variance = (
+        sample_image(part, onto - outwards * tol.core_px)[:, None] for part in inner
+    )
+    own = np.maximum(level + slope * np.minimum(along, 0), 0)
+    back = sample_image(behind, places)
+    weight = 1 / (sample_image(variance, places) + own_variance)
+    contrast = own - back
+    of_object = np.zeros((2, *mask.shape, len(along)), np.float32)
+    of_object[0, rows, columns] = weight * contrast * (sample_image(image, places) - back)
+    of_object[1, rows, columns] = weight * contrast**2
+    total, most = (_blurred(part, tol.along_px)[rows, columns] for part in of_object)
+    alpha = np.clip(total / np.maximum(most, 1e-9), 0, 1)
+    shift = np.zeros(mask.shape, np.float32)
+    certainty = np.zeros(mask.shape, np.float32)
+    # One deviation of contrast on the average tells an outline.
+    told = np.minimum(most.mean(axis=1) * 2 * np.pi * tol.along_px, 1)
+    # Beyond an outline the plane shows; where something else does, it hides the outline.
+    certainty[rows, columns] = told * known[rows, columns] * (alpha[:, -4:].mean(axis=1) < 0.5)
+    shift[rows, columns] = (step * alpha.sum(axis=1) - tol.reach_px - 0.5 * step) * certainty[
+        rows, columns
+    ]
+    shift, certainty = (cv2.GaussianBlur(i, (0, 0), tol.along_px) for i in (shift, certainty))
+    shift /= np.maximum(certainty, 0.1)
+    nearest = ndimage.distance_transform_edt(~border, return_distances=False, return_indices=True)
+    spread = shift[nearest[0], nearest[1]]
+    return FoundObject(
+        full < 0,
+        np.float32(view.factor) * cv2.resize(spread, size, interpolation=cv2.INTER_LINEAR),
+    )
+
+
+def _blurred(stack: Image, sigma: float) -> Image:
+    """A stack (h, w, n), each of which is blurred."""
+    return np.stack(
+        [cv2.GaussianBlur(stack[..., k], (0, 0), sigma) for k in range(stack.shape[-1])], axis=-1
+    )
+
+
+def _trend(image: Image, distance: Image, where: Mask, sigma: float) -> tuple[Image, Image, Image]:
+    """Local line over the distance through some pixels: its value at 0, its slope, the variance.
+
+    Each is (h, w). The slope shrinks where pixels at few distances tell it.
+    """
+    weight = np.maximum(cv2.GaussianBlur(where.astype(np.float32), (0, 0), sigma), 1e-6)
+
+    def mean(values: Image) -> Image:
+        blurred = cv2.GaussianBlur(np.where(where, values, 0).astype(np.float32), (0, 0), sigma)
+        return np.asarray(blurred / weight, np.float32)
+
+    level, middle = mean(image), mean(distance)
+    spread = mean(distance * distance) - middle * middle
+    slope = (mean(image * distance) - level * middle) / (spread + 1)
+    variance = mean(image * image) - level * level - slope * slope * spread
+    return level - slope * middle, slope, np.maximum(variance, 1e-8)
