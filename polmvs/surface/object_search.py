@@ -47,6 +47,7 @@ class SearchTolerances:
     num_near : other views that a view is correlated with.
     num_others : other views that predict the plane, at most.
     detail_px : deviation of the average that texture is told from.
+    lighting_px : window over which the plane's brightness may differ between views, working pixels.
     least_share : of a pixel's texture that is the plane's in two other views. Guess.
     wrong_share : views that may deny a place of the object wrongly; two at least must deny it.
     seen_share : views that must see a place; the objects lie in the common field of view.
@@ -63,6 +64,7 @@ class SearchTolerances:
     num_near: int = 6
     num_others: int = 12
     detail_px: float = 2.0
+    lighting_px: int = 41
     least_share: float = 0.2
     wrong_share: float = 0.15
     seen_share: float = 0.6
@@ -83,10 +85,12 @@ class FoundObject:
     mask : (H, W) bool.
     outline_shift : (H, W) float32 px, by how much the outline lies outside of the mask's border, at
         each pixel that of the border's nearest place.
+    inner : (H, W) bool, what lies well within it, whatever the outline.
     """
 
     mask: Mask
     outline_shift: Image
+    inner: Mask
 
 
 def find_object(
@@ -378,45 +382,58 @@ class _Plate:
     deviation: Image
 
 
+def _others(views: Sequence[_Working], index: int, tol: SearchTolerances) -> NDArray[np.int64]:
+    """Views that predict the plane in one: half near it, half from all around, which see behind."""
+    near, far = np.split(_nearest(views, index), [tol.num_others // 2])
+    chosen = np.linspace(0, max(len(far) - 1, 0), tol.num_others // 2).round().astype(int)
+    return np.concatenate([near, far[np.unique(chosen)] if len(far) else far])
+
+
 def _plates(
     views: Sequence[_Working], masks: Sequence[Mask], tol: SearchTolerances
 ) -> list[_Plate]:
-    """The plane in each view, as the others see it beside the object."""
-    free = [
-        (cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0).astype(np.float32)
-        for mask in masks
-    ]
+    """The plane in each view, as the others see it beside the object.
+
+    A lamp that moves with the camera, and gloss, change the plane's brightness from view to view;
+    over more than ``lighting_px`` each prediction is brought to the brightness of the view.
+    """
+    kernel = np.ones((3, 3), np.uint8)
+    free = [cv2.dilate(mask.astype(np.uint8), kernel) == 0 for mask in masks]
+    beside = [mask.astype(np.float32) for mask in free]
     plates = []
     for index, view in enumerate(views):
-        order = _nearest(views, index)
-        # Half of them near, which see the plane alike; half from all around, which see behind.
-        half = tol.num_others // 2
-        far = order[half:]
-        spread = (
-            far[np.unique(np.linspace(0, len(far) - 1, half).round().astype(int))]
-            if len(far)
-            else far
-        )
-        stack = []
-        for other in (*order[:half], *spread):
+        shown = []
+        for other in _others(views, index, tol):
             xy = views[other].project(view.on_plane)
-            seen = views[other].sees(xy) & (sample_image(free[other], xy) >= 1)
-            stack.append(np.where(seen, sample_image(views[other].log, xy), np.nan))
-        log = _median(np.array(stack, np.float32))
-        deviation = 1.4826 * _median(np.abs(np.array(stack, np.float32) - log))
-        plates.append(_Plate(log, np.nan_to_num(deviation)))
+            seen = views[other].sees(xy) & (sample_image(beside[other], xy) >= 1)
+            if not (both := seen & free[index]).any():
+                continue
+            log = sample_image(views[other].log, xy)
+            change = _local_mean(view.log - log, both, tol.lighting_px)
+            shown.append(np.where(seen, log + change, np.nan))
+        stack = np.array(shown, np.float32).reshape(-1, *view.log.shape)
+        log = _median(stack)
+        plates.append(_Plate(log, np.nan_to_num(1.4826 * _median(np.abs(stack - log)))))
     return plates
+
+
+def _local_mean(values: Image, where: Mask, window_px: int) -> Image:
+    """Mean (h, w) of some pixels over a window, where it has none that of all."""
+    weight = cv2.blur(where.astype(np.float32), (window_px, window_px))
+    total = cv2.blur(np.where(where, values, 0).astype(np.float32), (window_px, window_px))
+    least = 1 / window_px  # of the window: a line of it
+    mean = total / np.maximum(weight, least)
+    return np.where(weight >= least, mean, np.median(values[where])).astype(np.float32)
 
 
 def _median(stack: Image) -> Image:
     """Median over the finite ones of a stack (n, h, w); NaN where they are fewer than two."""
+    if not len(stack):
+        return np.full(stack.shape[1:], np.nan, np.float32)
     num = np.isfinite(stack).sum(axis=0)
     ordered = np.sort(stack, axis=0)  # NaN last
-    low, high = np.maximum(num - 1, 0) // 2, num // 2
-    middle = [
-        np.take_along_axis(ordered, k[None], axis=0)[0]
-        for k in (low, np.minimum(high, len(stack) - 1))
-    ]
+    low, high = np.maximum(num - 1, 0) // 2, np.minimum(num // 2, len(stack) - 1)
+    middle = [np.take_along_axis(ordered, k[None], axis=0)[0] for k in (low, high)]
     return np.where(num >= 2, 0.5 * (middle[0] + middle[1]), np.nan).astype(np.float32)
 
 
@@ -426,7 +443,8 @@ def _residual(views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequen
     for view, plate, mask in zip(views, plates, masks, strict=True):
         beside = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) == 0
         left.append((view.log - plate.log)[beside & np.isfinite(plate.log)])
-    return float(1.4826 * np.median(np.abs(np.concatenate(left))))
+    all_left = np.concatenate(left)
+    return float(1.4826 * np.median(np.abs(all_left))) if len(all_left) else np.inf
 
 
 def _denied(
@@ -469,9 +487,9 @@ def _outlined(
     border = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
     rows, columns = np.nonzero(border)
     size = (view.view.camera.width, view.view.camera.height)
-    full = cv2.resize(distance, size, interpolation=cv2.INTER_LINEAR) * view.factor
+    full = cv2.resize(distance, size) * np.float32(view.factor)
     if len(rows) < 10:
-        return FoundObject(full < 0, np.zeros_like(full))
+        return FoundObject(full < 0, np.zeros_like(full), np.zeros_like(full, np.bool_))
     smooth_distance = cv2.GaussianBlur(distance, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
     slopes = [cv2.Sobel(smooth_distance, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)]
     outwards = np.stack(slopes, axis=-1)[rows, columns]
@@ -504,21 +522,19 @@ def _outlined(
     alpha = np.clip(total / np.maximum(most, 1e-9), 0, 1)
     shift = np.zeros(mask.shape, np.float32)
     certainty = np.zeros(mask.shape, np.float32)
-    # One deviation of contrast on the average tells an outline.
+    # One deviation of contrast on the average tells an outline. Beyond it the plane shows; where
+    # something else does, it hides the outline.
     told = np.minimum(most.mean(axis=1) * 2 * np.pi * tol.along_px, 1)
-    # Beyond an outline the plane shows; where something else does, it hides the outline.
-    certainty[rows, columns] = told * known[rows, columns] * (alpha[:, -4:].mean(axis=1) < 0.5)
-    shift[rows, columns] = (step * alpha.sum(axis=1) - tol.reach_px - 0.5 * step) * certainty[
-        rows, columns
-    ]
-    shift, certainty = (cv2.GaussianBlur(i, (0, 0), tol.along_px) for i in (shift, certainty))
-    shift /= np.maximum(certainty, 0.1)
+    told *= known[rows, columns] & (alpha[:, -4:].mean(axis=1) < 0.5)
+    found, certainty = np.zeros((2, *mask.shape), np.float32)
+    found[rows, columns] = told * (step * (alpha.sum(axis=1) - 0.5) - tol.reach_px)
+    certainty[rows, columns] = told
+    found, certainty = (cv2.GaussianBlur(i, (0, 0), tol.along_px) for i in (found, certainty))
+    mean = np.asarray(found / np.maximum(certainty, 0.1), np.float32)
     nearest = ndimage.distance_transform_edt(~border, return_distances=False, return_indices=True)
-    spread = shift[nearest[0], nearest[1]]
-    return FoundObject(
-        full < 0,
-        np.float32(view.factor) * cv2.resize(spread, size, interpolation=cv2.INTER_LINEAR),
-    )
+    shift = cv2.resize(mean[nearest[0], nearest[1]], size)
+    inner_px = 1.5 * tol.reach_px * view.factor
+    return FoundObject(full < 0, np.float32(view.factor) * shift, full < -inner_px)
 
 
 def _blurred(stack: Image, sigma: float) -> Image:

@@ -44,7 +44,7 @@ from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
-POLARIZED_SHARE = 0.9  # of an object: then its polarized region shows it best
+POLARIZED_SHARE = 0.99  # of an object within its outline: its polarized region is whole then
 MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are held together
 
 
@@ -227,11 +227,12 @@ def _hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject]
     if found is None:
         return None
     shares = [
-        (one.region.inside & hiding.mask).sum() / max(hiding.mask.sum(), 1)
+        one.region.inside[inner].mean()
         for one, hiding in zip(maps, found, strict=True)
+        if (inner := hiding.inner).any()
     ]
-    share = float(np.median(shares))
-    logger.info("%.0f %% of what hides its support is polarized.", 100 * share)
+    share = float(np.median(shares)) if shares else 0.0
+    logger.info("%.1f %% of what hides its support is polarized.", 100 * share)
     return found if share < POLARIZED_SHARE else None
 
 
