@@ -118,10 +118,14 @@ def find_object(
     for scale in (4, 2, 1):  # what has no fine texture may have a coarse one
         small = [_working(phase_map, plane, tol.working_px / scale) for phase_map in maps]
         shares = _showing_plane(small, near, tol)
+        # A window at an outline on the plane shows the outline, within the object as well.
+        size = 2 * round(0.5 * tol.window_px + tol.detail_px) - 1
         found = [
-            (share > tol.least_share) & ~view.polarized
+            (cv2.erode(share, np.ones((size, size), np.uint8)) > tol.least_share) & ~view.polarized
             for share, view in zip(shares, small, strict=True)
         ]
+        window = np.ones((tol.window_px, tol.window_px), np.uint8)
+        textured = [cv2.erode(share, window) > tol.least_share for share in shares]
         shows_plane = [
             here | (cv2.resize(before.astype(np.uint8), here.shape[::-1]) > 0)
             for here, before in zip(found, shows_plane or found, strict=True)
@@ -134,6 +138,10 @@ def find_object(
     for _ in range(tol.num_rounds):
         plates = _plates(small, masks, tol)
         alone, together = _denied(small, plates, masks)
+        together = [
+            predicted | (seen & ~view.polarized)
+            for predicted, seen, view in zip(together, textured, small, strict=True)
+        ]
         left = cells.carved(small, alone, tol, needed=1)
         left = None if left is None else left.carved(small, together, tol)
         if left is None:
@@ -229,11 +237,8 @@ def _showing_plane(views: Sequence[_Working], points: Floats, tol: SearchToleran
         left = np.asarray(variances[-1] * (1 - correlations[-1] ** 2), np.float32)
         unexplained.append(sample_image(left, xy[view.sees(xy)]))
     noise = 3 * float(np.median(np.concatenate(unexplained)))
-    # A window at an outline on the plane shows the outline, within the object as well.
-    size = 2 * round(0.5 * tol.window_px + tol.detail_px) - 1
-    kernel = np.ones((size, size), np.uint8)
     return [
-        np.asarray(cv2.erode(value * variance / (variance + noise), kernel), np.float32)
+        np.asarray(value * variance / (variance + noise), np.float32)
         for value, variance in zip(correlations, variances, strict=True)
     ]
 

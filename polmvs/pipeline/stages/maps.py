@@ -118,7 +118,7 @@ def build_maps(
             num_inside += count
             on_progress(1)
         maps = [open_phase_map(view, folder) for view in views]
-        if options.mask is None and (found := _hidden_plane(maps, tracks)) is not None:
+        if options.mask is None and (found := hidden_plane(maps, tracks)) is not None:
             build = partial(_build_map, capture, options, folder)
             num_inside = sum(workers.map(build, views, raw_names, found))
             maps = [open_phase_map(view, folder) for view in views]
@@ -216,7 +216,7 @@ def find_mask(folder: Path, image: str) -> Path:
     raise DataError(folder, f"has no mask {stem}.png or {stem}_mask.png.")
 
 
-def _hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] | None:
+def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] | None:
     """What hides the plane beneath it, in each view; None where polarization shows it as well."""
     points = tracks.points_in_world
     centers = np.array([one.view.center_in_world for one in maps])
