@@ -24,6 +24,7 @@ from polmvs.simulation.capture import simulate_capture
 from polmvs.simulation.options import Simulation, SimulationRun
 
 MODEL = AngleModel.PPA
+CAPTURE, RUN = "capture", "run"  # folders of a trial
 HEADER = (
     "",
     "views",
@@ -94,8 +95,19 @@ def run_trial(
     ----------
     folder : of the capture and the run, ``capture`` and ``run``; both are resumed.
     """
-    capture, run = folder / "capture", folder / "run"
-    made = simulate_capture(mesh, capture, simulation, SimulationRun(resume=True))
+    simulate_capture(mesh, folder / CAPTURE, simulation, SimulationRun(resume=True))
+    return measure_trial(name, folder, simulation, workers=workers)
+
+
+def measure_trial(name: str, folder: Path, simulation: Simulation, *, workers: int = 1) -> Trial:
+    """Reconstruct a folder's finished capture and measure it; a failure is a result.
+
+    Parameters
+    ----------
+    folder : of the capture and the run, ``capture`` and ``run``.
+    simulation : which the capture was rendered by.
+    """
+    capture, run = folder / CAPTURE, folder / RUN
     begun = time.perf_counter()
     sensor = simulation.sensor
     options = Options(
@@ -111,7 +123,7 @@ def run_trial(
         options=options,
         run_options=RunOptions(workers=workers, overwrite=run.exists()),
     )
-    trial = Trial(name=name, views=made.num_views)
+    trial = Trial(name=name, views=simulation.path.views)
     try:
         outcome = compare(job, (MODEL,))
     except PolmvsError as error:
