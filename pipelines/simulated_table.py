@@ -40,7 +40,7 @@ from polmvs.simulation.options import (
     Simulation,
     SimulationRun,
 )
-from polmvs.simulation.trial import CAPTURE, RUN, Trial, measure_trial, trial_table
+from polmvs.simulation.trial import CAPTURE, RUN, Trial, measure, options_of, trial_table
 
 LIGHTS = tuple(light for light in LightName if light is not LightName.FILE)
 TRIAL, TABLE = "trial.json", "table.md"
@@ -172,7 +172,10 @@ def _trial(arguments: Arguments, row: Row) -> Trial:
     if stored.is_file() and not arguments.again:
         return from_json(Trial, parse_json(read_text(stored)))
     try:
-        trial = measure_trial(row.name, folder, row.simulation)
+        options = options_of(folder / CAPTURE, row.simulation.sensor)
+        (trial,) = measure(
+            row.name, folder / CAPTURE, folder / RUN, options, views=row.simulation.path.views
+        )
     except PolmvsError as error:
         trial = Trial(name=row.name, views=arguments.views, message=str(error)[:160])
     write_json(stored, trial)
