@@ -16,7 +16,14 @@ from polmvs.simulation.options import LightName
 from polmvs.simulation.scene import RING_IRRADIANCE
 from polmvs.simulation.truth import true_maps
 
-TINY = {"image_size": (96, 80), "views": 2, "max_samples": 16, "directions": 4, "exposure": 1.0}
+TINY = {
+    "image_size": (96, 80),
+    "views": 2,
+    "max_samples": 16,
+    "directions": 4,
+    "exposure": 1.0,
+    "elevation": (12, 12),
+}
 RING_RADIANCE = RING_IRRADIANCE / (np.pi * (RING_RADII[1] ** 2 - RING_RADII[0] ** 2))
 
 
@@ -79,11 +86,11 @@ def test_a_ring_light_lights_a_matt_surface_as_a_ring_does(renderer):
 
 @pytest.fixture(scope="module")
 def turned(renderer, tmp_path_factory):
-    """Light and depth of two views of a capture, from opposite sides just above the table."""
+    """Light and depth of two views of a capture, a right angle apart, just above the table."""
 
     def capture(shape, **options):
         folder = tmp_path_factory.mktemp("turned") / shape
-        options = {"light": "studio", "path": "ring", "elevation": (12, 12), **TINY, **options}
+        options = {"light": "studio", "path": "arc", "azimuth": (20, 110), **TINY, **options}
         polmvs.simulate(shape, folder, material="black-plastic", marks=0, **options)
         truth = open_ground_truth(folder)
         lights = [np.load(folder / "gt" / f"{name[:-4]}_stokes.npy")[0] for name in truth.names]
