@@ -317,7 +317,7 @@ class _Studio:
             elif (away & mask).sum() > 0.5 * mask.sum():
                 inside.append(view.name)
         for names, what in (
-            (inside, "look at the object from inside"),
+            (inside, "look at the object from inside, or at the backs of its faces"),
             (blind, "see nothing of it"),
         ):
             if names:

@@ -110,7 +110,9 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64], NDArray[np.float32] | N
         reason = " ".join(str(error).split())[:120]
         raise DataError(path, f"cannot be read as a mesh ({reason}). Export it again.") from error
     if len(triangles) == 0:
-        raise DataError(path, "has no faces: a cloud of points cannot be rendered. Mesh it first.")
+        raise DataError(
+            path, "has no faces: it is a cloud of points, or damaged. Mesh it, or export it again."
+        )
     if len(triangles) > MAX_TRIANGLES:
         raise DataError(
             path, f"has {len(triangles):,} faces, over {MAX_TRIANGLES:,}; simplify it first."
