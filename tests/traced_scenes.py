@@ -1,5 +1,7 @@
 """Small scenes, and the light that reaches a camera of 64x64 px from them."""
 
+from typing import Any
+
 import numpy as np
 
 from polmvs.camera import PinholeCamera, pixel_centers
@@ -61,7 +63,7 @@ def scaled(name: str, size: float = 0.2) -> Mesh:
     return Mesh(shape.vertices * size, shape.normals, shape.triangles)
 
 
-def stokes_of(scene: MitsubaScene, view: View) -> np.ndarray:
+def stokes_of(scene: MitsubaScene, view: View, **blur: Any) -> np.ndarray:
     """(H, W, 3), in the rays' transverse planes, of small samples about the pixels' centres."""
     centers = pixel_centers(SIDE, SIDE).reshape(-1, 1, 2)
     # One cell of four corners for each pixel: a tenth of it, so that edges and curvature are none.
@@ -72,7 +74,7 @@ def stokes_of(scene: MitsubaScene, view: View) -> np.ndarray:
     grid[1::2, 0], grid[1::2, 1] = np.stack([low[:, 0], high[:, 1]], 1), high
     found = trace(
         scene,
-        Lens(corners=grid.astype(np.float32)),
+        Lens(corners=grid.astype(np.float32), **blur),
         view.cam_from_world,
         np.arange(0, 2 * len(low) - 1, 2),
         np.zeros(len(low), np.float32),

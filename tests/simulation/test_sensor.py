@@ -1,14 +1,22 @@
-"""Polarizers behind lenses: what the angle models make of light that a telecentric lens turned."""
+"""The sensor: noise, levels and faults; and polarizers behind a lens that turns the light."""
 
 import numpy as np
 import pytest
 
+from polmvs.camera import PinholeCamera
 from polmvs.config import AngleModel
 from polmvs.geometry import unit
 from polmvs.polarization.angle_models import correct_parameters, phase_from_normal
 from polmvs.polarization.mosaic import ANGLES_DEG
-from polmvs.simulation.options import Optics
-from polmvs.simulation.sensor import polarizer_images
+from polmvs.simulation.options import Optics, SensorOptions
+from polmvs.simulation.sensor import (
+    draw_channels,
+    expose,
+    polarizer_images,
+    sample_angles,
+    stated_sigma,
+    vignette,
+)
 
 NUM = 20_000
 
@@ -69,3 +77,59 @@ def test_the_tilted_model_is_exact_for_rays_that_a_lens_does_not_turn(diffuse):
     found = measured(Optics.TILTED, rays, normals, diffuse=diffuse)
     corrected = correct_parameters(found, rays, diffuse=diffuse)
     assert phase_errors(corrected, rays, normals, diffuse=diffuse).max() < 1e-6
+
+
+def test_exposure_gain_black_level_and_full_well():
+    """Means and deviations of a grey card are those of the sensor's numbers."""
+    rng = np.random.default_rng(0)
+    light = np.full(200_000, 0.3)
+    for bits in (8, 10, 12, 16):
+        options = SensorOptions(bits=bits, gain=2.0, black_level=0.1, full_well=5000, read_noise=20)
+        found = expose(light, options, 0.8, rng) / (2**bits - 1)
+        assert found.mean() == pytest.approx(2 * 0.8 * 0.3 + 0.1, abs=2e-4)
+        variance = 4 * (0.24 / 5000 + (20 / 5000) ** 2) + (1 / (2**bits - 1)) ** 2 / 12
+        assert found.std() == pytest.approx(np.sqrt(variance), rel=0.02)
+        assert stated_sigma(light[:1], options, 0.8)[0] * 0.8 * 2 == pytest.approx(
+            np.sqrt(variance), rel=1e-3
+        )
+    bright = expose(np.full(100, 50.0), SensorOptions(bits=12, gain=0.5), 1.0, rng)
+    assert bright.max() == round(0.5 * 4095)  # a full well holds no more
+    assert (expose(np.full(1000, 50.0), SensorOptions(bits=8), 1.0, rng) == 255).all()
+
+
+def test_faults_of_the_polarizers():
+    """Extinction ratio, angles and gains, from what a rotating linear polarizer shows."""
+    rays = np.array([[0.0, 0.0, 1.0]])
+    ratio = SensorOptions(extinction=50.0)
+    faults = draw_channels(ratio, 0)
+    turned = np.radians(np.arange(0, 180, 5))
+    stokes = np.stack([np.ones(36), np.cos(2 * turned), np.sin(2 * turned)], axis=-1)
+    seen = polarizer_images(
+        stokes, np.repeat(rays, 36, 0), np.full(36, 45.0), Optics.TILTED, faults.diattenuation
+    )
+    assert seen.max() / seen.min() == pytest.approx(50)
+    assert np.degrees(turned[seen.argmax()]) == pytest.approx(45)
+    assert draw_channels(SensorOptions(), 0).diattenuation == 1
+    many = [draw_channels(SensorOptions(angle_errors=2.0, gain_errors=0.03), n) for n in range(400)]
+    errors = np.array([channels.angles_deg for channels in many]) - ANGLES_DEG
+    assert errors.std() == pytest.approx(2.0, rel=0.1)
+    gains = np.array([channels.gains for channels in many])
+    assert gains.mean(axis=1) == pytest.approx(1)
+    assert gains.std() == pytest.approx(0.03 * np.sqrt(3 / 4), rel=0.1)  # of the mean of four
+
+
+def test_vignetting_is_none_in_the_middle_and_stated_in_the_corners():
+    camera = PinholeCamera(width=61, height=51, fx=60.0, fy=60.0, cx=30.5, cy=25.5)
+    share = vignette(SensorOptions(vignetting=0.4), camera, np.array([[30.5, 25.5], [0.0, 0.0]]))
+    assert share == pytest.approx([1.0, 0.6])
+    assert (vignette(SensorOptions(), camera, np.zeros((2, 2))) == 1).all()
+
+
+def test_the_mosaic_repeats_its_cell():
+    angles = sample_angles(SensorOptions(pattern=(0, 45, 90, 135)), (4, 6))
+    assert [ANGLES_DEG[k] for k in (angles[2, 4], angles[2, 5], angles[3, 4], angles[3, 5])] == [
+        0,
+        45,
+        90,
+        135,
+    ]

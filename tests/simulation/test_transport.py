@@ -5,7 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
-from traced_scenes import GLOSS, SIDE, SMOOTH, cosines, lit_scene, scaled, stokes_of, view_of
+from traced_scenes import (
+    CAMERA,
+    GLOSS,
+    SIDE,
+    SMOOTH,
+    cosines,
+    lit_scene,
+    scaled,
+    stokes_of,
+    view_of,
+)
 
 from polmvs.camera import pixel_centers
 from polmvs.config import AngleModel
@@ -26,7 +36,7 @@ from polmvs.simulation.options import LightingOptions, LightName, Metal, Optics
 from polmvs.simulation.scene import MitsubaScene, SceneDescription, build_scene
 from polmvs.simulation.sensor import polarizer_images
 from polmvs.simulation.truth import true_maps
-from polmvs.synthetic.captures import render_view
+from polmvs.synthetic.captures import look_at, render_view
 from polmvs.synthetic.surfaces import Plane, Sphere
 
 
@@ -180,3 +190,26 @@ def test_sky_alone_is_unpolarized(renderer):
         _, _, mask = true_maps(scene, view)
         assert (stokes[~mask][:, 0] > 0).all()
         assert np.abs(stokes[~mask][:, 1:]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("blur", "deviation_px"),
+    [
+        # A disc of light's deviation along one axis is half its radius, a box's is 1 / sqrt(12).
+        ({"aperture": 0.02, "focus": 0.45}, 0.5 * 0.02 * (1 / 0.3 - 1 / 0.45) * 56),
+        ({"motion": (0.03, 0.0, 0.0)}, 0.03 / 0.3 * 56 / np.sqrt(12)),
+        ({"motion": (0.0, 0.03, 0.0)}, 0.0),  # along the edge
+        ({"aperture": 0.02, "focus": 0.3}, 0.0),
+    ],
+)
+def test_blur_of_an_edge_is_that_of_the_lens(renderer, blur, deviation_px):
+    """The border of a plane before the sky, across which light goes from little to 1."""
+    scene = lit_scene(renderer, scaled("plane"), GLOSS, samples=16)
+    top = scene.description.part.vertices[:, 2].max()
+    pose = look_at((0.1, 0.0, top + 0.3), (0.1, 0.0, 0.0), (0, 1, 0))
+    view = View(name="000.png", camera=CAMERA, cam_from_world=pose)
+    light = stokes_of(scene, view, **blur)[24:42, 10:54, 0].mean(axis=0)
+    steps = np.diff(light) / (light[-1] - light[0])
+    places = np.arange(len(steps)) - (steps * np.arange(len(steps))).sum()
+    found = np.sqrt(max(0.0, (steps * places**2).sum()))
+    assert found == pytest.approx(deviation_px, abs=0.3)
