@@ -717,7 +717,7 @@ class PlaneOptions(OptionGroup, group="plane"):
 
     model: AngleModel = option(
         AngleModel.PPA,
-        "angle and normal; 'tilted' presumes a lens not telecentric on the image side",
+        "angle and normal; 'tilted' is exact for a lens that is not telecentric on the image side",
     )
     light: Light = option(Light.SPECULAR, "reflection that dominates the polarisation")
     estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")

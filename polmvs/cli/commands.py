@@ -532,8 +532,8 @@ COMMANDS = (
         ),
         more="phase: error of the phases that the models predict from true normals; plane: normal "
         "of a planar region from one view; tracks: normals of surface points from K views; "
-        "contours: contours traced from seeds on the part's edge. The model 'tilted' presumes a "
-        "lens that is not telecentric on the image side.",
+        "contours: contours traced from seeds on the part's edge. The model 'tilted' is exact "
+        "for a lens that is not telecentric on the image side.",
     ),
     Command(
         name="simulate",

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import logging
-import os
-import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ from polmvs.errors import DataError, PolmvsError, as_data_error
 from polmvs.io.open3d_import import import_open3d
 from polmvs.io.ply import read_ply, read_ply_header, write_ply
 from polmvs.scene import MAX_COORDINATE
+from polmvs.unprinted import unprinted
 
 Array = NDArray[np.float64]
 
@@ -241,27 +240,11 @@ def solve_poisson(
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.normals = o3d.utility.Vector3dVector(normals)
     quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
-    with quiet, _unprinted():
+    with quiet, unprinted("Open3D"):
         mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
             cloud, depth=depth, scale=scale, n_threads=1
         )
     return np.array(mesh.vertices, np.float64), np.array(mesh.triangles, np.int32)
-
-
-@contextmanager
-def _unprinted() -> Iterator[None]:
-    """Keep what a library writes on stderr by itself for the log: it alarms and helps no one."""
-    with tempfile.TemporaryFile() as said:
-        own = os.dup(2)
-        os.dup2(said.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(own, 2)
-            os.close(own)
-            said.seek(0)
-            if text := said.read().decode(errors="replace").strip():
-                logger.debug("Open3D: %s", text)
 
 
 def write_mesh(path: str | Path, mesh: Mesh) -> None:
@@ -299,7 +282,7 @@ def read_any_mesh(path: str | Path) -> Mesh:
         empty = source.stat().st_size == 0
     o3d = import_open3d()
     quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
-    with quiet, _unprinted():
+    with quiet, unprinted("Open3D"):
         found = o3d.geometry.TriangleMesh() if empty else o3d.io.read_triangle_mesh(str(source))
     if not len(found.triangles):
         raise DataError(source, "holds no faces that can be read. Export it again.")

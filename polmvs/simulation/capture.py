@@ -56,7 +56,7 @@ from polmvs.simulation.renderer_import import Renderer, import_renderer
 from polmvs.simulation.scene import MitsubaScene, SceneDescription, build_scene
 from polmvs.simulation.sensor import Channels, draw_channels, stated_sigma
 from polmvs.simulation.surroundings import surroundings
-from polmvs.simulation.truth import true_maps, write_cameras, write_truth
+from polmvs.simulation.truth import CAMERAS_FILE, true_maps, write_cameras, write_truth
 
 logger = logging.getLogger(__name__)
 
@@ -151,15 +151,23 @@ def simulate_capture(
     run = run or SimulationRun()
     options = simulation.for_preview() if simulation.rendering.preview else simulation
     plan = _Plan.make(mesh, options)
+    record = {"version": __version__, "mesh": plan.mesh.source, **to_plain(asdict(options))}
+    finished = _open_folder(out, record, run)
+    whole = _whole(out, plan, finished)
+    if whole is not None:
+        on_progress(len(plan.views))
+        return whole
     renderer = import_renderer(
         colour=options.sensor.colour is not None, variant=options.rendering.variant
     )
-    record = {"version": __version__, "mesh": plan.mesh.source, **to_plain(asdict(options))}
-    finished = _open_folder(out, record, run)
     studio = _Studio(renderer, plan)
     studio.check_views()
     exposure = options.sensor.exposure or studio.metered_exposure()
-    _write_head(out, plan, {**record, "exposure": exposure, "channels": asdict(plan.channels)})
+    if run.overwrite and out.exists():  # when nothing stands in the way of another any more
+        with as_data_error(out, "removed"):
+            shutil.rmtree(out)
+    found_here = {"variant": renderer.variant, "exposure": exposure}
+    _write_head(out, plan, {**record, **found_here, "channels": asdict(plan.channels)})
     found: dict[str, SimulatedView] = {}
     for index, view in enumerate(plan.views):
         if view.name not in finished:
@@ -309,7 +317,7 @@ class _Studio:
             elif (away & mask).sum() > 0.5 * mask.sum():
                 inside.append(view.name)
         for names, what in (
-            (inside, "look at the object from inside"),
+            (inside, "look at the object from inside, or at the backs of its faces"),
             (blind, "see nothing of it"),
         ):
             if names:
@@ -392,7 +400,7 @@ def _require_compatible(options: Simulation) -> None:
 
 
 def _open_folder(out: Path, record: dict[str, Any], run: SimulationRun) -> set[str]:
-    """Make the folder ready; names of the views that are finished in it.
+    """Names of the views that are finished in a folder; none where it is to be replaced.
 
     Raises
     ------
@@ -409,8 +417,6 @@ def _open_folder(out: Path, record: dict[str, Any], run: SimulationRun) -> set[s
             out, f"exists and is no simulated capture (it has no {RECORD}). Choose another folder."
         )
     if run.overwrite:
-        with as_data_error(out, "removed"):
-            shutil.rmtree(out)
         return set()
     if not run.resume:
         raise OptionError(
@@ -438,6 +444,21 @@ def _open_folder(out: Path, record: dict[str, Any], run: SimulationRun) -> set[s
     }
 
 
+def _whole(out: Path, plan: _Plan, finished: set[str]) -> SimulatedCapture | None:
+    """The capture of the folder where nothing of it is missing; else None."""
+    missing = any(view.name not in finished for view in plan.views)
+    if missing or not (out / "gt" / CAMERAS_FILE).is_file():
+        return None
+    try:
+        record: Any = parse_json(read_text(out / RECORD))
+        exposure, variant = float(record["exposure"]), str(record["variant"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(out / RECORD, "is damaged. Give `run.overwrite`.") from error
+    return SimulatedCapture(
+        folder=out, views={}, num_views=len(plan.views), exposure=exposure, variant=variant
+    )
+
+
 def _entry(record: Any, group: str, name: str) -> Any:
     value = record.get(group) if isinstance(record, dict) else None
     return value.get(name) if isinstance(value, dict) else value
@@ -451,11 +472,11 @@ def _write_head(out: Path, plan: _Plan, record: dict[str, Any]) -> None:
             folder.mkdir(parents=True, exist_ok=True)
         if options.rendering.masks:
             (out / "masks").mkdir(exist_ok=True)
+    write_json(out / RECORD, record)  # first: by it the folder is known
     intrinsics = polarization_intrinsics(options.sensor)
     write_intrinsics(out / "camera.txt", intrinsics, "of the polarization images")
     write_bytes(out / "capture.toml", _capture_table(options.sensor).encode())
     write_mesh(out / "gt" / "mesh.ply", plan.mesh.mesh)
-    write_json(out / RECORD, record)
 
 
 def _capture_table(sensor: SensorOptions) -> str:

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 DEFAULT_SIZE = 0.2  # metres
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 METRIC_SUFFIXES = (".glb", ".gltf")  # whose format says metres
-MAX_TRIANGLES = 4_000_000  # 1.2 GB in the renderer
+MAX_TRIANGLES = 1_500_000  # 2 GB at the most
 FINE_TRIANGLES = 200_000  # a subdivision goes on to that many at most
 FINE_SAG = 2e-4  # of the size, between facets and their normals: 40 um at 0.2 m
 LARGEST_M, SMALLEST_M = 20.0, 0.002  # beyond which a file's unit is doubted
@@ -110,7 +110,9 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64], NDArray[np.float32] | N
         reason = " ".join(str(error).split())[:120]
         raise DataError(path, f"cannot be read as a mesh ({reason}). Export it again.") from error
     if len(triangles) == 0:
-        raise DataError(path, "has no faces: a cloud of points cannot be rendered. Mesh it first.")
+        raise DataError(
+            path, "has no faces: it is a cloud of points, or damaged. Mesh it, or export it again."
+        )
     if len(triangles) > MAX_TRIANGLES:
         raise DataError(
             path, f"has {len(triangles):,} faces, over {MAX_TRIANGLES:,}; simplify it first."
@@ -201,7 +203,7 @@ def _nearest(vertices: Array, colours: NDArray[np.float32], places: Array) -> ND
 def _warn_of_topology(path: Path, mesh: Any) -> None:
     if mesh.is_watertight:
         return
-    _, counts = np.unique(np.asarray(mesh.edges_sorted), axis=0, return_counts=True)
+    counts = np.bincount(np.asarray(mesh.edges_unique_inverse))
     faults = []
     if (counts == 1).any():
         faults.append("holes, through which its inside is black")

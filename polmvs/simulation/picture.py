@@ -22,10 +22,11 @@ from polmvs.simulation.sensor import (
     stated_sigma,
     vignette,
 )
-from polmvs.simulation.transport import RAYS, Lens, trace
+from polmvs.simulation.transport import RAYS, Lens, trace_parts
 
 Array = NDArray[np.float64]
 
+BAND_ROWS = 128  # of samples at a time, where they need much memory
 # Gaussian responses of a colour sensor's filters: centre and standard deviation, nm. A guess at
 # the published curves of a Sony IMX250MYR.
 FILTERS_NM = {"r": (610.0, 35.0), "g": (535.0, 35.0), "b": (460.0, 30.0)}
@@ -84,7 +85,7 @@ def render_picture(
         wavelengths = None
         if colours is not None:
             wavelengths = _wavelengths(colours[left], np.random.default_rng([seed, index, 5]))
-        traced = trace(
+        parts = trace_parts(
             scene,
             lens,
             view.cam_from_world,
@@ -94,9 +95,10 @@ def render_picture(
             seed=seed * 4099 + index,
             wavelengths=wavelengths,
         )
-        stokes[left] += traced.stokes
-        diffuse[left] += traced.diffuse
-        variance[left] += traced.variance
+        for part, traced in parts:
+            stokes[left[part]] += traced.stokes
+            diffuse[left[part]] += traced.diffuse
+            variance[left[part]] += traced.variance
         passes[left] += 1
         if not np.isfinite(exposure):
             break
@@ -149,27 +151,30 @@ def expose_picture(
     rng: np.random.Generator,
 ) -> list[NDArray[np.unsignedinteger]]:
     """The view's files: one mosaic, or four images in the order of ``ANGLES_DEG``."""
-    camera = view.camera
-    centers = sample_centers(camera, sensor.sensor)
-    rays = camera.rays(centers)
-    bright = picture.stokes * vignette(sensor, camera, centers)[..., None]
+    shape = picture.stokes.shape[:2]
+    centers = sample_centers(view.camera, sensor.sensor)
+
+    def behind(angles: Array) -> Array:
+        """Light (H, W) behind polarizers at these angles (H, W), some rows at a time."""
+        light = np.empty(shape)
+        for first in range(0, shape[0], BAND_ROWS):
+            rows = np.s_[first : first + BAND_ROWS]
+            bright = picture.stokes[rows]
+            bright = bright * vignette(sensor, view.camera, centers[rows])[..., None]
+            rays = view.camera.rays(centers[rows])
+            light[rows] = polarizer_images(
+                bright, rays, angles[rows], sensor.optics, channels.diattenuation
+            )
+        return light
+
     if sensor.sensor is SensorKind.MOSAIC:
-        which = _which_angle(sensor, bright.shape[:2])
-        behind = polarizer_images(
-            bright,
-            rays,
-            np.array(channels.angles_deg)[which],
-            sensor.optics,
-            channels.diattenuation,
-        )
-        return [expose(behind * np.array(channels.gains)[which], sensor, exposure, rng)]
+        which = _which_angle(sensor, shape)
+        light = behind(np.array(channels.angles_deg)[which]) * np.array(channels.gains)[which]
+        return [expose(light, sensor, exposure, rng)]
     files = []
     for angle, gain in zip(channels.angles_deg, channels.gains, strict=True):
-        behind = polarizer_images(
-            bright, rays, np.full(rays.shape[:2], angle), sensor.optics, channels.diattenuation
-        )
         drifted = gain * (1 + sensor.drift * rng.normal())
-        files.append(expose(behind * drifted, sensor, exposure, rng))
+        files.append(expose(behind(np.full(shape, angle)) * drifted, sensor, exposure, rng))
     return files
 
 

@@ -15,14 +15,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from polmvs.errors import OptionError
+from polmvs.unprinted import unprinted
 
 logger = logging.getLogger(__name__)
 
 INSTALL = "Mitsuba is not installed; install the extra: pip install 'polmvs[simulate]'."
-INSTALL_LLVM = (
-    "LLVM's library was not found, so that the slow scalar renderer is used. Install it (Debian "
-    "and Ubuntu: apt install libllvm19; Fedora: dnf install llvm-libs; conda: libllvm19; macOS: "
-    "brew install llvm), or name it by the environment variable DRJIT_LIBLLVM_PATH."
+HOW_TO_GET_LLVM = (
+    "Install it (Debian and Ubuntu: apt install libllvm19; Fedora: dnf install llvm-libs; conda: "
+    "libllvm19; macOS: brew install llvm), or name it by the environment variable "
+    "DRJIT_LIBLLVM_PATH."
+)
+NO_LLVM = (
+    f"LLVM's library was not found, so that the slow scalar renderer is used. {HOW_TO_GET_LLVM}"
 )
 LLVM_FOLDERS = (
     "/usr/lib/*-linux-gnu",
@@ -72,8 +76,9 @@ def import_renderer(*, colour: bool = False, variant: str | None = None) -> Rend
     if llvm is not None:
         os.environ.setdefault("DRJIT_LIBLLVM_PATH", llvm)
     try:
-        import drjit
-        import mitsuba
+        with unprinted("Dr.Jit"):  # which libraries it cannot load, as is said below
+            import drjit
+            import mitsuba
     except ImportError as error:
         raise OptionError(INSTALL) from error
     mi: Any = mitsuba
@@ -85,6 +90,7 @@ def import_renderer(*, colour: bool = False, variant: str | None = None) -> Rend
             f"{chosen}.",
             field="rendering.variant",
         )
+    _require_backend(dr, chosen)
     mi.set_variant(chosen)
     mi.set_log_level(mi.LogLevel.Error)
     return Renderer(mi, dr, chosen)
@@ -101,6 +107,23 @@ def find_llvm() -> str | None:
     return max(found, key=_version, default=None)
 
 
+def _require_backend(dr: Any, variant: str) -> None:
+    """Refuse a variant whose machine or library is not here.
+
+    Raises
+    ------
+    OptionError
+        Which that is.
+    """
+    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+        raise OptionError(
+            f"{variant} needs LLVM's library, which was not found. {HOW_TO_GET_LLVM}",
+            field="rendering.variant",
+        )
+    if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise OptionError(f"{variant} needs a GPU of NVIDIA.", field="rendering.variant")
+
+
 def _version(path: str) -> tuple[int, ...]:
     """Numbers of a library's name."""
     return tuple(map(int, re.findall(r"\d+", os.path.basename(path)))) or (0,)
@@ -113,5 +136,5 @@ def _best(dr: Any, *, has_llvm: bool, colour: bool) -> str:
         return f"cuda_ad_{kind}_polarized"
     if has_llvm and dr.has_backend(dr.JitBackend.LLVM):
         return f"llvm_ad_{kind}_polarized"
-    logger.warning(INSTALL_LLVM)
+    logger.warning(NO_LLVM)
     return "scalar_spectral_polarized"

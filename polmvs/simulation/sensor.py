@@ -22,6 +22,8 @@ from polmvs.synthetic.captures import add_noise, quantize
 
 Array = NDArray[np.float64]
 
+MOST_WELLS = 1e3  # of light on a sample: far over what it holds
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Channels:
@@ -114,8 +116,9 @@ def expose(
     light : (...), in units of radiance, behind the polarizers.
     exposure : full wells for each unit of radiance.
     """
-    wells = np.minimum(np.maximum(light, 0) * exposure, 1.0)  # a full well holds no more
+    wells = np.clip(light * exposure, 0, MOST_WELLS)
     noisy = add_noise(wells, full_well=options.full_well, read_noise=options.read_noise, rng=rng)
+    # A full well holds no more, and what overflows it has no noise.
     return quantize(np.minimum(noisy, 1.0) * options.gain + options.black_level, options.bits)
 
 

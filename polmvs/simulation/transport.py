@@ -9,6 +9,7 @@ rotation from the optical axis to the ray (as in :mod:`polmvs.polarization.angle
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,12 +90,41 @@ def trace(
     seed : of all that is random.
     wavelengths : (N, 4), nm, that each sample's rays have; None without colours.
     """
+    parts = trace_parts(
+        scene,
+        lens,
+        cam_from_world,
+        samples,
+        angles,
+        bounces=bounces,
+        seed=seed,
+        wavelengths=wavelengths,
+    )
+    found = [traced for _, traced in parts]
+    return Traced(
+        stokes=np.concatenate([one.stokes for one in found]),
+        diffuse=np.concatenate([one.diffuse for one in found]),
+        variance=np.concatenate([one.variance for one in found]),
+    )
+
+
+def trace_parts(
+    scene: MitsubaScene,
+    lens: Lens,
+    cam_from_world: RigidTransform,
+    samples: NDArray[np.int64],
+    angles: NDArray[np.float32],
+    *,
+    bounces: int,
+    seed: int,
+    wavelengths: NDArray[np.float32] | None = None,
+) -> Iterator[tuple[slice, Traced]]:
+    """As :func:`trace`, part after part of the samples: a large file needs much memory at once."""
     per_chunk = CHUNK_RAYS // RAYS
-    parts = []
     for start in range(0, len(samples), per_chunk):
-        part = np.s_[start : start + per_chunk]
-        colours = None if wavelengths is None else wavelengths[part]
-        parts.append(
+        part = slice(start, start + per_chunk)
+        yield (
+            part,
             _trace_chunk(
                 scene,
                 lens,
@@ -103,14 +133,9 @@ def trace(
                 angles[part],
                 bounces,
                 (seed * 1_000_003 + start) & 0x7FFFFFFF,
-                colours,
-            )
+                None if wavelengths is None else wavelengths[part],
+            ),
         )
-    return Traced(
-        stokes=np.concatenate([p.stokes for p in parts]),
-        diffuse=np.concatenate([p.diffuse for p in parts]),
-        variance=np.concatenate([p.variance for p in parts]),
-    )
 
 
 def _trace_chunk(

@@ -16,14 +16,16 @@ from polmvs.config import (
     SfmOptions,
 )
 from polmvs.errors import PolmvsError
+from polmvs.evaluation.comparison import ModelFigures
 from polmvs.evaluation.tables import format_table
 from polmvs.io.clouds import Mesh
 from polmvs.pipeline.jobs import compare
 from polmvs.pipeline.runner import Job
 from polmvs.simulation.capture import simulate_capture
-from polmvs.simulation.options import Simulation, SimulationRun
+from polmvs.simulation.options import SensorOptions, Simulation, SimulationRun
 
 MODEL = AngleModel.PPA
+CAPTURE, RUN = "capture", "run"  # folders of a trial
 HEADER = (
     "",
     "views",
@@ -94,35 +96,68 @@ def run_trial(
     ----------
     folder : of the capture and the run, ``capture`` and ``run``; both are resumed.
     """
-    capture, run = folder / "capture", folder / "run"
+    capture, run = folder / CAPTURE, folder / RUN
     made = simulate_capture(mesh, capture, simulation, SimulationRun(resume=True))
-    begun = time.perf_counter()
-    sensor = simulation.sensor
-    options = Options(
+    options = options_of(capture, simulation.sensor)
+    (trial,) = measure(name, capture, run, options, views=made.num_views, workers=workers)
+    return trial
+
+
+def options_of(capture: Path, sensor: SensorOptions) -> Options:
+    """What a rendered capture is reconstructed and measured by."""
+    return Options(
         capture=CaptureOptions(
             pattern=sensor.pattern, full_scale=float(2**sensor.bits - 1), bayer=sensor.colour
         ),
         sfm=SfmOptions(camera=capture / "camera.txt"),
         evaluation=EvaluationOptions(gt=capture / "gt"),
     )
+
+
+def measure(
+    name: str,
+    capture: Path,
+    run: Path,
+    options: Options,
+    *,
+    views: int,
+    models: Sequence[AngleModel] = (MODEL,),
+    workers: int = 1,
+) -> list[Trial]:
+    """Reconstruct a capture under each model and measure it; a failure is a result.
+
+    Parameters
+    ----------
+    run : folder of the results; what is in it is replaced.
+    options : with the capture's ground truth.
+    views : number of the capture's.
+    """
+    begun = time.perf_counter()
     job = Job(
         capture=capture,
         out=run,
         options=options,
         run_options=RunOptions(workers=workers, overwrite=run.exists()),
     )
-    trial = Trial(name=name, views=made.num_views)
+    trial = Trial(name=name, views=views)
     try:
-        outcome = compare(job, (MODEL,))
+        outcome = compare(job, tuple(models))
     except PolmvsError as error:
-        return replace(
-            trial, seconds=time.perf_counter() - begun, message=" ".join(str(error).split())[:160]
-        )
-    trial = replace(trial, seconds=time.perf_counter() - begun)
+        message = " ".join(str(error).split())[:160]
+        failed = replace(trial, seconds=time.perf_counter() - begun, message=message)
+        return [failed] * len(models)
     comparison = outcome.comparison
     assert comparison is not None
-    figures = comparison.models[MODEL]
-    trial = replace(trial, posed=comparison.sparse.num_views, message=outcome.empty or "")
+    trial = replace(
+        trial,
+        seconds=time.perf_counter() - begun,
+        posed=comparison.sparse.num_views,
+        message=outcome.empty or "",
+    )
+    return [_with_figures(trial, comparison.models[model]) for model in models]
+
+
+def _with_figures(trial: Trial, figures: ModelFigures) -> Trial:
     if figures.truth is None:
         return trial
     cloud = figures.truth.cloud

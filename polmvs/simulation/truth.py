@@ -26,6 +26,8 @@ from polmvs.simulation.picture import Picture
 from polmvs.simulation.scene import MitsubaScene
 
 Array = NDArray[np.float64]
+
+CAMERAS_FILE = "cameras.json"
 Mask = NDArray[np.bool_]
 
 SPECULAR, DIFFUSE = 255, 128
@@ -124,7 +126,7 @@ def write_cameras(folder: Path, views: Sequence[View]) -> None:
         rays = camera.rays(pixel_centers(camera.width, camera.height))
         save_array(folder / "plane_xy.npy", np.asarray(rays[..., :2] / rays[..., 2:], np.float32))
     write_json(
-        folder / "cameras.json",
+        folder / CAMERAS_FILE,
         {"width": camera.width, "height": camera.height, "images": images},
     )
 

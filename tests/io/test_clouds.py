@@ -1,10 +1,8 @@
-import os
-
 import numpy as np
 import pytest
 
 from polmvs.errors import DataError
-from polmvs.io.clouds import Cloud, _unprinted, read_cloud, write_cloud
+from polmvs.io.clouds import Cloud, read_cloud, write_cloud
 
 RNG = np.random.default_rng(0)
 
@@ -75,12 +73,3 @@ def test_a_truncated_cloud_is_named(tmp_path):
 def test_a_missing_cloud_is_named(tmp_path):
     with pytest.raises(DataError, match=r"nothing\.ply"):
         read_cloud(tmp_path / "nothing.ply")
-
-
-def test_what_a_library_writes_by_itself_is_not_shown(capfd, caplog):
-    with caplog.at_level("DEBUG", logger="polmvs"), _unprinted():
-        os.write(2, b"bad average roots: 4")
-    assert capfd.readouterr().err == ""
-    assert caplog.messages == ["Open3D: bad average roots: 4"]
-    os.write(2, b"mine")
-    assert capfd.readouterr().err == "mine"

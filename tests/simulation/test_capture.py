@@ -1,5 +1,6 @@
 """Whole captures, tiny: what is written, read again, resumed and refused."""
 
+import errno
 import json
 import os
 
@@ -115,6 +116,11 @@ def test_same_seed_same_capture_and_resume_gives_the_same(made, tmp_path, monkey
     )
     for path in files:
         assert (made.folder / path).read_bytes() == (tmp_path / "c" / path).read_bytes(), path
+    # What is complete is told from its files.
+    monkeypatch.setattr(capture_module, "import_renderer", None)
+    whole = polmvs.simulate("sphere", tmp_path / "c", resume=True, **options)
+    assert not whole.views
+    assert (whole.exposure, whole.variant) == (again.exposure, again.variant)
 
 
 def test_rotating_filter_of_twelve_bits(renderer, tmp_path):
@@ -177,6 +183,20 @@ def test_what_cannot_be_rendered_is_refused(renderer, tmp_path, changes, message
     assert not (tmp_path / "c").exists()
 
 
+def test_a_capture_is_replaced_only_by_one_that_can_be_rendered(renderer, tmp_path):
+    (tmp_path / "away.txt").write_text("a 1 0 0 0 0 0 -9\n")
+    options = {**SMALL, "image_size": (48, 40), "views": 1, "surroundings": "nothing"}
+    polmvs.simulate("plane", tmp_path / "c", **options)
+    first = (tmp_path / "c" / "raw" / "000.png").read_bytes()
+    with pytest.raises(OptionError, match="see nothing"):
+        polmvs.simulate(
+            "plane", tmp_path / "c", overwrite=True, cameras=tmp_path / "away.txt", **options
+        )
+    assert (tmp_path / "c" / "raw" / "000.png").read_bytes() == first
+    polmvs.simulate("plane", tmp_path / "c", overwrite=True, light="softbox", **options)
+    assert (tmp_path / "c" / "raw" / "000.png").read_bytes() != first
+
+
 def test_other_folders_are_left_alone(renderer, tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(DataError, match="no simulated capture"):
@@ -184,16 +204,32 @@ def test_other_folders_are_left_alone(renderer, tmp_path):
     assert (tmp_path / "thesis.txt").read_text() == "mine"
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-def test_a_full_disk_is_one_line(renderer, tmp_path, monkeypatch, capsys):
-    def full(path, data):
-        raise DataError(path, "cannot be written: No space left on device.")
+@pytest.mark.parametrize("full_at", ["mesh.ply", "001_depth.png", "001.png"])
+def test_a_full_disk_is_one_line_and_what_is_whole_is_gone_on_with(
+    renderer, tmp_path, monkeypatch, capsys, full_at
+):
+    """The system refuses a file at its end; those before it went well."""
+    replace = os.replace
 
-    monkeypatch.setattr("polmvs.io.images.write_bytes", full)
-    args = ["simulate", "dome", str(tmp_path / "c"), "--image-size", "96,80"]
-    status = main([*args, "--directions", "8"])
-    assert status == 1
-    assert capsys.readouterr().err.count("\n") == 1
+    def replaces(source, target, **kwargs):
+        if os.path.basename(target) == full_at:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(source))
+        replace(source, target, **kwargs)
+
+    out = tmp_path / "c"
+    args = ["simulate", "plane", str(out), "--image-size", "48,40", "--views", "2"]
+    args += ["--directions", "4", "--max-samples", "16", "--surroundings", "nothing"]
+    monkeypatch.setattr(os, "replace", replaces)
+    assert main(args) == 1
+    monkeypatch.undo()
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert full_at in message
+    assert "No space left" in message
+    assert not list(out.rglob(f"*{full_at}*"))  # nothing half-written
+    assert not (out / "gt" / "cameras.json").exists()
+    assert main([*args, "--resume"]) == 0
+    assert open_ground_truth(out).names == ("000.png", "001.png")
 
 
 def test_command_line_and_preview(renderer, tmp_path, capsys):

@@ -1,0 +1,156 @@
+"""Render a board of the same numbers as a shared capture's, and measure both alike.
+
+    python pipelines/simulated_board.py BOARD WORK [--seeds 0,1,2] [--light overcast]
+
+BOARD is a capture with ground truth of a black glossy board of 300 x 400 x 12 mm, turned by 12
+degrees on a textured table, that another program rendered. The board here has the same place,
+size, index and number of marks, the same cameras and sensor; prints, clutter and noise differ with
+each seed, whose spread is what figures may differ by. Captures and runs stay in WORK.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from polmvs.cli.call import Call, TerminalOptions
+from polmvs.cli.flags import Command
+from polmvs.cli.running import run
+from polmvs.cli.terminal import Terminal
+from polmvs.config import (
+    AngleModel,
+    EvaluationOptions,
+    OptionGroup,
+    Options,
+    SfmOptions,
+    option,
+)
+from polmvs.io.clouds import Mesh, write_mesh
+from polmvs.io.ground_truth import GroundTruth, open_ground_truth
+from polmvs.io.images import write_bytes
+from polmvs.io.intrinsics import Intrinsics, write_intrinsics
+from polmvs.simulation.camera_model import pinhole_of
+from polmvs.simulation.capture import simulate_capture
+from polmvs.simulation.options import (
+    LightingOptions,
+    LightName,
+    MaterialName,
+    ObjectOptions,
+    PathOptions,
+    RenderingOptions,
+    SensorOptions,
+    Simulation,
+    SimulationRun,
+)
+from polmvs.simulation.trial import Trial, measure, trial_table
+
+SIDES_M = (0.3, 0.4, 0.012)
+TURN_DEG = 12.0
+LONGEST_EDGE_M = 0.02
+MODELS = (AngleModel.OPA, AngleModel.PPA)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments(OptionGroup, group="arguments", in_files=False):
+    """Arguments."""
+
+    board: Path = option(MISSING, "the other program's capture", positional=True)
+    work: Path = option(MISSING, "folder of the captures and runs", positional=True)
+    seeds: tuple[int, ...] = option((0, 1, 2), "of the captures that are rendered")
+    light: LightName = option(LightName.OVERCAST, "preset of the light")
+
+
+def _run(call: Call, terminal: Terminal) -> int:
+    arguments = call.get(Arguments)
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    truth = open_ground_truth(arguments.board)
+    mesh, camera, poses = (arguments.work / n for n in ("board.ply", "camera.txt", "poses.txt"))
+    write_mesh(mesh, _board())
+    write_intrinsics(camera, _intrinsics(truth), "of the polarization images")
+    write_bytes(poses, _trajectory(truth).encode())
+    captures = [("shared", arguments.board)]
+    with terminal.stage("render", len(arguments.seeds)) as on_progress:
+        for seed in arguments.seeds:
+            made = simulate_capture(
+                mesh,
+                arguments.work / f"simulated_{seed}",
+                Simulation(
+                    object=ObjectOptions(material=MaterialName.BLACK_PLASTIC),
+                    lighting=LightingOptions(light=arguments.light),
+                    path=PathOptions(cameras=poses),
+                    sensor=SensorOptions(image_size=(1224, 1024), camera_file=camera),
+                    rendering=RenderingOptions(seed=seed),
+                ),
+                SimulationRun(resume=True),
+            )
+            captures.append((f"simulated, seed {seed}", made.folder))
+            on_progress(1)
+    trials: list[Trial] = []
+    with terminal.stage("measure", len(captures)) as on_progress:
+        for name, capture in captures:
+            options = Options(
+                sfm=SfmOptions(camera=camera), evaluation=EvaluationOptions(gt=capture / "gt")
+            )
+            found = measure(
+                name,
+                capture,
+                arguments.work / f"run_{name.replace(', ', '_').replace(' ', '_')}",
+                options,
+                views=len(truth.views),
+                models=MODELS,
+            )
+            for model, trial in zip(MODELS, found, strict=True):
+                trials.append(Trial(**{**vars(trial), "name": f"{name}, {model.upper()}"}))
+            write_bytes(arguments.work / "table.md", (trial_table(trials) + "\n").encode())
+            on_progress(1)
+    terminal.show(trial_table(trials), trials)
+    return 0
+
+
+def _board() -> Mesh:
+    """In squares small enough for the light on it to vary."""
+    box = trimesh.creation.box(SIDES_M).subdivide_to_size(LONGEST_EDGE_M)
+    vertices = np.asarray(box.vertices) @ _turn().T + [0, 0, 0.5 * SIDES_M[2]]
+    normals = np.zeros_like(vertices)  # those of its facets are taken
+    normals[:, 2] = 1
+    return Mesh(vertices, normals, np.asarray(box.faces, np.int32))
+
+
+def _turn() -> np.ndarray:
+    return np.asarray(Rotation.from_euler("z", TURN_DEG, degrees=True).as_matrix())
+
+
+def _intrinsics(truth: GroundTruth) -> Intrinsics:
+    camera = pinhole_of(next(iter(truth.views.values())).camera)
+    params = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return Intrinsics(model="PINHOLE", width=camera.width, height=camera.height, params=params)
+
+
+def _trajectory(truth: GroundTruth) -> str:
+    lines = []
+    for name, view in truth.views.items():
+        pose = view.cam_from_world
+        x, y, z, w = Rotation.from_matrix(pose.rotation).as_quat()
+        lines.append(" ".join([name, *(f"{v:.12g}" for v in (w, x, y, z, *pose.translation))]))
+    return "\n".join(lines) + "\n"
+
+
+COMMAND = Command(
+    help_text="measure a rendered board beside that of another program",
+    run=_run,
+    groups=(Arguments, TerminalOptions),
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Render, measure, and print the table."""
+    return run((COMMAND,), "simulated_board.py", argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
