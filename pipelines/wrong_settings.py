@@ -159,8 +159,8 @@ class Settings:
             values = ",".join(str(v) for v in (changed.fx, changed.fy, changed.cx, changed.cy))
             yield Setting(name, partial(_given, ("--intrinsics", values)), own_poses=True)
         changes: dict[str, Callable[[View], View]] = {
-            "model, focal length 1.1": partial(_with_focal, factor=1.1),
-            "model, focal length 1.03": partial(_with_focal, factor=1.03),
+            "model with focal length 1.1": partial(_with_focal, factor=1.1),
+            "model with focal length 1.03": partial(_with_focal, factor=1.03),
         }
         for name, change in changes.items():
             yield Setting(name, partial(self._model, change))
