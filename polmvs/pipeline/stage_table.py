@@ -222,15 +222,18 @@ def trust_of(model: AngleModel, folder: RunFolder, record: Record, options: Opti
     """Whether a dense cloud is to be trusted; nothing is written."""
     dense = record.result(densify.DensifyResult, model)
     found, mapped = record.find(sfm.SfmResult), record.find(maps.MapsResult)
+    unregistered = record.result(poses.PosesResult).unregistered
+    cameras = () if found is None else found.complaints
+    gone = {*unregistered, *dense.left_out}
     made = trust.Made(
         tilt_share=dense.tilt_share,
         left_out=dense.left_out,
-        num_unregistered=len(record.result(poses.PosesResult).unregistered),
+        num_unregistered=len(unregistered),
         tilt_aware=options.normals.tilt_aware_weights,
         masks_given=options.region.mask is not None,
         light=options.region.light,
         complaints=[
-            *(found.complaints if found is not None else ()),
+            *(one.text for one in cameras if one.view not in gone),
             *(mapped.complaints if mapped is not None else ()),
         ],
     )

@@ -17,7 +17,7 @@ from polmvs.colmap.database import NoRoomError
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.sfm import NoModelError, SfmTolerances, run_sfm
 from polmvs.colmap.sfm_failure import why_no_model
-from polmvs.colmap.trial_adjustment import try_cameras
+from polmvs.colmap.trial_adjustment import Complaint, try_cameras
 from polmvs.config import PropagationOptions, SfmOptions
 from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.io.arrays import save_array
@@ -54,14 +54,14 @@ class SfmResult:
         camera was given, or that is not known.
     bending : median deviation of the sparse points by what the estimated camera leaves open, as a
         share of their distance; likewise.
-    complaints : what the matches say against given cameras, a clause each.
+    complaints : what the matches say against given cameras.
     """
 
     num_views: int
     num_points: int
     focal_sigma: float | None = None
     bending: float | None = None
-    complaints: tuple[str, ...] = ()
+    complaints: tuple[Complaint, ...] = ()
 
     def __str__(self) -> str:
         text = f"{self.num_views} views, {self.num_points:,} sparse points"
@@ -128,7 +128,7 @@ def find_model(
         replace_folder(new, target)
     _warn_of_missing(model, images)
     _warn_of_few(len(model.views))
-    complaints: tuple[str, ...] = ()
+    complaints: tuple[Complaint, ...] = ()
     if options.intrinsics is not None or options.camera is not None:
         given = "`sfm.intrinsics`" if options.intrinsics is not None else "`sfm.camera`"
         complaints = _warn_of_cameras(target, given, "Leave it out, or give a camera that fits.")
@@ -244,8 +244,8 @@ def _warn_of_missing(model: SparseModel, source: Path) -> None:
         )
 
 
-def _warn_of_cameras(model: Path, given: str, remedy: str) -> tuple[str, ...]:
-    """Say which cameras would fit the matches where the given ones do not; a clause each."""
+def _warn_of_cameras(model: Path, given: str, remedy: str) -> tuple[Complaint, ...]:
+    """Say which cameras would fit the matches where the given ones do not."""
     trial = try_cameras(model)
     complaints = () if trial is None else trial.complaints
     for complaint in complaints:
@@ -253,12 +253,12 @@ def _warn_of_cameras(model: Path, given: str, remedy: str) -> tuple[str, ...]:
         logger.warning(
             "%s: %s (%.1f px off; %.1f px with what fits). Normals follow the cameras. %s",
             given,
-            complaint,
+            complaint.text,
             trial.error_px,
             trial.fitting_error_px,
             remedy,
         )
-    return tuple(f"{given}: {complaint}" for complaint in complaints)
+    return tuple(replace(one, text=f"{given}: {one.text}") for one in complaints)
 
 
 def _warn_of_few(num_views: int) -> None:
