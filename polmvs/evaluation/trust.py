@@ -178,6 +178,10 @@ class Trust:
         rows: list[_Row] = []
         if self.predicted is not None:
             enough = self.predicted.num_phases >= MIN_PHASES
+            remedy = "`sfm.intrinsics`, `sfm.sparse`, `region.light`, `capture.pattern`"
+            odd = self.predicted.odd_view(ranges.predicted_deg[1])
+            if odd is not None:
+                remedy = f"pose, image and mask of {odd}"
             rows += [
                 (
                     "planes of incidence of views left out, from a surface of the others, median "
@@ -185,7 +189,7 @@ class Trust:
                     self.predicted.error_deg if enough else float("nan"),
                     ranges.predicted_deg,
                     1.0,
-                    "`sfm.intrinsics`, `sfm.sparse`, `region.light`, `capture.pattern`",
+                    remedy,
                     True,
                 ),
                 (

@@ -12,7 +12,7 @@ from polmvs.evaluation.trust import Trust, measure_trust
 from polmvs.io.clouds import Cloud
 from polmvs.polarization.phase_map import turned
 from polmvs.scene import PointKind
-from polmvs.surface.held_out import Prediction
+from polmvs.surface.held_out import Prediction, ViewError
 from polmvs.surface.soundness import Soundness
 
 NO_TRACKS = Cloud(points=np.zeros((0, 3)), normals=np.zeros((0, 3)))
@@ -137,6 +137,16 @@ def test_one_figure_that_contradicts_is_enough(changes, said):
     found = replace(RIGHT, **changes).judged()
     assert not found.is_trusted
     assert re.match(f"Not to be trusted: .*{said}", found.verdict)
+
+
+def test_a_single_view_that_is_off_is_what_to_check():
+    views = tuple(ViewError(name=f"{k}.png", error_deg=deg) for k, deg in enumerate((1.0, 9.0)))
+    odd = replace(PREDICTED, error_deg=5.0, views=views)
+    assert (
+        replace(RIGHT, predicted=odd)
+        .judged()
+        .verdict.endswith("check pose, image and mask of 1.png.")
+    )
 
 
 def test_the_first_of_several_reasons_is_told_and_the_others_counted():

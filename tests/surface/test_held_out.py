@@ -111,6 +111,32 @@ def test_phases_of_something_else_are_at_chance(views) -> None:
     assert chance.unexplained > 0.5
 
 
+def test_one_view_that_is_odd_is_named(views) -> None:
+    """A view among those left out looks aside by 4 deg: it alone is predicted badly."""
+    turn = Rotation.from_rotvec([0, 0.07, 0]).as_matrix()
+    pose = views[6].view.cam_from_world
+    pose = RigidTransform(turn @ pose.rotation, turn @ pose.translation)
+    other = replace(views[6].view, cam_from_world=pose)
+    wrong = replace(views[6], phase_map=views[6].phase_map.changed(view=other))
+    found = predicted([*views[:6], wrong, *views[7:]])
+    assert [view.name for view in found.views] == ["002.png", "006.png", "010.png"]
+    assert found.odd_view(4.0) == "006.png"
+    assert predicted(views).odd_view(4.0) is None
+
+
+def test_a_short_trial_that_fails_is_done_again_with_care(views) -> None:
+    short = replace(FINE, levels=(replace(FINE.levels[0], edge_px=14.0, num_steps=1),))
+    once = replace(short, careful_levels=short.levels)
+    first, second = (
+        predict_left_out(views, None, LOOKING, NOTHING, tolerances=t)
+        for t in (once, replace(short, careful_levels=FINE.levels))
+    )
+    assert first is not None
+    assert second is not None
+    assert first.error_deg > FINE.doubtful_deg
+    assert second.error_deg < 2.5
+
+
 def test_a_silhouette_that_is_larger_overlaps_by_its_share() -> None:
     views = views_of(4, sphere())
     small = predict(extracted(sphere(0.8), step=0.05), views, LOOKING)
