@@ -58,11 +58,15 @@ class NormalRanges:
     sigma_share : measured, 0.0003 to 0.0019. The end is derived: twice the bending that the
         camera's model is allowed (`propagation.bending`).
 
-    predicted_deg : of views that were left out.
-    overlap : of their silhouettes.
+    predicted_deg : of views that were left out. Measured, 0.6 to 2.4; wrong ones 5 to 51. The end
+        is a guess in the gap.
+    overlap : of their silhouettes. Measured, 0.93 to 0.99; wrong masks 0.28 and 0.79, wrong gamma
+        0.18.
     unexplained : share of the phases that the surface explains under neither kind of light.
-    layered, overlapping : shares of the views' rays.
-    left_out : share of the views that have no pose or contradict the others.
+        Measured, 0.000 to 0.008; wrong angles 0.1 to 0.6.
+    layered, overlapping : shares of the views' rays. Measured, 0 to 0.004, and 0; the ends are
+        guesses.
+    left_out : share of the views that have no pose or contradict the others. Guess.
 
     Measured on right reconstructions: five rendered captures (``board``, ``dome``, ``demo``,
     ``mug``, ``step``) by one or both methods, ``board`` with six views, and analytic boards and
@@ -303,6 +307,9 @@ class Trust:
 
     def judged(self) -> Trust:
         """The same with its verdict."""
+        if np.isnan(self.inside) and np.isnan(self.residual_deg):
+            verdict = "Not to be trusted: no view sees a point of a surface in the result."
+            return replace(self, is_trusted=False, verdict=verdict)
         against = [*self.complaints]
         num_used = self.num_views - self.left_out
         if self.num_views and num_used < MIN_CHECKED:

@@ -83,6 +83,7 @@ def test_an_empty_cloud_tells_nothing(scene):
     unknown = [figure for figure in trust.figures() if figure.value is None]
     assert len(unknown) == 5
     assert "unknown" in str(unknown[0])
+    assert "no view sees a point of a surface" in trust.judged().verdict
 
 
 PREDICTED = Prediction(
