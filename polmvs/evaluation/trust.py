@@ -33,7 +33,7 @@ from polmvs.surface.soundness import Soundness
 LIGHT_OPTIONS = "`region.light`, `capture.pattern`, `capture.gamma`"
 MIN_CHECKED = 4  # views: three make a surface, and one checks it
 # Phases that a prediction is measured by, under which it tells nothing.
-MIN_PHASES = 200
+MIN_PHASES = 50
 
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -58,12 +58,12 @@ class NormalRanges:
     sigma_share : measured, 0.0003 to 0.0019. The end is derived: twice the bending that the
         camera's model is allowed (`propagation.bending`).
 
-    predicted_deg : of views that were left out. Measured, 0.6 to 2.4; wrong ones 5 to 51. The end
+    predicted_deg : of views that were left out. Measured, 0.6 to 2.5; wrong ones 5 to 78. The end
         is a guess in the gap.
     overlap : of their silhouettes. Measured, 0.93 to 0.99; wrong masks 0.28 and 0.79, wrong gamma
         0.18.
     unexplained : share of the phases that the surface explains under neither kind of light.
-        Measured, 0.000 to 0.008; wrong angles 0.1 to 0.6.
+        Measured, 0.000 to 0.03; wrong angles 0.1 to 0.6.
     layered, overlapping : shares of the views' rays. Measured, 0 to 0.004, and 0; the ends are
         guesses.
     left_out : share of the views that have no pose or contradict the others. Guess.
