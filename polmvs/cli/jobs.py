@@ -200,7 +200,7 @@ def _show_cloud(outcome: pipeline.JobOutcome, model: AngleModel, terminal: Termi
         lines.append(f"{dense.folder}: COLMAP dense workspace")
     trust = outcome.record.find(Trust, model)
     if trust is not None and cloud.num_points:
-        lines += map(str, trust.figures())
+        lines = [f"{model.upper()}: {trust.verdict}", *lines, *map(str, trust.figures())]
     terminal.show([in_flags(line) for line in lines], _content(outcome, terminal))
     return _status(outcome, terminal)
 

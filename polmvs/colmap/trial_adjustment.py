@@ -77,6 +77,20 @@ class PoseChange:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Complaint:
+    """What does not fit, and what would.
+
+    Attributes
+    ----------
+    text : a clause.
+    view : name of the view whose pose it is of; None: of all.
+    """
+
+    text: str
+    view: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class CameraTrial:
     """What the matches say of given cameras.
 
@@ -102,22 +116,24 @@ class CameraTrial:
     fitting_error_px: float
 
     @property
-    def complaints(self) -> tuple[str, ...]:
-        """What does not fit and what would, a clause each."""
+    def complaints(self) -> tuple[Complaint, ...]:
+        """What does not fit and what would."""
         found = []
         if not self.camera_fits:
             x, y = self.point
             fitting_x, fitting_y = self.fitting_point
-            found.append(
+            text = (
                 f"a focal length of {self.fitting_focal:.1f} +- {self.focal_sigma:.1f} px and a "
                 f"principal point of {fitting_x:.1f},{fitting_y:.1f} +- {self.point_sigma:.1f} px "
                 f"fit the matches, not the given {self.focal:.1f} px and {x:.1f},{y:.1f}"
             )
-        found += [
-            f"the pose of {pose.name} is {pose.turn_deg:.1f} deg and {100 * pose.shift:.1f} % of "
-            "its distance from one that fits the matches"
-            for pose in self.wrong_poses
-        ]
+            found.append(Complaint(text=text))
+        for pose in self.wrong_poses:
+            text = (
+                f"the pose of {pose.name} is {pose.turn_deg:.1f} deg and {100 * pose.shift:.1f} % "
+                "of its distance from one that fits the matches"
+            )
+            found.append(Complaint(text=text, view=pose.name))
         return tuple(found)
 
 

@@ -1,13 +1,14 @@
-"""What a reconstruction says about itself: a few figures, each with the range that is normal.
+"""What a reconstruction says about itself: one verdict, and figures with the range that is normal.
 
-No truth is needed. What can be derived is; the rest was measured on reconstructions that are right:
-see :class:`NormalRanges`.
+No truth is needed. What can be derived is; the rest was measured on reconstructions that are right
+and on wrong ones: see :class:`NormalRanges`. Some figures are of what the surface was fitted to;
+those of views that were left out, and of the mesh as such, can contradict it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -26,9 +27,17 @@ from polmvs.normals.tracks import BORDER_MARGIN_PX
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import grow_mask
 from polmvs.scene import PointKind
+from polmvs.surface.held_out import Prediction
+from polmvs.surface.soundness import Soundness
+
+LIGHT_OPTIONS = "`region.light`, `capture.pattern`, `capture.gamma`"
+MIN_CHECKED = 4  # views: three make a surface, and one checks it
+# Phases that a prediction is measured by, under which it tells nothing.
+MIN_PHASES = 50
 
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
+_Row = tuple[str, float, tuple[float, float], float, str, bool]  # as TrustFigure, unscaled
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +58,16 @@ class NormalRanges:
     sigma_share : measured, 0.0003 to 0.0019. The end is derived: twice the bending that the
         camera's model is allowed (`propagation.bending`).
 
+    predicted_deg : of views that were left out. Measured, 0.6 to 2.5; wrong ones 5 to 78. The end
+        is a guess in the gap.
+    overlap : of their silhouettes. Measured, 0.93 to 0.99; wrong masks 0.28 and 0.79, wrong gamma
+        0.18.
+    unexplained : share of the phases that the surface explains under neither kind of light.
+        Measured, 0.000 to 0.03; wrong angles 0.1 to 0.6.
+    layered, overlapping : shares of the views' rays. Measured, 0 to 0.004, and 0; the ends are
+        guesses.
+    left_out : share of the views that have no pose or contradict the others. Guess.
+
     Measured on right reconstructions: five rendered captures (``board``, ``dome``, ``demo``,
     ``mug``, ``step``) by one or both methods, ``board`` with six views, and analytic boards and
     balls of 6 and 12 views, sensors that obey PPA and tilted ones, noise of 0.2 and 1 % of full
@@ -61,6 +80,12 @@ class NormalRanges:
     inside: tuple[float, float] = (0.9, 1.0)
     determined: tuple[float, float] = (0.7, 1.0)
     sigma_share: tuple[float, float] = (0.0, 2 * PropagationOptions.bending)
+    predicted_deg: tuple[float, float] = (0.0, 4.0)
+    overlap: tuple[float, float] = (0.85, 1.0)
+    unexplained: tuple[float, float] = (0.0, 0.15)
+    layered: tuple[float, float] = (0.0, 0.05)
+    overlapping: tuple[float, float] = (0.0, 0.02)
+    left_out: tuple[float, float] = (0.0, 0.25)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +98,8 @@ class TrustFigure:
     value : None where there is nothing to tell it from.
     least, most : normal range.
     remedy : what to check where it lies outside.
+    decides : whether a result for which it is not normal is not to be trusted; else it is weaker
+        than others, or a part of it is missing.
     """
 
     name: str
@@ -80,6 +107,7 @@ class TrustFigure:
     least: float
     most: float
     remedy: str
+    decides: bool = True
 
     @property
     def is_normal(self) -> bool:
@@ -106,6 +134,13 @@ class Trust:
     determined : share of the regions, over all views, that show a point.
     sigma_share : median stated deviation of a place along its normal, share of its distance from
         the nearest camera.
+    num_views : of the capture.
+    left_out : those of them that have no pose, or contradict the others.
+    predicted : views left out, from a surface of the others; None where none was made.
+    fitted : all views, from the surface; None where the views were integrated one by one.
+    soundness : of the mesh; likewise.
+    complaints : what earlier stages found wrong (cameras, pattern, light), a clause each.
+    is_trusted, verdict : what all that comes to, in one sentence.
     """
 
     residual_deg: float
@@ -114,53 +149,20 @@ class Trust:
     inside: float
     determined: float
     sigma_share: float
+    num_views: int = 0
+    left_out: int = 0
+    predicted: Prediction | None = None
+    fitted: Prediction | None = None
+    soundness: Soundness | None = None
+    complaints: tuple[str, ...] = ()
+    is_trusted: bool = False
+    verdict: str = ""
 
     def __str__(self) -> str:
-        figures = self.figures()
-        normal = sum(figure.is_normal for figure in figures)
-        return f"{normal} of {len(figures)} figures are normal"
+        return self.verdict
 
     def figures(self, ranges: NormalRanges = NormalRanges()) -> tuple[TrustFigure, ...]:
-        """The figures with their normal ranges, for people."""
-        light = "`region.light`, `capture.pattern`, `capture.gamma`"
-        rows = (
-            ("phase residual, median, deg", self.residual_deg, ranges.residual_deg, 1.0, light),
-            (
-                "phase residual, median, stated deviations",
-                self.residual_sigmas,
-                ranges.residual_sigmas,
-                1.0,
-                light,
-            ),
-            (
-                "views that agree with a point they see, %",
-                self.agreement,
-                ranges.agreement,
-                100.0,
-                "poses: `sfm.intrinsics`, `sfm.sparse`",
-            ),
-            (
-                "points within the silhouettes of the views, %",
-                self.inside,
-                ranges.inside,
-                100.0,
-                "`region.mask`, poses",
-            ),
-            (
-                "part of the polarised regions determined, %",
-                self.determined,
-                ranges.determined,
-                100.0,
-                "marks on the part; more views",
-            ),
-            (
-                "stated deviation of the places, median, % of the distance",
-                self.sigma_share,
-                ranges.sigma_share,
-                100.0,
-                "`sfm.intrinsics`; more views",
-            ),
-        )
+        """The figures with their normal ranges, for people; first those that can contradict."""
         return tuple(
             TrustFigure(
                 name=name,
@@ -168,13 +170,171 @@ class Trust:
                 least=scale * low,
                 most=scale * high,
                 remedy=remedy,
+                decides=decides,
             )
-            for name, value, (low, high), scale, remedy in rows
+            for name, value, (low, high), scale, remedy, decides in [
+                *self._contradicting(ranges),
+                *self._fitted(ranges),
+            ]
         )
+
+    def _contradicting(self, ranges: NormalRanges) -> list[_Row]:
+        rows: list[_Row] = []
+        if self.predicted is not None:
+            enough = self.predicted.num_phases >= MIN_PHASES
+            remedy = "`sfm.intrinsics`, `sfm.sparse`, `region.light`, `capture.pattern`"
+            odd = self.predicted.odd_view(ranges.predicted_deg[1])
+            if odd is not None:
+                remedy = f"pose, image and mask of {odd}"
+            rows += [
+                (
+                    "planes of incidence of views left out, from a surface of the others, median "
+                    f"error, deg ({self.predicted.chance_deg:g} by chance)",
+                    self.predicted.error_deg if enough else float("nan"),
+                    ranges.predicted_deg,
+                    1.0,
+                    remedy,
+                    True,
+                ),
+                (
+                    "silhouettes of views left out, overlap with their prediction, %",
+                    self.predicted.overlap,
+                    ranges.overlap,
+                    100.0,
+                    "`region.mask`, `capture.gamma`, poses",
+                    True,
+                ),
+            ]
+        if self.fitted is not None:
+            rows.append(
+                (
+                    "phases that neither kind of light explains, %",
+                    self.fitted.unexplained,
+                    ranges.unexplained,
+                    100.0,
+                    LIGHT_OPTIONS,
+                    True,
+                )
+            )
+        if self.soundness is not None:
+            views = "views that contradict each other: poses, `region.mask`"
+            rows += [
+                (
+                    "lines of sight through two sheets of surface upon each other, %",
+                    self.soundness.layered,
+                    ranges.layered,
+                    100.0,
+                    views,
+                    True,
+                ),
+                (
+                    "lines of sight through a surface that intersects itself, %",
+                    self.soundness.overlapping,
+                    ranges.overlapping,
+                    100.0,
+                    views,
+                    True,
+                ),
+            ]
+        if self.num_views:
+            rows.append(
+                (
+                    "views without a pose or that contradict the others, %",
+                    self.left_out / self.num_views,
+                    ranges.left_out,
+                    100.0,
+                    "the images of these views, `sfm.intrinsics`, `region.mask`",
+                    True,
+                )
+            )
+        return rows
+
+    def _fitted(self, ranges: NormalRanges) -> list[_Row]:
+        return [
+            (
+                "phase residual, median, deg",
+                self.residual_deg,
+                ranges.residual_deg,
+                1.0,
+                LIGHT_OPTIONS,
+                True,
+            ),
+            (
+                "phase residual, median, stated deviations",
+                self.residual_sigmas,
+                ranges.residual_sigmas,
+                1.0,
+                LIGHT_OPTIONS,
+                False,
+            ),
+            (
+                "views that agree with a point they see, %",
+                self.agreement,
+                ranges.agreement,
+                100.0,
+                "poses: `sfm.intrinsics`, `sfm.sparse`",
+                True,
+            ),
+            (
+                "points within the silhouettes of the views, %",
+                self.inside,
+                ranges.inside,
+                100.0,
+                "`region.mask`, poses",
+                True,
+            ),
+            (
+                "part of the polarised regions determined, %",
+                self.determined,
+                ranges.determined,
+                100.0,
+                "marks on the part; more views",
+                False,
+            ),
+            (
+                "stated deviation of the places, median, % of the distance",
+                self.sigma_share,
+                ranges.sigma_share,
+                100.0,
+                "`sfm.intrinsics`; more views",
+                False,
+            ),
+        ]
 
     def doubts(self) -> tuple[str, ...]:
         """A line for each figure that is not normal."""
         return tuple(str(figure) for figure in self.figures() if not figure.is_normal)
+
+    def judged(self) -> Trust:
+        """The same with its verdict."""
+        if np.isnan(self.inside) and np.isnan(self.residual_deg):
+            verdict = "Not to be trusted: no view sees a point of a surface in the result."
+            return replace(self, is_trusted=False, verdict=verdict)
+        against = [*self.complaints]
+        num_used = self.num_views - self.left_out
+        if self.num_views and num_used < MIN_CHECKED:
+            against.append(
+                f"{num_used} views leave none to check the others by; record ten or more"
+            )
+        figures = self.figures()
+        against += [str(figure) for figure in figures if figure.decides and not figure.is_normal]
+        if against:
+            more = f" (and {len(against) - 1} more)" if len(against) > 1 else ""
+            verdict = f"Not to be trusted: {against[0].rstrip('.')}{more}."
+            return replace(self, is_trusted=False, verdict=verdict)
+        weak = [str(figure) for figure in figures if not figure.is_normal]
+        return replace(self, is_trusted=True, verdict=f"To be trusted: {self._why(weak)}.")
+
+    def _why(self, weak: Sequence[str]) -> str:
+        if self.predicted is not None:
+            reason = (
+                f"{self.predicted.num_views} views that were left out show what a surface of the "
+                f"others predicts, phases to {self.predicted.error_deg:.1f} deg (by chance "
+                f"{self.predicted.chance_deg:g}), silhouettes to {self.predicted.overlap:.0%}"
+            )
+        else:
+            reason = "the views agree with each other; no view was left out to check it"
+        return reason + (f". But {weak[0]}" if weak else "")
 
 
 def measure_trust(

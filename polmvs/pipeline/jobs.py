@@ -8,8 +8,9 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 from polmvs.config import COMPARED_MODELS, AngleModel, options_from_plain
-from polmvs.errors import OptionError
+from polmvs.errors import DataError, OptionError
 from polmvs.evaluation.comparison import Comparison, read_comparison
+from polmvs.evaluation.trust import Trust
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import Job, Run, load_record, open_run
@@ -22,6 +23,7 @@ from polmvs.pipeline.stage_table import (
     StageSpec,
     sparse_figures,
     stage_table,
+    trust_of,
     with_needed,
 )
 from polmvs.pipeline.stages.densify import DensifyResult
@@ -129,6 +131,21 @@ def densify(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> JobOu
 def finish(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
     """Mesh and COLMAP workspace of a folder that has a dense cloud."""
     return _do_alone(job, FINISH, (model,), (model,))
+
+
+def judge(run_folder: RunFolder, model: AngleModel = AngleModel.PPA) -> Trust:
+    """Whether the cloud of a finished run is to be trusted; nothing is written.
+
+    Raises
+    ------
+    DataError
+        The folder holds no such run.
+    """
+    record = load_record(run_folder)
+    options = options_from_plain(record.options, str(run_folder.run_file))
+    if record.find(DensifyResult, model) is None:
+        raise DataError(run_folder.cloud(model), "is not made yet; run `polmvs densify` first.")
+    return trust_of(model, run_folder, record, options)
 
 
 def measure(run_folder: RunFolder, models: Sequence[AngleModel]) -> Comparison:

@@ -215,13 +215,38 @@ def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
 
 
 def _find_trust(model: AngleModel, run: StageInput) -> Trust:
-    folder = run.run_folder
+    return trust_of(model, run.run_folder, run.record, run.options)
+
+
+def trust_of(model: AngleModel, folder: RunFolder, record: Record, options: Options) -> Trust:
+    """Whether a dense cloud is to be trusted; nothing is written."""
+    dense = record.result(densify.DensifyResult, model)
+    found, mapped = record.find(sfm.SfmResult), record.find(maps.MapsResult)
+    unregistered = record.result(poses.PosesResult).unregistered
+    cameras = () if found is None else found.complaints
+    gone = {*unregistered, *dense.left_out}
+    made = trust.Made(
+        tilt_share=dense.tilt_share,
+        left_out=dense.left_out,
+        num_unregistered=len(unregistered),
+        tilt_aware=options.normals.tilt_aware_weights,
+        masks_given=options.region.mask is not None,
+        light=options.region.light,
+        complaints=[
+            *(one.text for one in cameras if one.view not in gone),
+            *(mapped.complaints if mapped is not None else ()),
+        ],
+    )
     return trust.find_trust(
         model,
+        made,
         sparse=folder.sparse,
         maps=folder.maps(model),
         sparse_cloud=folder.sparse_cloud(model),
+        track_normals=folder.track_normals(model),
+        seeds=folder.seeds,
         cloud=folder.cloud(model),
+        views=folder.views(model),
     )
 
 
@@ -399,8 +424,18 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             name=f"trust_{model}",
             command=FINISH,
             angle_model=model,
-            reads=(HERE.sparse, HERE.maps(model), HERE.sparse_cloud(model), cloud),
+            reads=(
+                HERE.sfm,
+                HERE.sparse,
+                HERE.maps(model),
+                HERE.sparse_cloud(model),
+                HERE.track_normals(model),
+                HERE.seeds,
+                cloud,
+                views,
+            ),
             writes=(),
+            decides=("region.mask", "region.light", "normals.tilt_aware_weights"),
             work=partial(_find_trust, model),
             result=Trust,
         ),

@@ -112,7 +112,7 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
     text = page_text(
         Page(
             title=_title(given),
-            sentence=_sentence(given),
+            sentence=" ".join([*_verdict(given), _sentence(given)]),
             facts=_facts(given),
             warnings=tuple(w for stage in given.record.stages for w in stage.warnings),
             tables=_tables(given),
@@ -406,6 +406,15 @@ def _tables(given: _Given) -> tuple[Table, ...]:
     header, rows = comparison_rows(given.comparison)
     first = [row for row in rows if row[0] in HEADLINE]
     return Table(header=header, rows=first), Table(header=header, rows=rows)
+
+
+def _verdict(given: _Given) -> list[str]:
+    """Whether the main result is to be trusted, in one sentence."""
+    main = next(m for m in MAIN if m in given.models)
+    found = given.record.find(Trust, main)
+    if found is None or not found.verdict:
+        return []
+    return [f"{plots.LABELS[main]}: {found.verdict.replace('`', '')}"]
 
 
 def _trust(given: _Given) -> Table | None:

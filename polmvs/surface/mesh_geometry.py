@@ -159,6 +159,22 @@ class RayHits:
     barycentric: NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class Crossings:
+    """Where rays cross a mesh, by ray and then along it.
+
+    Attributes
+    ----------
+    ray : (C,) index.
+    distance : (C,) in lengths of the ray's direction.
+    cosine : (C,) between the direction and the face's normal; negative where the ray enters.
+    """
+
+    ray: NDArray[np.int64]
+    distance: NDArray[np.float32]
+    cosine: Array
+
+
 class RayScene:
     """A ``mesh`` to cast rays on and to measure distances to."""
 
@@ -236,6 +252,18 @@ class RayScene:
         count = np.bincount(np.ravel_multi_index((last, ray), shape), leaves, shape[0] * shape[1])
         beyond = np.cumsum(count.reshape(shape)[::-1], axis=0)[::-1]
         return np.asarray(np.rint(beyond[1:]) > 0)
+
+    def crossings(self, origins: Floats, directions: Floats) -> Crossings:
+        """All crossings of rays from ``origins`` (3,) or (N, 3) along ``directions`` (N, 3)."""
+        rays = np.empty((len(directions), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = self._local(origins), directions
+        found = self._scene.list_intersections(self._tensor(rays))
+        ray = found["ray_ids"].numpy().astype(np.int64)
+        length = found["t_hit"].numpy()
+        order = np.lexsort((length, ray))
+        face = found["primitive_ids"].numpy().astype(np.int64)[order]
+        cosine = np.einsum("ki,ki->k", self.mesh.face_normals[face], directions[ray[order]])
+        return Crossings(ray[order], length[order], cosine)
 
     def _windings(self, local: NDArray[np.float32], direction: Array) -> NDArray[np.int64]:
         """How often ``(N,)`` more a ray leaves the mesh than it enters it."""

@@ -88,7 +88,8 @@ def test_wrong_cameras_do_not_and_the_right_one_is_named(
     assert abs(found.fitting_focal - CAMERA.fx) < 4 * found.focal_sigma
     right = np.array([CAMERA.cx, CAMERA.cy])
     assert np.abs(np.array(found.fitting_point) - right).max() < 4 * found.point_sigma
-    (text,) = found.complaints
+    (complaint,) = found.complaints
+    text = complaint.text
     assert f"a focal length of {found.fitting_focal:.1f}" in text
     assert f"not the given {changes.get('fx', CAMERA.fx):.1f} px" in text
     assert found.fitting_error_px < found.error_px
@@ -108,7 +109,8 @@ def test_one_turned_pose(sound: SparseModel, tmp_path: Path, index: int, degrees
     assert wrong.name == view.name
     assert wrong.turn_deg == pytest.approx(degrees, abs=0.3)
     assert wrong.shift < 0.02
-    assert f"the pose of {view.name} is" in found.complaints[0]
+    assert f"the pose of {view.name} is" in found.complaints[0].text
+    assert found.complaints[0].view == view.name
 
 
 def test_one_camera_that_stands_farther_away(sound: SparseModel, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Figures of trust: normal where a surface is right, out of their ranges where it is not."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,8 @@ from polmvs.evaluation.trust import Trust, measure_trust
 from polmvs.io.clouds import Cloud
 from polmvs.polarization.phase_map import turned
 from polmvs.scene import PointKind
+from polmvs.surface.held_out import Prediction, ViewError
+from polmvs.surface.soundness import Soundness
 
 NO_TRACKS = Cloud(points=np.zeros((0, 3)), normals=np.zeros((0, 3)))
 
@@ -80,3 +83,85 @@ def test_an_empty_cloud_tells_nothing(scene):
     unknown = [figure for figure in trust.figures() if figure.value is None]
     assert len(unknown) == 5
     assert "unknown" in str(unknown[0])
+    assert "no view sees a point of a surface" in trust.judged().verdict
+
+
+PREDICTED = Prediction(
+    num_views=3,
+    num_phases=5000,
+    error_deg=1.2,
+    chance_deg=22.5,
+    within=0.9,
+    unexplained=0.01,
+    overlap=0.98,
+)
+RIGHT = Trust(
+    residual_deg=0.5,
+    residual_sigmas=0.6,
+    agreement=1.0,
+    inside=1.0,
+    determined=0.9,
+    sigma_share=1e-3,
+    num_views=12,
+    predicted=PREDICTED,
+    fitted=replace(PREDICTED, num_views=12),
+    soundness=Soundness(layered=0.001, overlapping=0.0),
+)
+
+
+def test_a_right_result_says_why_it_is_to_be_trusted():
+    found = RIGHT.judged()
+    assert found.is_trusted
+    assert found.verdict == str(found)
+    assert found.verdict == (
+        "To be trusted: 3 views that were left out show what a surface of the others predicts, "
+        "phases to 1.2 deg (by chance 22.5), silhouettes to 98%."
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"predicted": replace(PREDICTED, error_deg=12.0)}, "median error.* 12 .*region.light"),
+        ({"predicted": replace(PREDICTED, num_phases=20)}, "median error.* unknown"),
+        ({"predicted": replace(PREDICTED, overlap=0.7)}, "silhouettes of views left out.* 70 "),
+        ({"fitted": replace(PREDICTED, unexplained=0.5)}, "neither kind of light explains.* 50 "),
+        ({"soundness": Soundness(layered=0.2, overlapping=0.0)}, "two sheets.* 20 "),
+        ({"soundness": Soundness(layered=0.0, overlapping=0.1)}, "intersects itself.* 10 "),
+        ({"left_out": 5}, "contradict the others, %: 41.7 "),
+        ({"num_views": 3}, "3 views leave none to check"),
+        ({"complaints": ("the pose of 7.png is off.",)}, r"the pose of 7.png is off\.$"),
+        ({"agreement": 0.4}, "agree with a point they see, %: 40 "),
+    ],
+)
+def test_one_figure_that_contradicts_is_enough(changes, said):
+    found = replace(RIGHT, **changes).judged()
+    assert not found.is_trusted
+    assert re.match(f"Not to be trusted: .*{said}", found.verdict)
+
+
+def test_a_single_view_that_is_off_is_what_to_check():
+    views = tuple(ViewError(name=f"{k}.png", error_deg=deg) for k, deg in enumerate((1.0, 9.0)))
+    odd = replace(PREDICTED, error_deg=5.0, views=views)
+    assert (
+        replace(RIGHT, predicted=odd)
+        .judged()
+        .verdict.endswith("check pose, image and mask of 1.png.")
+    )
+
+
+def test_the_first_of_several_reasons_is_told_and_the_others_counted():
+    found = replace(RIGHT, complaints=("the camera is wrong",), inside=0.2, agreement=0.2).judged()
+    assert found.verdict == "Not to be trusted: the camera is wrong (and 2 more)."
+
+
+def test_a_part_that_is_missing_is_a_reservation():
+    found = replace(RIGHT, determined=0.3).judged()
+    assert found.is_trusted
+    assert "But part of the polarised regions determined, %: 30 " in found.verdict
+
+
+def test_views_integrated_one_by_one_say_that_none_was_left_out():
+    found = replace(RIGHT, predicted=None, fitted=None, soundness=None).judged()
+    assert found.is_trusted
+    assert "no view was left out to check it" in found.verdict

@@ -99,6 +99,37 @@ def test_sigma_is_honest(num_rows):
     np.testing.assert_allclose(estimate.sigma_deg, np.degrees(values[:, 1] ** -0.5), rtol=0.05)
 
 
+def simulate_arc(num_rows, num_points, sigma_deg, arc_deg, rng):
+    """As :func:`simulate`, with planes of incidence that lie within a short arc."""
+    shape = (num_rows, num_points)
+    normals = unit(rng.standard_normal((3, num_points)))
+    zenith = np.radians(rng.uniform(20, 70, shape))
+    azimuth = np.radians(arc_deg) * np.linspace(-0.5, 0.5, num_rows)[:, None]
+    first, second = tangents_of(normals)
+    across = np.cos(azimuth) * first[:, None] + np.sin(azimuth) * second[:, None]
+    rays = -np.cos(zenith) * normals[:, None] - np.sin(zenith) * across
+    rows = unit(np.cross(rays, normals[:, None], axis=0))
+    sigma = np.full(shape, np.radians(sigma_deg))
+    turn = sigma * rng.standard_normal(shape)
+    rows = np.cos(turn) * rows + np.sin(turn) * np.cross(rays, rows, axis=0)
+    return rows, rays, sigma, normals
+
+
+@pytest.mark.parametrize("num_rows", [10, 20])
+def test_noise_in_short_arcs_is_no_spread_and_draws_no_normal(num_rows):
+    """Noise parts rows of one plane of incidence as well; half of all were within a deviation."""
+    rows, rays, sigma, normals = simulate_arc(num_rows, 3000, 1.0, 10.0, np.random.default_rng(5))
+    estimate = solve_normals(rows, rays, sigma)
+    assert estimate.valid.mean() > 0.99
+    ratio = errors_deg(estimate, normals) / estimate.sigma_deg
+    assert 0.64 < np.nanmean(ratio < 1) < 0.75
+    assert np.nanmean(ratio < 2) > 0.93
+    towards = (normals.T * np.einsum("ikn->ni", rays)).sum(axis=1)
+    found = (estimate.normals * np.einsum("ikn->ni", rays)).sum(axis=1)
+    drawn = np.degrees(found - towards) / num_rows  # about the angle between them
+    assert abs(np.nanmedian(drawn)) < 0.25 * np.nanmedian(estimate.sigma_deg)
+
+
 def test_sigma_of_the_algebraic_estimator_is_that_of_unit_weights():
     rows, rays, sigma, normals = simulate(10, 4000, (0.3, 3), np.random.default_rng(3))
     estimate = solve_normals(rows, rays, sigma, robust=False)

@@ -5,7 +5,11 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import cv2
+import numpy as np
 import pytest
+
+from polmvs.colmap.models import read_model
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 SCRIPTS = sorted(path.stem for path in PIPELINES.glob("*.py"))
@@ -76,3 +80,101 @@ def test_benchmark_of_no_run_is_one_line(
 ) -> None:
     assert load("benchmark").main([str(tmp_path)]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_trust_table_tells_a_right_run(demo_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert load("trust_table").main([str(demo_run)]) == 0
+    text = capsys.readouterr().out
+    assert "To be trusted: 2 views that were left out" in text
+    assert "0 false alarms of 1 right results, 0 misses of 0 wrong ones" in text
+
+
+def test_false_alarms_and_misses_are_counted() -> None:
+    script = load("trust_table")
+    row = ("run", "0", "99", "right", "1", "99", "0", "yes", "")
+    rows = [
+        row,
+        (*row[:7], "no", ""),
+        (*row[:3], "wrong", *row[4:]),
+        (*row[:3], "wrong", *row[4:7], "no", ""),
+        (*row[:3], "between", *row[4:]),
+    ]
+    assert script.counts(rows) == (
+        "1 false alarms of 2 right results, 1 misses of 2 wrong ones; 1 of 1 in between are "
+        "trusted."
+    )
+
+
+@pytest.mark.parametrize(
+    ("normals", "scores", "state"),
+    [
+        (0.5, (0.8, 0.95, 1.0), "right"),
+        (5.0, (0.9, 0.95, 1.0), "wrong"),
+        (0.5, (0.1, 0.6, 1.0), "wrong"),
+        (float("nan"), (0.9, 0.95, 1.0), "wrong"),
+        (3.0, (0.9, 0.95, 1.0), "between"),
+        (0.5, (0.5, 0.8, 1.0), "between"),
+    ],
+)
+def test_results_are_right_wrong_or_between(normals, scores, state) -> None:
+    cloud = type(
+        "Cloud",
+        (),
+        {
+            "thresholds_m": (0.001, 0.002, 0.005),
+            "f_score": scores,
+            "normal_median_deg": normals,
+        },
+    )
+    assert load("trust_table").state_of(cloud) == state
+
+
+def test_wrong_settings_are_what_their_names_say(
+    demo_run: Path, demo_capture: Path, tmp_path: Path
+) -> None:
+    script = load("wrong_settings")
+    work = tmp_path / "work"
+    (work / "right" / "run").mkdir(parents=True)
+    shutil.copytree(demo_run / "sparse", work / "right" / "run" / "sparse")
+    settings = {
+        setting.name: setting
+        for setting in script.Settings(script.Arguments(capture=demo_capture, work=work))
+    }
+    right = {view.name: view for view in read_model(demo_run / "sparse").views}
+
+    def model_of(name: str) -> dict:
+        folder = tmp_path / name.replace(" ", "_")
+        folder.mkdir()
+        flag, path = settings[name].flags(folder)
+        assert flag == "--sparse"
+        return {view.name: view for view in read_model(path).views}
+
+    def turned_deg(name: str) -> list[float]:
+        angles = []
+        for key, view in model_of(name).items():
+            turn = view.cam_from_world.rotation @ right[key].cam_from_world.rotation.T
+            angles.append(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
+        return sorted(angles)
+
+    for name, degrees in {"pose off by 1 deg": 1, "pose off by 5 deg": 5}.items():
+        found = turned_deg(name)
+        assert found[-1] == pytest.approx(degrees, abs=1e-3)
+        assert found[-2] < 1e-3
+    focal = model_of("model with focal length 1.1")
+    assert all(v.camera.fx == pytest.approx(1.1 * right[k].camera.fx) for k, v in focal.items())
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    settings["mask shifted"].flags(masks)
+    mask = cv2.imread(str(masks / "000.png"), cv2.IMREAD_GRAYSCALE)
+    true = cv2.imread(str(demo_capture / "gt" / "000_mask.png"), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(mask[:, 20:] > 0, true[:, :-20] > 0)
+    frames = []
+    for k in range(6):
+        frames.append(tmp_path / f"{k}.raw")
+        frames[-1].write_bytes(bytes([k]))
+    settings["frames swapped"].frames(frames)
+    assert [frame.read_bytes()[0] for frame in frames] == [0, 3, 2, 1, 4, 5]
+    settings["frame duplicated"].frames(frames)
+    assert [frame.read_bytes()[0] for frame in frames] == [0, 3, 2, 3, 4, 5]
+    settings["three views"].frames(frames)
+    assert [frame.exists() for frame in frames] == [True] * 3 + [False] * 3

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import record_of, refused
+from helpers import record_of, refused, result_of
 
 from polmvs.colmap.models import read_model, write_model
 from polmvs.geometry import RigidTransform
@@ -49,6 +49,14 @@ def test_a_view_that_the_surface_contradicts_is_taken_out(
     record = record_of(out)
     assert record["options"]["sfm"]["without"] == ["004.png"]
     assert any("004.png contradicts the other views" in note for note in record["notes"])
+    # What is left is right: the complaint about the pose went with its view.
+    first, figures = text.splitlines()[0], text.splitlines()[1:]
+    assert first.startswith("PPA: To be trusted: 2 views that were left out show what a surface")
+    assert any(line.startswith("silhouettes of views left out") for line in figures)
+    trust = result_of(out, "trust_ppa")
+    assert trust["is_trusted"]
+    assert first == f"PPA: {trust['verdict']}"
+    assert (trust["num_views"], trust["left_out"], trust["complaints"]) == (10, 1, [])
     # It goes on with what is recorded.
     status, _, err = cli("reconstruct", demo_capture, out, *flags, "--resume")
     assert status == 0, err

@@ -1,11 +1,15 @@
 """Smoothing of the Stokes images into a phase map."""
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.config import Light
+from polmvs.config import CaptureOptions, Light
 from polmvs.geometry import RigidTransform
+from polmvs.polarization.capture import open_capture
 from polmvs.polarization.phase_map import PhaseTolerances, build_phase_map
 from polmvs.polarization.region import Region, find_region
 from polmvs.polarization.stokes import Stokes
@@ -103,3 +107,27 @@ def test_no_light_gives_no_phase():
     dark = np.zeros((HEIGHT, WIDTH))
     phase_map = build(dark, dark, dark, np.full_like(dark, 1e-3), inside)
     assert not phase_map.samples.any()
+
+
+@pytest.mark.parametrize(("level", "bounds"), [(12, (0.6, 0.8)), (100, (0.62, 0.74))])
+def test_dark_8_bit_mosaics_state_their_noise(level, bounds, tmp_path: Path):
+    """Rounding, shot noise and interpolation at 5 and at 40 % of full scale, end to end."""
+    rng = np.random.default_rng(level)
+    axes = np.tile(np.radians([[90, 45], [135, 0]]), (100, 100))
+    y, x = np.mgrid[:200, :200]
+    shade = level * (1 + 0.15 * np.sin(x / 37) + 0.15 * np.cos(y / 53))
+    electrons = rng.poisson(0.5 * shade * (1 + 0.5 * np.cos(2 * (axes - 0.5))) / 255 * 1e4)
+    noisy = electrons + 2.5 * rng.standard_normal(axes.shape)
+    cv2.imwrite(str(tmp_path / "0.png"), np.clip(np.rint(noisy / 1e4 * 255), 0, 255))
+    stokes = open_capture(tmp_path, CaptureOptions(full_scale=255.0)).load("0.png")
+    inside = np.ones(stokes.shape, bool)
+    camera = PinholeCamera(width=100, height=100, fx=120.0, fy=120.0, cx=50.0, cy=50.0)
+    view = View(name="a", camera=camera, cam_from_world=RigidTransform(np.eye(3), np.zeros(3)))
+    exact = PhaseTolerances(model_sigma=0.0, mixture_sigma=0.0)
+    region = Region(inside, inside, ~inside)
+    phase_map = build_phase_map(view, stokes, region, Light.DIFFUSE, tolerances=exact)
+    cos2, sin2, precision = np.moveaxis(phase_map.samples[5:-5, 5:-5], -1, 0)
+    turn = 0.5 * np.arctan2(sin2, cos2) - 0.5
+    ratio = np.abs(turn) * np.sqrt(precision)
+    assert bounds[0] < (ratio < 1).mean() < bounds[1]
+    assert (ratio < 2).mean() > 0.92

@@ -8,7 +8,7 @@ from scenes import board_scene
 
 from polmvs.config import FusionOptions
 from polmvs.surface.dense_view import DenseView
-from polmvs.surface.fusion import fuse
+from polmvs.surface.fusion import FusedCloud, fuse, merge
 from polmvs.synthetic.surfaces import Plane
 
 STRIDE = 2
@@ -95,3 +95,51 @@ def test_places_are_means_by_certainty(scene) -> None:
         for first in (sure, near, unsure)
     ]
     assert means[0] > means[1] > means[2]
+
+
+def test_the_deviation_of_a_point_is_not_narrowed_by_the_number_of_views(scene) -> None:
+    """Views err alike: six that state a tenth of a millimetre place a point no better than one."""
+    dense = [seen_by(scene, k, scene.surface) for k in range(NUM_VIEWS)]
+    options = FusionOptions(voxel=0.0)
+    two, six = (fuse(scene.maps[:n], dense[:n], options) for n in (2, NUM_VIEWS))
+    assert six.num_views.max() == NUM_VIEWS
+    for cloud in (two, six):
+        # Along the ray a place is less certain the more obliquely it is seen.
+        assert np.median(cloud.sigma) == pytest.approx(1e-4, rel=0.15)
+
+
+def test_what_others_see_no_part_at_goes(scene) -> None:
+    """Two views see a patch beside the board, where the regions of the four others are empty."""
+    beside = Plane(point=np.array([0.0, 0.2, 0.0]), normal=UP, extent=(0.02, 0.02))
+    others = range(2, NUM_VIEWS)
+    seen = [seen_by(scene, k, scene.surface, *([beside] * (k < 2))) for k in range(NUM_VIEWS)]
+    # Of the others only their regions tell: without a range there they see through nothing.
+    alone = fuse(scene.maps[:2], seen[:2], FusionOptions())
+    cloud = fuse(scene.maps, seen, FusionOptions())
+    far = [int((one.points[:, 1] > 0.175).sum()) for one in (alone, cloud)]
+    assert far[0] > 50
+    assert far[1] == 0
+    assert all(
+        not scene.maps[k].shows_surface(scene.views[k].project(beside.point[None])).any()
+        for k in others
+    )
+
+
+def test_merged_points_weigh_by_views_and_certainty() -> None:
+    cloud = FusedCloud(
+        points=np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [5.1, 0.1, 0.1]]),
+        normals=np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+        intensity=np.array([0.0, 1.0, 0.5], np.float32),
+        num_views=np.array([2, 4, 3], np.int32),
+        sigma_deg=np.array([1.0, 4.0, 2.0], np.float32),
+        sigma=np.array([0.1, 0.2, 0.1], np.float32),
+    )
+    merged = merge(cloud, 1.0)
+    order = np.argsort(merged.points[:, 0])
+    # 2 / 0.01 against 4 / 0.04: twice as much.
+    np.testing.assert_allclose(merged.points[order, 0], [0.5 / 3, 5.1], rtol=1e-6)
+    np.testing.assert_allclose(merged.normals[order[0]], np.array([0, 1, 2]) / np.sqrt(5))
+    np.testing.assert_allclose(merged.intensity[order], [1 / 3, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(merged.sigma_deg[order], [2, 2], rtol=1e-6)
+    assert merged.num_views[order].tolist() == [4, 3]
+    assert merge(cloud, 0.0) is cloud

@@ -56,10 +56,12 @@ class MapsResult:
     ----------
     num_region_px : pixels of all views that show a polarised surface.
     num_diffuse_px : those of them whose light is diffuse.
+    complaints : settings that the phases contradict, a clause each.
     """
 
     num_region_px: int
     num_diffuse_px: int
+    complaints: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.num_region_px:,} polarised pixels, {self.num_diffuse_px:,} of them diffuse"
@@ -123,6 +125,7 @@ def build_maps(
             num_inside = sum(workers.map(build, views, raw_names, found))
             maps = [open_phase_map(view, folder) for view in views]
         num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
+        wrong = None
         if len(tracks.point3D_ids):
             # Both ask all views, so that they are tasks of their own.
             questions: list[Callable[[], Any]] = [
@@ -135,7 +138,11 @@ def build_maps(
                 logger.warning("%s.", wrong)
             for of_views in diffuse:  # here: turned twice, should a worker be lost, it were wrong
                 num_diffuse += sum(map(partial(_turn_parts, folder), maps, of_views))
-    return MapsResult(num_region_px=num_inside, num_diffuse_px=num_diffuse)
+    return MapsResult(
+        num_region_px=num_inside,
+        num_diffuse_px=num_diffuse,
+        complaints=() if wrong is None else (wrong,),
+    )
 
 
 def tilt_maps(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Thread
 
@@ -17,7 +17,7 @@ from polmvs.colmap.database import NoRoomError
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.sfm import NoModelError, SfmTolerances, run_sfm
 from polmvs.colmap.sfm_failure import why_no_model
-from polmvs.colmap.trial_adjustment import try_cameras
+from polmvs.colmap.trial_adjustment import Complaint, try_cameras
 from polmvs.config import PropagationOptions, SfmOptions
 from polmvs.errors import MAX_QUOTED, DataError
 from polmvs.io.arrays import save_array
@@ -54,12 +54,14 @@ class SfmResult:
         camera was given, or that is not known.
     bending : median deviation of the sparse points by what the estimated camera leaves open, as a
         share of their distance; likewise.
+    complaints : what the matches say against given cameras.
     """
 
     num_views: int
     num_points: int
     focal_sigma: float | None = None
     bending: float | None = None
+    complaints: tuple[Complaint, ...] = ()
 
     def __str__(self) -> str:
         text = f"{self.num_views} views, {self.num_points:,} sparse points"
@@ -126,11 +128,12 @@ def find_model(
         replace_folder(new, target)
     _warn_of_missing(model, images)
     _warn_of_few(len(model.views))
+    complaints: tuple[Complaint, ...] = ()
     if options.intrinsics is not None or options.camera is not None:
         given = "`sfm.intrinsics`" if options.intrinsics is not None else "`sfm.camera`"
-        _warn_of_cameras(target, given, "Leave it out, or give a camera that fits.")
+        complaints = _warn_of_cameras(target, given, "Leave it out, or give a camera that fits.")
     if found is None:
-        return _result(model)
+        return replace(_result(model), complaints=complaints)
     bending = _bending(model, found.modes)
     if not bending < LARGE_BENDING:
         logger.warning(
@@ -191,8 +194,7 @@ def take_model(model: SparseModel, source: Path, target: Path) -> SfmResult:
     _warn_of_missing(model, source)
     _warn_of_few(len(model.views))
     remedy = "Adjust the model with its camera free, or leave `sfm.sparse` out."
-    _warn_of_cameras(target, str(source), remedy)
-    return _result(model)
+    return replace(_result(model), complaints=_warn_of_cameras(target, str(source), remedy))
 
 
 def _store_uncertainty(
@@ -242,19 +244,21 @@ def _warn_of_missing(model: SparseModel, source: Path) -> None:
         )
 
 
-def _warn_of_cameras(model: Path, given: str, remedy: str) -> None:
+def _warn_of_cameras(model: Path, given: str, remedy: str) -> tuple[Complaint, ...]:
     """Say which cameras would fit the matches where the given ones do not."""
     trial = try_cameras(model)
-    if trial is not None:
-        for complaint in trial.complaints:
-            logger.warning(
-                "%s: %s (%.1f px off; %.1f px with what fits). Normals follow the cameras. %s",
-                given,
-                complaint,
-                trial.error_px,
-                trial.fitting_error_px,
-                remedy,
-            )
+    complaints = () if trial is None else trial.complaints
+    for complaint in complaints:
+        assert trial is not None
+        logger.warning(
+            "%s: %s (%.1f px off; %.1f px with what fits). Normals follow the cameras. %s",
+            given,
+            complaint.text,
+            trial.error_px,
+            trial.fitting_error_px,
+            remedy,
+        )
+    return tuple(replace(one, text=f"{given}: {one.text}") for one in complaints)
 
 
 def _warn_of_few(num_views: int) -> None:

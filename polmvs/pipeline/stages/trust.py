@@ -1,34 +1,161 @@
-"""Stage ``trust_MODEL``: what a reconstruction says about itself, and what of it is not normal."""
+"""Stage ``trust_MODEL``: whether a reconstruction is to be trusted, and what is not normal."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 
-from polmvs.config import AngleModel
+import numpy as np
+
+from polmvs.colmap.models import read_model
+from polmvs.config import AngleModel, Light, default_num_workers
 from polmvs.evaluation.trust import Trust, measure_trust
-from polmvs.io.clouds import read_cloud
+from polmvs.io.clouds import read_cloud, read_mesh
+from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH
 from polmvs.pipeline.stages.maps import open_maps
+from polmvs.pipeline.stages.seeds import load_seeds
+from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind
+from polmvs.surface.held_out import predict, predict_left_out
+from polmvs.surface.mesh_geometry import TriangleMesh
+from polmvs.surface.observations import Looking
+from polmvs.surface.silhouettes import find_silhouette
+from polmvs.surface.soundness import find_soundness
+from polmvs.surface.surface_view import SurfaceView, surface_view
+from polmvs.surface.surroundings import sparse_surroundings
+from polmvs.surface.terms import KnownPoints
+from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
+# Views that are held against the surface, of more spread evenly: so that the time is bounded.
+MAX_TRIED_VIEWS = 24
+
+
+@dataclass(frozen=True, kw_only=True)
+class Made:
+    """How a surface was made.
+
+    Attributes
+    ----------
+    tilt_share, left_out : as of :class:`polmvs.pipeline.stages.densify.DensifyResult`.
+    num_unregistered : views without a pose.
+    tilt_aware : as ``NormalOptions.tilt_aware_weights``.
+    masks_given : the regions of the phase maps are the user's masks.
+    light : that the user states; None: inferred.
+    complaints : what earlier stages found wrong, a clause each.
+    """
+
+    tilt_share: float | None
+    left_out: tuple[str, ...] = ()
+    num_unregistered: int = 0
+    tilt_aware: bool = True
+    masks_given: bool = False
+    light: Light | None = None
+    complaints: Sequence[str] = ()
+
 
 def find_trust(
-    model: AngleModel, *, sparse: Path, maps: Path, sparse_cloud: Path, cloud: Path
+    model: AngleModel,
+    made: Made,
+    *,
+    sparse: Path,
+    maps: Path,
+    sparse_cloud: Path,
+    track_normals: Path,
+    seeds: Path,
+    cloud: Path,
+    views: Path,
 ) -> Trust:
-    """Measure a dense cloud against its capture, and warn of what is not normal.
+    """Measure a dense cloud against its capture, and warn if it is not to be trusted.
 
     Parameters
     ----------
     model : angle model.
+    made : how the surface was made.
     sparse : folder of the COLMAP model.
     maps : folder of the phase maps for ``model``.
     sparse_cloud, cloud : PLY of the sparse points with normals and of the dense cloud.
+    track_normals, seeds : files of the normals of the sparse points, and of the seeds.
+    views : folder of the dense views and of their mesh.
     """
-    dense = read_cloud(cloud)
-    trust = measure_trust(model, dense, read_cloud(sparse_cloud), open_maps(sparse, maps, model))
+    dense, phase_maps = read_cloud(cloud), open_maps(sparse, maps, model)
+    trust = measure_trust(model, dense, read_cloud(sparse_cloud), phase_maps)
+    trust = replace(
+        trust,
+        num_views=len(phase_maps) + made.num_unregistered,
+        left_out=len(made.left_out) + made.num_unregistered,
+        complaints=tuple(made.complaints),
+    )
+    if made.tilt_share is not None and (views / SURFACE_MESH).is_file():
+        trust = _contradicted(trust, model, made, phase_maps, sparse, track_normals, seeds, views)
+    trust = trust.judged()
     if (dense.scalars["kind"] == PointKind.SURFACE).any():  # else the job says what is missing
+        if not trust.is_trusted:
+            logger.warning("%s: %s", model, trust.verdict)
         for doubt in trust.doubts():
-            logger.warning("%s: not normal: %s.", model, doubt)
+            logger.info("%s: not normal: %s.", model, doubt)
     return trust
+
+
+def _contradicted(
+    trust: Trust,
+    model: AngleModel,
+    made: Made,
+    maps: Sequence[PhaseMap],
+    sparse: Path,
+    track_normals: Path,
+    seeds: Path,
+    views: Path,
+) -> Trust:
+    """With the figures of a surface of all views that it was not fitted to."""
+    assert made.tilt_share is not None
+    around = sparse_surroundings(read_model(sparse).tracks, maps).points
+    plane = supporting_plane(around, np.array([one.view.center_in_world for one in maps]))
+    maps = [one for one in maps if one.view.name not in made.left_out]
+    chosen = np.linspace(0, len(maps) - 1, min(len(maps), MAX_TRIED_VIEWS)).round().astype(int)
+    maps = [maps[index] for index in chosen]
+    known = load_seeds(seeds, track_normals)
+    looking = Looking(angle_model=model, tilt_aware=made.tilt_aware, tilt_share=made.tilt_share)
+    look = partial(_surface_view, masks_given=made.masks_given)
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        seen = list(pool.map(look, maps))
+    return replace(
+        trust,
+        predicted=predict_left_out(
+            seen,
+            plane,
+            looking,
+            KnownPoints(known.points_in_world, known.sigma),
+            light=made.light,
+        ),
+        fitted=predict(_read_mesh(views / SURFACE_MESH), seen, looking, light=made.light),
+        soundness=find_soundness(
+            _read_mesh(_last_level(views)), [phase_map.view for phase_map in maps]
+        ),
+    )
+
+
+def _surface_view(phase_map: PhaseMap, *, masks_given: bool) -> SurfaceView:
+    return surface_view(phase_map, find_silhouette(phase_map, mask_given=masks_given))
+
+
+def _last_level(views: Path) -> Path:
+    """The last closed mesh on the way to the surface, which has holes where nothing is known."""
+    found = views / SURFACE_MESH
+    for number in count():
+        path = views / SURFACE_LEVELS.format(number=number)
+        if not path.is_file():
+            return found
+        found = path
+    raise AssertionError
+
+
+def _read_mesh(path: Path) -> TriangleMesh:
+    mesh = read_mesh(path)
+    return TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64))

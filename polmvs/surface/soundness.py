@@ -1,0 +1,67 @@
+"""Whether a mesh is a surface at all: sheets that lie upon each other, and overlaps.
+
+Both come of views that contradict each other: each has its own sheet. A ray from a camera enters a
+sound body and leaves it, in turn, and some way apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from polmvs.scene import View
+from polmvs.surface.dense_view import lattice_xy
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
+
+STRIDE_PX = 6
+# Sheets nearer to each other than this are one within what silhouettes and phases place: their
+# deviation is a pixel at best.
+SHEET_PX = 3.0
+MIN_COSINE = 0.3  # of a crossing: a rim that the ray grazes is thin in any body. Guess
+
+
+@dataclass(frozen=True, kw_only=True)
+class Soundness:
+    """How a mesh is crossed by the views' rays.
+
+    Attributes
+    ----------
+    layered : share of the rays that meet it which cross two sheets, nearly one upon the other.
+    overlapping : share which enter it twice without leaving, or leave it twice: it intersects
+        itself.
+    """
+
+    layered: float
+    overlapping: float
+
+
+def find_soundness(mesh: TriangleMesh, views: Sequence[View]) -> Soundness:
+    """Cast rays of all views through a closed mesh.
+
+    Parameters
+    ----------
+    mesh : closed, its faces anticlockwise from outside.
+    views : whose rays are cast, every few pixels.
+    """
+    met, layered, overlapping = 0, 0, 0
+    scene = RayScene(mesh)
+    for view in views if len(mesh.faces) else ():
+        camera = view.camera
+        xy = lattice_xy(camera.height // STRIDE_PX, camera.width // STRIDE_PX, STRIDE_PX)
+        rays = view.rays_in_world(xy.reshape(-1, 2))
+        found = scene.crossings(view.center_in_world, rays)
+        footprint = found.distance / camera.mean_focal_px
+        follows = found.ray[1:] == found.ray[:-1]
+        enters, steep = found.cosine < 0, np.abs(found.cosine) > MIN_COSINE
+        near = np.diff(found.distance) < SHEET_PX * footprint[1:]
+        # Two faces that meet on an edge are both crossed by a ray through it.
+        apart = np.diff(found.distance) > 0.05 * footprint[1:]
+        both_steep = follows & steep[1:] & steep[:-1]
+        met += len(np.unique(found.ray))
+        layered += len(np.unique(found.ray[1:][both_steep & near & apart]))
+        overlapping += len(
+            np.unique(found.ray[1:][both_steep & apart & (enters[1:] == enters[:-1])])
+        )
+    return Soundness(layered=layered / max(met, 1), overlapping=overlapping / max(met, 1))

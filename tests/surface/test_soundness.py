@@ -1,0 +1,44 @@
+"""Sheets upon each other and overlaps are found, and sound bodies are not blamed."""
+
+import numpy as np
+import pytest
+from analytic_objects import box, ring_of_views, sphere, torus
+from test_mesh_geometry import extracted, side_by_side
+
+from polmvs.surface.mesh_geometry import TriangleMesh
+from polmvs.surface.soundness import find_soundness
+
+VIEWS = ring_of_views(6)
+FOOTPRINT = 5 / 150
+
+
+@pytest.mark.parametrize("distance", [sphere(), torus(), box()])
+def test_bodies_are_sound(distance) -> None:
+    found = find_soundness(extracted(distance, step=0.05), VIEWS)
+    assert found.layered < 0.02
+    assert found.overlapping == 0
+
+
+def test_a_shell_as_thin_as_a_pixel_is_two_sheets() -> None:
+    def shell(thickness):
+        return lambda p: abs(sphere()(p)) - thickness / 2
+
+    thin, thick = (
+        find_soundness(extracted(shell(t), half=1.2, step=0.03), VIEWS[:2]).layered
+        for t in (2 * FOOTPRINT, 6 * FOOTPRINT)
+    )
+    assert thin > 0.6  # all but the rim
+    assert thick < 0.1
+
+
+def test_bodies_in_each_other_overlap() -> None:
+    apart = side_by_side(extracted(sphere(0.5)), extracted(sphere(0.5, (1.05, 0, 0))))
+    within = side_by_side(extracted(sphere(1.0)), extracted(sphere(0.5)))
+    assert find_soundness(apart, VIEWS).overlapping == 0
+    # A quarter of the outer one's disc is the inner one's.
+    assert find_soundness(within, VIEWS).overlapping == pytest.approx(0.25, abs=0.04)
+
+
+def test_nothing_is_sound() -> None:
+    nothing = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    assert find_soundness(nothing, VIEWS).layered == 0
