@@ -478,6 +478,11 @@ class SfmOptions(OptionGroup, group="sfm"):
         "find a background that stands still while the part turns on a table, and leave its "
         "features out",
     )
+    feature_masks: Path | None = option(
+        None,
+        "folder of masks, named as those of `region.mask`: SfM takes features inside them alone; "
+        "for a part that turns before a background, where `sfm.static_background` does not help",
+    )
     without: tuple[str, ...] = option(
         (),
         "images to take out of the model; a run adds those whose pose its surface contradicts",
@@ -494,6 +499,11 @@ class SfmOptions(OptionGroup, group="sfm"):
             self.require(self.pairs is None, "pairs", reason)
             self.require(self.database is None, "database", reason)
             self.require(self.mapper is Mapper.INCREMENTAL, "mapper", reason)
+            self.require(self.feature_masks is None, "feature_masks", reason)
+        once = self.database is None or self.feature_masks is None
+        self.require(
+            once, "feature_masks", "and `sfm.database`, which has features, exclude each other"
+        )
         if self.pairs_file is not None:  # a run may go on from another folder
             object.__setattr__(self, "pairs", str(self.pairs_file.absolute()))
 

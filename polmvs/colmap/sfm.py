@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import logging
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +35,7 @@ from polmvs.colmap.database import (
     sound,
 )
 from polmvs.colmap.left_out_views import MAX_IMAGES, Trial, try_harder
+from polmvs.colmap.masked_features import keep_inside
 from polmvs.colmap.models import (
     model_from_reconstruction,
     reconstruction_of_views,
@@ -45,7 +46,7 @@ from polmvs.colmap.static_features import take_out_static
 from polmvs.colmap.thinning import thin_database
 from polmvs.config import Mapper, SfmOptions
 from polmvs.errors import DataError, OptionError
-from polmvs.io.images import read_gray
+from polmvs.io.images import read_gray, read_mask
 from polmvs.io.intrinsics import Intrinsics, read_intrinsics
 from polmvs.parallel import OnStep, no_step
 from polmvs.scene import KEYPOINT_SIGMA_PX, SparseModel, View, short_list
@@ -121,6 +122,7 @@ def run_sfm(
     options: SfmOptions,
     on_step: OnStep = no_step,
     *,
+    masks: Mapping[str, Path] | None = None,
     tolerances: SfmTolerances = SfmTolerances(),
 ) -> SparseModel:
     """Find the poses of the images and their sparse points.
@@ -136,6 +138,7 @@ def run_sfm(
     sparse_folder : gets the model as COLMAP binary, whole or not at all.
     options : see :class:`polmvs.config.SfmOptions`; ``sparse`` is not used here.
     on_step : called with the name of each stage when it starts.
+    masks : file of each image by its name, not 0 where features count; None: everywhere.
 
     Raises
     ------
@@ -159,12 +162,17 @@ def run_sfm(
         on_step("features")
         if given is None:
             _extract_features(database, image_folder, names, reader, options)
+            if masks is not None:
+                inside = {name: read_mask(masks[name], (height, width)) for name in names}
+                num_inside = keep_inside(database, inside)
+                logger.info("SfM: %d features inside the masks.", num_inside)
             static = take_out_static(database) if options.static_background else None
             if static is not None:
                 logger.warning(
                     "a background stands still while the part turns: its features, %.0f %% of all, "
                     "are left out. The poses are those of a camera that moves about the part; with "
-                    "`sfm.static_background` off all features are used.",
+                    "`sfm.static_background` off all features are used, with "
+                    "`sfm.feature_masks` those inside masks.",
                     100 * static,
                 )
         else:
