@@ -18,7 +18,7 @@ from polmvs.errors import OptionError
 
 logger = logging.getLogger(__name__)
 
-INSTALL = "Mitsuba is not installed; install the extra: pip install 'polmvs[simulate]'."
+INSTALL = "Mitsuba is not installed; install the extra: pip install '.[simulate]'."
 INSTALL_LLVM = (
     "LLVM's library was not found, so that the slow scalar renderer is used. Install it (Debian "
     "and Ubuntu: apt install libllvm19; Fedora: dnf install llvm-libs; conda: libllvm19; macOS: "
