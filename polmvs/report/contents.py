@@ -143,7 +143,7 @@ def _of_model(
     samples: ErrorSamples,
 ) -> list[Picture]:
     """Normals, depth, residual phase, and the errors where there is a truth."""
-    view, name = given.view, model.value.upper()
+    view, name = given.view, model.label
     xy = dense.lattice_xy()
     rays = view.camera.rays(xy)
     known = dense.known
