@@ -20,6 +20,7 @@ extensions = [
     "command_reference",
     "docstrings",
     "mathml",
+    "notebook_page",
 ]
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_extensions", "_build"]

@@ -285,7 +285,7 @@ def _connect(address: str, tls: TlsFiles | None, patience: ClusterPatience) -> A
         from distributed.security import Security
     except ImportError as error:
         raise OptionError(
-            "needs dask.distributed: pip install 'polmvs[dask]'.", field="run.scheduler"
+            "needs dask.distributed: pip install '.[dask]'.", field="run.scheduler"
         ) from error
     security = None
     if tls is not None:

@@ -34,11 +34,34 @@ T = TypeVar("T")
 
 
 class AngleModel(StrEnum):
-    """Relation between the measured angle and the surface normal."""
+    """Relation between the measured angle and the surface normal, and what polmvs adds to it.
+
+    The textbook models are OPA and PPA as published: each row says what its formula says, with the
+    weight of its noise. To the others polmvs adds what formula and camera leave open: rows count
+    less where their formula errs (``NormalOptions.tilt_aware_weights``).
+    """
 
     OPA = "opa"
     PPA = "ppa"
     TILTED = "tilted"
+    TEXTBOOK_OPA = "textbook-opa"
+    TEXTBOOK_PPA = "textbook-ppa"
+
+    @property
+    def is_textbook(self) -> bool:
+        """Whether nothing is added to the published model."""
+        return self in (AngleModel.TEXTBOOK_OPA, AngleModel.TEXTBOOK_PPA)
+
+    @property
+    def formula(self) -> AngleModel:
+        """OPA, PPA or tilted: the relation alone."""
+        return AngleModel(self.value.removeprefix("textbook-"))
+
+    @property
+    def label(self) -> str:
+        """Its name in tables and figures."""
+        name = self.formula.value if self is AngleModel.TILTED else self.formula.value.upper()
+        return f"textbook {name}" if self.is_textbook else f"polmvs {name}"
 
 
 class Light(StrEnum):
@@ -179,7 +202,15 @@ class Resolution(StrEnum):
     FULL = "full"
 
 
-COMPARED_MODELS = (AngleModel.OPA, AngleModel.PPA, AngleModel.TILTED)
+# In the order of a table's columns: first what the paper compares, then what polmvs makes of it.
+COMPARED_MODELS = (
+    AngleModel.TEXTBOOK_OPA,
+    AngleModel.TEXTBOOK_PPA,
+    AngleModel.OPA,
+    AngleModel.PPA,
+    AngleModel.TILTED,
+)
+FORMULAS = (AngleModel.OPA, AngleModel.PPA, AngleModel.TILTED)  # the relations, each once
 
 
 def option(
@@ -447,6 +478,11 @@ class SfmOptions(OptionGroup, group="sfm"):
         "find a background that stands still while the part turns on a table, and leave its "
         "features out",
     )
+    feature_masks: Path | None = option(
+        None,
+        "folder of masks, named as those of `region.mask`: SfM takes features inside them alone; "
+        "for a part that turns before a background, where `sfm.static_background` does not help",
+    )
     without: tuple[str, ...] = option(
         (),
         "images to take out of the model; a run adds those whose pose its surface contradicts",
@@ -463,6 +499,11 @@ class SfmOptions(OptionGroup, group="sfm"):
             self.require(self.pairs is None, "pairs", reason)
             self.require(self.database is None, "database", reason)
             self.require(self.mapper is Mapper.INCREMENTAL, "mapper", reason)
+            self.require(self.feature_masks is None, "feature_masks", reason)
+        once = self.database is None or self.feature_masks is None
+        self.require(
+            once, "feature_masks", "and `sfm.database`, which has features, exclude each other"
+        )
         if self.pairs_file is not None:  # a run may go on from another folder
             object.__setattr__(self, "pairs", str(self.pairs_file.absolute()))
 
@@ -754,6 +795,8 @@ class PlaneOptions(OptionGroup, group="plane"):
     def check(self) -> None:
         """A place is given once, and planes are found under models that tell them apart."""
         _require_intrinsics(self, self.intrinsics)
+        models = f"must be {', '.join(FORMULAS)}: of one plane they are the published models"
+        self.require(not self.model.is_textbook, "model", models, self.model)
         one = self.mask is None or self.polygon is None
         self.require(one, "polygon", "and `plane.mask` exclude each other")
         if self.polygon is not None:

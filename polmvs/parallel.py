@@ -83,6 +83,11 @@ class Workers:
         self.num = num
         self._backend = backend or (None if num == 1 else _Processes(num))
 
+    @property
+    def are_processes_here(self) -> bool:
+        """Whether tasks are done side by side in processes of this machine."""
+        return isinstance(self._backend, _Processes)
+
     @classmethod
     def of_cluster(
         cls,

@@ -21,6 +21,7 @@ from polmvs.polarization.capture import open_capture
 
 INTRINSICS = (333.75, 333.75, 230.6475, 196.608)  # of the bundled capture
 FRAME = "003.png"
+TEXTBOOK = "textbook-opa, textbook-ppa"
 
 
 def in_new_process(code: str) -> str:
@@ -100,11 +101,11 @@ def test_errors_name_fields_and_not_flags(demo_capture: Path, tmp_path: Path) ->
         "no option 'gama'; is it 'gamma'?": lambda: polmvs.read_stokes(frame, gama=2.0),
         "`capture.gamma` cannot be none": lambda: polmvs.read_stokes(frame, gamma=None),
         "`capture.gamma` cannot be '2'": lambda: polmvs.read_stokes(frame, gamma="2"),
-        "`model` must be one of opa, ppa, tilted, not 'best'": lambda: polmvs.reconstruct(
-            demo_capture, tmp_path / "out", "best"
+        f"`model` must be one of opa, ppa, tilted, {TEXTBOOK}, not 'best'": lambda: (
+            polmvs.reconstruct(demo_capture, tmp_path / "out", "best")
         ),
-        "`plane.model` must be one of opa, ppa, tilted, not best": lambda: polmvs.plane_normal(
-            polmvs.read_stokes(frame), INTRINSICS, model="best"
+        f"`plane.model` must be one of opa, ppa, tilted, {TEXTBOOK}, not best": lambda: (
+            polmvs.plane_normal(polmvs.read_stokes(frame), INTRINSICS, model="best")
         ),
         "`sfm.intrinsics` must be a finite number, not nan,1,1,1": lambda: polmvs.reconstruct(
             demo_capture, tmp_path / "out", intrinsics=(np.nan, 1, 1, 1)
@@ -118,7 +119,7 @@ def test_errors_name_fields_and_not_flags(demo_capture: Path, tmp_path: Path) ->
         "`models` needs one angle model or more": lambda: polmvs.compare(
             demo_capture, tmp_path / "out", models=()
         ),
-        "`models` must be one of opa, ppa, tilted, not 'best'": lambda: polmvs.compare(
+        f"`models` must be one of opa, ppa, tilted, {TEXTBOOK}, not 'best'": lambda: polmvs.compare(
             demo_capture, tmp_path / "out", models="best"
         ),
         "`run.workers` cannot be 1.5": lambda: polmvs.track_normals(

@@ -114,13 +114,19 @@ def copy_database(given: GivenDatabase, target: Path) -> None:
             pass
 
 
-def match_pairs(database: Path, pairs: Pairs, *, seed: int = 0) -> None:
+def match_pairs(database: Path, pairs: Pairs, *, seed: int = 0, guided: bool = False) -> None:
     """Match pairs of images and verify them; those that the database has matched already stay.
 
     Cores are used by processes, with a copy of the database each. Two threads that search COLMAP's
     indices of descriptors disturb each other: about once in 600 times ten images matched in pairs
     had other matches, whatever the number of threads of OpenMP and OpenBLAS; with one thread never
     in 3,000.
+
+    Parameters
+    ----------
+    pairs : of names of images.
+    seed : of the verification.
+    guided : look for more matches along the geometry that the first ones give.
 
     Raises
     ------
@@ -136,7 +142,7 @@ def match_pairs(database: Path, pairs: Pairs, *, seed: int = 0) -> None:
     ends = [len(lines) * k // num_shares for k in range(num_shares + 1)]
     with _renamed(database, {}):
         if num_shares == 1:
-            _match_share(database, "".join(lines), seed)
+            _match_share(database, "".join(lines), seed, guided)
             return
         copies = [database.with_name(f"share{k}.db") for k in range(num_shares)]
         with _room():
@@ -144,7 +150,15 @@ def match_pairs(database: Path, pairs: Pairs, *, seed: int = 0) -> None:
                 _copy(database, copy)
         shares = ["".join(lines[begin:end]) for begin, end in pairwise(ends)]
         with ThreadPoolExecutor(num_shares) as pool:  # each waits for its process
-            list(pool.map(partial(run_separately, _match_share), copies, shares, repeat(seed)))
+            list(
+                pool.map(
+                    partial(run_separately, _match_share),
+                    copies,
+                    shares,
+                    repeat(seed),
+                    repeat(guided),
+                )
+            )
         with _room():
             for copy in copies:
                 _take_matches(database, copy)
@@ -152,7 +166,7 @@ def match_pairs(database: Path, pairs: Pairs, *, seed: int = 0) -> None:
             path.unlink()
 
 
-def _match_share(database: Path, lines: str, seed: int, *_: object) -> None:
+def _match_share(database: Path, lines: str, seed: int, guided: bool, *_: object) -> None:
     """Match pairs of images that are named by their numbers, on one thread."""
     listed = database.with_suffix(".txt")
     listed.write_text(lines, encoding="utf-8")
@@ -160,6 +174,7 @@ def _match_share(database: Path, lines: str, seed: int, *_: object) -> None:
     pairing.match_list_path = listed
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = 1
+    matching.guided_matching = guided
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     pycolmap.set_random_seed(seed)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import logging
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ import pycolmap
 
 from polmvs.camera import PinholeCamera
 from polmvs.colmap.cameras import camera_to_colmap, quiet_colmap
+from polmvs.colmap.contradicting_pairs import drop_contradicting
 from polmvs.colmap.database import (
     GivenDatabase,
     check_database,
@@ -33,17 +34,19 @@ from polmvs.colmap.database import (
     replace_cameras,
     sound,
 )
+from polmvs.colmap.left_out_views import MAX_IMAGES, Trial, try_harder
+from polmvs.colmap.masked_features import keep_inside
 from polmvs.colmap.models import (
     model_from_reconstruction,
     reconstruction_of_views,
     write_reconstruction,
 )
-from polmvs.colmap.pairs import choose_pairs, read_pairs
+from polmvs.colmap.pairs import Pairs, choose_pairs, read_pairs
 from polmvs.colmap.static_features import take_out_static
 from polmvs.colmap.thinning import thin_database
 from polmvs.config import Mapper, SfmOptions
 from polmvs.errors import DataError, OptionError
-from polmvs.io.images import read_gray
+from polmvs.io.images import read_gray, read_mask
 from polmvs.io.intrinsics import Intrinsics, read_intrinsics
 from polmvs.parallel import OnStep, no_step
 from polmvs.scene import KEYPOINT_SIGMA_PX, SparseModel, View, short_list
@@ -119,6 +122,7 @@ def run_sfm(
     options: SfmOptions,
     on_step: OnStep = no_step,
     *,
+    masks: Mapping[str, Path] | None = None,
     tolerances: SfmTolerances = SfmTolerances(),
 ) -> SparseModel:
     """Find the poses of the images and their sparse points.
@@ -134,6 +138,7 @@ def run_sfm(
     sparse_folder : gets the model as COLMAP binary, whole or not at all.
     options : see :class:`polmvs.config.SfmOptions`; ``sparse`` is not used here.
     on_step : called with the name of each stage when it starts.
+    masks : file of each image by its name, not 0 where features count; None: everywhere.
 
     Raises
     ------
@@ -157,12 +162,17 @@ def run_sfm(
         on_step("features")
         if given is None:
             _extract_features(database, image_folder, names, reader, options)
+            if masks is not None:
+                inside = {name: read_mask(masks[name], (height, width)) for name in names}
+                num_inside = keep_inside(database, inside)
+                logger.info("SfM: %d features inside the masks.", num_inside)
             static = take_out_static(database) if options.static_background else None
             if static is not None:
                 logger.warning(
                     "a background stands still while the part turns: its features, %.0f %% of all, "
                     "are left out. The poses are those of a camera that moves about the part; with "
-                    "`sfm.static_background` off all features are used.",
+                    "`sfm.static_background` off all features are used, with "
+                    "`sfm.feature_masks` those inside masks.",
                     100 * static,
                 )
         else:
@@ -171,7 +181,9 @@ def run_sfm(
         if given is None or not given.has_matches or options.pairs is not None:
             _match(database, to_match, options)
         on_step("mapping")
-        reconstruction = _map(database, image_folder, work_folder, to_match, options, tolerances)
+        reconstruction = _map_all(
+            database, image_folder, work_folder, to_match, reader, options, tolerances
+        )
         on_step("bundle adjustment")
         single = options.single_camera if given is None else given.num_cameras == 1
         reconstruction = _refine(
@@ -342,8 +354,14 @@ def _extract_features(
     names: list[str],
     reader: pycolmap.ImageReaderOptions,
     options: SfmOptions,
+    *,
+    pooled: bool = False,
 ) -> None:
-    """Affine-adapted SIFT of all images into a new database."""
+    """Affine-adapted SIFT of all images into a new database.
+
+    ``pooled``: descriptors are means over sizes of the domain (DSP-SIFT), which takes three times
+    as long.
+    """
     single, each = pycolmap.CameraMode.SINGLE, pycolmap.CameraMode.PER_IMAGE
     mode = single if options.single_camera else each
     # Images first, in order: left to the extractor's threads their ids change from run to run,
@@ -352,6 +370,7 @@ def _extract_features(
     pycolmap.import_images(database, image_folder, mode, names, reader)
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.estimate_affine_shape = True
+    extraction.sift.domain_size_pooling = pooled
     pycolmap.extract_features(
         database, image_folder, names, mode, reader, extraction, pycolmap.Device.cpu
     )
@@ -377,15 +396,19 @@ def _take_database(
 
 def _match(database: Path, names: Sequence[str], options: SfmOptions) -> None:
     """Match the pairs of images that are asked for, or that are likely to show the same."""
+    match_pairs(database, _pairs(database, names, options), seed=options.seed)
+
+
+def _pairs(database: Path, names: Sequence[str], options: SfmOptions) -> Pairs:
+    """The pairs of images that are asked for, or that are likely to show the same."""
     numbers = image_numbers(database)
     with opened(database) as content:
-        pairs = choose_pairs(
+        return choose_pairs(
             sorted(names),
             options.pairs,
             lambda name: read_descriptors(content, numbers[name]),
             seed=options.seed,
         )
-    match_pairs(database, pairs, seed=options.seed)
 
 
 def _mapper_options(
@@ -461,6 +484,44 @@ def _global_options(
         mapper.retriangulation.complete_max_reproj_error = error_px
         mapper.retriangulation.merge_max_reproj_error = error_px
     return pipeline
+
+
+def _map_all(
+    database: Path,
+    image_folder: Path,
+    work_folder: Path,
+    names: Sequence[str],
+    reader: pycolmap.ImageReaderOptions,
+    options: SfmOptions,
+    tolerances: SfmTolerances,
+) -> pycolmap.Reconstruction:
+    """The largest model of the images, after harder matching where it leaves some out."""
+    is_known = options.intrinsics is not None or options.camera is not None
+    unable: list[NoModelError] = []
+
+    def map_once() -> pycolmap.Reconstruction | None:
+        if is_known and (num := drop_contradicting(database)):
+            logger.info("SfM: %d pairs match as no pair of this camera can; not used.", num)
+        try:
+            return _map(database, image_folder, work_folder, names, options, tolerances)
+        except NoModelError as error:
+            unable.append(error)
+            return None
+
+    def describe(target: Path) -> None:
+        _extract_features(target, image_folder, list(names), reader, options, pooled=True)
+
+    found = map_once()
+    # A given database's features may be of another kind.
+    if options.database is None and len(names) <= MAX_IMAGES:
+        pairs = _pairs(database, names, options)
+        trial = Trial(
+            database=database, pairs=pairs, describe=describe, map=map_once, seed=options.seed
+        )
+        found = try_harder(found, names, trial)
+    if found is None:
+        raise unable[0]
+    return found
 
 
 def _map(

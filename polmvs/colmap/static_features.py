@@ -7,7 +7,7 @@ more. They are told from the others by their place: the same pixel shows the sam
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,15 +63,21 @@ def take_out_static(
         still = find_static([k[:, :2] for k in keypoints], values, tolerances=tolerances)
         if still is None:
             return None
-        content.clear_keypoints()
-        content.clear_descriptors()
-        for number, points, features, out in zip(ids, keypoints, found, still, strict=True):
-            content.write_keypoints(number, np.ascontiguousarray(points[~out]))
-            features.data = np.ascontiguousarray(np.asarray(features.data)[~out])
-            content.write_descriptors(number, features)
+        keep_features(content, {n: ~out for n, out in zip(ids, still, strict=True)})
         return float(np.concatenate(still).mean())
     finally:
         content.close()
+
+
+def keep_features(content: pycolmap.Database, kept: Mapping[int, Mask]) -> None:
+    """Keep the features (N,) alone of each image, by its number, of a database without matches."""
+    found = {n: (content.read_keypoints(n), content.read_descriptors(n)) for n in kept}
+    content.clear_keypoints()
+    content.clear_descriptors()
+    for number, (points, features) in found.items():
+        content.write_keypoints(number, np.ascontiguousarray(points[kept[number]]))
+        features.data = np.ascontiguousarray(np.asarray(features.data)[kept[number]])
+        content.write_descriptors(number, features)
 
 
 def find_static(

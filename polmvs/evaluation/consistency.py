@@ -158,7 +158,9 @@ def phase_residuals_deg(
     """
     view = phase_map.view
     rays = unit(view.cam_from_world * points)
-    predicted = phase_from_normal(angle_model, normals @ view.cam_from_world.rotation.T, rays)
+    predicted = phase_from_normal(
+        angle_model.formula, normals @ view.cam_from_world.rotation.T, rays
+    )
     samples = sample_image(phase_map.samples, view.project(points))
     measured = 0.5 * np.arctan2(samples[:, 1], samples[:, 0])
     counted = (samples[:, 2] > 0) & (np.hypot(samples[:, 0], samples[:, 1]) > MIN_DOLP)

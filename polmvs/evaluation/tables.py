@@ -51,7 +51,7 @@ def best_fit_lines(comparison: Comparison) -> list[str]:
     if best is None or len(comparison.models) < 2:
         return []
     residual = comparison.models[best].consistency.track_residual_median_deg
-    return ["", f"The phases fit {best.upper()} best: {number(residual)} deg at the seeds."]
+    return ["", f"The phases fit {best.label} best: {number(residual)} deg at the seeds."]
 
 
 def comparison_rows(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
@@ -80,7 +80,7 @@ def comparison_rows(comparison: Comparison) -> tuple[list[str], list[list[str]]]
     truth = {model: figures.truth for model, figures in models.items() if figures.truth is not None}
     if len(truth) == len(models):
         rows += _truth_rows(truth, comparison.phase)
-    return ["", *[name.upper() for name in models]], rows
+    return ["", *[model.label for model in models]], rows
 
 
 def rmse_and_median(stats: AngleStats | None) -> str:
@@ -100,7 +100,7 @@ def _truth_rows(
     rows = []
     if phase is not None:
         for what, errors in (("smoothed", phase.maps), ("single pixels", phase.pixels)):
-            cells = [rmse_and_median(errors.get(model)) for model in models]
+            cells = [rmse_and_median(errors.get(model.formula)) for model in models]
             rows.append([f"phase error on the part, {what}, RMSE / median, deg", *cells])
     figures = list(models.values())
     rows.append(

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel
+from polmvs.config import FORMULAS
 from polmvs.experiments.contours import CONTOUR_LABELS, METHODS, ViewContours
 from polmvs.experiments.data import MODEL_LABELS
 from polmvs.experiments.phase import ANGLE_LIMITS_DEG, ANGLES, PhaseImages, PhaseResult
@@ -70,7 +70,7 @@ def draw_phase_density(result: PhaseResult) -> bytes:
     axes = figure.subplots(3, 3, sharey=True, sharex="col")
     norm = PowerNorm(0.4, vmin=0, vmax=0.5)
     image = None
-    for row, angle_model in enumerate(AngleModel):
+    for row, angle_model in enumerate(FORMULAS):
         for column, angle in enumerate(ANGLES):
             ax = axes[row, column]
             image = ax.imshow(
@@ -99,7 +99,7 @@ def draw_phase_maps(views: Sequence[PhaseImages]) -> bytes:
     titles = [
         "intensity",
         "measured phase",
-        *(f"{MODEL_LABELS[m]} phase" for m in AngleModel),
+        *(f"{MODEL_LABELS[m]} phase" for m in FORMULAS),
     ]
     height, width = views[0].intensity.shape
     panel = 2.3
@@ -159,7 +159,7 @@ def draw_plane(result: PlaneResult) -> bytes:
     left.set_ylabel("angular error of the normal (°)")
     left.grid(True, which="both", alpha=0.25)
     left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
-    places = np.arange(len(AngleModel))
+    places = np.arange(len(FORMULAS))
     for offset, values, label, color in (
         (-0.2, [a.rmse_deg for a in result.ambiguity.values()], "true normal", BLUE),
         (0.2, [a.rmse_turned_deg for a in result.ambiguity.values()], "turned by π", ORANGE),

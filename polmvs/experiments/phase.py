@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel
+from polmvs.config import FORMULAS, AngleModel
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.angle_models import phase_from_normal
@@ -117,13 +117,13 @@ def measure_phase(
     for view in workers.map(partial(measure_view, scene), range(len(scene.views))):
         views.append(view)
         on_progress(1)
-    totals = {m: _total([view.all_pixels[m] for view in views]).stats() for m in AngleModel}
+    totals = {m: _total([view.all_pixels[m] for view in views]).stats() for m in FORMULAS}
     require_counted(scene, totals[AngleModel.OPA].num_pixels)
     return PhaseResult(
         all_pixels=totals,
-        unmarked={m: _total([view.unmarked[m] for view in views]).stats() for m in AngleModel},
-        per_view={v.name: {m: v.all_pixels[m].stats().rmse_deg for m in AngleModel} for v in views},
-        densities={m: _normalize(np.sum([v.counts[m] for v in views], axis=0)) for m in AngleModel},
+        unmarked={m: _total([view.unmarked[m] for view in views]).stats() for m in FORMULAS},
+        per_view={v.name: {m: v.all_pixels[m].stats().rmse_deg for m in FORMULAS} for v in views},
+        densities={m: _normalize(np.sum([v.counts[m] for v in views], axis=0)) for m in FORMULAS},
     )
 
 
@@ -133,7 +133,7 @@ def measure_view(scene: Scene, index: int) -> ViewPhase:
     marked = data.beside_marks(data.find_region(scene.region.min_dolp), scene.blur_px)
     unmarked = ~marked[data.counted]
     angles = _angles(data)
-    errors = {angle_model: _errors_deg(data, angle_model) for angle_model in AngleModel}
+    errors = {angle_model: _errors_deg(data, angle_model) for angle_model in FORMULAS}
     return ViewPhase(
         name=data.view.name,
         all_pixels={angle_model: ErrorTally.of(error) for angle_model, error in errors.items()},
@@ -150,7 +150,7 @@ def phase_images(scene: Scene, index: int) -> PhaseImages:
     measured = _phase(data, AngleModel.PPA)
     # What tilted polarizers turn the phase by is the same for the light's and the normal's.
     turn = axial_difference(measured, _phase(data, AngleModel.TILTED))
-    predicted = {m: phase_from_normal(m, data.normals_in_cam, data.rays) for m in AngleModel}
+    predicted = {m: phase_from_normal(m, data.normals_in_cam, data.rays) for m in FORMULAS}
     predicted[AngleModel.TILTED] = np.mod(predicted[AngleModel.TILTED] + turn, np.pi)
     return PhaseImages(
         name=data.view.name,

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel, ExperimentOptions
+from polmvs.config import FORMULAS, AngleModel, ExperimentOptions
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.normals.single_view.measurement import MIN_PIXELS
@@ -170,7 +170,7 @@ def measure_plane(
         failed={name: int(np.isnan(error).sum()) for name, error in errors.items()},
         per_image=tuple(kept),
         skipped=tuple(im.name for i, im in enumerate(images) if i not in used),
-        ambiguity={m: _pool([residuals[i][m] for i in used]) for m in AngleModel},
+        ambiguity={m: _pool([residuals[i][m] for i in used]) for m in FORMULAS},
     )
 
 
@@ -180,7 +180,7 @@ def measure_image(
     """Estimates of one view, and its share in the ambiguity."""
     data = load_view(scene, index)
     region, true_normal = planar_region(data, planar_deg)
-    pixels = {angle_model: _pixels(data, angle_model, region) for angle_model in AngleModel}
+    pixels = {angle_model: _pixels(data, angle_model, region) for angle_model in FORMULAS}
     estimates, seconds = {}, {}
     enough = int(region.sum()) >= MIN_PIXELS
     turn = _tilt_turn(pixels[AngleModel.PPA][0], pixels[AngleModel.TILTED][0])
@@ -200,7 +200,7 @@ def measure_image(
         sigma_deg={name: e.sigma_deg for name, e in estimates.items()},
         seconds=seconds,
     )
-    ambiguity = {m: _ambiguity(m, true_normal, *pixels[m]) for m in AngleModel} if enough else {}
+    ambiguity = {m: _ambiguity(m, true_normal, *pixels[m]) for m in FORMULAS} if enough else {}
     return image, ambiguity
 
 

@@ -100,9 +100,7 @@ def _read_exr(path: PathArg) -> NDArray[np.float32]:
     try:
         import OpenEXR
     except ImportError as error:
-        raise DataError(
-            path, "needs OpenEXR; install the extra: pip install 'polmvs[exr]'."
-        ) from error
+        raise DataError(path, "needs OpenEXR; install the extra: pip install '.[exr]'.") from error
     try:
         with OpenEXR.File(str(path)) as file:
             channels = {name: np.asarray(c.pixels) for name, c in file.channels().items()}

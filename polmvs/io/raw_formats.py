@@ -344,7 +344,7 @@ def _read_exr(path: PathArg, limit: _Limit) -> NDArray[Any]:
         import OpenEXR
     except ImportError as error:
         raise DataError(
-            path, "is an OpenEXR file. Install its library: pip install 'polmvs[exr]'."
+            path, "is an OpenEXR file. Install its library: pip install '.[exr]'."
         ) from error
     try:
         with OpenEXR.File(str(path), header_only=True) as file:

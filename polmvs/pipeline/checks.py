@@ -151,6 +151,8 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
     _check_counts(options, num_images)
     if options.region.mask is not None:
         _check_masks(capture, options.region.mask)
+    if options.sfm.feature_masks is not None:
+        _check_masks(capture, options.sfm.feature_masks)
     load = intensity_loader(capture, image_names(capture))
     if options.evaluation.gt is not None:
         require_truth_of_capture(open_ground_truth(options.evaluation.gt), capture, load)

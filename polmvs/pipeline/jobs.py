@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 from polmvs.config import COMPARED_MODELS, AngleModel, options_from_plain
 from polmvs.errors import DataError, OptionError
@@ -241,8 +242,8 @@ def _open(
 def _do_all(run: Run, last: Sequence[StageSpec]) -> None:
     """Do stages that the options ask for, and all that they need."""
     wanted = [spec.name for spec in last if spec.is_wanted(run.options)]
-    for spec in with_needed(wanted, run.table):
-        run.do(spec)
+    for _, same in groupby(with_needed(wanted, run.table), key=lambda spec: spec.result):
+        run.do_all(list(same))
 
 
 def _take_out_rejected(run: Run, last: Sequence[StageSpec], models: Sequence[AngleModel]) -> None:

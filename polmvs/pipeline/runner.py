@@ -11,11 +11,11 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from polmvs.cluster import TlsFiles
 from polmvs.colmap.cameras import quiet_colmap
@@ -161,7 +161,31 @@ class Run(StageInput):
         return [path for path, number in wrote.items() if num_files(root / path) < number]
 
     def do(self, spec: StageSpec) -> None:
-        """Do a stage, unless it is finished, and record it.
+        """Do a stage, unless it is finished, and record it; see :meth:`do_all`."""
+        self.do_all([spec])
+
+    def do_all(self, specs: Sequence[StageSpec]) -> None:
+        """Do stages that read nothing of each other, unless they are finished, and record them.
+
+        They are done side by side where they can be (``StageSpec.call``), there are workers for it
+        on this machine, and no memory is to be kept free.
+
+        Raises
+        ------
+        DataError
+            A stage that one reads from is not finished.
+        """
+        due = [spec for spec in specs if self._is_due(spec)]
+        calls = [call for spec in due if (call := spec.call(self)) is not None]
+        alone = self.budget_gb is not None or not self.workers.are_processes_here
+        if alone or len(calls) < max(len(due), 2):
+            for spec in due:
+                self._carry_out(spec)
+        else:
+            self._carry_out_side_by_side(due, calls)
+
+    def _is_due(self, spec: StageSpec) -> bool:
+        """Whether a stage is to be done; what is left of it is cleared away then.
 
         One whose files are gone is done again, and alone: what was made of them stays, for the same
         options give the same files.
@@ -181,7 +205,7 @@ class Run(StageInput):
         if finished is not None and is_finished and not self._is_redone(spec, finished):
             logger.info("%s: finished earlier", spec.name, extra=FILE_ONLY)
             self.monitor.skipped(spec.name)
-            return
+            return False
         for other in needed_by(spec, self.table):
             if not self.is_finished(other):
                 state = "is not finished" if self.record.stage(other.name) is None else "lost files"
@@ -192,7 +216,7 @@ class Run(StageInput):
                 )
         if is_finished:
             self.forget([spec.name])
-        self._carry_out(spec)
+        return True
 
     def _carry_out(self, spec: StageSpec) -> None:
         """Do a stage whose input is there, and record it."""
@@ -212,7 +236,34 @@ class Run(StageInput):
                     peak_mb / 1e3,
                     self.budget_gb,
                 )
-        seconds = round(time.perf_counter() - start, 3)
+        done = _Done(result, time.perf_counter() - start, cpu_seconds() - cpu_start)
+        self._record(spec, done, peak_mb, warned)
+
+    def _carry_out_side_by_side(
+        self, specs: Sequence[StageSpec], calls: Sequence[Callable[[], Any]]
+    ) -> None:
+        """Do stages each in a process of its own, and record them in their order.
+
+        The memory of each is that of all together.
+        """
+        for spec in specs:
+            logger.info("%s: begins", spec.name)
+        memory = PeakMemory()
+        name = f"{len(specs)} side by side"
+        with (
+            self.monitor.stage(name, len(specs)) as on_progress,
+            self.workers.stopped_on_error(),
+        ):
+            for spec, done in zip(specs, self.workers.map(_done_apart, calls), strict=True):
+                with _collected_warnings() as warned:
+                    for logged in done.logged:
+                        logging.getLogger(logged.logger).log(logged.level, "%s", logged.text)
+                self._record(spec, done, memory.mb(), warned)
+                on_progress(1)
+
+    def _record(self, spec: StageSpec, done: _Done, peak_mb: float, warned: Sequence[str]) -> None:
+        """Record a stage that is done, and tell of it."""
+        result, seconds = done.result, round(done.seconds, 3)
         logger.info("%s: %.1f s, %s", spec.name, seconds, result, extra=FILE_ONLY)
         finished = StageRecord(
             name=spec.name,
@@ -226,7 +277,7 @@ class Run(StageInput):
             options=plain_options(self.options, spec.decides),
             inputs=self._inputs(spec),
             seconds=seconds,
-            cpu_s=round(cpu_seconds() - cpu_start, 3),
+            cpu_s=round(done.cpu_s, 3),
             peak_rss_mb=round(peak_mb, 1),
             warnings=tuple(dict.fromkeys(warned)),
             result=result,
@@ -330,6 +381,53 @@ class Run(StageInput):
         self._started = now
         self.record.finished = finished
         write_record(self.run_folder, self.record)
+
+
+@dataclass(frozen=True)
+class _Logged:
+    """What a process said: the name of its logger, the level and the text."""
+
+    logger: str
+    level: int
+    text: str
+
+
+@dataclass(frozen=True)
+class _Done:
+    """A stage's work: its result, how long it took, and what a process of its own said."""
+
+    result: Any
+    seconds: float
+    cpu_s: float
+    logged: Sequence[_Logged] = ()
+
+
+class _LogKeeper(logging.Handler):
+    """Keeps what a process says, for the one that it works for."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.logged: list[_Logged] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a record."""
+        self.logged.append(_Logged(record.name, record.levelno, record.getMessage()))
+
+
+def _done_apart(call: Callable[[], Any]) -> _Done:
+    """Do a stage's work in this process, which is a worker."""
+    keeper, package = _LogKeeper(), logging.getLogger("polmvs")
+    package.setLevel(logging.INFO)
+    package.propagate = False
+    package.addHandler(keeper)
+    start, cpu_start = time.perf_counter(), cpu_seconds()
+    try:
+        with quiet_colmap():
+            result = call()
+    finally:
+        package.removeHandler(keeper)
+    seconds, cpu_s = time.perf_counter() - start, cpu_seconds() - cpu_start
+    return _Done(result, seconds, cpu_s, keeper.logged)
 
 
 class _Collector(logging.Handler):

@@ -16,7 +16,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from polmvs.config import AngleModel, Options, SfmOptions, option_paths
+from polmvs.config import AngleModel, Method, Options, SfmOptions, option_paths
 from polmvs.evaluation.comparison import SparseFigures
 from polmvs.evaluation.trust import Trust
 from polmvs.memory import MemoryNeeds
@@ -90,6 +90,8 @@ class StageSpec:
     result : type of what it gives; no other stage of the same angle model gives that type.
     num_steps : how many steps it will report, known when it begins; None where that is not known.
     is_wanted : whether the options ask for it, where a command may leave it out.
+    call : what does its work in a process of its own; None where it takes workers itself or is not
+        worth one. Stages that have it and follow each other are done side by side.
     is_redone : whether it is done again when what decides it has changed, instead of refusing to
         take it over: for what is quickly done and nothing is made from.
     """
@@ -104,6 +106,7 @@ class StageSpec:
     result: type
     num_steps: Callable[[StageInput], int | None] = lambda run: None
     is_wanted: Callable[[Options], bool] = lambda options: True
+    call: Callable[[StageInput], Callable[[], Any] | None] = lambda run: None
     is_redone: bool = False
 
 
@@ -192,8 +195,19 @@ def _write_sparse_cloud(model: AngleModel, run: StageInput) -> sparse_cloud.Spar
 
 
 def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
+    return _densify_call(model, run)(workers=run.workers, on_progress=run.on_progress)
+
+
+def _densify_apart(model: AngleModel, run: StageInput) -> Callable[[], Any] | None:
+    """The surface of all views is one process's work, the views one by one are many's."""
+    whole = run.options.propagation.method is Method.SURFACE
+    return _densify_call(model, run) if whole else None
+
+
+def _densify_call(model: AngleModel, run: StageInput) -> Callable[..., densify.DensifyResult]:
     folder = run.run_folder
-    return densify.densify(
+    return partial(
+        densify.densify,
         model,
         sparse=folder.sparse,
         camera_modes=folder.camera_modes,
@@ -209,8 +223,6 @@ def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
         tilt_aware=run.options.normals.tilt_aware_weights,
         light=run.options.region.light,
         masks_given=run.options.region.mask is not None,
-        workers=run.workers,
-        on_progress=run.on_progress,
     )
 
 
@@ -417,6 +429,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             writes=(cloud, views),
             decides=(TILT_AWARE, "region.mask", "region.light", "propagation", "fusion"),
             work=partial(_densify, model),
+            call=partial(_densify_apart, model),
             result=densify.DensifyResult,
             num_steps=lambda run: densify.num_densify_steps(run.num_views, run.options.propagation),
         ),

@@ -66,7 +66,7 @@ OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
 
 def model_rays(angle_model: AngleModel, rays_in_cam: Floats) -> Floats:
     """Rays as the model sees them: the optical axis under OPA, themselves under the others."""
-    if angle_model is AngleModel.OPA:
+    if angle_model.formula is AngleModel.OPA:
         return np.broadcast_to(OPTICAL_AXIS.astype(rays_in_cam.dtype), rays_in_cam.shape)
     return rays_in_cam
 

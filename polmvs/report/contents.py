@@ -143,7 +143,7 @@ def _of_model(
     samples: ErrorSamples,
 ) -> list[Picture]:
     """Normals, depth, residual phase, and the errors where there is a truth."""
-    view, name = given.view, model.value.upper()
+    view, name = given.view, model.label
     xy = dense.lattice_xy()
     rays = view.camera.rays(xy)
     known = dense.known
@@ -193,10 +193,12 @@ def _of_model(
 
 def _wipe(of_model: Mapping[AngleModel, Sequence[Picture]]) -> tuple[Picture, Picture] | None:
     """The last picture of OPA and of the best of the others: errors if known, else residuals."""
-    if AngleModel.OPA not in of_model or len(of_model) < 2:
+    opa = next((m for m in (AngleModel.TEXTBOOK_OPA, AngleModel.OPA) if m in of_model), None)
+    others = (AngleModel.PPA, AngleModel.TILTED, AngleModel.TEXTBOOK_PPA)
+    other = next((m for m in others if m in of_model), None)
+    if opa is None or other is None:
         return None
-    other = AngleModel.PPA if AngleModel.PPA in of_model else AngleModel.TILTED
-    return of_model[AngleModel.OPA][-1], of_model[other][-1]
+    return of_model[opa][-1], of_model[other][-1]
 
 
 def _residual_deg(model: AngleModel, in_cam: Floats, rays: Floats, samples: Floats) -> Floats:

@@ -19,9 +19,21 @@ if TYPE_CHECKING:
 Floats = NDArray[np.floating]
 
 # Okabe and Ito's colours, with a dash each, so that colour is never the only sign.
-COLORS = {AngleModel.OPA: "#d55e00", AngleModel.PPA: "#0072b2", AngleModel.TILTED: "#009e73"}
-DASHES = {AngleModel.OPA: (4, 2), AngleModel.PPA: (1, 0), AngleModel.TILTED: (1, 1.5)}
-LABELS = {AngleModel.OPA: "OPA", AngleModel.PPA: "PPA", AngleModel.TILTED: "tilted"}
+COLORS = {
+    AngleModel.TEXTBOOK_OPA: "#d55e00",
+    AngleModel.TEXTBOOK_PPA: "#56b4e9",
+    AngleModel.OPA: "#e69f00",
+    AngleModel.PPA: "#0072b2",
+    AngleModel.TILTED: "#009e73",
+}
+DASHES = {
+    AngleModel.TEXTBOOK_OPA: (4, 2),
+    AngleModel.TEXTBOOK_PPA: (6, 1.5),
+    AngleModel.OPA: (4, 2, 1, 2),
+    AngleModel.PPA: (1, 0),
+    AngleModel.TILTED: (1, 1.5),
+}
+LABELS = {model: model.label for model in AngleModel}
 INK = "#123456"  # replaced by the page's text colour
 MIN_IN_BIN = 30  # values for a median to be drawn; its quartiles then err by a tenth or so
 
@@ -101,7 +113,7 @@ def deviation_histogram(distance_mm: Floats, tolerance_mm: float | None, limit_m
     axes.stairs(share, edges, fill=True, color=COLORS[AngleModel.PPA], alpha=0.6)
     if tolerance_mm is not None:
         for side in (-tolerance_mm, tolerance_mm):
-            axes.axvline(side, color=COLORS[AngleModel.OPA], lw=1.2, ls=(0, (4, 2)))
+            axes.axvline(side, color=COLORS[AngleModel.TEXTBOOK_OPA], lw=1.2, ls=(0, (4, 2)))
     axes.set(xlabel="distance from the reference, mm (outside positive)", ylabel="points, %")
     return _svg(figure, "Histogram of the distances from the reference").replace(
         "currentColor", "#555555"

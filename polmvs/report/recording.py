@@ -51,7 +51,7 @@ def require_rerun(path: Path) -> None:
     """
     if find_spec("rerun") is None:
         raise OptionError(
-            "needs the extra 'rerun': pip install 'polmvs[rerun]'.", field="recording.rerun"
+            "needs the extra 'rerun': pip install '.[rerun]'.", field="recording.rerun"
         )
     if path.suffix != SUFFIX:
         raise OptionError(f"must end with {SUFFIX}, not {path.name!r}.", field="recording.rerun")

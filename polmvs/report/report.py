@@ -60,7 +60,15 @@ HEADLINE = (
     "Chamfer distance, mm",
     "normal error, mean / median, deg",
 )
-MAIN = (AngleModel.PPA, AngleModel.TILTED, AngleModel.OPA)  # who stands for the run, in order
+# Who stands for the run, and for OPA, in order: people know OPA as the paper has it.
+MAIN = (
+    AngleModel.PPA,
+    AngleModel.TILTED,
+    AngleModel.TEXTBOOK_PPA,
+    AngleModel.OPA,
+    AngleModel.TEXTBOOK_OPA,
+)
+ORTHOGRAPHIC = (AngleModel.TEXTBOOK_OPA, AngleModel.OPA)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -333,7 +341,7 @@ def _scene(
         return labels.index(name) if name in labels else None
 
     main = next((i for i in map(index, MAIN) if i is not None), 0)
-    opa = index(AngleModel.OPA)
+    opa = next((i for i in map(index, ORTHOGRAPHIC) if i is not None), None)
     start = (opa, main) if opa is not None and opa != main else (main, None)
     return pack_scene(layers, channels, given.sparse.views, start)
 
@@ -352,7 +360,8 @@ def _title(given: _Given) -> str:
 
 def _sentence(given: _Given) -> str:
     """What a reader in a hurry takes along."""
-    opa, main = AngleModel.OPA, next(m for m in MAIN if m in given.models)
+    opa = next((m for m in ORTHOGRAPHIC if m in given.models), ORTHOGRAPHIC[0])
+    main = next(m for m in MAIN if m in given.models)
     figures = given.comparison.models if given.comparison is not None else {}
     if main is opa or opa not in figures or main not in figures:
         cloud = given.record.result(DensifyResult, main)
@@ -365,14 +374,15 @@ def _sentence(given: _Given) -> str:
         angles = [number(truth.cloud.normal_mean_deg, 1, 1) for truth in (second, first)]
         return (
             f"{name} has an F-score of {scores[0]} % at {1e3 * near:g} mm and normals "
-            f"{angles[0]} deg off, OPA {scores[1]} % and {angles[1]} deg: oblique rays turn the "
-            "phase of a surface, which OPA, for which all rays are parallel, takes for shape."
+            f"{angles[0]} deg off, {plots.LABELS[opa]} {scores[1]} % and {angles[1]} deg: oblique "
+            "rays turn the phase of a surface, which OPA, for which all rays are parallel, takes "
+            "for shape."
         )
     before = figures[opa].consistency.phase_residual.median_deg
     after = figures[main].consistency.phase_residual.median_deg
     return (
         f"The surface found under {name} explains the measured phase to {number(after)} deg in "
-        f"the median, that under OPA to {number(before)} deg."
+        f"the median, that under {plots.LABELS[opa]} to {number(before)} deg."
     )
 
 

@@ -19,7 +19,7 @@ from polmvs.unprinted import unprinted
 
 logger = logging.getLogger(__name__)
 
-INSTALL = "Mitsuba is not installed; install the extra: pip install 'polmvs[simulate]'."
+INSTALL = "Mitsuba is not installed; install the extra: pip install '.[simulate]'."
 HOW_TO_GET_LLVM = (
     "Install it (Debian and Ubuntu: apt install libllvm19; Fedora: dnf install llvm-libs; conda: "
     "libllvm19; macOS: brew install llvm), or name it by the environment variable "

@@ -187,7 +187,7 @@ def test_defaults_are_those_of_the_options() -> None:
     assert given.options() == Options()
     assert given.get(RunOptions) == RunOptions()
     assert given.get(ComparedModels).models == COMPARED_MODELS
-    assert COMPARED_MODELS[:2] == (AngleModel.OPA, AngleModel.PPA)
+    assert COMPARED_MODELS[:2] == (AngleModel.TEXTBOOK_OPA, AngleModel.TEXTBOOK_PPA)
 
 
 def test_flags_of_every_kind() -> None:

@@ -120,6 +120,7 @@ def test_mask_and_polygon_say_where(cli, mosaic, tmp_path) -> None:
         (["--min-dolp", "1.5"], 2, "--min-dolp must lie in 0 to 1"),
         (["--min-intensity", "2"], 2, "--min-intensity"),
         (["--find-planes", "--model", "opa"], 2, "--find-planes needs --model ppa or tilted"),
+        (["--model", "textbook-opa"], 2, "--model must be opa, ppa, tilted: of one plane"),
     ],
 )
 def test_bad_input_is_one_clear_line(cli, mosaic, flags, status, words) -> None:

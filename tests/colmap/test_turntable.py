@@ -10,11 +10,15 @@ import pytest
 from printed_images import CAMERA, INTRINSICS, write_printed_images
 
 from polmvs.camera import pixel_centers
+from polmvs.colmap.models import read_model
 from polmvs.colmap.sfm import run_sfm
 from polmvs.colmap.static_features import find_static
 from polmvs.config import SfmOptions
+from polmvs.errors import OptionError
+from polmvs.io.images import read_gray
+from polmvs.pipeline.stages.sfm import find_model
 from polmvs.poses.alignment import align_views
-from polmvs.scene import View
+from polmvs.scene import SparseModel, View
 
 NUM_VIEWS = 16
 TABLE_RADIUS = 0.4
@@ -39,7 +43,22 @@ def turntable(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[View
         image[off_table] = np.clip(noisy, 0, 255).astype(np.uint8)[off_table]
         assert 0.1 < off_table.mean() < 0.9
         cv2.imwrite(str(folder / view.name), image)
+        masks = folder / "masks"
+        masks.mkdir(exist_ok=True)
+        cv2.imwrite(str(masks / view.name), 255 * (~off_table).astype(np.uint8))
     return folder, views
+
+
+def largest_error(model: SparseModel, views: list[View]) -> float:
+    """Of a camera's place, as a share of its distance."""
+    truth = {view.name: view for view in views}
+    similarity, _ = align_views(model.views, truth, source="test")
+    errors = [
+        np.linalg.norm(similarity * view.center_in_world - truth[view.name].center_in_world)
+        / np.linalg.norm(truth[view.name].center_in_world)
+        for view in model.views
+    ]
+    return float(max(errors))
 
 
 def test_the_background_is_found_and_left_out(turntable, tmp_path: Path, caplog) -> None:
@@ -49,13 +68,25 @@ def test_the_background_is_found_and_left_out(turntable, tmp_path: Path, caplog)
     model = run_sfm(folder, names, tmp_path / "work", tmp_path / "sparse", options)
     assert "a background stands still" in caplog.text
     assert len(model.views) >= NUM_VIEWS - 1
-    truth = {view.name: view for view in views}
-    similarity, _ = align_views(model.views, truth, source="test")
-    for view in model.views:
-        place = similarity * view.center_in_world
-        # A degree of the orbit: the table is small and the images are of 300 px.
-        far = np.linalg.norm(truth[view.name].center_in_world)
-        assert np.linalg.norm(place - truth[view.name].center_in_world) < 0.02 * far
+    # A degree of the orbit: the table is small and the images are of 300 px.
+    assert largest_error(model, views) < 0.02
+
+
+def test_features_inside_masks_alone_find_the_turning_poses(turntable, tmp_path: Path) -> None:
+    """Without them, and without the search for a background, the camera seems to stand still."""
+    folder, views = turntable
+    names = [view.name for view in views][3:12]
+    options = SfmOptions(
+        intrinsics=INTRINSICS, static_background=False, feature_masks=folder / "masks"
+    )
+    find_model(folder, names, tmp_path / "sparse", options)
+    model = read_model(tmp_path / "sparse")
+    assert len(model.views) >= len(names) - 1
+    assert largest_error(model, views) < 0.02
+    for index, of_view in enumerate(model.tracks.of_views(len(model.views))):
+        mask = read_gray(folder / "masks" / model.views[index].name)
+        col, row = np.floor(model.tracks.obs_xy[of_view]).astype(int).T
+        assert (mask[row, col] > 0).all()
 
 
 def test_a_camera_that_moves_has_no_static_background(tmp_path: Path, caplog) -> None:
@@ -82,3 +113,11 @@ def test_static_keypoints_are_told_by_place_and_look() -> None:
     assert find_static(moved, descriptors) is None
     assert find_static(places[:2], descriptors[:2]) is None
     assert find_static([np.zeros((0, 2))] * 4, [np.zeros((0, 128), np.uint8)] * 4) is None
+
+
+def test_feature_masks_need_features_to_find() -> None:
+    masks = Path("masks")
+    with pytest.raises(OptionError, match=r"feature_masks.*sfm.database"):
+        SfmOptions(feature_masks=masks, database=Path("a.db"))
+    with pytest.raises(OptionError, match=r"feature_masks.*sfm.sparse"):
+        SfmOptions(feature_masks=masks, sparse=Path("model"))

@@ -47,6 +47,13 @@ def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
         assert loaded == [], page.name
 
 
+def test_the_notebook_is_a_page(site: Path) -> None:
+    text = (site / "notebook.html").read_text()
+    assert "%NOTEBOOK%" not in text
+    assert "First steps: from a raw frame" in text
+    assert text.count("highlight-python") >= 8
+
+
 def test_formulas_are_markup_and_not_their_source(site: Path) -> None:
     text = (site / "how_it_works.html").read_text()
     assert text.count("<math ") >= 20

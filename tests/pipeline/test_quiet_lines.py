@@ -44,7 +44,7 @@ def test_one_model_fits_best_of_none() -> None:
     two = SimpleNamespace(
         best_fit=AngleModel.PPA, models={AngleModel.OPA: figures, AngleModel.PPA: figures}
     )
-    assert best_fit_lines(two)[-1] == "The phases fit PPA best: 0.50 deg at the seeds."
+    assert best_fit_lines(two)[-1] == "The phases fit polmvs PPA best: 0.50 deg at the seeds."
 
 
 def test_stereo_that_finds_nothing_says_so_and_keeps_the_sparse_points(

@@ -359,7 +359,7 @@ def test_evaluation_of_other_models_is_done_again(
     shutil.copytree(demo_run, out)
     status, text, err = cli("compare", demo_capture, out, "--resume", "--models", "opa,ppa")
     assert (status, err) == (0, "")
-    assert "TILTED" not in text.splitlines()[0]
+    assert "tilted" not in text.splitlines()[0]
     assert set(json.loads((out / "metrics.json").read_text())["models"]) == {"opa", "ppa"}
     assert (out / "tilted.ply").exists()
 

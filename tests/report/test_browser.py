@@ -263,8 +263,8 @@ def test_the_slider_wipes_between_opa_and_ppa(opened: Opened) -> None:
         page.keyboard.press("ArrowLeft")
     assert opened.shot(".wipe >> nth=0") != before
     labels = page.locator(".wipe >> nth=0").inner_text()
-    assert "OPA" in labels
-    assert "PPA" in labels
+    assert "textbook OPA" in labels
+    assert "polmvs PPA" in labels
 
 
 def test_nothing_is_wider_than_the_screen(opened: Opened) -> None:

@@ -55,7 +55,7 @@ def test_references_inside_a_plot_hit() -> None:
 def test_labels_are_text() -> None:
     text = plots.error_curves(ERRORS, "mm", "depth error")
     assert "depth error, mm" in text
-    assert ">OPA<" in text
+    assert ">polmvs OPA<" in text
 
 
 @pytest.mark.parametrize("num", [0, 3])

@@ -142,7 +142,7 @@ def test_without_the_extra_nothing_is_begun(cli, tmp_path: Path, monkeypatch, wo
     status, out, err = cli(*words, tmp_path / "out", "--rerun", tmp_path / "out.rrd")
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
-    assert "--rerun needs the extra 'rerun': pip install 'polmvs[rerun]'" in err
+    assert "--rerun needs the extra 'rerun': pip install '.[rerun]'" in err
     assert list(tmp_path.iterdir()) == []
 
 

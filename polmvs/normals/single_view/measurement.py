@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import AngleModel, CaptureOptions, Estimator, Light, PlaneOptions, to_plain
+from polmvs.config import (
+    FORMULAS,
+    AngleModel,
+    CaptureOptions,
+    Estimator,
+    Light,
+    PlaneOptions,
+    to_plain,
+)
 from polmvs.errors import DataError, OptionError
 from polmvs.io.images import read_mask
 from polmvs.normals.single_view.focal import FocalEstimate
@@ -143,7 +151,7 @@ def measure_planes(
         camera = replace(camera, fx=camera.fx * scale, fy=camera.fy * scale)
         source = IntrinsicsSource.ESTIMATED
     robust = options.estimator is Estimator.ROBUST
-    planes = {model: view.plane(model, camera, robust=robust) for model in AngleModel}
+    planes = {model: view.plane(model, camera, robust=robust) for model in FORMULAS}
     found = None
     if options.find_planes:
         found = tuple(

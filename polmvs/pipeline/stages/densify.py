@@ -135,7 +135,7 @@ def densify(
     cloud : PLY to write.
     views : folder to write, with the dense depth and normals of each view.
     propagation, fusion : defaults where None.
-    tilt_aware : as ``NormalOptions.tilt_aware_weights``.
+    tilt_aware : as ``NormalOptions.tilt_aware_weights``; a textbook model never is.
     masks_given : the regions of the phase maps are the user's masks.
     light : that the user states; None: inferred for each observation.
 
@@ -146,6 +146,7 @@ def densify(
     """
     propagation, fusion = propagation or PropagationOptions(), fusion or FusionOptions()
     workers = workers or Workers()
+    tilt_aware = tilt_aware and not model.is_textbook
     phase_maps = open_maps(sparse, maps, model)
     known = load_seeds(seeds, track_normals)
     given = _open_given(fusion, sparse, images)
@@ -259,7 +260,7 @@ def _global_surface(
     levels: list[TriangleMesh] = []
     kept.mkdir()
     surface = reconstruct_surface(
-        model,
+        model.formula,
         maps,
         seeds,
         surroundings,
@@ -319,7 +320,7 @@ def _dense_surface(
         return no_points()
     spread = propagate if propagation.method is Method.CONTOUR else integrate
     dense = spread(
-        model,
+        model.formula,
         maps,
         seeds,
         propagation,

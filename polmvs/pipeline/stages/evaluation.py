@@ -33,9 +33,9 @@ class EvaluationResult:
     best_fit: AngleModel | None
 
     def __str__(self) -> str:
-        names = ", ".join(model.upper() for model in self.models)
+        names = ", ".join(model.label for model in self.models)
         best = self.best_fit
-        return f"figures of {names}" + (f"; {best.upper()} fits best" if best is not None else "")
+        return f"figures of {names}" + (f"; {best.label} fits best" if best is not None else "")
 
 
 def load_estimate(run_folder: RunFolder, model: AngleModel) -> ModelEstimate:

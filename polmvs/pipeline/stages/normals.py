@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -73,8 +73,11 @@ def solve_track_normals(
     phase_maps = open_maps(sparse, maps, model)
     stored = np.zeros(len(tracks.point3D_ids), NORMALS_TYPE)
     if len(stored):
+        options = options or NormalOptions()
+        if model.is_textbook:
+            options = replace(options, tilt_aware_weights=False)
         estimate = track_normals(
-            model, tracks, phase_maps, options or NormalOptions(), light, max_rows=max_rows
+            model.formula, tracks, phase_maps, options, light, max_rows=max_rows
         )
         for name in NORMALS_TYPE.names or ():
             stored[name] = getattr(estimate, "normals" if name == "normal" else name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Thread
@@ -25,6 +25,7 @@ from polmvs.io.clouds import preload
 from polmvs.parallel import OnProgress, OnStep, no_progress
 from polmvs.pipeline.run_folder import CAMERA_MODES, POSE_COVARIANCES, replace_folder, scratch
 from polmvs.pipeline.stages.images import image_names
+from polmvs.pipeline.stages.maps import find_mask
 from polmvs.polarization.capture import Capture
 from polmvs.scene import SparseModel, short_list
 from polmvs.separate import CrashError, run_separately
@@ -98,6 +99,13 @@ def find_model(
         logger.warning("`sfm.camera_model` is not used where the camera is given.")
     loading: list[Thread] = []
 
+    folder_of_masks = options.feature_masks
+    masks = (
+        None
+        if folder_of_masks is None
+        else {name: find_mask(folder_of_masks, name) for name in names}
+    )
+
     def on_step(name: str) -> None:
         if name == "mapping":  # on one core: the other can load what the next stages need
             loading.append(preload())
@@ -107,7 +115,9 @@ def find_model(
         work, new = folder / "work", folder / "sparse"
         try:
             # Where its database cannot be written COLMAP ends the process.
-            model = run_separately(_run_sfm, images, names, work, new, options, on_message=on_step)
+            model = run_separately(
+                _run_sfm, images, names, work, new, options, masks, on_message=on_step
+            )
             for thread in loading:
                 thread.join()
         except NoRoomError as error:
@@ -154,11 +164,12 @@ def _run_sfm(
     work: Path,
     new: Path,
     options: SfmOptions,
+    masks: Mapping[str, Path] | None,
     on_step: OnStep,
 ) -> SparseModel:
     """SfM, where what COLMAP says of a folder that it cannot work in is an error of that folder."""
     try:
-        return run_sfm(images, names, work, new, options, on_step)
+        return run_sfm(images, names, work, new, options, on_step, masks=masks)
     except RuntimeError as error:
         said = " ".join(str(error).split())[:MAX_QUOTED]
         raise DataError(new.parent.parent, f"{CANNOT_WRITE} COLMAP says: {said}") from error

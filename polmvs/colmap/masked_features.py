@@ -1,0 +1,36 @@
+"""Features inside masks alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polmvs.colmap.database import image_numbers, opened
+from polmvs.colmap.static_features import keep_features
+
+Mask = NDArray[np.bool_]
+
+
+def keep_inside(database: Path, masks: Mapping[str, Mask]) -> int:
+    """Take features outside of masks out of a database that has no matches yet.
+
+    Parameters
+    ----------
+    masks : (H, W) of each image, by its name.
+
+    Returns
+    -------
+    How many features stay.
+    """
+    numbers = image_numbers(database)
+    kept: dict[int, Mask] = {}
+    with opened(database) as content:
+        for name, mask in masks.items():
+            xy = np.asarray(content.read_keypoints(numbers[name]))[:, :2]
+            col, row = np.clip(np.floor(xy), 0, np.array(mask.shape[::-1]) - 1).astype(int).T
+            kept[numbers[name]] = mask[row, col]
+        keep_features(content, kept)
+    return int(sum(mask.sum() for mask in kept.values()))
