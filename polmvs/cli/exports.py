@@ -5,6 +5,7 @@ from __future__ import annotations
 from polmvs.cli.call import Call
 from polmvs.cli.commands import ExportArguments
 from polmvs.cli.terminal import Terminal
+from polmvs.config import CropOptions
 from polmvs.pipeline.export import export_format, export_run
 from polmvs.pipeline.run_folder import RunFolder
 
@@ -22,7 +23,7 @@ def export(call: Call, terminal: Terminal) -> int:
         texture_px=given.texture_px,
         colors=given.colors,
         part=given.part,
-        box=given.box,
+        crop=call.get(CropOptions),
         overwrite=given.overwrite,
     )
     what = [

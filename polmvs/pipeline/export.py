@@ -13,17 +13,19 @@ from polmvs.camera import pixel_centers
 from polmvs.colmap.camera_exports import CAMERA_FORMATS, CameraExport
 from polmvs.colmap.dense_workspace import open_dense_workspace
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Channel, ExportFormat, options_from_plain
+from polmvs.config import AngleModel, Channel, CropOptions, ExportFormat, options_from_plain
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.io.cloud_files import write_cloud_file
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
 from polmvs.io.folders import new_folder
 from polmvs.io.images import read_gray
 from polmvs.io.mesh_files import MESH_FORMATS, Texture, mesh_format_of, write_mesh_file
+from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import DISPLAY_GAMMA, Capture, open_capture
+from polmvs.poses.crop_box import CropBox, crop_box
 from polmvs.scene import PointKind, SparseModel, View
 from polmvs.surface.coloring import paint_texture, surface_colors, texture_size
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
@@ -31,7 +33,6 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 CLOUDS = {
     ExportFormat.CLOUD_PLY: "ply",
@@ -94,7 +95,7 @@ def export_run(
     texture_px: int | None = None,
     colors: bool = True,
     part: bool = False,
-    box: tuple[float, float, float, float, float, float] | None = None,
+    crop: CropOptions | None = None,
     overwrite: bool = False,
 ) -> Exported:
     """Write a mesh, a cloud or posed images of a finished run.
@@ -107,7 +108,7 @@ def export_run(
     texture_px : sides of the texture; by default a texel has the size of a pixel on the part.
     colors : of a mesh: without, it has none.
     part : of a cloud: the polarised surface alone, without its surroundings.
-    box : two opposite corners, world; of a mesh or cloud what lies within.
+    crop : of a mesh or cloud: what lies within its box.
     overwrite : replace what is there.
 
     Raises
@@ -117,8 +118,9 @@ def export_run(
     """
     record = load_record(run_folder)
     model = surface_of(run_folder, dense_models(record), model)
-    if box is not None and form not in (*MESHES, *CLOUDS):
-        raise OptionError("is of a mesh or a cloud.", field="arguments.box")
+    crop = crop or CropOptions()
+    if crop.box is not None and form not in (*MESHES, *CLOUDS):
+        raise OptionError("is of a mesh or a cloud.", field="crop.box")
     if texture and form not in MESHES:
         raise OptionError("is of a mesh.", field="arguments.texture")
     if texture and not MESH_FORMATS[f".{form}"].texture:
@@ -130,18 +132,18 @@ def export_run(
     if form in CLOUDS:
         cloud = read_cloud(run_folder.cloud(model))
         cloud = part_of(cloud) if part else cloud
-        if box is not None:
-            cloud = cloud.only(within_box(cloud.points, box))
+        if (box := _box_of_run(run_folder, record, crop)) is not None:
+            cloud = cloud.only(box.require_some(cloud.points))
         write_cloud_file(target, cloud, CLOUDS[form])
         return Exported(files=(target,), num_points=len(cloud.points))
     if form not in MESHES:
         return _export_cameras(run_folder, model, target, form, overwrite=overwrite)
     mesh_format_of(target)
     mesh = read_mesh(_existing(run_folder.mesh(model), "mesh"))
-    if box is not None:
-        mesh = cropped_mesh(mesh, within_box(mesh.vertices, box))
+    if (box := _box_of_run(run_folder, record, crop)) is not None:
+        mesh = mesh.only(box.require_some(mesh.vertices))
         if not len(mesh.triangles):
-            raise OptionError("holds nothing of the mesh.", field="arguments.box")
+            raise OptionError("holds no whole triangle of the mesh.", field="crop.box")
     painted: Texture | None = None
     if MESH_FORMATS[f".{form}"].colors and colors:
         painter = _Painter(run_folder, mesh)
@@ -157,27 +159,6 @@ def export_run(
         num_points=len(mesh.vertices),
         num_triangles=len(mesh.triangles),
         texture_px=0 if painted is None else painted.image.shape[0],
-    )
-
-
-def within_box(points: Array, box: tuple[float, float, float, float, float, float]) -> Mask:
-    """Which points (N, 3) lie between two opposite corners, whichever is which."""
-    corners = np.reshape(box, (2, 3))
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    return np.asarray(((points >= low) & (points <= high)).all(axis=1), np.bool_)
-
-
-def cropped_mesh(mesh: Mesh, kept: Mask) -> Mesh:
-    """The triangles of which all three vertices are kept, and their vertices."""
-    triangles = mesh.triangles[kept[mesh.triangles].all(axis=1)]
-    used = np.unique(triangles)
-    index = np.zeros(len(mesh.vertices), np.int32)
-    index[used] = np.arange(len(used))
-    return Mesh(
-        vertices=mesh.vertices[used],
-        normals=mesh.normals[used],
-        triangles=index[triangles],
-        colors=None if mesh.colors is None else mesh.colors[used],
     )
 
 
@@ -200,6 +181,19 @@ def surface_of(
             f"is {model}; {run_folder.root} has {', '.join(there)}.", field="arguments.model"
         )
     return model
+
+
+def _box_of_run(run_folder: RunFolder, record: Record, crop: CropOptions) -> CropBox | None:
+    """The box that is asked for, in the world of a finished run."""
+    if crop.box is None:
+        return None
+    options = options_from_plain(record.options, str(run_folder.run_file))
+    return crop_box(
+        crop,
+        options.reference.aruco,
+        read_model(run_folder.sparse).views,
+        lambda name: read_gray(run_folder.images / name),
+    )
 
 
 def _existing(path: Path, what: str) -> Path:
