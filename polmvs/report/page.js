@@ -55,4 +55,4 @@ for (const name of ["mouseover", "focusin"]) {
 }
 document.addEventListener("focusout", () => explain(null));
 document.addEventListener("keydown", (event) => event.key === "Escape" && explain(null));
-addEventListener("scroll", () => explained && explain(null), { passive: true });
+addEventListener("scroll", () => explained && explain(explained), { passive: true, capture: true });
