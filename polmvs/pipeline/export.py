@@ -301,15 +301,25 @@ class _Painter:
         if self.capture is None or view.name not in self.raw:
             gray = read_gray(self.images / view.name)
             return np.asarray((gray / 255) ** DISPLAY_GAMMA, np.float32)
-        capture = self.capture
-        channels: tuple[Channel, ...] = (capture.options.channel,)
-        if capture.has_colors and capture.options.channel is Channel.COMBINED:
-            channels = (Channel.RED, Channel.GREEN, Channel.BLUE)
-        planes = []
-        for channel in channels:
-            one = replace(capture, options=replace(capture.options, channel=channel))
-            stokes = one.load(self.raw[view.name])
-            plane = np.maximum(stokes.s0 - np.hypot(stokes.s1, stokes.s2), 0)
-            dark = stokes.s0 < 2 * capture.options.darkness
-            planes.append(np.where(stokes.valid | dark, plane, np.nan))
-        return np.asarray(np.stack(planes, axis=-1) if len(planes) > 1 else planes[0], np.float32)
+        return unpolarized_image(self.capture, self.raw[view.name])
+
+
+def unpolarized_image(capture: Capture, name: str) -> NDArray[np.float32]:
+    """Linear intensities of a raw image without what is polarized; NaN where they are clipped.
+
+    Returns
+    -------
+    (H, W), or (H, W, 3) red, green, blue of a colour camera, unless the capture's options choose
+    one of its colours.
+    """
+    channels: tuple[Channel, ...] = (capture.options.channel,)
+    if capture.has_colors and capture.options.channel is Channel.COMBINED:
+        channels = (Channel.RED, Channel.GREEN, Channel.BLUE)
+    planes = []
+    for channel in channels:
+        one = replace(capture, options=replace(capture.options, channel=channel))
+        stokes = one.load(name)
+        plane = np.maximum(stokes.s0 - np.hypot(stokes.s1, stokes.s2), 0)
+        dark = stokes.s0 < 2 * capture.options.darkness
+        planes.append(np.where(stokes.valid | dark, plane, np.nan))
+    return np.asarray(np.stack(planes, axis=-1) if len(planes) > 1 else planes[0], np.float32)
