@@ -50,8 +50,9 @@ class LengthUnit:
     factor: float = 1.0
 
     def text(self, length: float) -> str:
-        """A length of the model, to four digits, with its unit."""
-        return f"{self.factor * length:.4g} {self.name}"
+        """A length of the model, to three digits or whole, with its unit."""
+        value = self.factor * length
+        return f"{value:.0f} {self.name}" if abs(value) >= 1000 else f"{value:.3g} {self.name}"
 
 
 @dataclass(kw_only=True)

@@ -10,6 +10,11 @@ _MEANINGS = {
     "PPA": "Perspective phase angle: each pixel has a ray of its own.",
     "TILTED": "PPA, with polarizers that oblique rays meet at a tilt.",
     "tilted": "PPA, with polarizers that oblique rays meet at a tilt.",
+    "textbook OPA": "Orthographic phase angle as published, with nothing added.",
+    "textbook PPA": "Perspective phase angle as published, with nothing added.",
+    "polmvs OPA": "Orthographic phase angle, with what polmvs makes up for.",
+    "polmvs PPA": "Perspective phase angle, with what polmvs makes up for.",
+    "polmvs tilted": "PPA, with polarizers that oblique rays meet at a tilt.",
     # facts
     "views with a pose": "Photographs whose place and direction SfM found, of all.",
     "sparse points": "Points that SfM triangulated from features; the surface starts from those on "
