@@ -38,5 +38,6 @@ def export(call: Call, terminal: Terminal) -> int:
     if written.texture_px:
         what.append(f"a texture of {written.texture_px} px")
     names = ", ".join(map(str, written.files))
+    what.append("in metres" if written.is_metric else "in the model's own unit, of no known scale")
     terminal.show(f"{names}: {', '.join(what)}", {"format": form, **vars(written)})
     return 0

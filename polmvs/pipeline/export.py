@@ -24,6 +24,7 @@ from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.images import image_names
+from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.polarization.capture import DISPLAY_GAMMA, Capture, open_capture
 from polmvs.poses.crop_box import CropBox, crop_box
 from polmvs.scene import PointKind, SparseModel, View
@@ -52,6 +53,7 @@ class Exported:
     files : or the folder.
     num_points, num_triangles, num_views : of what was exported; 0 of what was not.
     texture_px : sides of the texture; 0 without one.
+    is_metric : whether its unit is the metre; else it is the model's own.
     """
 
     files: tuple[Path, ...]
@@ -59,6 +61,7 @@ class Exported:
     num_triangles: int = 0
     num_views: int = 0
     texture_px: int = 0
+    is_metric: bool = False
 
 
 def export_format(target: Path, given: ExportFormat | None) -> ExportFormat:
@@ -117,6 +120,7 @@ def export_run(
         The run lacks what is asked for, the target exists, or a library is missing.
     """
     record = load_record(run_folder)
+    is_metric = record.result(PosesResult).is_metric
     model = surface_of(run_folder, dense_models(record), model)
     crop = crop or CropOptions()
     if crop.box is not None and form not in (*MESHES, *CLOUDS):
@@ -135,9 +139,10 @@ def export_run(
         if (box := _box_of_run(run_folder, record, crop)) is not None:
             cloud = cloud.only(box.require_some(cloud.points))
         write_cloud_file(target, cloud, CLOUDS[form])
-        return Exported(files=(target,), num_points=len(cloud.points))
+        return Exported(files=(target,), num_points=len(cloud.points), is_metric=is_metric)
     if form not in MESHES:
-        return _export_cameras(run_folder, model, target, form, overwrite=overwrite)
+        posed = _export_cameras(run_folder, model, target, form, overwrite=overwrite)
+        return replace(posed, is_metric=is_metric)
     mesh_format_of(target)
     mesh = read_mesh(_existing(run_folder.mesh(model), "mesh"))
     if (box := _box_of_run(run_folder, record, crop)) is not None:
@@ -159,6 +164,7 @@ def export_run(
         num_points=len(mesh.vertices),
         num_triangles=len(mesh.triangles),
         texture_px=0 if painted is None else painted.image.shape[0],
+        is_metric=is_metric,
     )
 
 
