@@ -50,7 +50,9 @@ for (const name of ["mouseover", "focusin"]) {
   document.addEventListener(name, (event) => {
     const term = event.target.closest(".term");
     if (term) explain(term);
-    else if (name === "mouseover" && explained && !event.target.closest("#meaning")) explain(null);
+    else if (name === "mouseover" && explained && !event.target.closest("#meaning")) {
+      explain(document.activeElement.closest(".term")); // a resting pointer hides no focused one's
+    }
   });
 }
 document.addEventListener("focusout", () => explain(null));

@@ -214,8 +214,11 @@ def test_every_figure_has_a_meaning_for_pointer_and_keyboard(opened: Opened) -> 
     place = meaning.bounding_box()
     assert place["x"] >= 0
     assert place["x"] + place["width"] <= page.viewport_size["width"]
+    page.locator("h1").hover()  # the pointer elsewhere does not hide what has the focus
+    assert meaning.is_visible()
     page.keyboard.press("Escape")
     assert not meaning.is_visible()
+    page.evaluate("document.activeElement.blur()")
     page.locator("dt .term").first.hover()
     assert "SfM" in meaning.inner_text()
     page.locator("h1").hover()

@@ -3,7 +3,7 @@ import { BufferAttribute, BufferGeometry, LineBasicMaterial, LineSegments, Vecto
 import { pickCamera } from "./picking.js";
 
 const COLOR = 0x0072b2;
-const CHOSEN = 0xd6007f;
+const CHOSEN = 0xd55e00;
 const SHOWN = ["intensity", "AoLP", "reprojected mesh"]; // of the view's pictures, by their kind
 
 function frusta(cameras, color) {

@@ -2,7 +2,7 @@
 import { BufferAttribute, BufferGeometry, LineBasicMaterial, LineSegments, Matrix4, Vector3 } from "three";
 import { forEachProjected, pickPoint, worldPoint } from "./picking.js";
 
-const COLOR = 0xd6007f; // of lines that are drawn over a surface
+const COLOR = 0x00bcd4; // of lines that are drawn over a surface
 const CROSS = 0.02; // arm of the cross at a chosen point, in radii of the part
 const PAD = 0.01; // of a box beyond what was chosen, share of its diagonal
 const SURFACE_KINDS = [0, 4]; // of points: the part, as it is seen and as it is inferred
