@@ -29,6 +29,7 @@ FRUSTUM_SHARE = 0.08  # depth of a drawn camera, of the distance from the target
 EYE_DISTANCE = 3.2  # from the target, in radii of the part: all of it in a field of view of 40 deg
 EYE_ELEVATION_DEG = 35.0
 SPACING_SAMPLES = 2000  # points whose nearest neighbour is looked up; their median errs by 1 %
+UNKNOWN = "#999999"  # of points without a value
 KIND_COLORS = ("#0072b2", "#999999", "#e69f00", "#009e73", "#cc79a7")  # by PointKind
 
 
@@ -44,6 +45,7 @@ class Channel:
     colors : name of the colour map; None for grey.
     classes : names of the values 0, 1, ... where they are kinds and not amounts.
     note : what it says, in a sentence.
+    may_lack : some points have no value, NaN, and are grey; else what is NaN counts as the worst.
     """
 
     label: str
@@ -53,6 +55,7 @@ class Channel:
     colors: str | None = None
     classes: tuple[str, ...] = ()
     note: str = ""
+    may_lack: bool = False
 
 
 @dataclass(frozen=True)
@@ -229,7 +232,10 @@ def _bytes_of(
 
 
 def _quantised(values: NDArray[Any], channel: Channel) -> NDArray[np.uint8]:
-    """One byte a value; what is not finite counts as the highest, which is the worst."""
+    """One byte a value; what is not finite counts as the highest, which is the worst.
+
+    Of a channel that some points lack, 255 stands for no value.
+    """
     if channel.classes:
         share = (np.asarray(values, np.float64) + 0.5) / len(channel.classes)
     else:
@@ -237,6 +243,8 @@ def _quantised(values: NDArray[Any], channel: Channel) -> NDArray[np.uint8]:
             channel.high - channel.low, 1e-300
         )
     clean = np.clip(np.nan_to_num(share, nan=1.0, posinf=1.0, neginf=0.0), 0, 1)
+    if channel.may_lack:
+        return np.where(np.isnan(share), 255, np.round(254 * clean)).astype(np.uint8)
     return np.asarray(np.round(255 * clean), np.uint8)
 
 
@@ -257,6 +265,8 @@ def _channel_json(channel: Channel) -> dict[str, Any]:
     }
     if channel.colors is not None:
         result["colors"] = hex_palette(channel.colors)
+    if channel.may_lack:
+        result["unknown"] = UNKNOWN
     return result
 
 

@@ -78,6 +78,8 @@ MIN_SIZED = 100  # points for a size to be told
 SIZED = 5000  # points that a size is told from: its ends err by some of their spacings
 MAIN = (AngleModel.PPA, AngleModel.TILTED, AngleModel.OPA)  # who stands for the run, in order
 
+ORTHOGRAPHIC = (AngleModel.OPA,)  # who stands for OPA, in order
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Given:
@@ -329,6 +331,7 @@ def _layers(given: _Given) -> tuple[list[Layer], dict[str, Channel]]:
             colors=pictures.ERROR,
             note="Angle between the measured phase and the one that the surface predicts, mean of "
             "the views that see a point. Needs no ground truth.",
+            may_lack=True,
         ),
         "sigma": Channel(
             label="position uncertainty (1 sigma)",
@@ -364,6 +367,7 @@ def _layers(given: _Given) -> tuple[list[Layer], dict[str, Channel]]:
             unit="deg",
             colors=pictures.ERROR,
             note="Between the surface's direction and the true one.",
+            may_lack=True,
         )
     layers = [
         _cloud_layer(given, model, cloud, factor)
@@ -468,7 +472,8 @@ def _cloud_layer(given: _Given, model: AngleModel, cloud: Cloud, factor: float) 
         true.points, truth_from_world * layer.points, far=MAX_ERROR_M
     )
     normals = layer.normals @ truth_from_world.rotation.T
-    off = np.nan_to_num(angular_errors_deg(normals, true.normals[nearest]))
+    off = angular_errors_deg(normals, true.normals[nearest])
+    off[np.linalg.norm(normals, axis=1) < 0.5] = np.nan
     errors = {"error": 1e3 * distance, "normal_error": off}
     return replace(layer, values={**layer.values, **errors})
 
@@ -510,7 +515,7 @@ def _scene(
         return labels.index(name) if name in labels else None
 
     main = next((i for i in map(index, MAIN) if i is not None), 0)
-    opa = index(AngleModel.OPA)
+    opa = next((i for i in map(index, ORTHOGRAPHIC) if i is not None), None)
     start = (opa, main) if opa is not None and opa != main else (main, None)
     color = "normal"
     if start[1] is not None:
@@ -600,12 +605,14 @@ def _sides(points: Floats) -> Floats:
 
 def _quality_words(given: _Given) -> list[str]:
     """How good the surface is, and how it would be under OPA where that was tried."""
-    opa, main = AngleModel.OPA, given.main
+    main = given.main
     figures = given.comparison.models if given.comparison is not None else {}
     if main not in figures:
         return _uncertainty_words(given)
     name, truth = plots.LABELS[main], figures[main].truth
-    other = figures[opa] if opa in figures and main is not opa else None
+    opa = next((m for m in ORTHOGRAPHIC if m in figures and m is not main), None)
+    other = None if opa is None else figures[opa]
+    older = "" if opa is None else f"the older orthographic model ({plots.LABELS[opa]})"
     if truth is not None:
         near = f"{1e3 * truth.cloud.thresholds_m[0]:g} mm"
         right, covered = truth.cloud.accuracy[0], truth.cloud.completeness[0]
@@ -616,9 +623,8 @@ def _quality_words(given: _Given) -> list[str]:
         if other is not None and other.truth is not None:
             right, covered = other.truth.cloud.accuracy[0], other.truth.cloud.completeness[0]
             words.append(
-                f"Under the older orthographic model (OPA) it is {number(right, 100, 1)} % and "
-                f"{number(covered, 100, 1)} %: it takes what perspective does to the polarization "
-                "angle for shape."
+                f"Under {older} it is {number(right, 100, 1)} % and {number(covered, 100, 1)} %: "
+                "it takes what perspective does to the polarization angle for shape."
             )
         return words
     residual = figures[main].consistency.phase_residual.median_deg
@@ -628,7 +634,7 @@ def _quality_words(given: _Given) -> list[str]:
     ]
     if other is not None:
         before = other.consistency.phase_residual.median_deg
-        words[0] += f", under the older orthographic model (OPA) by {number(before)} deg"
+        words[0] += f", under {older} by {number(before)} deg"
     return [words[0] + "."]
 
 

@@ -125,7 +125,7 @@ class Opened:
     def legend(self) -> tuple[bool, np.ndarray]:
         """Colours (N, 3) of the legend as the browser shows them; whether they are a bar's."""
         bar = self.page.locator(".legend .bar")
-        if bar.count():
+        if bar.count():  # a colour for "no value" stands beside it
             shown = bar.evaluate("e => getComputedStyle(e).backgroundImage")
         else:
             shown = self.page.locator(".legend .class").evaluate_all(
@@ -345,9 +345,8 @@ def test_colours_in_3d_are_those_of_the_legend(browser, demo_run: Path, scheme: 
     opened = Opened(browser, demo_run / "report.html", 1000, scheme)
     page = opened.page
     layers = page.locator("[data-pane=left] select option").all_inner_texts()
-    shown = ["OPA cloud", "PPA cloud", "PPA mesh"]
-    assert set(shown) < set(layers)
-    for layer in shown:
+    wanted = ("OPA cloud", "PPA cloud", "PPA mesh")
+    for layer in [next(one for one in layers if one.endswith(end)) for end in wanted]:
         page.select_option("[data-pane=left] select", label=layer)
         page.wait_for_selector(f"[data-pane=left][data-layer='{layer}']")
         for name in ("intensity", "kind", "sigma", "normal_error"):
@@ -356,7 +355,7 @@ def test_colours_in_3d_are_those_of_the_legend(browser, demo_run: Path, scheme: 
                 continue
             bar, legend = opened.legend()
             assert len(legend) > 1, name  # a bar of one colour says nothing
-            colors = opened.evenly_coloured("left")
+            colors = opened.evenly_coloured("left") - {(153, 153, 153)}  # of points without one
             assert len(colors) > (1 if bar else 0), (layer, name)
             assert off_the_legend(colors, legend, bar) <= 3, (layer, name)
     before = opened.drawing()

@@ -89,6 +89,18 @@ def test_values_that_are_not_finite_look_worst(bad: float) -> None:
     assert part(scene, 0, scene.description["layers"][0]["channels"]["sigma"]).tolist() == [0, 255]
 
 
+def test_points_without_a_value_have_a_colour_of_their_own() -> None:
+    layer = Layer(
+        label="a", points=np.zeros((4, 3)), normals=np.zeros((4, 3)),
+        values={"sigma": np.array([0.0, np.nan, 9.0, 2.0])},
+    )  # fmt: skip
+    channels = {"sigma": Channel(label="s", high=2.0, colors="plasma", may_lack=True)}
+    scene = pack_scene([layer], channels, [], (0, None))
+    found = part(scene, 0, scene.description["layers"][0]["channels"]["sigma"])
+    assert found.tolist() == [0, 255, 254, 254]
+    assert scene.description["channels"]["sigma"]["unknown"].startswith("#")
+
+
 def test_thinning_takes_all_parts_of_the_cloud_alike() -> None:
     layer = random_layer(10_000)
     few = thinned(layer, 1000)

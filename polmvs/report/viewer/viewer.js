@@ -90,10 +90,13 @@ async function unpack(text) {
   return new Response(stream).arrayBuffer();
 }
 
-function paletteTexture(colors) {
+// With a colour of what is unknown the last place is its, and the others are the scale's.
+function paletteTexture(colors, unknown) {
   const bytes = new Uint8Array(256 * 4);
+  const places = unknown ? 255 : 256;
   for (let i = 0; i < 256; i++) {
-    const color = new Color(colors[Math.min(colors.length - 1, Math.floor((i * colors.length) / 256))]);
+    const place = Math.min(colors.length - 1, Math.floor((i * colors.length) / places));
+    const color = new Color(i < places ? colors[place] : unknown);
     const rounded = [color.r, color.g, color.b].map((share) => Math.round(255 * share));
     bytes.set([...rounded, 255], 4 * i);
   }
@@ -286,7 +289,7 @@ class View {
   }
 
   palette(name) {
-    if (!this.textures.has(name)) this.textures.set(name, paletteTexture(this.description.channels[name].colors));
+    if (!this.textures.has(name)) this.textures.set(name, paletteTexture(this.description.channels[name].colors, this.description.channels[name].unknown));
     return this.textures.get(name);
   }
 
@@ -397,6 +400,13 @@ class View {
       const stops = Array.from({ length: num }, (_, i) => colors[Math.round((i * (colors.length - 1)) / (num - 1))]);
       bar.style.background = `linear-gradient(90deg, ${stops.join(",")})`;
       legend.append(low, bar, high);
+      if (channel.unknown) {
+        const none = document.createElement("span");
+        none.textContent = "no value";
+        none.style.setProperty("--swatch", channel.unknown);
+        none.className = "class";
+        legend.append(none);
+      }
     }
     this.root.querySelector(".note").textContent = channel.note || "";
     this.panes.forEach((pane) => pane.paint());
