@@ -346,6 +346,8 @@ def test_a_box_cuts_cloud_maps_and_mesh(go_on: Continue, run: Path, demo_capture
     out = go_on("sparse_cloud_ppa", "densify", "--box", text, *QUICK)
     cloud = read_cloud(out / "ppa.ply")
     assert (cloud.points[:, :2] <= middle[:2]).all()
+    stage = next(s for s in record_of(out)["stages"] if s["name"] == "densify_ppa")
+    assert any("leaves out 7" in warning for warning in stage["warnings"])  # three quarters
     # All of that quarter, to its corner.
     reach = middle[:2] - surface_of(cloud)[:, :2].min(axis=0)
     np.testing.assert_allclose(reach, 0.5 * np.ptp(points[:, :2], axis=0), atol=0.02)

@@ -218,7 +218,14 @@ def densify(
             sparse, fused, phase_maps, fusion, given, folder / "around", workers=workers
         )
         if box is not None:
-            surface = surface.only(box.require_some(surface.points))
+            kept = box.require_some(surface.points)
+            if not kept.all():
+                logger.warning(
+                    "`crop.box` leaves out %.0f %% of the surface; figures of how much of the "
+                    "polarized regions is determined count that as missing.",
+                    100 * (1 - kept.mean()),
+                )
+            surface = surface.only(kept)
             around = around.only(box.contains(around.points))
             _crop_views(new_views, [phase_map.view for phase_map in phase_maps], box)
         replace_folder(new_views, views)
