@@ -347,10 +347,12 @@ def test_a_box_cuts_cloud_maps_and_mesh(go_on: Continue, run: Path, demo_capture
     cloud = read_cloud(out / "ppa.ply")
     assert (cloud.points[:, :2] <= middle[:2]).all()
     stage = next(s for s in record_of(out)["stages"] if s["name"] == "densify_ppa")
-    assert any("leaves out 7" in warning for warning in stage["warnings"])  # three quarters
-    # All of that quarter, to its corner.
-    reach = middle[:2] - surface_of(cloud)[:, :2].min(axis=0)
-    np.testing.assert_allclose(reach, 0.5 * np.ptp(points[:, :2], axis=0), atol=0.02)
+    (share,) = re.findall(r"`crop.box` leaves out (\d+) %", " ".join(stage["warnings"]))
+    assert 60 < int(share) < 90  # three quarters of the board
+    # It reaches far into that quarter; the board lies turned in it.
+    reach = (middle - surface_of(cloud).min(axis=0))[:2] / np.ptp(points, axis=0)[:2]
+    assert (reach > 0.35).all()
+    assert (reach < 0.55).all()
     assert len(surface_of(cloud)) > 1000
     for view, dense in zip(
         read_model(out / "sparse").views,
