@@ -632,6 +632,37 @@ class FusionOptions(OptionGroup, group="fusion"):
 
 
 @dataclass(frozen=True, kw_only=True)
+class CropOptions(OptionGroup, group="crop"):
+    """What of the scene is kept."""
+
+    box: tuple[float, float, float, float, float, float] | None = option(
+        None,
+        "two opposite corners, in the frame and unit of the model: what of cloud, mesh and maps "
+        "lies outside is left out; the report's 3D view gives the text",
+        metavar="X,Y,Z,X,Y,Z",
+    )
+    box_marker: int | None = option(
+        None,
+        "id of a marker of `reference.aruco` in whose frame the box is: origin in its middle, x to "
+        "its right, y to its top, z out of it, metres",
+        least=0,
+        metavar="ID",
+    )
+
+    def check(self) -> None:
+        """A box has three sides, and a marker is that of a box."""
+        if self.box is not None:
+            sides = [
+                abs(first - second)
+                for first, second in zip(self.box[:3], self.box[3:], strict=True)
+            ]
+            self.require(min(sides) > 0, "box", "needs corners that differ in x, y and z", self.box)
+        self.require(
+            self.box_marker is None or self.box is not None, "box_marker", "needs `crop.box`"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class ExportOptions(OptionGroup, group="export"):
     """What is made of a dense cloud."""
 
@@ -704,6 +735,7 @@ class Options:
     normals: NormalOptions = field(default_factory=NormalOptions)
     propagation: PropagationOptions = field(default_factory=PropagationOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
+    crop: CropOptions = field(default_factory=CropOptions)
     export: ExportOptions = field(default_factory=ExportOptions)
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)
 

@@ -15,6 +15,7 @@ from polmvs.config import (
     COMPARED_MODELS,
     AngleModel,
     CaptureOptions,
+    CropOptions,
     EvaluationOptions,
     Experiment,
     ExperimentOptions,
@@ -182,6 +183,9 @@ class DeviationArguments(OptionGroup, group="arguments", in_files=False):
     out: Path | None = option(
         None, "new folder for a coloured cloud, a picture, a histogram and the figures as JSON"
     )
+    report: bool = option(
+        False, "of a run: keep the same in RUN/deviation, and show it in RUN/report.html"
+    )
     unit: LengthUnit | None = option(
         None, "of the reference; by default that in which it is as large as the result"
     )
@@ -239,11 +243,6 @@ class ExportArguments(OptionGroup, group="arguments", in_files=False):
         True, "colours of a mesh, from the views that see a place best, without highlights"
     )
     part: bool = option(False, "of a cloud the polarised surface alone, without its surroundings")
-    box: tuple[float, float, float, float, float, float] | None = option(
-        None,
-        "two opposite corners, in the frame and unit of the model: what lies outside is left out",
-        metavar="X,Y,Z,X,Y,Z",
-    )
 
     def check(self) -> None:
         """A texture has colours, and a size is one of a texture."""
@@ -372,7 +371,7 @@ class PolarizerFrames(OptionGroup, group="polarizers"):
 # Options in the order in which data meets them.
 TO_POSES = (CaptureOptions, SfmOptions, ReferenceOptions)
 TO_NORMALS = (*TO_POSES, RegionOptions, NormalOptions)
-TO_CLOUD = (*TO_NORMALS, PropagationOptions, FusionOptions)
+TO_CLOUD = (*TO_NORMALS, PropagationOptions, FusionOptions, CropOptions)
 SHOWN = (ReportChoice, RecordingOptions)
 SIMULATION = (
     ObjectOptions,
@@ -440,7 +439,10 @@ COMMANDS = (
         name="densify",
         help_text="the dense cloud, after 'normals'",
         run="polmvs.cli.jobs:densify",
-        groups=(JobArguments, ModelChoice, PropagationOptions, FusionOptions, *EXECUTION),
+        groups=(
+            *(JobArguments, ModelChoice, PropagationOptions, FusionOptions, CropOptions),
+            *EXECUTION,
+        ),
         earlier=TO_NORMALS,
     ),
     Command(
@@ -454,7 +456,7 @@ COMMANDS = (
         name="export",
         help_text="mesh, cloud or posed images of a finished run as other programs read them",
         run="polmvs.cli.exports:export",
-        groups=(ExportArguments, TerminalOptions),
+        groups=(ExportArguments, CropOptions, TerminalOptions),
         more="Formats: meshes ply, obj (with its .mtl), stl, glb; clouds cloud-ply, xyz, las, laz; "
         "posed images, each in a folder: nerfstudio (transforms.json, for gsplat as well), neus "
         "(cameras.npz, for IDR as well), metashape, realityscan, bundler. OpenMVS and COLMAP read "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,17 @@ import numpy as np
 from polmvs.cli import OUT_OF_TOLERANCE
 from polmvs.cli.call import Call
 from polmvs.cli.commands import DeviationArguments
+from polmvs.cli.pages import make_report
 from polmvs.cli.terminal import Terminal
 from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError
 from polmvs.evaluation.deviation import Deviation, measure_deviation
 from polmvs.evaluation.registration import CloudReference, MeshReference, Reference
-from polmvs.io.clouds import Cloud, has_triangles, read_any_mesh, read_cloud, read_mesh
+from polmvs.io.clouds import Cloud, Mesh, has_triangles, read_any_mesh, read_cloud, read_mesh
 from polmvs.io.folders import new_folder
+from polmvs.pipeline.checks import digest_of
 from polmvs.pipeline.export import part_of, surface_of
-from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.run_folder import RunFolder, replacing
 from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.report.deviation_files import color_limit, write_deviation
@@ -31,8 +34,13 @@ def deviation(call: Call, terminal: Terminal) -> int:
     given = call.get(DeviationArguments)
     if given.out is not None and given.out.exists():
         raise OptionError(f"{given.out}: exists. Give another folder.")
+    if given.report and not given.result.is_dir():
+        raise OptionError("is of a finished run.", field="arguments.report")
+    cloud_file = given.result
+    if given.result.is_dir():
+        cloud_file = _cloud_of_run(given.result, given.model)
     cloud, is_metric = _result(given.result, given.model)
-    reference, unit = _reference(given.reference, given.model)
+    reference, unit, other_run = _reference(given.reference, given.model)
     with terminal.stage("registration", None):
         found = measure_deviation(
             cloud.points,
@@ -44,12 +52,25 @@ def deviation(call: Call, terminal: Terminal) -> int:
             aligned=given.aligned,
             tolerance_mm=given.tolerance,
             least_share=given.least_share,
+            other_run=other_run,
         )
+    figures = replace(
+        found.figures,
+        result=str(given.result),
+        reference=str(given.reference),
+        result_digest=digest_of(cloud_file),
+    )
+    found = replace(found, figures=figures)
     lines = deviation_lines(found)
     if given.out is not None:
         with new_folder(given.out) as folder:
             write_deviation(folder, found, color_limit(found))
         lines.append(f"{given.out}: deviation.ply, .png, .svg, .json")
+    if given.report:
+        run_folder = RunFolder(given.result)
+        with replacing(run_folder.deviation) as folder:
+            write_deviation(folder, found, color_limit(found))
+        lines.append(make_report(run_folder, terminal))
     terminal.show("\n".join(lines), found.figures)
     return OUT_OF_TOLERANCE if found.figures.passed is False else 0
 
@@ -81,6 +102,8 @@ def deviation_lines(found: Deviation) -> list[str]:
             f"stated deviation of a distance {f.median_sigma:.4f} mm (median); "
             f"{100 * f.significant_share:.1f} % of the points are farther off than three of theirs"
         )
+    if f.repeatability is not None:
+        lines.append(f"repeatability: one run has a standard deviation of {f.repeatability:.4f} mm")
     if f.tolerance is not None and f.share_within is not None:
         lines.append(
             f"{100 * f.share_within:.2f} % within {f.tolerance:g} mm, "
@@ -108,29 +131,40 @@ def _result(path: Path, model: AngleModel | None) -> tuple[Cloud, bool]:
     return cloud, is_metric
 
 
-def _surface_of_run(path: Path, model: AngleModel | None) -> tuple[Cloud, bool]:
+def _cloud_of_run(path: Path, model: AngleModel | None) -> Path:
+    """The file of a run's cloud."""
     run_folder = RunFolder(path)
-    record = load_record(run_folder)
-    model = surface_of(run_folder, dense_models(record), model)
-    return part_of(read_cloud(run_folder.cloud(model))), record.result(PosesResult).is_metric
+    return run_folder.cloud(surface_of(run_folder, dense_models(load_record(run_folder)), model))
 
 
-def _reference(path: Path, model: AngleModel | None) -> tuple[Reference, str | None]:
-    """The reference, and its unit where that is known."""
+def _surface_of_run(path: Path, model: AngleModel | None) -> tuple[Cloud, bool]:
+    record = load_record(RunFolder(path))
+    cloud = part_of(read_cloud(_cloud_of_run(path, model)))
+    return cloud, record.result(PosesResult).is_metric
+
+
+def _reference(
+    path: Path, model: AngleModel | None
+) -> tuple[Reference, str | None, tuple[np.ndarray, np.ndarray] | None]:
+    """The reference, its unit where that is known, and of a run its points and their deviations."""
     if path.is_dir():
         run_folder = RunFolder(path)
         models = dense_models(load_record(run_folder))
         mesh_file = run_folder.mesh(surface_of(run_folder, models, model))
         cloud, is_metric = _surface_of_run(path, model)
         unit = "m" if is_metric else None
+        sigma = cloud.scalars.get("sigma", np.full(len(cloud.points), np.nan))
+        own = (cloud.points, np.nan_to_num(sigma))
         if mesh_file.is_file():
-            mesh = read_mesh(mesh_file)
-            return MeshReference(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64))), unit
-        return _of_cloud(path, cloud), unit
+            return _of_mesh(read_mesh(mesh_file)), unit, own
+        return _of_cloud(path, cloud), unit, own
     if path.suffix.lower() == ".ply" and not has_triangles(path):
-        return _of_cloud(path, read_cloud(path)), None
-    mesh = read_any_mesh(path)
-    return MeshReference(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64))), None
+        return _of_cloud(path, read_cloud(path)), None, None
+    return _of_mesh(read_any_mesh(path)), None, None
+
+
+def _of_mesh(mesh: Mesh) -> MeshReference:
+    return MeshReference(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64)))
 
 
 def _of_cloud(path: Path, cloud: Cloud) -> CloudReference:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from polmvs.cli.call import Call
 from polmvs.cli.commands import ExportArguments
 from polmvs.cli.terminal import Terminal
+from polmvs.config import CropOptions
 from polmvs.pipeline.export import export_format, export_run
 from polmvs.pipeline.run_folder import RunFolder
 
@@ -22,7 +23,7 @@ def export(call: Call, terminal: Terminal) -> int:
         texture_px=given.texture_px,
         colors=given.colors,
         part=given.part,
-        box=given.box,
+        crop=call.get(CropOptions),
         overwrite=given.overwrite,
     )
     what = [
@@ -37,5 +38,6 @@ def export(call: Call, terminal: Terminal) -> int:
     if written.texture_px:
         what.append(f"a texture of {written.texture_px} px")
     names = ", ".join(map(str, written.files))
+    what.append("in metres" if written.is_metric else "in the model's own unit, of no known scale")
     terminal.show(f"{names}: {', '.join(what)}", {"format": form, **vars(written)})
     return 0

@@ -81,7 +81,8 @@ def measure_consistency(
         errors.append(
             phase_residuals_deg(angle_model, cloud.points[chosen], cloud.normals[chosen], phase_map)
         )
-    confirmed = np.minimum(cloud.scalars.get("num_views", np.zeros(num)), np.maximum(seeing, 1))
+    # Views that the buffer of cells takes for hidden may have confirmed a point all the same.
+    confirmed = np.minimum(cloud.scalars.get("num_views", np.zeros(num)), seeing)
     return Consistency(
         num_points=num,
         phase_residual=AngleStats.from_degrees(np.concatenate(errors)),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from polmvs.errors import OptionError
 from polmvs.evaluation.registration import IDENTITY, Reference, Registration, register
@@ -40,6 +41,10 @@ class DeviationFigures:
     scale : of the result that was estimated; 1 where it was given.
     unit : of the reference, and whether it was ``unit_inferred``.
     ambiguous : another place fits about as well: the part looks alike when it is turned.
+    reference_from_result : rows of the 4 x 4 matrix that laid the result, in the reference's unit.
+    repeatability : where the reference is another run of the part: standard deviation of one run,
+        as that of two runs' differences over the square root of two.
+    result, reference : what was compared; ``result_digest`` tells the result's content.
     """
 
     num_points: int
@@ -58,6 +63,11 @@ class DeviationFigures:
     unit: str
     unit_inferred: bool
     ambiguous: bool
+    reference_from_result: tuple[tuple[float, ...], ...]
+    repeatability: float | None = None
+    result: str = ""
+    reference: str = ""
+    result_digest: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +125,7 @@ def measure_deviation(
     aligned: bool = False,
     tolerance_mm: float | None = None,
     least_share: float = 1.0,
+    other_run: tuple[Array, Array] | None = None,
 ) -> Deviation:
     """Distances of a result from a reference.
 
@@ -126,6 +137,8 @@ def measure_deviation(
     aligned : the result lies in the frame of the reference.
     tolerance_mm : distance that is allowed either way, and the ``least_share`` of the points that
         must keep to it.
+    other_run : where the reference is another run of the part, its points (M, 3) and their
+        standard deviations (M,), in the reference's unit: these count as well.
 
     Raises
     ------
@@ -160,7 +173,16 @@ def measure_deviation(
     to_mm = 1e3 * metres
     own = np.full(len(points), np.nan) if sigma is None else sigma * to_unit.scale * place.scale
     fitted = 0.0 if found is None else found.distance_sigmas(moved, facing)
-    total = to_mm * np.sqrt(np.square(own) + np.square(fitted))
+    others: Array | float = 0.0
+    if other_run is not None:
+        _, nearest = cKDTree(other_run[0]).query(closest)
+        others = other_run[1][nearest]
+    total = to_mm * np.sqrt(np.square(own) + np.square(fitted) + np.square(others))
+    laid = SimilarityTransform(
+        scale=place.scale * to_unit.scale,
+        rotation=place.rotation,
+        translation=place.translation,
+    )
     return Deviation(
         index=np.flatnonzero(near),
         points=moved[near],
@@ -177,12 +199,10 @@ def measure_deviation(
             unit=unit,
             inferred=inferred,
             found=found,
+            laid=laid,
+            repeats=other_run is not None,
         ),
-        reference_from_result=SimilarityTransform(
-            scale=place.scale * to_unit.scale,
-            rotation=place.rotation,
-            translation=place.translation,
-        ),
+        reference_from_result=laid,
     )
 
 
@@ -197,7 +217,10 @@ def _figures(
     unit: str,
     inferred: bool,
     found: Registration | None,
+    laid: SimilarityTransform,
+    repeats: bool,
 ) -> DeviationFigures:
+    matrix = np.column_stack([laid.scale * laid.rotation, laid.translation])
     known = np.isfinite(sigma)
     within = None if tolerance is None else float(np.mean(np.abs(distance) <= tolerance))
     return DeviationFigures(
@@ -219,4 +242,6 @@ def _figures(
         unit=unit,
         unit_inferred=inferred,
         ambiguous=found is not None and found.runner_up < AMBIGUOUS,
+        reference_from_result=(*map(tuple, matrix.tolist()), (0.0, 0.0, 0.0, 1.0)),
+        repeatability=float(distance.std() / np.sqrt(2)) if repeats else None,
     )

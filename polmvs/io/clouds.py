@@ -71,6 +71,19 @@ class Mesh:
     triangles: NDArray[np.int32]
     colors: NDArray[np.uint8] | None = None
 
+    def only(self, kept: NDArray[np.bool_]) -> Mesh:
+        """The triangles of which all three vertices are ``kept`` (V,), and their vertices."""
+        triangles = self.triangles[kept[self.triangles].all(axis=1)]
+        used = np.unique(triangles)
+        index = np.zeros(len(self.vertices), np.int32)
+        index[used] = np.arange(len(used))
+        return Mesh(
+            vertices=self.vertices[used],
+            normals=self.normals[used],
+            triangles=index[triangles],
+            colors=None if self.colors is None else self.colors[used],
+        )
+
 
 def preload() -> threading.Thread:
     """Begin to import Open3D beside other work, such as that of COLMAP's mapper on one core.

@@ -157,6 +157,8 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
     if options.evaluation.gt is not None:
         require_truth_of_capture(open_ground_truth(options.evaluation.gt), capture, load)
     _check_references(capture, options.reference)
+    if options.crop.box_marker is not None and options.reference.aruco is None:
+        raise OptionError("needs `reference.aruco`, the markers.", field="crop.box_marker")
     if options.export.in_place and options.fusion.workspace is None:
         raise OptionError("needs a `fusion.workspace` to fill.", field="export.in_place")
     _check_camera_options(options.sfm)

@@ -13,17 +13,20 @@ from polmvs.camera import pixel_centers
 from polmvs.colmap.camera_exports import CAMERA_FORMATS, CameraExport
 from polmvs.colmap.dense_workspace import open_dense_workspace
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Channel, ExportFormat, options_from_plain
+from polmvs.config import AngleModel, Channel, CropOptions, ExportFormat, options_from_plain
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.io.cloud_files import write_cloud_file
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
 from polmvs.io.folders import new_folder
 from polmvs.io.images import read_gray
 from polmvs.io.mesh_files import MESH_FORMATS, Texture, mesh_format_of, write_mesh_file
+from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.images import image_names
+from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.polarization.capture import DISPLAY_GAMMA, Capture, open_capture
+from polmvs.poses.crop_box import CropBox, crop_box
 from polmvs.scene import PointKind, SparseModel, View
 from polmvs.surface.coloring import paint_texture, surface_colors, texture_size
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
@@ -31,7 +34,6 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 CLOUDS = {
     ExportFormat.CLOUD_PLY: "ply",
@@ -51,6 +53,7 @@ class Exported:
     files : or the folder.
     num_points, num_triangles, num_views : of what was exported; 0 of what was not.
     texture_px : sides of the texture; 0 without one.
+    is_metric : whether its unit is the metre; else it is the model's own.
     """
 
     files: tuple[Path, ...]
@@ -58,6 +61,7 @@ class Exported:
     num_triangles: int = 0
     num_views: int = 0
     texture_px: int = 0
+    is_metric: bool = False
 
 
 def export_format(target: Path, given: ExportFormat | None) -> ExportFormat:
@@ -94,7 +98,7 @@ def export_run(
     texture_px: int | None = None,
     colors: bool = True,
     part: bool = False,
-    box: tuple[float, float, float, float, float, float] | None = None,
+    crop: CropOptions | None = None,
     overwrite: bool = False,
 ) -> Exported:
     """Write a mesh, a cloud or posed images of a finished run.
@@ -107,7 +111,7 @@ def export_run(
     texture_px : sides of the texture; by default a texel has the size of a pixel on the part.
     colors : of a mesh: without, it has none.
     part : of a cloud: the polarised surface alone, without its surroundings.
-    box : two opposite corners, world; of a mesh or cloud what lies within.
+    crop : of a mesh or cloud: what lies within its box.
     overwrite : replace what is there.
 
     Raises
@@ -116,9 +120,11 @@ def export_run(
         The run lacks what is asked for, the target exists, or a library is missing.
     """
     record = load_record(run_folder)
+    is_metric = record.result(PosesResult).is_metric
     model = surface_of(run_folder, dense_models(record), model)
-    if box is not None and form not in (*MESHES, *CLOUDS):
-        raise OptionError("is of a mesh or a cloud.", field="arguments.box")
+    crop = crop or CropOptions()
+    if crop.box is not None and form not in (*MESHES, *CLOUDS):
+        raise OptionError("is of a mesh or a cloud.", field="crop.box")
     if texture and form not in MESHES:
         raise OptionError("is of a mesh.", field="arguments.texture")
     if texture and not MESH_FORMATS[f".{form}"].texture:
@@ -130,18 +136,19 @@ def export_run(
     if form in CLOUDS:
         cloud = read_cloud(run_folder.cloud(model))
         cloud = part_of(cloud) if part else cloud
-        if box is not None:
-            cloud = cloud.only(within_box(cloud.points, box))
+        if (box := _box_of_run(run_folder, record, crop)) is not None:
+            cloud = cloud.only(box.require_some(cloud.points))
         write_cloud_file(target, cloud, CLOUDS[form])
-        return Exported(files=(target,), num_points=len(cloud.points))
+        return Exported(files=(target,), num_points=len(cloud.points), is_metric=is_metric)
     if form not in MESHES:
-        return _export_cameras(run_folder, model, target, form, overwrite=overwrite)
+        posed = _export_cameras(run_folder, model, target, form, overwrite=overwrite)
+        return replace(posed, is_metric=is_metric)
     mesh_format_of(target)
     mesh = read_mesh(_existing(run_folder.mesh(model), "mesh"))
-    if box is not None:
-        mesh = cropped_mesh(mesh, within_box(mesh.vertices, box))
+    if (box := _box_of_run(run_folder, record, crop)) is not None:
+        mesh = mesh.only(box.require_some(mesh.vertices))
         if not len(mesh.triangles):
-            raise OptionError("holds nothing of the mesh.", field="arguments.box")
+            raise OptionError("holds no whole triangle of the mesh.", field="crop.box")
     painted: Texture | None = None
     if MESH_FORMATS[f".{form}"].colors and colors:
         painter = _Painter(run_folder, mesh)
@@ -157,27 +164,7 @@ def export_run(
         num_points=len(mesh.vertices),
         num_triangles=len(mesh.triangles),
         texture_px=0 if painted is None else painted.image.shape[0],
-    )
-
-
-def within_box(points: Array, box: tuple[float, float, float, float, float, float]) -> Mask:
-    """Which points (N, 3) lie between two opposite corners, whichever is which."""
-    corners = np.reshape(box, (2, 3))
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    return np.asarray(((points >= low) & (points <= high)).all(axis=1), np.bool_)
-
-
-def cropped_mesh(mesh: Mesh, kept: Mask) -> Mesh:
-    """The triangles of which all three vertices are kept, and their vertices."""
-    triangles = mesh.triangles[kept[mesh.triangles].all(axis=1)]
-    used = np.unique(triangles)
-    index = np.zeros(len(mesh.vertices), np.int32)
-    index[used] = np.arange(len(used))
-    return Mesh(
-        vertices=mesh.vertices[used],
-        normals=mesh.normals[used],
-        triangles=index[triangles],
-        colors=None if mesh.colors is None else mesh.colors[used],
+        is_metric=is_metric,
     )
 
 
@@ -200,6 +187,19 @@ def surface_of(
             f"is {model}; {run_folder.root} has {', '.join(there)}.", field="arguments.model"
         )
     return model
+
+
+def _box_of_run(run_folder: RunFolder, record: Record, crop: CropOptions) -> CropBox | None:
+    """The box that is asked for, in the world of a finished run."""
+    if crop.box is None:
+        return None
+    options = options_from_plain(record.options, str(run_folder.run_file))
+    return crop_box(
+        crop,
+        options.reference.aruco,
+        read_model(run_folder.sparse).views,
+        lambda name: read_gray(run_folder.images / name),
+    )
 
 
 def _existing(path: Path, what: str) -> Path:
@@ -307,15 +307,25 @@ class _Painter:
         if self.capture is None or view.name not in self.raw:
             gray = read_gray(self.images / view.name)
             return np.asarray((gray / 255) ** DISPLAY_GAMMA, np.float32)
-        capture = self.capture
-        channels: tuple[Channel, ...] = (capture.options.channel,)
-        if capture.has_colors and capture.options.channel is Channel.COMBINED:
-            channels = (Channel.RED, Channel.GREEN, Channel.BLUE)
-        planes = []
-        for channel in channels:
-            one = replace(capture, options=replace(capture.options, channel=channel))
-            stokes = one.load(self.raw[view.name])
-            plane = np.maximum(stokes.s0 - np.hypot(stokes.s1, stokes.s2), 0)
-            dark = stokes.s0 < 2 * capture.options.darkness
-            planes.append(np.where(stokes.valid | dark, plane, np.nan))
-        return np.asarray(np.stack(planes, axis=-1) if len(planes) > 1 else planes[0], np.float32)
+        return unpolarized_image(self.capture, self.raw[view.name])
+
+
+def unpolarized_image(capture: Capture, name: str) -> NDArray[np.float32]:
+    """Linear intensities of a raw image without what is polarized; NaN where they are clipped.
+
+    Returns
+    -------
+    (H, W), or (H, W, 3) red, green, blue of a colour camera, unless the capture's options choose
+    one of its colours.
+    """
+    channels: tuple[Channel, ...] = (capture.options.channel,)
+    if capture.has_colors and capture.options.channel is Channel.COMBINED:
+        channels = (Channel.RED, Channel.GREEN, Channel.BLUE)
+    planes = []
+    for channel in channels:
+        one = replace(capture, options=replace(capture.options, channel=channel))
+        stokes = one.load(name)
+        plane = np.maximum(stokes.s0 - np.hypot(stokes.s1, stokes.s2), 0)
+        dark = stokes.s0 < 2 * capture.options.darkness
+        planes.append(np.where(stokes.valid | dark, plane, np.nan))
+    return np.asarray(np.stack(planes, axis=-1) if len(planes) > 1 else planes[0], np.float32)

@@ -85,6 +85,11 @@ class RunFolder:
         return self.root / "report.html"
 
     @property
+    def deviation(self) -> Path:
+        """How far the part is from its reference, as ``polmvs deviation`` found it."""
+        return self.root / "deviation"
+
+    @property
     def run_file(self) -> Path:
         """Record of the run."""
         return self.root / RUN_FILE
@@ -137,6 +142,7 @@ FOLDER_FILES = {
         HERE.pose_covariances.name,
         *(HERE.track_normals(model).name for model in AngleModel),
     },
+    HERE.deviation.name: {f"deviation.{suffix}" for suffix in ("ply", "png", "svg", "json")},
     **{HERE.views(model).name: _SURFACES for model in AngleModel},
 }
 # Names of all that a run may write in its folder itself.
@@ -144,7 +150,7 @@ ROOT_NAMES = frozenset(
     path.parts[0]
     for path in (
         *(HERE.images, HERE.sfm, HERE.sparse, HERE.seeds, HERE.metrics, HERE.summary),
-        *(HERE.report, HERE.run_file, HERE.log),
+        *(HERE.report, HERE.deviation, HERE.run_file, HERE.log),
         *(
             path
             for model in AngleModel

@@ -220,6 +220,8 @@ def _densify_call(model: AngleModel, run: StageInput) -> Callable[..., densify.D
         views=folder.views(model),
         propagation=run.options.propagation,
         fusion=run.options.fusion,
+        crop=run.options.crop,
+        aruco=run.options.reference.aruco,
         tilt_aware=run.options.normals.tilt_aware_weights,
         light=run.options.region.light,
         masks_given=run.options.region.mask is not None,
@@ -427,7 +429,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
                 *(HERE.maps(model), track_normals, HERE.seeds),
             ),
             writes=(cloud, views),
-            decides=(TILT_AWARE, "region.mask", "region.light", "propagation", "fusion"),
+            decides=(TILT_AWARE, "region.mask", "region.light", "propagation", "fusion", "crop"),
             work=partial(_densify, model),
             call=partial(_densify_apart, model),
             result=densify.DensifyResult,
@@ -524,4 +526,5 @@ def result_types() -> dict[str, type]:
 def written_names() -> tuple[str, ...]:
     """Names of all files and folders that a run may write in its folder, the record last."""
     names = [path.parts[0] for spec in stage_table() for path in spec.writes]
-    return (*dict.fromkeys(names), HERE.report.name, LOG_FILE, RUN_FILE)
+    beside = (HERE.report.name, HERE.deviation.name, LOG_FILE, RUN_FILE)
+    return (*dict.fromkeys(names), *beside)

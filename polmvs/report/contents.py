@@ -24,14 +24,35 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.stokes import Stokes
 from polmvs.report import pictures
 from polmvs.report.page import Picture, ViewPage
+from polmvs.report.reprojection import mesh_normals_in_cam
 from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView
+from polmvs.surface.mesh_geometry import RayScene
 
 Floats = NDArray[np.floating]
 
 MAX_ERROR_DEG = 20.0  # top of the colour scales: OPA's phase errors on oblique surfaces
 MAX_ERROR_M = max(THRESHOLDS_M)  # of distances from the truth
 MAX_SAMPLES_A_VIEW = 4000  # of errors for the plots: quartiles of 16 views then err by under 1 %
+
+
+@dataclass(frozen=True)
+class LengthUnit:
+    """In which lengths of the model are shown.
+
+    Attributes
+    ----------
+    name : of the unit.
+    factor : units for each of the model's.
+    """
+
+    name: str
+    factor: float = 1.0
+
+    def text(self, length: float) -> str:
+        """A length of the model, to three digits or whole, with its unit."""
+        value = self.factor * length
+        return f"{value:.0f} {self.name}" if abs(value) >= 1000 else f"{value:.3g} {self.name}"
 
 
 @dataclass(kw_only=True)
@@ -75,6 +96,8 @@ def view_page(
     samples: Mapping[AngleModel, ErrorSamples],
     *,
     white: float,
+    length: LengthUnit,
+    mesh: RayScene | None = None,
 ) -> ViewPage:
     """Pictures of one view; its errors are added to the samples.
 
@@ -84,23 +107,35 @@ def view_page(
     truth : the truth and ``truth_from_world``.
     samples : for each model that ``given`` has; added to.
     white : intensity that is shown white.
+    length : in which depths are shown.
+    mesh : of the part, to be shown as the view sees it; None without one.
     """
     first = next(iter(given.maps.values()))
     shown = [*_measured(given, first, white)]
+    if mesh is not None:
+        over = mesh_normals_in_cam(mesh, given.view)
+        shown.append(
+            _picture(
+                "reprojected mesh",
+                "the mesh as this camera sees it, blue, over the intensity; its outline should be "
+                "the part's",
+                pictures.mesh_picture(first.intensity, white, over),
+            )
+        )
     of_model: dict[AngleModel, list[Picture]] = {}
     for model, dense in given.dense.items():
         if dense is not None:
             errors = None
             if truth is not None and truth[0].find(given.view.name) is not None:
                 errors = lattice_errors(given.view, dense, *truth)
-            of_model[model] = _of_model(model, given, dense, errors, samples[model])
+            of_model[model] = _of_model(model, given, dense, errors, samples[model], length)
     for several in zip(*of_model.values(), strict=False):
         shown += several
     return ViewPage(name=given.view.name, pictures=tuple(shown), wipe=_wipe(of_model))
 
 
 def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[Picture]:
-    """What the camera saw, and where a polarised surface was found."""
+    """What the camera saw, and where a polarized surface was found."""
     inside = phase_map.region.inside
     intensity = phase_map.intensity
     aolp: Floats
@@ -115,21 +150,25 @@ def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[Pictu
         aolp = 0.5 * np.arctan2(sign * samples[..., 1], sign * samples[..., 0])
         dolp = np.where(samples[..., 2] > 0, np.hypot(samples[..., 0], samples[..., 1]), np.nan)
     return [
-        _picture("intensity", "what COLMAP was given", pictures.gray_picture(intensity, white)),
+        _picture(
+            "intensity",
+            "brightness without regard to polarization, which COLMAP was given",
+            pictures.gray_picture(intensity, white),
+        ),
         _picture(
             "AoLP",
-            "angle of linear polarisation in cyclic colours, faint where the DoLP is low",
+            "angle of linear polarization in cyclic colours, faint where the DoLP is low",
             pictures.angle_picture(aolp, strength=dolp / SHOWN_DOLP),
         ),
         _picture(
             "DoLP",
-            "degree of linear polarisation",
+            "degree of linear polarization: the share of the light that has one direction",
             pictures.scalar_picture(dolp, 0, 1),
-            scale=("0", "1", pictures.SEQUENTIAL),
+            scale=("0", "100 %", pictures.SEQUENTIAL),
         ),
         _picture(
             "silhouette",
-            "the intensity, dim outside the polarised region, whose outline is drawn",
+            "the intensity, dim outside the polarized region, whose outline is drawn",
             pictures.outline_picture(intensity, white, inside),
         ),
     ]
@@ -141,6 +180,7 @@ def _of_model(
     dense: DenseView,
     errors: LatticeErrors | None,
     samples: ErrorSamples,
+    length: LengthUnit,
 ) -> list[Picture]:
     """Normals, depth, residual phase, and the errors where there is a truth."""
     view, name = given.view, model.label
@@ -156,12 +196,16 @@ def _of_model(
     _add(samples.residual_deg, samples.viewing_deg, residual, viewing)
     low, high = np.nanpercentile(depth, (1, 99)) if known.any() else (0.0, 1.0)
     result = [
-        _picture(f"{name}: normals", "normals, camera frame", pictures.normal_picture(in_cam)),
+        _picture(
+            f"{name}: normals",
+            "directions of the surface found, as the camera sees them",
+            pictures.normal_picture(in_cam),
+        ),
         _picture(
             f"{name}: depth",
-            "depth z",
+            "distance from the camera along its axis",
             pictures.scalar_picture(depth, low, high),
-            scale=(f"{low:.3g}", f"{high:.3g}", pictures.SEQUENTIAL),
+            scale=(length.text(low), length.text(high), pictures.SEQUENTIAL),
         ),
         _picture(
             f"{name}: residual phase",

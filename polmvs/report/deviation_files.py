@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.evaluation.deviation import Deviation
-from polmvs.io.clouds import Cloud, write_cloud
+from polmvs.errors import DataError
+from polmvs.evaluation.deviation import Deviation, DeviationFigures
+from polmvs.io.clouds import Cloud, read_cloud, write_cloud
 from polmvs.io.images import write_bytes, write_png
-from polmvs.io.typed_json import write_json
+from polmvs.io.plain_files import read_text
+from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.report.pictures import palette
 from polmvs.report.plots import deviation_histogram
 from polmvs.report.rendering import Viewpoint, contact_sheet
@@ -42,6 +44,23 @@ def write_deviation(folder: Path, found: Deviation, limit_mm: float) -> tuple[Pa
     write_bytes(names[2], svg.encode())
     write_json(names[3], found.figures)
     return tuple(names)
+
+
+def read_deviation(folder: Path) -> tuple[DeviationFigures, Cloud, str]:
+    """The figures, the coloured cloud, laid on the reference, and the histogram, as SVG text.
+
+    Raises
+    ------
+    DataError
+        A file is missing or damaged.
+    """
+    path = folder / "deviation.json"
+    try:
+        figures = from_json(DeviationFigures, parse_json(read_text(path)))
+        svg = read_text(folder / "deviation.svg")
+    except (OSError, ValueError) as error:
+        raise DataError(path, f"is no result of 'polmvs deviation' ({error}).") from error
+    return figures, read_cloud(folder / "deviation.ply"), svg
 
 
 def color_limit(found: Deviation) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.geometry import RigidTransform
 from polmvs.report.pictures import hex_palette
 from polmvs.scene import PointKind, View
 
@@ -28,6 +29,7 @@ FRUSTUM_SHARE = 0.08  # depth of a drawn camera, of the distance from the target
 EYE_DISTANCE = 3.2  # from the target, in radii of the part: all of it in a field of view of 40 deg
 EYE_ELEVATION_DEG = 35.0
 SPACING_SAMPLES = 2000  # points whose nearest neighbour is looked up; their median errs by 1 %
+UNKNOWN = "#999999"  # of points without a value
 KIND_COLORS = ("#0072b2", "#999999", "#e69f00", "#009e73", "#cc79a7")  # by PointKind
 
 
@@ -42,6 +44,8 @@ class Channel:
     low, high : the range that colours span; all layers share it.
     colors : name of the colour map; None for grey.
     classes : names of the values 0, 1, ... where they are kinds and not amounts.
+    note : what it says, in a sentence.
+    may_lack : some points have no value, NaN, and are grey; else what is NaN counts as the worst.
     """
 
     label: str
@@ -50,13 +54,34 @@ class Channel:
     high: float = 1.0
     colors: str | None = None
     classes: tuple[str, ...] = ()
+    note: str = ""
+    may_lack: bool = False
 
+
+@dataclass(frozen=True)
+class BoxFrame:
+    """A frame that a box may be given in.
+
+    Attributes
+    ----------
+    label : its name on the page.
+    option : flag that says so on the command line; "" for the model's.
+    frame_from_world : where it lies.
+    """
+
+    label: str
+    option: str
+    frame_from_world: RigidTransform
+
+
+WORLD = BoxFrame("the model", "", RigidTransform(np.eye(3), np.zeros(3)))
 
 KIND = Channel(
     label="kind of point",
     low=0,
     high=len(PointKind),
-    classes=("polarised surface", "sparse point", "stereo", "given workspace", "presumed"),
+    classes=("polarized surface", "sparse point", "stereo", "given workspace", "inferred"),
+    note="Where a point comes from; inferred is surface that no phase shows, as a rim suggests it.",
 )
 
 
@@ -114,6 +139,10 @@ def pack_scene(
     channels: Mapping[str, Channel],
     views: Sequence[View],
     start: tuple[int, int | None],
+    *,
+    color: str = "normal",
+    unit: tuple[str, float] = ("model units", 1.0),
+    frames: Sequence[BoxFrame] = (),
 ) -> Scene3D:
     """Pack layers that share one world.
 
@@ -123,6 +152,9 @@ def pack_scene(
     channels : by the names that the layers' values use.
     views : whose frusta can be shown.
     start : layers shown first in the left and the right pane; None: one pane.
+    color : channel, or ``normal``, that is shown first.
+    unit : name of the unit of lengths, and units for each of the world's.
+    frames : that a box may be given in, beside the world.
     """
     everything = np.concatenate([layer.points for layer in layers if len(layer.points)])
     origin, top = everything.min(axis=0), everything.max(axis=0)
@@ -154,7 +186,8 @@ def pack_scene(
         "channels": {
             "normal": {
                 "label": "normal",
-                "note": "red and green: sideways, blue: up; grey: no normal",
+                "note": "Direction of the surface. Red and green: sideways, blue: up; grey: no "
+                "normal.",
             },
             **{name: _channel_json(channel) for name, channel in channels.items()},
         },
@@ -163,8 +196,11 @@ def pack_scene(
         "basis": np.concatenate([side, np.cross(up, side), up]).tolist(),
         "eye": eye.tolist(),
         "radius": radius,
-        "frusta": _frusta(views, target),
+        "cameras": _cameras(views, target),
         "start": list(start),
+        "color": color,
+        "unit": {"name": unit[0], "factor": unit[1]},
+        "frames": [_frame_json(frame) for frame in (WORLD, *frames)],
     }
     return Scene3D(description=description, blocks=blocks)
 
@@ -196,7 +232,10 @@ def _bytes_of(
 
 
 def _quantised(values: NDArray[Any], channel: Channel) -> NDArray[np.uint8]:
-    """One byte a value; what is not finite counts as the highest, which is the worst."""
+    """One byte a value; what is not finite counts as the highest, which is the worst.
+
+    Of a channel that some points lack, 255 stands for no value.
+    """
     if channel.classes:
         share = (np.asarray(values, np.float64) + 0.5) / len(channel.classes)
     else:
@@ -204,20 +243,30 @@ def _quantised(values: NDArray[Any], channel: Channel) -> NDArray[np.uint8]:
             channel.high - channel.low, 1e-300
         )
     clean = np.clip(np.nan_to_num(share, nan=1.0, posinf=1.0, neginf=0.0), 0, 1)
+    if channel.may_lack:
+        return np.where(np.isnan(share), 255, np.round(254 * clean)).astype(np.uint8)
     return np.asarray(np.round(255 * clean), np.uint8)
 
 
 def _channel_json(channel: Channel) -> dict[str, Any]:
     if channel.classes:
         colors = [KIND_COLORS[i % len(KIND_COLORS)] for i in range(len(channel.classes))]
-        return {"label": channel.label, "classes": list(channel.classes), "colors": colors}
+        return {
+            "label": channel.label,
+            "classes": list(channel.classes),
+            "colors": colors,
+            "note": channel.note,
+        }
     result: dict[str, Any] = {
         "label": channel.label,
         "unit": channel.unit,
         "range": [channel.low, channel.high],
+        "note": channel.note,
     }
     if channel.colors is not None:
         result["colors"] = hex_palette(channel.colors)
+    if channel.may_lack:
+        result["unknown"] = UNKNOWN
     return result
 
 
@@ -256,18 +305,42 @@ def _any_across(up: Array) -> Array:
     return np.asarray(side / np.linalg.norm(side))
 
 
-def _frusta(views: Sequence[View], target: Array) -> list[float]:
-    """Line segments of all cameras, flat: their four edges and the image's border."""
-    segments: list[Array] = []
-    for view in views:
+def _frame_json(frame: BoxFrame) -> dict[str, Any]:
+    matrix = np.eye(4)
+    matrix[:3, :3] = frame.frame_from_world.rotation
+    matrix[:3, 3] = frame.frame_from_world.translation
+    return {"label": frame.label, "option": frame.option, "matrix": matrix.ravel().tolist()}
+
+
+def _cameras(views: Sequence[View], target: Array) -> list[dict[str, Any]]:
+    """Of each camera where it is drawn and what it sees; ``index`` is that of its view.
+
+    ``corners`` are the ends of its frustum, from the image's upper left corner clockwise;
+    ``half_field`` tangents from its axis to the image's side and top.
+    """
+    cameras = []
+    for index, view in enumerate(views):
         camera, center = view.camera, view.center_in_world
-        size = (camera.width, camera.height)
+        size = np.array([camera.width, camera.height], np.float64)
         corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float64) * size
-        rays = camera.rays(corners) @ view.cam_from_world.rotation
-        if not np.isfinite(rays).all():  # a lens that does not reach its image's corners
+        in_cam = camera.rays(corners)
+        if not np.isfinite(in_cam).all():  # a lens that does not reach its image's corners
             continue
         depth = FRUSTUM_SHARE * float(np.linalg.norm(center - target))
-        ends = center + depth * rays
-        for i in range(4):
-            segments += [center, ends[i], ends[i], ends[(i + 1) % 4]]
-    return [round(float(value), 6) for value in np.asarray(segments).ravel()]
+        ends = center + depth * in_cam @ view.cam_from_world.rotation
+        slopes = np.abs(in_cam[:, :2] / np.maximum(in_cam[:, 2:], 1e-3))
+        cameras.append(
+            {
+                "name": view.name,
+                "index": index,
+                "center": _rounded(center),
+                "corners": [_rounded(end) for end in ends],
+                "forward": _rounded(view.cam_from_world.rotation[2]),
+                "half_field": _rounded(slopes.max(axis=0)),
+            }
+        )
+    return cameras
+
+
+def _rounded(values: Array) -> list[float]:
+    return [round(float(value), 6) for value in values]

@@ -29,3 +29,32 @@ document.querySelectorAll(".wipe input").forEach((slider) =>
 addEventListener("beforeprint", () =>
   document.querySelectorAll("details").forEach((one) => (one.open = true)),
 );
+
+// What a term means: under the pointer or the keyboard's focus, until Escape.
+const meaning = document.getElementById("meaning");
+let explained = null;
+
+function explain(term) {
+  explained = term;
+  meaning.hidden = !term;
+  if (!term) return;
+  meaning.textContent = term.getAttribute("aria-description");
+  const at = term.getBoundingClientRect();
+  const [width, height] = [meaning.offsetWidth, meaning.offsetHeight];
+  const below = at.bottom + 6 + height < innerHeight;
+  meaning.style.left = `${Math.max(6, Math.min(at.left, innerWidth - width - 6))}px`;
+  meaning.style.top = `${below ? at.bottom + 6 : Math.max(6, at.top - height - 6)}px`;
+}
+
+for (const name of ["mouseover", "focusin"]) {
+  document.addEventListener(name, (event) => {
+    const term = event.target.closest(".term");
+    if (term) explain(term);
+    else if (name === "mouseover" && explained && !event.target.closest("#meaning")) {
+      explain(document.activeElement.closest(".term")); // a resting pointer hides no focused one's
+    }
+  });
+}
+document.addEventListener("focusout", () => explain(null));
+document.addEventListener("keydown", (event) => event.key === "Escape" && explain(null));
+addEventListener("scroll", () => explained && explain(explained), { passive: true, capture: true });

@@ -11,6 +11,7 @@ from typing import Any
 from polmvs._version import __version__
 from polmvs.errors import printable
 from polmvs.report import pictures
+from polmvs.report.glossary import meaning
 from polmvs.report.layers import Scene3D
 
 
@@ -73,6 +74,26 @@ class Table:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DeviationSection:
+    """The part against its reference.
+
+    Attributes
+    ----------
+    sentence : what came out.
+    passed : whether it keeps to the tolerance; None without one.
+    table : figures.
+    picture : coded picture of the coloured cloud.
+    histogram : SVG text.
+    """
+
+    sentence: str
+    passed: bool | None
+    table: Table
+    picture: str
+    histogram: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class Page:
     """All that the page shows.
 
@@ -84,6 +105,7 @@ class Page:
     warnings : of the run, each with its remedy.
     tables : of the models' figures, if there are any: those to begin with, and all.
     trust : figures of the result about itself, with what is normal.
+    deviation : the part against its reference; None where it was not compared.
     views, plots : in order.
     scene : of the 3D view; None where no cloud has a point.
     thinned : points above which the clouds on the page are thinned; 0 if none is.
@@ -97,6 +119,7 @@ class Page:
     warnings: Sequence[str]
     tables: Sequence[Table]
     trust: Table | None
+    deviation: DeviationSection | None
     views: Sequence[ViewPage]
     plots: Sequence[Plot]
     scene: Scene3D | None
@@ -119,6 +142,7 @@ def page_text(page: Page) -> str:
     return template.render(
         vars(page)
         | {
+            "meaning": meaning,
             "version": __version__,
             "css": _asset("page.css"),
             "js": _asset("page.js"),

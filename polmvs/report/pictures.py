@@ -18,7 +18,7 @@ Rgb = NDArray[np.uint8]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-CYCLIC, SEQUENTIAL, ERROR = "twilight", "viridis", "inferno"
+CYCLIC, SEQUENTIAL, ERROR = "twilight", "viridis", "plasma"
 NOTHING = 236  # grey of pixels without a value; reads on light and dark pages
 QUALITY = 82  # of 100, of what compresses; 100 px of a thumbnail hardly show a difference above
 
@@ -95,6 +95,23 @@ def outline_picture(intensity: Floats, white: float, inside: Mask) -> Rgb:
     edge = cv2.dilate(flags, np.ones((3, 3), np.uint8)) > flags
     picture[edge] = (230, 159, 0)
     return picture
+
+
+def mesh_picture(intensity: Floats, white: float, normals_in_cam: Floats) -> Rgb:
+    """The intensity with a mesh over it, blue and shaded by its normals, and its outline.
+
+    Parameters
+    ----------
+    normals_in_cam : (H, W, 3), camera frame, NaN where the mesh is not.
+    """
+    picture = gray_picture(intensity, white).astype(np.float64)
+    shown = np.isfinite(normals_in_cam).all(axis=-1)
+    facing = np.clip(-np.where(shown, normals_in_cam[..., 2], -1.0), 0, 1)
+    tint = (0.25 + 0.75 * facing)[..., None] * np.array([86.0, 180.0, 233.0])
+    picture[shown] = 0.45 * picture[shown] + 0.55 * tint[shown]
+    flags = np.asarray(shown, np.uint8)
+    picture[cv2.dilate(flags, np.ones((3, 3), np.uint8)) > flags] = (230, 159, 0)
+    return np.asarray(picture, np.uint8)
 
 
 def _colored(share: Floats, colors: Rgb) -> Rgb:

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import base64
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from polmvs.colmap.models import read_model
 from polmvs.config import AngleModel, Options, options_from_plain, to_plain
 from polmvs.errors import DataError, PolmvsError
 from polmvs.evaluation.comparison import Comparison, named_as_truth, read_comparison
+from polmvs.evaluation.consistency import first_seen, phase_residuals_deg
+from polmvs.evaluation.deviation import DeviationFigures
 from polmvs.evaluation.metrics import angular_errors_deg
 from polmvs.evaluation.tables import comparison_rows, number
 from polmvs.evaluation.trust import Trust
 from polmvs.geometry import SimilarityTransform
-from polmvs.io.clouds import Cloud, read_cloud, read_mesh
+from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
-from polmvs.io.images import write_bytes
+from polmvs.io.images import read_bytes, read_gray, write_bytes
 from polmvs.neighbors import nearest_points
 from polmvs.parallel import OnProgress, no_progress
+from polmvs.pipeline.checks import digest_of
 from polmvs.pipeline.record import Record
-from polmvs.pipeline.run_folder import RunFolder
+from polmvs.pipeline.run_folder import SURFACE_MESH, RunFolder
 from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.densify import DensifyResult, open_dense_views
 from polmvs.pipeline.stages.images import image_names
@@ -33,17 +39,22 @@ from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
 from polmvs.polarization.capture import WHITE_PERCENTILE, Capture, open_capture
 from polmvs.poses.alignment import align_views
+from polmvs.poses.crop_box import marker_frames
 from polmvs.report import pictures, plots
 from polmvs.report.contents import (
     MAX_ERROR_DEG,
     MAX_ERROR_M,
     ErrorSamples,
+    LengthUnit,
     ViewInput,
     view_page,
 )
-from polmvs.report.layers import KIND, Channel, Layer, Scene3D, pack_scene, thinned
-from polmvs.report.page import Page, Plot, Table, ViewPage, page_text
+from polmvs.report.deviation_files import COLORS as DEVIATION_COLORS
+from polmvs.report.deviation_files import read_deviation
+from polmvs.report.layers import KIND, BoxFrame, Channel, Layer, Scene3D, pack_scene, thinned
+from polmvs.report.page import DeviationSection, Page, Plot, Table, ViewPage, page_text
 from polmvs.scene import PointKind, SparseModel, View
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
 logger = logging.getLogger(__name__)
 
@@ -60,6 +71,11 @@ HEADLINE = (
     "Chamfer distance, mm",
     "normal error, mean / median, deg",
 )
+# Colour scales that end where 95 % of the worst layer's values do, and at most here.
+ADAPTED = {"residual": MAX_ERROR_DEG, "normal_error": MAX_ERROR_DEG, "error": 1e3 * MAX_ERROR_M}
+SIZE_PERCENTILES = (0.5, 99.5)
+MIN_SIZED = 100  # points for a size to be told
+SIZED = 5000  # points that a size is told from: its ends err by some of their spacings
 # Who stands for the run, and for OPA, in order: people know OPA as the paper has it.
 MAIN = (
     AngleModel.PPA,
@@ -91,6 +107,43 @@ class _Given:
     capture: Capture | None
     truth: tuple[GroundTruth, SimilarityTransform] | None
     comparison: Comparison | None
+    deviation: _FoundDeviation | None
+
+    @property
+    def main(self) -> AngleModel:
+        """Who stands for the run."""
+        return next(model for model in MAIN if model in self.models)
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether the unit is the metre."""
+        return self.record.result(PosesResult).is_metric
+
+    @property
+    def length(self) -> LengthUnit:
+        """In which lengths are shown; the truth is metric, and so is the scale that it gives."""
+        if self.truth is not None:
+            return LengthUnit("mm", 1e3 * self.truth[1].scale)
+        return LengthUnit("mm", 1e3) if self.is_metric else LengthUnit("model units")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FoundDeviation:
+    """What ``polmvs deviation --report`` left in the run folder.
+
+    Attributes
+    ----------
+    cloud : the compared points, laid on the reference.
+    histogram : SVG text.
+    picture : coded.
+    is_stale : the run's cloud is another one now.
+    """
+
+    figures: DeviationFigures
+    cloud: Cloud
+    histogram: str
+    picture: str
+    is_stale: bool
 
 
 def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress) -> Path:
@@ -117,17 +170,19 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
         views.append(page)
         on_progress(1)
     layers, channels = _layers(given)
+    scene = _scene(given, layers, channels)
     text = page_text(
         Page(
             title=_title(given),
             sentence=" ".join([*_verdict(given), _sentence(given)]),
             facts=_facts(given),
-            warnings=tuple(w for stage in given.record.stages for w in stage.warnings),
+            warnings=_warnings(given),
             tables=_tables(given),
             trust=_trust(given),
             views=views,
             plots=_plots(given, samples),
-            scene=_scene(given, layers, channels),
+            deviation=_deviation_section(given),
+            scene=scene,
             thinned=MAX_POINTS if _is_thinned(given) else 0,
             stages=[
                 (stage.name, number(stage.seconds, 1, 1), number(stage.peak_rss_mb, 1, 0))
@@ -168,6 +223,27 @@ def _open(folder: RunFolder) -> _Given:
         capture=_open_capture(record, options),
         truth=truth,
         comparison=comparison,
+        deviation=_open_deviation(folder, clouds),
+    )
+
+
+def _open_deviation(folder: RunFolder, models: Iterable[AngleModel]) -> _FoundDeviation | None:
+    """The comparison with a reference, if there is a whole one."""
+    if not folder.deviation.is_dir():
+        return None
+    try:
+        figures, cloud, histogram = read_deviation(folder.deviation)
+        picture = read_bytes(folder.deviation / "deviation.png")
+        digests = {digest_of(folder.cloud(model)) for model in models}
+    except PolmvsError as error:
+        logger.warning("the report shows no deviation: %s", error)
+        return None
+    return _FoundDeviation(
+        figures=figures,
+        cloud=cloud,
+        histogram=histogram,
+        picture="data:image/png;base64," + base64.b64encode(picture).decode("ascii"),
+        is_stale=figures.result_digest not in digests,
     )
 
 
@@ -178,7 +254,7 @@ def _open_capture(record: Record, options: Options) -> Capture | None:
     try:
         return open_capture(record.capture.folder, options.capture)
     except PolmvsError as error:
-        logger.warning("the report shows no raw polarisation: %s", error)
+        logger.warning("the report shows no raw polarization: %s", error)
         return None
 
 
@@ -203,6 +279,10 @@ def _view_pages(given: _Given, samples: Mapping[AngleModel, ErrorSamples]) -> It
     first = next(iter(maps.values()))
     white = max(float(np.percentile(one.intensity, WHITE_PERCENTILE)) for one in first)
     views = given.sparse.views
+    mesh = _mesh_of(given, given.main)
+    surface = None
+    if mesh is not None:
+        surface = RayScene(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64)))
     if given.truth is not None:
         views = tuple(named_as_truth(views, given.truth[0]))
     for index, view in enumerate(views):
@@ -220,7 +300,18 @@ def _view_pages(given: _Given, samples: Mapping[AngleModel, ErrorSamples]) -> It
             given.truth,
             samples,
             white=max(white, 1e-9),
+            length=given.length,
+            mesh=surface,
         )
+
+
+def _mesh_of(given: _Given, model: AngleModel) -> Mesh | None:
+    """The mesh of a model: the run's, or the one that its cloud was made from."""
+    for path in (given.folder.mesh(model), given.folder.views(model) / SURFACE_MESH):
+        if path.is_file():
+            mesh = read_mesh(path)
+            return mesh if len(mesh.triangles) else None
+    return None
 
 
 # The 3D scene
@@ -235,39 +326,54 @@ def _layers(given: _Given) -> tuple[list[Layer], dict[str, Channel]]:
     ]
     finite = np.concatenate([np.zeros(0), *sigmas])
     finite = finite[np.isfinite(finite)]
-    poses = given.record.result(PosesResult)
-    factor, unit = (1e3, "mm") if poses.is_metric else (1.0, "of the model's unit")
-    if given.truth is not None:  # the truth is metric, and so is its scale
-        factor, unit = 1e3 * given.truth[1].scale, "mm"
+    factor, unit = given.length.factor, given.length.name
     top = float(np.percentile(finite, 95)) * factor if len(finite) else 1.0
     channels = {
-        "intensity": Channel(label="intensity"),
+        "intensity": Channel(label="intensity", note="Brightness in the photographs."),
         "kind": KIND,
+        "residual": Channel(
+            label="phase residual",
+            unit="deg",
+            colors=pictures.ERROR,
+            note="Angle between the measured phase and the one that the surface predicts, mean of "
+            "the views that see a point. Needs no ground truth.",
+            may_lack=True,
+        ),
         "sigma": Channel(
-            label="stated deviation of the place", unit=unit, high=top, colors=pictures.SEQUENTIAL
+            label="position uncertainty (1 sigma)",
+            unit=unit,
+            high=top,
+            colors=pictures.SEQUENTIAL,
+            note="Standard deviation of a place along its normal, by its own statement.",
         ),
         "sigma_deg": Channel(
-            label="stated deviation of the normal", unit="deg", high=5.0, colors=pictures.SEQUENTIAL
+            label="normal uncertainty (1 sigma)",
+            unit="deg",
+            high=5.0,
+            colors=pictures.SEQUENTIAL,
+            note="Standard deviation of the surface's direction, by its own statement.",
         ),
         "num_views": Channel(
             label="views that agree",
-            unit="",
+            unit="views",
             high=float(len(given.sparse.views)),
             colors=pictures.SEQUENTIAL,
+            note="Photographs that agree on a point, in place and normal.",
         ),
     }
     if given.truth is not None:
         channels["error"] = Channel(
-            label="distance from the truth",
+            label="distance to ground truth",
             unit="mm",
-            high=1e3 * MAX_ERROR_M,
             colors=pictures.ERROR,
+            note="From each point to the true surface.",
         )
         channels["normal_error"] = Channel(
             label="angle to the true normal, on the part",
             unit="deg",
-            high=MAX_ERROR_DEG,
             colors=pictures.ERROR,
+            note="Between the surface's direction and the true one.",
+            may_lack=True,
         )
     layers = [
         _cloud_layer(given, model, cloud, factor)
@@ -275,23 +381,77 @@ def _layers(given: _Given) -> tuple[list[Layer], dict[str, Channel]]:
         if len(cloud.points)
     ]
     for model in given.models:
-        if given.folder.mesh(model).is_file():
-            mesh = read_mesh(given.folder.mesh(model))
-            values: dict[str, Floats] = {}
-            if mesh.colors is not None:
-                values["intensity"] = mesh.colors[:, 0] / 255
-            else:
-                values["intensity"] = np.full(len(mesh.vertices), 0.7)
-            layers.append(
-                Layer(
-                    label=f"{plots.LABELS[model]} mesh",
-                    points=mesh.vertices,
-                    normals=mesh.normals,
-                    values=values,
-                    triangles=mesh.triangles,
-                )
-            )
-    return layers, channels
+        if (mesh := _mesh_of(given, model)) is not None:
+            layers.append(_mesh_layer(model, mesh, layers))
+    if given.deviation is not None and not given.deviation.is_stale:
+        layer, channels["deviation"] = _deviation_layer(given.deviation)
+        layers.append(layer)
+    for name, limit in ADAPTED.items():
+        if name in channels:
+            channels[name] = replace(channels[name], high=_top(layers, name, limit))
+    used = {name for layer in layers for name in layer.values}
+    return layers, {name: one for name, one in channels.items() if name in used}
+
+
+def _mesh_layer(model: AngleModel, mesh: Mesh, layers: Sequence[Layer]) -> Layer:
+    """A mesh with the values of the cloud's nearest points."""
+    label = plots.LABELS[model]
+    values: dict[str, NDArray[Any]] = {}
+    of_cloud = next((layer for layer in layers if layer.label == f"{label} cloud"), None)
+    if of_cloud is not None:
+        kind = of_cloud.values.get("kind", np.zeros(len(of_cloud.points)))
+        own = np.flatnonzero(np.isin(kind, (PointKind.SURFACE, PointKind.PRESUMED)))
+        if len(own):
+            nearest = own[cKDTree(of_cloud.points[own]).query(mesh.vertices)[1]]
+            # Kinds are names, which cannot change gradually over a triangle.
+            names = [name for name in of_cloud.values if name != "kind"]
+            values = {name: of_cloud.values[name][nearest] for name in names}
+    if not values:
+        values["intensity"] = np.full(len(mesh.vertices), 0.7)
+    return Layer(
+        label=f"{label} mesh",
+        points=mesh.vertices,
+        normals=mesh.normals,
+        values=values,
+        triangles=mesh.triangles,
+    )
+
+
+def _top(layers: Sequence[Layer], name: str, limit: float) -> float:
+    """End of a colour scale: what 95 % of the worst layer's values keep to, as a round number."""
+    tops = []
+    for layer in layers:
+        values = np.asarray(layer.values.get(name, ()), np.float64)
+        if np.isfinite(values).any():
+            tops.append(float(np.nanpercentile(values, 95)))
+    wanted = min(max(tops, default=limit), limit)
+    steps = limit / np.array([1, 2, 4, 10, 20, 40, 100])
+    return float(steps[steps >= 0.999 * wanted].min())
+
+
+def _deviation_layer(found: _FoundDeviation) -> tuple[Layer, Channel]:
+    """The compared points in the model's frame, and the colours of their distances."""
+    matrix = np.linalg.inv(np.asarray(found.figures.reference_from_result))
+    limit = found.figures.tolerance
+    distance = np.asarray(found.cloud.scalars["distance_mm"], np.float64)
+    if limit is None:
+        limit = float(np.percentile(np.abs(distance), 99)) or 1.0
+    turned = np.asarray(found.cloud.normals) @ matrix[:3, :3].T
+    layer = Layer(
+        label="deviation from the reference",
+        points=found.cloud.points @ matrix[:3, :3].T + matrix[:3, 3],
+        normals=turned / np.linalg.norm(turned, axis=1, keepdims=True),
+        values={"deviation": distance},
+    )
+    channel = Channel(
+        label="deviation from the reference",
+        unit="mm",
+        low=-limit,
+        high=limit,
+        colors=DEVIATION_COLORS,
+        note="Signed distance: blue is inside the reference, red outside.",
+    )
+    return thinned(layer, MAX_POINTS), channel
 
 
 def _cloud_layer(given: _Given, model: AngleModel, cloud: Cloud, factor: float) -> Layer:
@@ -309,6 +469,7 @@ def _cloud_layer(given: _Given, model: AngleModel, cloud: Cloud, factor: float) 
         ),
         MAX_POINTS,
     )
+    layer = replace(layer, values={**layer.values, "residual": _residuals(given, model, layer)})
     if given.truth is None:
         return layer
     truth, truth_from_world = given.truth
@@ -317,9 +478,28 @@ def _cloud_layer(given: _Given, model: AngleModel, cloud: Cloud, factor: float) 
         true.points, truth_from_world * layer.points, far=MAX_ERROR_M
     )
     normals = layer.normals @ truth_from_world.rotation.T
-    off = np.nan_to_num(angular_errors_deg(normals, true.normals[nearest]))
+    off = angular_errors_deg(normals, true.normals[nearest])
+    off[np.linalg.norm(normals, axis=1) < 0.5] = np.nan
     errors = {"error": 1e3 * distance, "normal_error": off}
     return replace(layer, values={**layer.values, **errors})
+
+
+def _residuals(given: _Given, model: AngleModel, layer: Layer) -> Floats:
+    """Mean residual phase of each point over the views that see it, degrees; NaN without one."""
+    total, count = np.zeros(len(layer.points)), np.zeros(len(layer.points))
+    on_surface = np.flatnonzero(np.linalg.norm(layer.normals, axis=1) > 0.5)
+    points, normals = layer.points[on_surface], layer.normals[on_surface]
+    for phase_map in open_maps(given.folder.sparse, given.folder.maps(model), model):
+        visible, _ = first_seen(points, normals, phase_map.view, phase_map.shows_surface)
+        found = phase_residuals_deg(model, points[visible], normals[visible], phase_map)
+        known = np.isfinite(found)
+        index = on_surface[visible][known]
+        total[index] += found[known]
+        count[index] += 1
+    mean = np.full(len(total), np.nan)
+    seen = count > 0
+    mean[seen] = total[seen] / count[seen]
+    return mean
 
 
 def _on_surface(cloud: Cloud) -> NDArray[np.bool_]:
@@ -343,7 +523,36 @@ def _scene(
     main = next((i for i in map(index, MAIN) if i is not None), 0)
     opa = next((i for i in map(index, ORTHOGRAPHIC) if i is not None), None)
     start = (opa, main) if opa is not None and opa != main else (main, None)
-    return pack_scene(layers, channels, given.sparse.views, start)
+    color = "normal"
+    if start[1] is not None:
+        color = "normal_error" if "normal_error" in channels else "residual"
+    return pack_scene(
+        layers,
+        channels,
+        given.sparse.views,
+        start,
+        color=color,
+        unit=(given.length.name, given.length.factor),
+        frames=_box_frames(given),
+    )
+
+
+def _box_frames(given: _Given) -> list[BoxFrame]:
+    """Frames of the printed markers that the run's scale came from."""
+    aruco = given.options.reference.aruco
+    if aruco is None:
+        return []
+    try:
+        frames = marker_frames(
+            given.sparse.views, aruco, lambda name: read_gray(given.folder.images / name)
+        )
+    except PolmvsError as error:
+        logger.warning("the report offers no box in a marker's frame: %s", error)
+        return []
+    return [
+        BoxFrame(f"marker {marker}", f"--box-marker={marker}", frame)
+        for marker, frame in frames.items()
+    ]
 
 
 def _is_thinned(given: _Given) -> bool:
@@ -354,41 +563,156 @@ def _is_thinned(given: _Given) -> bool:
 
 
 def _title(given: _Given) -> str:
+    """What the run made, in a sentence."""
     capture = given.record.capture
-    return f"{capture.folder.name}: reconstruction from polarisation" if capture else "polmvs"
+    name = capture.folder.name if capture else given.folder.root.name
+    num_views = given.record.result(PosesResult).num_views
+    points = given.record.result(DensifyResult, given.main).num_points
+    return f"{name}: {num_views} views became a surface of {points:,} points"
 
 
 def _sentence(given: _Given) -> str:
-    """What a reader in a hurry takes along."""
-    opa = next((m for m in ORTHOGRAPHIC if m in given.models), ORTHOGRAPHIC[0])
-    main = next(m for m in MAIN if m in given.models)
+    """What a reader in a hurry takes along, in plain words."""
+    words = [*_size_words(given), *_quality_words(given)]
+    return " ".join(words)
+
+
+def _size_words(given: _Given) -> list[str]:
+    size = _size(given)
+    if size is None:
+        return []
+    return [f"The part is about {size} in size."]
+
+
+def _size(given: _Given) -> str | None:
+    """Extents of the part along its main directions; None where lengths have no unit."""
+    surface = given.clouds[given.main]
+    points = surface.points[_on_surface(surface)]
+    if not (given.is_metric or given.truth is not None) or len(points) < MIN_SIZED:
+        return None
+    sides = " x ".join(f"{given.length.factor * side:.0f}" for side in _sides(points))
+    return f"{sides} {given.length.name}"
+
+
+def _sides(points: Floats) -> Floats:
+    """Sides (3,) of a box about points (N, 3): the smallest of those on their mean plane."""
+    some = np.asarray(points[:: max(1, len(points) // SIZED)], np.float64)
+    centered = some - some.mean(axis=0)
+    along = centered @ np.linalg.eigh(centered.T @ centered)[1][:, ::-1]
+    best = np.full(3, np.inf)
+    for turn in np.radians(np.arange(0.0, 90.0)):
+        cos, sin = np.cos(turn), np.sin(turn)
+        turned = along @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        sides = np.ptp(np.percentile(turned, SIZE_PERCENTILES, axis=0), axis=0)
+        if sides[0] * sides[1] < best[0] * best[1]:
+            best = sides
+    return np.sort(best)[::-1]
+
+
+def _quality_words(given: _Given) -> list[str]:
+    """How good the surface is, and how it would be under OPA where that was tried."""
+    main = given.main
     figures = given.comparison.models if given.comparison is not None else {}
-    if main is opa or opa not in figures or main not in figures:
-        cloud = given.record.result(DensifyResult, main)
-        return f"{plots.LABELS[main]}: {cloud}."
-    first, second = figures[opa].truth, figures[main].truth
-    name = plots.LABELS[main]
-    if first is not None and second is not None:
-        near = first.cloud.thresholds_m[0]
-        scores = [number(truth.cloud.f_score[0], 100, 1) for truth in (second, first)]
-        angles = [number(truth.cloud.normal_mean_deg, 1, 1) for truth in (second, first)]
-        return (
-            f"{name} has an F-score of {scores[0]} % at {1e3 * near:g} mm and normals "
-            f"{angles[0]} deg off, {plots.LABELS[opa]} {scores[1]} % and {angles[1]} deg: oblique "
-            "rays turn the phase of a surface, which OPA, for which all rays are parallel, takes "
-            "for shape."
+    if main not in figures:
+        return _uncertainty_words(given)
+    name, truth = plots.LABELS[main], figures[main].truth
+    opa = next((m for m in ORTHOGRAPHIC if m in figures and m is not main), None)
+    other = None if opa is None else figures[opa]
+    older = "" if opa is None else f"the older orthographic model ({plots.LABELS[opa]})"
+    if truth is not None:
+        near = f"{1e3 * truth.cloud.thresholds_m[0]:g} mm"
+        right, covered = truth.cloud.accuracy[0], truth.cloud.completeness[0]
+        words = [
+            f"{number(right, 100, 1)} % of the points lie within {near} of the true surface and "
+            f"cover {number(covered, 100, 1)} % of it ({name})."
+        ]
+        if other is not None and other.truth is not None:
+            right, covered = other.truth.cloud.accuracy[0], other.truth.cloud.completeness[0]
+            words.append(
+                f"Under {older} it is {number(right, 100, 1)} % and {number(covered, 100, 1)} %: "
+                "it takes what perspective does to the polarization angle for shape."
+            )
+        return words
+    residual = figures[main].consistency.phase_residual.median_deg
+    words = [
+        f"The polarization angles that the surface predicts differ from the measured ones by "
+        f"{number(residual)} deg in the median ({name})"
+    ]
+    if other is not None:
+        before = other.consistency.phase_residual.median_deg
+        words[0] += f", under {older} by {number(before)} deg"
+    return [words[0] + "."]
+
+
+def _uncertainty_words(given: _Given) -> list[str]:
+    """What the points state of themselves."""
+    cloud = given.clouds[given.main]
+    sigma = np.asarray(cloud.scalars.get("sigma", ()), np.float64)
+    known = sigma[_on_surface(cloud)] if len(sigma) else sigma
+    known = known[np.isfinite(known)]
+    if not len(known):
+        return []
+    typical = given.length.text(float(np.median(known)))
+    return [
+        f"Half of its points are known to {typical} or better along the normal, by their own "
+        "statement (one standard deviation)."
+    ]
+
+
+def _warnings(given: _Given) -> tuple[str, ...]:
+    """Those of the run, and of what stands beside it."""
+    warnings = [w for stage in given.record.stages for w in stage.warnings]
+    if given.deviation is not None and given.deviation.is_stale:
+        warnings.append(
+            "the deviation from the reference is of an earlier cloud of this run and is not shown; "
+            "run 'polmvs deviation RUN REFERENCE --report' again."
         )
-    before = figures[opa].consistency.phase_residual.median_deg
-    after = figures[main].consistency.phase_residual.median_deg
-    return (
-        f"The surface found under {name} explains the measured phase to {number(after)} deg in "
-        f"the median, that under {plots.LABELS[opa]} to {number(before)} deg."
+    return tuple(warnings)
+
+
+def _deviation_section(given: _Given) -> DeviationSection | None:
+    """The part against its reference, in words, figures and pictures."""
+    if given.deviation is None or given.deviation.is_stale:
+        return None
+    f = given.deviation.figures
+    name = Path(f.reference).name
+    sentence = (
+        f"Against {name} the part is {number(f.rms, 1, 3)} mm off in the root mean square, "
+        f"{number(abs(f.mean), 1, 3)} mm {'outside' if f.mean >= 0 else 'inside'} in the mean."
+    )
+    if f.passed is not None and f.share_within is not None:
+        verdict = "passes" if f.passed else "fails"
+        sentence = (
+            f"The part {verdict}: {number(f.share_within, 100, 2)} % of its points are within "
+            f"{f.tolerance:g} mm of {name}, {100 * f.least_share:g} % are asked for. " + sentence
+        )
+    rows = [
+        ["compared points", f"{f.num_points:,}"],
+        ["mean, mm", f"{f.mean:+.4f}"],
+        ["standard deviation, mm", number(f.standard_deviation, 1, 4)],
+        ["RMS, mm", number(f.rms, 1, 4)],
+        *[[f"percentile {p} %, mm", f"{value:+.3f}"] for p, value in f.percentiles.items()],
+        ["stated deviation of a distance, median, mm", number(f.median_sigma, 1, 4)],
+        ["farther off than three of these, %", number(f.significant_share, 100, 1)],
+    ]
+    if f.share_within is not None:
+        rows.append(["within the tolerance, %", number(f.share_within, 100, 2)])
+    if f.repeatability is not None:
+        rows.append(["repeatability of one run, mm", number(f.repeatability, 1, 4)])
+    if f.scale != 1:
+        rows.append(["scale that was fitted", f"{f.scale:.6g}"])
+    return DeviationSection(
+        sentence=sentence,
+        passed=f.passed,
+        table=Table(header=["", "value"], rows=rows),
+        picture=given.deviation.picture,
+        histogram=given.deviation.histogram.replace("#555555", "currentColor"),
     )
 
 
 def _facts(given: _Given) -> list[tuple[str, str]]:
     poses, seeds = given.record.result(PosesResult), given.record.result(SeedsResult)
-    main = next(m for m in MAIN if m in given.models)
+    main = given.main
     total = poses.num_views + len(poses.unregistered)
     facts = [
         ("views with a pose", f"{poses.num_views} of {total}"),
@@ -399,12 +723,14 @@ def _facts(given: _Given) -> list[tuple[str, str]]:
             f"{given.record.result(DensifyResult, main).num_points:,}",
         ),
     ]
+    if (size := _size(given)) is not None:
+        facts.append(("size", size))
     if given.comparison is not None and main in given.comparison.models:
         coverage = given.comparison.models[main].consistency.coverage
         facts.append(("region covered", f"{number(coverage, 100, 1)} %"))
     facts += [
         ("time", f"{number(given.record.wall_s, 1, 1)} s"),
-        ("unit", "metre" if poses.is_metric else "of the model, not metric"),
+        ("scale", "metric, in metres" if poses.is_metric else "unknown: model units"),
     ]
     return facts
 

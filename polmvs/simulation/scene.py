@@ -20,6 +20,7 @@ from polmvs.simulation.marks import Marks
 from polmvs.simulation.materials import Material, bsdf_of
 from polmvs.simulation.renderer_import import Renderer
 from polmvs.simulation.surroundings import Surrounding
+from polmvs.simulation.vertex_albedo import ATTRIBUTE, vertex_albedo
 
 Array = NDArray[np.float64]
 
@@ -100,13 +101,15 @@ def build_scene(
     albedo = _albedo_texture(renderer, description)
     bsdf = bsdf_of(material, colour=description.colour)
     if description.vertex_albedo is not None and material.metal is None:
-        bsdf["diffuse_reflectance"] = {"type": "mesh_attribute", "name": "vertex_color"}
+        bsdf["diffuse_reflectance"] = vertex_albedo(
+            renderer, float(description.vertex_albedo.mean())
+        )
     part = _shape(renderer, description.part, mi.load_dict(bsdf))
     if description.vertex_albedo is not None:
         colours = description.vertex_albedo
         if not description.colour:
             colours = colours @ np.array([[0.2126], [0.7152], [0.0722]], np.float32)
-        part.add_attribute("vertex_color", colours.shape[1], colours.ravel())
+        part.add_attribute(ATTRIBUTE, colours.shape[1], colours.ravel())
     parts["part"] = part
     shapes = [part]
     for index, surrounding in enumerate(description.surroundings):
@@ -145,7 +148,7 @@ def _albedo_texture(renderer: Renderer, description: SceneDescription) -> Any:
     if material.metal is not None:
         return None
     if description.vertex_albedo is not None:
-        return renderer.mi.load_dict({"type": "mesh_attribute", "name": "vertex_color"})
+        return renderer.mi.load_dict({"type": "mesh_attribute", "name": ATTRIBUTE})
     return renderer.mi.load_dict(
         bsdf_of(material, colour=description.colour)["diffuse_reflectance"]
     )

@@ -65,3 +65,14 @@ def test_surroundings_alone_are_no_points(scene: Scene) -> None:
     assert found.num_points == 0
     assert found.coverage == 0
     assert np.isnan(found.agreement)
+
+
+def test_no_more_than_all_views_agree(scene: Scene) -> None:
+    surface = surface_of(scene)
+    hidden = surface.points - np.array([0.0, 0.0, 0.05])  # below the board: no view sees them
+    cloud = Cloud(
+        points=np.concatenate([surface.points, hidden]),
+        normals=np.concatenate([surface.normals, surface.normals]),
+        scalars={"num_views": np.full(4000, 4.0)},
+    )
+    assert 0.9 < measure(scene, cloud).agreement <= 1

@@ -26,11 +26,12 @@ from polmvs.colmap.dense_workspace import (
 from polmvs.colmap.maps import DepthNormals, read_depth_map, write_depth_map
 from polmvs.colmap.models import read_model, write_model
 from polmvs.config import FusionOptions, Method, PropagationOptions
-from polmvs.geometry import SimilarityTransform
+from polmvs.geometry import RigidTransform, SimilarityTransform, points_on_rays
 from polmvs.io.clouds import Cloud, read_cloud, read_mesh, write_cloud
 from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
-from polmvs.pipeline.run_folder import DENSE_MARKER
-from polmvs.pipeline.stages.densify import unused_options
+from polmvs.pipeline.run_folder import DENSE_MARKER, SURFACE_MESH
+from polmvs.pipeline.stages.densify import _crop_views, open_dense_views, unused_options
+from polmvs.poses.crop_box import CropBox
 from polmvs.poses.metric_frame import transform_model
 from polmvs.scene import PointKind
 from polmvs.surface.kept_depth import kept_cloud
@@ -41,6 +42,7 @@ BOARD_HEIGHT_M = 0.012  # of the true plane z = const, in the capture's gt/scene
 TOLERANCE_M = 0.001
 # For what is not about the surface: one that is a quarter of the work.
 QUICK = ("--method", "integrate")
+ONES = np.ones(3)
 
 # Runs a command on a copy of the finished run that was cut short, and gives the copy.
 Continue = Callable[..., Path]
@@ -334,6 +336,48 @@ def test_voxel_in_metres_thins_and_there_are_no_surroundings(
     cells = len(np.unique(np.floor(before / voxel), axis=0))
     assert 0.5 * cells < len(points) < 1.5 * cells
     assert_on_board(off_board(points))
+
+
+def test_a_box_cuts_cloud_maps_and_mesh(go_on: Continue, run: Path, demo_capture, cli) -> None:
+    points = surface_of(read_cloud(run / "ppa.ply"))
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    corners = (*middle, *(points.min(axis=0) - 0.01))  # a quarter of the board, and all its height
+    text = ",".join(str(value) for value in (*corners[:2], 1, *corners[3:5], -1))
+    out = go_on("sparse_cloud_ppa", "densify", "--box", text, *QUICK)
+    cloud = read_cloud(out / "ppa.ply")
+    assert (cloud.points[:, :2] <= middle[:2]).all()
+    stage = next(s for s in record_of(out)["stages"] if s["name"] == "densify_ppa")
+    (share,) = re.findall(r"`crop.box` leaves out (\d+) %", " ".join(stage["warnings"]))
+    assert 60 < int(share) < 90  # three quarters of the board
+    # It reaches far into that quarter; the board lies turned in it.
+    reach = (middle - surface_of(cloud).min(axis=0))[:2] / np.ptp(points, axis=0)[:2]
+    assert (reach > 0.35).all()
+    assert (reach < 0.55).all()
+    assert len(surface_of(cloud)) > 1000
+    for view, dense in zip(
+        read_model(out / "sparse").views,
+        open_dense_views(out / "sparse", out / "views_ppa"),
+        strict=True,
+    ):
+        assert dense is not None
+        rays = view.rays_in_world(dense.lattice_xy())
+        shown = points_on_rays(view.center_in_world, rays, dense.range_map)[dense.known]
+        assert (shown[:, :2] <= middle[:2] + 1e-6).all()
+    err = refused(
+        cli("densify", demo_capture, out, "--box", text, "--box-marker", 3, "--overwrite"), 2
+    )
+    assert "--box-marker needs --aruco" in err
+
+
+def test_a_box_cuts_the_surface_of_all_views(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run / "views_ppa", tmp_path / "views")
+    whole = read_mesh(run / "views_ppa" / SURFACE_MESH)
+    middle = whole.vertices.mean(axis=0)
+    box = CropBox(RigidTransform(np.eye(3), np.zeros(3)), np.array([middle[0], -9, -9]), 9 * ONES)
+    _crop_views(tmp_path / "views", read_model(run / "sparse").views, box)
+    half = read_mesh(tmp_path / "views" / SURFACE_MESH)
+    assert half.vertices[:, 0].min() >= middle[0]
+    assert 0.3 < len(half.triangles) / len(whole.triangles) < 0.7
 
 
 def test_more_views_must_agree(go_on: Continue, run: Path) -> None:
@@ -751,6 +795,7 @@ def test_meshes_have_colours_or_a_texture(run: Path, tmp_path: Path, cli) -> Non
     status, text, err = cli("export", run, tmp_path / "part.ply")
     assert (status, err) == (0, "")
     assert f"{len(expected.triangles):,} triangles" in text
+    assert "in the model's own unit, of no known scale" in text
     coloured = read_mesh(tmp_path / "part.ply")
     top = np.abs(coloured.vertices[:, 2] - BOARD_HEIGHT_M) < TOLERANCE_M
     # Black lacquer, whose reflections are polarised, with some printed marks.
@@ -797,7 +842,7 @@ def test_a_box_cuts_meshes_and_clouds(run: Path, tmp_path: Path, cli) -> None:
     assert cli("export", run, tmp_path / "half.xyz", "--part", "--box", box)[0] == 0
     assert np.loadtxt(tmp_path / "half.xyz")[:, 0].min() >= middle[0] - 1e-6
     err = refused(cli("export", run, tmp_path / "no.stl", "--box", "90,90,90,91,91,91"), 2)
-    assert "--box holds nothing of the mesh" in err
+    assert "--box holds nothing of the surface, which lies in " in err
     err = refused(cli("export", run, tmp_path / "n", "--format", "neus", "--box", box), 2)
     assert "--box is of a mesh or a cloud" in err
 

@@ -8,7 +8,7 @@ import pytest
 
 from polmvs.camera import PinholeCamera
 from polmvs.geometry import RigidTransform
-from polmvs.report.layers import KIND, Channel, Layer, pack_scene, thinned
+from polmvs.report.layers import KIND, BoxFrame, Channel, Layer, pack_scene, thinned
 from polmvs.scene import PointKind, View
 
 CAMERA = PinholeCamera(width=60, height=40, fx=50, fy=50, cx=30, cy=20)
@@ -89,6 +89,18 @@ def test_values_that_are_not_finite_look_worst(bad: float) -> None:
     assert part(scene, 0, scene.description["layers"][0]["channels"]["sigma"]).tolist() == [0, 255]
 
 
+def test_points_without_a_value_have_a_colour_of_their_own() -> None:
+    layer = Layer(
+        label="a", points=np.zeros((4, 3)), normals=np.zeros((4, 3)),
+        values={"sigma": np.array([0.0, np.nan, 9.0, 2.0])},
+    )  # fmt: skip
+    channels = {"sigma": Channel(label="s", high=2.0, colors="plasma", may_lack=True)}
+    scene = pack_scene([layer], channels, [], (0, None))
+    found = part(scene, 0, scene.description["layers"][0]["channels"]["sigma"])
+    assert found.tolist() == [0, 255, 254, 254]
+    assert scene.description["channels"]["sigma"]["unknown"].startswith("#")
+
+
 def test_thinning_takes_all_parts_of_the_cloud_alike() -> None:
     layer = random_layer(10_000)
     few = thinned(layer, 1000)
@@ -107,12 +119,29 @@ def test_up_is_where_the_cameras_are_and_the_eye_sees_the_part() -> None:
     np.testing.assert_allclose(np.linalg.norm(np.reshape(d["basis"], (3, 3)), axis=1), 1)
 
 
-def test_frusta_begin_at_the_cameras() -> None:
+def test_cameras_stand_where_they_are_and_look_where_they_do() -> None:
     scene = pack_scene([random_layer()], CHANNELS, [looking_down(2.0)], (0, None))
-    ends = np.reshape(scene.description["frusta"], (-1, 3))
-    assert len(ends) == 16  # four edges to the corners, four along the image
-    np.testing.assert_allclose(ends[::4], np.tile([2.0, 3.0, 30.0], (4, 1)))
-    assert (ends[1::4][:, 2] < 30).all()  # they look down
+    (camera,) = scene.description["cameras"]
+    assert camera["name"] == "v"
+    np.testing.assert_allclose(camera["center"], [2, 3, 30])
+    np.testing.assert_allclose(camera["forward"], [0, 0, -1], atol=1e-9)
+    corners = np.array(camera["corners"]) - camera["center"]
+    assert (corners[:, 2] < 0).all()  # they look down
+    assert (corners[[0, 3], 0] < 0).all()  # of the image's left side
+    assert (corners[[0, 1], 1] > 0).all()  # and its top, for up in the image is +y here
+    np.testing.assert_allclose(camera["half_field"], [30 / 50, 20 / 50])
+
+
+def test_frames_of_boxes_begin_with_the_model_s() -> None:
+    turn = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    marker = BoxFrame("marker 3", "--box-marker=3", RigidTransform(turn, np.array([1.0, 2, 3])))
+    scene = pack_scene([random_layer()], CHANNELS, [], (0, None), frames=[marker])
+    model, other = scene.description["frames"]
+    np.testing.assert_array_equal(np.reshape(model["matrix"], (4, 4)), np.eye(4))
+    assert (model["option"], other["option"]) == ("", "--box-marker=3")
+    point = np.array([0.3, -0.2, 0.7])
+    found = np.reshape(other["matrix"], (4, 4)) @ [*point, 1]
+    np.testing.assert_allclose(found[:3], turn @ point + [1, 2, 3])
 
 
 def test_the_target_is_on_the_polarised_surface() -> None:

@@ -13,7 +13,7 @@ TRUST = Table(header=["PPA", "value", "normal", ""], rows=[["agreement", "50", "
 
 def page(**changes) -> str:
     empty = {"facts": [], "warnings": (), "tables": (), "trust": None, "views": [], "plots": []}
-    empty |= {"scene": None, "thinned": 0, "stages": [], "record": {}}
+    empty |= {"deviation": None, "scene": None, "thinned": 0, "stages": [], "record": {}}
     return page_text(Page(title="title", sentence="sentence", **(empty | changes)))
 
 

@@ -1,5 +1,6 @@
 """Lengths on the page are in the unit that stands beside them."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from polmvs.config import AngleModel
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.clouds import Cloud
-from polmvs.report.report import _layers
+from polmvs.report import report
+from polmvs.report.report import _Given, _layers
 from polmvs.scene import PointKind
 
 
@@ -16,11 +18,13 @@ from polmvs.scene import PointKind
     ("is_metric", "scale", "factor", "unit"),
     [
         (True, None, 1000.0, "mm"),
-        (False, None, 1.0, "of the model's unit"),
-        (False, 0.25, 250.0, "mm"),  # by the truth, of which one of the model's units is 0.25 m
+        (False, None, 1.0, "model units"),
+        (False, 0.25, 250.0, "mm"),  # by the truth, of which one model unitss is 0.25 m
     ],
 )
-def test_deviations_of_a_metric_cloud_are_millimetres(is_metric, scale, factor, unit) -> None:
+def test_deviations_of_a_metric_cloud_are_millimetres(
+    is_metric, scale, factor, unit, monkeypatch
+) -> None:
     sigma = np.full(50, 0.002)
     cloud = Cloud(
         points=np.random.default_rng(0).normal(size=(50, 3)),
@@ -33,7 +37,9 @@ def test_deviations_of_a_metric_cloud_are_millimetres(is_metric, scale, factor, 
         record=SimpleNamespace(result=lambda kind: SimpleNamespace(is_metric=is_metric)),
         truth=None,
         models=(AngleModel.PPA,),
-        folder=SimpleNamespace(mesh=lambda model: nothing),
+        folder=SimpleNamespace(mesh=lambda model: nothing, views=lambda model: Path("nowhere")),
+        is_metric=is_metric,
+        deviation=None,
         sparse=SimpleNamespace(views=range(6)),
     )
     if scale is not None:
@@ -41,6 +47,8 @@ def test_deviations_of_a_metric_cloud_are_millimetres(is_metric, scale, factor, 
         places = scale * cloud.points + [0, 0, 0.001]
         true = SimpleNamespace(points=places, normals=np.asarray(cloud.normals))
         given.truth = (SimpleNamespace(surface_points=lambda: true), similarity)
+    given.length = _Given.length.fget(given)
+    monkeypatch.setattr(report, "_residuals", lambda *_: np.full(50, 1.0))
     layers, channels = _layers(given)
     assert channels["sigma"].unit == unit
     assert channels["sigma"].high == pytest.approx(0.002 * factor)

@@ -23,8 +23,17 @@ from polmvs.colmap.dense_workspace import (
 )
 from polmvs.colmap.filling import previous_backups
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, FusionOptions, Light, Method, PropagationOptions, Surroundings
-from polmvs.io.clouds import Cloud, Mesh, write_cloud, write_mesh
+from polmvs.config import (
+    AngleModel,
+    CropOptions,
+    FusionOptions,
+    Light,
+    Method,
+    PropagationOptions,
+    Surroundings,
+)
+from polmvs.geometry import points_on_rays
+from polmvs.io.clouds import Cloud, Mesh, read_mesh, write_cloud, write_mesh
 from polmvs.io.images import read_gray
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, replace_folder, scratch
@@ -33,7 +42,8 @@ from polmvs.pipeline.stages.poses import load_floats
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import PointKind, Seeds
+from polmvs.poses.crop_box import CropBox, crop_box
+from polmvs.scene import PointKind, Seeds, View
 from polmvs.surface.camera_sigma import CameraModes, widen_by_poses
 from polmvs.surface.consensus import hidden_by
 from polmvs.surface.contour import propagate
@@ -113,6 +123,8 @@ def densify(
     views: Path,
     propagation: PropagationOptions | None = None,
     fusion: FusionOptions | None = None,
+    crop: CropOptions | None = None,
+    aruco: str | None = None,
     tilt_aware: bool = True,
     masks_given: bool = False,
     light: Light | None = None,
@@ -135,6 +147,7 @@ def densify(
     cloud : PLY to write.
     views : folder to write, with the dense depth and normals of each view.
     propagation, fusion : defaults where None.
+    crop, aruco : box of what is kept, and the markers (``DICT:SIZE``) that it may be relative to.
     tilt_aware : as ``NormalOptions.tilt_aware_weights``; a textbook model never is.
     masks_given : the regions of the phase maps are the user's masks.
     light : that the user states; None: inferred for each observation.
@@ -150,6 +163,12 @@ def densify(
     phase_maps = open_maps(sparse, maps, model)
     known = load_seeds(seeds, track_normals)
     given = _open_given(fusion, sparse, images)
+    box = crop_box(
+        crop or CropOptions(),
+        aruco,
+        [phase_map.view for phase_map in phase_maps],
+        lambda name: read_gray(images / name),
+    )
     with scratch(views) as folder, workers.stopped_on_error():
         new_views = folder / "views"
         new_views.mkdir()
@@ -199,6 +218,17 @@ def densify(
         around = _surroundings_cloud(
             sparse, fused, phase_maps, fusion, given, folder / "around", workers=workers
         )
+        if box is not None:
+            kept = box.require_some(surface.points)
+            if not kept.all():
+                logger.warning(
+                    "`crop.box` leaves out %.0f %% of the surface; figures of how much of the "
+                    "polarized regions is determined count that as missing.",
+                    100 * (1 - kept.mean()),
+                )
+            surface = surface.only(kept)
+            around = around.only(box.contains(around.points))
+            _crop_views(new_views, [phase_map.view for phase_map in phase_maps], box)
         replace_folder(new_views, views)
     write_cloud(cloud, _join_clouds(surface, around))
     for sentence in unused_options(method, propagation, fusion):
@@ -210,6 +240,20 @@ def densify(
         tilt_share=tilt_share,
         left_out=left_out,
     )
+
+
+def _crop_views(folder: Path, views: Sequence[View], box: CropBox) -> None:
+    """Leave of stored views, and of the mesh beside them, what lies in a box."""
+    for view in views:
+        dense = find_dense_view(folder / view.name)
+        if dense is None:
+            continue
+        rays = view.rays_in_world(dense.lattice_xy())
+        points = points_on_rays(view.center_in_world, rays, dense.range_map.astype(np.float64))
+        store_dense_view(dense.only(box.contains(points)), folder / view.name)
+    if (folder / SURFACE_MESH).is_file():
+        mesh = read_mesh(folder / SURFACE_MESH)
+        write_mesh(folder / SURFACE_MESH, mesh.only(box.contains(mesh.vertices)))
 
 
 def unused_options(

@@ -10,10 +10,9 @@ import {
   ColorManagement,
   DataTexture,
   DoubleSide,
-  LineBasicMaterial,
-  LineSegments,
   LinearSRGBColorSpace,
   Matrix3,
+  Matrix4,
   Mesh,
   PerspectiveCamera,
   Points,
@@ -24,6 +23,8 @@ import {
   WebGLRenderer,
 } from "three";
 import { TrackballControls } from "three/examples/jsm/controls/TrackballControls.js";
+import { Cameras, standIn } from "./cameras.js";
+import { Tools } from "./tools.js";
 
 // Colours are those of the page's legend all the way to the screen: no conversion on the way in,
 // none on the way out.
@@ -39,6 +40,8 @@ const LEGEND_STOPS = 33; // of a bar; between them a colour map is straight to 1
 const VERTEX = `
 attribute float value;
 uniform float pointSize;
+uniform mat4 boxFrame;
+varying vec3 vInBox;
 varying float vValue;
 varying vec3 vNormal;
 varying vec3 vWorldNormal;
@@ -49,6 +52,7 @@ void main() {
   vWorldNormal = normal;
   vNormal = mat3(viewMatrix) * normal;
   vEye = inCamera.xyz;
+  vInBox = (boxFrame * modelMatrix * vec4(position, 1.0)).xyz;
   gl_Position = projectionMatrix * inCamera;
   gl_PointSize = max(1.5, pointSize / -inCamera.z);
 }`;
@@ -59,6 +63,11 @@ uniform int mode;
 uniform float shading;
 uniform bool isPoint;
 uniform mat3 basis;
+uniform bool boxed;
+uniform vec3 boxLow;
+uniform vec3 boxHigh;
+uniform vec3 ground;
+varying vec3 vInBox;
 varying float vValue;
 varying vec3 vNormal;
 varying vec3 vWorldNormal;
@@ -70,7 +79,9 @@ void main() {
     : texture2D(palette, vec2((vValue * 255.0 + 0.5) / 256.0, 0.5)).rgb;
   float size = length(vNormal);
   float facing = size > 0.1 ? abs(dot(vNormal / size, normalize(vEye))) : 0.8;
-  gl_FragColor = vec4(color * mix(1.0, 0.3 + 0.7 * facing, shading), 1.0);
+  color *= mix(1.0, 0.3 + 0.7 * facing, shading);
+  bool outside = boxed && (any(lessThan(vInBox, boxLow)) || any(greaterThan(vInBox, boxHigh)));
+  gl_FragColor = vec4(outside ? mix(ground, color, 0.15) : color, 1.0);
 }`;
 
 async function unpack(text) {
@@ -79,10 +90,13 @@ async function unpack(text) {
   return new Response(stream).arrayBuffer();
 }
 
-function paletteTexture(colors) {
+// With a colour of what is unknown the last place is its, and the others are the scale's.
+function paletteTexture(colors, unknown) {
   const bytes = new Uint8Array(256 * 4);
+  const places = unknown ? 255 : 256;
   for (let i = 0; i < 256; i++) {
-    const color = new Color(colors[Math.min(colors.length - 1, Math.floor((i * colors.length) / 256))]);
+    const place = Math.min(colors.length - 1, Math.floor((i * colors.length) / places));
+    const color = new Color(i < places ? colors[place] : unknown);
     const rounded = [color.r, color.g, color.b].map((share) => Math.round(255 * share));
     bytes.set([...rounded, 255], 4 * i);
   }
@@ -115,6 +129,11 @@ async function buildLayer(layer, scene) {
       shading: { value: 0 },
       isPoint: { value: !layer.triangles },
       basis: { value: new Matrix3().set(...scene.basis) },
+      boxed: { value: false },
+      boxFrame: { value: new Matrix4() },
+      boxLow: { value: new Vector3() },
+      boxHigh: { value: new Vector3() },
+      ground: { value: new Color() },
     },
   });
   const object = layer.triangles ? new Mesh(geometry, material) : new Points(geometry, material);
@@ -143,7 +162,28 @@ class Pane {
     this.controls.addEventListener("change", () => view.draw());
     this.canvas.addEventListener("pointermove", () => this.follow());
     this.canvas.addEventListener("wheel", () => this.follow(), { passive: true });
-    this.canvas.addEventListener("keydown", (event) => view.key(event));
+    this.canvas.addEventListener("keydown", (event) => view.key(event, this));
+    view.tools.bind(this);
+  }
+
+  // The rectangle that is being dragged, between two places of the canvas; none without.
+  band(first, last) {
+    const band = this.element.querySelector(".band");
+    band.hidden = !first;
+    if (!first) return;
+    band.style.left = `${Math.min(first[0], last[0])}px`;
+    band.style.top = `${Math.min(first[1], last[1])}px`;
+    band.style.width = `${Math.abs(last[0] - first[0])}px`;
+    band.style.height = `${Math.abs(last[1] - first[1])}px`;
+  }
+
+  compose() {
+    this.scene.clear();
+    if (this.object) this.scene.add(this.object);
+    this.view.cameras.drawn().forEach((lines) => this.scene.add(lines));
+    const lines = this.view.tools.lines();
+    if (lines) this.scene.add(lines);
+    this.paint();
   }
 
   follow() {
@@ -157,15 +197,12 @@ class Pane {
     this.select.value = String(index);
     const built = await this.view.layer(index);
     if (this.index !== index) return;
-    this.scene.clear();
     // Each pane has its own copy of the object, of the same arrays.
     this.object = built.object.clone();
     this.object.geometry = built.object.geometry.clone();
     this.object.material = built.object.material.clone();
     this.built = built;
-    this.scene.add(this.object);
-    if (this.view.frusta.visible) this.scene.add(this.view.frusta.clone());
-    this.paint();
+    this.compose();
     this.element.dataset.layer = built.layer.label;
     this.element.dataset.points = String(built.layer.count);
     this.view.draw();
@@ -182,6 +219,13 @@ class Pane {
     uniforms.mode.value = name === "normal" ? MODES.normal : has && channel.colors ? MODES.palette : MODES.grey;
     uniforms.palette.value = has && channel.colors ? this.view.palette(name) : this.view.blank;
     uniforms.shading.value = this.view.shaded ? SHADING : 0;
+    const { box } = this.view.tools;
+    uniforms.boxed.value = Boolean(box);
+    if (box) {
+      uniforms.boxFrame.value.copy(this.view.tools.matrix());
+      uniforms.boxLow.value.fromArray(box.low);
+      uniforms.boxHigh.value.fromArray(box.high);
+    }
     this.element.querySelector(".without").hidden = has;
   }
 
@@ -198,7 +242,10 @@ class Pane {
     camera.aspect = width / height;
     // The narrower side spans the field of view, so that a tall pane shows the whole part too.
     camera.fov = FIELD_DEG;
-    if (camera.aspect < 1) {
+    if (this.view.through) {
+      const [right, up] = this.view.through.half_field;
+      camera.fov = (360 / Math.PI) * Math.atan(Math.max(up, right / camera.aspect));
+    } else if (camera.aspect < 1) {
       const half = Math.tan((0.5 * FIELD_DEG * Math.PI) / 180) / camera.aspect;
       camera.fov = (360 / Math.PI) * Math.atan(half);
     }
@@ -208,7 +255,9 @@ class Pane {
       this.object.material.uniforms.pointSize.value =
         3 * this.built.layer.spacing * focal * this.view.pointScale;
     }
-    this.renderer.setClearColor(getComputedStyle(this.element).getPropertyValue("--canvas").trim() || "#ffffff", 1);
+    const ground = getComputedStyle(this.element).getPropertyValue("--canvas").trim() || "#ffffff";
+    if (this.object) this.object.material.uniforms.ground.value.set(ground);
+    this.renderer.setClearColor(ground, 1);
     this.renderer.render(this.scene, camera);
     this.element.dataset.frames = String(1 + Number(this.element.dataset.frames || 0));
   }
@@ -221,18 +270,13 @@ class View {
     this.built = new Map();
     this.textures = new Map();
     this.blank = paletteTexture(["#888888"]);
-    this.color = "normal_error" in this.description.channels ? "normal_error" : "normal";
+    this.color = this.description.color;
     this.pointScale = 1;
     this.shaded = false;
     this.camera = new PerspectiveCamera(FIELD_DEG, 1, 0.01 * this.description.radius, 100 * this.description.radius);
-    this.frusta = new LineSegments(
-      new BufferGeometry().setAttribute(
-        "position",
-        new BufferAttribute(new Float32Array(this.description.frusta), 3),
-      ),
-      new LineBasicMaterial({ color: 0x0072b2 }),
-    );
-    this.frusta.visible = false;
+    this.through = null;
+    this.cameras = new Cameras(this);
+    this.tools = new Tools(this);
     this.reset();
     this.panes = [...root.querySelectorAll(".pane")].map((element) => new Pane(element, this));
     this.reset(); // the controls looked at the origin when they were made
@@ -245,18 +289,45 @@ class View {
   }
 
   palette(name) {
-    if (!this.textures.has(name)) this.textures.set(name, paletteTexture(this.description.channels[name].colors));
+    if (!this.textures.has(name)) this.textures.set(name, paletteTexture(this.description.channels[name].colors, this.description.channels[name].unknown));
     return this.textures.get(name);
   }
 
   reset() {
+    this.through = null;
     this.camera.position.fromArray(this.description.eye);
     this.camera.up.fromArray(this.description.up);
     this.camera.lookAt(new Vector3().fromArray(this.description.target));
     (this.panes || []).forEach((pane) => pane.controls.target.fromArray(this.description.target));
   }
 
-  key(event) {
+  compose() {
+    (this.panes || []).forEach((pane) => pane.compose());
+    if (this.panes) this.draw();
+  }
+
+  clickCamera(pane, x, y) {
+    return this.cameras.click(pane, x, y);
+  }
+
+  lookThrough(camera) {
+    this.through = camera;
+    const target = standIn(this, camera);
+    this.camera.lookAt(target);
+    this.panes.forEach((pane) => pane.controls.target.copy(target));
+    this.draw();
+  }
+
+  key(event, pane) {
+    if (event.key === "Enter" && this.tools.mode) {
+      this.tools.click(pane, 0.5 * pane.canvas.clientWidth, 0.5 * pane.canvas.clientHeight);
+      event.preventDefault();
+      return;
+    }
+    if (event.key === "Escape" && this.tools.mode) {
+      this.tools.clear();
+      return;
+    }
     const turns = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0] };
     const target = this.panes[0].controls.target;
     const offset = this.camera.position.clone().sub(target);
@@ -286,15 +357,6 @@ class View {
       at("color").add(new Option(channel.label, name));
     }
     at("color").addEventListener("change", (event) => this.recolor(event.target.value));
-    at("frusta").addEventListener("change", (event) => {
-      this.frusta.visible = event.target.checked;
-      this.panes.forEach((pane) => {
-        pane.scene.clear();
-        if (pane.object) pane.scene.add(pane.object);
-        if (this.frusta.visible) pane.scene.add(this.frusta.clone());
-      });
-      this.draw();
-    });
     at("two").addEventListener("change", (event) => {
       this.panes[1].element.hidden = !event.target.checked;
       this.draw();
@@ -330,7 +392,7 @@ class View {
         legend.append(item);
       });
     } else if (channel.range) {
-      const [low, high] = channel.range.map((value) => `${Number(value.toPrecision(3))} ${channel.unit}`);
+      const [low, high] = channel.range.map((value) => `${Number(value.toPrecision(3))} ${channel.unit}`.trim());
       const bar = document.createElement("span");
       bar.className = "bar";
       const colors = channel.colors || ["#000000", "#ffffff"];
@@ -338,7 +400,15 @@ class View {
       const stops = Array.from({ length: num }, (_, i) => colors[Math.round((i * (colors.length - 1)) / (num - 1))]);
       bar.style.background = `linear-gradient(90deg, ${stops.join(",")})`;
       legend.append(low, bar, high);
-    } else legend.append(channel.note || "");
+      if (channel.unknown) {
+        const none = document.createElement("span");
+        none.textContent = "no value";
+        none.style.setProperty("--swatch", channel.unknown);
+        none.className = "class";
+        legend.append(none);
+      }
+    }
+    this.root.querySelector(".note").textContent = channel.note || "";
     this.panes.forEach((pane) => pane.paint());
     this.draw();
   }

@@ -1,0 +1,59 @@
+"""Colours of a mesh's vertices as the albedo of a plastic, which asks a texture for its mean."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from polmvs.simulation.renderer_import import Renderer
+
+ATTRIBUTE = "vertex_color"  # of Mitsuba's mesh
+NAME = "vertex_albedo"
+
+_registered: set[str] = set()  # variants of the renderer
+
+
+def vertex_albedo(renderer: Renderer, mean: float) -> dict[str, Any]:
+    """Description of a texture for Mitsuba: a mesh's attribute, which has no mean of its own.
+
+    Parameters
+    ----------
+    mean : of the albedo; from it a plastic tells how often to sample its gloss, and nothing else.
+    """
+    if renderer.variant not in _registered:
+        _register(renderer)
+        _registered.add(renderer.variant)
+    return {"type": NAME, "mean": mean}
+
+
+def _register(renderer: Renderer) -> None:
+    """Make the texture known to the variant."""
+    mi = renderer.mi
+
+    class VertexAlbedo(mi.Texture):  # type: ignore[misc, name-defined]
+        """What Mitsuba's ``mesh_attribute`` is, with a mean."""
+
+        def __init__(self, properties: Any) -> None:
+            mi.Texture.__init__(self, properties)
+            self.attribute = mi.load_dict({"type": "mesh_attribute", "name": ATTRIBUTE})
+            self.share = float(properties["mean"])
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            """Spectrum at a place."""
+            return self.attribute.eval(si, active)
+
+        def mean(self) -> Any:
+            """Of the mesh."""
+            return mi.Float(self.share)
+
+        def is_spatially_varying(self) -> bool:
+            """It is."""
+            return True
+
+        def traverse(self, callback: Any) -> None:
+            """There is nothing to optimise."""
+
+        def to_string(self) -> str:
+            """For Mitsuba's messages."""
+            return NAME
+
+    mi.register_texture(NAME, VertexAlbedo)
