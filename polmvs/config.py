@@ -480,7 +480,7 @@ class SfmOptions(OptionGroup, group="sfm"):
     )
     feature_masks: Path | None = option(
         None,
-        "folder of masks, named as those of `region.mask`: SfM takes features inside them alone; "
+        "folder of masks, NAME.png of each image: SfM takes features inside them alone; "
         "for a part that turns before a background, where `sfm.static_background` does not help",
     )
     without: tuple[str, ...] = option(
@@ -643,7 +643,7 @@ class CropOptions(OptionGroup, group="crop"):
     )
     box_marker: int | None = option(
         None,
-        "id of a marker of `reference.aruco` in whose frame the box is: origin in its middle, x to "
+        "id of an ArUco marker in whose frame the box is: origin in its middle, x to "
         "its right, y to its top, z out of it, metres",
         least=0,
         metavar="ID",

@@ -163,7 +163,7 @@ def test_storage_that_workers_do_not_see(address, tmp_path, monkeypatch) -> None
 
 def test_without_dask(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(OptionError, match=r"`run\.scheduler` needs .*polmvs\[dask\]"):
+    with pytest.raises(OptionError, match=r"`run\.scheduler` needs .*'\.\[dask\]'"):
         Cluster("tcp://127.0.0.1:9")
 
 

@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
@@ -78,6 +78,11 @@ class _LogFileHandler(logging.FileHandler):
 
     def handleError(self, record: logging.LogRecord) -> None:
         """Do nothing."""
+
+    def close(self) -> None:
+        """Close the file; what is left of the log may find no room any more."""
+        with suppress(OSError):
+            super().close()
 
 
 class Terminal:

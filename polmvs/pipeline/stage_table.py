@@ -44,6 +44,7 @@ from polmvs.scene import SparseModel
 SFM, NORMALS, DENSIFY, FINISH, COMPARE = "sfm", "normals", "densify", "finish", "compare"
 WITHOUT = "sfm.without"
 TILT_AWARE = "normals.tilt_aware_weights"
+CROPPING = ("crop", "reference.aruco")
 
 
 @dataclass(kw_only=True)
@@ -429,7 +430,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
                 *(HERE.maps(model), track_normals, HERE.seeds),
             ),
             writes=(cloud, views),
-            decides=(TILT_AWARE, "region.mask", "region.light", "propagation", "fusion", "crop"),
+            decides=(TILT_AWARE, "region.mask", "region.light", "propagation", "fusion", *CROPPING),
             work=partial(_densify, model),
             call=partial(_densify_apart, model),
             result=densify.DensifyResult,

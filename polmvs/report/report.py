@@ -665,7 +665,7 @@ def _warnings(given: _Given) -> tuple[str, ...]:
     if given.deviation is not None and given.deviation.is_stale:
         warnings.append(
             "the deviation from the reference is of an earlier cloud of this run and is not shown; "
-            "run 'polmvs deviation RUN REFERENCE --report' again."
+            "'polmvs deviation' makes it anew."
         )
     return tuple(warnings)
 

@@ -34,9 +34,10 @@ def test_report_makes_the_page_again_and_escapes_names(cli, run_copy: Path) -> N
 def test_report_says_what_came_out(demo_run: Path) -> None:
     text = (demo_run / "report.html").read_text()
     metrics = json.loads((demo_run / "metrics.json").read_text())
-    score = metrics["models"]["ppa"]["truth"]["cloud"]["f_score"][0]
-    angle = metrics["models"]["ppa"]["truth"]["cloud"]["normal_mean_deg"]
-    assert f"PPA has an F-score of {100 * score:.1f} % at 1 mm and normals {angle:.1f} deg" in text
+    cloud = metrics["models"]["ppa"]["truth"]["cloud"]
+    near, covered = (f"{100 * cloud[name][0]:.1f} %" for name in ("accuracy", "completeness"))
+    assert f"{near} of the points lie within 1 mm of the true surface" in text
+    assert f"cover {covered} of it" in text
     for name in ("000.png", "009.png"):
         assert f"<summary>{name}</summary>" in text
 
@@ -49,7 +50,7 @@ def test_report_without_the_capture_and_the_truth(cli, run_copy: Path) -> None:
     (run_copy / "run.json").write_text(json.dumps(record))
     status, _, err = cli("report", run_copy)
     assert status == 0
-    assert "no raw polarisation" in err
+    assert "no raw polarization" in err
     assert "no errors against the truth" in err
     text = (run_copy / "report.html").read_text()
     assert "residual phase" in text

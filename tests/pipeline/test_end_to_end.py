@@ -63,7 +63,7 @@ def test_run_record(demo_run: Path) -> None:
     assert [stage["name"] for stage in record["stages"]] == STAGES
     for stage in record["stages"]:
         assert stage["seconds"] > 0
-        assert 50 < stage["peak_rss_mb"] < 2500
+        assert 50 < stage["peak_rss_mb"] < 4000  # two surfaces side by side
     # The surfaces are made side by side.
     one_by_one = [s["seconds"] for s in record["stages"] if not s["name"].startswith("densify")]
     assert record["wall_s"] >= 0.99 * sum(one_by_one)
@@ -224,13 +224,13 @@ def test_run_killed_in_sfm_finds_the_same_model(
 def test_killed_comparison_goes_on_to_the_same_result(demo_run: Path, tmp_path: Path, cli) -> None:
     """While it densifies with the last model; the finished stages stay."""
     out = tmp_path / "out"
-    copy_until(demo_run, out, "densify_ppa")
-    for name in ("tilted.ply", "metrics.json"):
+    copy_until(demo_run, out, "densify_textbook-opa")
+    for name in ("textbook-ppa.ply", "metrics.json"):
         (out / name).unlink()
     process = start(out, "--resume")
-    wait_until(lambda: unfinished(out, "views_tilted"), process)
+    wait_until(lambda: unfinished(out, "views_textbook-ppa"), process)
     kill(process)
-    assert not (out / "tilted.ply").exists()
+    assert not (out / "textbook-ppa.ply").exists()
     assert stages_of(out) == STAGES[:-2]
 
     status, _, err = cli("demo", out, "--resume", "--workers", 2)

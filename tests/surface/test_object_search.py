@@ -89,7 +89,8 @@ def capture(texture: np.ndarray, *, ball: float = 0.5, lamp: bool = False) -> li
                 photograph(view, texture, ball=ball, lamp=lamp),
                 nothing,
                 np.zeros(size, np.uint8),
-                np.zeros((*size, 4), np.float32),
+                # Too little polarization for a region, and ten times its noise.
+                np.full((*size, 4), (0.02, 0.0, 1e-4, 0.0), np.float32),
             )
         )
     return maps
@@ -139,6 +140,10 @@ def test_what_polarization_shows_is_left_to_it(white):
         for one, hiding in zip(white, found, strict=True)
     ]
     assert hidden_plane(polarized, tracks) is None
+    unpolarized = [one.changed(polarization=0.02 * one.polarization) for one in white]
+    for one in unpolarized:
+        one.polarization[..., 2] = 1e-4
+    assert hidden_plane(unpolarized, tracks) is None
 
 
 def test_the_outline_found_is_the_silhouette(white):

@@ -34,6 +34,7 @@ from polmvs.polarization.phase_map import (
     as_tilted,
     build_phase_map,
     open_phase_map,
+    smoothed_polarization,
     store_phase_map,
     turned,
 )
@@ -45,6 +46,8 @@ from polmvs.surface.visual_hull import supporting_plane
 logger = logging.getLogger(__name__)
 
 POLARIZED_SHARE = 0.99  # of an object within its outline: its polarized region is whole then
+MIN_DOLP_SIGMAS = 3.0  # of the median pixel of an object; white plastic in a studio has 12
+DOLP_WINDOW_PX = 3.0
 MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are held together
 
 
@@ -240,7 +243,23 @@ def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] 
     ]
     share = float(np.median(shares)) if shares else 0.0
     logger.info("%.1f %% of what hides its support is polarized.", 100 * share)
-    return found if share < POLARIZED_SHARE else None
+    if share >= POLARIZED_SHARE:
+        return None
+    # Without any phase its outline alone would be taken for a surface.
+    strengths = [
+        _dolp_in_sigmas(one, hiding.inner) for one, hiding in zip(maps, found, strict=True)
+    ]
+    return found if float(np.median(strengths)) > MIN_DOLP_SIGMAS else None
+
+
+def _dolp_in_sigmas(phase_map: PhaseMap, where: NDArray[np.bool_]) -> float:
+    """Median DoLP of some pixels over its standard deviation; 0 of none."""
+    smoothed = smoothed_polarization(np.asarray(phase_map.polarization), DOLP_WINDOW_PX)[where]
+    known = smoothed[..., 2] > 0
+    if not known.any():
+        return 0.0
+    dolp = np.hypot(smoothed[..., 0], smoothed[..., 1])[known]
+    return float(np.median(dolp / np.sqrt(smoothed[..., 2][known])))
 
 
 def _build_map(
