@@ -13,6 +13,7 @@ import pytest
 
 from polmvs.cli import pages
 from polmvs.colmap.models import read_model
+from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError
 from polmvs.io.clouds import Mesh, read_cloud, write_mesh
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
@@ -61,7 +62,7 @@ def run(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "run"
     shutil.copytree(demo_run, folder)
     views = RunFolder(folder).views("ppa")
-    for model in ("opa", "ppa", "tilted"):
+    for model in AngleModel:
         for path in RunFolder(folder).views(model).glob("surface*.ply"):
             path.unlink()
     for number, name in enumerate(
