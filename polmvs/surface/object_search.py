@@ -110,7 +110,7 @@ def find_object(
 
     Returns
     -------
-    None where the plane shows too little texture to tell what hides it.
+    None where the plane shows too little texture to tell what hides it, or its light moves.
     """
     tol = tolerances or SearchTolerances()
     near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
@@ -149,6 +149,9 @@ def find_object(
         masks = [left.mask(view) for view in small]
     plates = _plates(small, masks, tol)
     noise = _residual(small, plates, masks)
+    changes = np.concatenate([plate.changes for plate in plates])
+    if not len(changes) or float(np.median(changes)) > noise:
+        return None  # the lamp moves with the camera: outlines would be pixels wide
     return [
         _outlined(view, mask, plate, noise, tol)
         for view, mask, plate in zip(small, masks, plates, strict=True)
@@ -381,10 +384,12 @@ class _Plate:
     ----------
     log : (h, w) float32, logarithm of the intensity; NaN where no two other views see the plane.
     deviation : (h, w) float32, of the views that see it.
+    changes : (n,), by how much the light on the plane varies over the image from view to view.
     """
 
     log: Image
     deviation: Image
+    changes: Array
 
 
 def _others(views: Sequence[_Working], index: int, tol: SearchTolerances) -> NDArray[np.int64]:
@@ -407,7 +412,7 @@ def _plates(
     beside = [mask.astype(np.float32) for mask in free]
     plates = []
     for index, view in enumerate(views):
-        shown = []
+        shown, changes = [], []
         for other in _others(views, index, tol):
             xy = views[other].project(view.on_plane)
             seen = views[other].sees(xy) & (sample_image(beside[other], xy) >= 1)
@@ -416,9 +421,12 @@ def _plates(
             log = sample_image(views[other].log, xy)
             change = _local_mean(view.log - log, both, tol.lighting_px)
             shown.append(np.where(seen, log + change, np.nan))
+            varying = change[both]
+            changes.append(1.4826 * np.median(np.abs(varying - np.median(varying))))
         stack = np.array(shown, np.float32).reshape(-1, *view.log.shape)
         log = _median(stack)
-        plates.append(_Plate(log, np.nan_to_num(1.4826 * _median(np.abs(stack - log)))))
+        deviation = np.nan_to_num(1.4826 * _median(np.abs(stack - log)))
+        plates.append(_Plate(log, deviation, np.array(changes)))
     return plates
 
 

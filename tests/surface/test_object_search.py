@@ -106,9 +106,9 @@ def white() -> list[PhaseMap]:
     return capture(printed())
 
 
-@pytest.mark.parametrize(("ball", "lamp"), [(0.5, False), (0.05, False), (0.5, True)])
-def test_a_ball_is_found_to_a_fraction_of_a_pixel(white, ball, lamp):
-    maps = white if (ball, lamp) == (0.5, False) else capture(printed(), ball=ball, lamp=lamp)
+@pytest.mark.parametrize("ball", [0.5, 0.05])
+def test_a_ball_is_found_to_a_fraction_of_a_pixel(white, ball):
+    maps = white if ball == 0.5 else capture(printed(), ball=ball)
     found = find_object(maps, TABLE, table_points())
     assert found is not None
     overlaps, places = [], []
@@ -123,12 +123,15 @@ def test_a_ball_is_found_to_a_fraction_of_a_pixel(white, ball, lamp):
         places.append((truth - own + hiding.outline_shift)[border])
     # The hull of ten views has a tip above the ball where two views alone bound it: 2 to 9 %.
     assert np.median(overlaps) > 0.9
-    # Measured: 0.35 to 0.41 px, 0.8 px where the plane's brightness moves with the lamp.
-    assert np.median(np.abs(np.concatenate(places))) < (1.0 if lamp else 0.6)
+    assert np.median(np.abs(np.concatenate(places))) < 0.6  # measured: 0.35 to 0.41 px
 
 
 def test_a_plane_without_texture_tells_nothing():
     assert find_object(capture(np.full((400, 400), 0.5, np.float32)), TABLE, table_points()) is None
+
+
+def test_a_lamp_that_moves_with_the_camera_tells_nothing():
+    assert find_object(capture(printed(), lamp=True), TABLE, table_points()) is None
 
 
 def test_what_polarization_shows_is_left_to_it(white):
