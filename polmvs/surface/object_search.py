@@ -9,7 +9,6 @@ prediction to the object's brightness, as in matting against a known background.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,14 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from polmvs.camera import sample_image
+from polmvs.camera import pixel_centers, sample_image
 from polmvs.geometry import lengths
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
 from polmvs.surface.surface_view import signed_distance_px
 from polmvs.surface.visual_hull import Plane
-
-logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -42,7 +39,7 @@ class SearchTolerances:
 
     Attributes
     ----------
-    working_px : longest side of the images that are searched; the outline is measured in full ones.
+    working_px : longest side of the images in which the object and its outline are searched.
     window_px : of the correlation with other views, working pixels.
     num_near : other views that a view is correlated with.
     num_others : other views that predict the plane, at most.
@@ -206,8 +203,7 @@ def _working(phase_map: PhaseMap, plane: Plane, longest_px: float) -> _Working:
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1 else image
     lowest = 1e-3 * max(float(np.percentile(small, 99)), 1e-12)
     log = np.log(np.maximum(cv2.GaussianBlur(small, (0, 0), 0.5), lowest)).astype(np.float32)
-    xy = np.stack(np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5), axis=-1)
-    rays = view.rays_in_world(xy * factor)
+    rays = view.rays_in_world(pixel_centers(*size) * factor)
     center = view.center_in_world
     with np.errstate(divide="ignore", invalid="ignore"):
         ranges = (plane.offset - center @ plane.normal) / (rays @ plane.normal)
@@ -533,8 +529,6 @@ def _outlined(
     of_object[1, rows, columns] = weight * contrast**2
     total, most = (_blurred(part, tol.along_px)[rows, columns] for part in of_object)
     alpha = np.clip(total / np.maximum(most, 1e-9), 0, 1)
-    shift = np.zeros(mask.shape, np.float32)
-    certainty = np.zeros(mask.shape, np.float32)
     # One deviation of contrast on the average tells an outline. Beyond it the plane shows; where
     # something else does, it hides the outline.
     told = np.minimum(most.mean(axis=1) * 2 * np.pi * tol.along_px, 1)
