@@ -19,13 +19,13 @@ import numpy as np
 
 from polmvs.camera import pixel_centers
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel
 from polmvs.io.clouds import read_mesh
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.pipeline.run_folder import SURFACE_MESH, RunFolder
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.stokes import axial_difference
 from polmvs.report.pictures import ERROR, angle_picture, gray_picture, scalar_picture
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh

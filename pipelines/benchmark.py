@@ -41,7 +41,6 @@ from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
 from polmvs.colmap.models import write_model
 from polmvs.config import (
-    AngleModel,
     EvaluationOptions,
     ExportOptions,
     OptionGroup,
@@ -64,6 +63,7 @@ from polmvs.pipeline.stages.images import write_images
 from polmvs.pipeline.stages.maps import build_maps
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
 from polmvs.polarization.capture import Capture, open_capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.synthetic.printed_capture import Part, printed_model, scene_of, write_printed_capture
 
 Array = NDArray[np.float64]

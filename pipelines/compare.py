@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 
-from polmvs.cli import EMPTY_STATUS
 from polmvs.cli.call import Call
 from polmvs.cli.commands import EXECUTION, TO_CLOUD
+from polmvs.cli.exit_status import EMPTY_STATUS
 from polmvs.cli.flags import Command
 from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal

@@ -23,12 +23,18 @@ from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.flags import Command
 from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
-from polmvs.config import AngleModel, CaptureOptions, OptionGroup, RegionOptions, option
+from polmvs.config import (
+    CaptureOptions,
+    OptionGroup,
+    RegionOptions,
+    option,
+)
 from polmvs.evaluation.tables import format_table
 from polmvs.geometry import unit
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.polarization.angle_models import correct_stokes, phase_from_normal
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.mosaic import ANGLES_DEG, split_mosaic, split_mosaic_full
 from polmvs.polarization.stokes import Stokes, axial_difference, stokes_from_intensities
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from polmvs.cli import EMPTY_STATUS
 from polmvs.cli.call import Call
 from polmvs.cli.commands import EXECUTION, TO_CLOUD, JobArguments, ModelChoice
+from polmvs.cli.exit_status import EMPTY_STATUS
 from polmvs.cli.flags import Command
 from polmvs.cli.jobs import job_of
 from polmvs.cli.running import run

@@ -23,7 +23,6 @@ from polmvs.cli.flags import Command
 from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
 from polmvs.config import (
-    AngleModel,
     EvaluationOptions,
     OptionGroup,
     Options,
@@ -34,6 +33,7 @@ from polmvs.io.clouds import Mesh, write_mesh
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.io.images import write_bytes
 from polmvs.io.intrinsics import Intrinsics, write_intrinsics
+from polmvs.polarization.kinds import AngleModel
 from polmvs.simulation.camera_model import pinhole_of
 from polmvs.simulation.capture import simulate_capture
 from polmvs.simulation.options import (
@@ -47,7 +47,7 @@ from polmvs.simulation.options import (
     Simulation,
     SimulationRun,
 )
-from polmvs.simulation.trial import Trial, measure, trial_table
+from polmvs.simulation.trial import TrialResult, measure, trial_table
 
 SIDES_M = (0.3, 0.4, 0.012)
 TURN_DEG = 12.0
@@ -90,7 +90,7 @@ def _run(call: Call, terminal: Terminal) -> int:
             )
             captures.append((f"simulated, seed {seed}", made.folder))
             on_progress(1)
-    trials: list[Trial] = []
+    trials: list[TrialResult] = []
     with terminal.stage("measure", len(captures)) as on_progress:
         for name, capture in captures:
             options = Options(
@@ -105,7 +105,7 @@ def _run(call: Call, terminal: Terminal) -> int:
                 models=MODELS,
             )
             for model, trial in zip(MODELS, found, strict=True):
-                trials.append(Trial(**{**vars(trial), "name": f"{name}, {model.upper()}"}))
+                trials.append(TrialResult(**{**vars(trial), "name": f"{name}, {model.upper()}"}))
             write_bytes(arguments.work / "table.md", (trial_table(trials) + "\n").encode())
             on_progress(1)
     terminal.show(trial_table(trials), trials)

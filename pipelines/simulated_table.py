@@ -40,7 +40,7 @@ from polmvs.simulation.options import (
     Simulation,
     SimulationRun,
 )
-from polmvs.simulation.trial import CAPTURE, RUN, Trial, measure, options_of, trial_table
+from polmvs.simulation.trial import CAPTURE, RUN, TrialResult, measure, options_of, trial_table
 
 LIGHTS = tuple(light for light in LightName if light is not LightName.FILE)
 TRIAL, TABLE = "trial.json", "table.md"
@@ -148,7 +148,7 @@ def _render(arguments: Arguments, rows: Sequence[Row], terminal: Terminal) -> in
     return failed
 
 
-def _measure(arguments: Arguments, rows: Sequence[Row], terminal: Terminal) -> list[Trial]:
+def _measure(arguments: Arguments, rows: Sequence[Row], terminal: Terminal) -> list[TrialResult]:
     """Trials of the captures that are there, in order."""
     there = [row for row in rows if row.folder(arguments.work).is_dir()]
     for row in rows:
@@ -165,19 +165,19 @@ def _measure(arguments: Arguments, rows: Sequence[Row], terminal: Terminal) -> l
     return trials
 
 
-def _trial(arguments: Arguments, row: Row) -> Trial:
+def _trial(arguments: Arguments, row: Row) -> TrialResult:
     """One row, from its file where it is finished."""
     folder = row.folder(arguments.work)
     stored = folder / TRIAL
     if stored.is_file() and not arguments.again:
-        return from_json(Trial, parse_json(read_text(stored)))
+        return from_json(TrialResult, parse_json(read_text(stored)))
     try:
         options = options_of(folder / CAPTURE, row.simulation.sensor)
         (trial,) = measure(
             row.name, folder / CAPTURE, folder / RUN, options, views=row.simulation.path.views
         )
     except PolmvsError as error:
-        trial = Trial(name=row.name, views=arguments.views, message=str(error)[:160])
+        trial = TrialResult(name=row.name, views=arguments.views, message=str(error)[:160])
     write_json(stored, trial)
     if not arguments.keep:
         shutil.rmtree(folder / RUN, ignore_errors=True)

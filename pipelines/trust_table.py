@@ -20,7 +20,7 @@ from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.flags import Command
 from polmvs.cli.running import run
 from polmvs.cli.terminal import Terminal
-from polmvs.config import AngleModel, OptionGroup, option
+from polmvs.config import OptionGroup, option
 from polmvs.errors import DataError
 from polmvs.evaluation.comparison import read_comparison
 from polmvs.evaluation.metrics import CloudMetrics
@@ -28,6 +28,7 @@ from polmvs.evaluation.tables import format_table
 from polmvs.io.images import write_bytes
 from polmvs.pipeline.jobs import judge
 from polmvs.pipeline.run_folder import RunFolder
+from polmvs.polarization.kinds import AngleModel
 
 MODEL = AngleModel.PPA
 RIGHT_DEG, WRONG_DEG = 2.0, 4.0

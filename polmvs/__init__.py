@@ -60,8 +60,9 @@ if TYPE_CHECKING:
         track_normals,
     )
     from polmvs.camera import PinholeCamera
-    from polmvs.config import AngleModel, Options
+    from polmvs.config import Options
     from polmvs.errors import DataError, OptionError, PolmvsError
+    from polmvs.polarization.kinds import AngleModel
 
 __all__ = [
     "AngleModel",
@@ -87,7 +88,7 @@ __all__ = [
 
 # Where the names are that are not in polmvs.api; each is imported when it is first used.
 _ELSEWHERE = {
-    "AngleModel": "polmvs.config",
+    "AngleModel": "polmvs.polarization.kinds",
     "DataError": "polmvs.errors",
     "OptionError": "polmvs.errors",
     "Options": "polmvs.config",

@@ -22,11 +22,8 @@ from numpy.typing import NDArray
 
 from polmvs.camera import Camera, PinholeCamera
 from polmvs.config import (
-    COMPARED_MODELS,
-    AngleModel,
     CaptureOptions,
     Estimator,
-    Light,
     OptionGroup,
     Options,
     PlaneOptions,
@@ -40,6 +37,7 @@ from polmvs.io.array_captures import Frame, Frames, are_frames, write_frames
 from polmvs.io.clouds import Cloud, Mesh, mesh_to_open3d, read_cloud, read_mesh, to_open3d
 from polmvs.io.folders import new_folder
 from polmvs.parallel import OnProgress, no_progress
+from polmvs.polarization.kinds import COMPARED_MODELS, AngleModel, Light
 from polmvs.scene import find_name
 from polmvs.simulation.options import LightName, MaterialName, Simulation, SimulationRun
 

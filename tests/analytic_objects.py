@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.config import AngleModel
 from polmvs.geometry import RigidTransform
 from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import Region
 from polmvs.scene import View

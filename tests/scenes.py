@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import Light
+from polmvs.polarization.kinds import Light
 from polmvs.polarization.phase_map import PhaseMap, build_phase_map
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes

@@ -9,9 +9,9 @@ import pytest
 from scenes import CAMERA
 
 from polmvs.camera import PinholeCamera, pixel_centers, sample_image, xy_from_opencv, xy_to_opencv
-from polmvs.config import AngleModel, Light
 from polmvs.geometry import RigidTransform, align_points
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.scene import View
 from polmvs.synthetic.captures import look_at, render_view
 from polmvs.synthetic.surfaces import Plane

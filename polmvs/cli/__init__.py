@@ -7,14 +7,9 @@ import sys
 from collections.abc import Sequence
 from types import FrameType
 
-__all__ = ["EMPTY_STATUS", "INTERRUPTED", "OUT_OF_TOLERANCE", "entry_point", "interrupts", "main"]
+from polmvs.cli.exit_status import INTERRUPTED, interrupts
 
-# Exit statuses beside those of errors.
-EMPTY_STATUS = 3  # the run came to its end, and has no points
-OUT_OF_TOLERANCE = 4  # the part deviates from its reference by more than is allowed
-INTERRUPTED = 130  # as shells report a program ended by Ctrl-C
-
-interrupts: list[int] = []  # signals that asked this process to end
+__all__ = ["entry_point", "main"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

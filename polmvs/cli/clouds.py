@@ -5,8 +5,7 @@ from __future__ import annotations
 from polmvs.cli.call import Call, require_new
 from polmvs.cli.commands import EvaluateArguments, MeshArguments
 from polmvs.cli.terminal import Terminal
-from polmvs.evaluation.comparison import evaluate_file
-from polmvs.evaluation.tables import evaluation_text
+from polmvs.evaluation.comparison import evaluate_file, evaluation_text
 from polmvs.io.clouds import read_cloud
 from polmvs.io.mesh_files import mesh_format_of, write_mesh_file
 from polmvs.surface.poisson import poisson_mesh

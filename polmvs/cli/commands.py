@@ -12,8 +12,6 @@ from pathlib import Path
 from polmvs.cli.call import FileOptions, RecordingOptions, TerminalOptions
 from polmvs.cli.flags import Command
 from polmvs.config import (
-    COMPARED_MODELS,
-    AngleModel,
     CaptureOptions,
     CropOptions,
     EvaluationOptions,
@@ -33,6 +31,7 @@ from polmvs.config import (
     default_num_workers,
     option,
 )
+from polmvs.polarization.kinds import COMPARED_MODELS, AngleModel
 from polmvs.simulation.options import (
     LightingOptions,
     ObjectOptions,

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from polmvs.cli import OUT_OF_TOLERANCE
 from polmvs.cli.call import Call
 from polmvs.cli.commands import DeviationArguments
+from polmvs.cli.exit_status import OUT_OF_TOLERANCE
 from polmvs.cli.pages import make_report
 from polmvs.cli.terminal import Terminal
-from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError
 from polmvs.evaluation.deviation import Deviation, measure_deviation
 from polmvs.evaluation.registration import CloudReference, MeshReference, Reference
@@ -23,6 +22,7 @@ from polmvs.pipeline.export import part_of, surface_of
 from polmvs.pipeline.run_folder import RunFolder, replacing
 from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.poses import PosesResult
+from polmvs.polarization.kinds import AngleModel
 from polmvs.report.deviation_files import color_limit, write_deviation
 from polmvs.surface.mesh_geometry import TriangleMesh
 

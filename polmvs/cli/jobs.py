@@ -8,7 +8,6 @@ from typing import Any
 
 import polmvs
 from polmvs.camera import PinholeCamera
-from polmvs.cli import EMPTY_STATUS
 from polmvs.cli.call import Call, RecordingOptions
 from polmvs.cli.commands import (
     BatchArguments,
@@ -18,11 +17,17 @@ from polmvs.cli.commands import (
     ModelChoice,
     ReportChoice,
 )
+from polmvs.cli.exit_status import EMPTY_STATUS
 from polmvs.cli.flags import in_flags
 from polmvs.cli.terminal import Terminal
-from polmvs.config import AngleModel, EvaluationOptions, Options, RunOptions, SfmOptions
+from polmvs.config import (
+    EvaluationOptions,
+    Options,
+    RunOptions,
+    SfmOptions,
+)
 from polmvs.errors import PolmvsError, printable
-from polmvs.evaluation.tables import best_fit_lines
+from polmvs.evaluation.comparison import best_fit_lines
 from polmvs.evaluation.trust import Trust
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.pipeline import jobs as pipeline
@@ -37,6 +42,7 @@ from polmvs.pipeline.stages.mesh import MeshResult
 from polmvs.pipeline.stages.normals import NormalsResult
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
+from polmvs.polarization.kinds import AngleModel
 
 DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"
 

@@ -14,13 +14,13 @@ import numpy as np
 from polmvs.cli.call import Call, RecordingOptions, require_new
 from polmvs.cli.commands import FolderArguments, RenderArguments
 from polmvs.cli.terminal import Terminal
-from polmvs.config import AngleModel
 from polmvs.errors import DataError
 from polmvs.io.clouds import Cloud, Mesh, has_triangles, read_cloud, read_mesh, show_in_viewer
 from polmvs.io.images import write_png
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import load_record
 from polmvs.pipeline.stages.poses import PosesResult
+from polmvs.polarization.kinds import AngleModel
 from polmvs.report.recording import num_recorded_steps, require_rerun, write_recording
 from polmvs.report.rendering import Viewpoint, contact_sheet
 from polmvs.report.report import write_report

@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any
 
-from polmvs.cli import INTERRUPTED, interrupts
 from polmvs.cli.call import Call, TerminalOptions
+from polmvs.cli.exit_status import INTERRUPTED, interrupts
 from polmvs.cli.flags import Command, UsageError, in_flags, parse
 from polmvs.errors import OptionError, PolmvsError, final_name, printable
 

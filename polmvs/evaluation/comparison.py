@@ -10,12 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel
 from polmvs.errors import DataError
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
 from polmvs.evaluation.map_errors import MapErrors, map_errors
 from polmvs.evaluation.metrics import AngleStats, CloudMetrics
-from polmvs.evaluation.tables import best_fit_lines, comparison_rows, format_table
+from polmvs.evaluation.tables import (
+    cloud_rows,
+    format_table,
+    mean_and_median,
+    number,
+    rmse_and_median,
+)
 from polmvs.evaluation.truth_errors import (
     TrackNormalErrors,
     evaluate,
@@ -28,6 +33,7 @@ from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import from_json, parse_json
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import Capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.poses.alignment import Alignment
 from polmvs.scene import View, match_names
@@ -285,3 +291,94 @@ def _measure_all(
         )
         for model, one in estimates.items()
     }
+
+
+def best_fit_lines(comparison: Comparison) -> list[str]:
+    """Which of several models the capture's phases fit best, if there is anything to tell it by."""
+    best = comparison.best_fit
+    if best is None or len(comparison.models) < 2:
+        return []
+    residual = comparison.models[best].consistency.track_residual_median_deg
+    return ["", f"The phases fit {best.label} best: {number(residual)} deg at the seeds."]
+
+
+def comparison_rows(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the figures, a column for each model."""
+    models = comparison.models
+
+    def row(name: str, cell: Callable[[ModelFigures], str]) -> list[str]:
+        return [name, *map(cell, models.values())]
+
+    rows = [
+        row("points", lambda m: f"{m.consistency.num_points:,}"),
+        row("part of the region covered, %", lambda m: number(m.consistency.coverage, 100, 1)),
+        row(
+            "agreement of the views that see a point, %",
+            lambda m: number(m.consistency.agreement, 100, 1),
+        ),
+        row(
+            "phase residual over all views, RMSE / median, deg",
+            lambda m: rmse_and_median(m.consistency.phase_residual),
+        ),
+        row(
+            "phase residual of the seeds, median, deg",
+            lambda m: number(m.consistency.track_residual_median_deg),
+        ),
+    ]
+    truth = {model: figures.truth for model, figures in models.items() if figures.truth is not None}
+    if len(truth) == len(models):
+        rows += _truth_rows(truth, comparison.phase)
+    return ["", *[model.label for model in models]], rows
+
+
+def _truth_rows(
+    models: Mapping[AngleModel, TruthFigures], phase: PhaseFigures | None
+) -> list[list[str]]:
+    """Rows of the measures against the truth."""
+    rows = []
+    if phase is not None:
+        for what, errors in (("smoothed", phase.maps), ("single pixels", phase.pixels)):
+            cells = [rmse_and_median(errors.get(model.formula)) for model in models]
+            rows.append([f"phase error on the part, {what}, RMSE / median, deg", *cells])
+    figures = list(models.values())
+    rows.append(
+        [
+            "error of the sparse normals, mean / median, deg",
+            *[mean_and_median(f.tracks.errors if f.tracks else None) for f in figures],
+        ]
+    )
+    maps = [f.maps for f in figures]
+    rows += [
+        ["depth maps, RMSE, mm", *[number(m.depth_rmse_m if m else None, 1e3) for m in maps]],
+        [
+            "depth maps within 1 mm, %",
+            *[number(m.depth_within_1mm if m else None, 100, 1) for m in maps],
+        ],
+        [
+            "depths within one / two stated deviations, %",
+            *[_within_sigmas(m) if m else number(None) for m in maps],
+        ],
+        [
+            "normal maps, mean / median error, deg",
+            *[mean_and_median(m.normals if m else None) for m in maps],
+        ],
+    ]
+    for same in zip(*(cloud_rows(f.cloud) for f in figures), strict=True):
+        rows.append([same[0][0], *[row[1] for row in same]])
+    return rows
+
+
+def _within_sigmas(errors: MapErrors) -> str:
+    shares = (errors.within_one_sigma, errors.within_two_sigma)
+    return " / ".join(number(share, 100, 0) for share in shares)
+
+
+def evaluation_text(figures: TruthFigures) -> str:
+    """Table of one cloud against the truth, and how it was aligned."""
+    cloud, alignment = figures.cloud, figures.alignment
+    return (
+        format_table(["", "value"], cloud_rows(cloud))
+        + f"\n{cloud.num_points:,} points, {cloud.num_on_part:,} on "
+        f"the part. Aligned by {alignment.num_cameras} cameras, "
+        f"{alignment.rms_residual_mm:.2f} mm RMS."
+    )

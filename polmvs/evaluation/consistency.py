@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import depth_buffer, sample_image
-from polmvs.config import AngleModel
 from polmvs.evaluation.metrics import MIN_DOLP, AngleStats, axial_errors_deg
 from polmvs.geometry import unit
 from polmvs.io.clouds import Cloud
 from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind, View
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
-from polmvs.config import AngleModel, PropagationOptions
+from polmvs.config import PropagationOptions
 from polmvs.evaluation.consistency import (
     MAX_RESIDUAL_POINTS,
     first_seen,
@@ -24,6 +24,7 @@ from polmvs.evaluation.consistency import (
 )
 from polmvs.io.clouds import Cloud
 from polmvs.normals.tracks import BORDER_MARGIN_PX
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import grow_mask
 from polmvs.scene import PointKind

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import in_image, pixel_centers
-from polmvs.config import AngleModel
 from polmvs.evaluation.metrics import (
     MIN_DOLP,
     AngleStats,
@@ -24,6 +23,7 @@ from polmvs.io.ground_truth import GroundTruth
 from polmvs.neighbors import nearest_points
 from polmvs.polarization.angle_models import correct_stokes, phase_from_normal
 from polmvs.polarization.capture import Capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap, as_tilted, view_rays
 from polmvs.polarization.stokes import Stokes
 from polmvs.poses.alignment import Alignment, align_views

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel, ExperimentOptions
+from polmvs.config import ExperimentOptions
 from polmvs.errors import DataError
 from polmvs.evaluation.metrics import FAR_M
 from polmvs.experiments.data import (
@@ -38,6 +38,7 @@ from polmvs.neighbors import nearest_points
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.parallel import OnProgress, Workers, no_progress
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap, open_phase_map, store_phase_map, view_rays
 from polmvs.scene import MIN_DISTANCE
 from polmvs.surface.contour import Contours, direction_field, trace_contours

@@ -12,7 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import match_model_to_capture, read_model
-from polmvs.config import AngleModel, CaptureOptions, ExperimentOptions, Light, RegionOptions
+from polmvs.config import (
+    CaptureOptions,
+    ExperimentOptions,
+    RegionOptions,
+)
 from polmvs.errors import DataError, OptionError
 from polmvs.io.folders import resolved
 from polmvs.io.ground_truth import open_ground_truth
@@ -21,6 +25,7 @@ from polmvs.io.layouts import AUTHOR_OPTIONS, BoardTruth, is_author_layout, read
 from polmvs.pipeline.stages.maps import find_mask
 from polmvs.polarization.angle_models import correct_stokes, phase_sign
 from polmvs.polarization.capture import Capture, open_capture
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap, as_tilted, build_phase_map, view_rays
 from polmvs.polarization.region import Region, find_region, grow_mask, smooth
 from polmvs.polarization.stokes import Stokes

@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
-from polmvs.config import FORMULAS
 from polmvs.experiments.contours import CONTOUR_LABELS, METHODS, ViewContours
 from polmvs.experiments.data import MODEL_LABELS
 from polmvs.experiments.phase import ANGLE_LIMITS_DEG, ANGLES, PhaseImages, PhaseResult
 from polmvs.experiments.plane import ESTIMATES, PLANE_LABELS, PlaneResult
 from polmvs.experiments.tracks import ESTIMATORS, TRACK_LABELS, TrackResult
+from polmvs.polarization.kinds import FORMULAS
 
 Array = NDArray[np.float64]
 

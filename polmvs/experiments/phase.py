@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import FORMULAS, AngleModel
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.kinds import FORMULAS, AngleModel
 from polmvs.polarization.stokes import axial_difference
 
 Array = NDArray[np.float64]

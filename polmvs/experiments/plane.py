@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import FORMULAS, AngleModel, ExperimentOptions
+from polmvs.config import ExperimentOptions
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.normals.single_view.measurement import MIN_PIXELS
 from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
 from polmvs.parallel import OnProgress, Workers, no_progress
+from polmvs.polarization.kinds import FORMULAS, AngleModel
 from polmvs.polarization.stokes import Stokes
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from polmvs.config import AngleModel, ExperimentOptions
+from polmvs.config import ExperimentOptions
 from polmvs.evaluation.tables import format_table
 from polmvs.experiments import figures
 from polmvs.experiments.contours import (
@@ -41,6 +41,7 @@ from polmvs.experiments.tracks import (
     measure_tracks,
 )
 from polmvs.parallel import OnProgress, Workers
+from polmvs.polarization.kinds import AngleModel
 
 NUM_FIGURE_VIEWS = 3
 

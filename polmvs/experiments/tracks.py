@@ -19,13 +19,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel, ExperimentOptions, Selection
+from polmvs.config import ExperimentOptions, Selection
 from polmvs.errors import OptionError
 from polmvs.evaluation.metrics import angular_errors_deg
 from polmvs.experiments.data import Scene, load_view, require_counted
 from polmvs.normals.estimator import solve_normals
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.parallel import OnProgress, Workers, no_progress
+from polmvs.polarization.kinds import AngleModel
 from polmvs.surface.surface_quality import MIN_POINTS
 
 Array = NDArray[np.float64]
@@ -109,7 +110,7 @@ class TrackResult:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SurfacePoints:
+class TruePoints:
     """N true points and normals (N, 3), true world, metres."""
 
     points: Array
@@ -163,27 +164,27 @@ def measure_tracks(
 
 def sample_points(
     scene: Scene, num_points: int, rng: np.random.Generator, workers: Workers
-) -> SurfacePoints:
+) -> TruePoints:
     """Random pixels of the part in all views, at their true places; as many from each view."""
     seeds = rng.integers(0, 2**63, len(scene.views)).tolist()
     quotas = np.diff(np.linspace(0, num_points, len(scene.views) + 1).round().astype(int)).tolist()
     parts = list(workers.map(partial(_sample_view, scene), range(len(scene.views)), quotas, seeds))
-    return SurfacePoints(
+    return TruePoints(
         points=np.concatenate([part.points for part in parts]),
         normals=np.concatenate([part.normals for part in parts]),
     )
 
 
-def _sample_view(scene: Scene, index: int, num: int, seed: int) -> SurfacePoints:
+def _sample_view(scene: Scene, index: int, num: int, seed: int) -> TruePoints:
     """Random points that one view sees, from the true maps alone."""
     truth, name = scene.truth, scene.views[index].name
     view, depth, normals = truth.views[name], truth.depth(name), truth.normals(name)
     pixels = np.argwhere(truth.mask(name) & np.isfinite(depth) & np.isfinite(normals[..., 0]))
     if len(pixels) == 0:
-        return SurfacePoints(points=np.zeros((0, 3)), normals=np.zeros((0, 3)))
+        return TruePoints(points=np.zeros((0, 3)), normals=np.zeros((0, 3)))
     rows, cols = pixels[np.random.default_rng(seed).integers(0, len(pixels), num)].T
     xy = np.stack([cols + 0.5, rows + 0.5], axis=-1)
-    return SurfacePoints(
+    return TruePoints(
         points=view.points_at(xy, depth[rows, cols] / view.camera.rays(xy)[:, 2]),
         normals=normals[rows, cols] @ view.cam_from_world.rotation,
     )

@@ -43,7 +43,6 @@ from polmvs.config import (
     BayerOrder,
     CaptureKind,
     CaptureOptions,
-    Light,
     Packing,
     Resolution,
     describe_fields,
@@ -56,6 +55,7 @@ from polmvs.io.intrinsics import Intrinsics, from_opencv_matrix
 from polmvs.io.layouts import is_author_layout, read_author_views
 from polmvs.io.plain_files import open_plain
 from polmvs.io.raw_formats import read_npy, read_raw
+from polmvs.polarization.kinds import Light
 from polmvs.scene import stem_of
 
 Array = NDArray[np.float64]

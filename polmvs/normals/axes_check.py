@@ -14,12 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel, CaptureKind, CaptureOptions, NormalOptions
+from polmvs.config import (
+    CaptureKind,
+    CaptureOptions,
+    NormalOptions,
+)
 from polmvs.fitting import BEYOND_CHANCE
 from polmvs.normals.mixture_estimator import solve_mixture
 from polmvs.normals.observations import gather_observations_under
 from polmvs.normals.rows import AS_MEASURED, Reading
 from polmvs.normals.tracks import evenly_chosen, matched_views, tracks_on_parts
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
 

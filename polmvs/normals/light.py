@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
-from polmvs.config import AngleModel, NormalOptions
+from polmvs.config import NormalOptions
 from polmvs.geometry import lengths, points_on_rays
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.mixture_estimator import solve_mixture
 from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
 from polmvs.normals.tracks import MAX_ROWS, in_tiles, observe, tracks_on_parts
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS, Tracks
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polmvs.config import Light
 from polmvs.normals.axes_check import VoteTolerances, is_clear
 from polmvs.normals.light import track_votes
 from polmvs.normals.tracks import tracks_on_parts
+from polmvs.polarization.kinds import Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks
 

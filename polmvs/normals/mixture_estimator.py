@@ -148,7 +148,7 @@ def solve_mixture(
     stated = observations.turn_variances
     scaled = np.asarray(stated * np.square(scales.of_views)[:, None], stated.dtype)
     observations = replace(observations, turn_variances=scaled)
-    problem = _Problem(observations, matched, prior_specular, t)
+    problem = _MixtureProblem(observations, matched, prior_specular, t)
     starts = problem.best_directions()
     num_points = matched.shape[1]
     normals = np.zeros((len(starts), 3, num_points))
@@ -226,7 +226,7 @@ class _Mode:
     log_likelihood: Array
 
 
-class _Problem:
+class _MixtureProblem:
     """Observations of which nothing is NaN, and who surely sees a point."""
 
     def __init__(
@@ -239,13 +239,13 @@ class _Problem:
         self.matched = matched & self.known
         self.prior_specular, self.t = prior_specular, t
 
-    def some(self, points: NDArray[np.intp]) -> _Problem:
+    def some(self, points: NDArray[np.intp]) -> _MixtureProblem:
         """The problem of some of the points."""
         if len(points) == self.matched.shape[1]:
             return self
         stated = (self.rows, self.rays, self.turns, self.dolp, self.dolp_variance)
         found = Observations(*stated).some(points)
-        return _Problem(found, self.matched[:, points], self.prior_specular, self.t)
+        return _MixtureProblem(found, self.matched[:, points], self.prior_specular, self.t)
 
     def best_directions(self) -> list[tuple[Array, Floats]]:
         """Normals (3, N) of most likelihood with it (N,), then those of most apart, and so on."""

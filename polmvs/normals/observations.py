@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
-from polmvs.config import AngleModel, Light
 from polmvs.normals.rows import AS_MEASURED, Reading
 from polmvs.polarization.angle_models import (
     correct_polarization,
@@ -23,6 +22,7 @@ from polmvs.polarization.angle_models import (
     rows_from_axial,
     tilt_turn,
 )
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.light_mixture import phase_variance
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_DISTANCE

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel
 from polmvs.polarization.angle_models import rows_from_axial, tilt_turn
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_DISTANCE, View
 

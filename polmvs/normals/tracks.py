@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import in_image, sample_image
-from polmvs.config import AngleModel, Estimator, Light, NormalOptions
+from polmvs.config import Estimator, NormalOptions
 from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.mixture_estimator import MixtureEstimate, row_scales, solve_mixture
 from polmvs.normals.observations import Observations, gather_observations
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
 

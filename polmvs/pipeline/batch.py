@@ -22,7 +22,6 @@ from typing import Any
 
 from polmvs.cluster import TlsFiles
 from polmvs.config import (
-    AngleModel,
     FieldInfo,
     Options,
     PairChoice,
@@ -46,6 +45,7 @@ from polmvs.pipeline.run_folder import RunFolder, has_content
 from polmvs.pipeline.runner import Job, NoMonitor
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.poses import PosesResult
+from polmvs.polarization.kinds import AngleModel
 
 logger = logging.getLogger(__name__)
 

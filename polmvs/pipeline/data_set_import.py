@@ -15,7 +15,12 @@ import numpy as np
 
 from polmvs.colmap.cameras import ColmapCamera
 from polmvs.colmap.sfm import triangulate_views
-from polmvs.config import CaptureKind, CaptureOptions, Light, Options, to_plain
+from polmvs.config import (
+    CaptureKind,
+    CaptureOptions,
+    Options,
+    to_plain,
+)
 from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.arrays import save_array
 from polmvs.io.data_sets import (
@@ -30,6 +35,7 @@ from polmvs.io.images import write_bytes, write_png
 from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.pipeline.stages.images import image_names, write_images
 from polmvs.polarization.capture import Capture, open_capture
+from polmvs.polarization.kinds import Light
 from polmvs.scene import View, stem_of
 
 logger = logging.getLogger(__name__)

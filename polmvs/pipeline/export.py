@@ -13,7 +13,12 @@ from polmvs.camera import pixel_centers
 from polmvs.colmap.camera_exports import CAMERA_FORMATS, CameraExport
 from polmvs.colmap.dense_workspace import open_dense_workspace
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Channel, CropOptions, ExportFormat, options_from_plain
+from polmvs.config import (
+    Channel,
+    CropOptions,
+    ExportFormat,
+    options_from_plain,
+)
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.io.cloud_files import write_cloud_file
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
@@ -26,6 +31,7 @@ from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.polarization.capture import DISPLAY_GAMMA, Capture, open_capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.poses.crop_box import CropBox, crop_box
 from polmvs.scene import PointKind, SparseModel, View
 from polmvs.surface.coloring import paint_texture, surface_colors, texture_size

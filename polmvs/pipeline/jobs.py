@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from itertools import groupby
 
-from polmvs.config import COMPARED_MODELS, AngleModel, options_from_plain
+from polmvs.config import options_from_plain
 from polmvs.errors import DataError, OptionError
 from polmvs.evaluation.comparison import Comparison, read_comparison
 from polmvs.evaluation.trust import Trust
@@ -33,6 +33,7 @@ from polmvs.pipeline.stages.maps import MapsResult
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import COMPARED_MODELS, AngleModel
 from polmvs.scene import MIN_VIEWS, short_list
 
 logger = logging.getLogger(__name__)

@@ -10,11 +10,12 @@ from typing import Any, TypeVar
 
 from polmvs._version import __version__
 from polmvs.cluster import PACKAGES, installed_versions
-from polmvs.config import AngleModel, options_from_plain
+from polmvs.config import options_from_plain
 from polmvs.errors import DataError, OptionError
 from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
+from polmvs.polarization.kinds import AngleModel
 
 R = TypeVar("R")
 

@@ -13,10 +13,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from polmvs.config import AngleModel
 from polmvs.errors import DataError
 from polmvs.io.plain_files import read_text
 from polmvs.io.temporary import remove_temporary, temporary_path
+from polmvs.polarization.kinds import AngleModel
 
 RUN_FILE = "run.json"
 LOG_FILE = "polmvs.log"

@@ -20,7 +20,6 @@ from typing import Any, Protocol
 from polmvs.cluster import TlsFiles
 from polmvs.colmap.cameras import quiet_colmap
 from polmvs.config import (
-    AngleModel,
     Options,
     RunOptions,
     plain_options,
@@ -71,6 +70,7 @@ from polmvs.pipeline.stage_table import (
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.threads import one_blas_thread
 
 logger = logging.getLogger(__name__)

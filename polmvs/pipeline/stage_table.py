@@ -16,7 +16,12 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from polmvs.config import AngleModel, Method, Options, SfmOptions, option_paths
+from polmvs.config import (
+    Method,
+    Options,
+    SfmOptions,
+    option_paths,
+)
 from polmvs.evaluation.comparison import SparseFigures
 from polmvs.evaluation.trust import Trust
 from polmvs.memory import MemoryNeeds
@@ -38,6 +43,7 @@ from polmvs.pipeline.stages import (
     trust,
 )
 from polmvs.polarization.capture import Capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import SparseModel
 
 # Commands that do stages alone, by the stage; ``compare`` has no command for its own alone.

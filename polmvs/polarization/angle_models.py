@@ -54,7 +54,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel, Light
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.stokes import Stokes, wrap_axial
 
 Floats = NDArray[np.floating]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Light
+from polmvs.polarization.kinds import Light
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]

@@ -33,8 +33,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Light
 from polmvs.polarization.fresnel import fresnel_dolp
+from polmvs.polarization.kinds import Light
 
 Floats = NDArray[np.floating]
 Array = NDArray[np.float64]

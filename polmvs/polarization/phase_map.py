@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import pixel_centers, sample_image
-from polmvs.config import Light
 from polmvs.errors import DataError
 from polmvs.io.arrays import map_array, save_array
 from polmvs.polarization.angle_models import correct_stokes, phase_sign
+from polmvs.polarization.kinds import Light
 from polmvs.polarization.region import Region, smooth
 from polmvs.polarization.stokes import Stokes
 from polmvs.scene import View

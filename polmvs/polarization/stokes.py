@@ -53,7 +53,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 
-from polmvs.config import CaptureOptions, Light, RegionOptions
+from polmvs.config import CaptureOptions, RegionOptions
+from polmvs.polarization.kinds import Light
 from polmvs.polarization.lossy import BLOCK
 from polmvs.polarization.mosaic import INTERPOLATION_NOISE_GAIN
 

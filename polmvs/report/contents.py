@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel
 from polmvs.evaluation.map_errors import LatticeErrors, lattice_errors
 from polmvs.evaluation.metrics import THRESHOLDS_M, axial_errors_deg
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.ground_truth import GroundTruth
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.inspection import SHOWN_DOLP
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.stokes import Stokes
 from polmvs.report import pictures
-from polmvs.report.page import Picture, ViewPage
+from polmvs.report.page import PagePicture, ViewPage
 from polmvs.report.reprojection import mesh_normals_in_cam
 from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView
@@ -37,7 +37,7 @@ MAX_SAMPLES_A_VIEW = 4000  # of errors for the plots: quartiles of 16 views then
 
 
 @dataclass(frozen=True)
-class LengthUnit:
+class DisplayUnit:
     """In which lengths of the model are shown.
 
     Attributes
@@ -96,7 +96,7 @@ def view_page(
     samples: Mapping[AngleModel, ErrorSamples],
     *,
     white: float,
-    length: LengthUnit,
+    length: DisplayUnit,
     mesh: RayScene | None = None,
 ) -> ViewPage:
     """Pictures of one view; its errors are added to the samples.
@@ -122,7 +122,7 @@ def view_page(
                 pictures.mesh_picture(first.intensity, white, over),
             )
         )
-    of_model: dict[AngleModel, list[Picture]] = {}
+    of_model: dict[AngleModel, list[PagePicture]] = {}
     for model, dense in given.dense.items():
         if dense is not None:
             errors = None
@@ -134,7 +134,7 @@ def view_page(
     return ViewPage(name=given.view.name, pictures=tuple(shown), wipe=_wipe(of_model))
 
 
-def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[Picture]:
+def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[PagePicture]:
     """What the camera saw, and where a polarized surface was found."""
     inside = phase_map.region.inside
     intensity = phase_map.intensity
@@ -180,8 +180,8 @@ def _of_model(
     dense: DenseView,
     errors: LatticeErrors | None,
     samples: ErrorSamples,
-    length: LengthUnit,
-) -> list[Picture]:
+    length: DisplayUnit,
+) -> list[PagePicture]:
     """Normals, depth, residual phase, and the errors where there is a truth."""
     view, name = given.view, model.label
     xy = dense.lattice_xy()
@@ -235,7 +235,9 @@ def _of_model(
     ]
 
 
-def _wipe(of_model: Mapping[AngleModel, Sequence[Picture]]) -> tuple[Picture, Picture] | None:
+def _wipe(
+    of_model: Mapping[AngleModel, Sequence[PagePicture]],
+) -> tuple[PagePicture, PagePicture] | None:
     """The last picture of OPA and of the best of the others: errors if known, else residuals."""
     opa = next((m for m in (AngleModel.TEXTBOOK_OPA, AngleModel.OPA) if m in of_model), None)
     others = (AngleModel.PPA, AngleModel.TILTED, AngleModel.TEXTBOOK_PPA)
@@ -272,5 +274,5 @@ def _picture(
     rgb: NDArray[np.uint8],
     *,
     scale: tuple[str, str, str] | None = None,
-) -> Picture:
-    return Picture(title=title, alt=alt, uri=pictures.data_uri(rgb), scale=scale)
+) -> PagePicture:
+    return PagePicture(title=title, alt=alt, uri=pictures.data_uri(rgb), scale=scale)

@@ -34,7 +34,7 @@ KIND_COLORS = ("#0072b2", "#999999", "#e69f00", "#009e73", "#cc79a7")  # by Poin
 
 
 @dataclass(frozen=True, kw_only=True)
-class Channel:
+class PointColoring:
     """Something that points can be coloured by.
 
     Attributes
@@ -76,7 +76,7 @@ class BoxFrame:
 
 WORLD = BoxFrame("the model", "", RigidTransform(np.eye(3), np.zeros(3)))
 
-KIND = Channel(
+KIND = PointColoring(
     label="kind of point",
     low=0,
     high=len(PointKind),
@@ -136,7 +136,7 @@ class Scene3D:
 
 def pack_scene(
     layers: Sequence[Layer],
-    channels: Mapping[str, Channel],
+    channels: Mapping[str, PointColoring],
     views: Sequence[View],
     start: tuple[int, int | None],
     *,
@@ -206,7 +206,7 @@ def pack_scene(
 
 
 def _bytes_of(
-    layer: Layer, channels: Mapping[str, Channel], origin: Array, extent: float
+    layer: Layer, channels: Mapping[str, PointColoring], origin: Array, extent: float
 ) -> tuple[bytes, dict[str, Any]]:
     """One buffer, and where what lies in it; every part begins at a multiple of four bytes."""
     pieces: list[bytes] = []
@@ -231,7 +231,7 @@ def _bytes_of(
     return b"".join(pieces), parts
 
 
-def _quantised(values: NDArray[Any], channel: Channel) -> NDArray[np.uint8]:
+def _quantised(values: NDArray[Any], channel: PointColoring) -> NDArray[np.uint8]:
     """One byte a value; what is not finite counts as the highest, which is the worst.
 
     Of a channel that some points lack, 255 stands for no value.
@@ -248,7 +248,7 @@ def _quantised(values: NDArray[Any], channel: Channel) -> NDArray[np.uint8]:
     return np.asarray(np.round(255 * clean), np.uint8)
 
 
-def _channel_json(channel: Channel) -> dict[str, Any]:
+def _channel_json(channel: PointColoring) -> dict[str, Any]:
     if channel.classes:
         colors = [KIND_COLORS[i % len(KIND_COLORS)] for i in range(len(channel.classes))]
         return {

@@ -16,7 +16,7 @@ from polmvs.report.layers import Scene3D
 
 
 @dataclass(frozen=True, kw_only=True)
-class Picture:
+class PagePicture:
     """One picture of a view.
 
     Attributes
@@ -45,8 +45,8 @@ class ViewPage:
     """
 
     name: str
-    pictures: tuple[Picture, ...]
-    wipe: tuple[Picture, Picture] | None
+    pictures: tuple[PagePicture, ...]
+    wipe: tuple[PagePicture, PagePicture] | None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel
+from polmvs.polarization.kinds import AngleModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

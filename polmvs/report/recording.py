@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from polmvs.camera import Camera, PinholeCamera
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
 from polmvs.io.images import read_gray
@@ -30,6 +29,7 @@ from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.polarization.inspection import SHOWN_DOLP
+from polmvs.polarization.kinds import AngleModel
 from polmvs.report.layers import KIND_COLORS
 from polmvs.report.pictures import QUALITY, angle_picture
 from polmvs.report.rendering import SURFACE

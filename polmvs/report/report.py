@@ -14,13 +14,22 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Options, options_from_plain, to_plain
+from polmvs.config import (
+    Options,
+    options_from_plain,
+    to_plain,
+)
 from polmvs.errors import DataError, PolmvsError
-from polmvs.evaluation.comparison import Comparison, named_as_truth, read_comparison
+from polmvs.evaluation.comparison import (
+    Comparison,
+    comparison_rows,
+    named_as_truth,
+    read_comparison,
+)
 from polmvs.evaluation.consistency import first_seen, phase_residuals_deg
 from polmvs.evaluation.deviation import DeviationFigures
 from polmvs.evaluation.metrics import angular_errors_deg
-from polmvs.evaluation.tables import comparison_rows, number
+from polmvs.evaluation.tables import number
 from polmvs.evaluation.trust import Trust
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
@@ -38,20 +47,21 @@ from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
 from polmvs.polarization.capture import WHITE_PERCENTILE, Capture, open_capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.poses.alignment import align_views
 from polmvs.poses.crop_box import marker_frames
 from polmvs.report import pictures, plots
 from polmvs.report.contents import (
     MAX_ERROR_DEG,
     MAX_ERROR_M,
+    DisplayUnit,
     ErrorSamples,
-    LengthUnit,
     ViewInput,
     view_page,
 )
 from polmvs.report.deviation_files import COLORS as DEVIATION_COLORS
 from polmvs.report.deviation_files import read_deviation
-from polmvs.report.layers import KIND, BoxFrame, Channel, Layer, Scene3D, pack_scene, thinned
+from polmvs.report.layers import KIND, BoxFrame, Layer, PointColoring, Scene3D, pack_scene, thinned
 from polmvs.report.page import DeviationSection, Page, Plot, Table, ViewPage, page_text
 from polmvs.scene import PointKind, SparseModel, View
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
@@ -88,7 +98,7 @@ ORTHOGRAPHIC = (AngleModel.TEXTBOOK_OPA, AngleModel.OPA)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given:
+class _ReportInput:
     """A finished run, opened.
 
     Attributes
@@ -120,11 +130,11 @@ class _Given:
         return self.record.result(PosesResult).is_metric
 
     @property
-    def length(self) -> LengthUnit:
+    def length(self) -> DisplayUnit:
         """In which lengths are shown; the truth is metric, and so is the scale that it gives."""
         if self.truth is not None:
-            return LengthUnit("mm", 1e3 * self.truth[1].scale)
-        return LengthUnit("mm", 1e3) if self.is_metric else LengthUnit("model units")
+            return DisplayUnit("mm", 1e3 * self.truth[1].scale)
+        return DisplayUnit("mm", 1e3) if self.is_metric else DisplayUnit("model units")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,7 +211,7 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
     return run_folder.report
 
 
-def _open(folder: RunFolder) -> _Given:
+def _open(folder: RunFolder) -> _ReportInput:
     record = load_record(folder)
     options = options_from_plain(record.options, source=str(folder.run_file))
     models = dense_models(record)
@@ -213,7 +223,7 @@ def _open(folder: RunFolder) -> _Given:
     if options.evaluation.gt is not None:
         truth = _open_truth(options.evaluation.gt, sparse.views)
     comparison = read_comparison(folder.metrics) if folder.metrics.is_file() else None
-    return _Given(
+    return _ReportInput(
         folder=folder,
         record=record,
         options=options,
@@ -271,7 +281,9 @@ def _open_truth(
         return None
 
 
-def _view_pages(given: _Given, samples: Mapping[AngleModel, ErrorSamples]) -> Iterator[ViewPage]:
+def _view_pages(
+    given: _ReportInput, samples: Mapping[AngleModel, ErrorSamples]
+) -> Iterator[ViewPage]:
     folder = given.folder
     maps = {m: open_maps(folder.sparse, folder.maps(m), m) for m in given.models}
     dense = {m: open_dense_views(folder.sparse, folder.views(m)) for m in given.models}
@@ -305,7 +317,7 @@ def _view_pages(given: _Given, samples: Mapping[AngleModel, ErrorSamples]) -> It
         )
 
 
-def _mesh_of(given: _Given, model: AngleModel) -> Mesh | None:
+def _mesh_of(given: _ReportInput, model: AngleModel) -> Mesh | None:
     """The mesh of a model: the run's, or the one that its cloud was made from."""
     for path in (given.folder.mesh(model), given.folder.views(model) / SURFACE_MESH):
         if path.is_file():
@@ -317,7 +329,7 @@ def _mesh_of(given: _Given, model: AngleModel) -> Mesh | None:
 # The 3D scene
 
 
-def _layers(given: _Given) -> tuple[list[Layer], dict[str, Channel]]:
+def _layers(given: _ReportInput) -> tuple[list[Layer], dict[str, PointColoring]]:
     """Clouds and meshes of all models, and what they can be coloured by."""
     sigmas = [
         np.asarray(cloud.scalars["sigma"])[_on_surface(cloud)]
@@ -329,9 +341,9 @@ def _layers(given: _Given) -> tuple[list[Layer], dict[str, Channel]]:
     factor, unit = given.length.factor, given.length.name
     top = float(np.percentile(finite, 95)) * factor if len(finite) else 1.0
     channels = {
-        "intensity": Channel(label="intensity", note="Brightness in the photographs."),
+        "intensity": PointColoring(label="intensity", note="Brightness in the photographs."),
         "kind": KIND,
-        "residual": Channel(
+        "residual": PointColoring(
             label="phase residual",
             unit="deg",
             colors=pictures.ERROR,
@@ -339,21 +351,21 @@ def _layers(given: _Given) -> tuple[list[Layer], dict[str, Channel]]:
             "the views that see a point. Needs no ground truth.",
             may_lack=True,
         ),
-        "sigma": Channel(
+        "sigma": PointColoring(
             label="position uncertainty (1 sigma)",
             unit=unit,
             high=top,
             colors=pictures.SEQUENTIAL,
             note="Standard deviation of a place along its normal, by its own statement.",
         ),
-        "sigma_deg": Channel(
+        "sigma_deg": PointColoring(
             label="normal uncertainty (1 sigma)",
             unit="deg",
             high=5.0,
             colors=pictures.SEQUENTIAL,
             note="Standard deviation of the surface's direction, by its own statement.",
         ),
-        "num_views": Channel(
+        "num_views": PointColoring(
             label="views that agree",
             unit="views",
             high=float(len(given.sparse.views)),
@@ -362,13 +374,13 @@ def _layers(given: _Given) -> tuple[list[Layer], dict[str, Channel]]:
         ),
     }
     if given.truth is not None:
-        channels["error"] = Channel(
+        channels["error"] = PointColoring(
             label="distance to ground truth",
             unit="mm",
             colors=pictures.ERROR,
             note="From each point to the true surface.",
         )
-        channels["normal_error"] = Channel(
+        channels["normal_error"] = PointColoring(
             label="angle to the true normal, on the part",
             unit="deg",
             colors=pictures.ERROR,
@@ -429,7 +441,7 @@ def _top(layers: Sequence[Layer], name: str, limit: float) -> float:
     return float(steps[steps >= 0.999 * wanted].min())
 
 
-def _deviation_layer(found: _FoundDeviation) -> tuple[Layer, Channel]:
+def _deviation_layer(found: _FoundDeviation) -> tuple[Layer, PointColoring]:
     """The compared points in the model's frame, and the colours of their distances."""
     matrix = np.linalg.inv(np.asarray(found.figures.reference_from_result))
     limit = found.figures.tolerance
@@ -443,7 +455,7 @@ def _deviation_layer(found: _FoundDeviation) -> tuple[Layer, Channel]:
         normals=turned / np.linalg.norm(turned, axis=1, keepdims=True),
         values={"deviation": distance},
     )
-    channel = Channel(
+    channel = PointColoring(
         label="deviation from the reference",
         unit="mm",
         low=-limit,
@@ -454,7 +466,7 @@ def _deviation_layer(found: _FoundDeviation) -> tuple[Layer, Channel]:
     return thinned(layer, MAX_POINTS), channel
 
 
-def _cloud_layer(given: _Given, model: AngleModel, cloud: Cloud, factor: float) -> Layer:
+def _cloud_layer(given: _ReportInput, model: AngleModel, cloud: Cloud, factor: float) -> Layer:
     num = len(cloud.points)
     shown = {"intensity": np.full(num, 0.7) if cloud.colors is None else cloud.colors[:, 0] / 255}
     for name, values in cloud.scalars.items():
@@ -484,7 +496,7 @@ def _cloud_layer(given: _Given, model: AngleModel, cloud: Cloud, factor: float) 
     return replace(layer, values={**layer.values, **errors})
 
 
-def _residuals(given: _Given, model: AngleModel, layer: Layer) -> Floats:
+def _residuals(given: _ReportInput, model: AngleModel, layer: Layer) -> Floats:
     """Mean residual phase of each point over the views that see it, degrees; NaN without one."""
     total, count = np.zeros(len(layer.points)), np.zeros(len(layer.points))
     on_surface = np.flatnonzero(np.linalg.norm(layer.normals, axis=1) > 0.5)
@@ -510,7 +522,7 @@ def _on_surface(cloud: Cloud) -> NDArray[np.bool_]:
 
 
 def _scene(
-    given: _Given, layers: Sequence[Layer], channels: Mapping[str, Channel]
+    given: _ReportInput, layers: Sequence[Layer], channels: Mapping[str, PointColoring]
 ) -> Scene3D | None:
     if not layers:
         return None
@@ -537,7 +549,7 @@ def _scene(
     )
 
 
-def _box_frames(given: _Given) -> list[BoxFrame]:
+def _box_frames(given: _ReportInput) -> list[BoxFrame]:
     """Frames of the printed markers that the run's scale came from."""
     aruco = given.options.reference.aruco
     if aruco is None:
@@ -555,14 +567,14 @@ def _box_frames(given: _Given) -> list[BoxFrame]:
     ]
 
 
-def _is_thinned(given: _Given) -> bool:
+def _is_thinned(given: _ReportInput) -> bool:
     return any(len(cloud.points) > MAX_POINTS for cloud in given.clouds.values())
 
 
 # Words and figures
 
 
-def _title(given: _Given) -> str:
+def _title(given: _ReportInput) -> str:
     """What the run made, in a sentence."""
     capture = given.record.capture
     name = capture.folder.name if capture else given.folder.root.name
@@ -571,20 +583,20 @@ def _title(given: _Given) -> str:
     return f"{name}: {num_views} views became a surface of {points:,} points"
 
 
-def _sentence(given: _Given) -> str:
+def _sentence(given: _ReportInput) -> str:
     """What a reader in a hurry takes along, in plain words."""
     words = [*_size_words(given), *_quality_words(given)]
     return " ".join(words)
 
 
-def _size_words(given: _Given) -> list[str]:
+def _size_words(given: _ReportInput) -> list[str]:
     size = _size(given)
     if size is None:
         return []
     return [f"The part is about {size} in size."]
 
 
-def _size(given: _Given) -> str | None:
+def _size(given: _ReportInput) -> str | None:
     """Extents of the part along its main directions; None where lengths have no unit."""
     surface = given.clouds[given.main]
     points = surface.points[_on_surface(surface)]
@@ -609,7 +621,7 @@ def _sides(points: Floats) -> Floats:
     return np.sort(best)[::-1]
 
 
-def _quality_words(given: _Given) -> list[str]:
+def _quality_words(given: _ReportInput) -> list[str]:
     """How good the surface is, and how it would be under OPA where that was tried."""
     main = given.main
     figures = given.comparison.models if given.comparison is not None else {}
@@ -644,7 +656,7 @@ def _quality_words(given: _Given) -> list[str]:
     return [words[0] + "."]
 
 
-def _uncertainty_words(given: _Given) -> list[str]:
+def _uncertainty_words(given: _ReportInput) -> list[str]:
     """What the points state of themselves."""
     cloud = given.clouds[given.main]
     sigma = np.asarray(cloud.scalars.get("sigma", ()), np.float64)
@@ -659,7 +671,7 @@ def _uncertainty_words(given: _Given) -> list[str]:
     ]
 
 
-def _warnings(given: _Given) -> tuple[str, ...]:
+def _warnings(given: _ReportInput) -> tuple[str, ...]:
     """Those of the run, and of what stands beside it."""
     warnings = [w for stage in given.record.stages for w in stage.warnings]
     if given.deviation is not None and given.deviation.is_stale:
@@ -670,7 +682,7 @@ def _warnings(given: _Given) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _deviation_section(given: _Given) -> DeviationSection | None:
+def _deviation_section(given: _ReportInput) -> DeviationSection | None:
     """The part against its reference, in words, figures and pictures."""
     if given.deviation is None or given.deviation.is_stale:
         return None
@@ -710,7 +722,7 @@ def _deviation_section(given: _Given) -> DeviationSection | None:
     )
 
 
-def _facts(given: _Given) -> list[tuple[str, str]]:
+def _facts(given: _ReportInput) -> list[tuple[str, str]]:
     poses, seeds = given.record.result(PosesResult), given.record.result(SeedsResult)
     main = given.main
     total = poses.num_views + len(poses.unregistered)
@@ -735,7 +747,7 @@ def _facts(given: _Given) -> list[tuple[str, str]]:
     return facts
 
 
-def _tables(given: _Given) -> tuple[Table, ...]:
+def _tables(given: _ReportInput) -> tuple[Table, ...]:
     """The figures to begin with, and all of them."""
     if given.comparison is None:
         return ()
@@ -744,7 +756,7 @@ def _tables(given: _Given) -> tuple[Table, ...]:
     return Table(header=header, rows=first), Table(header=header, rows=rows)
 
 
-def _verdict(given: _Given) -> list[str]:
+def _verdict(given: _ReportInput) -> list[str]:
     """Whether the main result is to be trusted, in one sentence."""
     main = next(m for m in MAIN if m in given.models)
     found = given.record.find(Trust, main)
@@ -753,7 +765,7 @@ def _verdict(given: _Given) -> list[str]:
     return [f"{plots.LABELS[main]}: {found.verdict.replace('`', '')}"]
 
 
-def _trust(given: _Given) -> Table | None:
+def _trust(given: _ReportInput) -> Table | None:
     """What the main result says about itself, with what is normal."""
     main = next(m for m in MAIN if m in given.models)
     found = given.record.find(Trust, main)
@@ -771,7 +783,7 @@ def _trust(given: _Given) -> Table | None:
     return Table(header=[plots.LABELS[main], "value", "normal", ""], rows=rows)
 
 
-def _plots(given: _Given, samples: Mapping[AngleModel, ErrorSamples]) -> list[Plot]:
+def _plots(given: _ReportInput, samples: Mapping[AngleModel, ErrorSamples]) -> list[Plot]:
     def joined(name: str) -> dict[AngleModel, Floats]:
         found = {m: np.concatenate([np.zeros(0), *getattr(s, name)]) for m, s in samples.items()}
         return {model: values for model, values in found.items() if len(values)}
@@ -820,7 +832,7 @@ def _plots(given: _Given, samples: Mapping[AngleModel, ErrorSamples]) -> list[Pl
     return result
 
 
-def _against_views(given: _Given) -> list[Plot]:
+def _against_views(given: _ReportInput) -> list[Plot]:
     """Stated deviation of the points by the number of views that agree on them."""
     sigma, count = {}, {}
     for model, cloud in given.clouds.items():

@@ -16,7 +16,7 @@ from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import from_json, json_bytes, parse_json, write_json
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.simulation.options import LightName, PlanOptions, Simulation
-from polmvs.simulation.trial import HEADER, Trial, run_trial
+from polmvs.simulation.trial import HEADER, TrialResult, run_trial
 
 ENOUGH_OF_BEST = 0.02  # F-score given up for fewer views; defines the recommendation
 USELESS = 0.5  # F-score at 2 mm under which nothing is recommended; defines it as well
@@ -28,7 +28,7 @@ class PlannedTrial:
     """A trial and what it was of."""
 
     light: LightName
-    trial: Trial
+    trial: TrialResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +132,7 @@ def _trial(
     place = folder / f"{light}_{views:03d}_{digest}"  # of other options it is another
     stored = place / "trial.json"
     if stored.is_file():
-        trial = from_json(Trial, parse_json(read_text(stored)))
+        trial = from_json(TrialResult, parse_json(read_text(stored)))
     else:
         trial = run_trial(f"{light}, {views}", mesh, place, asked)
         write_json(stored, trial)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from polmvs.config import (
-    AngleModel,
     CaptureOptions,
     EvaluationOptions,
     Options,
@@ -21,6 +20,7 @@ from polmvs.evaluation.tables import format_table
 from polmvs.io.clouds import Mesh
 from polmvs.pipeline.jobs import compare
 from polmvs.pipeline.runner import Job
+from polmvs.polarization.kinds import AngleModel
 from polmvs.simulation.capture import simulate_capture
 from polmvs.simulation.options import SensorOptions, Simulation, SimulationRun
 
@@ -41,7 +41,7 @@ HEADER = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class TrialResult:
     """What came of one capture.
 
     Attributes
@@ -89,7 +89,7 @@ def run_trial(
     simulation: Simulation,
     *,
     workers: int = 1,
-) -> Trial:
+) -> TrialResult:
     """Render a capture into a folder, reconstruct it and measure it; a failure is a result.
 
     Parameters
@@ -123,7 +123,7 @@ def measure(
     views: int,
     models: Sequence[AngleModel] = (MODEL,),
     workers: int = 1,
-) -> list[Trial]:
+) -> list[TrialResult]:
     """Reconstruct a capture under each model and measure it; a failure is a result.
 
     Parameters
@@ -139,7 +139,7 @@ def measure(
         options=options,
         run_options=RunOptions(workers=workers, overwrite=run.exists()),
     )
-    trial = Trial(name=name, views=views)
+    trial = TrialResult(name=name, views=views)
     try:
         outcome = compare(job, tuple(models))
     except PolmvsError as error:
@@ -157,7 +157,7 @@ def measure(
     return [_with_figures(trial, comparison.models[model]) for model in models]
 
 
-def _with_figures(trial: Trial, figures: ModelFigures) -> Trial:
+def _with_figures(trial: TrialResult, figures: ModelFigures) -> TrialResult:
     if figures.truth is None:
         return trial
     cloud = figures.truth.cloud
@@ -170,6 +170,6 @@ def _with_figures(trial: Trial, figures: ModelFigures) -> Trial:
     )
 
 
-def trial_table(trials: Sequence[Trial], first: str = "capture") -> str:
+def trial_table(trials: Sequence[TrialResult], first: str = "capture") -> str:
     """A row for each trial, in Markdown."""
     return format_table((first, *HEADER[1:]), [trial.cells for trial in trials])

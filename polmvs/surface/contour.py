@@ -24,9 +24,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel, Contour, PropagationOptions
+from polmvs.config import Contour, PropagationOptions
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.angle_models import rows_from_axial
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap, view_rays
 from polmvs.scene import Seeds
 from polmvs.surface.dense_view import DenseView, store_dense_view

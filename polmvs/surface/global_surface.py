@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel, Light, default_num_workers
+from polmvs.config import default_num_workers
 from polmvs.geometry import lengths
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.parallel import OnProgress, no_progress
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, View
 from polmvs.surface.creases import (

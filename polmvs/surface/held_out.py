@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import Light
 from polmvs.geometry import dots, points_on_rays
+from polmvs.polarization.kinds import Light
 from polmvs.scene import MIN_VIEWS
 from polmvs.surface.dense_view import lattice_xy
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh

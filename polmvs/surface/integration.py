@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel, PropagationOptions
+from polmvs.config import PropagationOptions
 from polmvs.geometry import points_on_rays
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.rows import gather_rows
 from polmvs.parallel import OnProgress, Workers, no_progress
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
 from polmvs.surface.consensus import MAX_DEVIATIONS, sight, surface_of_others

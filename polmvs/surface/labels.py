@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from polmvs.config import Light
 from polmvs.geometry import dots, unit
 from polmvs.polarization.fresnel import fresnel_dolp
+from polmvs.polarization.kinds import Light
 from polmvs.surface.mesh_geometry import TriangleMesh
 from polmvs.surface.observations import DIFFUSE, SPECULAR, Observations
 

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel, default_num_workers
+from polmvs.config import default_num_workers
 from polmvs.geometry import dots, unit_or_zero
 from polmvs.polarization.angle_models import correct_parameters, rows_from_axial, tilt_turn
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.light_mixture import phase_variance
 from polmvs.polarization.phase_map import smoothed_polarization
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points

@@ -30,11 +30,12 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay, cKDTree
 
 from polmvs.camera import in_frame, sample_image
-from polmvs.config import AngleModel, default_num_workers
+from polmvs.config import default_num_workers
 from polmvs.fitting import geman_mcclure_weights, robust_deviation
 from polmvs.io.arrays import kept_array
 from polmvs.normals.rows import Rows, gather_rows
 from polmvs.normals.tracks import SeedTolerances
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
 from polmvs.surface.borders import drawn_border, smoothly_beside

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.camera import sample_image
-from polmvs.config import AngleModel
 from polmvs.normals.estimator import NormalEstimate
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds
 from polmvs.surface.dense_view import NUM_NEAREST, REACH, SurfaceSamples

@@ -22,10 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from polmvs.config import Light, default_num_workers
+from polmvs.config import default_num_workers
 from polmvs.fitting import CAUCHY_SCALE, robust_deviation
 from polmvs.geometry import points_on_rays
 from polmvs.parallel import OnProgress, no_progress
+from polmvs.polarization.kinds import Light
 from polmvs.surface.creases import CreaseTolerances, crease_vertices
 from polmvs.surface.labels import (
     LabelTolerances,

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from polmvs.config import COMPARED_MODELS
+from polmvs.polarization.kinds import COMPARED_MODELS
 
 
 def test_demo_prints_both_models_and_no_progress(demo_run: Path, cli) -> None:

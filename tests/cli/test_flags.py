@@ -14,8 +14,6 @@ from polmvs.cli.call import Call
 from polmvs.cli.commands import ABOUT, COMMANDS, TO_CLOUD, TO_NORMALS, ComparedModels
 from polmvs.cli.flags import UsageError, in_flags, parse
 from polmvs.config import (
-    COMPARED_MODELS,
-    AngleModel,
     Contour,
     Options,
     RunOptions,
@@ -23,6 +21,7 @@ from polmvs.config import (
     groups_of,
     option_paths,
 )
+from polmvs.polarization.kinds import COMPARED_MODELS, AngleModel
 
 NAMES = tuple(command.name for command in COMMANDS)
 HEAVY = ("numpy", "scipy", "cv2", "pycolmap", "open3d", "matplotlib", "msgspec", "multiprocessing")

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import AngleModel, Estimator, PlaneOptions
+from polmvs.config import Estimator, PlaneOptions
 from polmvs.normals.single_view.measurement import measure_planes
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import View
 from polmvs.synthetic.captures import add_noise, look_at, quantize, render_mosaic, render_view
 from polmvs.synthetic.surfaces import Plane

@@ -142,7 +142,8 @@ def test_a_terminal_gets_a_bar_with_name_and_count() -> None:
 
 def test_what_goes_wrong_after_an_interrupt_is_the_interrupt(monkeypatch, capsys):
     """Libraries that it reaches make errors of their own of it."""
-    from polmvs.cli import interrupts, running
+    from polmvs.cli import running
+    from polmvs.cli.exit_status import interrupts
 
     class Silent:
         log = None

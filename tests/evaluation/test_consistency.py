@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scenes import Scene, board_scene
 
-from polmvs.config import AngleModel
 from polmvs.evaluation.consistency import Consistency, measure_consistency
 from polmvs.io.clouds import Cloud
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import PointKind
 
 NO_TRACKS = Cloud(np.zeros((0, 3)))

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scenes import board_scene
 
-from polmvs.config import AngleModel
 from polmvs.evaluation.trust import Trust, measure_trust
 from polmvs.io.clouds import Cloud
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import turned
 from polmvs.scene import PointKind
 from polmvs.surface.held_out import Prediction, ViewError

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 import polmvs
 from polmvs.camera import pixel_centers
-from polmvs.config import AngleModel
 from polmvs.errors import DataError
 from polmvs.evaluation.truth_errors import evaluate, phase_errors_on_part, track_normal_errors
 from polmvs.geometry import RigidTransform
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
 from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.kinds import AngleModel
 from polmvs.poses.alignment import align_views
 from polmvs.scene import View
 

@@ -10,10 +10,8 @@ from scenes import CAMERA
 
 import polmvs
 from polmvs.config import (
-    AngleModel,
     CaptureOptions,
     ExperimentOptions,
-    Light,
     Poses,
     RegionOptions,
 )
@@ -36,6 +34,7 @@ from polmvs.io.images import write_png
 from polmvs.io.open3d_import import import_open3d
 from polmvs.parallel import Workers
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.synthetic.captures import quantize, render_mosaic, render_view, ring_of_views
 from polmvs.synthetic.surfaces import Plane
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import Scene, board_scene, phase_map_of, tracks_at
 
-from polmvs.config import CaptureKind, CaptureOptions, Light
+from polmvs.config import CaptureKind, CaptureOptions
 from polmvs.normals.axes_check import (
     MIRRORED,
     TURNED,
@@ -15,6 +15,7 @@ from polmvs.normals.axes_check import (
     check_axes,
 )
 from polmvs.normals.rows import AS_MEASURED
+from polmvs.polarization.kinds import Light
 from polmvs.synthetic.captures import render_view
 from polmvs.synthetic.surfaces import Sphere
 

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from scenes import CAMERA, Scene, board_scene, phase_map_of, tracks_at
 
-from polmvs.config import AngleModel, Light, NormalOptions
+from polmvs.config import NormalOptions
 from polmvs.evaluation.comparison import Consistency, best_fitting_model
 from polmvs.evaluation.metrics import AngleStats
 from polmvs.normals import light as light_module
 from polmvs.normals.light import LightTolerances, diffuse_pixels, find_diffuse_parts
 from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import track_normals
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import as_tilted, open_phase_map, store_phase_map, turned
 from polmvs.scene import some_tracks
 from polmvs.synthetic.captures import render_view, ring_of_views

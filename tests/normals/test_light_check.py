@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scenes import Scene, board_scene, phase_map_of, seen_tracks, tracks_at
 
-from polmvs.config import Light
 from polmvs.normals.light import track_votes
 from polmvs.normals.light_check import check_light
+from polmvs.polarization.kinds import Light
 from polmvs.synthetic.captures import render_view
 from polmvs.synthetic.surfaces import Sphere
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scenes import board_scene, seen_tracks
 
-from polmvs.config import AngleModel, Light, NormalOptions
+from polmvs.config import NormalOptions
 from polmvs.normals.observations import gather_observations, window_polarization
 from polmvs.normals.tracks import select_seeds, track_normals
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.region import Region
 
 WINDOW = 7

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scenes import board_scene
 
-from polmvs.config import AngleModel
 from polmvs.normals.rows import gather_rows, sample_range
+from polmvs.polarization.kinds import AngleModel
 
 
 @pytest.fixture(scope="module")

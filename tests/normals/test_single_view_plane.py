@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.config import AngleModel, Light
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.normals.single_view.focal import estimate_focal
 from polmvs.normals.single_view.pixels import PlaneView, polygon_mask
@@ -14,6 +13,7 @@ from polmvs.normals.single_view.plane import phase_residuals, plane_normal
 from polmvs.normals.single_view.search import find_planes
 from polmvs.polarization.angle_models import normal_from_angles, phase_from_normal
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.scene import View
 from polmvs.synthetic.captures import add_noise, look_at, render_view
 from polmvs.synthetic.surfaces import Group, Plane, Sphere

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scenes import board_scene, tracks_at
 
-from polmvs.config import AngleModel, Estimator, NormalOptions
+from polmvs.config import Estimator, NormalOptions
 from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import dolp_shares, seen_shares, select_seeds, track_normals
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import open_phase_map, store_phase_map
 from polmvs.scene import point_sigmas
 

@@ -13,9 +13,7 @@ from helpers import content_of, record_of, refused
 from printed_images import INTRINSICS, write_printed_capture
 
 from polmvs.config import (
-    AngleModel,
     FieldInfo,
-    Light,
     Options,
     PropagationOptions,
     RunOptions,
@@ -27,6 +25,7 @@ from polmvs.config import (
 )
 from polmvs.errors import DataError, OptionError
 from polmvs.pipeline.batch import BatchEntry, _row_of, read_batch, run_batch
+from polmvs.polarization.kinds import AngleModel, Light
 
 COARSE = ("--method", "integrate", "--stride-px", 8, "--no-mesh", "--no-colmap", "--workers", 2)
 

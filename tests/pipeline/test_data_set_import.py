@@ -21,13 +21,20 @@ from data_set_writer import (
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.colmap.models import read_model
-from polmvs.config import BayerOrder, CaptureKind, CaptureOptions, Light, Options, SfmOptions
+from polmvs.config import (
+    BayerOrder,
+    CaptureKind,
+    CaptureOptions,
+    Options,
+    SfmOptions,
+)
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform
 from polmvs.io.data_sets import DataSetKind, read_data_set, recognise_data_set
 from polmvs.io.raw_formats import read_raw
 from polmvs.pipeline.data_set_import import as_capture, import_data_set
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import Light
 from polmvs.polarization.stokes import axial_difference
 from polmvs.scene import View
 

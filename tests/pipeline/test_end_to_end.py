@@ -15,9 +15,10 @@ import pytest
 from helpers import content_of, cut_after, record_of, result_of, stages_of
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, PropagationOptions
+from polmvs.config import PropagationOptions
 from polmvs.io.clouds import read_cloud
 from polmvs.pipeline.record import SCHEMA_VERSION
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import PointKind
 
 BEFORE_CLOUDS = [

@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import pytest
 
 from polmvs.colmap import sfm
-from polmvs.config import AngleModel, FusionOptions, Surroundings
-from polmvs.evaluation.tables import best_fit_lines
+from polmvs.config import FusionOptions, Surroundings
+from polmvs.evaluation.comparison import best_fit_lines
 from polmvs.parallel import Workers
 from polmvs.pipeline.stages import densify
+from polmvs.polarization.kinds import AngleModel
 
 
 @pytest.mark.parametrize(("registered", "warns"), [(5, False), (4, True)])

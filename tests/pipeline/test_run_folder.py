@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError
 from polmvs.io.typed_json import write_json
 from polmvs.pipeline import checks
@@ -29,6 +28,7 @@ from polmvs.pipeline.run_lock import locked
 from polmvs.pipeline.runner import load_record, prepare_output
 from polmvs.pipeline.stage_table import written_names
 from polmvs.pipeline.stages.images import ImagesResult
+from polmvs.polarization.kinds import AngleModel
 
 
 def finished_run(root: Path) -> RunFolder:

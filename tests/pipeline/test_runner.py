@@ -13,7 +13,6 @@ from helpers import cut_after, record_of, refused, result_of, stages_of
 
 from polmvs.colmap.models import read_model, write_model
 from polmvs.config import (
-    AngleModel,
     EvaluationOptions,
     FusionOptions,
     Options,
@@ -33,6 +32,7 @@ from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import Job, NoMonitor, Run, prepare_output
 from polmvs.pipeline.stage_table import StageSpec, stage_table
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import SparseModel, some_tracks
 
 INTRINSICS = (333.75, 333.75, 230.6475, 196.608)  # of the bundled capture

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from polmvs.config import AngleModel, Options, plain_options
+from polmvs.config import Options, plain_options
 from polmvs.pipeline.run_folder import HERE
 from polmvs.pipeline.stage_table import (
     StageSpec,
@@ -15,6 +15,7 @@ from polmvs.pipeline.stage_table import (
     with_needed,
     written_names,
 )
+from polmvs.polarization.kinds import AngleModel
 
 PPA, OPA, TILTED = AngleModel.PPA, AngleModel.OPA, AngleModel.TILTED
 # Which stages are done, not what they find.

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from polmvs.config import FORMULAS, AngleModel
 from polmvs.polarization.angle_models import (
     model_rays,
     normal_from_angles,
@@ -13,6 +12,7 @@ from polmvs.polarization.angle_models import (
     rows_from_axial,
     rows_from_phase,
 )
+from polmvs.polarization.kinds import FORMULAS, AngleModel
 
 SHAPES = [(1,), (7,), (2, 3)]
 

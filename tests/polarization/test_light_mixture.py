@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from polmvs.config import AngleModel, Light
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
 from polmvs.polarization.fresnel import fresnel_dolp
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.light_mixture import (
     LightMixtureTolerances,
     angle_log_density,

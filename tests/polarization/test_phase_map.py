@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.config import CaptureOptions, Light
+from polmvs.config import CaptureOptions
 from polmvs.geometry import RigidTransform
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import Light
 from polmvs.polarization.phase_map import PhaseTolerances, build_phase_map
 from polmvs.polarization.region import Region, find_region
 from polmvs.polarization.stokes import Stokes

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import BayerOrder, Light
+from polmvs.config import BayerOrder
 from polmvs.geometry import RigidTransform
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import Light
 from polmvs.polarization.mosaic import (
     noise_area_px,
     split_colour_mosaic,

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.config import AngleModel, Light
 from polmvs.polarization.angle_models import (
     correct_parameters,
     correct_stokes,
@@ -12,6 +11,7 @@ from polmvs.polarization.angle_models import (
     sigma_scale,
     tilt_turn,
 )
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.stokes import Stokes
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Plane, Sphere

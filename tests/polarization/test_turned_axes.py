@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.colmap.undistort import undistorted_camera, warp_image
-from polmvs.config import AngleModel
 from polmvs.geometry import RigidTransform
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.mosaic import split_mosaic, turned_pattern
 from polmvs.polarization.stokes import (
     Stokes,

@@ -13,9 +13,9 @@ import trimesh
 from helpers import refused
 
 from polmvs.cli import deviations
-from polmvs.config import AngleModel
 from polmvs.io.clouds import read_cloud
 from polmvs.pipeline.run_folder import RunFolder
+from polmvs.polarization.kinds import AngleModel
 from polmvs.report import report
 from polmvs.scene import PointKind
 

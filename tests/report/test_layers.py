@@ -8,7 +8,7 @@ import pytest
 
 from polmvs.camera import PinholeCamera
 from polmvs.geometry import RigidTransform
-from polmvs.report.layers import KIND, BoxFrame, Channel, Layer, pack_scene, thinned
+from polmvs.report.layers import KIND, BoxFrame, Layer, PointColoring, pack_scene, thinned
 from polmvs.scene import PointKind, View
 
 CAMERA = PinholeCamera(width=60, height=40, fx=50, fy=50, cx=30, cy=20)
@@ -39,7 +39,7 @@ def looking_down(x: float) -> View:
     )
 
 
-CHANNELS = {"sigma": Channel(label="s", unit="mm", high=2.0), "kind": KIND}
+CHANNELS = {"sigma": PointColoring(label="s", unit="mm", high=2.0), "kind": KIND}
 
 
 def test_round_trip_of_positions_normals_and_channels() -> None:
@@ -94,7 +94,7 @@ def test_points_without_a_value_have_a_colour_of_their_own() -> None:
         label="a", points=np.zeros((4, 3)), normals=np.zeros((4, 3)),
         values={"sigma": np.array([0.0, np.nan, 9.0, 2.0])},
     )  # fmt: skip
-    channels = {"sigma": Channel(label="s", high=2.0, colors="plasma", may_lack=True)}
+    channels = {"sigma": PointColoring(label="s", high=2.0, colors="plasma", may_lack=True)}
     scene = pack_scene([layer], channels, [], (0, None))
     found = part(scene, 0, scene.description["layers"][0]["channels"]["sigma"])
     assert found.tolist() == [0, 255, 254, 254]

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from polmvs.config import AngleModel
+from polmvs.polarization.kinds import AngleModel
 from polmvs.report import plots
 
 RNG = np.random.default_rng(0)

@@ -13,10 +13,10 @@ import pytest
 
 from polmvs.cli import pages
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel
 from polmvs.errors import DataError, OptionError
 from polmvs.io.clouds import Mesh, read_cloud, write_mesh
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
+from polmvs.polarization.kinds import AngleModel
 from polmvs.report import recording
 from polmvs.report.recording import num_recorded_steps, write_recording
 

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from polmvs.config import AngleModel
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.clouds import Cloud
+from polmvs.polarization.kinds import AngleModel
 from polmvs.report import report
 from polmvs.report.report import _Given, _layers
 from polmvs.scene import PointKind

@@ -13,8 +13,8 @@ from polmvs.config import CropOptions
 from polmvs.geometry import RigidTransform
 from polmvs.poses.crop_box import CropBox
 from polmvs.report import pictures
-from polmvs.report.layers import KIND, BoxFrame, Channel, Layer, pack_scene
-from polmvs.report.page import Page, Picture, ViewPage, page_text
+from polmvs.report.layers import KIND, BoxFrame, Layer, PointColoring, pack_scene
+from polmvs.report.page import Page, PagePicture, ViewPage, page_text
 from polmvs.scene import PointKind
 from polmvs.synthetic.captures import ring_of_views
 
@@ -52,14 +52,16 @@ def page_of() -> tuple[str, dict]:
     views = ring_of_views(4, CAMERA, distance=1.2, elevation_deg=50)
     scene = pack_scene(
         [cloud, mesh],
-        {"intensity": Channel(label="intensity"), "kind": KIND},
+        {"intensity": PointColoring(label="intensity"), "kind": KIND},
         views,
         (0, None),
         unit=("mm", 1e3),
         frames=[BoxFrame("marker 3", "--box-marker=3", MARKER)],
     )
     grey = pictures.data_uri(np.full((40, 60, 3), 90, np.uint8))
-    shown = [Picture(title=t, alt=t, uri=grey) for t in ("intensity", "AoLP", "reprojected mesh")]
+    shown = [
+        PagePicture(title=t, alt=t, uri=grey) for t in ("intensity", "AoLP", "reprojected mesh")
+    ]
     pages = [ViewPage(name=view.name, pictures=tuple(shown), wipe=None) for view in views]
     page = Page(
         title="plate", sentence="A plate.", facts=[], warnings=(), tables=(), trust=None,

@@ -12,13 +12,14 @@ import polmvs
 from polmvs.camera import pixel_centers
 from polmvs.cli import main
 from polmvs.cli.call import read_config
-from polmvs.config import AngleModel, CaptureKind, CaptureOptions
+from polmvs.config import CaptureKind, CaptureOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.io.clouds import read_mesh
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.intrinsics import read_intrinsics
 from polmvs.polarization.angle_models import correct_stokes, phase_from_normal
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.simulation import capture as capture_module
 
 SMALL = {"image_size": (96, 80), "views": 2, "max_samples": 16, "directions": 8}

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from polmvs.config import AngleModel
 from polmvs.errors import OptionError
 from polmvs.io.images import decode_image
+from polmvs.polarization.kinds import AngleModel
 from polmvs.simulation import planning
 from polmvs.simulation.options import LightName, PathOptions, PlanOptions, Simulation
-from polmvs.simulation.trial import MODEL, Trial
+from polmvs.simulation.trial import MODEL, TrialResult
 
 OPTIONS = PlanOptions(view_counts=(20, 8), lights=(LightName.EVEN, LightName.STUDIO))
 
@@ -20,7 +20,7 @@ def given_trial(name, mesh, folder, simulation):
     good = simulation.path.views >= 20 or simulation.lighting.light is LightName.STUDIO
     share = 0.97 if good else 0.6
     folder.mkdir(parents=True)
-    return Trial(
+    return TrialResult(
         name=name,
         views=simulation.path.views,
         posed=simulation.path.views,
@@ -51,7 +51,7 @@ def test_plan_takes_the_fewest_views_that_suffice(tmp_path, monkeypatch):
 
 
 def test_where_nothing_works_nothing_is_recommended():
-    poor = Trial(name="x", views=8, f_score=(0.0, 0.1), completeness=(0.0, 0.1))
+    poor = TrialResult(name="x", views=8, f_score=(0.0, 0.1), completeness=(0.0, 0.1))
     trials = [planning.PlannedTrial(light=LightName.EVEN, trial=poor)]
     assert planning.recommend(trials).startswith("None of these suffices")
     trials.append(planning.PlannedTrial(light=LightName.EVEN, trial=replace(poor, views=20)))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import AngleModel
 from polmvs.geometry import unit
 from polmvs.polarization.angle_models import correct_parameters, phase_from_normal
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.simulation.options import Optics, SensorOptions
 from polmvs.simulation.sensor import (

@@ -18,9 +18,9 @@ from traced_scenes import (
 )
 
 from polmvs.camera import pixel_centers
-from polmvs.config import AngleModel
 from polmvs.geometry import unit
 from polmvs.polarization.angle_models import phase_from_normal
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.scene import View
 from polmvs.simulation.lights import environment

@@ -3,7 +3,7 @@ import pytest
 from scenes import CAMERA, board_scene
 
 from polmvs.camera import pixel_centers
-from polmvs.config import AngleModel
+from polmvs.polarization.kinds import AngleModel
 from polmvs.surface.contour import cover_with_contours, direction_field, trace_contours
 
 

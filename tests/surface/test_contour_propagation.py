@@ -5,8 +5,13 @@ import pytest
 from scenes import CAMERA, board_scene
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import AngleModel, Contour, FusionOptions, PropagationOptions
+from polmvs.config import (
+    Contour,
+    FusionOptions,
+    PropagationOptions,
+)
 from polmvs.parallel import Workers
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
 from polmvs.surface.contour import propagate
 from polmvs.surface.dense_view import DenseView, open_dense_view, store_dense_view

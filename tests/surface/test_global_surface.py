@@ -14,7 +14,7 @@ from analytic_objects import (
 )
 from test_mesh_geometry import extracted
 
-from polmvs.config import AngleModel
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.region import Region
 from polmvs.scene import Seeds
 from polmvs.surface.global_surface import (

@@ -8,8 +8,8 @@ from analytic_objects import phase_maps_of, ring_of_views, sphere
 from scipy.spatial.transform import Rotation
 from test_mesh_geometry import extracted
 
-from polmvs.config import AngleModel, Light
 from polmvs.geometry import RigidTransform
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.surface.held_out import HeldOutTolerances, Prediction, predict, predict_left_out
 from polmvs.surface.mesh_geometry import TriangleMesh
 from polmvs.surface.observations import Looking

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import AngleModel, Light
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import build_phase_map
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes

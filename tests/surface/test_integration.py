@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scenes import CAMERA, Scene, board_scene, phase_map_of
 
-from polmvs.config import AngleModel, FusionOptions, PropagationOptions
+from polmvs.config import FusionOptions, PropagationOptions
 from polmvs.geometry import RigidTransform
 from polmvs.parallel import Workers
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import store_phase_map
 from polmvs.scene import Seeds
 from polmvs.surface.dense_view import SurfaceSamples

@@ -7,7 +7,7 @@ import pytest
 from analytic_objects import phase_maps_of, ring_of_views, sphere
 from test_mesh_geometry import extracted
 
-from polmvs.config import AngleModel
+from polmvs.polarization.kinds import AngleModel
 from polmvs.surface.labels import LabelTolerances, neighbors, responsibilities, vote
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import DIFFUSE, SPECULAR, Looking, level_image, observe

@@ -7,7 +7,7 @@ import pytest
 from scenes import phase_map_of
 
 from polmvs.camera import PinholeCamera, pixel_centers
-from polmvs.config import AngleModel
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
 from polmvs.surface.offsets import face_scene, find_faces, snapped_border, stepped_faces
 from polmvs.synthetic.captures import render_view, ring_of_views

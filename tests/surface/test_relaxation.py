@@ -8,8 +8,8 @@ from scenes import CAMERA, board_scene, phase_map_of
 from test_consensus import BALL, BOARD, scene_of, true_samples, true_view
 
 from polmvs.camera import pixel_centers
-from polmvs.config import AngleModel
 from polmvs.normals.rows import gather_rows
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import as_tilted, turned
 from polmvs.scene import Seeds
 from polmvs.surface.integration import (

@@ -8,7 +8,8 @@ from scenes import phase_map_of
 from scipy.spatial import cKDTree
 
 from polmvs.camera import PinholeCamera
-from polmvs.config import AngleModel, PropagationOptions
+from polmvs.config import PropagationOptions
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
 from polmvs.surface.global_surface import Undetermined, reconstruct_surface
 from polmvs.surface.integration import integrate

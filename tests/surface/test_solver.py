@@ -6,8 +6,8 @@ import pytest
 from analytic_objects import box, phase_maps_of, ring_of_views, sphere, torus, union
 from test_mesh_geometry import euler_number, extracted
 
-from polmvs.config import AngleModel
 from polmvs.polarization.angle_models import tilt_turn
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import view_rays
 from polmvs.surface.creases import crease_vertices, sharpened
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh

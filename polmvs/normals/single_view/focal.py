@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from polmvs.config import AngleModel, Light
 from polmvs.fitting import CAUCHY_SCALE, cauchy_weights
 from polmvs.normals.single_view.plane import (
     EXACT,
@@ -35,6 +34,7 @@ from polmvs.normals.single_view.plane import (
     tangents,
 )
 from polmvs.polarization.angle_models import correct_parameters, phase_sign, sigma_scale
+from polmvs.polarization.kinds import AngleModel, Light
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Array: TypeAlias = NDArray[np.float64]

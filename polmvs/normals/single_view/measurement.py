@@ -15,11 +15,8 @@ from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera
 from polmvs.config import (
-    FORMULAS,
-    AngleModel,
     CaptureOptions,
     Estimator,
-    Light,
     PlaneOptions,
     to_plain,
 )
@@ -28,6 +25,7 @@ from polmvs.io.images import read_mask
 from polmvs.normals.single_view.focal import FocalEstimate
 from polmvs.normals.single_view.pixels import PlaneView, load_stokes, polygon_mask
 from polmvs.normals.single_view.plane import PlaneEstimate
+from polmvs.polarization.kinds import FORMULAS, AngleModel, Light
 from polmvs.polarization.stokes import Stokes
 
 Mask = NDArray[np.bool_]

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import Camera, PinholeCamera, pixel_centers
-from polmvs.config import AngleModel, CaptureOptions, Light
+from polmvs.config import CaptureOptions
 from polmvs.normals.single_view.focal import FocalEstimate, estimate_focal
 from polmvs.normals.single_view.plane import PlaneEstimate, plane_normal
 from polmvs.normals.single_view.search import FoundPlane, find_planes
 from polmvs.polarization.angle_models import correct_stokes, phase_sign
 from polmvs.polarization.capture import open_image
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseTolerances
 from polmvs.polarization.stokes import Stokes
 

@@ -26,9 +26,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel
 from polmvs.fitting import BEYOND_CHANCE, CAUCHY_SCALE, annealed_scales, robust_deviation
 from polmvs.normals.estimator import EstimatorTolerances, smallest_eigenvectors
+from polmvs.polarization.kinds import AngleModel
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Array: TypeAlias = NDArray[np.float64]

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.config import AngleModel
 from polmvs.normals.single_view.plane import (
     PlaneEstimate,
     PlaneTolerances,
@@ -25,6 +24,7 @@ from polmvs.normals.single_view.plane import (
     stack_samples,
 )
 from polmvs.polarization.angle_models import rows_from_axial
+from polmvs.polarization.kinds import AngleModel
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Array: TypeAlias = NDArray[np.float64]
@@ -34,7 +34,7 @@ BLOCK_PX = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchTolerances:
+class PlaneSearchTolerances:
     """How planes are searched for.
 
     Attributes
@@ -111,7 +111,7 @@ def find_planes(
     max_residual_deg: float = 3.0,
     min_angle_deg: float = 5.0,
     seed: int = 0,
-    tolerances: SearchTolerances = SearchTolerances(),
+    tolerances: PlaneSearchTolerances = PlaneSearchTolerances(),
 ) -> list[FoundPlane]:
     """Find the planes of a view, the largest support first.
 
@@ -163,7 +163,7 @@ def _average(
     sigma: Floats,
     mask: Mask,
     *,
-    tolerances: SearchTolerances,
+    tolerances: PlaneSearchTolerances,
 ) -> _Blocks:
     """Average a phase map over blocks, weighted by precision; half a block has to be known."""
     length = np.hypot(axial[0], axial[1])
@@ -196,7 +196,7 @@ def _best_plane(
     min_blocks: int,
     rng: np.random.Generator,
     *,
-    tolerances: SearchTolerances,
+    tolerances: PlaneSearchTolerances,
 ) -> tuple[Array, Mask]:
     """The best hypothesis about the blocks left, refined, and its coherent support."""
     best, support = np.full(3, np.nan), np.zeros_like(left)
@@ -224,7 +224,7 @@ def _hypotheses(
     min_blocks: int,
     rng: np.random.Generator,
     *,
-    tolerances: SearchTolerances,
+    tolerances: PlaneSearchTolerances,
 ) -> list[Array]:
     """Normals of pairs of rows near each other, those first that most blocks agree with."""
     rows = np.full((*left.shape, 3), np.nan)
@@ -256,7 +256,9 @@ def _hypotheses(
     return list(normals[np.argsort(scores)[::-1][: tolerances.num_refined]])
 
 
-def _coherent(agree: Mask, left: Mask, min_blocks: int, *, tolerances: SearchTolerances) -> Mask:
+def _coherent(
+    agree: Mask, left: Mask, min_blocks: int, *, tolerances: PlaneSearchTolerances
+) -> Mask:
     """Blocks left in whose neighbourhood most agree, in areas of some size."""
     window = (tolerances.coherence_blocks, tolerances.coherence_blocks)
     agreeing = cv2.blur((agree & left).astype(np.float32), window)
@@ -276,7 +278,7 @@ def _assign(
     limit: Floats,
     min_blocks: int,
     *,
-    tolerances: SearchTolerances,
+    tolerances: PlaneSearchTolerances,
 ) -> NDArray[np.int64]:
     """Number of the plane of each block (H', W'), -1 for none."""
     labels = np.full(blocks.known.shape, -1, np.int64)
@@ -302,7 +304,7 @@ def _assign(
     return labels
 
 
-def _mean_where(image: Floats, known: Mask, *, tolerances: SearchTolerances) -> Floats:
+def _mean_where(image: Floats, known: Mask, *, tolerances: PlaneSearchTolerances) -> Floats:
     """Mean over the known blocks of a window."""
     window = (tolerances.coherence_blocks, tolerances.coherence_blocks)
     total = cv2.blur(np.where(known, image, 0).astype(np.float32), window)

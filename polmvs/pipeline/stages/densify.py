@@ -24,10 +24,8 @@ from polmvs.colmap.dense_workspace import (
 from polmvs.colmap.filling import previous_backups
 from polmvs.colmap.models import read_model
 from polmvs.config import (
-    AngleModel,
     CropOptions,
     FusionOptions,
-    Light,
     Method,
     PropagationOptions,
     Surroundings,
@@ -41,6 +39,7 @@ from polmvs.pipeline.stages.maps import open_maps, posed_views
 from polmvs.pipeline.stages.poses import load_floats
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.polarization.capture import DISPLAY_GAMMA
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.poses.crop_box import CropBox, crop_box
 from polmvs.scene import PointKind, Seeds, View

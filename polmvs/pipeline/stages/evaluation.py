@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from polmvs.config import AngleModel
 from polmvs.evaluation.comparison import Comparison, ModelEstimate, SparseFigures, compare_models
 from polmvs.io.clouds import read_cloud
 from polmvs.io.ground_truth import open_ground_truth
@@ -17,6 +16,7 @@ from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.densify import open_dense_views
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.polarization.capture import Capture
+from polmvs.polarization.kinds import AngleModel
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model, read_views
-from polmvs.config import AngleModel, Light, RegionOptions
+from polmvs.config import RegionOptions
 from polmvs.errors import DataError
 from polmvs.io.images import read_mask
 from polmvs.normals.axes_check import check_axes
@@ -29,6 +29,7 @@ from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.run_folder import replacing
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import (
     PhaseMap,
     as_tilted,

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Light, NormalOptions
+from polmvs.config import NormalOptions
 from polmvs.io.arrays import map_array, save_array
 from polmvs.normals.mixture_estimator import MixtureEstimate
 from polmvs.normals.tracks import MAX_ROWS, track_normals
 from polmvs.pipeline.stages.maps import open_maps
+from polmvs.polarization.kinds import AngleModel, Light
 
 # Columns of the stored normals, a row for each track; see MixtureEstimate.
 NORMALS_TYPE = np.dtype(

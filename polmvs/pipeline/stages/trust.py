@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from polmvs.colmap.models import read_model
-from polmvs.config import AngleModel, Light, default_num_workers
+from polmvs.config import default_num_workers
 from polmvs.evaluation.trust import Trust, measure_trust
 from polmvs.io.clouds import read_cloud, read_mesh
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.seeds import load_seeds
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind
 from polmvs.surface.held_out import predict, predict_left_out
