@@ -6,7 +6,8 @@ the range). An option is named by its path ``group.field`` such as ``propagation
 messages between backquotes; only the command line knows flags.
 
 This module is light, so that ``--help`` is: it imports neither NumPy nor anything of this package
-but the errors, and msgspec, which checks and converts values, when it is needed.
+but the errors and the names of angle models. msgspec, which checks and converts values, is
+imported when it is needed.
 """
 
 from __future__ import annotations

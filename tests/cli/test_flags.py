@@ -156,9 +156,11 @@ def test_help_and_usage_errors_import_nothing_heavy(arguments: list[str]) -> Non
         "polmvs.config",
         "polmvs.errors",
         "polmvs.cli",
+        "polmvs.polarization",
+        "polmvs.polarization.kinds",
         "polmvs.simulation",
         "polmvs.simulation.options",
-        *(f"polmvs.cli.{name}" for name in ("call", "commands", "flags", "running")),
+        *(f"polmvs.cli.{name}" for name in ("call", "commands", "exit_status", "flags", "running")),
     }
 
 
