@@ -21,7 +21,7 @@ import platform
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -50,15 +50,15 @@ from polmvs.config import (
     option,
 )
 from polmvs.errors import OptionError
-from polmvs.evaluation.tables import format_table
+from polmvs.evaluation.tables import format_table, number
 from polmvs.io.images import write_bytes
 from polmvs.normals.estimator import EstimatorTolerances, solve_normals
 from polmvs.normals.single_view.plane import plane_normal
 from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import compare, reconstruct
-from polmvs.pipeline.record import versions
+from polmvs.pipeline.record import Record, versions
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
-from polmvs.pipeline.runner import Job, load_record, timing_table
+from polmvs.pipeline.runner import Job, load_record
 from polmvs.pipeline.stages.images import write_images
 from polmvs.pipeline.stages.maps import build_maps
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
@@ -124,6 +124,39 @@ def _benchmark(call: Call, terminal: Terminal) -> int:
     if records:
         print(timing_table(records))
     return 0
+
+
+def timing_table(records: Mapping[str, Record]) -> str:
+    """Seconds, those of the processor, and memory of the stages of one or more runs."""
+    names = dict.fromkeys(stage.name for record in records.values() for stage in record.stages)
+    header = ["stage"]
+    for name in records:
+        header += [f"{name}, s", "CPU s", "peak MB"]
+    rows = [[name, *_stage_cells(name, records)] for name in names]
+    total, rest, wall = ["all stages"], ["all but poses"], ["wall clock"]
+    for record in records.values():
+        seconds = {stage.name: stage.seconds for stage in record.stages}
+        peak = max((stage.peak_rss_mb for stage in record.stages), default=None)
+        cpu = {stage.name: stage.cpu_s for stage in record.stages}
+        total += [number(sum(seconds.values())), number(sum(cpu.values())), number(peak, 1, 0)]
+        rest += [number(_without_poses(times)) for times in (seconds, cpu)] + [""]
+        wall += [number(record.wall_s), "", ""]
+    return format_table(header, [*rows, total, rest, wall])
+
+
+def _without_poses(times: Mapping[str, float]) -> float:
+    return sum(time for name, time in times.items() if name not in ("sfm", "poses"))
+
+
+def _stage_cells(name: str, records: Mapping[str, Record]) -> list[str]:
+    cells = []
+    for record in records.values():
+        stage = record.stage(name)
+        if stage is None:
+            cells += [number(None)] * 3
+        else:
+            cells += [number(stage.seconds), number(stage.cpu_s), number(stage.peak_rss_mb, 1, 0)]
+    return cells
 
 
 COMMAND = Command(

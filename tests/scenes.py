@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from polmvs.camera import PinholeCamera
+from polmvs.polarization.angle_models import model_rays, phase_direction
 from polmvs.polarization.kinds import Light
 from polmvs.polarization.phase_map import PhaseMap, build_phase_map
 from polmvs.polarization.region import find_region
@@ -92,3 +93,13 @@ def seen_tracks(scene, points, normals):
         kept[here] = view.faces(points, normals)[tracks.obs_track[here]]
     observed = {name: getattr(tracks, name)[kept] for name in ("obs_track", "obs_view", "obs_xy")}
     return replace(tracks, **observed)
+
+
+def normal_from_angles(angle_model, phase, zenith, rays_in_cam) -> np.ndarray:
+    """Normal ``n = -exp(zenith a^) v`` of the paper; the zenith angle is from ``-v``, or the axis."""
+    v = model_rays(angle_model, np.asarray(rays_in_cam, np.float64))
+    axis = np.cross(phase_direction(phase), v)
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    zenith = np.asarray(zenith)[..., None]
+    # Rodrigues; the axis is perpendicular to v.
+    return np.asarray(-(np.cos(zenith) * v + np.sin(zenith) * np.cross(axis, v)))

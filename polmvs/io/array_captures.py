@@ -20,13 +20,6 @@ Frame: TypeAlias = ArrayLike | Mapping[float, ArrayLike]
 Frames: TypeAlias = Mapping[str, Frame] | Sequence[Frame]
 
 
-def is_frame(value: Any) -> bool:
-    """Whether a value is one frame, and no path and no collection of frames."""
-    if isinstance(value, Mapping):
-        return all(isinstance(key, int | float | np.number) for key in value) and bool(value)
-    return isinstance(value, np.ndarray)
-
-
 def are_frames(value: Any) -> bool:
     """Whether a value is a collection of frames, by name or in order."""
     if isinstance(value, Mapping):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,7 +29,6 @@ from polmvs.config import (
     with_absolute_paths,
 )
 from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
-from polmvs.evaluation.tables import format_table, number
 from polmvs.io.folders import require_unicode
 from polmvs.memory import MemoryPlan, PeakMemory, cpu_seconds, plan_memory
 from polmvs.parallel import OnProgress, Workers, no_progress
@@ -636,36 +635,3 @@ def _remove_results(run_folder: RunFolder) -> None:
 
 def _names(paths: Iterable[Path]) -> tuple[str, ...]:
     return tuple(path.as_posix() for path in paths)
-
-
-def timing_table(records: Mapping[str, Record]) -> str:
-    """Seconds, those of the processor, and memory of the stages of one or more runs."""
-    names = list(dict.fromkeys(stage.name for run in records.values() for stage in run.stages))
-    header = ["stage"]
-    for run in records:
-        header += [f"{run}, s", "CPU s", "peak MB"]
-    rows = [[name, *_stage_cells(name, records)] for name in names]
-    total, rest, wall = ["all stages"], ["all but poses"], ["wall clock"]
-    for record in records.values():
-        seconds = {stage.name: stage.seconds for stage in record.stages}
-        peak = max((stage.peak_rss_mb for stage in record.stages), default=None)
-        cpu = {stage.name: stage.cpu_s for stage in record.stages}
-        total += [number(sum(seconds.values())), number(sum(cpu.values())), number(peak, 1, 0)]
-        rest += [number(_without_poses(times)) for times in (seconds, cpu)] + [""]
-        wall += [number(record.wall_s), "", ""]
-    return format_table(header, [*rows, total, rest, wall])
-
-
-def _without_poses(times: Mapping[str, float]) -> float:
-    return sum(time for name, time in times.items() if name not in ("sfm", "poses"))
-
-
-def _stage_cells(name: str, records: Mapping[str, Record]) -> list[str]:
-    cells = []
-    for record in records.values():
-        stage = record.stage(name)
-        if stage is None:
-            cells += [number(None)] * 3
-        else:
-            cells += [number(stage.seconds), number(stage.cpu_s), number(stage.peak_rss_mb, 1, 0)]
-    return cells

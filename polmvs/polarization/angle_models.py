@@ -149,30 +149,6 @@ def rows_from_axial(
     return np.stack([x * scale, y * scale, z * scale], axis=-1)
 
 
-def normal_from_angles(
-    angle_model: AngleModel, phase: Floats, zenith: Floats, rays_in_cam: Floats
-) -> Array:
-    """Normal ``n = -exp(zenith a^) v`` of a phase and a zenith angle (paper, same table).
-
-    Parameters
-    ----------
-    angle_model : OPA, PPA or tilted.
-    phase, zenith : (...) radians; the zenith angle lies between the normal and ``-v`` (PPA) or
-        the optical axis (OPA).
-    rays_in_cam : (..., 3), unit rays, camera frame.
-
-    Returns
-    -------
-    (..., 3) float64, unit, camera frame.
-    """
-    v = model_rays(angle_model, np.asarray(rays_in_cam, np.float64))
-    axis = np.cross(phase_direction(phase), v)
-    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
-    zenith = np.asarray(zenith)[..., None]
-    # Rodrigues; the axis is perpendicular to v.
-    return np.asarray(-(np.cos(zenith) * v + np.sin(zenith) * np.cross(axis, v)))
-
-
 def correct_parameters(parameters: Floats, rays_in_cam: Floats, *, diffuse: Mask | bool) -> Floats:
     """Stokes parameters that a sensor obeying PPA would have measured behind tilted polarizers.
 

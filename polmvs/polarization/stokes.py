@@ -486,31 +486,6 @@ def axial_difference(a: Angles, b: Angles) -> NDArray[np.float64]:
     return np.asarray(wrap_axial(difference + 0.5 * np.pi) - 0.5 * np.pi)
 
 
-def axial_mean(
-    angles: Angles, weights: Angles | None = None, axis: int | tuple[int, ...] | None = None
-) -> NDArray[np.float64]:
-    """Mean of axial angles through ``(cos 2x, sin 2x)``.
-
-    Parameters
-    ----------
-    angles : (...), rad
-    weights : as ``angles`` or broadcastable, not negative; None weighs all alike.
-    axis : averaged axes, all where it is None.
-
-    Returns
-    -------
-    Angles in [0, pi), rad, without the averaged axes; NaN where the angles cancel out or no
-    weight is left.
-    """
-    doubled = 2.0 * np.asarray(angles, np.float64)
-    weight = np.ones(()) if weights is None else np.asarray(weights, np.float64)
-    weight = np.broadcast_to(weight, doubled.shape)
-    x = np.sum(weight * np.cos(doubled), axis=axis)
-    y = np.sum(weight * np.sin(doubled), axis=axis)
-    known = np.hypot(x, y) > 1e-12 * np.sum(weight, axis=axis)
-    return np.where(known, wrap_axial(0.5 * np.arctan2(y, x)), np.nan)
-
-
 def wrap_axial(angle: Any) -> Any:
     """An axial angle to [0, pi), in its own precision."""
     wrapped = np.mod(angle, np.pi)

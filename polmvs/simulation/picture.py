@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.config import BayerOrder
-from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.scene import View
 from polmvs.simulation.options import RenderingOptions, SensorKind, SensorOptions
 from polmvs.simulation.scalar import render_stokes
@@ -208,8 +207,3 @@ def _wavelengths(colours: NDArray[np.intp], rng: np.random.Generator) -> NDArray
     share = np.clip(share, 0.006, 0.994)
     quantile = 4.91 * (share**0.14 - (1 - share) ** 0.14)
     return np.asarray(np.clip(centers[:, None] + widths[:, None] * quantile, 390, 790), np.float32)
-
-
-def nominal_angles() -> tuple[int, ...]:
-    """Angles of the files of a rotating filter, in order."""
-    return ANGLES_DEG

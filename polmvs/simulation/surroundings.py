@@ -72,11 +72,6 @@ def surroundings(
     return [_table(size, rng, round_=options.turntable), *_blocks(size, radius, rng, options)]
 
 
-def board_marker_side(size: float) -> float:
-    """Side of the black square of a marker of the board, metres; ``reference.aruco`` takes it."""
-    return TABLE_SIDE * size / BOARD_MARKERS * MARKER_SHARE
-
-
 def marker_board(markers: int, texels: int) -> Image:
     """A square grid of ArUco markers (DICT_4X4_250), black on white paper, all different.
 

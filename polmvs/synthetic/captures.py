@@ -109,18 +109,6 @@ def render_mosaic(
     return mosaic
 
 
-def mosaic_from_intensities(
-    intensities: NDArray[np.floating], pattern: tuple[int, int, int, int] = CaptureOptions.pattern
-) -> Array:
-    """Interleave angle images ``(4, H, W)`` into a mosaic ``(2 H, 2 W)``, without resampling."""
-    if intensities.ndim != 3 or intensities.shape[0] != 4:
-        raise ValueError(f"{intensities.shape=} but expected (4, H, W).")
-    mosaic = np.empty((2 * intensities.shape[1], 2 * intensities.shape[2]))
-    for cell, index in enumerate(_pattern_indices(pattern)):
-        mosaic[cell // 2 :: 2, cell % 2 :: 2] = intensities[index]
-    return mosaic
-
-
 def quantize(values: NDArray[np.floating], bits: int = 8) -> NDArray[np.unsignedinteger[Any]]:
     """Share of full scale to integers, clipped: uint8 for up to 8 bits, uint16 above."""
     largest = 2**bits - 1

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import normal_from_angles
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.io.ground_truth import open_ground_truth
@@ -11,7 +12,7 @@ from polmvs.normals.single_view.focal import estimate_focal
 from polmvs.normals.single_view.pixels import PlaneView, polygon_mask
 from polmvs.normals.single_view.plane import phase_residuals, plane_normal
 from polmvs.normals.single_view.search import find_planes
-from polmvs.polarization.angle_models import normal_from_angles, phase_from_normal
+from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.capture import open_capture
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.scene import View

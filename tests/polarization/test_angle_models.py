@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from scenes import normal_from_angles
 from scipy.linalg import expm
 
 from polmvs.polarization.angle_models import (
     model_rays,
-    normal_from_angles,
     phase_direction,
     phase_from_normal,
     rows_from_axial,

@@ -10,7 +10,6 @@ from polmvs.scene import View
 from polmvs.synthetic.captures import (
     add_noise,
     look_at,
-    mosaic_from_intensities,
     quantize,
     render_mosaic,
     render_view,
@@ -234,14 +233,6 @@ def test_mosaic_samples_lie_at_their_own_pixels(sensor):
         )
 
 
-def test_mosaic_order():
-    intensities = np.array([0.0, 45.0, 90.0, 135.0])[:, None, None] * np.ones((4, 3, 2))
-    mosaic = mosaic_from_intensities(intensities)
-    np.testing.assert_array_equal(mosaic, np.tile([[90.0, 45.0], [135.0, 0.0]], (3, 2)))
-    other = mosaic_from_intensities(intensities, (0, 45, 135, 90))
-    np.testing.assert_array_equal(other, np.tile([[0.0, 45.0], [135.0, 90.0]], (3, 2)))
-
-
 def test_noise_has_the_stated_mean_and_variance():
     rng = np.random.default_rng(0)
     for level in (0.0, 0.02, 0.5):
@@ -333,8 +324,6 @@ def test_unknown_options_are_refused(options):
         render_view(make_view(), SURFACES["plane"], **options)
 
 
-def test_malformed_patterns_and_stacks_are_refused():
+def test_malformed_patterns_are_refused():
     with pytest.raises(ValueError, match="pattern"):
         render_mosaic(make_view(), SURFACES["plane"], pattern=(0, 45, 90, 90))
-    with pytest.raises(ValueError, match="shape"):
-        mosaic_from_intensities(np.zeros((3, 2, 2)))
