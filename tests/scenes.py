@@ -96,7 +96,7 @@ def seen_tracks(scene, points, normals):
 
 
 def normal_from_angles(angle_model, phase, zenith, rays_in_cam) -> np.ndarray:
-    """Normal ``n = -exp(zenith a^) v`` of the paper; the zenith angle is from ``-v``, or the axis."""
+    """Normal ``n = -exp(zenith a^) v`` of the paper; zenith angles from ``-v`` or the axis."""
     v = model_rays(angle_model, np.asarray(rays_in_cam, np.float64))
     axis = np.cross(phase_direction(phase), v)
     axis /= np.linalg.norm(axis, axis=-1, keepdims=True)

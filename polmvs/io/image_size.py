@@ -1,4 +1,4 @@
-"""Size of an image as its header declares it, told before anything is decoded.
+"""Headers of images: sizes as they are declared, told before anything is decoded, and tags.
 
 A compressed file of a megabyte may declare an image of a terabyte. Only containers whose header is
 read here are decoded.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Iterator
 from math import prod
 from os import PathLike
 from typing import NamedTuple
@@ -26,9 +27,13 @@ _PNG_CHANNELS = {2: 3, 4: 2, 6: 4}  # by colour type; 1 of all others
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277
 _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
+_MAX_TIFF_IMAGES = 1 << 16
+_MAX_TIFF_TAGS = 1 << 12
 # Markers of JPEG that begin a frame: all of their group but tables, and those without a length.
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _JPEG_BARE = {0x01, *range(0xD0, 0xD9)}
+_JPEG_SCAN = 0xDA
+_PNM_NUMBER = rb"(?:\s|#[^\n\r]*[\n\r])+(\d{1,11})"
 
 
 class ImageSize(NamedTuple):
@@ -45,6 +50,21 @@ class ImageSize(NamedTuple):
     num_bytes: int
 
 
+class TiffTag(NamedTuple):
+    """First number of a tag.
+
+    Attributes
+    ----------
+    value : the number.
+    place : of it in the file, bytes.
+    format : of it, as ``struct`` has it.
+    """
+
+    value: int
+    place: int
+    format: str
+
+
 def declared_size(path: str | PathLike[str], data: bytes) -> ImageSize:
     """Size of an encoded image by its header: PNG, TIFF, JPEG, BMP, PGM, PPM or Radiance HDR.
 
@@ -55,7 +75,7 @@ def declared_size(path: str | PathLike[str], data: bytes) -> ImageSize:
     """
     try:
         found = _declared(data)
-    except (struct.error, ValueError, IndexError) as error:
+    except (struct.error, ValueError, IndexError, StopIteration) as error:
         raise DataError(
             path, f"is not a readable image, or is damaged or truncated. {BROKEN}"
         ) from error
@@ -119,28 +139,45 @@ def _declared(data: bytes) -> ImageSize | None:
     return None
 
 
+def tiff_images(data: bytes) -> Iterator[dict[int, TiffTag]]:
+    """Tags that hold whole numbers of each image in a TIFF's or BigTIFF's chain.
+
+    Raises
+    ------
+    ValueError
+        The chain is not whole.
+    """
+    order = "<" if data[:2] == b"II" else ">"
+    offset, counter, length = ("Q", "Q", 20) if data[:4] in BIG_TIFF_SIGNATURES else ("I", "H", 12)
+    room = struct.calcsize(offset)  # bytes of a value that lies in the tag itself
+
+    def number(letter: str, at: int) -> int:
+        if at + struct.calcsize(letter) > len(data):
+            raise ValueError("not whole")
+        return int(struct.unpack_from(order + letter, data, at)[0])
+
+    start, seen = number(offset, room), set[int]()
+    while start and start not in seen and len(seen) < _MAX_TIFF_IMAGES:
+        seen.add(start)
+        num, first = number(counter, start), start + struct.calcsize(counter)
+        tags: dict[int, TiffTag] = {}
+        for at in range(first, first + length * min(num, _MAX_TIFF_TAGS), length):
+            letter, count = _TIFF_TYPES.get(number("H", at + 2)), number(offset, at + 4)
+            if letter is None or not count:
+                continue
+            place = at + length - room
+            if count * struct.calcsize(letter) > room:
+                place = number(offset, place)
+                if place + struct.calcsize(letter) > len(data):
+                    continue
+            tags.setdefault(number("H", at), TiffTag(number(letter, place), place, order + letter))
+        yield tags
+        start = number(offset, first + length * num)
+
+
 def _of_tiff(data: bytes) -> ImageSize:
     """Of the first image."""
-    order = "<" if data[:2] == b"II" else ">"
-    big = data[:4] in BIG_TIFF_SIGNATURES
-    start = struct.unpack_from(f"{order}Q" if big else f"{order}I", data, 8 if big else 4)[0]
-    num = struct.unpack_from(f"{order}Q" if big else f"{order}H", data, start)[0]
-    first, length = (start + 8, 20) if big else (start + 2, 12)
-    room = 8 if big else 4  # bytes of a value that lies in the tag itself
-    tags: dict[int, int] = {}
-    for index in range(min(num, 4096)):
-        at = first + length * index
-        tag, kind = struct.unpack_from(f"{order}HH", data, at)
-        count = struct.unpack_from(f"{order}Q" if big else f"{order}I", data, at + 4)[0]
-        letter = _TIFF_TYPES.get(kind)
-        if letter is None or not count:
-            continue
-        value_at = at + length - room
-        if count * struct.calcsize(letter) > room:
-            value_at = struct.unpack_from(f"{order}Q" if big else f"{order}I", data, value_at)[0]
-            if value_at + struct.calcsize(letter) > len(data):
-                continue
-        tags.setdefault(tag, struct.unpack_from(order + letter, data, value_at)[0])
+    tags = {tag: found.value for tag, found in next(tiff_images(data), {}).items()}
     if _TIFF_WIDTH not in tags or _TIFF_HEIGHT not in tags:
         raise ValueError("no size")
     width = max(tags[_TIFF_WIDTH], tags.get(_TIFF_TILE_WIDTH, 0))
@@ -149,9 +186,16 @@ def _of_tiff(data: bytes) -> ImageSize:
     return ImageSize(width, height, width * height * tags.get(_TIFF_SAMPLES, 1) * -(-bits // 8))
 
 
-def _of_jpeg(data: bytes) -> ImageSize:
-    position = 2
-    while True:
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Markers of a JPEG, and what belongs to each, as far as its samples.
+
+    Raises
+    ------
+    ValueError, IndexError, struct.error
+        It is not whole.
+    """
+    position, marker = 2, 0
+    while marker != _JPEG_SCAN:
         if data[position] != 0xFF:
             raise ValueError("no marker")
         marker = data[position + 1]
@@ -159,11 +203,16 @@ def _of_jpeg(data: bytes) -> ImageSize:
             position += 1
         elif marker in _JPEG_BARE:
             position += 2
-        elif marker in _JPEG_FRAMES:
-            height, width, channels = struct.unpack_from(">HHB", data, position + 5)
-            return ImageSize(width, height, width * height * channels)
         else:
-            position += 2 + struct.unpack_from(">H", data, position + 2)[0]
+            end = position + 2 + struct.unpack_from(">H", data, position + 2)[0]
+            yield marker, data[position + 4 : end]
+            position = end
+
+
+def _of_jpeg(data: bytes) -> ImageSize:
+    frame = next(content for marker, content in jpeg_segments(data) if marker in _JPEG_FRAMES)
+    height, width, channels = struct.unpack_from(">HHB", frame, 1)
+    return ImageSize(width, height, width * height * channels)
 
 
 def _of_bmp(data: bytes) -> ImageSize:
@@ -176,14 +225,23 @@ def _of_bmp(data: bytes) -> ImageSize:
     return ImageSize(width, height, 4 * width * height)
 
 
-def _of_netpbm(data: bytes) -> ImageSize:
-    kind = data[1:2]
-    needed = 2 if kind in b"14" else 3
-    text = re.sub(rb"#[^\n\r]*", b" ", data[2 : 1 << 16])
-    words = [int(word) for word in text.split(maxsplit=needed)[:needed] if len(word) < 12]
-    if len(words) < needed:
+def netpbm_header(data: bytes) -> tuple[list[int], int]:
+    """Width, height and largest value (1 of bits) of a PBM, PGM or PPM; where samples begin.
+
+    Raises
+    ------
+    ValueError
+        It is not whole.
+    """
+    is_bits = data[1:2] in b"14"
+    pattern = rb"P[1-6]" + _PNM_NUMBER * (2 if is_bits else 3) + rb"\s"
+    found = re.match(pattern, data[: 1 << 16])
+    if found is None:
         raise ValueError("header is not whole")
-    width, height = words[:2]
-    channels = 3 if kind in b"36" else 1
-    wide = 2 if needed == 3 and words[2] > 0xFF else 1
-    return ImageSize(width, height, prod((width, height, channels, wide)))
+    return [*map(int, found.groups()), 1][:3], found.end()
+
+
+def _of_netpbm(data: bytes) -> ImageSize:
+    (width, height, largest), _ = netpbm_header(data)
+    channels = 3 if data[1:2] in b"36" else 1
+    return ImageSize(width, height, prod((width, height, channels, 2 if largest > 0xFF else 1)))

@@ -30,8 +30,12 @@ from polmvs.io.image_size import (
     SCALE_DOWN,
     TIFF_SIGNATURES,
     ImageSize,
+    TiffTag,
     declared_size,
+    jpeg_segments,
+    netpbm_header,
     require_size,
+    tiff_images,
 )
 from polmvs.io.images import PathArg, check_png, decode_image, read_bytes
 
@@ -49,8 +53,8 @@ PNG_GRAY = 0  # colour type of a monochrome PNG without alpha
 UPRIGHT = 1  # orientation tag of an image that is stored as it is shown
 TIFF_BITS, TIFF_COMPRESSION, TIFF_ORIENTATION = 258, 259, 274
 TIFF_SUBFILE, TIFF_REDUCED = 254, 1  # tag of what an image is for; bit of one that is a preview
-MAX_TIFF_PAGES = 1 << 16
 TIFF_JPEG = (6, 7)
+JPEG_TABLES = 0xDB
 # Order of an 8x8 block's coefficients in a JPEG file, as (row, column).
 _ZIGZAG = sorted(
     ((v, u) for v in range(8) for u in range(8)),
@@ -380,26 +384,11 @@ def _size_of_part(part: Any) -> ImageSize:
 
 def _read_pgm(path: PathArg, data: bytes) -> RawImage:
     """A binary PGM; OpenCV would forget its largest value, which tells the bit depth."""
-    words: list[bytes] = []
-    position = 2
-    while len(words) < 3 and position < len(data):
-        if data[position : position + 1].isspace():
-            position += 1
-        elif data[position : position + 1] == b"#":
-            position = (data.find(b"\n", position) + 1) or len(data)
-        else:
-            end = position
-            while end < len(data) and not data[end : end + 1].isspace() and end - position < 12:
-                end += 1
-            words.append(data[position:end])
-            position = end
-    if len(words) < 3 or not all(word.isdigit() for word in words):
-        raise DataError(path, f"is damaged: its PGM header is not whole. {BROKEN}")
-    width, height, largest = map(int, words)
-    if not 0 < width * height <= MAX_PIXELS or not 0 < largest < 1 << 16:
+    (width, height, largest), start = netpbm_header(data)
+    if not 0 < largest < 1 << 16:
         raise DataError(path, f"is damaged: its PGM header makes no image. {BROKEN}")
     dtype = np.dtype(">u2" if largest > 0xFF else np.uint8)
-    pixels = data[position + 1 : position + 1 + width * height * dtype.itemsize]
+    pixels = data[start : start + width * height * dtype.itemsize]
     if len(pixels) < width * height * dtype.itemsize:
         raise DataError(path, f"is truncated: {width}x{height} px are promised. {BROKEN}")
     samples = np.frombuffer(pixels, dtype).reshape(height, width).astype(dtype.newbyteorder("="))
@@ -410,86 +399,50 @@ def _read_pgm(path: PathArg, data: bytes) -> RawImage:
 
 def _read_tiff(path: PathArg, data: bytes, limit: _Limit) -> RawImage:
     """A TIFF as stored: its orientation is read, and hidden from OpenCV, which would apply it."""
-    pages = _tiff_pages(data)
+    tags, pages = _tiff_tags(data)
     if pages > 1:
         raise DataError(
             path,
             f"holds {pages} images; one in a file is read. Store each in a file of its own, those "
             "of polarizer angles named by them (NAME_000.tif, NAME_045.tif, ...).",
         )
-    tags = _tiff_tags(data)
-    orientation, at = tags.get(TIFF_ORIENTATION, (UPRIGHT, 0))
-    if at and orientation != UPRIGHT:
-        order = "<H" if data[:2] == b"II" else ">H"
+    orientation = tags.get(TIFF_ORIENTATION, TiffTag(UPRIGHT, 0, ""))
+    if orientation.value != UPRIGHT:
         patched = bytearray(data)
-        struct.pack_into(order, patched, at, UPRIGHT)
+        struct.pack_into(orientation.format, patched, orientation.place, UPRIGHT)
         data = bytes(patched)
     samples = _colour_last(path, decode_image(path, data, **limit._asdict()))
-    bits = tags.get(TIFF_BITS, (0, 0))[0]
-    lossy = tags.get(TIFF_COMPRESSION, (1, 0))[0] in TIFF_JPEG
+    bits = tags[TIFF_BITS].value if TIFF_BITS in tags else 0
     odd = samples.dtype.kind == "u" and 8 < bits < 8 * samples.itemsize
     return RawImage(
         samples,
         declared_bits=bits if odd else None,
-        orientation=orientation if 1 <= orientation <= 8 else UPRIGHT,
-        lossy=lossy,
+        orientation=orientation.value if 1 <= orientation.value <= 8 else UPRIGHT,
+        lossy=TIFF_COMPRESSION in tags and tags[TIFF_COMPRESSION].value in TIFF_JPEG,
     )
 
 
-def _tiff_tags(data: bytes) -> dict[int, tuple[int, int]]:
-    """Tags of the first image that hold one short number: value and place in the file."""
-    order = "<" if data[:2] == b"II" else ">"
-    tags: dict[int, tuple[int, int]] = {}
-    try:
-        (start,) = struct.unpack_from(f"{order}I", data, 4)
-        (num,) = struct.unpack_from(f"{order}H", data, start)
-        for index in range(num):
-            at = start + 2 + 12 * index
-            tag, kind, count = struct.unpack_from(f"{order}HHI", data, at)
-            if kind == 3 and count == 1:
-                tags[tag] = (struct.unpack_from(f"{order}H", data, at + 8)[0], at + 8)
-    except struct.error:
-        pass  # OpenCV names the damage
-    return tags
-
-
-def _tiff_pages(data: bytes) -> int:
-    """Images in a TIFF's chain, previews not counted; 1 where the chain is damaged."""
-    order = "<" if data[:2] == b"II" else ">"
-    seen: set[int] = set()
+def _tiff_tags(data: bytes) -> tuple[dict[int, TiffTag], int]:
+    """Tags of the first image, and how many there are, without previews; 1 of a damaged chain."""
+    tags: dict[int, TiffTag] = {}
     pages = 0
     try:
-        (start,) = struct.unpack_from(f"{order}I", data, 4)
-        while start and start not in seen and len(seen) < MAX_TIFF_PAGES:
-            seen.add(start)
-            (num,) = struct.unpack_from(f"{order}H", data, start)
-            purpose = 0
-            for at in range(start + 2, start + 2 + 12 * num, 12):
-                if struct.unpack_from(f"{order}H", data, at) == (TIFF_SUBFILE,):
-                    (purpose,) = struct.unpack_from(f"{order}I", data, at + 8)
-            pages += not purpose & TIFF_REDUCED
-            (start,) = struct.unpack_from(f"{order}I", data, start + 2 + 12 * num)
-    except struct.error:
-        return 1  # OpenCV names the damage
-    return pages
+        for image in tiff_images(data):
+            tags = tags or image
+            pages += TIFF_SUBFILE not in image or not image[TIFF_SUBFILE].value & TIFF_REDUCED
+    except ValueError:
+        return tags, 1  # OpenCV names the damage
+    return tags, pages
 
 
 def _luminance_steps(path: PathArg, data: bytes) -> NDArray[np.float64]:
     """Quantisation steps (8, 8) of a JPEG's first table, rows for vertical frequencies."""
-    position = 2
-    while position + 4 <= len(data):
-        marker, length = struct.unpack_from(">HH", data, position)
-        if marker == 0xFFDB and position + 2 + length <= len(data):
-            wide = data[position + 4] >> 4
-            count = 64 * (1 + wide)
-            values = data[position + 5 : position + 5 + count]
-            if len(values) == count:
-                steps = np.zeros((8, 8))
-                flat = np.frombuffer(values, ">u2" if wide else np.uint8)
-                for place, step in zip(_ZIGZAG, flat, strict=True):
-                    steps[place] = step
-                return steps
-        if marker == 0xFFDA or marker >> 8 != 0xFF:
-            break
-        position += 2 + length
-    raise DataError(path, f"is a damaged JPEG without quantisation tables. {BROKEN}")
+    try:
+        table = next(content for marker, content in jpeg_segments(data) if marker == JPEG_TABLES)
+        steps = np.zeros((8, 8))
+        kind = np.dtype(">u2" if table[0] >> 4 else np.uint8)
+        steps[tuple(np.transpose(_ZIGZAG))] = np.frombuffer(table, kind, 64, 1)
+        return steps
+    except (ValueError, IndexError, struct.error, StopIteration) as error:
+        reason = f"is a damaged JPEG without quantisation tables. {BROKEN}"
+        raise DataError(path, reason) from error

@@ -70,6 +70,12 @@ def test_size_of_a_big_tiff(order: str) -> None:
     assert declared_size("a", head + body) == (64, 32, 64 * 32)  # of a tile, which is larger
 
 
+def test_a_big_tiff_that_begins_beyond_every_file_is_damaged() -> None:
+    for start in (1 << 63, (1 << 64) - 1, 1000):
+        with pytest.raises(DataError, match="damaged or truncated"):
+            declared_size("a", b"II+\0" + struct.pack("<HHQ", 8, 0, start) + bytes(64))
+
+
 def test_what_is_no_known_container_is_not_decoded() -> None:
     for data in (b"RIFF0000WEBPVP8 ", b"\0\0\0\x0cjP  \r\n\x87\n", b"GIF89a", b"mine", b"P7\n"):
         with pytest.raises(DataError, match="is no PNG, TIFF"):
