@@ -15,7 +15,7 @@ from polmvs.simulation.materials import Material
 from polmvs.simulation.options import LightingOptions, LightName
 from polmvs.simulation.renderer_import import Renderer
 from polmvs.simulation.scene import MitsubaScene, SceneDescription, build_scene
-from polmvs.simulation.transport import Lens, trace
+from polmvs.simulation.transport import Lens, Samples, trace
 from polmvs.synthetic.captures import look_at, rolled
 from polmvs.synthetic.shapes import named_shape
 
@@ -72,16 +72,12 @@ def stokes_of(scene: MitsubaScene, view: View, **blur: Any) -> np.ndarray:
     grid = np.empty((2 * len(low), 2, 2))
     grid[0::2, 0], grid[0::2, 1] = low, np.stack([high[:, 0], low[:, 1]], 1)
     grid[1::2, 0], grid[1::2, 1] = np.stack([low[:, 0], high[:, 1]], 1), high
-    found = trace(
-        scene,
-        Lens(corners=grid.astype(np.float32), **blur),
-        view.cam_from_world,
-        np.arange(0, 2 * len(low) - 1, 2),
-        np.zeros(len(low), np.float32),
-        bounces=2,
-        seed=1,
+    samples = Samples(
+        places=np.arange(0, 2 * len(low) - 1, 2), angles=np.zeros(len(low), np.float32)
     )
-    return found.stokes.reshape(SIDE, SIDE, 3)
+    lens = Lens(corners=grid.astype(np.float32), **blur)
+    parts = trace(scene, lens, view.cam_from_world, samples, bounces=2, seed=1)
+    return np.concatenate([found.stokes for _, found in parts]).reshape(SIDE, SIDE, 3)
 
 
 def cosines(view: View, normals: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from polmvs.simulation.sensor import (
     stated_sigma,
     vignette,
 )
-from polmvs.simulation.transport import RAYS, Lens, trace_parts
+from polmvs.simulation.transport import RAYS, Lens, Samples, trace
 
 Array = NDArray[np.float64]
 
@@ -84,15 +84,9 @@ def render_picture(
         wavelengths = None
         if colours is not None:
             wavelengths = _wavelengths(colours[left], np.random.default_rng([seed, index, 5]))
-        parts = trace_parts(
-            scene,
-            lens,
-            view.cam_from_world,
-            left,
-            angles[left],
-            bounces=bounces,
-            seed=seed * 4099 + index,
-            wavelengths=wavelengths,
+        samples = Samples(places=left, angles=angles[left], wavelengths=wavelengths)
+        parts = trace(
+            scene, lens, view.cam_from_world, samples, bounces=bounces, seed=seed * 4099 + index
         )
         for part, traced in parts:
             stokes[left[part]] += traced.stokes

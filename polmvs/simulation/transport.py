@@ -69,72 +69,66 @@ class Traced:
     variance: Array
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Samples:
+    """N samples of a file, which rays go through.
+
+    Attributes
+    ----------
+    places : (N,), flat indices of samples, row by row.
+    angles : (N,), of each one's polarizer, rad.
+    wavelengths : (N, 4), nm, that each sample's rays have; None without colours.
+    """
+
+    places: NDArray[np.int64]
+    angles: NDArray[np.float32]
+    wavelengths: NDArray[np.float32] | None = None
+
+    def part(self, chosen: slice) -> Samples:
+        """Some of them."""
+        waves = self.wavelengths
+        return Samples(
+            places=self.places[chosen],
+            angles=self.angles[chosen],
+            wavelengths=None if waves is None else waves[chosen],
+        )
+
+    def padded(self, num: int) -> Samples:
+        """Followed by others, so that they are so many."""
+        add, waves = (0, num - len(self.places)), self.wavelengths
+        return Samples(
+            places=np.pad(self.places, add),
+            angles=np.pad(self.angles, add),
+            wavelengths=None if waves is None else np.pad(waves, (add, (0, 0)), mode="edge"),
+        )
+
+
 def trace(
     scene: MitsubaScene,
     lens: Lens,
     cam_from_world: RigidTransform,
-    samples: NDArray[np.int64],
-    angles: NDArray[np.float32],
+    samples: Samples,
     *,
     bounces: int,
     seed: int,
-    wavelengths: NDArray[np.float32] | None = None,
-) -> Traced:
-    """Send ``RAYS`` rays through each of some samples of a file, evenly spread over its area.
+) -> Iterator[tuple[slice, Traced]]:
+    """Send ``RAYS`` rays through each sample, evenly spread over its area.
+
+    Part after part of the samples, as a large file needs much memory at once.
 
     Parameters
     ----------
-    samples : (N,), flat indices of samples, row by row.
-    angles : (N,), of each one's polarizer, rad.
     bounces : reflections that are followed.
     seed : of all that is random.
-    wavelengths : (N, 4), nm, that each sample's rays have; None without colours.
     """
-    parts = trace_parts(
-        scene,
-        lens,
-        cam_from_world,
-        samples,
-        angles,
-        bounces=bounces,
-        seed=seed,
-        wavelengths=wavelengths,
-    )
-    found = [traced for _, traced in parts]
-    return Traced(
-        stokes=np.concatenate([one.stokes for one in found]),
-        diffuse=np.concatenate([one.diffuse for one in found]),
-        variance=np.concatenate([one.variance for one in found]),
-    )
-
-
-def trace_parts(
-    scene: MitsubaScene,
-    lens: Lens,
-    cam_from_world: RigidTransform,
-    samples: NDArray[np.int64],
-    angles: NDArray[np.float32],
-    *,
-    bounces: int,
-    seed: int,
-    wavelengths: NDArray[np.float32] | None = None,
-) -> Iterator[tuple[slice, Traced]]:
-    """As :func:`trace`, part after part of the samples: a large file needs much memory at once."""
     per_chunk = CHUNK_RAYS // RAYS
-    for start in range(0, len(samples), per_chunk):
-        part = slice(start, start + per_chunk)
+    num = len(samples.places)
+    for start in range(0, num, per_chunk):
+        part = slice(start, min(start + per_chunk, num))
+        seed_of_part = (seed * 1_000_003 + start) & 0x7FFFFFFF
         yield (
             part,
-            _trace_chunk(
-                scene,
-                lens,
-                cam_from_world,
-                samples[part],
-                angles[part],
-                bounces,
-                (seed * 1_000_003 + start) & 0x7FFFFFFF,
-                None if wavelengths is None else wavelengths[part],
-            ),
+            _trace_chunk(scene, lens, cam_from_world, samples.part(part), bounces, seed_of_part),
         )
 
 
@@ -142,25 +136,24 @@ def _trace_chunk(
     scene: MitsubaScene,
     lens: Lens,
     cam_from_world: RigidTransform,
-    samples: NDArray[np.int64],
-    angles: NDArray[np.float32],
+    samples: Samples,
     bounces: int,
     seed: int,
-    wavelengths: NDArray[np.float32] | None,
 ) -> Traced:
     mi, dr = scene.renderer.mi, scene.renderer.dr
     # Kernels are compiled for a number of rays: there are few of these, and they are kept.
-    num_samples = len(samples)
-    padding = max(MIN_CHUNK_RAYS // RAYS, 1 << (num_samples - 1).bit_length()) - num_samples
-    samples, angles = np.pad(samples, (0, padding)), np.pad(angles, (0, padding))
-    if wavelengths is not None:
-        wavelengths = np.pad(wavelengths, ((0, padding), (0, 0)), mode="edge")
-    num = len(samples) * RAYS
+    num_samples = len(samples.places)
+    samples = samples.padded(max(MIN_CHUNK_RAYS // RAYS, 1 << (num_samples - 1).bit_length()))
+    num = len(samples.places) * RAYS
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(dr.opaque(mi.UInt32, seed), num)
     index = dr.arange(mi.UInt32, num)
     site = index // RAYS
-    sample = dr.gather(mi.UInt32, mi.UInt32(samples.astype(np.uint32)), site)
+
+    def of_sample(values: NDArray[np.float32]) -> Any:
+        return dr.gather(mi.Float, mi.Float(np.ascontiguousarray(values)), site)
+
+    sample = dr.gather(mi.UInt32, mi.UInt32(samples.places.astype(np.uint32)), site)
     direction_in_cam, offset_in_cam = _camera_rays(scene, lens, sample, index % RAYS, sampler)
     world_from_cam = cam_from_world.inverse()
     # Numbers that change with the view are no literals: a kernel would be compiled for each.
@@ -169,13 +162,8 @@ def _trace_chunk(
     direction = _rotated(mi, rotation, direction_in_cam)
     offset = _rotated(mi, rotation, offset_in_cam)
     ray = mi.Ray3f(mi.Point3f(center) + offset, direction)
-    if wavelengths is not None:
-        ray.wavelengths = type(ray.wavelengths)(
-            *(
-                dr.gather(mi.Float, mi.Float(np.ascontiguousarray(wavelengths[:, k])), site)
-                for k in range(4)
-            )
-        )
+    if samples.wavelengths is not None:
+        ray.wavelengths = type(ray.wavelengths)(*map(of_sample, samples.wavelengths.T))
     total, diffuse = _follow(scene, ray, sampler, bounces)
     # Mitsuba's basis, turned to that of the image; angles count anticlockwise as displayed.
     along, up = _image_basis(mi, direction_in_cam)
@@ -187,26 +175,36 @@ def _trace_chunk(
     def turned(s1: Any, s2: Any) -> tuple[Any, Any]:
         return cos2 * s1 - sin2 * s2, sin2 * s1 + cos2 * s2
 
-    s1, s2 = turned(total[1], total[2])
-    d1, d2 = turned(diffuse[0], diffuse[1])
-    angle = dr.gather(mi.Float, mi.Float(angles), site)
-    behind = 0.5 * (total[0] + dr.cos(2 * angle) * s1 + dr.sin(2 * angle) * s2)
-    dr.eval(behind, total, s1, s2, d1, d2)
-    # Third differences along a row of strata: a gradient across the sample is no noise.
-    first = index - index % STRATA
-    row = [dr.gather(mi.Float, behind, first + k) for k in range(STRATA)]
-    differences = dr.square(row[0] - 3 * row[1] + 3 * row[2] - row[3]) / 20
-    sums = [
-        dr.block_reduce(dr.ReduceOp.Add, value, RAYS)
-        for value in (total[0], s1, s2, d1, d2, differences)
-    ]
-    dr.eval(sums)
-    columns = [np.asarray(value, np.float64)[:num_samples] / RAYS for value in sums]
+    light = (total[0], *turned(total[1], total[2]), *turned(diffuse[0], diffuse[1]))
+    means = _means(scene, light, of_sample(samples.angles), index)
+    columns = [np.asarray(mean, np.float64)[:num_samples] for mean in means]
     return Traced(
         stokes=np.stack(columns[:3], axis=1),
         diffuse=np.stack(columns[3:5], axis=1),
         variance=columns[5],
     )
+
+
+def _means(scene: MitsubaScene, light: tuple[Any, ...], angle: Any, index: Any) -> list[Any]:
+    """Means over the rays of each sample: of light as it is, and of the variance of one ray.
+
+    Parameters
+    ----------
+    light : s0, s1, s2 and more of each ray.
+    angle : of each ray's polarizer.
+    index : of each ray.
+    """
+    mi, dr = scene.renderer.mi, scene.renderer.dr
+    s0, s1, s2 = light[:3]
+    behind = 0.5 * (s0 + dr.cos(2 * angle) * s1 + dr.sin(2 * angle) * s2)
+    dr.eval(behind, *light)
+    # Third differences along a row of strata: a gradient across the sample is no noise.
+    first = index - index % STRATA
+    row = [dr.gather(mi.Float, behind, first + k) for k in range(STRATA)]
+    differences = dr.square(row[0] - 3 * row[1] + 3 * row[2] - row[3]) / 20
+    means = [dr.block_reduce(dr.ReduceOp.Add, v, RAYS) / RAYS for v in (*light, differences)]
+    dr.eval(means)
+    return means
 
 
 def _camera_rays(
