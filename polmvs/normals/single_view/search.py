@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import cv2
@@ -45,6 +46,11 @@ class PlaneSearchTolerances:
     coherence_blocks : side of the window in which most blocks have to agree. Guess.
     coherent_share : of that window. Derived: the majority, with a margin.
     model_sigma : rad; error of a block's phase that does not average out. Guess.
+    min_share : least support of a plane, share of the mask. Guess.
+    max_planes : the search ends there at the latest. Guess; time only.
+    max_residual_deg : of a block that supports a plane, beside three times its noise. Guess.
+    min_angle_deg : between the normals of two planes; what differs by less is the same plane under
+        light that the model does not explain. Guess.
     """
 
     num_hypotheses: int = 400
@@ -53,6 +59,10 @@ class PlaneSearchTolerances:
     coherence_blocks: int = 5
     coherent_share: float = 0.6
     model_sigma: float = 0.01
+    min_share: float = 0.04
+    max_planes: int = 8
+    max_residual_deg: float = 3.0
+    min_angle_deg: float = 5.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,13 +81,29 @@ class FoundPlane:
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Averages over blocks; (H', W') maps of what counts, arrays of the blocks that do."""
+    """Averages over blocks; (H', W') maps of what counts, arrays of the blocks that do.
+
+    ``limit`` (H', W') is the residual of a block that supports a plane, ``min_blocks`` the least
+    support there is.
+    """
 
     angle_model: AngleModel
     known: Mask
     axial: Floats
     rays: Floats
     sigma: Floats
+    tolerances: PlaneSearchTolerances
+
+    @cached_property
+    def limit(self) -> Array:
+        limit = np.zeros(self.known.shape)
+        limit[self.known] = np.hypot(np.radians(self.tolerances.max_residual_deg), 3 * self.sigma)
+        return limit
+
+    @cached_property
+    def min_blocks(self) -> int:
+        share = int(self.tolerances.min_share * np.count_nonzero(self.known))
+        return max(share, self.tolerances.coherence_blocks**2)
 
     def residuals(self, normal: Floats) -> Floats:
         """Size of the phase residual (H', W'), infinite where nothing is known."""
@@ -106,10 +132,6 @@ def find_planes(
     sigma: Floats,
     mask: Mask,
     *,
-    min_share: float = 0.04,
-    max_planes: int = 8,
-    max_residual_deg: float = 3.0,
-    min_angle_deg: float = 5.0,
     seed: int = 0,
     tolerances: PlaneSearchTolerances = PlaneSearchTolerances(),
 ) -> list[FoundPlane]:
@@ -122,11 +144,6 @@ def find_planes(
     rays : (3, H, W), unit, camera frame.
     sigma : (H, W), standard deviation of the phase, rad.
     mask : (H, W) bool, pixels to explain.
-    min_share : least support of a plane, share of the mask.
-    max_planes : the search ends there at the latest.
-    max_residual_deg : of a block that supports a plane, beside three times its noise; degrees.
-    min_angle_deg : between the normals of two planes; what differs by less is the same plane
-        under light that the model does not explain.
     seed : of the random pairs.
     tolerances : of this step.
 
@@ -136,23 +153,19 @@ def find_planes(
     """
     if axial.shape != (2, *mask.shape) or rays.shape != (3, *mask.shape):
         raise ValueError(f"{axial.shape=}, {rays.shape=}, {mask.shape=}.")
-    blocks = _average(angle_model, axial, rays, sigma, mask, tolerances=tolerances)
-    limit = np.full(blocks.known.shape, 0.0)
-    limit[blocks.known] = np.hypot(np.radians(max_residual_deg), 3 * blocks.sigma)
-    min_blocks = max(
-        int(min_share * np.count_nonzero(blocks.known)), tolerances.coherence_blocks**2
-    )
+    blocks = _average(angle_model, axial, rays, sigma, mask, tolerances)
     rng = np.random.default_rng(seed)
     left = blocks.known.copy()
     normals: list[Array] = []
-    while len(normals) < max_planes and np.count_nonzero(left) >= min_blocks:
-        normal, support = _best_plane(blocks, left, limit, min_blocks, rng, tolerances=tolerances)
-        if np.count_nonzero(support) < min_blocks:
+    apart = np.cos(np.radians(tolerances.min_angle_deg))
+    while len(normals) < tolerances.max_planes and np.count_nonzero(left) >= blocks.min_blocks:
+        normal, support = _best_plane(blocks, left, rng)
+        if np.count_nonzero(support) < blocks.min_blocks:
             break
         left &= ~support
-        if all(abs(float(normal @ other)) < np.cos(np.radians(min_angle_deg)) for other in normals):
+        if all(abs(float(normal @ other)) < apart for other in normals):
             normals.append(normal)
-    labels = _assign(blocks, normals, limit, min_blocks, tolerances=tolerances)
+    labels = _assign(blocks, normals)
     return _finish(angle_model, axial, rays, sigma, mask, labels)
 
 
@@ -162,7 +175,6 @@ def _average(
     rays: Floats,
     sigma: Floats,
     mask: Mask,
-    *,
     tolerances: PlaneSearchTolerances,
 ) -> _Blocks:
     """Average a phase map over blocks, weighted by precision; half a block has to be known."""
@@ -177,9 +189,8 @@ def _average(
     means = np.stack([_block_sums(weight * u)[known] for u in unit]) / total
     mean_rays = np.stack([_block_sums(np.where(usable, r, 0))[known] for r in rays])
     mean_rays /= np.sqrt((mean_rays * mean_rays).sum(axis=0))
-    return _Blocks(
-        angle_model, known, means, mean_rays, np.sqrt(1 / total + tolerances.model_sigma**2)
-    )
+    deviations = np.sqrt(1 / total + tolerances.model_sigma**2)
+    return _Blocks(angle_model, known, means, mean_rays, deviations, tolerances)
 
 
 def _block_sums(image: NDArray[Any]) -> Array:
@@ -189,44 +200,25 @@ def _block_sums(image: NDArray[Any]) -> Array:
     return np.asarray(whole.sum(axis=(1, 3), dtype=np.float64))
 
 
-def _best_plane(
-    blocks: _Blocks,
-    left: Mask,
-    limit: Floats,
-    min_blocks: int,
-    rng: np.random.Generator,
-    *,
-    tolerances: PlaneSearchTolerances,
-) -> tuple[Array, Mask]:
+def _best_plane(blocks: _Blocks, left: Mask, rng: np.random.Generator) -> tuple[Array, Mask]:
     """The best hypothesis about the blocks left, refined, and its coherent support."""
     best, support = np.full(3, np.nan), np.zeros_like(left)
-    for hypothesis in _hypotheses(blocks, left, limit, min_blocks, rng, tolerances=tolerances):
+    for hypothesis in _hypotheses(blocks, left, rng):
         normal: Array = hypothesis
-        inside = _coherent(
-            blocks.residuals(normal) < limit, left, min_blocks // 2, tolerances=tolerances
-        )
+        inside = _coherent(blocks, blocks.residuals(normal) < blocks.limit, left)
         for _ in range(4):
-            if np.count_nonzero(inside) < min_blocks // 2:
+            if np.count_nonzero(inside) < blocks.min_blocks // 2:
                 break
             normal = blocks.refine(inside, normal).normal
-            inside = _coherent(
-                blocks.residuals(normal) < limit, left, min_blocks // 2, tolerances=tolerances
-            )
+            inside = _coherent(blocks, blocks.residuals(normal) < blocks.limit, left)
         if np.count_nonzero(inside) > np.count_nonzero(support):
             best, support = normal, inside
     return best, support
 
 
-def _hypotheses(
-    blocks: _Blocks,
-    left: Mask,
-    limit: Floats,
-    min_blocks: int,
-    rng: np.random.Generator,
-    *,
-    tolerances: PlaneSearchTolerances,
-) -> list[Array]:
+def _hypotheses(blocks: _Blocks, left: Mask, rng: np.random.Generator) -> list[Array]:
     """Normals of pairs of rows near each other, those first that most blocks agree with."""
+    tolerances = blocks.tolerances
     rows = np.full((*left.shape, 3), np.nan)
     rows[blocks.known] = rows_from_axial(
         blocks.angle_model, blocks.axial[0], blocks.axial[1], blocks.rays.T
@@ -235,7 +227,7 @@ def _hypotheses(
     where = np.argwhere(left)
     first = where[rng.integers(len(where), size=tolerances.num_hypotheses)]
     # Up to the side of the least plane there is.
-    reach = np.geomspace(4, np.sqrt(min_blocks), tolerances.num_hypotheses)[:, None]
+    reach = np.geomspace(4, np.sqrt(blocks.min_blocks), tolerances.num_hypotheses)[:, None]
     second = first + np.rint(rng.uniform(-1, 1, first.shape) * reach).astype(np.int64)
     second = np.clip(second, 0, [height - 1, width - 1])
     normals = np.cross(rows[tuple(first.T)], rows[tuple(second.T)])
@@ -248,7 +240,7 @@ def _hypotheses(
         blocks.angle_model, blocks.axial[:, some], blocks.rays[:, some], blocks.sigma[some]
     )
     step = max(1, samples.shape[1] // tolerances.num_scored)
-    limits = limit[left][::step]
+    limits = blocks.limit[left][::step]
     scores = [
         np.count_nonzero(np.abs(phase_errors(normal, samples[:, ::step])) < limits)
         for normal in normals
@@ -256,10 +248,9 @@ def _hypotheses(
     return list(normals[np.argsort(scores)[::-1][: tolerances.num_refined]])
 
 
-def _coherent(
-    agree: Mask, left: Mask, min_blocks: int, *, tolerances: PlaneSearchTolerances
-) -> Mask:
-    """Blocks left in whose neighbourhood most agree, in areas of some size."""
+def _coherent(blocks: _Blocks, agree: Mask, left: Mask) -> Mask:
+    """Blocks left in whose neighbourhood most agree, in areas of half a plane or more."""
+    tolerances = blocks.tolerances
     window = (tolerances.coherence_blocks, tolerances.coherence_blocks)
     agreeing = cv2.blur((agree & left).astype(np.float32), window)
     present = cv2.blur(left.astype(np.float32), window)
@@ -267,46 +258,36 @@ def _coherent(
     num, labels, stats, _ = cv2.connectedComponentsWithStats(
         inside.astype(np.uint8), connectivity=4
     )
-    keep = stats[:, cv2.CC_STAT_AREA] >= min_blocks
+    keep = stats[:, cv2.CC_STAT_AREA] >= blocks.min_blocks // 2
     keep[0] = False
     return np.asarray(keep[labels]) if num > 1 else np.zeros_like(inside)
 
 
-def _assign(
-    blocks: _Blocks,
-    normals: Sequence[Array],
-    limit: Floats,
-    min_blocks: int,
-    *,
-    tolerances: PlaneSearchTolerances,
-) -> NDArray[np.int64]:
+def _assign(blocks: _Blocks, normals: Sequence[Array]) -> NDArray[np.int64]:
     """Number of the plane of each block (H', W'), -1 for none."""
     labels = np.full(blocks.known.shape, -1, np.int64)
     if not normals:
         return labels
     for _ in range(2):
         residuals = np.stack([blocks.residuals(normal) for normal in normals])
-        smooth = [
-            _mean_where(np.minimum(r, 2 * limit), blocks.known, tolerances=tolerances)
-            for r in residuals
-        ]
+        smooth = [_mean_where(blocks, np.minimum(r, 2 * blocks.limit)) for r in residuals]
         nearest = np.argmin(smooth, axis=0)
         labels[:] = -1
         refined = []
         for index, normal in enumerate(normals):
-            agree = (residuals[index] < limit) & (nearest == index)
-            inside = _coherent(agree, blocks.known, min_blocks // 2, tolerances=tolerances)
+            agree = (residuals[index] < blocks.limit) & (nearest == index)
+            inside = _coherent(blocks, agree, blocks.known)
             inside &= nearest == index
             labels[inside] = index
-            enough = np.count_nonzero(inside) >= min_blocks
+            enough = np.count_nonzero(inside) >= blocks.min_blocks
             refined.append(blocks.refine(inside, normal).normal if enough else normal)
         normals = refined
     return labels
 
 
-def _mean_where(image: Floats, known: Mask, *, tolerances: PlaneSearchTolerances) -> Floats:
+def _mean_where(blocks: _Blocks, image: Floats) -> Floats:
     """Mean over the known blocks of a window."""
-    window = (tolerances.coherence_blocks, tolerances.coherence_blocks)
+    known, window = blocks.known, (blocks.tolerances.coherence_blocks,) * 2
     total = cv2.blur(np.where(known, image, 0).astype(np.float32), window)
     return np.asarray(total / np.maximum(cv2.blur(known.astype(np.float32), window), 1e-6))
 
