@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.errors import OptionError
-from polmvs.evaluation.registration import IDENTITY, Reference, Registration, register
+from polmvs.evaluation.registration import IDENTITY, Reference, register
 from polmvs.geometry import SimilarityTransform, dots, lengths
 
 Array = NDArray[np.float64]
@@ -183,65 +184,45 @@ def measure_deviation(
         rotation=place.rotation,
         translation=place.translation,
     )
+    matrix = np.column_stack([laid.scale * laid.rotation, laid.translation])
+    spread = (to_mm * distance[near]).std()
     return Deviation(
         index=np.flatnonzero(near),
         points=moved[near],
         normals=facing[near],
         distance=to_mm * distance[near],
         sigma=total[near],
-        figures=_figures(
-            to_mm * distance[near],
-            total[near],
+        figures=DeviationFigures(
+            **_statistics(to_mm * distance[near], total[near], tolerance_mm, least_share),
             num_far=int((~near).sum()),
-            tolerance=tolerance_mm,
-            least_share=least_share,
             scale=place.scale if not is_metric else 1.0,
             unit=unit,
-            inferred=inferred,
-            found=found,
-            laid=laid,
-            repeats=other_run is not None,
+            unit_inferred=inferred,
+            ambiguous=found is not None and found.runner_up < AMBIGUOUS,
+            reference_from_result=(*map(tuple, matrix.tolist()), (0.0, 0.0, 0.0, 1.0)),
+            repeatability=None if other_run is None else float(spread / np.sqrt(2)),
         ),
         reference_from_result=laid,
     )
 
 
-def _figures(
-    distance: Array,
-    sigma: Array,
-    *,
-    num_far: int,
-    tolerance: float | None,
-    least_share: float,
-    scale: float,
-    unit: str,
-    inferred: bool,
-    found: Registration | None,
-    laid: SimilarityTransform,
-    repeats: bool,
-) -> DeviationFigures:
-    matrix = np.column_stack([laid.scale * laid.rotation, laid.translation])
+def _statistics(
+    distance: Array, sigma: Array, tolerance: float | None, least_share: float
+) -> dict[str, Any]:
+    """The figures that follow from distances and their standard deviations alone."""
     known = np.isfinite(sigma)
+    beyond = np.abs(distance[known]) > 3 * sigma[known]
     within = None if tolerance is None else float(np.mean(np.abs(distance) <= tolerance))
-    return DeviationFigures(
-        num_points=len(distance),
-        num_far=num_far,
-        mean=float(distance.mean()),
-        rms=float(np.sqrt(np.mean(distance**2))),
-        standard_deviation=float(distance.std()),
-        percentiles={str(p): float(np.percentile(distance, p)) for p in PERCENTILES},
-        median_sigma=float(np.median(sigma[known])) if known.any() else float("nan"),
-        significant_share=float(np.mean((np.abs(distance) > 3 * sigma)[known]))
-        if known.any()
-        else float("nan"),
-        tolerance=tolerance,
-        share_within=within,
-        least_share=least_share,
-        passed=None if within is None else within >= least_share,
-        scale=scale,
-        unit=unit,
-        unit_inferred=inferred,
-        ambiguous=found is not None and found.runner_up < AMBIGUOUS,
-        reference_from_result=(*map(tuple, matrix.tolist()), (0.0, 0.0, 0.0, 1.0)),
-        repeatability=float(distance.std() / np.sqrt(2)) if repeats else None,
-    )
+    return {
+        "num_points": len(distance),
+        "mean": float(distance.mean()),
+        "rms": float(np.sqrt(np.mean(distance**2))),
+        "standard_deviation": float(distance.std()),
+        "percentiles": {str(p): float(np.percentile(distance, p)) for p in PERCENTILES},
+        "median_sigma": float(np.median(sigma[known])) if known.any() else float("nan"),
+        "significant_share": float(beyond.mean()) if known.any() else float("nan"),
+        "tolerance": tolerance,
+        "share_within": within,
+        "least_share": least_share,
+        "passed": None if within is None else within >= least_share,
+    }
