@@ -103,3 +103,8 @@ def normal_from_angles(angle_model, phase, zenith, rays_in_cam) -> np.ndarray:
     zenith = np.asarray(zenith)[..., None]
     # Rodrigues; the axis is perpendicular to v.
     return np.asarray(-(np.cos(zenith) * v + np.sin(zenith) * np.cross(axis, v)))
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))

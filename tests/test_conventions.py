@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pycolmap
 import pytest
-from scenes import CAMERA
+from scenes import CAMERA, random_rotation
 
 from polmvs.camera import PinholeCamera, pixel_centers, sample_image, xy_from_opencv, xy_to_opencv
 from polmvs.geometry import RigidTransform, align_points
@@ -17,11 +17,6 @@ from polmvs.synthetic.captures import look_at, render_view
 from polmvs.synthetic.surfaces import Plane
 
 RNG = np.random.default_rng(0)
-
-
-def random_rotation(rng=RNG):
-    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return q * np.sign(np.linalg.det(q))
 
 
 def test_pixel_centres_are_at_half_integers():
@@ -74,14 +69,14 @@ def test_sampling_outside_or_nan_gives_zero_whatever_the_number_of_points():
 
 
 def test_transforms_compose_with_their_inverse():
-    transform = RigidTransform(random_rotation(), RNG.normal(size=3))
+    transform = RigidTransform(random_rotation(RNG), RNG.normal(size=3))
     points = RNG.normal(size=(2, 5, 3))
     np.testing.assert_allclose(transform.inverse() * (transform * points), points, atol=1e-12)
 
 
 def test_similarity_is_recovered_and_lines_are_refused():
     source = RNG.normal(size=(6, 3))
-    rotation, scale, shift = random_rotation(), 2.5, np.array([1.0, -2.0, 0.5])
+    rotation, scale, shift = random_rotation(RNG), 2.5, np.array([1.0, -2.0, 0.5])
     found = align_points(source, scale * source @ rotation.T + shift)
     np.testing.assert_allclose(found.rotation, rotation, atol=1e-12)
     assert found.scale == pytest.approx(scale)

@@ -264,7 +264,7 @@ def _read_pisr(folder: Path, given: CaptureOptions) -> DataSet:
         if match is None:
             raise DataError(path, "names no gamma; gamma0.5.txt is expected.")
         gamma = float(match[1])
-    lens = _read_npz(folder / "intrinsics.npz")
+    lens = read_npz(folder / "intrinsics.npz")
     width, height = _size_of(next(iter(images.values())))
     if raw:
         width, height = width // 2, height // 2
@@ -441,7 +441,7 @@ def _size_of(path: Path) -> tuple[int, int]:
     return header.width, header.height
 
 
-def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
+def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """Arrays of numbers by name.
 
     Raises
@@ -471,7 +471,7 @@ def _read_world_mats(
     path: Path, stems: tuple[str, ...], width: int, height: int
 ) -> tuple[PosedImage, ...]:
     """Cameras of IDR and NeuS, by name or by place in the order of names."""
-    content = _read_npz(path)
+    content = read_npz(path)
     cameras = []
     for index, stem in enumerate(stems):
         keys = [f"world_mat_{stem}", f"world_mat_{index}"]

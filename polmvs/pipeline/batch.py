@@ -220,7 +220,7 @@ def run_batch(
         outcomes = workers.outcomes(partial(_run_one, out, each), entries)
         try:
             for entry, outcome in zip(entries, outcomes, strict=True):
-                rows.append(_row_of(entry, outcome))
+                rows.append(row_of(entry, outcome))
                 everything = [*earlier, *rows]
                 write_json(out / JSON_FILE, everything)
                 write_bytes(out / TABLE_FILE, f"{batch_table(everything)}\n".encode())
@@ -310,7 +310,8 @@ def _run_one(out: Path, run_options: RunOptions, entry: BatchEntry) -> BatchRow:
         monitor.close()
 
 
-def _row_of(entry: BatchEntry, outcome: Callable[[], BatchRow]) -> BatchRow:
+def row_of(entry: BatchEntry, outcome: Callable[[], BatchRow]) -> BatchRow:
+    """Row of a capture, whose error, or lost process, makes a row as well."""
     try:
         return outcome()
     except BrokenProcessPool:

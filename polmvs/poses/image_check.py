@@ -112,8 +112,8 @@ def fit_to_images(
     """Compare cameras with the matches of the images' features; see there."""
     t = tolerances
     chosen = [views[k] for k in _evenly(len(views), t.max_views)]
-    sift = _detector(t)
-    found = [_features(sift, load_image(view.name)) for view in chosen]
+    sift = feature_detector(t)
+    found = [find_features(sift, load_image(view.name)) for view in chosen]
     distances = [np.zeros(0)]
     for (first, a), (second, b) in combinations(zip(chosen, found, strict=True), 2):
         matches = _consistent_matches(a, b, t)
@@ -147,12 +147,12 @@ def _evenly(num: int, most: int) -> list[int]:
     return sorted({round(float(k)) for k in np.linspace(0, num - 1, min(num, most))})
 
 
-def _detector(t: ImageCheckTolerances) -> cv2.SIFT:
+def feature_detector(t: ImageCheckTolerances) -> cv2.SIFT:
     """Without the quarter of a pixel by which OpenCV's enlarged image is shifted by default."""
     return cv2.SIFT.create(nfeatures=t.max_features, enable_precise_upscale=True)
 
 
-def _features(
+def find_features(
     sift: cv2.SIFT, image: NDArray[np.uint8]
 ) -> tuple[Array, NDArray[np.float32], tuple[int, int]]:
     """Places (N, 2), COLMAP's pixels, descriptors (N, 128), and the image's shape."""

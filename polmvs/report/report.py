@@ -98,7 +98,7 @@ ORTHOGRAPHIC = (AngleModel.TEXTBOOK_OPA, AngleModel.OPA)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ReportInput:
+class ReportInput:
     """A finished run, opened.
 
     Attributes
@@ -179,7 +179,7 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
     for page in _view_pages(given, samples):
         views.append(page)
         on_progress(1)
-    layers, channels = _layers(given)
+    layers, channels = scene_layers(given)
     scene = _scene(given, layers, channels)
     text = page_text(
         Page(
@@ -211,7 +211,7 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
     return run_folder.report
 
 
-def _open(folder: RunFolder) -> _ReportInput:
+def _open(folder: RunFolder) -> ReportInput:
     record = load_record(folder)
     options = options_from_plain(record.options, source=str(folder.run_file))
     models = dense_models(record)
@@ -223,7 +223,7 @@ def _open(folder: RunFolder) -> _ReportInput:
     if options.evaluation.gt is not None:
         truth = _open_truth(options.evaluation.gt, sparse.views)
     comparison = read_comparison(folder.metrics) if folder.metrics.is_file() else None
-    return _ReportInput(
+    return ReportInput(
         folder=folder,
         record=record,
         options=options,
@@ -282,7 +282,7 @@ def _open_truth(
 
 
 def _view_pages(
-    given: _ReportInput, samples: Mapping[AngleModel, ErrorSamples]
+    given: ReportInput, samples: Mapping[AngleModel, ErrorSamples]
 ) -> Iterator[ViewPage]:
     folder = given.folder
     maps = {m: open_maps(folder.sparse, folder.maps(m), m) for m in given.models}
@@ -317,7 +317,7 @@ def _view_pages(
         )
 
 
-def _mesh_of(given: _ReportInput, model: AngleModel) -> Mesh | None:
+def _mesh_of(given: ReportInput, model: AngleModel) -> Mesh | None:
     """The mesh of a model: the run's, or the one that its cloud was made from."""
     for path in (given.folder.mesh(model), given.folder.views(model) / SURFACE_MESH):
         if path.is_file():
@@ -329,7 +329,7 @@ def _mesh_of(given: _ReportInput, model: AngleModel) -> Mesh | None:
 # The 3D scene
 
 
-def _layers(given: _ReportInput) -> tuple[list[Layer], dict[str, PointColoring]]:
+def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColoring]]:
     """Clouds and meshes of all models, and what they can be coloured by."""
     sigmas = [
         np.asarray(cloud.scalars["sigma"])[_on_surface(cloud)]
@@ -466,7 +466,7 @@ def _deviation_layer(found: _FoundDeviation) -> tuple[Layer, PointColoring]:
     return thinned(layer, MAX_POINTS), channel
 
 
-def _cloud_layer(given: _ReportInput, model: AngleModel, cloud: Cloud, factor: float) -> Layer:
+def _cloud_layer(given: ReportInput, model: AngleModel, cloud: Cloud, factor: float) -> Layer:
     num = len(cloud.points)
     shown = {"intensity": np.full(num, 0.7) if cloud.colors is None else cloud.colors[:, 0] / 255}
     for name, values in cloud.scalars.items():
@@ -496,7 +496,7 @@ def _cloud_layer(given: _ReportInput, model: AngleModel, cloud: Cloud, factor: f
     return replace(layer, values={**layer.values, **errors})
 
 
-def _residuals(given: _ReportInput, model: AngleModel, layer: Layer) -> Floats:
+def _residuals(given: ReportInput, model: AngleModel, layer: Layer) -> Floats:
     """Mean residual phase of each point over the views that see it, degrees; NaN without one."""
     total, count = np.zeros(len(layer.points)), np.zeros(len(layer.points))
     on_surface = np.flatnonzero(np.linalg.norm(layer.normals, axis=1) > 0.5)
@@ -522,7 +522,7 @@ def _on_surface(cloud: Cloud) -> NDArray[np.bool_]:
 
 
 def _scene(
-    given: _ReportInput, layers: Sequence[Layer], channels: Mapping[str, PointColoring]
+    given: ReportInput, layers: Sequence[Layer], channels: Mapping[str, PointColoring]
 ) -> Scene3D | None:
     if not layers:
         return None
@@ -549,7 +549,7 @@ def _scene(
     )
 
 
-def _box_frames(given: _ReportInput) -> list[BoxFrame]:
+def _box_frames(given: ReportInput) -> list[BoxFrame]:
     """Frames of the printed markers that the run's scale came from."""
     aruco = given.options.reference.aruco
     if aruco is None:
@@ -567,14 +567,14 @@ def _box_frames(given: _ReportInput) -> list[BoxFrame]:
     ]
 
 
-def _is_thinned(given: _ReportInput) -> bool:
+def _is_thinned(given: ReportInput) -> bool:
     return any(len(cloud.points) > MAX_POINTS for cloud in given.clouds.values())
 
 
 # Words and figures
 
 
-def _title(given: _ReportInput) -> str:
+def _title(given: ReportInput) -> str:
     """What the run made, in a sentence."""
     capture = given.record.capture
     name = capture.folder.name if capture else given.folder.root.name
@@ -583,20 +583,20 @@ def _title(given: _ReportInput) -> str:
     return f"{name}: {num_views} views became a surface of {points:,} points"
 
 
-def _sentence(given: _ReportInput) -> str:
+def _sentence(given: ReportInput) -> str:
     """What a reader in a hurry takes along, in plain words."""
     words = [*_size_words(given), *_quality_words(given)]
     return " ".join(words)
 
 
-def _size_words(given: _ReportInput) -> list[str]:
+def _size_words(given: ReportInput) -> list[str]:
     size = _size(given)
     if size is None:
         return []
     return [f"The part is about {size} in size."]
 
 
-def _size(given: _ReportInput) -> str | None:
+def _size(given: ReportInput) -> str | None:
     """Extents of the part along its main directions; None where lengths have no unit."""
     surface = given.clouds[given.main]
     points = surface.points[_on_surface(surface)]
@@ -621,7 +621,7 @@ def _sides(points: Floats) -> Floats:
     return np.sort(best)[::-1]
 
 
-def _quality_words(given: _ReportInput) -> list[str]:
+def _quality_words(given: ReportInput) -> list[str]:
     """How good the surface is, and how it would be under OPA where that was tried."""
     main = given.main
     figures = given.comparison.models if given.comparison is not None else {}
@@ -656,7 +656,7 @@ def _quality_words(given: _ReportInput) -> list[str]:
     return [words[0] + "."]
 
 
-def _uncertainty_words(given: _ReportInput) -> list[str]:
+def _uncertainty_words(given: ReportInput) -> list[str]:
     """What the points state of themselves."""
     cloud = given.clouds[given.main]
     sigma = np.asarray(cloud.scalars.get("sigma", ()), np.float64)
@@ -671,7 +671,7 @@ def _uncertainty_words(given: _ReportInput) -> list[str]:
     ]
 
 
-def _warnings(given: _ReportInput) -> tuple[str, ...]:
+def _warnings(given: ReportInput) -> tuple[str, ...]:
     """Those of the run, and of what stands beside it."""
     warnings = [w for stage in given.record.stages for w in stage.warnings]
     if given.deviation is not None and given.deviation.is_stale:
@@ -682,7 +682,7 @@ def _warnings(given: _ReportInput) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _deviation_section(given: _ReportInput) -> DeviationSection | None:
+def _deviation_section(given: ReportInput) -> DeviationSection | None:
     """The part against its reference, in words, figures and pictures."""
     if given.deviation is None or given.deviation.is_stale:
         return None
@@ -722,7 +722,7 @@ def _deviation_section(given: _ReportInput) -> DeviationSection | None:
     )
 
 
-def _facts(given: _ReportInput) -> list[tuple[str, str]]:
+def _facts(given: ReportInput) -> list[tuple[str, str]]:
     poses, seeds = given.record.result(PosesResult), given.record.result(SeedsResult)
     main = given.main
     total = poses.num_views + len(poses.unregistered)
@@ -747,7 +747,7 @@ def _facts(given: _ReportInput) -> list[tuple[str, str]]:
     return facts
 
 
-def _tables(given: _ReportInput) -> tuple[Table, ...]:
+def _tables(given: ReportInput) -> tuple[Table, ...]:
     """The figures to begin with, and all of them."""
     if given.comparison is None:
         return ()
@@ -756,7 +756,7 @@ def _tables(given: _ReportInput) -> tuple[Table, ...]:
     return Table(header=header, rows=first), Table(header=header, rows=rows)
 
 
-def _verdict(given: _ReportInput) -> list[str]:
+def _verdict(given: ReportInput) -> list[str]:
     """Whether the main result is to be trusted, in one sentence."""
     main = next(m for m in MAIN if m in given.models)
     found = given.record.find(Trust, main)
@@ -765,7 +765,7 @@ def _verdict(given: _ReportInput) -> list[str]:
     return [f"{plots.LABELS[main]}: {found.verdict.replace('`', '')}"]
 
 
-def _trust(given: _ReportInput) -> Table | None:
+def _trust(given: ReportInput) -> Table | None:
     """What the main result says about itself, with what is normal."""
     main = next(m for m in MAIN if m in given.models)
     found = given.record.find(Trust, main)
@@ -783,7 +783,7 @@ def _trust(given: _ReportInput) -> Table | None:
     return Table(header=[plots.LABELS[main], "value", "normal", ""], rows=rows)
 
 
-def _plots(given: _ReportInput, samples: Mapping[AngleModel, ErrorSamples]) -> list[Plot]:
+def _plots(given: ReportInput, samples: Mapping[AngleModel, ErrorSamples]) -> list[Plot]:
     def joined(name: str) -> dict[AngleModel, Floats]:
         found = {m: np.concatenate([np.zeros(0), *getattr(s, name)]) for m, s in samples.items()}
         return {model: values for model, values in found.items() if len(values)}
@@ -832,7 +832,7 @@ def _plots(given: _ReportInput, samples: Mapping[AngleModel, ErrorSamples]) -> l
     return result
 
 
-def _against_views(given: _ReportInput) -> list[Plot]:
+def _against_views(given: ReportInput) -> list[Plot]:
     """Stated deviation of the points by the number of views that agree on them."""
     sigma, count = {}, {}
     for model, cloud in given.clouds.items():

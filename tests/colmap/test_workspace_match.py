@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from dense_scenes import board_scene
-from test_conventions import random_rotation
+from scenes import random_rotation
 
 from polmvs.colmap.cameras import rescaled_camera
 from polmvs.colmap.dense_workspace import (

@@ -15,7 +15,7 @@ import pytest
 
 from polmvs.config import MAX_PIXELS, CaptureOptions
 from polmvs.errors import DataError
-from polmvs.io.data_sets import _read_npz
+from polmvs.io.data_sets import read_npz
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.image_size import declared_size
 from polmvs.io.images import read_gray, read_mask
@@ -201,7 +201,7 @@ def test_cameras_of_a_set_are_weighed_before_they_are_unpacked(tmp_path: Path) -
     np.savez_compressed(path, world_mat_0=np.zeros((40_000, 1000)))
     assert path.stat().st_size < 1 << 20
     with pytest.raises(DataError, match="is too large for cameras"):
-        _read_npz(path)
+        read_npz(path)
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(
         header, {"descr": "<f8", "fortran_order": False, "shape": (700_000_000,)}
@@ -210,10 +210,10 @@ def test_cameras_of_a_set_are_weighed_before_they_are_unpacked(tmp_path: Path) -
         file.writestr("world_mat_0.npy", header.getvalue())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(DataError, match="truncated"):
-        _read_npz(path)
+        read_npz(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
     np.savez_compressed(path, world_mat_0=np.eye(4))
-    np.testing.assert_array_equal(_read_npz(path)["world_mat_0"], np.eye(4))
+    np.testing.assert_array_equal(read_npz(path)["world_mat_0"], np.eye(4))
 
 
 def test_a_file_without_end_is_not_read(tmp_path: Path) -> None:

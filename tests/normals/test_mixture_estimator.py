@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_estimator import errors_deg, simulate, tangents_of, unit
+from rows_of_points import errors_deg, simulate, tangents_of, unit
 
 from polmvs.normals.mixture_estimator import MixtureTolerances, row_scales, solve_mixture
 from polmvs.normals.observations import Observations

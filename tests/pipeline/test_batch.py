@@ -24,7 +24,7 @@ from polmvs.config import (
     to_plain,
 )
 from polmvs.errors import DataError, OptionError
-from polmvs.pipeline.batch import BatchEntry, _row_of, read_batch, run_batch
+from polmvs.pipeline.batch import BatchEntry, read_batch, row_of, run_batch
 from polmvs.polarization.kinds import AngleModel, Light
 
 COARSE = ("--method", "integrate", "--stride-px", 8, "--no-mesh", "--no-colmap", "--workers", 2)
@@ -247,7 +247,7 @@ def test_a_lost_worker_is_one_row() -> None:
     def lose(error):
         raise error
 
-    row = _row_of(entry, partial(lose, BrokenProcessPool()))
+    row = row_of(entry, partial(lose, BrokenProcessPool()))
     assert (row.state, "out of memory" in row.message) == ("failed", True)
-    row = _row_of(entry, partial(lose, DataError("tcp://a", "workers were lost.")))
+    row = row_of(entry, partial(lose, DataError("tcp://a", "workers were lost.")))
     assert (row.state, row.message) == ("failed", "tcp://a: workers were lost.")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from test_markers import ONE, OPTION, PINHOLE, loader, views_of
+from marker_scenes import ONE, OPTION, PINHOLE, loader, views_of
 
 from polmvs.config import CropOptions
 from polmvs.errors import OptionError

@@ -10,7 +10,7 @@ from polmvs.geometry import SimilarityTransform
 from polmvs.io.clouds import Cloud
 from polmvs.polarization.kinds import AngleModel
 from polmvs.report import report
-from polmvs.report.report import _layers, _ReportInput
+from polmvs.report.report import ReportInput, scene_layers
 from polmvs.scene import PointKind
 
 
@@ -47,9 +47,9 @@ def test_deviations_of_a_metric_cloud_are_millimetres(
         places = scale * cloud.points + [0, 0, 0.001]
         true = SimpleNamespace(points=places, normals=np.asarray(cloud.normals))
         given.truth = (SimpleNamespace(surface_points=lambda: true), similarity)
-    given.length = _ReportInput.length.fget(given)
+    given.length = ReportInput.length.fget(given)
     monkeypatch.setattr(report, "_residuals", lambda *_: np.full(50, 1.0))
-    layers, channels = _layers(given)
+    layers, channels = scene_layers(given)
     assert channels["sigma"].unit == unit
     assert channels["sigma"].high == pytest.approx(0.002 * factor)
     np.testing.assert_allclose(layers[0].values["sigma"], 0.002 * factor)
