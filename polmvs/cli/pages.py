@@ -17,6 +17,7 @@ from polmvs.cli.terminal import Terminal
 from polmvs.errors import DataError
 from polmvs.io.clouds import Cloud, Mesh, has_triangles, read_cloud, read_mesh, show_in_viewer
 from polmvs.io.images import write_png
+from polmvs.pipeline.export import part_of
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import load_record
 from polmvs.pipeline.stages.poses import PosesResult
@@ -24,7 +25,6 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.report.recording import num_recorded_steps, require_rerun, write_recording
 from polmvs.report.rendering import Viewpoint, contact_sheet
 from polmvs.report.report import write_report
-from polmvs.scene import PointKind
 from polmvs.separate import CrashError, run_separately
 
 
@@ -110,7 +110,7 @@ def render(call: Call, terminal: Terminal) -> int:
         read_mesh(path) if has_triangles(path) else read_cloud(path) for path in arguments.files
     ]
     if arguments.part:
-        subjects = [_part(one) if isinstance(one, Cloud) else one for one in subjects]
+        subjects = [part_of(one) if isinstance(one, Cloud) else one for one in subjects]
     viewpoints = [
         Viewpoint(elevation_deg=elevation, azimuth_deg=azimuth)
         for elevation, azimuth in product(arguments.elevations, arguments.azimuths)
@@ -125,11 +125,3 @@ def render(call: Call, terminal: Terminal) -> int:
     write_png(arguments.picture, np.ascontiguousarray(sheet[..., ::-1]))  # OpenCV counts BGR
     terminal.show([str(arguments.picture)], {"picture": arguments.picture})
     return 0
-
-
-def _part(cloud: Cloud) -> Cloud:
-    """A cloud without points of the surroundings; all of one that does not tell."""
-    kind = cloud.scalars.get("kind")
-    if kind is None:
-        return cloud
-    return cloud.only(np.isin(kind, (PointKind.SURFACE, PointKind.PRESUMED)))

@@ -23,7 +23,7 @@ from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation, unit
 from polmvs.io.image_size import PNG_SIGNATURE
-from polmvs.io.images import decode_image, read_bytes
+from polmvs.io.images import decode_image, read_bytes, write_png
 from polmvs.io.plain_files import read_text
 from polmvs.io.raw_formats import read_npy
 from polmvs.io.typed_json import parse_json
@@ -310,3 +310,25 @@ def _is_smooth(depth: Array) -> Mask:
         behind = padded[1 - row : 1 - row + height, 1 - col : 1 - col + width]
         np.maximum(bend, np.abs(ahead + behind - 2.0 * inverse), out=bend)
     return np.asarray(bend < MAX_RELATIVE_BEND * inverse, np.bool_)
+
+
+def write_true_maps(stem: Path, depth: Array, normals_in_cam: Array, mask: Mask) -> None:
+    """Write the maps of one view, ``STEM_depth.png``, ``STEM_mask.png`` and ``STEM_normal.png``.
+
+    Parameters
+    ----------
+    depth : (H, W), m; what is too far for 16 bits is unknown.
+    normals_in_cam : (H, W, 3), of the part.
+    mask : (H, W), where the part is seen.
+
+    Raises
+    ------
+    DataError
+        The system refuses.
+    """
+    encoded = np.rint(depth / DEPTH_UNIT_M)
+    encoded = np.where(encoded <= np.iinfo(np.uint16).max, encoded, 0)
+    write_png(f"{stem}_depth.png", encoded.astype(np.uint16))
+    write_png(f"{stem}_mask.png", np.where(mask, 255, 0).astype(np.uint8))
+    coded = np.rint((np.where(mask[..., None], normals_in_cam, 0) + 1) * 32767.5)
+    write_png(f"{stem}_normal.png", np.ascontiguousarray(coded.astype(np.uint16)[..., ::-1]))

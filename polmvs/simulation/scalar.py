@@ -18,6 +18,7 @@ from polmvs.errors import OptionError
 from polmvs.geometry import unit
 from polmvs.scene import View
 from polmvs.simulation.scene import MitsubaScene
+from polmvs.simulation.sensor import across
 from polmvs.simulation.transport import Lens
 
 logger = logging.getLogger(__name__)
@@ -135,13 +136,7 @@ def _to_image_basis(parameters: Array, rays: Array) -> Array:
 
     The integrator's first axis lies across the sensor's upward axis in the transverse plane.
     """
-    x, y, z = rays[..., 0], rays[..., 1], rays[..., 2]
-    upward = unit(np.stack([x * y, y * y - 1, y * z], axis=-1))  # (0, -1, 0) without its part along
-    scale = 1 / (1 + z)
-    along = np.stack([1 - x * x * scale, -x * y * scale, -x], axis=-1)
-    up = np.stack([x * y * scale, y * y * scale - 1, y], axis=-1)
-    cos, sin = (upward * along).sum(axis=-1), (upward * up).sum(axis=-1)
-    cos2, sin2 = (sin * sin - cos * cos)[..., None], (-2 * sin * cos)[..., None]
+    cos2, sin2 = (part[..., None] for part in across(np.array([0.0, -1.0, 0.0]), rays))
     s0, s1, s2 = np.moveaxis(parameters, 2, 0)
     return np.stack([s0, cos2 * s1 - sin2 * s2, sin2 * s1 + cos2 * s2], axis=2)
 

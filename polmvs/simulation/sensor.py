@@ -81,13 +81,22 @@ def transmitted_axis(rays: Array, angles: Array, optics: Optics) -> tuple[Array,
     if optics is Optics.TELECENTRIC:
         return np.cos(2 * angles), np.sin(2 * angles)
     # Across the projected absorbing axis, which is (sin, cos, 0) of the transmission axis' angle.
-    x, y, z = rays[..., 0], rays[..., 1], rays[..., 2]
     absorbing = np.stack([np.sin(angles), np.cos(angles), np.zeros_like(angles)], axis=-1)
-    absorbing = unit(absorbing - (absorbing * rays).sum(axis=-1, keepdims=True) * rays)
+    return across(absorbing, rays)
+
+
+def across(axis: Array, rays: Array) -> tuple[Array, Array]:
+    """Cosine and sine of twice the angle of the direction across an axis, transverse plane.
+
+    Angles count from the image's x, turned by the shortest rotation from the optical axis to the
+    ray.
+    """
+    x, y, z = rays[..., 0], rays[..., 1], rays[..., 2]
+    axis = unit(axis - (axis * rays).sum(axis=-1, keepdims=True) * rays)
     scale = 1 / (1 + z)
     along = np.stack([1 - x * x * scale, -x * y * scale, -x], axis=-1)
     up = np.stack([x * y * scale, y * y * scale - 1, y], axis=-1)
-    cos, sin = (absorbing * along).sum(axis=-1), (absorbing * up).sum(axis=-1)
+    cos, sin = (axis * along).sum(axis=-1), (axis * up).sum(axis=-1)
     return sin * sin - cos * cos, -2 * sin * cos
 
 

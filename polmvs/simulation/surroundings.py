@@ -18,6 +18,7 @@ from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
 from polmvs.simulation.options import Scenery, SceneryOptions
 from polmvs.synthetic.printed import random_print
+from polmvs.synthetic.shapes import grid_triangles
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -113,17 +114,14 @@ def _table(size: float, rng: np.random.Generator, *, round_: bool) -> Surroundin
         rows = cols = TABLE_CELLS
     unit_xy = unit_xy.reshape(-1, 2)
     points = np.column_stack([half * unit_xy, np.zeros(len(unit_xy))])
-    index = np.arange((rows + 1) * (cols + 1)).reshape(rows + 1, cols + 1)
-    a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
-    c, d = index[1:, 1:].ravel(), index[1:, :-1].ravel()
-    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    triangles = grid_triangles(rows, cols)
     if round_:
         triangles = triangles[:, ::-1]
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape).copy()
     # The print's texels are of one size whatever the table's.
     share = half / (0.5 * TABLE_SIDE * size)
     uv = 0.5 + 0.5 * share * unit_xy
-    mesh = Mesh(points, normals, np.ascontiguousarray(triangles, np.int32))
+    mesh = Mesh(points, normals, np.ascontiguousarray(triangles))
     return Surrounding(
         mesh=mesh, uv=uv.astype(np.float32), print=_print(PRINT_SIDE, int(rng.integers(1 << 31)))
     )
@@ -157,13 +155,10 @@ def _block(sides: Array, turn: float, center: Array, texture: Image) -> Surround
     points: list[Array] = []
     normals: list[Array] = []
     uvs: list[Array] = []
-    triangles: list[NDArray[np.int64]] = []
+    triangles: list[NDArray[np.int32]] = []
     steps = np.linspace(-1, 1, cells + 1)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
-    a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
-    c, d = index[1:, 1:].ravel(), index[1:, :-1].ravel()
-    quad = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    quad = grid_triangles(cells, cells)
     rotation = np.array(
         [[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]]
     )
@@ -185,9 +180,5 @@ def _block(sides: Array, turn: float, center: Array, texture: Image) -> Surround
         corner = np.array([face % 3, face // 3]) / 3
         uvs.append(corner + (0.5 * grid + 0.5) * extent)
         triangles.append(quad + start)
-    mesh = Mesh(
-        np.concatenate(points),
-        unit(np.concatenate(normals)),
-        np.concatenate(triangles).astype(np.int32),
-    )
+    mesh = Mesh(np.concatenate(points), unit(np.concatenate(normals)), np.concatenate(triangles))
     return Surrounding(mesh=mesh, uv=np.concatenate(uvs).astype(np.float32), print=texture)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.io.arrays import save_array
-from polmvs.io.ground_truth import DEPTH_UNIT_M
+from polmvs.io.ground_truth import write_true_maps
 from polmvs.io.images import write_png
 from polmvs.io.typed_json import write_json
 from polmvs.scene import View, stem_of
@@ -90,12 +90,7 @@ def write_truth(
     """
     depth, normals, mask = maps
     stem = folder / stem_of(view.name)
-    encoded = np.rint(depth / DEPTH_UNIT_M)
-    encoded = np.where(encoded <= np.iinfo(np.uint16).max, encoded, 0)  # too far: unknown
-    write_png(f"{stem}_depth.png", encoded.astype(np.uint16))
-    write_png(f"{stem}_mask.png", np.where(mask, 255, 0).astype(np.uint8))
-    coded = np.rint((np.where(mask[..., None], normals, 0) + 1) * 32767.5)
-    write_png(f"{stem}_normal.png", np.ascontiguousarray(coded.astype(np.uint16)[..., ::-1]))
+    write_true_maps(stem, depth, normals, mask)
     stokes = _at_pixels(picture.stokes, mask.shape)
     if picture.diffuse is not None:
         diffuse = _at_pixels(picture.diffuse, mask.shape)

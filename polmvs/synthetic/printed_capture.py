@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, in_image
 from polmvs.io.folders import new_folder
-from polmvs.io.ground_truth import DEPTH_UNIT_M
+from polmvs.io.ground_truth import write_true_maps
 from polmvs.io.images import write_bytes, write_png
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.scene import SparseModel, Tracks, View
@@ -183,10 +183,4 @@ def _write_view(folder: Path, scene: PrintedScene, maps: bool, view: View, seed:
         return
     part, depth = render_printed_truth(view, scene)
     seen = part.mask & (part.depth <= depth + 1e-9)
-    stem = folder / "gt" / Path(view.name).stem
-    encoded = np.rint(depth / DEPTH_UNIT_M)
-    encoded = np.where(encoded <= np.iinfo(np.uint16).max, encoded, 0)  # the far ground: unknown
-    write_png(f"{stem}_depth.png", encoded.astype(np.uint16))
-    write_png(f"{stem}_mask.png", np.where(seen, 255, 0).astype(np.uint8))
-    normals = np.rint((np.where(seen[..., None], part.normals_in_cam, 0) + 1) * 32767.5)
-    write_png(f"{stem}_normal.png", normals.astype(np.uint16)[..., ::-1].copy())
+    write_true_maps(folder / "gt" / Path(view.name).stem, depth, part.normals_in_cam, seen)

@@ -162,7 +162,7 @@ def _segments(radius: float) -> int:
     return 4 * math.ceil(math.pi / math.acos(1 - MAX_SAG / radius) / 4)
 
 
-def _grid_triangles(rows: int, cols: int) -> Triangles:
+def grid_triangles(rows: int, cols: int) -> Triangles:
     """Of a grid of (rows + 1) x (cols + 1) vertices."""
     index = np.arange((rows + 1) * (cols + 1)).reshape(rows + 1, cols + 1)
     a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
@@ -174,9 +174,7 @@ def _surface(place: Callable[[Array, Array], Array], across: int, up: int) -> Me
     """Points ``place(u, v)`` of a grid over the unit square, without normals."""
     v, u = np.meshgrid(np.linspace(0, 1, up + 1), np.linspace(0, 1, across + 1), indexing="ij")
     points = place(u, v).reshape(-1, 3)
-    return Mesh(
-        points, np.zeros_like(points), _without_slivers(points, _grid_triangles(up, across))
-    )
+    return Mesh(points, np.zeros_like(points), _without_slivers(points, grid_triangles(up, across)))
 
 
 def _without_slivers(points: Array, triangles: Triangles) -> Triangles:
@@ -220,7 +218,7 @@ def _lathe_smooth(profile: Array, slope: Array, segments: int) -> Mesh:
     normals = unit(
         np.stack([outwards * np.cos(angle), outwards * np.sin(angle), up + 0 * angle], axis=-1)
     ).reshape(-1, 3)
-    triangles = _grid_triangles(len(profile) - 1, segments)
+    triangles = grid_triangles(len(profile) - 1, segments)
     return Mesh(points, normals, _without_slivers(points, triangles))
 
 
@@ -240,7 +238,7 @@ def _tube(path: Array, tangents: Array, sides: Array, radius: float, *, closed: 
     across = np.cross(tangents, sides)
     normals = np.cos(angle) * sides[:, None] + np.sin(angle) * across[:, None]
     points = path[:, None] + radius * normals
-    triangles = _grid_triangles(len(path) - 1, num)
+    triangles = grid_triangles(len(path) - 1, num)
     return Mesh(points.reshape(-1, 3), normals.reshape(-1, 3), triangles)
 
 
@@ -276,7 +274,7 @@ def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> M
             points[:, axis] = high_[axis] if side else low_[axis]
             normal = np.zeros(3)
             normal[axis] = 1.0 if side else -1.0
-            triangles = _grid_triangles(counts[1], counts[0])
+            triangles = grid_triangles(counts[1], counts[0])
             if not side:
                 triangles = triangles[:, ::-1].copy()
             faces.append(Mesh(points, np.broadcast_to(normal, points.shape).copy(), triangles))
