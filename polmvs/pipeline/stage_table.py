@@ -202,37 +202,15 @@ def _write_sparse_cloud(model: AngleModel, run: StageInput) -> sparse_cloud.Spar
 
 
 def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
-    return _densify_call(model, run)(workers=run.workers, on_progress=run.on_progress)
+    return densify.densify(
+        model, run.run_folder, run.options, workers=run.workers, on_progress=run.on_progress
+    )
 
 
 def _densify_apart(model: AngleModel, run: StageInput) -> Callable[[], Any] | None:
     """The surface of all views is one process's work, the views one by one are many's."""
     whole = run.options.propagation.method is Method.SURFACE
-    return _densify_call(model, run) if whole else None
-
-
-def _densify_call(model: AngleModel, run: StageInput) -> Callable[..., densify.DensifyResult]:
-    folder = run.run_folder
-    return partial(
-        densify.densify,
-        model,
-        sparse=folder.sparse,
-        camera_modes=folder.camera_modes,
-        pose_covariances=folder.pose_covariances,
-        images=folder.images,
-        maps=folder.maps(model),
-        track_normals=folder.track_normals(model),
-        seeds=folder.seeds,
-        cloud=folder.cloud(model),
-        views=folder.views(model),
-        propagation=run.options.propagation,
-        fusion=run.options.fusion,
-        crop=run.options.crop,
-        aruco=run.options.reference.aruco,
-        tilt_aware=run.options.normals.tilt_aware_weights,
-        light=run.options.region.light,
-        masks_given=run.options.region.mask is not None,
-    )
+    return partial(densify.densify, model, run.run_folder, run.options) if whole else None
 
 
 def _find_trust(model: AngleModel, run: StageInput) -> Trust:
@@ -258,17 +236,7 @@ def trust_of(model: AngleModel, folder: RunFolder, record: Record, options: Opti
             *(mapped.complaints if mapped is not None else ()),
         ],
     )
-    return trust.find_trust(
-        model,
-        made,
-        sparse=folder.sparse,
-        maps=folder.maps(model),
-        sparse_cloud=folder.sparse_cloud(model),
-        track_normals=folder.track_normals(model),
-        seeds=folder.seeds,
-        cloud=folder.cloud(model),
-        views=folder.views(model),
-    )
+    return trust.find_trust(model, made, folder)
 
 
 def _make_mesh(model: AngleModel, run: StageInput) -> mesh.MeshResult:

@@ -30,7 +30,7 @@ from polmvs.geometry import RigidTransform, SimilarityTransform, points_on_rays
 from polmvs.io.clouds import Cloud, read_cloud, read_mesh, write_cloud
 from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
 from polmvs.pipeline.run_folder import DENSE_MARKER, SURFACE_MESH
-from polmvs.pipeline.stages.densify import _crop_views, open_dense_views, unused_options
+from polmvs.pipeline.stages.densify import crop_views, open_dense_views, unused_options
 from polmvs.poses.crop_box import CropBox
 from polmvs.poses.metric_frame import transform_model
 from polmvs.scene import PointKind
@@ -374,7 +374,7 @@ def test_a_box_cuts_the_surface_of_all_views(run: Path, tmp_path: Path) -> None:
     whole = read_mesh(run / "views_ppa" / SURFACE_MESH)
     middle = whole.vertices.mean(axis=0)
     box = CropBox(RigidTransform(np.eye(3), np.zeros(3)), np.array([middle[0], -9, -9]), 9 * ONES)
-    _crop_views(tmp_path / "views", read_model(run / "sparse").views, box)
+    crop_views(tmp_path / "views", read_model(run / "sparse").views, box)
     half = read_mesh(tmp_path / "views" / SURFACE_MESH)
     assert half.vertices[:, 0].min() >= middle[0]
     assert 0.3 < len(half.triangles) / len(whole.triangles) < 0.7

@@ -23,26 +23,26 @@ from polmvs.colmap.dense_workspace import (
 )
 from polmvs.colmap.filling import previous_backups
 from polmvs.colmap.models import read_model
-from polmvs.config import (
-    CropOptions,
-    FusionOptions,
-    Method,
-    PropagationOptions,
-    Surroundings,
-)
+from polmvs.config import FusionOptions, Method, Options, PropagationOptions, Surroundings
 from polmvs.geometry import points_on_rays
 from polmvs.io.clouds import Cloud, Mesh, read_mesh, write_cloud, write_mesh
 from polmvs.io.images import read_gray
 from polmvs.parallel import OnProgress, Workers, no_progress
-from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, replace_folder, scratch
+from polmvs.pipeline.run_folder import (
+    SURFACE_LEVELS,
+    SURFACE_MESH,
+    RunFolder,
+    replace_folder,
+    scratch,
+)
 from polmvs.pipeline.stages.maps import open_maps, posed_views
 from polmvs.pipeline.stages.poses import load_floats
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.polarization.capture import DISPLAY_GAMMA
-from polmvs.polarization.kinds import AngleModel, Light
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.poses.crop_box import CropBox, crop_box
-from polmvs.scene import PointKind, Seeds, View
+from polmvs.scene import PointKind, Seeds, Tracks, View
 from polmvs.surface.camera_sigma import CameraModes, widen_by_poses
 from polmvs.surface.consensus import hidden_by
 from polmvs.surface.contour import propagate
@@ -108,25 +108,42 @@ class DensifyResult:
         return f"{self.num_points:,} points, and {self.num_surroundings:,} of the surroundings"
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Inputs:
+    """What both ways to a surface start from."""
+
+    model: AngleModel
+    maps: Sequence[PhaseMap]
+    seeds: Seeds
+    options: Options
+    workers: Workers
+    on_progress: OnProgress
+
+    @property
+    def tilt_aware(self) -> bool:
+        return self.options.normals.tilt_aware_weights and not self.model.is_textbook
+
+    @property
+    def views(self) -> list[View]:
+        return [phase_map.view for phase_map in self.maps]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Surface:
+    """The polarised surfaces, and how they were made; ``points`` are of a surface of all views."""
+
+    cloud: FusedCloud
+    method: Method
+    points: SurfacePoints | None = None
+    tilt_share: float | None = None
+    left_out: tuple[str, ...] = ()
+
+
 def densify(
     model: AngleModel,
+    folder: RunFolder,
+    options: Options,
     *,
-    sparse: Path,
-    camera_modes: Path,
-    pose_covariances: Path,
-    images: Path,
-    maps: Path,
-    track_normals: Path,
-    seeds: Path,
-    cloud: Path,
-    views: Path,
-    propagation: PropagationOptions | None = None,
-    fusion: FusionOptions | None = None,
-    crop: CropOptions | None = None,
-    aruco: str | None = None,
-    tilt_aware: bool = True,
-    masks_given: bool = False,
-    light: Light | None = None,
     workers: Workers | None = None,
     on_progress: OnProgress = no_progress,
 ) -> DensifyResult:
@@ -138,110 +155,73 @@ def densify(
 
     Parameters
     ----------
-    model : angle model.
-    sparse, images : folders of the COLMAP model and of its images.
-    camera_modes, pose_covariances : files of what the estimated camera and poses leave open.
-    maps : folder of the phase maps for ``model``.
-    track_normals, seeds : files of the model's normals of the sparse points, and of the seeds.
-    cloud : PLY to write.
-    views : folder to write, with the dense depth and normals of each view.
-    propagation, fusion : defaults where None.
-    crop, aruco : box of what is kept, and the markers (``DICT:SIZE``) that it may be relative to.
-    tilt_aware : as ``NormalOptions.tilt_aware_weights``; a textbook model never is.
-    masks_given : the regions of the phase maps are the user's masks.
-    light : that the user states; None: inferred for each observation.
+    model : angle model; a textbook model is never aware of the polarizers' tilt.
+    folder : of a run with images, model, phase maps, normals of the tracks, and seeds; the cloud
+        and the views of ``model`` are written.
+    options : of the run.
 
     Raises
     ------
     DataError
-        An input is unusable, or the COLMAP workspace of ``fusion`` is not of these images.
+        An input is unusable, or the COLMAP workspace of the options is not of these images.
     """
-    propagation, fusion = propagation or PropagationOptions(), fusion or FusionOptions()
-    workers = workers or Workers()
-    tilt_aware = tilt_aware and not model.is_textbook
-    phase_maps = open_maps(sparse, maps, model)
-    known = load_seeds(seeds, track_normals)
-    given = _open_given(fusion, sparse, images)
-    box = crop_box(
-        crop or CropOptions(),
-        aruco,
-        [phase_map.view for phase_map in phase_maps],
-        lambda name: read_gray(images / name),
+    given = _Inputs(
+        model=model,
+        maps=open_maps(folder.sparse, folder.maps(model), model),
+        seeds=load_seeds(folder.seeds, folder.track_normals(model)),
+        options=options,
+        workers=workers or Workers(),
+        on_progress=on_progress,
     )
-    with scratch(views) as folder, workers.stopped_on_error():
-        new_views = folder / "views"
+    workspace = _open_given(options.fusion, folder.sparse, folder.images)
+    sparse = read_model(folder.sparse)
+    box = crop_box(
+        options.crop,
+        options.reference.aruco,
+        given.views,
+        lambda name: read_gray(folder.images / name),
+    )
+    with scratch(folder.views(model)) as kept, given.workers.stopped_on_error():
+        new_views = kept / "views"
         new_views.mkdir()
-        found, method = None, propagation.method
-        if method is Method.SURFACE:
-            found = _global_surface(
-                model,
-                phase_maps,
-                known,
-                sparse_surroundings(read_model(sparse).tracks, phase_maps).points,
-                propagation,
-                fusion,
-                new_views,
-                folder / "kept",
-                tilt_aware=tilt_aware,
-                masks_given=masks_given,
-                light=light,
-                on_progress=on_progress,
-            )
-        if found is not None:
-            points, tilt_share, left_out = found
-            fused = points.cloud
-        else:
-            if method is Method.SURFACE:
-                method = Method.INTEGRATE
-            points, tilt_share, left_out = None, None, ()
-            fused = _dense_surface(
-                model,
-                phase_maps,
-                known,
-                propagation,
-                fusion,
-                folder,
-                new_views,
-                tilt_aware=tilt_aware,
-                workers=workers,
-                on_progress=on_progress,
-            )
-        sparse_model = read_model(sparse)
-        modes = CameraModes(sparse_model.tracks.points_in_world, load_floats(camera_modes))
-        modes.widen_stored([phase_map.view for phase_map in phase_maps], new_views)
-        widen_by_poses(sparse_model.views, load_floats(pose_covariances), new_views)
-        surface = surface_cloud(modes.widened(fused))
-        if points is not None:
-            surface.scalars["kind"][points.presumed] = PointKind.PRESUMED
-            surface = replace(surface, scalars={**surface.scalars, **points.scalars()})
-        around = _surroundings_cloud(
-            sparse, fused, phase_maps, fusion, given, folder / "around", workers=workers
-        )
+        found = None
+        if options.propagation.method is Method.SURFACE:
+            found = _global_surface(given, sparse.tracks, new_views, kept / "kept")
+        if found is None:
+            found = _dense_surface(given, kept, new_views)
+        modes = CameraModes(sparse.tracks.points_in_world, load_floats(folder.camera_modes))
+        modes.widen_stored(given.views, new_views)
+        widen_by_poses(sparse.views, load_floats(folder.pose_covariances), new_views)
+        surface = surface_cloud(modes.widened(found.cloud))
+        if found.points is not None:
+            surface.scalars["kind"][found.points.presumed] = PointKind.PRESUMED
+            surface = replace(surface, scalars={**surface.scalars, **found.points.scalars()})
+        around = _surroundings_cloud(sparse.tracks, found.cloud, given, workspace, kept / "around")
         if box is not None:
-            kept = box.require_some(surface.points)
-            if not kept.all():
+            inside = box.require_some(surface.points)
+            if not inside.all():
                 logger.warning(
                     "`crop.box` leaves out %.0f %% of the surface; figures of how much of the "
                     "polarized regions is determined count that as missing.",
-                    100 * (1 - kept.mean()),
+                    100 * (1 - inside.mean()),
                 )
-            surface = surface.only(kept)
+            surface = surface.only(inside)
             around = around.only(box.contains(around.points))
-            _crop_views(new_views, [phase_map.view for phase_map in phase_maps], box)
-        replace_folder(new_views, views)
-    write_cloud(cloud, _join_clouds(surface, around))
-    for sentence in unused_options(method, propagation, fusion):
+            crop_views(new_views, given.views, box)
+        replace_folder(new_views, folder.views(model))
+    write_cloud(folder.cloud(model), _join_clouds(surface, around))
+    for sentence in unused_options(found.method, options.propagation, options.fusion):
         logger.warning("%s.", sentence)
     return DensifyResult(
         num_points=len(surface.points),
         num_surroundings=len(around.points),
-        method=method,
-        tilt_share=tilt_share,
-        left_out=left_out,
+        method=found.method,
+        tilt_share=found.tilt_share,
+        left_out=found.left_out,
     )
 
 
-def _crop_views(folder: Path, views: Sequence[View], box: CropBox) -> None:
+def crop_views(folder: Path, views: Sequence[View], box: CropBox) -> None:
     """Leave of stored views, and of the mesh beside them, what lies in a box."""
     for view in views:
         dense = find_dense_view(folder / view.name)
@@ -280,38 +260,26 @@ def unused_options(
     return sentences
 
 
-def _global_surface(
-    model: AngleModel,
-    maps: Sequence[PhaseMap],
-    seeds: Seeds,
-    surroundings: NDArray[np.float64],
-    propagation: PropagationOptions,
-    fusion: FusionOptions,
-    views: Path,
-    kept: Path,
-    *,
-    tilt_aware: bool,
-    masks_given: bool,
-    light: Light | None,
-    on_progress: OnProgress,
-) -> tuple[SurfacePoints, float, tuple[str, ...]] | None:
-    """Points of the surface of all views, its share of the tilt, and the views left out.
+def _global_surface(given: _Inputs, tracks: Tracks, views: Path, kept: Path) -> _Surface | None:
+    """The surface of all views; None where silhouettes do not bound the objects.
 
     Its mesh and its depth in each view go to ``views``, what it is made from meanwhile to ``kept``,
-    a new folder. None where silhouettes do not bound the objects.
+    a new folder.
     """
+    maps, model, options = given.maps, given.model, given.options
+    fusion, stride_px = options.fusion, options.propagation.stride_px
     levels: list[TriangleMesh] = []
     kept.mkdir()
     surface = reconstruct_surface(
         model.formula,
         maps,
-        seeds,
-        surroundings,
-        masks_given=masks_given,
-        light=light,
-        tilt_aware=tilt_aware,
+        given.seeds,
+        sparse_surroundings(tracks, maps).points,
+        masks_given=options.region.mask is not None,
+        light=options.region.light,
+        tilt_aware=given.tilt_aware,
         min_views=fusion.min_views,
-        on_progress=on_progress,
+        on_progress=given.on_progress,
         on_mesh=levels.append,
         folder=kept,
     )
@@ -328,10 +296,10 @@ def _global_surface(
     for phase_map, left_out in zip(maps, surface.left_out, strict=True):
         dense = None
         if not left_out:
-            dense = render_view(surface, scene, phase_map.view, propagation.stride_px)
+            dense = render_view(surface, scene, phase_map.view, stride_px)
         if dense is not None:
             store_dense_view(dense, views / phase_map.view.name)
-        on_progress(1)
+        given.on_progress(1)
     spacing = fusion.voxel if fusion.voxel is not None else fusion.voxel_px * surface.footprint
     believed = list(compress(maps, ~surface.left_out))
     points = surface_points(surface, believed, spacing or FINEST_SPACING_PX * surface.footprint)
@@ -340,46 +308,42 @@ def _global_surface(
         faces = mesh.faces.astype(np.int32)
         whole = Mesh(vertices=mesh.vertices, normals=mesh.vertex_normals, triangles=faces)
         write_mesh(views / SURFACE_LEVELS.format(number=number), whole)
-    names = tuple(phase_map.view.name for phase_map in compress(maps, surface.left_out))
-    return points, surface.tilt_share, names
+    return _Surface(
+        cloud=points.cloud,
+        method=Method.SURFACE,
+        points=points,
+        tilt_share=surface.tilt_share,
+        left_out=tuple(view.name for view in compress(given.views, surface.left_out)),
+    )
 
 
-def _dense_surface(
-    model: AngleModel,
-    maps: Sequence[PhaseMap],
-    seeds: Seeds,
-    propagation: PropagationOptions,
-    fusion: FusionOptions,
-    folder: Path,
-    views: Path,
-    *,
-    tilt_aware: bool,
-    workers: Workers,
-    on_progress: OnProgress,
-) -> FusedCloud:
-    """The fused polarised surfaces; what each view confirms of them goes to ``views``."""
+def _dense_surface(given: _Inputs, folder: Path, views: Path) -> _Surface:
+    """The fused surfaces of views one by one; what each view confirms of them goes to ``views``."""
+    maps, options = given.maps, given.options.propagation
+    is_contour = options.method is Method.CONTOUR
+    method = Method.CONTOUR if is_contour else Method.INTEGRATE
     num_inside = sum(int(phase_map.region.inside.sum()) for phase_map in maps)
-    if num_inside == 0 or len(seeds.sigma) == 0:
-        return no_points()
-    spread = propagate if propagation.method is Method.CONTOUR else integrate
+    if num_inside == 0 or len(given.seeds.sigma) == 0:
+        return _Surface(cloud=no_points(), method=method)
+    spread = propagate if is_contour else integrate
     dense = spread(
-        model.formula,
+        given.model.formula,
         maps,
-        seeds,
-        propagation,
+        given.seeds,
+        options,
         folder,
-        tilt_aware=tilt_aware,
-        workers=workers,
-        on_progress=on_progress,
+        tilt_aware=given.tilt_aware,
+        workers=given.workers,
+        on_progress=given.on_progress,
     )
     confirmed: dict[int, NDArray[np.bool_]] = {}
     cloud = fuse(
         maps,
         dense,
-        fusion,
-        max_neighbors=propagation.max_neighbors,
-        workers=workers,
-        on_progress=on_progress,
+        given.options.fusion,
+        max_neighbors=options.max_neighbors,
+        workers=given.workers,
+        on_progress=given.on_progress,
         on_confirmed=confirmed.__setitem__,
     )
     for index, points in confirmed.items():
@@ -387,7 +351,7 @@ def _dense_surface(
         assert dense_view is not None  # has points
         seen = points & ~hidden_by(dense_view, view, cloud.points, cloud.normals)
         store_dense_view(dense_view.only(seen), views / view.name)
-    return cloud
+    return _Surface(cloud=cloud, method=method)
 
 
 def num_densify_steps(num_views: int, options: PropagationOptions) -> int:
@@ -461,37 +425,33 @@ def surface_cloud(cloud: FusedCloud, kind: PointKind = PointKind.SURFACE) -> Clo
 
 
 def _surroundings_cloud(
-    sparse: Path,
+    tracks: Tracks,
     surface: FusedCloud,
-    maps: Sequence[PhaseMap],
-    options: FusionOptions,
-    given: DenseWorkspace | None,
+    given: _Inputs,
+    workspace: DenseWorkspace | None,
     folder: Path,
-    *,
-    workers: Workers,
 ) -> Cloud:
     """Points of the scene beside its polarised parts, of the kind that the options ask for.
 
     Parameters
     ----------
-    sparse : folder of the COLMAP model.
+    tracks : of the COLMAP model.
     surface : of the polarised parts; what COLMAP saw there is left out.
-    maps : of all views.
-    given : the user's COLMAP workspace, if there is one; its points are the surroundings.
+    workspace : the user's of COLMAP, if there is one; its points are the surroundings.
     folder : for what is kept on disk meanwhile.
     """
-    if given is not None:
-        return surface_cloud(kept_cloud(given, surface.points), PointKind.COLMAP)
-    tracks = read_model(sparse).tracks
-    if options.surroundings is Surroundings.STEREO:
-        found = stereo_surroundings(tracks, maps, folder, workers=workers)
+    if workspace is not None:
+        return surface_cloud(kept_cloud(workspace, surface.points), PointKind.COLMAP)
+    maps, wanted = given.maps, given.options.fusion.surroundings
+    if wanted is Surroundings.STEREO:
+        found = stereo_surroundings(tracks, maps, folder, workers=given.workers)
         if len(found.points):
             return surface_cloud(found, PointKind.STEREO)
         logger.warning(
             "`fusion.surroundings` stereo finds no points: too few views lie near enough to each "
             "other to be matched and confirmed. The sparse points are kept; record more views."
         )
-    if options.surroundings is not Surroundings.NONE:
+    if wanted is not Surroundings.NONE:
         return _sparse_cloud(sparse_surroundings(tracks, maps))
     return surface_cloud(surface[np.zeros(len(surface.points), np.bool_)])
 

@@ -16,7 +16,7 @@ from polmvs.colmap.models import read_model
 from polmvs.config import default_num_workers
 from polmvs.evaluation.trust import Trust, measure_trust
 from polmvs.io.clouds import read_cloud, read_mesh
-from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH
+from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.polarization.kinds import AngleModel, Light
@@ -61,40 +61,26 @@ class Made:
     complaints: Sequence[str] = ()
 
 
-def find_trust(
-    model: AngleModel,
-    made: Made,
-    *,
-    sparse: Path,
-    maps: Path,
-    sparse_cloud: Path,
-    track_normals: Path,
-    seeds: Path,
-    cloud: Path,
-    views: Path,
-) -> Trust:
+def find_trust(model: AngleModel, made: Made, folder: RunFolder) -> Trust:
     """Measure a dense cloud against its capture, and warn if it is not to be trusted.
 
     Parameters
     ----------
     model : angle model.
     made : how the surface was made.
-    sparse : folder of the COLMAP model.
-    maps : folder of the phase maps for ``model``.
-    sparse_cloud, cloud : PLY of the sparse points with normals and of the dense cloud.
-    track_normals, seeds : files of the normals of the sparse points, and of the seeds.
-    views : folder of the dense views and of their mesh.
+    folder : of the run.
     """
-    dense, phase_maps = read_cloud(cloud), open_maps(sparse, maps, model)
-    trust = measure_trust(model, dense, read_cloud(sparse_cloud), phase_maps)
+    dense = read_cloud(folder.cloud(model))
+    phase_maps = open_maps(folder.sparse, folder.maps(model), model)
+    trust = measure_trust(model, dense, read_cloud(folder.sparse_cloud(model)), phase_maps)
     trust = replace(
         trust,
         num_views=len(phase_maps) + made.num_unregistered,
         left_out=len(made.left_out) + made.num_unregistered,
         complaints=tuple(made.complaints),
     )
-    if made.tilt_share is not None and (views / SURFACE_MESH).is_file():
-        trust = _contradicted(trust, model, made, phase_maps, sparse, track_normals, seeds, views)
+    if made.tilt_share is not None and (folder.views(model) / SURFACE_MESH).is_file():
+        trust = _contradicted(trust, model, made, phase_maps, folder)
     trust = trust.judged()
     if (dense.scalars["kind"] == PointKind.SURFACE).any():  # else the job says what is missing
         if not trust.is_trusted:
@@ -105,23 +91,17 @@ def find_trust(
 
 
 def _contradicted(
-    trust: Trust,
-    model: AngleModel,
-    made: Made,
-    maps: Sequence[PhaseMap],
-    sparse: Path,
-    track_normals: Path,
-    seeds: Path,
-    views: Path,
+    trust: Trust, model: AngleModel, made: Made, maps: Sequence[PhaseMap], folder: RunFolder
 ) -> Trust:
     """With the figures of a surface of all views that it was not fitted to."""
+    views = folder.views(model)
     assert made.tilt_share is not None
-    around = sparse_surroundings(read_model(sparse).tracks, maps).points
+    around = sparse_surroundings(read_model(folder.sparse).tracks, maps).points
     plane = supporting_plane(around, np.array([one.view.center_in_world for one in maps]))
     maps = [one for one in maps if one.view.name not in made.left_out]
     chosen = np.linspace(0, len(maps) - 1, min(len(maps), MAX_TRIED_VIEWS)).round().astype(int)
     maps = [maps[index] for index in chosen]
-    known = load_seeds(seeds, track_normals)
+    known = load_seeds(folder.seeds, folder.track_normals(model))
     looking = Looking(angle_model=model, tilt_aware=made.tilt_aware, tilt_share=made.tilt_share)
     look = partial(_surface_view, masks_given=made.masks_given)
     with ThreadPoolExecutor(default_num_workers()) as pool:
