@@ -369,7 +369,7 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             is_redone=True,
         ),
     ]
-    return _in_order(table)
+    return in_order(table)
 
 
 def _model_stages(model: AngleModel) -> list[StageSpec]:
@@ -456,7 +456,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
 # What follows from it
 
 
-def _in_order(table: Sequence[StageSpec]) -> tuple[StageSpec, ...]:
+def in_order(table: Sequence[StageSpec]) -> tuple[StageSpec, ...]:
     """Each stage after those that it reads from; where that leaves a choice, as they are listed."""
     written = {path for spec in table for path in spec.writes}
     waiting, done, ordered = list(table), set[Path](), list[StageSpec]()

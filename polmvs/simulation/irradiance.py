@@ -9,6 +9,7 @@ others are interpolated.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -47,9 +48,8 @@ def bake(scene: MitsubaScene, *, bounces: int, samples: int, spacing: float, see
         vertices, normals = mesh.vertices, mesh.normals
         chosen = _representatives(vertices, normals, spacing) if is_part else slice(None)
         ior = material.ior if is_part else None
-        gathered = _gather(
-            scene, vertices[chosen], normals[chosen], ior, bounces, samples, seed + index
-        )
+        light = _Gathering(scene=scene, ior=ior, bounces=bounces, samples=samples)
+        gathered = light.at(vertices[chosen], normals[chosen], seed + index)
         if is_part:
             values = _spread(
                 vertices[chosen], normals[chosen], gathered, vertices, normals, spacing
@@ -90,41 +90,38 @@ def _spread(
     return found
 
 
-def _gather(
-    scene: MitsubaScene,
-    points: Array,
-    normals: Array,
-    ior: float | None,
-    bounces: int,
-    samples: int,
-    seed: int,
-) -> Array:
-    """Irradiance (N,) at points with their normals."""
-    per_chunk = max(1, CHUNK // samples)
-    parts = [
-        _gather_chunk(
-            scene,
-            points[start : start + per_chunk],
-            normals[start : start + per_chunk],
-            ior,
-            bounces,
-            samples,
-            seed * 7919 + start,
-        )
-        for start in range(0, len(points), per_chunk)
-    ]
-    return np.concatenate(parts) if parts else np.zeros(0)
+@dataclass(frozen=True, kw_only=True)
+class _Gathering:
+    """How light is gathered at places: under which surface, after how many reflections."""
+
+    scene: MitsubaScene
+    ior: float | None
+    bounces: int
+    samples: int
+
+    def at(self, points: Array, normals: Array, seed: int) -> Array:
+        """Irradiance (N,) at points with their normals."""
+        step = max(1, CHUNK // self.samples)
+        parts = [
+            _gather(self, points[at : at + step], normals[at : at + step], seed * 7919 + at)
+            for at in range(0, len(points), step)
+        ]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def entering(self, cosine: Any) -> Any:
+        """Transmittance of unpolarized light, over that at normal incidence."""
+        mi, dr, ior = self.scene.renderer.mi, self.scene.renderer.dr, self.ior
+        if ior is None:
+            return mi.Float(1.0)
+        refracted = dr.sqrt(1 - (1 - cosine * cosine) / ior**2)
+        across = dr.square((cosine - ior * refracted) / (cosine + ior * refracted))
+        along = dr.square((ior * cosine - refracted) / (ior * cosine + refracted))
+        normal_incidence = float(transmittance(np.array(1.0), complex(ior)))
+        return (1 - 0.5 * (across + along)) / normal_incidence
 
 
-def _gather_chunk(
-    scene: MitsubaScene,
-    points: Array,
-    normals: Array,
-    ior: float | None,
-    bounces: int,
-    samples: int,
-    seed: int,
-) -> Array:
+def _gather(light: _Gathering, points: Array, normals: Array, seed: int) -> Array:
+    scene, samples = light.scene, light.samples
     mi, dr = scene.renderer.mi, scene.renderer.dr
     num = len(points) * samples
     sampler = mi.load_dict({"type": "independent"})
@@ -151,15 +148,6 @@ def _gather_chunk(
             values.append(value - dr.floor(value))
         return mi.Point2f(*values)
 
-    def entering(cosine: Any) -> Any:
-        if ior is None:
-            return mi.Float(1.0)
-        refracted = dr.sqrt(1 - (1 - cosine * cosine) / ior**2)
-        across = dr.square((cosine - ior * refracted) / (cosine + ior * refracted))
-        along = dr.square((ior * cosine - refracted) / (ior * cosine + refracted))
-        normal_incidence = float(transmittance(np.array(1.0), complex(ior)))
-        return (1 - 0.5 * (across + along)) / normal_incidence
-
     def brightness(value: Any) -> Any:
         # Of unpolarized light: the first element of Mueller's matrix, its mean over wavelengths.
         return dr.mean(value[0, 0])
@@ -181,21 +169,21 @@ def _gather_chunk(
     of_emitter = scene.scene.pdf_emitter_direction(start, record, has_emitter)
     emitted *= density / (density + of_emitter)
     indirect = mi.Float(0.0)
-    if bounces > 1:
+    if light.bounces > 1:
         path = mi.load_dict(
-            {"type": "path", "max_depth": bounces, "rr_depth": 64, "hide_emitters": True}
+            {"type": "path", "max_depth": light.bounces, "rr_depth": 64, "hide_emitters": True}
         )
         found, _, _ = path.sample(
             scene.scene, sampler, mi.RayDifferential3f(ray), None, hit.is_valid() & ~has_emitter
         )
         indirect = dr.select(hit.is_valid() & ~has_emitter, brightness(found), 0.0)
-    total = dr.pi * entering(cosine) * (dr.select(has_emitter, emitted, 0.0) + indirect)
+    total = dr.pi * light.entering(cosine) * (dr.select(has_emitter, emitted, 0.0) + indirect)
     # Samples of the emitters, with theirs.
     towards, weight = scene.scene.sample_emitter_direction(start, stratified(2), True)
     cosine = dr.dot(towards.d, normal)
     lit = (cosine > 0) & (towards.pdf > 0)
     share = towards.pdf / (towards.pdf + cosine / dr.pi)
-    direct = brightness(weight) * cosine * entering(dr.maximum(cosine, 1e-6)) * share
+    direct = brightness(weight) * cosine * light.entering(dr.maximum(cosine, 1e-6)) * share
     total += dr.select(lit, direct, 0.0)
     summed = dr.block_reduce(dr.ReduceOp.Add, total, samples)
     return np.asarray(summed, np.float64) / samples

@@ -9,7 +9,7 @@ from polmvs.config import Options, plain_options
 from polmvs.pipeline.run_folder import HERE
 from polmvs.pipeline.stage_table import (
     StageSpec,
-    _in_order,
+    in_order,
     stage_table,
     with_dependent,
     with_needed,
@@ -40,12 +40,12 @@ def toy(name: str, reads: str = "", writes: str = "") -> StageSpec:
 
 def test_order_follows_from_what_is_read() -> None:
     table = [toy("c", "xy", "z"), toy("b", "x", "y"), toy("a", "", "x"), toy("d", "", "w")]
-    assert names(_in_order(table)) == ["a", "b", "c", "d"]
+    assert names(in_order(table)) == ["a", "b", "c", "d"]
 
 
 def test_circle_is_refused() -> None:
     with pytest.raises(ValueError, match=r"in a circle: \['a', 'b'\]"):
-        _in_order([toy("a", "y", "x"), toy("b", "x", "y")])
+        in_order([toy("a", "y", "x"), toy("b", "x", "y")])
 
 
 def test_what_is_needed_and_what_is_stale() -> None:
