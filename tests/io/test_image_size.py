@@ -70,6 +70,37 @@ def test_size_of_a_big_tiff(order: str) -> None:
     assert declared_size("a", head + body) == (64, 32, 64 * 32)  # of a tile, which is larger
 
 
+def big_tiff(images: list[np.ndarray], orientation: int) -> bytes:
+    """Uncompressed, 16 bits; the orientation as a long number, as some writers store it."""
+    data = b"MM\0+" + struct.pack(">HHQ", 8, 0, 16)
+    for index, image in enumerate(images):
+        rows, cols = image.shape
+        num, start = 9, len(data)
+        strip = start + 8 + 20 * num + 8
+        tags = [(256, 3, cols), (257, 3, rows), (258, 3, 16), (259, 3, 1), (262, 3, 1)]
+        tags += [(273, 16, strip), (274, 4, orientation), (278, 3, rows), (279, 16, image.nbytes)]
+        data += struct.pack(">Q", num)
+        for tag, kind, value in tags:
+            packed = struct.pack({3: ">H", 4: ">I", 16: ">Q"}[kind], value)
+            data += struct.pack(">HHQ", tag, kind, 1) + packed.ljust(8, b"\0")
+        last = index == len(images) - 1
+        data += struct.pack(">Q", 0 if last else strip + image.nbytes)
+        data += image.astype(">u2").tobytes()
+    return data
+
+
+def test_orientation_and_images_of_a_big_tiff(tmp_path: Path) -> None:
+    image = np.arange(24, dtype=np.uint16).reshape(4, 6)
+    path = tmp_path / "a.tif"
+    path.write_bytes(big_tiff([image], 6))
+    found = read_raw(path)
+    np.testing.assert_array_equal(found.samples, image)  # as stored
+    assert found.orientation == 6
+    path.write_bytes(big_tiff([image, image], 1))
+    with pytest.raises(DataError, match="holds 2 images"):
+        read_raw(path)
+
+
 def test_a_big_tiff_that_begins_beyond_every_file_is_damaged() -> None:
     for start in (1 << 63, (1 << 64) - 1, 1000):
         with pytest.raises(DataError, match="damaged or truncated"):
