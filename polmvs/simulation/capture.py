@@ -332,8 +332,9 @@ class _Studio:
         step = max(1, len(plan.views) // METERED_VIEWS)
         levels = []
         for index in range(0, len(plan.views), step):
-            picture, chosen = self._metered(index)
-            stokes = picture.stokes.reshape(-1, 3)[chosen]
+            scene = self.scene(plan.views[index])
+            picture = self.render(scene, index, np.inf, step=METERED_STEP)
+            stokes = picture.stokes.reshape(-1, 3)[::METERED_STEP]
             levels.append(0.5 * (stokes[:, 0] + np.hypot(stokes[:, 1], stokes[:, 2])))
         level = float(np.percentile(np.concatenate(levels), METERED_PERCENTILE))
         if not level > 0:
@@ -342,39 +343,14 @@ class _Studio:
             )
         return float(f"{(METERED_LEVEL - plan.options.sensor.black_level) / level:.4g}")
 
-    def _metered(self, index: int) -> tuple[Picture, NDArray[np.int64]]:
+    def render(self, scene: MitsubaScene, index: int, exposure: float, *, step: int = 1) -> Picture:
+        """One view, or each such sample of it."""
         plan = self.plan
         view = plan.views[index]
         lens = self._lens(view, index)
-        chosen = np.arange(0, lens.shape[0] * lens.shape[1], METERED_STEP)
-        picture = render_picture(
-            self.scene(view),
-            view,
-            lens,
-            plan.options.sensor,
-            plan.options.rendering,
-            plan.channels,
-            np.inf,
-            bounces=plan.options.lighting.bounces,
-            seed=self._seed(index),
-            only=chosen,
-        )
-        return picture, chosen
-
-    def render(self, scene: MitsubaScene, index: int, exposure: float) -> Picture:
-        """One view."""
-        plan = self.plan
-        view = plan.views[index]
+        seed = self._seed(index)
         return render_picture(
-            scene,
-            view,
-            self._lens(view, index),
-            plan.options.sensor,
-            plan.options.rendering,
-            plan.channels,
-            exposure,
-            bounces=plan.options.lighting.bounces,
-            seed=self._seed(index),
+            scene, view, lens, plan.options, plan.channels, exposure, seed=seed, step=step
         )
 
     def _lens(self, view: View, index: int) -> Any:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from polmvs.config import BayerOrder
 from polmvs.scene import View
-from polmvs.simulation.options import RenderingOptions, SensorKind, SensorOptions
+from polmvs.simulation.options import SensorKind, SensorOptions, Simulation
 from polmvs.simulation.scalar import render_stokes
 from polmvs.simulation.scene import MitsubaScene
 from polmvs.simulation.sensor import (
@@ -53,22 +53,21 @@ def render_picture(
     scene: MitsubaScene,
     view: View,
     lens: Lens,
-    sensor: SensorOptions,
-    rendering: RenderingOptions,
+    options: Simulation,
     channels: Channels,
     exposure: float,
     *,
-    bounces: int,
     seed: int,
-    only: NDArray[np.int64] | None = None,
+    step: int = 1,
 ) -> Picture:
     """Render a view: passes over its samples until their noise is below the sensor's.
 
     Parameters
     ----------
     exposure : full scales for each unit of radiance; infinite for one pass without a target.
-    only : flat indices of samples to render, the others stay 0; None for all.
+    step : only each such sample is rendered, row by row; the others stay 0.
     """
+    sensor, rendering, bounces = options.sensor, options.rendering, options.lighting.bounces
     rows, cols = lens.shape
     num = rows * cols
     if scene.renderer.is_scalar:
@@ -78,7 +77,7 @@ def render_picture(
     angles = np.radians(np.array(channels.angles_deg))[which].astype(np.float32)
     stokes, diffuse = np.zeros((num, 3)), np.zeros((num, 2))
     variance, passes = np.zeros(num), np.zeros(num, np.int64)
-    left = np.arange(num) if only is None else only
+    left = np.arange(0, num, step)
     colours = None if sensor.colour is None else _filter_of(sensor.colour, (rows, cols)).ravel()
     for index in range(max(1, rendering.max_samples // RAYS)):
         wavelengths = None
