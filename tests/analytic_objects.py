@@ -1,4 +1,4 @@
-"""Phase maps of objects that are given by their signed distance: exact, small and fast."""
+"""Phase maps and meshes of objects given by their signed distance: exact, small and fast."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import Region
 from polmvs.scene import View
+from polmvs.surface.mesh_geometry import TriangleMesh, mesh_from_grid
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
@@ -131,3 +132,23 @@ def phase_map_of(
 
 def phase_maps_of(distance: Distance, views: list[View], **kwargs) -> list[PhaseMap]:
     return [phase_map_of(distance, view, **kwargs) for view in views]
+
+
+def extracted(distance, half=1.6, step=0.08) -> TriangleMesh:
+    axis = np.arange(-half, half + step, step)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    values = distance(grid).astype(np.float32)
+    return mesh_from_grid(values, np.full(3, -half), step)
+
+
+def side_by_side(*parts: TriangleMesh) -> TriangleMesh:
+    """One mesh of several that may overlap."""
+    offsets = np.cumsum([0] + [len(m.vertices) for m in parts[:-1]])
+    return TriangleMesh(
+        np.concatenate([m.vertices for m in parts]),
+        np.concatenate([m.faces + o for m, o in zip(parts, offsets, strict=True)]),
+    )
+
+
+def euler_number(mesh: TriangleMesh) -> int:
+    return len(mesh.vertices) - mesh.adjacency.nnz // 2 + len(mesh.faces)

@@ -5,6 +5,7 @@ import pytest
 from analytic_objects import (
     DOLP,
     box,
+    extracted,
     looking_at,
     phase_maps_of,
     ring_of_views,
@@ -12,7 +13,6 @@ from analytic_objects import (
     trace,
     union,
 )
-from test_mesh_geometry import extracted
 
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.region import Region

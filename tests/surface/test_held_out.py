@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic_objects import phase_maps_of, ring_of_views, sphere
+from analytic_objects import extracted, phase_maps_of, ring_of_views, sphere
 from scipy.spatial.transform import Rotation
-from test_mesh_geometry import extracted
 
 from polmvs.geometry import RigidTransform
 from polmvs.polarization.kinds import AngleModel, Light

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic_objects import phase_maps_of, ring_of_views, sphere
-from test_mesh_geometry import extracted
+from analytic_objects import extracted, phase_maps_of, ring_of_views, sphere
 
 from polmvs.polarization.kinds import AngleModel
 from polmvs.surface.labels import LabelTolerances, neighbors, responsibilities, vote

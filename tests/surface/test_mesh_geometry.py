@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from analytic_objects import sphere, torus, union
+from analytic_objects import euler_number, extracted, side_by_side, sphere, torus, union
 
 from polmvs.surface.mesh_geometry import (
     RayScene,
@@ -11,26 +11,6 @@ from polmvs.surface.mesh_geometry import (
     sample_surface,
     visible_points,
 )
-
-
-def extracted(distance, half=1.6, step=0.08) -> TriangleMesh:
-    axis = np.arange(-half, half + step, step)
-    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    values = distance(grid).astype(np.float32)
-    return mesh_from_grid(values, np.full(3, -half), step)
-
-
-def side_by_side(*parts: TriangleMesh) -> TriangleMesh:
-    """One mesh of several that may overlap."""
-    offsets = np.cumsum([0] + [len(m.vertices) for m in parts[:-1]])
-    return TriangleMesh(
-        np.concatenate([m.vertices for m in parts]),
-        np.concatenate([m.faces + o for m, o in zip(parts, offsets, strict=True)]),
-    )
-
-
-def euler_number(mesh: TriangleMesh) -> int:
-    return len(mesh.vertices) - mesh.adjacency.nnz // 2 + len(mesh.faces)
 
 
 def enclosed_volume(mesh: TriangleMesh) -> float:

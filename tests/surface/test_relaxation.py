@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenes import CAMERA, board_scene, phase_map_of
-from test_consensus import BALL, BOARD, scene_of, true_samples, true_view
+from true_views import BALL, BOARD, scene_of, true_samples, true_view
 
 from polmvs.camera import pixel_centers
 from polmvs.normals.rows import gather_rows

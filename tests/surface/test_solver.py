@@ -3,8 +3,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from analytic_objects import box, phase_maps_of, ring_of_views, sphere, torus, union
-from test_mesh_geometry import euler_number, extracted
+from analytic_objects import (
+    box,
+    euler_number,
+    extracted,
+    phase_maps_of,
+    ring_of_views,
+    sphere,
+    torus,
+    union,
+)
 
 from polmvs.polarization.angle_models import tilt_turn
 from polmvs.polarization.kinds import AngleModel

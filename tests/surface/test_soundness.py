@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from analytic_objects import box, ring_of_views, sphere, torus
-from test_mesh_geometry import extracted, side_by_side
+from analytic_objects import box, extracted, ring_of_views, side_by_side, sphere, torus
 
 from polmvs.surface.mesh_geometry import TriangleMesh
 from polmvs.surface.soundness import find_soundness

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_stereo import DISTANCE, map_of, plane_points, views_of
+from stereo_scenes import DISTANCE, map_of, plane_points, views_of
 
 from polmvs.polarization.phase_map import store_phase_map
 from polmvs.scene import Tracks

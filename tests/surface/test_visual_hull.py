@@ -2,8 +2,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic_objects import looking_at, phase_maps_of, ring_of_views, sphere, torus, union
-from test_mesh_geometry import euler_number
+from analytic_objects import (
+    euler_number,
+    looking_at,
+    phase_maps_of,
+    ring_of_views,
+    sphere,
+    torus,
+    union,
+)
 
 from polmvs.surface.surface_view import Silhouette, surface_view
 from polmvs.surface.visual_hull import HullTolerances, Plane, supporting_plane, visual_hull
