@@ -6,7 +6,7 @@ weights of Geman and McClure: a dent or a missing part is an outlier and does no
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import permutations, product
 from typing import Protocol
@@ -130,7 +130,6 @@ def register(
     reference: Reference,
     *,
     with_scale: bool = False,
-    start: SimilarityTransform | None = None,
     tolerances: RegistrationTolerances = RegistrationTolerances(),
 ) -> Registration:
     """Lay points onto a reference.
@@ -140,26 +139,23 @@ def register(
     points : (N, 3) of the result.
     normals : (N, 3) unit, outwards; they keep thin parts from being taken for their other side.
     with_scale : estimate the scale as well.
-    start : where the points lie about right; None: anywhere.
     """
     chosen = _some(points, normals, tolerances.fine_points)
     few = _some(points, normals, tolerances.coarse_points)
     size = float(np.linalg.norm(np.ptp(reference.points, axis=0)))
-    if start is not None:
-        found = [(_spread(few, reference, start), start)]
-    else:
-        found = []
-        for guess in _starts(points, reference.points, with_scale=with_scale):
-            place = _refined(few, reference, guess, with_scale, 4, size, tolerances)
-            found.append((_spread(few, reference, place), place))
-        found.sort(key=lambda pair: pair[0])
-        kept = []
-        for _, place in found[: tolerances.num_kept]:
-            place = _refined(
-                few, reference, place, with_scale, tolerances.coarse_steps, size, tolerances
-            )
-            kept.append((_spread(few, reference, place), place))
-        found = sorted(kept, key=lambda pair: pair[0])
+
+    def ranked(
+        places: Iterable[SimilarityTransform], steps: int
+    ) -> list[tuple[float, SimilarityTransform]]:
+        refined = [
+            _refined(few, reference, place, with_scale, steps, size, tolerances) for place in places
+        ]
+        found = [(_spread(few, reference, place), place) for place in refined]
+        return sorted(found, key=lambda pair: pair[0])
+
+    found = ranked(_starts(points, reference.points, with_scale=with_scale), 4)
+    kept = [place for _, place in found[: tolerances.num_kept]]
+    found = ranked(kept, tolerances.coarse_steps)
     best = _refined(
         chosen, reference, found[0][1], with_scale, tolerances.fine_steps, size, tolerances
     )
