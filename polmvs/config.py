@@ -436,6 +436,14 @@ class SfmOptions(OptionGroup, group="sfm"):
         "folder of masks, NAME.png of each image: SfM takes features inside them alone; "
         "for a part that turns before a background, where `sfm.static_background` does not help",
     )
+    aliked: Path | None = option(
+        None,
+        "weights of ALIKED-N16ROT, an ONNX file: learned features instead of SIFT; needs "
+        "`sfm.lightglue` and a pycolmap that was built with ONNX",
+    )
+    lightglue: Path | None = option(
+        None, "weights of LightGlue for ALIKED, an ONNX file: matches the features of `sfm.aliked`"
+    )
     without: tuple[str, ...] = option(
         (),
         "images to take out of the model; a run adds those whose pose its surface contradicts",
@@ -453,6 +461,12 @@ class SfmOptions(OptionGroup, group="sfm"):
             self.require(self.database is None, "database", reason)
             self.require(self.mapper is Mapper.INCREMENTAL, "mapper", reason)
             self.require(self.feature_masks is None, "feature_masks", reason)
+            self.require(self.aliked is None, "aliked", reason)
+        both = (self.aliked is None) == (self.lightglue is None)
+        missing, given = ("lightglue", "aliked") if self.aliked else ("aliked", "lightglue")
+        self.require(both, given, f"needs `sfm.{missing}` as well")
+        once = self.database is None or self.aliked is None
+        self.require(once, "aliked", "and `sfm.database`, which has features, exclude each other")
         once = self.database is None or self.feature_masks is None
         self.require(
             once, "feature_masks", "and `sfm.database`, which has features, exclude each other"

@@ -19,6 +19,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from polmvs.colmap.cameras import quiet_colmap
+from polmvs.colmap.learned_features import LearnedFeatures
 from polmvs.colmap.pairs import Pairs
 from polmvs.config import default_num_workers
 from polmvs.errors import DataError, PolmvsError
@@ -114,7 +115,14 @@ def copy_database(given: GivenDatabase, target: Path) -> None:
             pass
 
 
-def match_pairs(database: Path, pairs: Pairs, *, seed: int = 0, guided: bool = False) -> None:
+def match_pairs(
+    database: Path,
+    pairs: Pairs,
+    *,
+    seed: int = 0,
+    guided: bool = False,
+    learned: LearnedFeatures | None = None,
+) -> None:
     """Match pairs of images and verify them; those that the database has matched already stay.
 
     Cores are used by processes, with a copy of the database each. Two threads that search COLMAP's
@@ -127,6 +135,7 @@ def match_pairs(database: Path, pairs: Pairs, *, seed: int = 0, guided: bool = F
     pairs : of names of images.
     seed : of the verification.
     guided : look for more matches along the geometry that the first ones give.
+    learned : by which the features were extracted; None: SIFT.
 
     Raises
     ------
@@ -142,7 +151,7 @@ def match_pairs(database: Path, pairs: Pairs, *, seed: int = 0, guided: bool = F
     ends = [len(lines) * k // num_shares for k in range(num_shares + 1)]
     with _renamed(database, {}):
         if num_shares == 1:
-            _match_share(database, "".join(lines), seed, guided)
+            _match_share(database, "".join(lines), seed, guided, learned)
             return
         copies = [database.with_name(f"share{k}.db") for k in range(num_shares)]
         with _room():
@@ -157,6 +166,7 @@ def match_pairs(database: Path, pairs: Pairs, *, seed: int = 0, guided: bool = F
                     shares,
                     repeat(seed),
                     repeat(guided),
+                    repeat(learned),
                 )
             )
         with _room():
@@ -166,13 +176,20 @@ def match_pairs(database: Path, pairs: Pairs, *, seed: int = 0, guided: bool = F
             path.unlink()
 
 
-def _match_share(database: Path, lines: str, seed: int, guided: bool, *_: object) -> None:
+def _match_share(
+    database: Path,
+    lines: str,
+    seed: int,
+    guided: bool,
+    learned: LearnedFeatures | None,
+    *_: object,
+) -> None:
     """Match pairs of images that are named by their numbers, on one thread."""
     listed = database.with_suffix(".txt")
     listed.write_text(lines, encoding="utf-8")
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = listed
-    matching = pycolmap.FeatureMatchingOptions()
+    matching = pycolmap.FeatureMatchingOptions() if learned is None else learned.matching()
     matching.num_threads = 1
     matching.guided_matching = guided
     verification = pycolmap.TwoViewGeometryOptions()

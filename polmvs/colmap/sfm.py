@@ -34,6 +34,7 @@ from polmvs.colmap.database import (
     replace_cameras,
     sound,
 )
+from polmvs.colmap.learned_features import learned_features
 from polmvs.colmap.left_out_views import MAX_IMAGES, Trial, try_harder
 from polmvs.colmap.masked_features import keep_inside
 from polmvs.colmap.models import (
@@ -357,7 +358,7 @@ def _extract_features(
     *,
     pooled: bool = False,
 ) -> None:
-    """Affine-adapted SIFT of all images into a new database.
+    """Affine-adapted SIFT of all images into a new database, or the features that are asked for.
 
     ``pooled``: descriptors are means over sizes of the domain (DSP-SIFT), which takes three times
     as long.
@@ -368,9 +369,13 @@ def _extract_features(
     # and with them the order of everything after.
     pycolmap.Database.open(database).close()  # creates the file
     pycolmap.import_images(database, image_folder, mode, names, reader)
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.sift.estimate_affine_shape = True
-    extraction.sift.domain_size_pooling = pooled
+    learned = learned_features(options)
+    if learned is not None:
+        extraction = learned.extraction()
+    else:
+        extraction = pycolmap.FeatureExtractionOptions()
+        extraction.sift.estimate_affine_shape = True
+        extraction.sift.domain_size_pooling = pooled
     pycolmap.extract_features(
         database, image_folder, names, mode, reader, extraction, pycolmap.Device.cpu
     )
@@ -396,7 +401,8 @@ def _take_database(
 
 def _match(database: Path, names: Sequence[str], options: SfmOptions) -> None:
     """Match the pairs of images that are asked for, or that are likely to show the same."""
-    match_pairs(database, _pairs(database, names, options), seed=options.seed)
+    pairs = _pairs(database, names, options)
+    match_pairs(database, pairs, seed=options.seed, learned=learned_features(options))
 
 
 def _pairs(database: Path, names: Sequence[str], options: SfmOptions) -> Pairs:
@@ -512,8 +518,8 @@ def _map_all(
         _extract_features(target, image_folder, list(names), reader, options, pooled=True)
 
     found = map_once()
-    # A given database's features may be of another kind.
-    if options.database is None and len(names) <= MAX_IMAGES:
+    # The steps are SIFT's; a given database's features may be of another kind.
+    if options.database is None and options.aliked is None and len(names) <= MAX_IMAGES:
         pairs = _pairs(database, names, options)
         trial = Trial(
             database=database, pairs=pairs, describe=describe, map=map_once, seed=options.seed

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -59,7 +60,7 @@ def take_out_static(
         ids = [image.image_id for image in content.read_all_images()]
         keypoints = [np.asarray(content.read_keypoints(number)) for number in ids]
         found = [content.read_descriptors(number) for number in ids]
-        values = [np.asarray(one.data) for one in found]
+        values = [np.asarray(one.to_float().data) for one in found]
         still = find_static([k[:, :2] for k in keypoints], values, tolerances=tolerances)
         if still is None:
             return None
@@ -82,7 +83,7 @@ def keep_features(content: pycolmap.Database, kept: Mapping[int, Mask]) -> None:
 
 def find_static(
     places: Sequence[NDArray[np.floating]],
-    descriptors: Sequence[NDArray[np.uint8]],
+    descriptors: Sequence[NDArray[np.number[Any]]],
     *,
     tolerances: StaticTolerances = StaticTolerances(),
 ) -> list[Mask] | None:

@@ -11,6 +11,7 @@ import numpy as np
 from polmvs.camera import PinholeCamera
 from polmvs.colmap.database import check_database
 from polmvs.colmap.dense_workspace import open_dense_workspace, require_same_frame
+from polmvs.colmap.learned_features import learned_features
 from polmvs.colmap.pairs import read_pairs
 from polmvs.colmap.sfm import check_camera, check_intrinsics
 from polmvs.config import Options, ReferenceOptions, SfmOptions, get_option, option_paths
@@ -174,6 +175,7 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
         if dense is not None and options.reference == ReferenceOptions():
             require_same_frame(dense, model)
         return model
+    learned_features(options.sfm)
     if options.sfm.intrinsics is not None:
         check_intrinsics(options.sfm.intrinsics, capture.width, capture.height)
     if options.sfm.camera is not None:
