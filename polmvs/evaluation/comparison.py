@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model
 from polmvs.errors import DataError
@@ -160,12 +163,14 @@ class ModelEstimate:
     tracks : sparse points with normals, quality and ``seed``.
     maps : phase maps of all views for the model.
     dense : dense depth and normals of the same views.
+    outside : pixels (H, W) of views, by name, that show what lies outside the box of the result.
     """
 
     cloud: Cloud
     tracks: Cloud
     maps: Sequence[PhaseMap]
     dense: DenseViews
+    outside: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
 
 def compare_models(
@@ -192,7 +197,8 @@ def compare_models(
         tasks.append(partial(_measure_all, estimates, truth))
         tasks.append(partial(phase_errors, capture, maps, truth))
     tasks += [
-        partial(measure_consistency, m, e.cloud, e.tracks, e.maps) for m, e in estimates.items()
+        partial(measure_consistency, m, e.cloud, e.tracks, e.maps, e.outside)
+        for m, e in estimates.items()
     ]
     done = list((workers or Workers()).map(operator.call, tasks))
     found: list[Consistency] = done[len(done) - len(estimates) :]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from polmvs.io.clouds import Cloud
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.polarization.region import Region
 from polmvs.scene import PointKind, View
 
 Floats = NDArray[np.floating]
@@ -49,7 +51,11 @@ class Consistency:
 
 
 def measure_consistency(
-    angle_model: AngleModel, cloud: Cloud, tracks: Cloud, maps: Sequence[PhaseMap]
+    angle_model: AngleModel,
+    cloud: Cloud,
+    tracks: Cloud,
+    maps: Sequence[PhaseMap],
+    outside: Mapping[str, Mask] = MappingProxyType({}),
 ) -> Consistency:
     """Compare the polarised surface of a cloud with the phase maps of all views.
 
@@ -60,6 +66,8 @@ def measure_consistency(
         that of the surroundings are left out; without a ``kind`` all are of the surface.
     tracks : sparse points with ``residual`` and ``seed``.
     maps : of all views.
+    outside : pixels (H, W) of each view, by its name, that show what lies outside the box that the
+        cloud was cut to: they count for nothing.
     """
     cloud = _polarised_surface(cloud)
     num = len(cloud.points)
@@ -67,7 +75,8 @@ def measure_consistency(
     covered = inside = 0
     seeing = np.zeros(num, np.int64)
     errors = [np.zeros(0)]
-    for phase_map in maps:
+    for whole in maps:
+        phase_map = within_box(whole, outside)
         cells = _region_cells(phase_map.region.inside)
         inside += int(cells.sum())
         if num == 0 or cloud.normals is None:
@@ -90,6 +99,19 @@ def measure_consistency(
         agreement=float(confirmed.sum() / max(seeing.sum(), 1)) if num else float("nan"),
         track_residual_median_deg=_track_residual(tracks),
     )
+
+
+def within_box(phase_map: PhaseMap, outside: Mapping[str, Mask]) -> PhaseMap:
+    """The map with a region of those pixels alone that do not show what lies outside a box.
+
+    What lies behind a surface that a box cut away is then not taken for visible.
+    """
+    if phase_map.view.name not in outside:
+        return phase_map
+    region = phase_map.region
+    inside = region.inside & ~outside[phase_map.view.name]
+    kept = Region(inside=inside, reliable=region.reliable & inside, edges=region.edges)
+    return phase_map.changed(region=kept)
 
 
 def _polarised_surface(cloud: Cloud) -> Cloud:

@@ -7,9 +7,10 @@ those of views that were left out, and of the mesh as such, can contradict it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from polmvs.evaluation.consistency import (
     first_seen,
     measure_consistency,
     phase_residuals_deg,
+    within_box,
 )
 from polmvs.io.clouds import Cloud
 from polmvs.normals.tracks import BORDER_MARGIN_PX
@@ -339,7 +341,11 @@ class Trust:
 
 
 def measure_trust(
-    angle_model: AngleModel, cloud: Cloud, tracks: Cloud, maps: Sequence[PhaseMap]
+    angle_model: AngleModel,
+    cloud: Cloud,
+    tracks: Cloud,
+    maps: Sequence[PhaseMap],
+    outside: Mapping[str, Mask] = MappingProxyType({}),
 ) -> Trust:
     """Measure a cloud against the capture that it was made from.
 
@@ -349,8 +355,9 @@ def measure_trust(
     cloud : dense, with ``kind``, ``num_views`` and ``sigma``.
     tracks : sparse points, as :func:`polmvs.evaluation.consistency.measure_consistency` takes them.
     maps : of all views, for the model.
+    outside : as :func:`polmvs.evaluation.consistency.measure_consistency` takes it.
     """
-    consistency = measure_consistency(angle_model, cloud, tracks, maps)
+    consistency = measure_consistency(angle_model, cloud, tracks, maps, outside)
     surface = cloud.only(cloud.scalars["kind"] == PointKind.SURFACE)
     nothing = np.zeros((0, 3))
     points, normals = surface.points, nothing if surface.normals is None else surface.normals
@@ -359,10 +366,11 @@ def measure_trust(
     chosen[::step] = True
     in_sigmas, num_seen, num_inside = [np.zeros(0)], 0, 0
     nearest = np.full(len(points), np.inf)
-    for phase_map in maps if len(points) else ():
-        view = phase_map.view
+    for whole in maps if len(points) else ():
+        phase_map, view = within_box(whole, outside), whole.view
         nearest = np.minimum(nearest, view.ranges(points))
-        seen = first_seen(points, normals, view, partial(in_image, view.camera))[0] & chosen
+        shows = partial(_shows, phase_map, outside.get(view.name))
+        seen = first_seen(points, normals, view, shows)[0] & chosen
         xy = view.project(points[seen])
         region = grow_mask(phase_map.region.inside, BORDER_MARGIN_PX).astype(np.float32)
         inside = sample_image(region, xy, nearest=True) > 0
@@ -381,3 +389,11 @@ def measure_trust(
         determined=consistency.coverage,
         sigma_share=float(np.nanmedian(sigma)) if np.isfinite(sigma).any() else float("nan"),
     )
+
+
+def _shows(phase_map: PhaseMap, outside: Mask | None, xy: Floats) -> Mask:
+    """Whether image coordinates (M, 2) lie in the image, and not where a box cut away."""
+    shown = in_image(phase_map.view.camera, xy)
+    if outside is not None:
+        shown[shown] = sample_image(outside.astype(np.float32), xy[shown], nearest=True) == 0
+    return shown

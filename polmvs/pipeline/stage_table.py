@@ -29,6 +29,7 @@ from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import HERE, LOG_FILE, RUN_FILE, RunFolder
 from polmvs.pipeline.stages import (
+    box,
     dense_workspace,
     densify,
     evaluation,
@@ -146,6 +147,11 @@ def _place_model(run: StageInput) -> poses.PosesResult:
         run.options.reference,
         run.options.sfm.without,
     )
+
+
+def _check_box(run: StageInput) -> box.BoxResult:
+    folder, aruco = run.run_folder, run.options.reference.aruco
+    return box.check_box(folder.sparse, folder.images, run.options.crop, aruco)
 
 
 def _build_maps(run: StageInput) -> maps.MapsResult:
@@ -317,6 +323,17 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             decides=("reference", WITHOUT),
             work=_place_model,
             result=poses.PosesResult,
+        ),
+        StageSpec(
+            name="box",
+            command=NORMALS,
+            reads=(HERE.images, HERE.sparse),
+            writes=(),
+            decides=CROPPING,
+            work=_check_box,
+            result=box.BoxResult,
+            is_wanted=lambda options: options.crop.box is not None,
+            is_redone=True,
         ),
         StageSpec(
             name="maps",

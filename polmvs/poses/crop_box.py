@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull, QhullError
 
+from polmvs.camera import pixel_centers
 from polmvs.config import CropOptions
 from polmvs.errors import OptionError
 from polmvs.geometry import RigidTransform, align_points
@@ -17,6 +20,7 @@ from polmvs.scene import View, short_list
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+MOST = (2, 98)  # percentiles of the coordinates of sparse points that a message names
 # Corners of a marker of unit side in its own frame, clockwise from its first, as OpenCV has them.
 UNIT_MARKER = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
@@ -40,6 +44,61 @@ class CropBox:
         inside = self.frame_from_world * np.asarray(points, np.float64)
         return np.asarray(((inside >= self.low) & (inside <= self.high)).all(axis=-1), np.bool_)
 
+    def misses(self, view: View) -> Mask:
+        """Pixels (H, W) of a view whose rays do not meet the box."""
+        height, width = view.camera.height, view.camera.width
+        rays = view.rays_in_world(pixel_centers(width, height).reshape(-1, 2))
+        along = rays @ np.asarray(self.frame_from_world.rotation).T
+        along = np.where(along == 0, np.finfo(np.float64).tiny, along)
+        center = np.asarray(self.frame_from_world * view.center_in_world)
+        with np.errstate(over="ignore"):
+            ends = np.sort([(side - center) / along for side in (self.low, self.high)], axis=0)
+        enters, leaves = ends[0].max(axis=-1), ends[1].min(axis=-1)
+        return np.asarray((leaves < np.maximum(enters, 0)).reshape(height, width))
+
+    def require_possible(self, points: NDArray[np.floating], centers: Array) -> Mask:
+        """Refuse a box that cannot hold anything that the cameras see.
+
+        A surface without sparse points may lie in a box. But what is seen lies before what has
+        points, or among it: between them and the cameras.
+
+        Parameters
+        ----------
+        points : (N, 3), sparse ones, world.
+        centers : (V, 3), of the cameras, world.
+
+        Returns
+        -------
+        (N,), which of the points lie in the box.
+
+        Raises
+        ------
+        OptionError
+            It lies beside them all; says where they are.
+        """
+        kept = self.contains(points)
+        scene = np.asarray(self.frame_from_world * np.concatenate([points, centers]))
+        if not kept.any() and not self._meets_hull(scene):
+            near = np.asarray(self.frame_from_world * np.asarray(points, np.float64))
+            text = _corners(np.percentile(near, MOST, axis=0)) if len(near) else "no place"
+            raise OptionError(
+                f"lies beside all that the cameras see: most sparse points lie in {text}. Is it in "
+                "the unit and the frame of this model?",
+                field="crop.box",
+            )
+        return kept
+
+    def _meets_hull(self, points: Array) -> bool:
+        """Whether the box meets the convex hull of points (N, 3) in its frame."""
+        try:
+            planes = ConvexHull(points).equations
+        except (QhullError, ValueError):  # in one plane: its box is the next best
+            low, high = points.min(axis=0), points.max(axis=0)
+            return bool(((self.low <= high) & (self.high >= low)).all())
+        sides = list(zip(self.low, self.high, strict=True))
+        found = linprog(np.zeros(3), A_ub=planes[:, :3], b_ub=-planes[:, 3], bounds=sides)
+        return bool(found.status != 2)  # 2: there is no such point
+
     def require_some(self, points: NDArray[np.floating]) -> Mask:
         """As :meth:`contains`; points (N, 3).
 
@@ -51,12 +110,16 @@ class CropBox:
         kept = self.contains(points)
         if len(points) and not kept.any():
             inside = self.frame_from_world * np.asarray(points, np.float64)
-            corners = np.concatenate([inside.min(axis=0), inside.max(axis=0)])
-            text = ",".join(f"{value:.4g}" for value in corners)
+            text = _corners(np.array([inside.min(axis=0), inside.max(axis=0)]))
             raise OptionError(
                 f"holds nothing of the surface, which lies in {text}.", field="crop.box"
             )
         return kept
+
+
+def _corners(ends: Array) -> str:
+    """Two corners (2, 3) as the option takes them."""
+    return ",".join(f"{value:.4g}" for value in ends.reshape(-1))
 
 
 def crop_box(

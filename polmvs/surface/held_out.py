@@ -9,8 +9,9 @@ show.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +119,7 @@ def predict_left_out(
     known: KnownPoints,
     *,
     light: Light | None = None,
+    outside: Mapping[str, Mask] = MappingProxyType({}),
     tolerances: HeldOutTolerances | None = None,
 ) -> Prediction | None:
     """Predict some views from a surface of the others.
@@ -129,6 +131,8 @@ def predict_left_out(
     looking : angle model and the share of the tilt that the whole surface took back.
     known : points of the surface.
     light : as of :func:`polmvs.surface.global_surface.reconstruct_surface`.
+    outside : pixels (H, W) of each view, by its name, that are not compared: they show what lies
+        outside a box that the result was cut to.
 
     Returns
     -------
@@ -151,7 +155,7 @@ def predict_left_out(
                 used, looking, hull.footprint, known=known, light=light, tolerances=solver
             )
             mesh = refine(mesh, fit).mesh
-        return predict(mesh, others, looking, light=light, width_px=tol.width_px)
+        return predict(mesh, others, looking, light=light, outside=outside, width_px=tol.width_px)
 
     found = trial(tol.levels)
     if found.error_deg > tol.doubtful_deg:
@@ -166,6 +170,7 @@ def predict(
     looking: Looking,
     *,
     light: Light | None = None,
+    outside: Mapping[str, Mask] = MappingProxyType({}),
     width_px: float = HeldOutTolerances.width_px,
 ) -> Prediction:
     """Hold what views show against a mesh; parameters as of :func:`predict_left_out`."""
@@ -178,6 +183,9 @@ def predict(
         camera = view.view.camera
         xy = lattice_xy(camera.height // STRIDE_PX, camera.width // STRIDE_PX, STRIDE_PX)
         xy = xy.reshape(-1, 2)
+        if view.view.name in outside:
+            cols, rows = np.floor(xy).astype(np.intp).T
+            xy = xy[~outside[view.view.name][rows, cols]]
         cols, rows = np.floor(xy).astype(np.intp).T
         rays = view.view.rays_in_world(xy)
         hit, face, points = _first_hits(scene, view, rays)

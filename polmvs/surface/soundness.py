@@ -6,14 +6,18 @@ sound body and leaves it, in turn, and some way apart.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polmvs.scene import View
 from polmvs.surface.dense_view import lattice_xy
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
+
+Mask = NDArray[np.bool_]
 
 STRIDE_PX = 6
 # Sheets nearer to each other than this are one within what silhouettes and phases place: their
@@ -37,20 +41,28 @@ class Soundness:
     overlapping: float
 
 
-def find_soundness(mesh: TriangleMesh, views: Sequence[View]) -> Soundness:
+def find_soundness(
+    mesh: TriangleMesh, views: Sequence[View], outside: Mapping[str, Mask] = MappingProxyType({})
+) -> Soundness:
     """Cast rays of all views through a closed mesh.
 
     Parameters
     ----------
     mesh : closed, its faces anticlockwise from outside.
     views : whose rays are cast, every few pixels.
+    outside : pixels (H, W) of each view, by its name, that show what lies outside a box that the
+        result was cut to; no rays are cast there.
     """
     met, layered, overlapping = 0, 0, 0
     scene = RayScene(mesh)
     for view in views if len(mesh.faces) else ():
         camera = view.camera
         xy = lattice_xy(camera.height // STRIDE_PX, camera.width // STRIDE_PX, STRIDE_PX)
-        rays = view.rays_in_world(xy.reshape(-1, 2))
+        xy = xy.reshape(-1, 2)
+        if view.name in outside:
+            cols, rows = np.floor(xy).astype(np.intp).T
+            xy = xy[~outside[view.name][rows, cols]]
+        rays = view.rays_in_world(xy)
         found = scene.crossings(view.center_in_world, rays)
         footprint = found.distance / camera.mean_focal_px
         follows = found.ray[1:] == found.ray[:-1]

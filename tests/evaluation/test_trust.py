@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from scenes import board_scene
 
+from polmvs.camera import pixel_centers
 from polmvs.evaluation.trust import Trust, measure_trust
+from polmvs.geometry import RigidTransform
 from polmvs.io.clouds import Cloud
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import turned
+from polmvs.poses.crop_box import CropBox
 from polmvs.scene import PointKind
 from polmvs.surface.held_out import Prediction, ViewError
 from polmvs.surface.soundness import Soundness
@@ -71,6 +74,41 @@ def test_views_that_disagree_and_wide_deviations(scene):
     assert {"views that agree with a point they see", "stated deviation of the places"} <= set(
         names(trust)
     )
+
+
+def boxed(scene, cloud: Cloud) -> tuple[Cloud, dict[str, np.ndarray]]:
+    """The half of the cloud of larger x, and the pixels of each view that show the other half."""
+    kept = cloud.points[:, 0] > 0
+    half = cloud.only(kept)
+    box = CropBox(RigidTransform(np.eye(3), np.zeros(3)), np.array([0, -9, -9]), np.full(3, 9.0))
+    outside = {}
+    for one in scene.maps:
+        camera, center = one.view.camera, one.view.center_in_world
+        rays = one.view.rays_in_world(pixel_centers(camera.width, camera.height))
+        ranges = -(center @ scene.surface.normal) / (rays @ scene.surface.normal)
+        outside[one.view.name] = ~box.contains(center + rays * ranges[..., None])
+    return half, outside
+
+
+def test_what_a_box_cut_away_is_not_missing(scene):
+    cloud = cloud_of(scene)
+    whole = measure_trust(AngleModel.PPA, cloud, NO_TRACKS, scene.maps)
+    half, outside = boxed(scene, cloud)
+    trust = measure_trust(AngleModel.PPA, half, NO_TRACKS, scene.maps, outside)
+    assert trust.determined == pytest.approx(whole.determined, abs=0.03)
+    assert names(trust) == names(whole)
+    blind = measure_trust(AngleModel.PPA, half, NO_TRACKS, scene.maps)
+    assert blind.determined < 0.6 * whole.determined
+
+
+def test_what_lies_behind_a_cut_is_not_visible(scene):
+    """Points under the board, which the part that is cut away hides, contradict no view."""
+    cloud = cloud_of(scene, shift=-0.05)
+    everywhere = {m.view.name: np.ones(m.region.inside.shape, np.bool_) for m in scene.maps}
+    trust = measure_trust(AngleModel.PPA, cloud, NO_TRACKS, scene.maps, everywhere)
+    assert np.isnan(trust.inside)
+    assert np.isnan(trust.determined)
+    assert measure_trust(AngleModel.PPA, cloud, NO_TRACKS, scene.maps).inside < 1
 
 
 def test_an_empty_cloud_tells_nothing(scene):

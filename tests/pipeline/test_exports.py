@@ -29,7 +29,8 @@ from polmvs.config import FusionOptions, Method, PropagationOptions
 from polmvs.geometry import RigidTransform, SimilarityTransform, points_on_rays
 from polmvs.io.clouds import Cloud, read_cloud, read_mesh, write_cloud
 from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_truth
-from polmvs.pipeline.run_folder import DENSE_MARKER, SURFACE_MESH
+from polmvs.pipeline.jobs import judge
+from polmvs.pipeline.run_folder import DENSE_MARKER, SURFACE_MESH, RunFolder
 from polmvs.pipeline.stages.densify import crop_views, open_dense_views, unused_options
 from polmvs.poses.crop_box import CropBox
 from polmvs.poses.metric_frame import transform_model
@@ -363,6 +364,10 @@ def test_a_box_cuts_cloud_maps_and_mesh(go_on: Continue, run: Path, demo_capture
         rays = view.rays_in_world(dense.lattice_xy())
         shown = points_on_rays(view.center_in_world, rays, dense.range_map)[dense.known]
         assert (shown[:, :2] <= middle[:2] + 1e-6).all()
+    trust, whole = judge(RunFolder(out)), judge(RunFolder(run))
+    assert trust.determined > whole.determined - 0.05  # what lies outside is not missing
+    assert trust.agreement > 0.8
+    assert trust.inside > 0.9
     err = refused(
         cli("densify", demo_capture, out, "--box", text, "--box-marker", 3, "--overwrite"), 2
     )
@@ -370,14 +375,33 @@ def test_a_box_cuts_cloud_maps_and_mesh(go_on: Continue, run: Path, demo_capture
 
 
 def test_a_box_cuts_the_surface_of_all_views(run: Path, tmp_path: Path) -> None:
-    shutil.copytree(run / "views_ppa", tmp_path / "views")
+    out = tmp_path / "run"
+    shutil.copytree(run, out)
     whole = read_mesh(run / "views_ppa" / SURFACE_MESH)
     middle = whole.vertices.mean(axis=0)
     box = CropBox(RigidTransform(np.eye(3), np.zeros(3)), np.array([middle[0], -9, -9]), 9 * ONES)
-    crop_views(tmp_path / "views", read_model(run / "sparse").views, box)
-    half = read_mesh(tmp_path / "views" / SURFACE_MESH)
+    crop_views(out / "views_ppa", read_model(run / "sparse").views, box)
+    cloud = read_cloud(run / "ppa.ply")
+    write_cloud(out / "ppa.ply", cloud.only(box.contains(cloud.points)))
+    half = read_mesh(out / "views_ppa" / SURFACE_MESH)
     assert half.vertices[:, 0].min() >= middle[0]
     assert 0.3 < len(half.triangles) / len(whole.triangles) < 0.7
+    trust, before = judge(RunFolder(out)), judge(RunFolder(run))
+    assert trust.determined > before.determined - 0.05
+    assert trust.is_trusted == before.is_trusted
+    assert trust.predicted is not None
+    assert before.predicted is not None
+    assert 0.2 < trust.predicted.num_phases / before.predicted.num_phases < 0.8
+
+
+def test_a_box_beside_the_scene_is_refused_before_the_surface_is_made(
+    run: Path, demo_capture: Path, tmp_path: Path, cli
+) -> None:
+    flags = ("--sparse", run / "sparse", "--box", "90,90,90,91,91,91", "--workers", 1)
+    err = refused(cli("reconstruct", demo_capture, tmp_path / "out", *flags), 2)
+    assert "--box lies beside all that the cameras see: most sparse points lie in " in err
+    assert "unit and the frame of this model" in err
+    assert stages_of(tmp_path / "out") == ["images", "sfm", "poses"]
 
 
 def test_more_views_must_agree(go_on: Continue, run: Path) -> None:

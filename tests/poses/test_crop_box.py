@@ -7,11 +7,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from marker_scenes import ONE, OPTION, PINHOLE, loader, views_of
+from scipy.spatial.transform import Rotation
 
+from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.config import CropOptions
 from polmvs.errors import OptionError
 from polmvs.geometry import RigidTransform
 from polmvs.poses.crop_box import CropBox, crop_box, marker_frames
+from polmvs.scene import View
+from polmvs.synthetic.captures import look_at
+
+ONES = np.ones(3)
 
 
 def no_image(name: str) -> np.ndarray:
@@ -83,3 +89,69 @@ def test_boxes_that_are_none() -> None:
         CropOptions(box=(0, 0, 0, 1, 1, 0))
     with pytest.raises(OptionError, match=r"needs `crop.box`"):
         CropOptions(box_marker=1)
+
+
+WORLD = RigidTransform(np.eye(3), np.zeros(3))
+
+
+def test_pixels_whose_rays_miss_a_box() -> None:
+    """Against points of the rays: near, far, and behind the camera."""
+    camera = PinholeCamera(width=40, height=30, fx=35, fy=35, cx=20, cy=15)
+    view = View(name="a", camera=camera, cam_from_world=look_at([0.1, -0.5, 0.6], (0, 0, 0)))
+    turned = RigidTransform(Rotation.from_euler("xyz", [0.3, 0.2, 1.0]).as_matrix(), ONES / 50)
+    rays = view.rays_in_world(pixel_centers(40, 30))
+    for box in (
+        CropBox(WORLD, np.array([-0.2, -0.1, -0.05]), np.array([0.1, 0.2, 0.1])),
+        CropBox(turned, np.array([-0.2, -0.1, -0.05]), np.array([0.1, 0.2, 0.1])),
+        CropBox(WORLD, np.array([-0.1, -0.7, 0.4]), np.array([0.3, -0.3, 0.8])),  # about the camera
+        CropBox(WORLD, np.array([-0.3, -1.9, 1.2]), np.array([0.3, -1.5, 1.8])),  # behind it
+    ):
+        steps = np.linspace(0, 3, 6001)[:, None, None, None]
+        meets = box.contains(view.center_in_world + steps * rays).any(axis=0)
+        differ = meets == box.misses(view)
+        assert differ.mean() < 0.01  # rays that touch an edge between two steps
+        assert not (meets & box.misses(view)).any()
+
+
+SPARSE = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [1, 1, 0.05]  # a table
+CENTERS = np.array([[2, 0, 2.0], [-2, 0, 2], [0, 2, 2], [0, -2, 2]])
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "num"),
+    [
+        ((-0.5, -0.5, -0.1), (0.5, 0.5, 0.1), "some"),
+        ((-0.1, -0.1, 0.3), (0.1, 0.1, 0.5), None),  # over the table, without any point
+        ((-100, -100, -100), (100, 100, 100), "all"),
+    ],
+)
+def test_boxes_that_may_hold_a_surface(low, high, num) -> None:
+    kept = CropBox(WORLD, np.array(low, float), np.array(high, float)).require_possible(
+        SPARSE, CENTERS
+    )
+    assert kept.any() == (num is not None)
+    assert kept.all() == (num == "all")
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ((90, 90, 90), (91, 91, 91)),
+        ((-1, -1, -0.6), (1, 1, -0.3)),  # under the table
+        ((1.9, 1.9, 1.0), (2, 2, 1.9)),  # within the scene's own box, beside its hull
+    ],
+)
+def test_boxes_beside_the_scene(low, high) -> None:
+    box = CropBox(WORLD, np.array(low, float), np.array(high, float))
+    with pytest.raises(
+        OptionError, match=r"most sparse points lie in -0\.9\d+,-0\.9\d+,-0\.0"
+    ) as caught:
+        box.require_possible(SPARSE, CENTERS)
+    assert caught.value.field == "crop.box"
+
+
+def test_a_scene_in_one_plane_has_a_hull_as_well() -> None:
+    flat = SPARSE * [1, 1, 0]
+    box = CropBox(WORLD, np.array([-2, -2, 1.0]), np.array([2, 2, 2.0]))
+    with pytest.raises(OptionError, match="lies beside all"):
+        box.require_possible(flat, flat[:3])

@@ -25,6 +25,7 @@ from polmvs.colmap.filling import previous_backups
 from polmvs.colmap.models import read_model
 from polmvs.config import FusionOptions, Method, Options, PropagationOptions, Surroundings
 from polmvs.geometry import points_on_rays
+from polmvs.io.arrays import map_array, save_array
 from polmvs.io.clouds import Cloud, Mesh, read_mesh, write_cloud, write_mesh
 from polmvs.io.images import read_gray
 from polmvs.parallel import OnProgress, Workers, no_progress
@@ -81,6 +82,7 @@ UNUSED: Mapping[Method, tuple[str, ...]] = {
     Method.CONTOUR: (),
 }
 
+OUTSIDE = "{name}.outside.npy"  # among dense views: pixels that show nothing within the box
 FINEST_SPACING_PX = 0.25  # of points that are not to be merged, in footprints of a pixel
 
 
@@ -181,6 +183,9 @@ def densify(
         given.views,
         lambda name: read_gray(folder.images / name),
     )
+    if box is not None:
+        centers = np.array([view.center_in_world for view in given.views])
+        box.require_possible(sparse.tracks.points_in_world, centers)
     with scratch(folder.views(model)) as kept, given.workers.stopped_on_error():
         new_views = kept / "views"
         new_views.mkdir()
@@ -201,8 +206,8 @@ def densify(
             inside = box.require_some(surface.points)
             if not inside.all():
                 logger.warning(
-                    "`crop.box` leaves out %.0f %% of the surface; figures of how much of the "
-                    "polarized regions is determined count that as missing.",
+                    "`crop.box` leaves out %.0f %% of the surface; figures against a ground truth "
+                    "count that as missing.",
                     100 * (1 - inside.mean()),
                 )
             surface = surface.only(inside)
@@ -222,14 +227,28 @@ def densify(
 
 
 def crop_views(folder: Path, views: Sequence[View], box: CropBox) -> None:
-    """Leave of stored views, and of the mesh beside them, what lies in a box."""
+    """Leave of stored views, and of the mesh beside them, what lies in a box.
+
+    ``OUTSIDE`` are then the pixels (H, W) that show what lies beside the box: their rays miss it,
+    or the surface there lies outside; all of a view that has no surface.
+    """
     for view in views:
         dense = find_dense_view(folder / view.name)
+        outside = folder / OUTSIDE.format(name=view.name)
         if dense is None:
+            save_array(outside, np.ones((view.camera.height, view.camera.width), np.bool_))
             continue
         rays = view.rays_in_world(dense.lattice_xy())
         points = points_on_rays(view.center_in_world, rays, dense.range_map.astype(np.float64))
-        store_dense_view(dense.only(box.contains(points)), folder / view.name)
+        kept = box.contains(points)
+        cut = dense.known & ~kept
+        misses = box.misses(view)
+        rows, cols = (
+            np.minimum(np.arange(side) // dense.stride_px, most - 1)
+            for side, most in zip(misses.shape, cut.shape, strict=True)
+        )
+        save_array(outside, misses | cut[rows[:, None], cols])
+        store_dense_view(dense.only(kept), folder / view.name)
     if (folder / SURFACE_MESH).is_file():
         mesh = read_mesh(folder / SURFACE_MESH)
         write_mesh(folder / SURFACE_MESH, mesh.only(box.contains(mesh.vertices)))
@@ -372,6 +391,17 @@ def open_dense_views(sparse: Path, views: Path) -> list[DenseView | None]:
     views : folder that :func:`densify` wrote.
     """
     return [find_dense_view(views / view.name) for view in posed_views(sparse)]
+
+
+def open_outside(sparse: Path, views: Path) -> dict[str, NDArray[np.bool_]]:
+    """Pixels (H, W) of views, by name, that show what lies outside a box; none without a box.
+
+    Parameters
+    ----------
+    sparse, views : as of :func:`open_dense_views`.
+    """
+    paths = {v.name: views / OUTSIDE.format(name=v.name) for v in posed_views(sparse)}
+    return {n: map_array(path, np.bool_) for n, path in paths.items() if path.is_file()}
 
 
 def open_checked(folder: Path, sparse: Path, images: Path) -> DenseWorkspace:

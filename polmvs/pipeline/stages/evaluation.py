@@ -13,7 +13,7 @@ from polmvs.io.images import write_bytes
 from polmvs.io.typed_json import write_json
 from polmvs.parallel import Workers
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.stages.densify import open_dense_views
+from polmvs.pipeline.stages.densify import open_dense_views, open_outside
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.polarization.capture import Capture
 from polmvs.polarization.kinds import AngleModel
@@ -51,6 +51,7 @@ def load_estimate(run_folder: RunFolder, model: AngleModel) -> ModelEstimate:
         tracks=read_cloud(run_folder.sparse_cloud(model)),
         maps=open_maps(run_folder.sparse, run_folder.maps(model), model),
         dense=open_dense_views(run_folder.sparse, run_folder.views(model)),
+        outside=open_outside(run_folder.sparse, run_folder.views(model)),
     )
 
 

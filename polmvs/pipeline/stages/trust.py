@@ -17,6 +17,7 @@ from polmvs.config import default_num_workers
 from polmvs.evaluation.trust import Trust, measure_trust
 from polmvs.io.clouds import read_cloud, read_mesh
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
+from polmvs.pipeline.stages.densify import open_outside
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.polarization.kinds import AngleModel, Light
@@ -72,7 +73,8 @@ def find_trust(model: AngleModel, made: Made, folder: RunFolder) -> Trust:
     """
     dense = read_cloud(folder.cloud(model))
     phase_maps = open_maps(folder.sparse, folder.maps(model), model)
-    trust = measure_trust(model, dense, read_cloud(folder.sparse_cloud(model)), phase_maps)
+    outside = open_outside(folder.sparse, folder.views(model))
+    trust = measure_trust(model, dense, read_cloud(folder.sparse_cloud(model)), phase_maps, outside)
     trust = replace(
         trust,
         num_views=len(phase_maps) + made.num_unregistered,
@@ -102,6 +104,7 @@ def _contradicted(
     chosen = np.linspace(0, len(maps) - 1, min(len(maps), MAX_TRIED_VIEWS)).round().astype(int)
     maps = [maps[index] for index in chosen]
     known = load_seeds(folder.seeds, folder.track_normals(model))
+    outside = open_outside(folder.sparse, folder.views(model))
     looking = Looking(angle_model=model, tilt_aware=made.tilt_aware, tilt_share=made.tilt_share)
     look = partial(_surface_view, masks_given=made.masks_given)
     with ThreadPoolExecutor(default_num_workers()) as pool:
@@ -114,10 +117,13 @@ def _contradicted(
             looking,
             KnownPoints(known.points_in_world, known.sigma),
             light=made.light,
+            outside=outside,
         ),
-        fitted=predict(_read_mesh(views / SURFACE_MESH), seen, looking, light=made.light),
+        fitted=predict(
+            _read_mesh(views / SURFACE_MESH), seen, looking, light=made.light, outside=outside
+        ),
         soundness=find_soundness(
-            _read_mesh(_last_level(views)), [phase_map.view for phase_map in maps]
+            _read_mesh(_last_level(views)), [phase_map.view for phase_map in maps], outside
         ),
     )
 

@@ -1,0 +1,65 @@
+"""Stage ``box``: whether the box that a result is to be cut to holds any of the scene.
+
+It is asked as soon as there are poses, before the surface is made.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from polmvs.colmap.models import read_model
+from polmvs.config import CropOptions
+from polmvs.io.images import read_gray
+from polmvs.poses.crop_box import crop_box
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxResult:
+    """What the stage found.
+
+    Attributes
+    ----------
+    num_points : sparse points in the box; None without a box.
+    num_all : sparse points of the model.
+    """
+
+    num_points: int | None
+    num_all: int
+
+    def __str__(self) -> str:
+        if self.num_points is None:
+            return "no box"
+        return f"{self.num_points:,} of {self.num_all:,} sparse points in the box"
+
+
+def check_box(sparse: Path, images: Path, crop: CropOptions, aruco: str | None) -> BoxResult:
+    """Hold a box against the sparse points.
+
+    Parameters
+    ----------
+    sparse, images : folders of the COLMAP model and of its images.
+    crop, aruco : the box, and the markers (``DICT:SIZE``) that it may be relative to.
+
+    Raises
+    ------
+    OptionError
+        The box lies beside all that the cameras see, or its marker is not found.
+    """
+    model = read_model(sparse)
+    box = crop_box(crop, aruco, model.views, lambda name: read_gray(images / name))
+    points = model.tracks.points_in_world
+    if box is None:
+        return BoxResult(num_points=None, num_all=len(points))
+    centers = np.array([view.center_in_world for view in model.views])
+    kept = box.require_possible(points, centers)
+    if not kept.any():
+        logger.warning(
+            "`crop.box` holds no sparse point: it may hold a surface without marks, or nothing."
+        )
+    return BoxResult(num_points=int(kept.sum()), num_all=len(points))
