@@ -1,12 +1,11 @@
 """The drawn figures of the documentation, each made from the package itself.
 
-python docs/figures.py [NAME ...]     # into docs/images/; all of them without a name
+python docs/pictures.py [NAME ...]     # into docs/images/, with all other pictures
 
 """
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -400,7 +399,3 @@ def _save(figure: plt.Figure, path: Path, dpi: int = 110) -> None:
     metadata = {"Date": None} if path.suffix == ".svg" else {}
     figure.savefig(path, metadata=metadata, bbox_inches="tight", dpi=dpi)
     plt.close(figure)
-
-
-if __name__ == "__main__":
-    draw(sys.argv[1:])

@@ -1,13 +1,10 @@
 """The pictures of the README: what goes in, what comes out, and what OPA and PPA say of a phase.
 
-polmvs reconstruct mug RUN --intrinsics 445,445,307.53,262.144
-python docs/hero.py mug RUN [FOLDER]     # into docs/images/
-
+python docs/pictures.py hero.png phases.png --captures FOLDER     # FOLDER/mug is the capture
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import matplotlib as mpl
@@ -30,7 +27,6 @@ from polmvs.polarization.stokes import axial_difference
 from polmvs.report.pictures import ERROR, angle_picture, gray_picture, scalar_picture
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
-IMAGES = Path(__file__).parent / "images"
 VIEW = "005.png"  # which shows handle, lip and foot
 LIGHT = np.array([-0.45, -0.65, -0.61])  # of the shaded mesh, camera frame: from the upper left
 LIT = np.array([0.83, 0.85, 0.88])
@@ -125,10 +121,3 @@ def _frame(axis: plt.Axes, width: int, height: int) -> None:
 def _save(figure: plt.Figure, path: Path) -> None:
     figure.savefig(path, bbox_inches="tight", dpi=90, facecolor="white")
     plt.close(figure)
-
-
-if __name__ == "__main__":
-    images, finished = Path(sys.argv[1]), RunFolder(Path(sys.argv[2]))
-    folder = Path(sys.argv[3]) if len(sys.argv) > 3 else IMAGES
-    hero(images, finished, folder / "hero.png")
-    phases(images, finished, folder / "phases.png")

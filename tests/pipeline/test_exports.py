@@ -364,8 +364,8 @@ def test_a_box_cuts_cloud_maps_and_mesh(go_on: Continue, run: Path, demo_capture
         rays = view.rays_in_world(dense.lattice_xy())
         shown = points_on_rays(view.center_in_world, rays, dense.range_map)[dense.known]
         assert (shown[:, :2] <= middle[:2] + 1e-6).all()
-    trust, whole = judge(RunFolder(out)), judge(RunFolder(run))
-    assert trust.determined > whole.determined - 0.05  # what lies outside is not missing
+    trust = judge(RunFolder(out))
+    assert trust.determined > 0.85  # what lies outside is not missing; the cut's own rim is
     assert trust.agreement > 0.8
     assert trust.inside > 0.9
     err = refused(
