@@ -33,7 +33,7 @@ ROOT = DOCS.parent
 IMAGES = DOCS / "images"
 MADE = "made.json"
 INTRINSICS = "445,445,307.53,262.144"  # of the captures' polarization images
-PAGE_PX = (1100, 900)
+PAGE_PX = (1100, 1400)
 SITE_PX = (1280, 800)
 # What a page is known by: its headings, the names of its figures and of what can be chosen.
 # WebGL in software, where there is no graphics card.
@@ -111,14 +111,14 @@ def sheet(sources: Sources, path: Path) -> Sequence[str]:
 def opa_ppa(sources: Sources, path: Path) -> Sequence[str]:
     """The bundled board under both models as they are published."""
     clouds = [sources.demo() / f"textbook-{model}.ply" for model in ("opa", "ppa")]
-    polmvs("render", path, *clouds, "--labels", "OPA,PPA", "--plain", "--part")
+    polmvs("render", path, *clouds, "--labels", "OPA,PPA", "--plain", "--part", "--overwrite")
     return ()
 
 
 def surface(sources: Sources, path: Path) -> Sequence[str]:
     """Two captures, from above and from below."""
     clouds = [sources.run(name) / "ppa.ply" for name in ("mug", "step")]
-    polmvs("render", path, *clouds, "--plain", "--part", "--elevations", "30,-25")
+    polmvs("render", path, *clouds, "--plain", "--part", "--elevations", "30,-25", "--overwrite")
     return ()
 
 
@@ -126,7 +126,7 @@ def levels(sources: Sources, path: Path) -> Sequence[str]:
     """From the hull of the silhouettes to the surface."""
     views = sources.run("mug") / "views_ppa"
     meshes = [*sorted(views.glob("surface_*.ply")), views / "surface.ply"]
-    polmvs("render", path, *meshes, "--plain")
+    polmvs("render", path, *meshes, "--plain", "--overwrite")
     return ()
 
 
@@ -232,8 +232,10 @@ def faults(folder: Path = IMAGES, shown: Mapping[str, str] | None = None) -> lis
 
 
 def words_of_site() -> str:
-    """What its pages are called, and their headings."""
-    return " ".join(text.read_text(encoding="utf-8") for text in sorted(DOCS.glob("*.md")))
+    """All that its pages say."""
+    others = [ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md", "data/README.md")]
+    found = [*DOCS.glob("*.md"), *others, *(ROOT / "notebooks").glob("*.ipynb")]
+    return plain(" ".join(path.read_text(encoding="utf-8") for path in sorted(found)))
 
 
 def words_of_page(page: Path) -> str:
@@ -267,7 +269,8 @@ def screenshot(page: Path, path: Path, size: tuple[int, int], ready: str) -> lis
             height,
         )
         browser.close()
-    return list(dict.fromkeys(word for text in texts if (word := plain(text))))
+    lines = (line for text in texts for line in text.splitlines())
+    return list(dict.fromkeys(words for line in lines if (words := plain(line))))
 
 
 def chromium() -> str | None:
@@ -325,7 +328,7 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="name those that are out of date")
     given = parser.parse_args()
     if given.check:
-        found = faults(shown={"site.png": plain(words_of_site())})
+        found = faults(shown={"site.png": words_of_site()})
         print("\n".join(found) or "all pictures are as they were made")
         return 1 if found else 0
     given.work.mkdir(parents=True, exist_ok=True)

@@ -32,7 +32,7 @@ def assert_alike(made: Path, kept: Path, *, most: float) -> None:
 
 def test_every_picture_is_as_the_script_made_it(demo_run: Path) -> None:
     shown = {
-        "site.png": script.plain(script.words_of_site()),
+        "site.png": script.words_of_site(),
         "report.png": script.words_of_page(demo_run / "report.html"),
     }
     assert script.faults(shown=shown) == []
