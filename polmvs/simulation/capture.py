@@ -322,8 +322,8 @@ class _Studio:
         ):
             if names:
                 raise OptionError(
-                    f"{short_list(names)} {what}; change `path.distance`, `path.elevation` or "
-                    "`path.cameras`."
+                    f"there are views that {what}: {short_list(names)}. Change "
+                    "`path.distance`, `path.elevation` or `path.cameras`."
                 )
 
     def metered_exposure(self) -> float:
