@@ -264,7 +264,7 @@ def _import_trimesh() -> Any:
         import trimesh
     except ImportError as error:
         raise OptionError(
-            "trimesh is not installed, which reads meshes; install the extra: pip install "
-            "'polmvs[simulate]'."
+            "trimesh is not installed, which reads meshes; install the extra: "
+            "pip install '.[simulate]'."
         ) from error
     return trimesh
