@@ -143,12 +143,15 @@ def _trial(
 
 
 def _plot(trials: Sequence[PlannedTrial]) -> bytes:
-    """Completeness, F-score and error of normals over the number of views, a line each light."""
+    """Completeness, F-score, error of normals and time over the number of views, by the light."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 3.2), layout="constrained")
-    axes = figure.subplots(1, 3)
-    titles = ("completeness at 1 mm, %", "F-score at 1 mm, %", "normal error, median, deg")
+    figure = Figure(figsize=(13, 3.2), layout="constrained")
+    axes = figure.subplots(1, 4)
+    titles = (
+        *("completeness at 1 mm, %", "F-score at 1 mm, %", "normal error, median, deg"),
+        "time of the reconstruction, s",
+    )
     for light in dict.fromkeys(one.light for one in trials):
         own = [one.trial for one in trials if one.light is light]
         views = [trial.views for trial in own]
@@ -156,15 +159,18 @@ def _plot(trials: Sequence[PlannedTrial]) -> bytes:
             [100 * trial.completeness[0] for trial in own],
             [100 * trial.f_score[0] for trial in own],
             [trial.normal_median_deg for trial in own],
+            [trial.seconds for trial in own],
         )
         for axis, column in zip(axes, columns, strict=True):
             axis.plot(views, column, marker="o", label=light.value)
     for axis, title in zip(axes, titles, strict=True):
         axis.set(xlabel="views", title=title)
+        axis.set_xticks(sorted({one.trial.views for one in trials}))
         axis.grid(alpha=0.3)
+        axis.margins(y=0.15)  # what lies at the end is seen whole
+        axis.set_ylim(bottom=0)
     for axis in axes[:2]:
-        axis.set_ylim(0, 100)
-    axes[2].set_ylim(bottom=0)
+        axis.set_ylim(0, 105)
     axes[0].legend()
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)

@@ -31,7 +31,16 @@ INLINE = sorted(
     }
 )
 # Flags of scripts, of pip and of Python.
-OTHERS = {"--help", "--help-all", "--version", "--estimators", "--way", "--group", "--no"}
+OTHERS = {
+    "--check",
+    "--help",
+    "--help-all",
+    "--version",
+    "--estimators",
+    "--way",
+    "--group",
+    "--no",
+}
 
 
 def test_there_are_some() -> None:
