@@ -152,3 +152,16 @@ def test_no_surface_predicts_nothing_right(views) -> None:
     found = predict(nothing, views, LOOKING)
     assert (found.num_phases, found.overlap) == (0, 0)
     assert np.isnan(found.error_deg)
+
+
+def test_pixels_outside_a_box_are_not_compared(views) -> None:
+    """Of the left half of each image nothing counts, and of whole images nothing is known."""
+    mesh = extracted(ellipsoid, step=0.05)
+    height, width = views[0].silhouette.certain.shape
+    left = np.arange(width)[None] < width // 2
+    outside = {view.view.name: np.broadcast_to(left, (height, width)) for view in views}
+    whole, half = predict(mesh, views, LOOKING), predict(mesh, views, LOOKING, outside=outside)
+    assert 0.4 < half.num_phases / whole.num_phases < 0.6
+    assert half.overlap > 0.9
+    everything = {name: np.ones((height, width), np.bool_) for name in outside}
+    assert np.isnan(predict(mesh, views, LOOKING, outside=everything).overlap)

@@ -38,6 +38,18 @@ def test_bodies_in_each_other_overlap() -> None:
     assert find_soundness(within, VIEWS).overlapping == pytest.approx(0.25, abs=0.04)
 
 
+def test_what_a_box_cut_away_is_not_looked_at() -> None:
+    within = side_by_side(extracted(sphere(1.0)), extracted(sphere(0.5)))
+    outside = {}
+    for view in VIEWS:  # all pixels that show the inner one
+        camera = view.camera
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        middle = view.project(np.zeros(3))
+        outside[view.name] = np.hypot(x - middle[0], y - middle[1]) < 0.6 * camera.fx / 5
+    assert find_soundness(within, VIEWS).overlapping > 0.2
+    assert find_soundness(within, VIEWS, outside).overlapping == 0
+
+
 def test_nothing_is_sound() -> None:
     nothing = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     assert find_soundness(nothing, VIEWS).layered == 0
