@@ -60,7 +60,7 @@ def _write_laspy(path: Path, cloud: Cloud, *, compressed: bool) -> None:
         import laspy
     except ImportError as error:
         raise PolmvsError(
-            f"{path}: LAS and LAZ need a library: install polmvs with its extra 'las'."
+            f"{path}: LAS and LAZ need a library, in the clone: pip install '.[las]'."
         ) from error
     header = laspy.LasHeader(version=LAS_VERSION, point_format=POINT_FORMAT)
     low = cloud.points.min(axis=0) if len(cloud.points) else np.zeros(3)

@@ -279,7 +279,7 @@ class _Painter:
             import xatlas
         except ImportError as error:
             raise PolmvsError(
-                "a texture needs a library: install polmvs with its extra 'texture'."
+                "a texture needs a library, in the clone: pip install '.[texture]'."
             ) from error
         old = self.mesh
         came_from, faces, uv = xatlas.parametrize(
