@@ -10,6 +10,7 @@ import numpy as np
 from polmvs.cli.call import Call
 from polmvs.cli.commands import DeviationArguments
 from polmvs.cli.exit_status import OUT_OF_TOLERANCE
+from polmvs.cli.flags import in_flags
 from polmvs.cli.pages import make_report
 from polmvs.cli.terminal import Terminal
 from polmvs.errors import DataError, OptionError
@@ -71,7 +72,7 @@ def deviation(call: Call, terminal: Terminal) -> int:
         with replacing(run_folder.deviation) as folder:
             write_deviation(folder, found, color_limit(found))
         lines.append(make_report(run_folder, terminal))
-    terminal.show("\n".join(lines), found.figures)
+    terminal.show([in_flags(line) for line in lines], found.figures)
     return OUT_OF_TOLERANCE if found.figures.passed is False else 0
 
 
@@ -89,8 +90,8 @@ def deviation_lines(found: Deviation) -> list[str]:
         )
     if f.ambiguous:
         lines.append(
-            "the part fits about as well when it is turned: give the right place by `arguments."
-            "aligned`"
+            "the part fits about as well when it is turned: bring it to its place and give "
+            "`arguments.aligned`"
         )
     lines += [
         f"mean {f.mean:+.4f} mm, standard deviation {f.standard_deviation:.4f} mm, RMS "

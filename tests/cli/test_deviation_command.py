@@ -64,6 +64,20 @@ def test_references_of_any_format_and_unit(
     assert json.loads(text)["passed"] is True
 
 
+def test_a_part_that_looks_alike_when_turned_is_said_with_the_flag(tmp_path: Path, cli) -> None:
+    block = trimesh.creation.box((120, 80, 30))
+    block.export(tmp_path / "block.stl")
+    points, face = trimesh.sample.sample_surface(block, 5_000, seed=0)
+    write_cloud(
+        tmp_path / "cloud.ply",
+        Cloud(points=1e-3 * np.array(points), normals=block.face_normals[face]),
+    )
+    arguments = (tmp_path / "cloud.ply", tmp_path / "block.stl", "--metric", "--tolerance", 0.2)
+    status, text, _ = cli("deviation", *arguments)
+    assert status == 0
+    assert "when it is turned: bring it to its place and give --aligned" in text
+
+
 def test_a_cloud_without_a_scale_needs_a_unit(tmp_path: Path, result: Path, cli) -> None:
     part().apply_scale(1e3).export(tmp_path / "part.stl")
     err = refused(cli("deviation", result, tmp_path / "part.stl"), 2)
