@@ -125,8 +125,11 @@ def surface(sources: Sources, path: Path) -> Sequence[str]:
 def levels(sources: Sources, path: Path) -> Sequence[str]:
     """From the hull of the silhouettes to the surface."""
     views = sources.run("mug") / "views_ppa"
-    meshes = [*sorted(views.glob("surface_*.ply")), views / "surface.ply"]
-    polmvs("render", path, *meshes, "--plain", "--overwrite")
+    made = sorted(views.glob("surface_*.ply"))
+    meshes = [made[0], made[1], made[-1], views / "surface.ply"]
+    labels = "hull,first level,last level,supported"
+    flags = ("--plain", "--elevations", 35, "--size", "400,300", "--overwrite")
+    polmvs("render", path, *meshes, "--labels", labels, *flags)
     return ()
 
 
