@@ -82,13 +82,15 @@ def fail_or_write(folder, diary, index):
     if index == 0:
         raise DataError("a", "is bad.")
     (folder / f"begun {index}").touch()
-    time.sleep(1)
-    with diary.open("a") as file:
-        file.write(f"done {index}, folder there: {folder.is_dir()}\n")
+    try:
+        time.sleep(1)
+    finally:
+        with diary.open("a") as file:
+            file.write(f"left {index}, folder there: {folder.is_dir()}\n")
 
 
 def test_a_failing_worker_stops_the_others_before_their_files_go(tmp_path) -> None:
-    """What is under way ends in the folder that it works in, and nothing begins after that."""
+    """What is under way is left before its folder goes, and nothing begins after that."""
     diary = tmp_path / "diary"
     diary.touch()
     with Workers(3) as workers:
@@ -103,8 +105,28 @@ def test_a_failing_worker_stops_the_others_before_their_files_go(tmp_path) -> No
                 time.sleep(0.01)
             first()
         lines = diary.read_text().splitlines()
-        assert 2 <= len(lines) < 19
+        assert 1 <= len(lines) < 19
         assert all(line.endswith("folder there: True") for line in lines)
         assert [path.name for path in tmp_path.iterdir()] == ["diary"]
         time.sleep(1.2)
         assert diary.read_text().splitlines() == lines
+
+
+def fail_or_wait(folder, index):
+    """The first fails when the second is at work, which would take a minute."""
+    if index == 0:
+        while not any(folder.glob(".polmvs-*")):
+            time.sleep(0.01)
+        raise DataError("a", "is bad.")
+    with scratch(folder / "result"):
+        for _ in range(600):
+            time.sleep(0.1)
+    return index
+
+
+def test_what_is_cancelled_ends_at_once_and_leaves_nothing(tmp_path) -> None:
+    start = time.monotonic()
+    with pytest.raises(DataError, match="a: is bad"), Workers(2) as workers:
+        list(workers.map(fail_or_wait, [tmp_path] * 2, range(2)))
+    assert time.monotonic() - start < 30
+    assert list(tmp_path.iterdir()) == []
