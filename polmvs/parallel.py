@@ -228,7 +228,7 @@ def _signals_held_back() -> Iterator[None]:
 
 
 class _Stopped(BaseException):
-    """This worker is to end; what it is at leaves nothing behind."""
+    """A worker is to end; what it is at leaves nothing behind."""
 
 
 _works = False  # whether this process, a worker, is at a task

@@ -303,9 +303,12 @@ def test_masks_are_honoured(cli, demo_run: Path, demo_capture: Path, tmp_path: P
         expected += np.count_nonzero(mask)
         cv2.imwrite(str(masks / path.name), mask)
     flags = ("--sparse", demo_run / "sparse", "--mask", masks)
-    status, _, _ = cli("reconstruct", demo_capture, out, *flags, *QUICK, *CLOUD_ONLY)
+    assert cli("sfm", demo_capture, out, *flags)[0] == 0
+    status, _, err = cli("normals", demo_capture, out, "--mask", masks)
     assert status == 0
     assert result_of(out, "maps")["num_region_px"] == expected
+    assert result_of(out, "maps")["cut_share"] > 0.1
+    assert "Give masks of the whole object, its sides too, or none" in err
 
 
 def test_ground_truth_that_is_none(fails, demo_capture: Path, tmp_path: Path) -> None:

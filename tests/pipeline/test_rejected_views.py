@@ -36,6 +36,7 @@ def wrong_model(demo_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return folder
 
 
+@pytest.mark.slow
 def test_a_view_that_the_surface_contradicts_is_taken_out(
     wrong_model: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:
