@@ -189,7 +189,10 @@ class Trust:
         rows: list[_Row] = []
         if self.predicted is not None:
             enough = self.predicted.num_phases >= MIN_PHASES
-            remedy = "`sfm.intrinsics`, `sfm.sparse`, `region.light`, `capture.pattern`"
+            remedy = (
+                "`sfm.intrinsics`, `sfm.sparse`, `region.light`, `capture.pattern`, and that "
+                "nothing was moved between the images"
+            )
             odd = self.predicted.odd_view(ranges.predicted_deg[1])
             if odd is not None:
                 remedy = f"pose, image and mask of {odd}"
