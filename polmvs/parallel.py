@@ -35,6 +35,7 @@ OnProgress: TypeAlias = Callable[[int], None]  # called with the steps done sinc
 OnStep: TypeAlias = Callable[[str], None]  # called with the name of a step that begins
 
 HELD_BACK = (signal.SIGINT, signal.SIGTERM)
+GRACE_S = 3.0  # for a worker that is stopped to clear up
 POSIX = hasattr(signal, "pthread_sigmask")
 
 
@@ -247,10 +248,17 @@ def _at_work(function: Callable[..., T], task: tuple[Any, ...]) -> T:
 
 
 def _stop_worker(number: int, frame: FrameType | None) -> None:
-    """End this worker: at once, or when what it is at has cleared up."""
+    """End this worker: at once, or when what it is at has cleared up, which may not take long.
+
+    An exception that arrives in a callback of a library is lost; what is left then is the parent's
+    to clear away.
+    """
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if not _works:
         os._exit(1)
+    timer = threading.Timer(GRACE_S, os._exit, (1,))
+    timer.daemon = True
+    timer.start()
     raise _Stopped
 
 

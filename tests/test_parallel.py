@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -130,3 +131,21 @@ def test_what_is_cancelled_ends_at_once_and_leaves_nothing(tmp_path) -> None:
         list(workers.map(fail_or_wait, [tmp_path] * 2, range(2)))
     assert time.monotonic() - start < 30
     assert list(tmp_path.iterdir()) == []
+
+
+def deaf(folder):
+    (folder / "begun").touch()
+    for _ in range(600):
+        with suppress(BaseException):  # as a callback of a library
+            time.sleep(0.1)
+
+
+def test_a_worker_that_does_not_listen_ends_all_the_same(tmp_path) -> None:
+    start = time.monotonic()
+    with suppress(KeyboardInterrupt), Workers(2) as workers:
+        tasks = workers.outcomes(deaf, [tmp_path] * 2)
+        threading.Thread(target=next, args=(tasks,)).start()
+        while not (tmp_path / "begun").exists():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+    assert time.monotonic() - start < 30
