@@ -302,8 +302,7 @@ def test_masks_are_honoured(cli, demo_run: Path, demo_capture: Path, tmp_path: P
         mask[:, : mask.shape[1] // 2] = 0
         expected += np.count_nonzero(mask)
         cv2.imwrite(str(masks / path.name), mask)
-    flags = ("--sparse", demo_run / "sparse", "--mask", masks)
-    assert cli("sfm", demo_capture, out, *flags)[0] == 0
+    assert cli("sfm", demo_capture, out, "--sparse", demo_run / "sparse")[0] == 0
     status, _, err = cli("normals", demo_capture, out, "--mask", masks)
     assert status == 0
     assert result_of(out, "maps")["num_region_px"] == expected
