@@ -6,8 +6,8 @@ Each setting is a run of ``polmvs compare`` in ``WORK/NAME``, with PPA alone; ``
 how far the result is from the truth, how much worse than with right settings (harm), what was said,
 and whether the result called itself trustworthy. CAPTURE has a ``gt`` folder. OTHER is a capture
 with truth whose frames, model and truth are mistaken for CAPTURE's; MOVED one with the same cameras
-and the object elsewhere, two of whose frames take the place of CAPTURE's. A finished run is not
-done again, but judged again.
+and the object elsewhere, two of whose frames take the place of CAPTURE's of the same names. A
+finished run is not done again, but judged again.
 """
 
 from __future__ import annotations
@@ -183,12 +183,13 @@ class Settings:
             yield Setting("model of another capture", self._model_of_other)
 
     def _from(self, other: Path) -> Callable[[list[Path]], None]:
-        """Puts two frames of another capture in the place of its own."""
+        """Puts two frames of another capture in the place of its own of these names."""
 
         def mix(frames: list[Path]) -> None:
-            sources = sorted((other / "raw").iterdir())
-            for index in (len(frames) // 3, 2 * len(frames) // 3):
-                shutil.copy(sources[index], frames[index])
+            names = {path.name for path in (other / "raw").iterdir()}
+            common = [frame for frame in frames if frame.name in names]
+            for index in sorted({len(common) // 3, 2 * len(common) // 3}):
+                shutil.copy(other / "raw" / common[index].name, common[index])
 
         return mix
 
@@ -214,15 +215,20 @@ class Settings:
         return ("--sparse", str(folder / "model"))
 
     def _model_of_other(self, folder: Path) -> tuple[str, ...]:
-        """Another capture's views, with the right run's points."""
+        """The model that SfM finds of another capture."""
         assert self.other is not None
-        model = read_model(self.model)
-        other = open_ground_truth(self.other / "gt").views
-        views = tuple(
-            replace(view, cam_from_world=other[view.name].cam_from_world) for view in model.views
+        camera = next(iter(open_ground_truth(self.other / "gt").views.values())).camera
+        assert isinstance(camera, PinholeCamera)
+        values = ",".join(map(str, (camera.fx, camera.fy, camera.cx, camera.cy)))
+        subprocess.run(
+            [
+                *(sys.executable, "-m", "polmvs", "sfm", str(self.other), str(folder / "other")),
+                *("--intrinsics", values),
+            ],
+            capture_output=True,
+            check=True,
         )
-        write_model(replace(model, views=views), folder / "model")
-        return ("--sparse", str(folder / "model"))
+        return ("--sparse", str(folder / "other" / "sparse"))
 
     def _farther(self, view: View) -> View:
         center = read_model(self.model).tracks.points_in_world.mean(axis=0)

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 from polmvs.safe_path import safe_path
@@ -35,6 +35,7 @@ OnProgress: TypeAlias = Callable[[int], None]  # called with the steps done sinc
 OnStep: TypeAlias = Callable[[str], None]  # called with the name of a step that begins
 
 HELD_BACK = (signal.SIGINT, signal.SIGTERM)
+GRACE_S = 3.0  # for a worker that is stopped to clear up
 POSIX = hasattr(signal, "pthread_sigmask")
 
 
@@ -185,15 +186,18 @@ class _Processes:
                 )
         with _signals_held_back(), safe_path():
             try:
-                return self._pool.submit(function, *task)
+                return self._pool.submit(_at_work, function, task)
             except BrokenProcessPool as error:  # by one of the tasks before, as is told of them
                 lost: Future[T] = Future()
                 lost.set_exception(error)
                 return lost
 
     def close(self, *, cancel: bool) -> None:
-        """End the processes."""
+        """End the processes; if their work is cancelled, that which they are at as well."""
         if self._pool is not None:
+            if cancel and POSIX:  # elsewhere a process cannot be told to clear up and end
+                for process in list((self._pool._processes or {}).values()):
+                    process.terminate()
             self._pool.shutdown(wait=True, cancel_futures=cancel)
             self._pool = None
 
@@ -224,9 +228,44 @@ def _signals_held_back() -> Iterator[None]:
             signal.raise_signal(number)
 
 
+class _Stopped(BaseException):
+    """A worker is to end; what it is at leaves nothing behind."""
+
+
+_works = False  # whether this process, a worker, is at a task
+
+
+def _at_work(function: Callable[..., T], task: tuple[Any, ...]) -> T:
+    """Do a task in a worker, which may be stopped meanwhile."""
+    global _works
+    try:
+        _works = True
+        return function(*task)
+    except _Stopped:
+        os._exit(1)
+    finally:
+        _works = False
+
+
+def _stop_worker(number: int, frame: FrameType | None) -> None:
+    """End this worker: at once, or when what it is at has cleared up, which may not take long.
+
+    An exception that arrives in a callback of a library is lost; what is left then is the parent's
+    to clear away.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if not _works:
+        os._exit(1)
+    timer = threading.Timer(GRACE_S, os._exit, (1,))
+    timer.daemon = True
+    timer.start()
+    raise _Stopped
+
+
 def _start_worker() -> None:
     """Ctrl-C is the parent's to handle, and one worker is one core."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _stop_worker)
     keep_to_one_core()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

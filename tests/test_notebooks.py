@@ -28,6 +28,7 @@ def test_there_is_one() -> None:
     assert "first_steps.ipynb" in {path.name for path in NOTEBOOKS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(notebook: Path, tmp_path: Path) -> None:
     done = subprocess.run(

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -82,13 +83,15 @@ def fail_or_write(folder, diary, index):
     if index == 0:
         raise DataError("a", "is bad.")
     (folder / f"begun {index}").touch()
-    time.sleep(1)
-    with diary.open("a") as file:
-        file.write(f"done {index}, folder there: {folder.is_dir()}\n")
+    try:
+        time.sleep(1)
+    finally:
+        with diary.open("a") as file:
+            file.write(f"left {index}, folder there: {folder.is_dir()}\n")
 
 
 def test_a_failing_worker_stops_the_others_before_their_files_go(tmp_path) -> None:
-    """What is under way ends in the folder that it works in, and nothing begins after that."""
+    """What is under way is left before its folder goes, and nothing begins after that."""
     diary = tmp_path / "diary"
     diary.touch()
     with Workers(3) as workers:
@@ -103,8 +106,46 @@ def test_a_failing_worker_stops_the_others_before_their_files_go(tmp_path) -> No
                 time.sleep(0.01)
             first()
         lines = diary.read_text().splitlines()
-        assert 2 <= len(lines) < 19
+        assert 1 <= len(lines) < 19
         assert all(line.endswith("folder there: True") for line in lines)
         assert [path.name for path in tmp_path.iterdir()] == ["diary"]
         time.sleep(1.2)
         assert diary.read_text().splitlines() == lines
+
+
+def fail_or_wait(folder, index):
+    """The first fails when the second is at work, which would take a minute."""
+    if index == 0:
+        while not any(folder.glob(".polmvs-*")):
+            time.sleep(0.01)
+        raise DataError("a", "is bad.")
+    with scratch(folder / "result"):
+        for _ in range(600):
+            time.sleep(0.1)
+    return index
+
+
+def test_what_is_cancelled_ends_at_once_and_leaves_nothing(tmp_path) -> None:
+    start = time.monotonic()
+    with pytest.raises(DataError, match="a: is bad"), Workers(2) as workers:
+        list(workers.map(fail_or_wait, [tmp_path] * 2, range(2)))
+    assert time.monotonic() - start < 30
+    assert list(tmp_path.iterdir()) == []
+
+
+def deaf(folder):
+    (folder / "begun").touch()
+    for _ in range(600):
+        with suppress(BaseException):  # as a callback of a library
+            time.sleep(0.1)
+
+
+def test_a_worker_that_does_not_listen_ends_all_the_same(tmp_path) -> None:
+    start = time.monotonic()
+    with suppress(KeyboardInterrupt), Workers(2) as workers:
+        tasks = workers.outcomes(deaf, [tmp_path] * 2)
+        threading.Thread(target=next, args=(tasks,)).start()
+        while not (tmp_path / "begun").exists():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+    assert time.monotonic() - start < 30

@@ -27,6 +27,7 @@ from polmvs.evaluation.consistency import (
 from polmvs.io.clouds import Cloud
 from polmvs.normals.tracks import BORDER_MARGIN_PX
 from polmvs.polarization.kinds import AngleModel
+from polmvs.polarization.mask_check import MAX_CUT_SHARE
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import grow_mask
 from polmvs.scene import PointKind
@@ -70,6 +71,7 @@ class NormalRanges:
     layered, overlapping : shares of the views' rays. Measured, 0 to 0.004, and 0; the ends are
         guesses.
     left_out : share of the views that have no pose or contradict the others. Guess.
+    cut : measured, see :mod:`polmvs.polarization.mask_check`.
 
     Measured on right reconstructions: five rendered captures (``board``, ``dome``, ``demo``,
     ``mug``, ``step``) by one or both methods, ``board`` with six views, and analytic boards and
@@ -89,6 +91,7 @@ class NormalRanges:
     layered: tuple[float, float] = (0.0, 0.05)
     overlapping: tuple[float, float] = (0.0, 0.02)
     left_out: tuple[float, float] = (0.0, 0.25)
+    cut: tuple[float, float] = (0.0, MAX_CUT_SHARE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +146,8 @@ class Trust:
     fitted : all views, from the surface; None where the views were integrated one by one.
     soundness : of the mesh; likewise.
     complaints : what earlier stages found wrong (cameras, pattern, light), a clause each.
+    cut_share : of what lies along the user's masks, outside of them, how much is polarized as a
+        surface is; None without masks.
     is_trusted, verdict : what all that comes to, in one sentence.
     """
 
@@ -158,6 +163,7 @@ class Trust:
     fitted: Prediction | None = None
     soundness: Soundness | None = None
     complaints: tuple[str, ...] = ()
+    cut_share: float | None = None
     is_trusted: bool = False
     verdict: str = ""
 
@@ -185,7 +191,10 @@ class Trust:
         rows: list[_Row] = []
         if self.predicted is not None:
             enough = self.predicted.num_phases >= MIN_PHASES
-            remedy = "`sfm.intrinsics`, `sfm.sparse`, `region.light`, `capture.pattern`"
+            remedy = (
+                "`sfm.intrinsics`, `sfm.sparse`, `region.light`, `capture.pattern`, and that "
+                "nothing was moved between the images"
+            )
             odd = self.predicted.odd_view(ranges.predicted_deg[1])
             if odd is not None:
                 remedy = f"pose, image and mask of {odd}"
@@ -248,6 +257,18 @@ class Trust:
                     100.0,
                     "the images of these views, `sfm.intrinsics`, `region.mask`",
                     True,
+                )
+            )
+        if self.cut_share is not None:
+            rows.append(
+                (
+                    "polarized surface along the masks, outside of them, %",
+                    self.cut_share,
+                    ranges.cut,
+                    100.0,
+                    "`region.mask`, which ends within a surface: its edge is frayed there; masks "
+                    "of the whole object, its sides too, or none",
+                    False,
                 )
             )
         return rows

@@ -1,4 +1,4 @@
-"""Names of unfinished files and folders: each carries a token that only this process knows.
+"""Names of unfinished files and folders: each carries a token that only this run knows.
 
 Whoever must clean up after a process that was killed removes what has its token in the name, and
 nothing else: no file of a user's can look like it by chance.
@@ -22,6 +22,12 @@ SHOWN = (
 
 _NAME = re.compile(re.escape(PREFIX) + r"([0-9a-f]{16})-\d{1,10}-\d{1,10}-(.+)", re.DOTALL)
 _numbers = itertools.count()
+
+
+def work_for(token: str) -> None:
+    """Give names with the token of the run that this process, a worker, is at work for."""
+    global TOKEN
+    TOKEN = token
 
 
 def temporary_path(target: Path) -> Path:

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -30,6 +31,7 @@ from polmvs.config import (
 )
 from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
 from polmvs.io.folders import require_unicode
+from polmvs.io.temporary import TOKEN, work_for
 from polmvs.memory import MemoryPlan, PeakMemory, cpu_seconds, plan_memory
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.checks import (
@@ -253,7 +255,8 @@ class Run(StageInput):
             self.monitor.stage(name, len(specs)) as on_progress,
             self.workers.stopped_on_error(),
         ):
-            for spec, done in zip(specs, self.workers.map(_done_apart, calls), strict=True):
+            work = self.workers.map(partial(_done_apart, TOKEN), calls)
+            for spec, done in zip(specs, work, strict=True):
                 with _collected_warnings() as warned:
                     for logged in done.logged:
                         logging.getLogger(logged.logger).log(logged.level, "%s", logged.text)
@@ -413,8 +416,9 @@ class _LogKeeper(logging.Handler):
         self.logged.append(_Logged(record.name, record.levelno, record.getMessage()))
 
 
-def _done_apart(call: Callable[[], Any]) -> _Done:
-    """Do a stage's work in this process, which is a worker."""
+def _done_apart(token: str, call: Callable[[], Any]) -> _Done:
+    """Do a stage's work in this process, which is a worker of the run with a token."""
+    work_for(token)
     keeper, package = _LogKeeper(), logging.getLogger("polmvs")
     package.setLevel(logging.INFO)
     package.propagate = False

@@ -236,6 +236,7 @@ def trust_of(model: AngleModel, folder: RunFolder, record: Record, options: Opti
         num_unregistered=len(unregistered),
         tilt_aware=options.normals.tilt_aware_weights,
         masks_given=options.region.mask is not None,
+        cut_share=None if mapped is None else mapped.cut_share,
         light=options.region.light,
         complaints=[
             *(one.text for one in cameras if one.view not in gone),

@@ -71,7 +71,8 @@ class PhaseMap:
     polarization : (H, W, 4) float32: ``s1 / s0`` and ``s2 / s0`` of each pixel as measured, inside
         and outside of the region, and the variance of either: that of a mean of n pixels is the
         third channel over n (noise, of which neighbours share some, and lossy compression) plus
-        the fourth, which all pixels share (gains). Both are inf where a pixel is clipped or dark.
+        the fourth, which all pixels share (gains, and rounding that no noise blurs). Both are inf
+        where a pixel is clipped or dark.
     outline_shift : (H, W) float32 px, by how much the outline of the region lies outside of its
         border, at each pixel that of the border's nearest place; None where it was not measured.
     folder : where the arrays are stored, if they are.
@@ -209,7 +210,8 @@ def build_phase_map(
     Parameters
     ----------
     stokes : of this view. Of its noise smoothing leaves what neighbours do not share; the errors
-        of compression are shared by whole blocks, those of the channels' gains by all pixels.
+        of compression are shared by whole blocks, those of the channels' gains by all pixels, those
+        of rounding by neighbours where no noise blurs them.
     region : of this view.
     light : which reflection dominates; specular light turns the phase by pi/2 from the AoLP.
     tolerances : of this step.
@@ -236,7 +238,7 @@ def build_phase_map(
     # Neighbours were interpolated from the same samples: they err together.
     area = stokes.noise_area_px
     noise = noise * np.maximum(area / (1 + area / (4 * np.pi * width_px**2)), 1)
-    noise = noise + lossy / np.maximum(blocks, 1) + stokes.gain_sigma**2
+    noise = noise + lossy / np.maximum(blocks, 1) + _shared_by_all(stokes, s0)
     with np.errstate(divide="ignore"):
         variance = t.model_sigma**2 + (t.mixture_sigma**2 + noise / 4) / dolp**2
         precision = np.where(region.inside & (share > MIN_SHARE), 1 / variance, 0)
@@ -257,10 +259,18 @@ def measured_polarization(stokes: Stokes) -> Image:
     s0 = np.where(known, stokes.s0, np.float32(1))
     whole, lossy = np.square(stokes.sigma / s0), np.square(stokes.lossy_sigma / s0)
     own = stokes.noise_area_px * np.maximum(whole - lossy, 0) + stokes.lossy_block_px**2 * lossy
-    shared = np.full_like(own, stokes.gain_sigma**2)
+    shared = np.broadcast_to(_shared_by_all(stokes, s0), own.shape)
     channels = np.dstack([stokes.s1 / s0, stokes.s2 / s0, own, shared])
     nothing = np.array([0, 0, np.inf, np.inf], np.float32)
     return np.where(known[..., None], channels, nothing).astype(np.float32)
+
+
+def _shared_by_all(stokes: Stokes, s0: Image) -> Image:
+    """Variance of s1 / s0 and of s2 / s0 that no smoothing reduces, (H, W) or of any shape."""
+    gains = np.asarray(stokes.gain_sigma**2, np.float32)
+    if stokes.rounding is None:
+        return gains
+    return np.asarray(gains + stokes.rounding / np.square(s0), np.float32)
 
 
 def smoothed_polarization(

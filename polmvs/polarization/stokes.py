@@ -57,6 +57,7 @@ from polmvs.config import CaptureOptions, RegionOptions
 from polmvs.polarization.kinds import Light
 from polmvs.polarization.lossy import BLOCK
 from polmvs.polarization.mosaic import INTERPOLATION_NOISE_GAIN
+from polmvs.polarization.rounding import shared_rounding
 
 Image: TypeAlias = NDArray[np.float32]
 Mask: TypeAlias = NDArray[np.bool_]
@@ -97,6 +98,8 @@ class Stokes:
     lossy_sigma : the part of ``sigma`` that lossy compression makes, which the pixels of a block
         share.
     lossy_block_px : side of such a block, px; by default at half the resolution of the samples.
+    rounding : (H, W) float32, variance of s1 and of s2 by rounding that neighbours share, beside
+        ``sigma``: see :mod:`polmvs.polarization.rounding`; None: noise blurs it everywhere.
     noise_area_px : pixels that share the rest of the noise, as interpolation makes them; see
         :func:`polmvs.polarization.mosaic.noise_area_px`.
     """
@@ -110,6 +113,7 @@ class Stokes:
     lossy_sigma: float = 0.0
     lossy_block_px: float = BLOCK / 2
     noise_area_px: float = 1.0
+    rounding: Image | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -150,10 +154,14 @@ class Stokes:
 
 
 class NoiseModel(NamedTuple):
-    """Variance of s1 and of s2 in smooth areas: ``constant + slope * s0``."""
+    """Variance of s1 and of s2 in smooth areas: ``constant + slope * s0``.
+
+    ``raised`` is by how much the constant was raised to what rounding alone makes.
+    """
 
     constant: float
     slope: float
+    raised: float = 0.0
 
     def variance(self, s0: Image) -> Image:
         """Variance (H, W) at the intensities ``s0``."""
@@ -212,6 +220,9 @@ def stokes_from_intensities(
         valid=valid,
         gain_sigma=gain_sigma,
         lossy_sigma=float(np.sqrt(lossy_variance)),
+        rounding=_shared_rounding(
+            intensities, valid, noise, quantum, gain=2.0, interpolation=INTERPOLATION_NOISE_GAIN
+        ),
     )
 
 
@@ -274,10 +285,9 @@ def stokes_by_least_squares(
     # Scaled so that its variance is twice that of s1 and s2, as that of four images is.
     null = (np.sqrt(2.0 * gain) * u[:, 3:].T).astype(np.float32)
     redundancy = (null @ residual).reshape(num - 3, *shape)
-    noise_gain = gain * (INTERPOLATION_NOISE_GAIN if interpolated else 1.0)
-    variance = _variance(
-        s0, s1, s2, redundancy, valid, noise_gain * quantum**2 / 12.0, interpolated=interpolated
-    )
+    interpolation = INTERPOLATION_NOISE_GAIN if interpolated else 1.0
+    floor = gain * interpolation * quantum**2 / 12.0
+    noise, variance = _variance(s0, s1, s2, redundancy, valid, floor, interpolated=interpolated)
     gain_sigma = 0.0 if gains_known else _gain_sigma(s0, s1, s2, redundancy, valid)
     sigma = np.sqrt(variance + np.float32(lossy_variance))
     return Stokes(
@@ -288,7 +298,31 @@ def stokes_by_least_squares(
         valid=valid,
         gain_sigma=gain_sigma,
         lossy_sigma=float(np.sqrt(lossy_variance)),
+        rounding=_shared_rounding(
+            intensities, valid, noise, quantum, gain=gain, interpolation=interpolation
+        ),
     )
+
+
+def _shared_rounding(
+    intensities: Image,
+    valid: Mask,
+    noise: NoiseModel,
+    quantum: float,
+    *,
+    gain: float,
+    interpolation: float,
+) -> Image | None:
+    """Variance of s1 and s2 by rounding that neighbours share, from that of s1 and s2 in all."""
+    scale = gain * interpolation
+    found = shared_rounding(
+        intensities,
+        valid,
+        constant=(noise.constant - noise.raised) / scale - quantum**2 / 12.0,
+        slope=2.0 * noise.slope / scale,
+        quantum=quantum,
+    )
+    return None if found is None else np.float32(gain) * found
 
 
 def stokes_from_maps(
@@ -305,7 +339,7 @@ def stokes_from_maps(
     images = [np.asarray(image, np.float32) for image in (s0, s1, s2)]
     none = np.empty((0, *images[0].shape), np.float32)
     planes = (images[0], images[1], images[2])
-    variance = _variance(*planes, none, valid, quantum**2 / 12.0, interpolated=False)
+    _, variance = _variance(*planes, none, valid, quantum**2 / 12.0, interpolated=False)
     return Stokes(s0=planes[0], s1=planes[1], s2=planes[2], sigma=np.sqrt(variance), valid=valid)
 
 
@@ -351,7 +385,7 @@ def combine(images: list[Stokes]) -> Stokes:
     valid = np.logical_and.reduce([s.valid for _, s in used_images])
     own = sum(np.float32(w) ** 2 * np.square(s.sigma) for w, s in used_images)
     none = np.empty((0, *s0.shape), np.float32)
-    shown = _variance(s0, s1, s2, none, valid, 0.0, interpolated=False)
+    _, shown = _variance(s0, s1, s2, none, valid, 0.0, interpolated=False)
     variance = np.maximum(np.asarray(own, np.float32), shown)
     return Stokes(
         s0=s0,
@@ -364,7 +398,13 @@ def combine(images: list[Stokes]) -> Stokes:
         lossy_sigma=float(sum(w * s.lossy_sigma for w, s in used_images)),
         lossy_block_px=images[0].lossy_block_px,
         noise_area_px=images[0].noise_area_px,
+        rounding=_rounding_of_sum(used_images),
     )
+
+
+def _rounding_of_sum(images: list[tuple[float, Stokes]]) -> Image | None:
+    known = [w * w * s.rounding for w, s in images if s.rounding is not None]
+    return np.asarray(sum(known), np.float32) if known else None
 
 
 def estimate_noise(
@@ -402,7 +442,7 @@ def estimate_noise(
     quantiles = np.array([np.quantile(spread[members], PATCH_QUANTILE) for members in classes])
     variances = np.maximum(quantiles / (2.0 * quantile_of_noise), max(floor, TINY))
     constant, slope = _highest_line_under(np.maximum(levels, TINY), variances)
-    return NoiseModel(max(constant, floor), slope)
+    return NoiseModel(max(constant, floor), slope, max(floor - constant, 0.0))
 
 
 def _variance(
@@ -414,12 +454,15 @@ def _variance(
     floor: float,
     *,
     interpolated: bool,
-) -> Image:
-    """Variance of s1 and s2 (H, W), by their redundancy (k, H, W), or their curvature if k = 0."""
+) -> tuple[NoiseModel, Image]:
+    """Noise, and variance of s1 and s2 (H, W), with what edges mix.
+
+    By their redundancy (k, H, W), or their curvature if k = 0.
+    """
     if interpolated:
         noise = estimate_noise(s0, redundancy, valid, floor=floor)
         variance = noise.variance(s0)
-        return variance + _redundant_mismatch(s0, redundancy, valid, variance)
+        return noise, variance + _redundant_mismatch(s0, redundancy, valid, variance)
     known, quantile = redundancy, PATCH_QUANTILE_OF_WHITE
     if len(redundancy) == 0:
         known = np.stack([_curvature(s1), _curvature(s2)])
@@ -427,7 +470,8 @@ def _variance(
     noise = estimate_noise(s0, known, valid, floor=floor, quantile_of_noise=quantile)
     variance = noise.variance(s0)
     mixed = _mixed_variance(s0, s1, s2, valid, variance)
-    return variance + np.maximum(mixed, _redundant_mismatch(s0, redundancy, valid, variance))
+    mixed = np.maximum(mixed, _redundant_mismatch(s0, redundancy, valid, variance))
+    return noise, variance + mixed
 
 
 def _redundant_mismatch(s0: Image, redundancy: Image, valid: Mask, variance: Image) -> Image:

@@ -299,7 +299,7 @@ def _warn_of_inconsistent(
         logger.warning(
             "%s: %s contradicts the other views: %.0f %% of what it shows is not explained by "
             "a first surface (median of all: %.0f %%). It is left out; its pose, its mask "
-            "or its image may be wrong.",
+            "or its image may be wrong, or the object was moved.",
             angle_model,
             view.view.name,
             100 * share,

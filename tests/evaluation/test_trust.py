@@ -203,3 +203,11 @@ def test_views_integrated_one_by_one_say_that_none_was_left_out():
     found = replace(RIGHT, predicted=None, fitted=None, soundness=None).judged()
     assert found.is_trusted
     assert "no view was left out to check it" in found.verdict
+
+
+@pytest.mark.parametrize(("share", "said"), [(None, False), (0.01, False), (0.1, True)])
+def test_masks_that_end_within_a_surface_are_said(share, said):
+    found = replace(RIGHT, cut_share=share).judged()
+    assert found.is_trusted
+    assert ("But polarized surface along the masks" in found.verdict) == said
+    assert ("its sides too" in found.verdict) == said

@@ -174,3 +174,18 @@ def test_a_view_that_is_not_known_to_see_a_point_counts_where_it_faces_it():
     assert estimate.valid.mean() > 0.9
     assert (estimate.labels[7] == 0).all()
     assert np.mean(estimate.labels[6] > 0.5) > 0.9
+
+
+def test_conditioning_is_the_spread_of_the_rows():
+    """Rows of a normal turn about it: over an arc of 2 a their spreads are sin and cos of it."""
+    num, arcs = 12, np.radians([10.0, 30.0, 45.0])
+    angle = np.linspace(-1, 1, num)[:, None] * arcs
+    rows = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
+    tilt = np.radians(50)
+    # Rays across their rows, tilted against the normal (0, 0, 1).
+    across = np.stack([-np.sin(angle), np.cos(angle), np.zeros_like(angle)])
+    rays = np.sin(tilt) * across - np.cos(tilt) * np.array([0, 0, 1])[:, None, None]
+    found = observe(rows, rays, dolp=0.2, noise=0.001)
+    estimate = solve_mixture(found, everyone(found))
+    expected = np.sqrt((np.sin(angle) ** 2).mean(axis=0) / (np.cos(angle) ** 2).mean(axis=0))
+    np.testing.assert_allclose(estimate.conditioning, expected, rtol=0.1)

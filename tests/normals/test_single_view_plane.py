@@ -9,12 +9,13 @@ from scenes import normal_from_angles
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.normals.single_view.focal import estimate_focal
-from polmvs.normals.single_view.pixels import PlaneView, polygon_mask
+from polmvs.normals.single_view.pixels import PlaneView, phase_sigma, polygon_mask
 from polmvs.normals.single_view.plane import phase_residuals, plane_normal
 from polmvs.normals.single_view.search import find_planes
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.capture import open_capture
 from polmvs.polarization.kinds import AngleModel, Light
+from polmvs.polarization.stokes import Stokes
 from polmvs.scene import View
 from polmvs.synthetic.captures import add_noise, look_at, render_view
 from polmvs.synthetic.surfaces import Group, Plane, Sphere
@@ -363,3 +364,12 @@ def test_normals_of_the_board():
     assert mean[AngleModel.PPA, True] < 1.5  # the tilt of the rendered polarizers
     assert mean[AngleModel.TILTED, False] < 1.7
     assert mean[AngleModel.TILTED, True] < 0.1
+
+
+def test_phases_of_pixels_err_by_noise_model_and_mixed_light():
+    one = np.ones((1, 1), np.float32)
+    stokes = Stokes(
+        s0=0.5 * one, s1=0.06 * one, s2=0.08 * one, sigma=0.01 * one, valid=one.astype(bool)
+    )
+    # sqrt(0.014^2 + (0.006^2 + (0.01 / 2 / 0.5)^2) / 0.2^2)
+    assert phase_sigma(stokes)[0, 0] == pytest.approx(0.05997, rel=1e-3)

@@ -39,6 +39,21 @@ def test_ppa_recovers_the_normals_of_a_perspective_view_and_opa_does_not(scene, 
     assert (ppa.num_rows >= 3).all()
 
 
+def test_the_estimator_that_is_chosen_is_used(scene):
+    """The algebraic one weighs rows alike: its normals are others where rows err unlike."""
+    tracks, options = tracks_at(scene, scene.surface_points(60)[0]), NormalOptions(window_px=5)
+    found = {
+        estimator: track_normals(
+            AngleModel.OPA, tracks, scene.maps, replace(options, estimator=estimator)
+        )
+        for estimator in Estimator
+    }
+    both = found[Estimator.ALGEBRAIC].valid & found[Estimator.ROBUST].valid
+    assert both.any()
+    normals = [one.normals[both] for one in found.values()]
+    assert np.abs(normals[0] - normals[1]).max() > 1e-3
+
+
 def test_rows_of_a_true_point_are_perpendicular_to_its_normal(scene):
     points, truth = scene.surface_points(40)
     rows = gather_rows(AngleModel.PPA, points, scene.maps)

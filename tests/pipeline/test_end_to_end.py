@@ -40,11 +40,6 @@ def metrics_of(out: Path) -> dict:
     return json.loads((out / "metrics.json").read_text())
 
 
-def assert_same_results(out: Path, expected: Path) -> None:
-    for name in RESULTS:
-        assert (out / name).read_bytes() == (expected / name).read_bytes(), name
-
-
 def assert_no_temporary_files(out: Path) -> None:
     assert [path.name for path in out.rglob(".*")] == []
 
@@ -222,27 +217,9 @@ def test_run_killed_in_sfm_finds_the_same_model(
     assert_no_temporary_files(out)
 
 
-def test_killed_comparison_goes_on_to_the_same_result(demo_run: Path, tmp_path: Path, cli) -> None:
-    """While it densifies with the last model; the finished stages stay."""
-    out = tmp_path / "out"
-    copy_until(demo_run, out, "densify_textbook-opa")
-    for name in ("textbook-ppa.ply", "metrics.json"):
-        (out / name).unlink()
-    process = start(out, "--resume")
-    wait_until(lambda: unfinished(out, "views_textbook-ppa"), process)
-    kill(process)
-    assert not (out / "textbook-ppa.ply").exists()
-    assert stages_of(out) == STAGES[:-2]
-
-    status, _, err = cli("demo", out, "--resume", "--workers", 2)
-    assert (status, err) == (0, "")
-    assert_same_results(out, demo_run)
-    assert_no_temporary_files(out)
-    assert stages_of(out) == STAGES
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupt_keeps_finished_stages_only(demo_run: Path, tmp_path: Path, number: int) -> None:
+    """And does not wait for the surfaces that are being made."""
     out = tmp_path / "out"
     copy_until(demo_run, out, BEFORE_CLOUDS[-1])
     process = start(out, "--resume")
@@ -254,28 +231,6 @@ def test_interrupt_keeps_finished_stages_only(demo_run: Path, tmp_path: Path, nu
     assert stdout == ""
     assert_no_temporary_files(out)
     assert stages_of(out) == BEFORE_CLOUDS
-
-
-def test_stages_alone_and_one_worker_give_the_same_result(
-    demo_run: Path, demo_capture: Path, tmp_path: Path, cli
-) -> None:
-    out = tmp_path / "out"
-    copy_until(demo_run, out, "poses")
-    for name in RESULTS:
-        (out / name).unlink()
-    shutil.rmtree(out / "maps")
-    for path in (out / "tracks").iterdir():
-        if path.name not in ("camera.npy", "poses.npy"):  # what the poses leave there stays
-            path.unlink()
-    status, text, err = cli("normals", demo_capture, out, "--workers", 1)
-    assert (status, err) == (0, "")
-    assert "are seeds" in text
-    status, text, err = cli("densify", demo_capture, out, "--workers", 1)
-    assert (status, err) == (0, "")
-    assert text.startswith(f"{out / 'ppa.ply'}: ")
-    for name in ("normals.ply", "ppa.ply"):
-        assert (out / name).read_bytes() == (demo_run / name).read_bytes()
-    assert not (out / "opa.ply").exists()
 
 
 def test_stage_alone_is_done_again_only_with_overwrite(

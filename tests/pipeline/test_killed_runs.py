@@ -34,7 +34,6 @@ from polmvs.synthetic.surfaces import Plane
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks, and reads /proc")
 
 CAMERA = PinholeCamera(width=96, height=80, fx=80.0, fy=80.0, cx=48.0, cy=40.0)
-NUM_KILLS = 20
 MAX_KILLS_OF_RUN = 6  # then it may go on to its end: a stage may take longer than it is given
 FLAGS = (
     "--workers",
@@ -109,14 +108,15 @@ def results_of(out: Path) -> dict[str, bytes]:
     return {name: data for name, data in content_of(out).items() if name not in TIMED}
 
 
+@pytest.mark.parametrize(("seed", "least"), [(0, 6), pytest.param(1, 20, marks=pytest.mark.slow)])
 def test_a_run_killed_at_any_moments_comes_to_the_same(
-    call: Call, given, undisturbed, tmp_path: Path
+    call: Call, given, undisturbed, tmp_path: Path, seed: int, least: int
 ) -> None:
     """Killed again and again on its way, so that what goes on is killed as well."""
     expected, seconds, _ = undisturbed
-    rng = random.Random(0)
+    rng = random.Random(seed)
     num_kills, kills_of_runs = 0, list[int]()
-    while num_kills < NUM_KILLS:
+    while num_kills < least:
         out = tmp_path / str(len(kills_of_runs))
         again = ["reconstruct", given[0], out, *given[1:], *FLAGS]
         kills = 0
@@ -158,6 +158,43 @@ def test_a_run_interrupted_in_any_stage_goes_on(
                 again.append("--resume")
     assert call(*again)["status"] == 0
     assert results_of(out) == expected
+
+
+def test_stages_alone_and_two_workers_give_the_same(
+    call: Call, given, undisturbed, tmp_path: Path
+) -> None:
+    expected, _, stages = undisturbed
+    out = tmp_path / "out"
+    flags = ["--workers", "2", "--quiet"]
+    assert call("sfm", given[0], out, *given[1:], *flags)["status"] == 0
+    done = call("normals", given[0], out, *flags)
+    assert done["status"] == 0
+    assert "are seeds" in done["stdout"]
+    done = call("densify", given[0], out, *flags, "--stride-px", "3")
+    assert done["status"] == 0
+    assert done["stdout"].startswith(f"{out / 'ppa.ply'}: ")
+    assert call("finish", given[0], out, *flags, "--no-mesh")["status"] == 0
+    assert stages_of(out) == stages
+    assert results_of(out) == expected
+
+
+def test_a_comparison_killed_in_its_surfaces_goes_on_to_the_same(
+    call: Call, given, tmp_path: Path
+) -> None:
+    """Two surfaces side by side; the finished stages stay."""
+    models = ("--models", "opa,ppa", "--workers", "2", "--quiet", "--no-report")
+    models += ("--stride-px", "3")
+    expected, out = tmp_path / "expected", tmp_path / "out"
+    assert call("compare", given[0], expected, *given[1:], *models)["status"] == 0
+    before = [name for name in stages_of(expected) if not name.startswith(("densify", "eval"))]
+    command = ("compare", given[0], out, *given[1:], *models)
+    done = call(*command, number=signal.SIGKILL, stage="2 side by side", after=0.5)
+    assert (done["status"], done["orphans"]) == (-signal.SIGKILL, [])
+    assert stages_of(out) == before
+    assert not (out / "ppa.ply").exists()
+    assert call(*command, "--resume")["status"] == 0
+    assert results_of(out) == results_of(expected)
+    assert [path.name for path in out.rglob(".*")] == []
 
 
 def test_a_second_run_beside_a_first_is_refused(

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from polmvs.config import CaptureOptions
+from polmvs.config import CaptureKind, CaptureOptions
 from polmvs.errors import DataError
 from polmvs.io.capture_files import find_capture
 from polmvs.io.images import read_mask, write_bytes, write_png
@@ -342,3 +342,32 @@ def test_rendered_capture_opens():
     assert stokes.valid.mean() > 0.9
     assert 0.001 < np.median(stokes.sigma) < 0.05
     assert 0 < capture.exposure() <= 2
+
+
+@pytest.mark.parametrize(
+    "angles",
+    [
+        (0, 45, 90, 135),
+        (0, 45, 90),
+        (0, 60, 120),
+        (0, 30, 60, 90, 120, 150),
+        (0, 22.5, 45, 67.5, 90, 112.5, 135, 157.5),
+        range(0, 180, 20),
+        range(0, 180, 15),
+        range(0, 180, 10),
+    ],
+)
+def test_usual_sets_of_angles_are_known_by_their_names(tmp_path, angles):
+    for view in "ab":
+        for angle in angles:
+            save(tmp_path / f"{view}_{angle:g}.png", mosaic())
+    found = find_capture(tmp_path)
+    assert found.kind is CaptureKind.ANGLES
+    assert found.angles_deg == tuple(angles)
+
+
+def test_an_odd_angle_makes_no_set(tmp_path):
+    for view in "ab":
+        for angle in (0, 30, 61, 90, 120, 150):
+            save(tmp_path / f"{view}_{angle:g}.png", mosaic())
+    assert find_capture(tmp_path).kind is not CaptureKind.ANGLES

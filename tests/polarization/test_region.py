@@ -56,6 +56,19 @@ def test_a_textureless_unpolarised_spot_belongs_to_the_region_without_being_reli
     assert not region.reliable[50:70, 70:100].any()
 
 
+@pytest.mark.parametrize(
+    ("factor", "joins"), [(1.0, True), (1.3, True), (0.77, True), (2.5, False), (0.4, False)]
+)
+def test_an_unpolarised_side_joins_if_it_is_as_bright(factor, joins):
+    s0, s1, s2, _ = stokes_scene()
+    side = np.zeros(SHAPE, bool)
+    side[30:90, 95:130] = True
+    s0[side] *= factor
+    s1[side], s2[side] = 0, 0
+    found = find(s0, s1, s2).inside[45:75, 104:116].mean()
+    assert found == pytest.approx(float(joins), abs=0.05)
+
+
 def test_a_textured_hole_stays_a_hole():
     s0, s1, s2, _ = stokes_scene()
     hole = np.zeros(SHAPE, bool)

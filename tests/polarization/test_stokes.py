@@ -15,6 +15,7 @@ from polmvs.polarization.stokes import (
     Stokes,
     axial_difference,
     combine,
+    estimate_noise,
     ideal_analyzers,
     stokes_by_least_squares,
     stokes_from_intensities,
@@ -220,6 +221,15 @@ def test_noise_has_the_floor_of_quantisation():
         sigma = stokes_from_intensities(flat, np.zeros((80, 80), bool), quantum=quantum).sigma
         # Two interpolated samples, each with 0.39 of the variance of a rounded one.
         np.testing.assert_allclose(sigma, quantum * np.sqrt(2 * 0.390625 / 12), rtol=1e-4)
+
+
+def test_of_too_few_patches_the_rounding_alone_is_known():
+    rng = np.random.default_rng(0)
+    few = (0.25 + 0.01 * rng.standard_normal((4, 16, 16))).astype(np.float32)
+    redundancy = few[0] + few[2] - few[1] - few[3]
+    s0 = few.sum(axis=0) / 2
+    found = estimate_noise(s0, redundancy, np.ones((16, 16), bool), floor=1e-6)
+    np.testing.assert_allclose(found.variance(s0), 1e-6, rtol=1e-6)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.3])

@@ -304,6 +304,18 @@ def test_cameras_on_a_line(wobble: float) -> None:
         frame_from_centers(WORLD, dict.fromkeys(CENTERS, np.ones(3)), "test")
 
 
+def test_cameras_on_a_narrow_band() -> None:
+    """Nine hundredths as broad as long: enough to tell the rotation about its length."""
+    known = {n: np.array([0.1 * k, 0.02 * (-1) ** k, 0.3]) for k, n in enumerate(CENTERS)}
+    views = [
+        replace(v, cam_from_world=RigidTransform(np.eye(3), -known[v.name])) for v in METRIC.views
+    ]
+    double = {name: 2 * center for name, center in known.items()}
+    frame = frame_from_centers(replace(METRIC, views=tuple(views)), double, "test")
+    assert frame.metric_from_world.scale == pytest.approx(2)
+    np.testing.assert_allclose(frame.metric_from_world.rotation, np.eye(3), atol=1e-9)
+
+
 def test_centres_that_do_not_fit() -> None:
     names = list(CENTERS)
     shuffled = dict(zip(names, [CENTERS[n] for n in names[3:] + names[:3]][::-1], strict=True))

@@ -30,6 +30,7 @@ from polmvs.pipeline.run_folder import replacing
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture
 from polmvs.polarization.kinds import AngleModel, Light
+from polmvs.polarization.mask_check import MAX_CUT_SHARE, cut_share
 from polmvs.polarization.phase_map import (
     PhaseMap,
     as_tilted,
@@ -61,11 +62,14 @@ class MapsResult:
     num_region_px : pixels of all views that show a polarised surface.
     num_diffuse_px : those of them whose light is diffuse.
     complaints : settings that the phases contradict, a clause each.
+    cut_share : of the bands outside of the user's masks, how much is polarized as a surface is,
+        mean over the views; None without masks.
     """
 
     num_region_px: int
     num_diffuse_px: int
     complaints: tuple[str, ...] = ()
+    cut_share: float | None = None
 
     def __str__(self) -> str:
         return f"{self.num_region_px:,} polarised pixels, {self.num_diffuse_px:,} of them diffuse"
@@ -118,15 +122,17 @@ def build_maps(
     workers = workers or Workers()
     with replacing(target) as folder, workers.stopped_on_error():
         build = partial(_build_map, capture, options, folder)
-        num_inside = 0
         raw_names = [names[view.name] for view in views]
-        for count in workers.map(build, views, raw_names):
-            num_inside += count
+        built: list[_Built] = []
+        for one in workers.map(build, views, raw_names):
+            built.append(one)
             on_progress(1)
+        num_inside = sum(one.num_inside for one in built)
         maps = [open_phase_map(view, folder) for view in views]
         if options.mask is None and (found := hidden_plane(maps, tracks)) is not None:
             build = partial(_build_map, capture, options, folder)
-            num_inside = sum(workers.map(build, views, raw_names, found))
+            again = workers.map(build, views, raw_names, found)
+            num_inside = sum(one.num_inside for one in again)
             maps = [open_phase_map(view, folder) for view in views]
         num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
         wrong = None
@@ -146,7 +152,24 @@ def build_maps(
         num_region_px=num_inside,
         num_diffuse_px=num_diffuse,
         complaints=() if wrong is None else (wrong,),
+        cut_share=_cut_by_masks(built),
     )
+
+
+def _cut_by_masks(built: Sequence[_Built]) -> float | None:
+    """Mean share of what lies outside of masks and is polarized, told if it is too much."""
+    shares = [one.cut_share for one in built if np.isfinite(one.cut_share)]
+    if not shares:
+        return None
+    share = float(np.mean(shares))
+    if share > MAX_CUT_SHARE:
+        logger.warning(
+            "`region.mask`: %.0f %% of what lies along the masks, outside of them, is polarized as "
+            "a surface is. Where masks end within a surface it frays and bends. Give masks of the "
+            "whole object, its sides too, or none.",
+            100 * share,
+        )
+    return share
 
 
 def tilt_maps(
@@ -263,6 +286,14 @@ def _dolp_in_sigmas(phase_map: PhaseMap, where: NDArray[np.bool_]) -> float:
     return float(np.median(dolp / np.sqrt(smoothed[..., 2][known])))
 
 
+@dataclass(frozen=True)
+class _Built:
+    """A view's map: the number of its region's pixels, and NaN or its mask's ``cut_share``."""
+
+    num_inside: int
+    cut_share: float
+
+
 def _build_map(
     capture: Capture,
     options: RegionOptions,
@@ -270,12 +301,13 @@ def _build_map(
     view: View,
     name: str,
     found: FoundObject | None = None,
-) -> int:
-    """Phase map of one view; returns the number of its region's pixels."""
+) -> _Built:
+    """Phase map of one view."""
     stokes = capture.load(name)
-    mask = None if found is None else found.mask
+    mask, cut = None if found is None else found.mask, float("nan")
     if options.mask is not None:
         mask = read_mask(find_mask(options.mask, view.name), stokes.shape)
+        cut = cut_share(stokes, mask, min_dolp=options.min_dolp)
     s0, s1, s2 = stokes.s0, stokes.s1, stokes.s2
     region = find_region(s0, s1, s2, stokes.valid, min_dolp=options.min_dolp, mask=mask)
     light = options.light or Light.SPECULAR
@@ -283,7 +315,7 @@ def _build_map(
     if found is not None:
         phase_map = phase_map.changed(outline_shift=found.outline_shift)
     store_phase_map(phase_map, folder)
-    return int(region.inside.sum())
+    return _Built(int(region.inside.sum()), cut)
 
 
 def _wrong_setting(

@@ -49,6 +49,7 @@ class Made:
     num_unregistered : views without a pose.
     tilt_aware : as ``NormalOptions.tilt_aware_weights``.
     masks_given : the regions of the phase maps are the user's masks.
+    cut_share : as of :class:`polmvs.pipeline.stages.maps.MapsResult`.
     light : that the user states; None: inferred.
     complaints : what earlier stages found wrong, a clause each.
     """
@@ -58,6 +59,7 @@ class Made:
     num_unregistered: int = 0
     tilt_aware: bool = True
     masks_given: bool = False
+    cut_share: float | None = None
     light: Light | None = None
     complaints: Sequence[str] = ()
 
@@ -80,6 +82,7 @@ def find_trust(model: AngleModel, made: Made, folder: RunFolder) -> Trust:
         num_views=len(phase_maps) + made.num_unregistered,
         left_out=len(made.left_out) + made.num_unregistered,
         complaints=tuple(made.complaints),
+        cut_share=made.cut_share,
     )
     if made.tilt_share is not None and (folder.views(model) / SURFACE_MESH).is_file():
         trust = _contradicted(trust, model, made, phase_maps, folder)
