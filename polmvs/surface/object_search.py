@@ -44,7 +44,11 @@ class SearchTolerances:
     num_near : other views that a view is correlated with.
     num_others : other views that predict the plane, at most.
     detail_px : deviation of the average that texture is told from.
-    lighting_px : window over which the plane's brightness may differ between views, working pixels.
+    lighting_px : window over which the plane's brightness may differ between views, and in which
+        what lies beyond the plane is compared with the object, working pixels.
+    num_levels : of brightness, in that comparison. Guess.
+    extent_cells : of the grid on which the plane's extent is found, along its side. Guess.
+    extent_gap : width of gaps in the extent that are closed, in those cells. Guess.
     least_share : of a pixel's texture that is the plane's in two other views. Guess.
     wrong_share : views that may deny a place of the object wrongly; two at least must deny it.
     seen_share : views that must see a place; the objects lie in the common field of view.
@@ -62,6 +66,9 @@ class SearchTolerances:
     num_others: int = 12
     detail_px: float = 2.0
     lighting_px: int = 41
+    num_levels: int = 32
+    extent_cells: int = 100
+    extent_gap: int = 10
     least_share: float = 0.2
     wrong_share: float = 0.15
     seen_share: float = 0.6
@@ -71,6 +78,10 @@ class SearchTolerances:
     blend_px: float = 2.5
     along_px: float = 3.0
     reach_px: float = 4.0
+
+    def needed(self, num_views: int) -> int:
+        """Views that must deny a place."""
+        return max(2, round(self.wrong_share * num_views))
 
 
 @dataclass(frozen=True)
@@ -127,20 +138,22 @@ def find_object(
             here | (cv2.resize(before.astype(np.uint8), here.shape[::-1]) > 0)
             for here, before in zip(found, shows_plane or found, strict=True)
         ]
-    coarse = _space(small, plane, tol).carved(small, shows_plane, tol)
-    if coarse is None or coarse.ends_at_sides:
+    small = _with_extent(small, textured, plane, tol)
+    coarse = _bounded(_space(small, plane, tol), small, shows_plane, tol)
+    if coarse is None:
         return None
     cells = coarse.finer(tol)
     masks = [coarse.mask(view) for view in small]
     for _ in range(tol.num_rounds):
         plates = _plates(small, masks, tol)
-        alone, together = _denied(small, plates, masks)
+        alone, together = _denied(small, plates, masks, tol)
         together = [
             predicted | (seen & ~view.polarized)
             for predicted, seen, view in zip(together, textured, small, strict=True)
         ]
         left = cells.carved(small, alone, tol, needed=1)
-        left = None if left is None else left.carved(small, together, tol)
+        if left is not None:
+            left = left.carved(small, together, tol, needed=tol.needed(len(maps)))
         if left is None:
             return None
         masks = [left.mask(view) for view in small]
@@ -166,6 +179,7 @@ class _Working:
     log : (h, w) float32, logarithm of the intensity.
     polarized : (h, w) bool, its polarized region.
     on_plane : (h, w, 3), where each pixel's ray meets the plane; NaN where it does not.
+    has_plane : (h, w) bool, where the plane is known to reach to.
     """
 
     view: View
@@ -173,6 +187,7 @@ class _Working:
     log: Image
     polarized: Mask
     on_plane: Array
+    has_plane: Mask
 
     @property
     def center(self) -> Array:
@@ -209,7 +224,7 @@ def _working(phase_map: PhaseMap, plane: Plane, longest_px: float) -> _Working:
         ranges = (plane.offset - center @ plane.normal) / (rays @ plane.normal)
     ranges = np.where(ranges > 0, ranges, np.nan)
     polarized = cv2.resize(inside, size, interpolation=cv2.INTER_AREA) > 0.5
-    return _Working(view, factor, log, polarized, center + ranges[..., None] * rays)
+    return _Working(view, factor, log, polarized, center + ranges[..., None] * rays, ranges > 0)
 
 
 def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
@@ -256,6 +271,11 @@ def _correlation(a: Image, b: Image, window_px: int) -> Image:
     return np.asarray(covariance / np.sqrt(np.maximum(spread, 1e-12)), np.float32)
 
 
+def _marked(pixels: Mask, xy: Floats) -> Mask:
+    """Whether the pixels at some coordinates are marked."""
+    return np.asarray(sample_image(pixels.astype(np.float32), xy, nearest=True) > 0)
+
+
 @dataclass(frozen=True)
 class _Cells:
     """Space on a grid, and which cells of it may hold the object.
@@ -281,25 +301,33 @@ class _Cells:
         free: Sequence[Mask],
         tol: SearchTolerances,
         *,
-        needed: int | None = None,
+        needed: int,
+        testable: Sequence[Mask] | None = None,
     ) -> _Cells | None:
         """Without the cells that some views see through; what is left of the middle one's part.
+
+        Parameters
+        ----------
+        free : pixels of each view that see through.
+        needed : views that must see through a cell.
+        testable : pixels of each view that could see through; a cell must lie in those of two.
 
         Returns
         -------
         None where nothing is left.
         """
         points = self.centers()
-        num_free, num_seen = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
-        for view, pixels in zip(views, free, strict=True):
+        num_free, num_seen, num_tests = np.zeros((3, len(points)), np.int32)
+        for index, (view, pixels) in enumerate(zip(views, free, strict=True)):
             xy = view.project(points)
             seen = view.sees(xy, 0.5)
             num_seen += seen
-            num_free += seen & (sample_image(pixels.astype(np.float32), xy, nearest=True) > 0)
-        if needed is None:
-            needed = max(2, round(tol.wrong_share * len(views)))
+            num_free += seen & _marked(pixels, xy)
+            num_tests += seen if testable is None else seen & _marked(testable[index], xy)
         held = np.zeros_like(self.held)
-        held[self.held] = (num_free < needed) & (num_seen >= tol.seen_share * len(views))
+        held[self.held] = (
+            (num_free < needed) & (num_seen >= tol.seen_share * len(views)) & (num_tests >= 2)
+        )
         parts, num = ndimage.label(held)
         if not num:
             return None
@@ -363,13 +391,78 @@ def _space(views: Sequence[_Working], plane: Plane, tol: SearchTolerances) -> _C
             ]
         )
     )
-    along = np.cross(plane.normal, np.eye(3)[np.argmin(np.abs(plane.normal))])
-    along /= lengths(along)
+    along = _along(plane)
     step = 2 * reach / tol.num_cells
     axes = step * np.stack([along, np.cross(plane.normal, along), plane.normal])
     shape = (tol.num_cells, tol.num_cells, max(round(0.75 * tol.num_cells), 1))
     origin = foot - 0.5 * (tol.num_cells - 1) * (axes[0] + axes[1]) + 0.5 * axes[2]
     return _Cells(origin, axes, np.ones(shape, bool))
+
+
+def _bounded(
+    space: _Cells, views: Sequence[_Working], free: Sequence[Mask], tol: SearchTolerances
+) -> _Cells | None:
+    """What is left of the space about the middle, if it ends within the space.
+
+    A view may deny a place wrongly, so that others must as well; among clutter fewer views see the
+    plane, and where what is left has no end one is enough.
+    """
+    testable = [view.has_plane for view in views]
+    for needed in (tol.needed(len(views)), 1):
+        left = space.carved(views, free, tol, needed=needed, testable=testable)
+        if left is not None and not left.ends_at_sides:
+            return left
+    return None
+
+
+def _with_extent(
+    views: Sequence[_Working],
+    shows_plane: Sequence[Mask],
+    plane: Plane,
+    tol: SearchTolerances,
+) -> list[_Working]:
+    """Views that know how far the plane reaches: where two of them show it, and in between."""
+    along = _along(plane)
+    axes = np.stack([along, np.cross(plane.normal, along)], axis=1)
+    shown = [view.on_plane[mask] @ axes for view, mask in zip(views, shows_plane, strict=True)]
+    everything = np.concatenate(shown)
+    if not len(everything):
+        return [replace(view, has_plane=np.zeros_like(view.has_plane)) for view in views]
+    low, high = np.percentile(everything, (0.5, 99.5), axis=0)
+    step = max(float(np.prod(high - low) ** 0.5) / tol.extent_cells, 1e-12)
+    counts = np.ceil((high - low) / step).astype(np.int64) + 1
+    num_views = np.zeros(counts, np.int32)
+    for places in shown:
+        cells, inside = _cells_of(places, low, step, counts)
+        num_views[tuple(np.unique(cells[inside], axis=0).T)] += 1
+    size = tol.extent_gap + 1
+    extent = cv2.morphologyEx(
+        np.pad(num_views >= 2, size).astype(np.uint8),
+        cv2.MORPH_CLOSE,
+        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)),
+    )
+    extent = ndimage.binary_fill_holes(extent)[size:-size, size:-size]
+    found = []
+    for view in views:
+        cells, inside = _cells_of(view.on_plane @ axes, low, step, counts)
+        found.append(replace(view, has_plane=inside & extent[cells[..., 0], cells[..., 1]]))
+    return found
+
+
+def _cells_of(
+    places: Floats, low: Array, step: float, counts: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Mask]:
+    """Cells ``(..., 2)`` of a grid of some counts that hold places on a plane, and whether any."""
+    with np.errstate(invalid="ignore"):
+        cells = np.floor((places - low) / step)
+        inside = np.asarray(((cells >= 0) & (cells < counts)).all(axis=-1))
+    return np.where(inside[..., None], cells, 0).astype(np.int64), inside
+
+
+def _along(plane: Plane) -> Array:
+    """A unit vector on a plane (3,)."""
+    along = np.cross(plane.normal, np.eye(3)[np.argmin(np.abs(plane.normal))])
+    return np.asarray(along / lengths(along))
 
 
 @dataclass(frozen=True)
@@ -422,6 +515,7 @@ def _plates(
         stack = np.array(shown, np.float32).reshape(-1, *view.log.shape)
         log = _median(stack)
         deviation = np.nan_to_num(1.4826 * _median(np.abs(stack - log)))
+        log[~view.has_plane] = np.nan
         plates.append(_Plate(log, deviation, np.array(changes)))
     return plates
 
@@ -457,9 +551,12 @@ def _residual(views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequen
 
 
 def _denied(
-    views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequence[Mask]
+    views: Sequence[_Working],
+    plates: Sequence[_Plate],
+    masks: Sequence[Mask],
+    tol: SearchTolerances,
 ) -> tuple[list[Mask], list[Mask]]:
-    """Where each view shows the plane rather than something of any brightness.
+    """Where each view shows the plane, or what lies beyond it, rather than the object.
 
     Returns
     -------
@@ -469,18 +566,51 @@ def _denied(
     noise = _residual(views, plates, masks)
     spread = np.mean([np.diff(np.percentile(view.log, (1, 99)))[0] for view in views])
     found: tuple[list[Mask], list[Mask]] = ([], [])
-    for view, plate in zip(views, plates, strict=True):
-        sigma = np.hypot(plate.deviation, noise)
+    for view, plate, mask in zip(views, plates, masks, strict=True):
         known = np.isfinite(plate.log)
-        residual = np.where(known, view.log - plate.log, 0)
-        odds = np.log(spread / (np.sqrt(2 * np.pi) * sigma)) - 0.5 * (residual / sigma) ** 2
-        odds = np.where(known, np.clip(odds, -MAX_ODDS, MAX_ODDS), 0).astype(np.float32)
+        odds = _odds(view.log - plate.log, np.hypot(plate.deviation, noise), spread)
+        odds = np.where(known, odds, 0)
         for masks_of, width, least in zip(found, (2.5, 0.8), (0.95, 0.3), strict=True):
             total = cv2.GaussianBlur(odds, (0, 0), width)
             share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), width)
             shows_plane = (share > least) & (total > LEAST_ODDS * share)
             masks_of.append(np.asarray(shows_plane & ~view.polarized))
+        found[0][-1] |= _shows_beyond(view, mask, tol)
     return found
+
+
+def _shows_beyond(view: _Working, mask: Mask, tol: SearchTolerances) -> Mask:
+    """Where a view shows what lies beyond the plane's end, a wall or another table (h, w).
+
+    No other view predicts it. Its brightness tells it from the object, if theirs differ: that of
+    the object is known where the plane is behind it, that beyond the plane from beside the object.
+    """
+    pixels = mask.astype(np.uint8)
+    near = cv2.dilate(pixels, np.ones((tol.lighting_px, tol.lighting_px), np.uint8)) > 0
+    inner_px = tol.lighting_px // 4
+    inner = cv2.erode(pixels, np.ones((inner_px, inner_px), np.uint8)) > 0
+    lowest, highest = float(view.log.min()), float(view.log.max())
+    levels = (view.log - lowest) / max(highest - lowest, 1e-6) * tol.num_levels
+    levels = np.clip(levels.astype(np.int64), 0, tol.num_levels - 1)
+
+    def shares(where: Mask) -> Array:
+        counts = np.bincount(levels[where], minlength=tol.num_levels).astype(np.float64)
+        counts = ndimage.gaussian_filter1d(counts, 1.0)
+        # One in a hundred may have any brightness; of nothing, all are as likely.
+        counts += max(0.01 * counts.sum(), 1.0) / tol.num_levels
+        return np.asarray(counts / counts.sum())
+
+    of_object, of_beyond = shares(inner & view.has_plane), shares(near & ~mask & ~view.has_plane)
+    odds = np.log(of_beyond / of_object)[levels]
+    odds = np.clip(odds, -MAX_ODDS, MAX_ODDS).astype(np.float32)
+    smooth = cv2.GaussianBlur(odds, (0, 0), 1.5)
+    return np.asarray(~view.has_plane & ~view.polarized & (smooth > LEAST_ODDS))
+
+
+def _odds(residual: Image, sigma: Image, spread: float) -> Image:
+    """Logarithm, that an image shows what was predicted rather than anything of a spread."""
+    odds = np.log(spread / (np.sqrt(2 * np.pi) * sigma)) - 0.5 * (residual / sigma) ** 2
+    return np.asarray(np.clip(odds, -MAX_ODDS, MAX_ODDS), np.float32)
 
 
 def _outlined(
@@ -532,7 +662,7 @@ def _outlined(
     # One deviation of contrast on the average tells an outline. Beyond it the plane shows; where
     # something else does, it hides the outline.
     told = np.minimum(most.mean(axis=1) * 2 * np.pi * tol.along_px, 1)
-    told *= known[rows, columns] & (alpha[:, -4:].mean(axis=1) < 0.5)
+    told *= (known | ~view.has_plane)[rows, columns] & (alpha[:, -4:].mean(axis=1) < 0.5)
     found, certainty = np.zeros((2, *mask.shape), np.float32)
     found[rows, columns] = told * (step * (alpha.sum(axis=1) - 0.5) - tol.reach_px)
     certainty[rows, columns] = told
