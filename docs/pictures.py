@@ -28,6 +28,8 @@ from hashlib import blake2b
 from pathlib import Path
 from shutil import which
 
+import cv2
+
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 IMAGES = DOCS / "images"
@@ -101,10 +103,12 @@ def site(sources: Sources, path: Path) -> Sequence[str]:
 
 
 def sheet(sources: Sources, path: Path) -> Sequence[str]:
-    """The sheet of the bundled capture."""
+    """The sheet of the bundled capture, half as large."""
     with tempfile.TemporaryDirectory() as folder:  # the sheet names the capture as it is called
         (Path(folder) / "capture").symlink_to(ROOT / "polmvs" / "demo_capture" / "raw")
         polmvs("inspect", "capture", "--sheet", path.absolute(), place=Path(folder))
+    whole = cv2.imread(str(path))
+    cv2.imwrite(str(path), cv2.resize(whole, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     return ()
 
 
