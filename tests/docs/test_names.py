@@ -18,8 +18,11 @@ NAMES = sorted(
         if name != "polmvs.log"  # a file of a run
     }
 )
-# The table of the energy names members of one folder.
-SHORT = ("docs/how_it_works.md", "polmvs.surface")
+# Tables whose names begin in a package: its name, and names that the table must have.
+SHORT = {
+    "docs/how_it_works.md": ("polmvs.surface", "terms|labels|observations|solver", 10),
+    "docs/glossary.md": ("polmvs", "surface|polarization|normals|evaluation|scene", 20),
+}
 
 
 def resolve(name: str) -> None:
@@ -47,17 +50,24 @@ def test_name(name: str) -> None:
     resolve(name)
 
 
-def test_short_names_of_the_energy() -> None:
-    page, package = SHORT
+@pytest.mark.parametrize("page", SHORT)
+def test_short_names_of_a_table(page: str) -> None:
+    package, first, num = SHORT[page]
     text = (ROOT / page).read_text(encoding="utf-8")
-    names = re.findall(r"`((?:terms|labels|observations|solver)\.\w+)`", text)
-    assert len(names) >= 10
+    names = re.findall(rf"`((?:{first})\.[\w.]+)`", text)
+    assert len(names) >= num
     for name in names:
         resolve(f"{package}.{name}")
+
+
+def test_members_of_the_observations() -> None:
     from polmvs.surface.observations import Observations
 
+    text = (ROOT / "docs" / "how_it_works.md").read_text(encoding="utf-8")
     members = {*vars(Observations), *Observations.__dataclass_fields__}
-    assert set(re.findall(r"`Observations\.(\w+)`", text)) <= members
+    names = set(re.findall(r"`Observations\.(\w+)`", text))
+    assert names
+    assert names <= members
 
 
 @pytest.mark.parametrize("page", CURRENT, ids=lambda page: f"{page.parent.name}-{page.stem}")
