@@ -75,9 +75,9 @@ def geometry(path: Path) -> None:
         _arrow(axis, point, point + 0.8 * m, color, "row $m$")
         angle = np.degrees(np.arcsin(abs(m @ normal)))
         title = (
-            "PPA: the plane holds the normal"
+            "PPA: the plane contains the normal"
             if model == "ppa"
-            else (f"OPA: the normal sticks out by {angle:.0f}°")
+            else (f"OPA: the normal is {angle:.0f}° off the plane")
         )
         axis.set_title(title, color=color)
         axis.text(*_shown(np.array([0.0, 0.1, -0.1])), "camera")
@@ -163,7 +163,7 @@ def rows(path: Path) -> None:
 
 
 def dolp(path: Path) -> None:
-    """Degree of polarisation by the angle between ray and normal."""
+    """Degree of polarization by the angle between ray and normal."""
     figure, axis = plt.subplots(figsize=(6.4, 3.2), layout="constrained")
     camera = PinholeCamera(width=2, height=2, fx=1e4, fy=1e4, cx=1, cy=1)
     angles = np.arange(0.5, 89.0, 0.5)
@@ -287,7 +287,7 @@ def positions(path: Path) -> None:
     side.text(
         0.1,
         1.06,
-        "straight above: little polarisation,\none view of it is enough",
+        "straight above: little polarization,\none view of it is enough",
         fontsize=9,
         color=ORANGE,
     )

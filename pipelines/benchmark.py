@@ -3,7 +3,7 @@
     python pipelines/benchmark.py OUT [OUT ...]
     python pipelines/benchmark.py --capture CAPTURE OUT [flags of polmvs compare]
     OMP_NUM_THREADS=1 python pipelines/benchmark.py --estimators --ingest
-    python pipelines/benchmark.py --growth WORK --views 25,50,100 --num-workers 1,2,4 --write docs
+    python pipelines/benchmark.py --growth WORK --views 25,50,100 --num-workers 1,2,4 --write DIR
 
 With ``--capture`` that capture is run first, into the only OUT. ``--estimators`` times the normal
 estimators beside a plain NumPy baseline, ``--ingest`` the way from a mosaic of 5 megapixels to
@@ -424,7 +424,7 @@ def growth_page(
         [
             "# Growth with views and workers",
             f"`python pipelines/benchmark.py --growth WORK --views {sizes} --width {given.width} "
-            f"--num-workers {','.join(map(str, given.num_workers))} --write docs`, on "
+            f"--num-workers {','.join(map(str, given.num_workers))}`, on "
             f"{_machine()}.",
             f"Captures of `pipelines/synthetic.py`, half-size images {given.width} px wide, true "
             "poses and 2,000 true sparse points in place of SfM's, one process. An exponent of 1 "

@@ -43,7 +43,7 @@ class PairTolerances:
     ----------
     max_exhaustive_images : that are matched in all pairs; a guess: 780 pairs take seconds.
     num_similar : most similar images that each one is matched with; measured: see
-        ``docs/scale.md``.
+        ``docs/records/scale.md``.
     num_in_time : images before and after that each one is matched with, where names count up; a
         guess.
     num_words : of the vocabulary; a guess, published figures hardly change from 64 to 256.

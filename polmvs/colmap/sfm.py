@@ -93,7 +93,7 @@ class SfmTolerances:
         guess. Farther from the centre an estimate has gone astray; as near to the lower right
         corner given intrinsics are those of the full mosaic, which have it there.
     min_pair_matches : that each pair keeps where the mapper is given fewer. Derived: what COLMAP
-        asks of the pair that it begins with. Measured: docs/scale.md.
+        asks of the pair that it begins with. Measured: docs/records/scale.md.
     max_images_dense : up to which the last adjustment's equations are solved as a dense matrix.
         Measured: of 100 and 282 images faster than sparse, 8.2 of 9.6 and 19 of 32 s; a guess
         where that ends, as the cube of the images does.

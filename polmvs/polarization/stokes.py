@@ -99,7 +99,7 @@ class Stokes:
         share.
     lossy_block_px : side of such a block, px; by default at half the resolution of the samples.
     rounding : (H, W) float32, variance of s1 and of s2 by rounding that neighbours share, beside
-        ``sigma``: see :mod:`polmvs.polarization.rounding`; None: noise blurs it everywhere.
+        ``sigma``: see ``polmvs.polarization.rounding``; None: noise blurs it everywhere.
     noise_area_px : pixels that share the rest of the noise, as interpolation makes them; see
         :func:`polmvs.polarization.mosaic.noise_area_px`.
     """

@@ -40,13 +40,13 @@ class Block:
 
 
 def pages() -> list[Path]:
-    """All pages: the README, those of ``docs`` and what they include."""
+    """All pages: the README, those of ``docs`` with its records, and what they include."""
     return [
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",
         ROOT / "CHANGELOG.md",
         ROOT / "data" / "README.md",
-        *sorted((ROOT / "docs").glob("*.md")),
+        *sorted((ROOT / "docs").rglob("*.md")),
     ]
 
 
