@@ -4,7 +4,7 @@
 
 Of each way, at half and at full resolution: the error of the AoLP on the part against the light
 that the true normals reflect (tilted polarizers), single pixels, DoLP above 0.1; the degree of
-polarization that edges of the unpolarised surroundings seem to have; and the time of a frame.
+polarization that edges of the unpolarized surroundings seem to have; and the time of a frame.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ def _part_errors(
 def _false_dolp(
     stokes: Stokes, truth: GroundTruth, name: str, scale: int, clear: Mask
 ) -> NDArray[np.float64]:
-    """DoLP (N,) at edges well beside the part, where the light is not polarised."""
+    """DoLP (N,) at edges well beside the part, where the light is not polarized."""
     s0 = stokes.s0
     dx, dy = (
         cv2.Sobel(s0, cv2.CV_32F, i, 1 - i, scale=1 / 8) * scale / np.maximum(s0, 1e-3)

@@ -154,7 +154,7 @@ def plane_normal(
         convention.
     model : angle model.
     light : reflection that dominates on the plane.
-    mask : (H, W) bool, True on the plane; None where all that is polarised is of it.
+    mask : (H, W) bool, True on the plane; None where all that is polarized is of it.
     estimator : weighted robust, or the paper's eigenvector.
     **changes : further options of ``polmvs plane`` by name: ``min_dolp``, ``min_intensity``,
         ``drop_clipped``, ``polygon``.
@@ -369,7 +369,7 @@ class Reconstruction:
 
         Parameters
         ----------
-        surroundings : with the points beside the polarised surfaces, whose normals are zero.
+        surroundings : with the points beside the polarized surfaces, whose normals are zero.
         """
         from polmvs.scene import PointKind
 
@@ -379,7 +379,7 @@ class Reconstruction:
         return to_open3d(cloud).to_legacy()
 
     def mesh(self) -> open3d.geometry.TriangleMesh:
-        """The Poisson mesh of the polarised surfaces.
+        """The Poisson mesh of the polarized surfaces.
 
         Raises
         ------

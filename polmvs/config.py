@@ -51,7 +51,7 @@ class Contour(StrEnum):
 
 
 class Surroundings(StrEnum):
-    """What a cloud holds beside the polarised parts."""
+    """What a cloud holds beside the polarized parts."""
 
     NONE = "none"
     SPARSE = "sparse"
@@ -360,7 +360,7 @@ class CaptureOptions(OptionGroup, group="capture"):
     equalize: bool = option(
         False,
         "images of a view behind different polarizer angles differ in exposure: divide them by the "
-        "gains that unpolarised places show",
+        "gains that unpolarized places show",
     )
     calibration: Path | None = option(
         None, "TOML file of 'polmvs calibrate polarizers': gains, angles, dark frame, flat field"
@@ -492,7 +492,7 @@ class RegionOptions(OptionGroup, group="region"):
     """Where the part is and which phase its light shows."""
 
     light: Light | None = option(
-        None, "reflection that dominates the polarisation; by default decided for each part"
+        None, "reflection that dominates the polarization; by default decided for each part"
     )
     min_dolp: float = option(
         0.1, "DoLP from which a pixel's phase is used on its own", above=0, below=1
@@ -525,7 +525,7 @@ class NormalOptions(OptionGroup, group="normals"):
 
 @dataclass(frozen=True, kw_only=True)
 class PropagationOptions(OptionGroup, group="propagation"):
-    """How ranges spread from the seeds over the polarised region."""
+    """How ranges spread from the seeds over the polarized region."""
 
     method: Method = option(
         Method.SURFACE,
@@ -588,7 +588,7 @@ class FusionOptions(OptionGroup, group="fusion"):
     )
     surroundings: Surroundings = option(
         Surroundings.SPARSE,
-        "what the cloud holds beside the polarised parts: nothing, the sparse points, or points "
+        "what the cloud holds beside the polarized parts: nothing, the sparse points, or points "
         "of OpenCV's stereo",
     )
     workspace: Path | None = option(
@@ -759,7 +759,7 @@ class PlaneOptions(OptionGroup, group="plane"):
         AngleModel.PPA,
         "angle and normal; 'tilted' is exact for a lens that is not telecentric on the image side",
     )
-    light: Light = option(Light.SPECULAR, "reflection that dominates the polarisation")
+    light: Light = option(Light.SPECULAR, "reflection that dominates the polarization")
     estimator: Estimator = option(Estimator.ROBUST, "weighted robust, or the paper's eigenvector")
     intrinsics: tuple[float, ...] | None = option(
         None,
@@ -772,7 +772,7 @@ class PlaneOptions(OptionGroup, group="plane"):
         None, "corners about the plane, half-size px; without it all valid pixels", metavar="X,Y"
     )
     min_dolp: float = option(
-        0.1, "degree of polarisation from which a pixel counts", above=0, below=1
+        0.1, "degree of polarization from which a pixel counts", above=0, below=1
     )
     min_intensity: float = option(
         0.5,

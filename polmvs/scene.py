@@ -251,7 +251,7 @@ def without_views(model: SparseModel, names: Collection[str]) -> tuple[SparseMod
 
 
 class PointKind(IntEnum):
-    """What a point of a cloud is: on a polarised part, or how it was found beside one.
+    """What a point of a cloud is: on a polarized part, or how it was found beside one.
 
     ``PRESUMED`` is on a part where no phase shows it: the inner wall of a vessel, presumed to be
     as thick as its rim.

@@ -86,7 +86,7 @@ def test_similarity_is_recovered_and_lines_are_refused():
 
 
 def test_aolp_is_anticlockwise_as_displayed_and_specular_phase_is_turned_by_half_pi():
-    """A floor below the camera's axis, seen level: its specular light is polarised along x."""
+    """A floor below the camera's axis, seen level: its specular light is polarized along x."""
     floor = Plane(point=np.array([0.0, 0.0, 0.0]), normal=np.array([0.0, 0.0, 1.0]))
     view = View(
         name="v",

@@ -241,7 +241,7 @@ class ExportArguments(OptionGroup, group="arguments", in_files=False):
     colors: bool = option(
         True, "colours of a mesh, from the views that see a place best, without highlights"
     )
-    part: bool = option(False, "of a cloud the polarised surface alone, without its surroundings")
+    part: bool = option(False, "of a cloud the polarized surface alone, without its surroundings")
 
     def check(self) -> None:
         """A texture has colours, and a size is one of a texture."""

@@ -30,17 +30,17 @@ MAX_RELATIVE_EXCESS = 0.01  # of a visible point's distance over the nearest one
 
 @dataclass(frozen=True, kw_only=True)
 class Consistency:
-    """How well a cloud's polarised surface fits the capture that it was made from.
+    """How well a cloud's polarized surface fits the capture that it was made from.
 
     Attributes
     ----------
-    num_points : of the cloud, on the polarised surface.
+    num_points : of the cloud, on the polarized surface.
     phase_residual : angle between the phase that a point's normal predicts, under the cloud's
         model, and the measured one, over all views that see the point.
     coverage : share of the region's pixels, over all views, that show a point of the cloud.
     agreement : share of the views that see a point that agree with it in place and normal.
     track_residual_median_deg : angle between the normals of the sparse points and their planes
-        of incidence, over the points on the polarised surface.
+        of incidence, over the points on the polarized surface.
     """
 
     num_points: int
@@ -57,7 +57,7 @@ def measure_consistency(
     maps: Sequence[PhaseMap],
     outside: Mapping[str, Mask] = MappingProxyType({}),
 ) -> Consistency:
-    """Compare the polarised surface of a cloud with the phase maps of all views.
+    """Compare the polarized surface of a cloud with the phase maps of all views.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def measure_consistency(
     outside : pixels (H, W) of each view, by its name, that show what lies outside the box that the
         cloud was cut to: they count for nothing.
     """
-    cloud = _polarised_surface(cloud)
+    cloud = _polarized_surface(cloud)
     num = len(cloud.points)
     step = -(-num // MAX_RESIDUAL_POINTS) or 1
     covered = inside = 0
@@ -114,8 +114,8 @@ def within_box(phase_map: PhaseMap, outside: Mapping[str, Mask]) -> PhaseMap:
     return phase_map.changed(region=kept)
 
 
-def _polarised_surface(cloud: Cloud) -> Cloud:
-    """The points of the polarised surface, as a cloud of their own."""
+def _polarized_surface(cloud: Cloud) -> Cloud:
+    """The points of the polarized surface, as a cloud of their own."""
     kind = cloud.scalars.get("kind")
     if kind is None:
         return cloud
@@ -177,7 +177,7 @@ def phase_residuals_deg(
 
     Returns
     -------
-    (N,), NaN where the view shows no polarised light.
+    (N,), NaN where the view shows no polarized light.
     """
     view = phase_map.view
     rays = unit(view.cam_from_world * points)

@@ -136,7 +136,7 @@ class Trust:
     residual_sigmas : the same in the deviations that the phase maps state.
     agreement : share of the views that see a point that agree with it in place and normal.
     inside : share of the points that views see, nothing before them, that lie in the views'
-        polarised regions: what lies outside contradicts their silhouettes.
+        polarized regions: what lies outside contradicts their silhouettes.
     determined : share of the regions, over all views, that show a point.
     sigma_share : median stated deviation of a place along its normal, share of its distance from
         the nearest camera.
@@ -308,7 +308,7 @@ class Trust:
                 True,
             ),
             (
-                "part of the polarised regions determined, %",
+                "part of the polarized regions determined, %",
                 self.determined,
                 ranges.determined,
                 100.0,

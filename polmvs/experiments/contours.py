@@ -263,7 +263,7 @@ def _thinned(
 def _trace(
     angle_model: AngleModel, phase_map: PhaseMap, seeds_xy: Floats, step_px: float, min_dolp: float
 ) -> Contours:
-    """Contours of a model where the view shows the part, polarised over the threshold."""
+    """Contours of a model where the view shows the part, polarized over the threshold."""
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
     passable = phase_map.region.inside & ~phase_map.region.edges & (dolp > min_dolp)
     field = direction_field(angle_model, phase_map.samples, view_rays(phase_map.view), passable)

@@ -311,7 +311,7 @@ def require_counted(scene: Scene, num_counted: Sequence[int] | int) -> None:
         raise DataError(
             scene.capture.folder,
             f"no pixel of the part has a DoLP above {scene.region.min_dolp}; "
-            "give a lower `region.min_dolp`, or the mask of a polarised surface.",
+            "give a lower `region.min_dolp`, or the mask of a polarized surface.",
         )
 
 

@@ -192,7 +192,7 @@ def _overridden(options: CaptureOptions, given: CaptureOptions) -> CaptureOption
 def load_converted(data_set: DataSet, stem: str) -> tuple[Image, Image, Image]:
     """Stokes images s0, s1, s2 ``(H, W)`` or ``(H, W, 3)`` of an image of PANDORA or MVAS.
 
-    Of an azimuth map the light is taken as fully polarised in the mask and unpolarised off it, and
+    Of an azimuth map the light is taken as fully polarized in the mask and unpolarized off it, and
     s0 is the intensity image's where there is one of that name and size, else 1.
 
     Raises

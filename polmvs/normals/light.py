@@ -1,4 +1,4 @@
-"""Specular or diffuse: which reflection dominates the polarisation of each part of a region.
+"""Specular or diffuse: which reflection dominates the polarization of each part of a region.
 
 The two differ by a quarter turn of the phase, so the wrong choice puts every plane of incidence
 at a right angle to the true one. One view cannot tell; three or more can, because wrong planes of
@@ -6,7 +6,7 @@ incidence do not meet in one normal. Every sparse point on a part votes with the
 its two best normals, and so do pixels of the part, placed where the regions of most views have it
 (their visual hull), as deep in it as explains their phases best, for either kind of light. What
 one view says of a thing is doubtful, so that a part is decided by all views that show it. The
-degree of polarisation has a say where phases have none (specular light is polarised up to wholly,
+degree of polarization has a say where phases have none (specular light is polarized up to wholly,
 diffuse light of a smooth dielectric hardly over 0.4).
 """
 
@@ -106,7 +106,7 @@ def find_diffuse_parts(
         unknown = np.isnan(known) & np.isnan(dense)
         own.append(np.where(unknown, np.nan, np.nan_to_num(known) + np.nan_to_num(dense)))
         overall += float(np.nansum(dense))
-    # Without any evidence light is specular: what polarises most.
+    # Without any evidence light is specular: what polarizes most.
     tie = overall if overall != 0 else 1.0
     verdicts = (
         np.where(np.isfinite(pooled), pooled, overall)
@@ -382,7 +382,7 @@ def _costs_of_both(
 
 
 def _dolp_votes(maps: Sequence[PhaseMap], t: LightTolerances) -> float:
-    """What the highest degrees of polarisation of the capture speak for."""
+    """What the highest degrees of polarization of the capture speak for."""
     highest = []
     for phase_map in maps:
         reliable = phase_map.region.reliable

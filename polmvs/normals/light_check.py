@@ -17,7 +17,7 @@ from polmvs.scene import Tracks
 
 @dataclass(frozen=True, kw_only=True)
 class LightCheck:
-    """How the sparse points on the polarised surfaces vote on their light.
+    """How the sparse points on the polarized surfaces vote on their light.
 
     Attributes
     ----------

@@ -48,7 +48,7 @@ class SeedTolerances:
     max_dolp_share : of a mark's DoLP in that of the surface about it. Guess.
     clear_dolp : of the surface, for the comparison to tell. Guess.
     max_sigma_deg : of the normal. Guess.
-    min_on_region : seeds on strongly polarised regions, beside which others are surroundings.
+    min_on_region : seeds on strongly polarized regions, beside which others are surroundings.
         Derived: three points make a plane.
     """
 
@@ -196,7 +196,7 @@ def dolp_shares(
 ) -> Array:
     """DoLP at the keypoints over that of the surface about them, the median ``(T,)`` of a track.
 
-    NaN where the surface is nowhere polarised enough to tell.
+    NaN where the surface is nowhere polarized enough to tell.
     """
     ratio = np.full(len(tracks.obs_track), np.nan)
     for phase_map, here in zip(maps, tracks.of_views(len(maps)), strict=True):
@@ -228,12 +228,12 @@ def select_seeds(
 ) -> tuple[Seeds, Mask]:
     """Tracks whose normal explains what all views measure of them.
 
-    Where some of them lie on regions that are polarised strongly, these are what is wanted, and the
+    Where some of them lie on regions that are polarized strongly, these are what is wanted, and the
     others its surroundings; else all are.
 
     A glossy surface mirrors its surroundings, and on a flat one their mirror images make tracks
     as good as any, behind the surface. They give themselves away: seen from aside they leave the
-    region, and unlike what is printed on the surface they are polarised as it is.
+    region, and unlike what is printed on the surface they are polarized as it is.
 
     Returns
     -------

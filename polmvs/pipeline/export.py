@@ -116,7 +116,7 @@ def export_run(
     texture : of a mesh: a texture instead of a colour for each vertex.
     texture_px : sides of the texture; by default a texel has the size of a pixel on the part.
     colors : of a mesh: without, it has none.
-    part : of a cloud: the polarised surface alone, without its surroundings.
+    part : of a cloud: the polarized surface alone, without its surroundings.
     crop : of a mesh or cloud: what lies within its box.
     overwrite : replace what is there.
 
@@ -309,7 +309,7 @@ class _Painter:
         return float(np.median(sizes))
 
     def _load(self, view: View) -> NDArray[np.float32]:
-        """Linear intensities of a view without what is polarised; NaN where it is clipped."""
+        """Linear intensities of a view without what is polarized; NaN where it is clipped."""
         if self.capture is None or view.name not in self.raw:
             gray = read_gray(self.images / view.name)
             return np.asarray((gray / 255) ** DISPLAY_GAMMA, np.float32)

@@ -42,11 +42,11 @@ MIN_SFM_IMAGES = 2
 MAX_REJECTIONS = 2  # rounds in which views are taken out of the model
 
 NO_REGION = (
-    "no polarised region: no view shows a surface with polarised light. Lower `region.min_dolp`, "
+    "no polarized region: no view shows a surface with polarized light. Lower `region.min_dolp`, "
     "check `capture.pattern` and `capture.gamma`, or give the part with `region.mask`."
 )
 NO_SEEDS = (
-    "no seeds: no sparse point lies on the polarised surface with a normal that fits its light, "
+    "no seeds: no sparse point lies on the polarized surface with a normal that fits its light, "
     "and silhouettes place no surface. Put a few printed marks or labels on the part, check "
     "`region.light`, or give the part with `region.mask`."
 )

@@ -1,11 +1,11 @@
 """Gains between the images of one view that were taken behind a polarizer at several angles.
 
 A camera that exposes each image anew, or a filter that is turned by hand, makes one image of a view
-brighter than another, which looks like strong polarisation everywhere. Where the light is not
-polarised all images are alike: there their ratios are those of the gains, the same at all places,
-while polarised surfaces have ratios of every kind. So the gains are the most frequent ratios.
+brighter than another, which looks like strong polarization everywhere. Where the light is not
+polarized all images are alike: there their ratios are those of the gains, the same at all places,
+while polarized surfaces have ratios of every kind. So the gains are the most frequent ratios.
 
-Four or more angles tell a gain from light that is polarised alike everywhere: linear images fit
+Four or more angles tell a gain from light that is polarized alike everywhere: linear images fit
 three Stokes parameters, images of different gains do not.
 """
 
@@ -32,7 +32,7 @@ class GainTolerances:
     bin_log : width of a bin of logarithms of ratios. Guess: wider than the noise of a pixel.
     radius_log : of the pixels about the mode that the gains are the median of. Guess.
     min_support : share of the pixels that have these ratios. Guess.
-    min_ratio : of the largest gain to the smallest; light that is polarised by 10 % everywhere
+    min_ratio : of the largest gain to the smallest; light that is polarized by 10 % everywhere
         has 1.2. Derived from that.
     max_misfit_share : of the misfit to three Stokes parameters that may be left once the gains
         are divided by. Guess.

@@ -19,7 +19,7 @@ measures
 
     (1 - g^2 C^2) s1 = q^2 C S1r - q S S2r,   (1 - g^2 S^2) s2 = q^2 S S1r + q C S2r
 
-with S1r, S2r relative to the radial direction. They give the direction e of polarisation, a 3D
+with S1r, S2r relative to the radial direction. They give the direction e of polarization, a 3D
 vector perpendicular to the ray; the normal of the plane of incidence is e for specular light,
 ``v x e`` for diffuse light. The *corrected* Stokes parameters are those of a sensor that obeys
 PPA, so that all that follows is PPA:
@@ -130,7 +130,7 @@ def rows_from_axial(
 ) -> Floats:
     """Rows from ``(cos 2 phase, sin 2 phase)`` of any common length; float32 stays float32.
 
-    A pair of zero length (no polarisation) gives a NaN row.
+    A pair of zero length (no polarization) gives a NaN row.
     """
     length = np.sqrt(cos2 * cos2 + sin2 * sin2)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -158,7 +158,7 @@ def correct_parameters(parameters: Floats, rays_in_cam: Floats, *, diffuse: Mask
         ``s2 = I45 - I135``.
     rays_in_cam : (..., 3), unit, camera frame.
     diffuse : (...) or one for all, whether diffuse reflection dominates; specular else. It decides
-        how the polarisation is projected.
+        how the polarization is projected.
 
     Returns
     -------
@@ -219,7 +219,7 @@ def sigma_scale(s1: Floats, s2: Floats, rays_in_cam: Floats, *, diffuse: Mask | 
 
     Returns
     -------
-    (...); 1 where there is no polarisation.
+    (...); 1 where there is no polarization.
     """
     x, y, z = rays_in_cam[..., 0], rays_in_cam[..., 1], rays_in_cam[..., 2]
     polarized = np.sqrt(s1 * s1 + s2 * s2)

@@ -2,7 +2,7 @@
 
 A sample of gain g behind a polarizer of angle a and extinction ratio E measures
 ``I = g / 2 (s0 + d (cos 2a s1 + sin 2a s2))`` with the diattenuation ``d = (E - 1) / (E + 1)``.
-The gain is that for unpolarised light, so frames of a uniform unpolarised source give it alone
+The gain is that for unpolarized light, so frames of a uniform unpolarized source give it alone
 (the flat field), and frames of a linear polarizer at known angles give a and d: behind a polarizer
 at t the sample's value is ``A + B cos 2t + C sin 2t`` with ``tan 2a = C / B`` and
 ``d = hypot(B, C) / A``. Each of the three is one number a channel (0, 45, 90, 135 degrees), or an
@@ -59,13 +59,13 @@ class PolarizerCalibration:
     Attributes
     ----------
     pattern : polarizer angles of a 2x2 cell that it is of, row by row, degrees.
-    gains : (4,), response to unpolarised light of the channels 0, 45, 90, 135 degrees, mean 1;
+    gains : (4,), response to unpolarized light of the channels 0, 45, 90, 135 degrees, mean 1;
         ones where a flat field has them. Of a colour sensor (16,): those of each 2x2 block of its
         cell, row by row.
     angles_deg : (4,) or (16,), true angles of the channels, as displayed.
     diattenuations : (4,) or (16,), ``(E - 1) / (E + 1)``.
     dark : file of (H, W) float32, value of each sample without light, share of full scale.
-    flat : file of (H, W) float32, response of each sample to unpolarised light, mean 1.
+    flat : file of (H, W) float32, response of each sample to unpolarized light, mean 1.
     angle_map, diattenuation_map : files of (H, W) float32, of each sample; in place of
         ``angles_deg`` and ``diattenuations``.
     full_scale : value of a saturated sample of the frames, which the dark frame is a share of.
@@ -180,7 +180,7 @@ def measure_response(
     Parameters
     ----------
     pattern : nominal polarizer angles of a 2x2 cell, row by row, degrees.
-    unpolarized : mosaics (H, W) of a uniform unpolarised source, linear, shares of full scale.
+    unpolarized : mosaics (H, W) of a uniform unpolarized source, linear, shares of full scale.
     polarized : mosaics of that source behind a linear polarizer, each with the polarizer's
         transmission angle in degrees, anticlockwise from +x as displayed; three or more angles.
         The source's brightness may change between them.
@@ -197,7 +197,7 @@ def measure_response(
     frames = [*unpolarized, *(frame for _, frame in polarized), *dark]
     shapes = {frame.shape for frame in frames}
     if not unpolarized and not polarized:
-        raise ValueError("no frames of a source; give unpolarised ones, polarised ones or both.")
+        raise ValueError("no frames of a source; give unpolarized ones, polarized ones or both.")
     if len(shapes) != 1 or any(side % 2 for side in next(iter(shapes))):
         raise ValueError(f"frames of {sorted(shapes)}; expected one even size.")
     dark_mean = _mean(dark) if dark else None
@@ -206,7 +206,7 @@ def measure_response(
     if unpolarized:
         mean = _mean(unpolarized) - base
         if mean.mean() < MIN_LIGHT:
-            raise ValueError("the frames of the unpolarised source are dark.")
+            raise ValueError("the frames of the unpolarized source are dark.")
         levels = _channel_means(mean, pattern)
         gains = levels / levels.mean()
         if per_sample:
@@ -216,7 +216,7 @@ def measure_response(
     if polarized:
         lit = [(angle, frame - base) for angle, frame in polarized]
         if min(frame.mean() for _, frame in lit) < MIN_LIGHT:
-            raise ValueError("a frame of the polarised source is dark.")
+            raise ValueError("a frame of the polarized source is dark.")
         tilt = np.radians([angle for angle, _ in lit])
         values = np.stack([_channel_means(frame, pattern) for _, frame in lit])
         brightness, fitted, residual = _fit_polarizer(tilt, values)

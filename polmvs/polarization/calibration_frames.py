@@ -1,6 +1,6 @@
 """Frames for polarizer calibration on disk: folders of darkness, a lamp, and a lamp's polarizer.
 
-The folder holds ``unpolarized/`` (a uniform unpolarised source: an integrating sphere, or a
+The folder holds ``unpolarized/`` (a uniform unpolarized source: an integrating sphere, or a
 diffuser before the lens), ``polarized/`` (the same behind a linear polarizer, files named by its
 transmission angle in degrees, ``045.png`` or ``045_01.png``, three angles or more) and ``dark/``
 (lens cap on, same exposure). Any may be missing, but one of the first two.

@@ -68,7 +68,7 @@ WHITE_PERCENTILE = 99.5
 WHITE_IMAGES = 32  # images that the white level is taken from, evenly spread over the capture
 WHITE_SAMPLES = 20_000  # cells of each
 # That are looked at for lossy compression, the pattern and the gamma, evenly spread. Fewer do not
-# tell the gamma: in one image the scene's own change of polarisation passes for one, found 0.46 to
+# tell the gamma: in one image the scene's own change of polarization passes for one, found 0.46 to
 # 1.29 in single linear images of the shared captures, 1.00 to 1.03 in whole captures.
 CHECKED_IMAGES = 3
 MOST_PIXELS, MAX_DOLP = 0.9, 1.5  # a map of which a tenth exceeds this holds something else
@@ -203,7 +203,7 @@ class Capture:
             f"the images of a view differ in exposure by up to a factor of {worst.ratio:.1f} "
             f"({gains}), in {len(differing)} of {len(self.angle_gains)} views looked at: automatic "
             "exposure, or a filter turned by hand? Record them at one exposure, or give "
-            "`capture.equalize`, which divides them by the gains found over unpolarised places"
+            "`capture.equalize`, which divides them by the gains found over unpolarized places"
         )
 
     def load(self, name: str) -> Stokes:

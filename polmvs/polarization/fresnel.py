@@ -1,4 +1,4 @@
-"""Degree of linear polarization that unpolarised light has after a smooth dielectric (Fresnel)."""
+"""Degree of linear polarization that unpolarized light has after a smooth dielectric (Fresnel)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 def fresnel_dolp(cosines: Floats, light: Light | str, ior: Floats | float) -> Array:
-    """DoLP of unpolarised light that a surface mirrors, or that leaves it from inside.
+    """DoLP of unpolarized light that a surface mirrors, or that leaves it from inside.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ class InspectionLimits:
     noisy_deg : deviation of the AoLP on the part, the median of the views.
     few_views, least_views : under which a surface is carried by little, or by nothing.
     dark_white : brightest 0.5 % of the capture, share of full scale.
-    polarized : share of the capture's pixels that are polarised.
+    polarized : share of the capture's pixels that are polarized.
     edge_px : width of the sharpest edges of a view.
     uneven : ratio of the brightest to the darkest view's median intensity.
     colour : difference of the four 2x2 blocks' brightness, share, of a colour sensor.
@@ -71,12 +71,12 @@ class ViewFigures:
     name : of the view.
     median_intensity : of s0 / 2, share of full scale.
     saturated : share of pixels that a clipped sample contributes to, or that are not finite.
-    part : share of all pixels that lie on the polarised part.
+    part : share of all pixels that lie on the polarized part.
     part_saturated : share of the part's pixels that are clipped; NaN without a part.
     dark : share of pixels under the darkness threshold.
     polarized : share of all pixels that are valid and have a DoLP of 0.1 and more.
     median_dolp : of the valid pixels.
-    sigma_aolp_deg : median over the polarised pixels; NaN without any.
+    sigma_aolp_deg : median over the polarized pixels; NaN without any.
     gain_sigma : see :class:`polmvs.polarization.stokes.Stokes`.
     edge_px : width of the sharpest edges, px: contrast over slope. 2 is perfect, 5 blurred.
     """
@@ -129,7 +129,7 @@ class Inspection:
         """The whole in lines of text: what it is, a table of the views, warnings."""
         header = (
             f"{'view':<24} {'intensity':>9} {'part':>6} {'clipped':>8} {'dark':>7} "
-            f"{'polarised':>9} {'DoLP':>6} {'sigma AoLP':>10} {'edge':>7}"
+            f"{'polarized':>9} {'DoLP':>6} {'sigma AoLP':>10} {'edge':>7}"
         )
         rows = [
             f"{printable(v.name)[-24:]:<24} {100 * v.median_intensity:>7.1f} % "
@@ -140,7 +140,7 @@ class Inspection:
         ]
         size = f"polarization images of {self.capture.width}x{self.capture.height} px"
         warned = [f"warning: {text}" for text in self.warnings]
-        told = "clipped: share of the part, where the light is polarised"
+        told = "clipped: share of the part, where the light is polarized"
         return (*self.capture.notes, size, header, *rows, told, *warned, self.verdict)
 
 
@@ -231,7 +231,7 @@ def dolp_picture(stokes: Stokes) -> Picture:
 def _hue_picture(aolp: Image, strength: Image) -> Picture:
     """Axial angles in rad as colours; OpenCV's hue has 180 steps."""
     hue = np.mod(np.rint(aolp * (180 / np.pi)), 180).astype(np.uint8)
-    # A root keeps weakly polarised surfaces visible.
+    # A root keeps weakly polarized surfaces visible.
     value = np.rint(255 * np.sqrt(np.clip(strength, 0, 1))).astype(np.uint8)
     hsv = np.dstack([hue, value, value])
     return np.asarray(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR), np.uint8)
@@ -302,7 +302,7 @@ def _figures_of(name: str, stokes: Stokes, darkness: float) -> ViewFigures:
 
 
 def _part(stokes: Stokes, clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Where light is polarised (H, W), and clipped spots more than half of whose rim is there."""
+    """Where light is polarized (H, W), and clipped spots more than half of whose rim is there."""
     region = find_region(
         stokes.s0, stokes.s1, stokes.s2, stokes.valid, min_dolp=RegionOptions.min_dolp
     ).inside
@@ -363,19 +363,19 @@ def _obstacles(
     polarized = float(np.mean([v.polarized for v in views]))
     if polarized < limits.polarized:
         lines.append(
-            f"{100 * polarized:.1f} % of its pixels are polarised (DoLP "
+            f"{100 * polarized:.1f} % of its pixels are polarized (DoLP "
             f"{RegionOptions.min_dolp:g}); is it a polarization camera's raw format, and is the "
             "part glossy?"
         )
     sigma = [v.sigma_aolp_deg for v in views if np.isfinite(v.sigma_aolp_deg)]
     if sigma and float(np.median(sigma)) > limits.noisy_deg:
         lines.append(
-            f"noise turns the angles by {np.median(sigma):.0f} deg (median of the polarised "
+            f"noise turns the angles by {np.median(sigma):.0f} deg (median of the polarized "
             "pixels); expose more"
         )
     if capture.unequal_exposure is not None and not capture.options.equalize:
         lines.append(
-            "the exposures of its polarizer angles differ, which looks like polarisation "
+            "the exposures of its polarizer angles differ, which looks like polarization "
             "everywhere; give `capture.equalize`"
         )
     return lines

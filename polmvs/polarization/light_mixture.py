@@ -10,8 +10,8 @@ Likelihood
 Gaussian noise of p makes psi von Mises distributed on twice the angle, ``exp(kappa cos 2 psi) / (pi
 I0(kappa))`` with ``kappa = 1 / (4 var(psi))``, and ``kappa cos 2 psi = kappa - (m . n)^2 / (2
 var(m . n))``, ``var(m . n) = sin^2(theta) var(psi)``. So a sure observation has the Gaussian of its
-residual, and the less it is polarised the more even is its density: it neither tells a normal nor a
-label. "Neither" (light reflected twice, marks, polarised surroundings) is even, ``1 / pi``.
+residual, and the less it is polarized the more even is its density: it neither tells a normal nor a
+label. "Neither" (light reflected twice, marks, polarized surroundings) is even, ``1 / pi``.
 
 Degree of polarization
 ----------------------
@@ -53,9 +53,9 @@ class LightMixtureTolerances:
     neither_share : of all observations. Guess.
     min_ior, max_ior : refractive indices of dielectrics, all alike likely between. Derived: water
         1.33, plastics, glazes, lacquers and glass 1.45 to 1.6, dense glass 1.7.
-    dolp_margin : by which a bound may be exceeded beside noise: reflections of polarised light,
+    dolp_margin : by which a bound may be exceeded beside noise: reflections of polarized light,
         another model of the surface. Guess.
-    model_sigma : rad; error of the phase of strongly polarised light that noise does not explain.
+    model_sigma : rad; error of the phase of strongly polarized light that noise does not explain.
         Measured on the shared captures.
     mixture_sigma : rad times DoLP; by which light of a second reflection turns the phase, over the
         DoLP. Measured on the shared captures.
@@ -78,7 +78,7 @@ class LightShares(NamedTuple):
     ----------
     specular, diffuse, neither : (...) in [0, 1].
     log_likelihood : (...) of the observation's angle and DoLP over that of an angle by chance: 0
-        where nothing is polarised, at least ``log(neither_share)``.
+        where nothing is polarized, at least ``log(neither_share)``.
     """
 
     specular: Floats
@@ -95,7 +95,7 @@ def phase_variance(
 ) -> Floats:
     """Variance (...) of a phase, rad^2: noise, the model's error and light of other reflections.
 
-    Infinite where the DoLP does not exceed what noise alone makes of no polarisation. (The square
+    Infinite where the DoLP does not exceed what noise alone makes of no polarization. (The square
     of a measured DoLP is too large by twice the noise's variance in the mean.)
 
     Parameters

@@ -1,4 +1,4 @@
-"""Which encoding gamma the samples of a mosaic have, told by polarised light itself.
+"""Which encoding gamma the samples of a mosaic have, told by polarized light itself.
 
 Behind an analyzer at ``a`` stands ``I = s0 / 2 (1 + q cos 2a + u sin 2a)``. Whatever gains, angles
 and extinction ratios the four analyzers have, and however oblique rays tilt them, the redundancy
@@ -35,11 +35,11 @@ class LinearityTolerances:
     max_contrast : deviation of the intensity within a patch over its mean. Guess.
     min_patches : Guess.
     min_quadratic : deviation of ``q^2 - u^2`` over the patches, for them to tell anything. Guess:
-        that of light polarised by 7 % in all directions.
+        that of light polarized by 7 % in all directions.
     num_rounds : of weights and exponents; the exponent converges quadratically.
     num_groups : of patches, neighbours together, each of which is left out once (jackknife), as is
         each image.
-    min_ratio : of the two gammas, whatever the certainty. Guess: the degree of polarisation is off
+    min_ratio : of the two gammas, whatever the certainty. Guess: the degree of polarization is off
         by as much. Real sensors are linear to some percent.
     max_log_sigma : of the gamma's logarithm, for an estimate to be named. Guess.
     """
@@ -61,7 +61,7 @@ class LinearityCheck:
     Attributes
     ----------
     given : gamma that the samples are decoded with.
-    found : that they show; None where too little polarised light tells.
+    found : that they show; None where too little polarized light tells.
     log_sigma : standard deviation of its logarithm.
     fits : whether the two agree; None where nothing tells.
     """
@@ -76,7 +76,7 @@ class LinearityCheck:
         """One line for the user."""
         if self.fits is None or self.found is None:
             return (
-                "too little polarised light, or images that show different things, to check "
+                "too little polarized light, or images that show different things, to check "
                 f"`capture.gamma` {self.given:g}"
             )
         if self.fits:

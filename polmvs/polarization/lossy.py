@@ -1,7 +1,7 @@
 """Traces of lossy compression in a mosaic, and what it does to the Stokes images.
 
 A JPEG rounds the coefficients of each 8x8 block of samples to multiples of a step. A mosaic's
-polarisation lies at the highest frequencies (the difference of neighbouring samples), where the
+polarization lies at the highest frequencies (the difference of neighbouring samples), where the
 steps are largest, and the redundancy of the four samples shrinks with it: the noise that it shows
 is too small. So the steps are found, and the variance that rounding to them puts into s1 and s2 is
 computed: each coefficient errs uniformly within its step.

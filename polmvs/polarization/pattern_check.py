@@ -2,7 +2,7 @@
 
 Perpendicular polarizers sum to the whole intensity, so ``I0 + I90 = I45 + I135``, whatever the
 light. Of the three ways to part the four places of a cell into two pairs only the right one makes
-the sums agree where light is polarised. That tells 8 of the 24 orders from the other 16. The eight
+the sums agree where light is polarized. That tells 8 of the 24 orders from the other 16. The eight
 are turned and mirrored images of each other, which one picture cannot tell apart: their angles of
 polarization differ, their sums do not.
 """
@@ -28,12 +28,12 @@ PAIRINGS = (((0, 3), (1, 2)), ((0, 1), (2, 3)), ((0, 2), (1, 3)))
 PAIRING_NAMES = ("diagonals", "rows", "columns")
 SMOOTHING_PX = 9
 MIN_LIGHT = 0.02  # share of the brightest
-MIN_PIXELS = 500  # polarised ones
-# A wrong pairing shows polarised light as disagreement: several times what the right one has.
+MIN_PIXELS = 500  # polarized ones
+# A wrong pairing shows polarized light as disagreement: several times what the right one has.
 # Between this ratio and its inverse nothing is said (guess; right patterns of rendered and real
 # captures have 0.1 to 0.4, a swapped one the inverse).
 CLEAR_RATIO = 0.5
-POLARIZED_SHARE = 0.05  # of s0, beyond which the sums of the best pairing count as polarised
+POLARIZED_SHARE = 0.05  # of s0, beyond which the sums of the best pairing count as polarized
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,10 +43,10 @@ class PatternCheck:
     Attributes
     ----------
     pattern : that was checked.
-    disagreement : of the sums under the three pairings, median over polarised pixels, share of
+    disagreement : of the sums under the three pairings, median over polarized pixels, share of
         s0; in the order of ``PAIRING_NAMES``.
-    num_pixels : polarised ones that were looked at.
-    fits : None where too little light is polarised to tell.
+    num_pixels : polarized ones that were looked at.
+    fits : None where too little light is polarized to tell.
     fitting : the eight patterns that fit, the sensor's own and turned ones first; empty if unknown.
     """
 
@@ -61,7 +61,7 @@ class PatternCheck:
         """One line for the user."""
         text = ",".join(map(str, self.pattern))
         if self.fits is None:
-            return f"too little polarised light to check `capture.pattern` {text}"
+            return f"too little polarized light to check `capture.pattern` {text}"
         if self.fits:
             return f"`capture.pattern` {text} fits, or a turned or mirrored one"
         likely = ",".join(map(str, self.fitting[0]))
@@ -108,7 +108,7 @@ def check_pattern(mosaics: Sequence[NDArray[Any]], pattern: Pattern, clip: float
 def _differences(raw: NDArray[Any], clip: float) -> NDArray[np.float32]:
     """Intensity s0 and the signed disagreement of the three pairings, (4, N), smoothed.
 
-    Texture disagrees with changing sign, polarised light with the same one.
+    Texture disagrees with changing sign, polarized light with the same one.
     """
     images = split_mosaic(raw, ANGLES_DEG)  # places instead of angles: the image of place k
     inside = ~clipped_cells(raw, clip)

@@ -38,7 +38,7 @@ class PhaseTolerances:
     fine_smoothing_px : of the phase. Measured, F at 1 mm with 1.5 px, 1 px and 0.7 px: of `step`
         97.6, 98.0 and 97.8 %, of `mug` 97.6, 98.2 and 98.0 %.
     coarse_smoothing_px : of the phase where few pixels count: it bridges clipped spots. Guess.
-    model_sigma : rad; error of the phase of strongly polarised light that noise does not
+    model_sigma : rad; error of the phase of strongly polarized light that noise does not
         explain. Measured on the shared captures.
     ridge : of the local linear fits, as a share of the window's variance: bounds their slopes
         where few pixels count. Guess.
@@ -61,13 +61,13 @@ class PhaseMap:
     Attributes
     ----------
     view : camera, pose and name.
-    region : where the view shows a polarised surface.
+    region : where the view shows a polarized surface.
     samples : (H, W, 3) float32: ``dolp cos 2 phase``, ``dolp sin 2 phase`` and the phase's inverse
         variance (1 / rad^2; 0: no phase here): noise and mixed light, whatever the angle model.
     intensity : (H, W) float32, s0 in units of full scale.
     diffuse : (H, W) bool, pixels whose light is diffuse-dominant; the others' is specular.
     lowest_dolp : (H, W) uint8, lowest DoLP of single pixels next to each pixel, in 1/255: what
-        is printed on a surface is less polarised than it, what is mirrored in it is not.
+        is printed on a surface is less polarized than it, what is mirrored in it is not.
     polarization : (H, W, 4) float32: ``s1 / s0`` and ``s2 / s0`` of each pixel as measured, inside
         and outside of the region, and the variance of either: that of a mean of n pixels is the
         third channel over n (noise, of which neighbours share some, and lossy compression) plus

@@ -1,4 +1,4 @@
-"""Where to densify: the polarised, textureless region of a view, and the edges inside it."""
+"""Where to densify: the polarized, textureless region of a view, and the edges inside it."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class RegionTolerances:
-    """What belongs to the polarised region of a view.
+    """What belongs to the polarized region of a view.
 
     Lengths that are those of things in the scene hold for images of ``reference_area_px`` pixels;
     :meth:`at` scales them.
 
     Attributes
     ----------
-    smoothing_px : over which texture's false polarisation (the four samples see different
+    smoothing_px : over which texture's false polarization (the four samples see different
         points) averages out. Derived: twice a cell.
     low_texture : relative intensity gradient per px under which a surface shows no texture.
         Guess.
-    similar_intensity : factor within which unpolarised pixels may belong to a polarised
+    similar_intensity : factor within which unpolarized pixels may belong to a polarized
         region. Guess.
     min_area_px : of a region, single pixels whatever the resolution. Guess.
     min_core_share : of a region: less means that it has run into the background. Guess.
@@ -75,7 +75,7 @@ class Region:
     ----------
     inside : (H, W) bool, the surface to densify, holes (marks, frontal spots) filled.
     reliable : (H, W) bool, pixels that averages over windows and votes on the light count:
-        polarised, unsaturated, neither mark nor what passes for one. Phase maps take all.
+        polarized, unsaturated, neither mark nor what passes for one. Phase maps take all.
     edges : (H, W) bool, creases and depth edges; contours stop there.
     """
 
@@ -100,10 +100,10 @@ def find_region(
     mask: Mask | None = None,
     tolerances: RegionTolerances = RegionTolerances(),
 ) -> Region:
-    """Find the polarised, textureless region of a view.
+    """Find the polarized, textureless region of a view.
 
-    Polarised pixels are the core. It grows into dark neighbours without texture (a surface seen
-    frontally has no polarisation) and its holes are filled where they show no texture or are
+    Polarized pixels are the core. It grows into dark neighbours without texture (a surface seen
+    frontally has no polarization) and its holes are filled where they show no texture or are
     as small as a printed mark.
 
     Parameters
@@ -224,10 +224,10 @@ def _fill_holes(mask: Mask, texture: Image, *, tolerances: RegionTolerances) -> 
     return np.asarray(mask | fill[labels])
 
 
-def _marks(s0: Image, polarised: Mask, reach_px: float) -> Mask:
-    """Pixels much brighter or darker than the polarised surface about them, with a margin."""
-    weight = smooth(polarised.astype(np.float32), reach_px)
-    reference = smooth(np.where(polarised, s0, 0).astype(np.float32), reach_px) / np.maximum(
+def _marks(s0: Image, polarized: Mask, reach_px: float) -> Mask:
+    """Pixels much brighter or darker than the polarized surface about them, with a margin."""
+    weight = smooth(polarized.astype(np.float32), reach_px)
+    reference = smooth(np.where(polarized, s0, 0).astype(np.float32), reach_px) / np.maximum(
         weight, 1e-6
     )
     deviation = smooth(s0, 0.8) / np.maximum(reference, 1e-6)
@@ -237,10 +237,10 @@ def _marks(s0: Image, polarised: Mask, reach_px: float) -> Mask:
 def _phase_jumps(
     axial: Floats, dolp: Floats, min_dolp: float, *, tolerances: RegionTolerances
 ) -> Mask:
-    """Where the phase changes abruptly between two polarised sides."""
+    """Where the phase changes abruptly between two polarized sides."""
     unit = axial / np.maximum(np.linalg.norm(axial, axis=-1, keepdims=True), 1e-9)
     dx = cv2.Sobel(unit, cv2.CV_32F, 1, 0, scale=1 / 8)
     dy = cv2.Sobel(unit, cv2.CV_32F, 0, 1, scale=1 / 8)
     jump = np.sqrt((dx**2 + dy**2).sum(axis=-1))
-    near_polarised = grow_mask(dolp > min_dolp, 2)
-    return np.asarray((jump > tolerances.min_phase_jump) & near_polarised & (dolp > 0.5 * min_dolp))
+    near_polarized = grow_mask(dolp > min_dolp, 2)
+    return np.asarray((jump > tolerances.min_phase_jump) & near_polarized & (dolp > 0.5 * min_dolp))

@@ -33,10 +33,10 @@ Gains
 -----
 Polarizer channels differ in gain, some percent on real sensors. That is an error common to all
 pixels, which no smoothing reduces, so it is kept apart from ``sigma``: ``gain_sigma``. Gains
-``1 + e_k`` of equal spread make ``r / s0 = (e0 + e90 - e45 - e135) / 2`` in unpolarised light, and
+``1 + e_k`` of equal spread make ``r / s0 = (e0 + e90 - e45 - e135) / 2`` in unpolarized light, and
 independent of it ``(e0 - e90) / 2`` and ``(e45 - e135) / 2`` of s0 in s1 and s2, each with the
 spread of r / s0 over sqrt(2). One (n - 3) such value known, the error's distribution is Student's.
-The second combination of gains that polarised light would show is not used: what oblique rays do
+The second combination of gains that polarized light would show is not used: what oblique rays do
 in the polarizers looks the same. Measured with gains of 2 % spread on rendered captures, the error
 of the AoLP is within one stated deviation for 33 % of the pixels without this term; the test
 ``test_sigma_covers_gain_errors`` holds the figure with it.
@@ -361,7 +361,7 @@ def turned_axes(stokes: Stokes, *, zero_deg: float = 0.0, clockwise: bool = Fals
 def combine(images: list[Stokes]) -> Stokes:
     """Sum of the Stokes images of several colours, weighted by what their noise leaves of them.
 
-    One weight a colour for the whole image, so that s0 stays an intensity: polarised intensity
+    One weight a colour for the whole image, so that s0 stays an intensity: polarized intensity
     over the variance, whose weighted sum has the best ratio of the two (matched filter). The
     weights sum to one. A pixel is valid where it is in every colour with weight. Noise is each
     colour's own; what an edge mixes they have in common, and their sum shows it.
@@ -514,7 +514,7 @@ def _gain_sigma(s0: Image, s1: Image, s2: Image, redundancy: Image, valid: Mask)
     level = s0[sample][lit]
     if len(redundancy) == 0 or level.size == 0:
         return 0.0
-    # Of light that counts as unpolarised.
+    # Of light that counts as unpolarized.
     weak = np.hypot(s1[sample][lit], s2[sample][lit]) < RegionOptions.min_dolp * level
     if np.count_nonzero(weak) < MIN_SAMPLES:
         weak[:] = True

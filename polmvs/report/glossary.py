@@ -58,7 +58,7 @@ _MEANINGS = {
     "normal.",
     "points within the silhouettes": "Share of the points that fall inside the outline of the part "
     "in the views that see them.",
-    "part of the polarised regions": "Share of the polarized pixels that the surface explains.",
+    "part of the polarized regions": "Share of the polarized pixels that the surface explains.",
     "stated deviation of the places": "How uncertain places are by their own statement, as a share "
     "of their distance.",
     # deviation

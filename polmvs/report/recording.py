@@ -128,7 +128,7 @@ class _Recorder:
         models = dense_models(self.record)
         first = next(iter(models), None)
         if first is not None:
-            self.begin("maps", "phases of the polarised regions")
+            self.begin("maps", "phases of the polarized regions")
             self.phases(first, on_progress)
         for model in models:
             self.normals(model)

@@ -1,6 +1,6 @@
 """Colours of a surface from the views that see a place best, without their highlights.
 
-Of each view the unpolarised part of the light is taken, which lacks most of what is reflected, and
+Of each view the unpolarized part of the light is taken, which lacks most of what is reflected, and
 of the views that see a place best their weighted median, in which a highlight that some see loses.
 """
 

@@ -42,7 +42,7 @@ class Sighting:
     excess : (N,) how much farther than the point its surface lies, along its own ray; NaN: it has
         none there.
     facing : (N,) cosine between the point's normal and the direction to the other camera.
-    outside : (N,) it shows the point's place and no polarised surface there.
+    outside : (N,) it shows the point's place and no polarized surface there.
     """
 
     place: Array

@@ -1,4 +1,4 @@
-"""Contours of phase: ranges carried along them over a polarised region, as in the paper.
+"""Contours of phase: ranges carried along them over a polarized region, as in the paper.
 
 A row ``m`` is a tangent of the surface. Under PPA it is perpendicular to the ray, so a point moved
 along it keeps its distance to the camera centre: the contour is an iso-range curve. Under OPA it
@@ -83,7 +83,7 @@ def propagate(
     on_progress: OnProgress = no_progress,
     tolerances: ContourTolerances = ContourTolerances(),
 ) -> list[DenseView | None]:
-    """Range and normal over the polarised region of every view.
+    """Range and normal over the polarized region of every view.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def trace_contours(
 ) -> Contours:
     """Trace contours both ways from all seeds in lock step (midpoint rule).
 
-    A contour ends where the field ends (region edge, crease, weak polarisation, clipped pixels:
+    A contour ends where the field ends (region edge, crease, weak polarization, clipped pixels:
     whatever was not passable), where neighbouring directions disagree, or where it closes. One that
     winds about without an end is cut where each half is as long as the image's border.
 

@@ -82,7 +82,7 @@ def fuse(
     """Fuse the dense views into one cloud.
 
     A point stays if enough views agree with it in distance and normal and if not most of the
-    views that should see it see through it or show no polarised surface there. Distances may
+    views that should see it see through it or show no polarized surface there. Distances may
     differ by what their deviations explain, at most by as many footprints as the options say and
     never by less than half of it. The point moves along its ray to the mean of the places that the
     agreeing views give it, weighted by their deviations. Points closer than the merging voxel

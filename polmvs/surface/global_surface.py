@@ -144,7 +144,7 @@ class Undetermined:
 
     Attributes
     ----------
-    reason : a clause without its end, such as "no view shows a polarised region".
+    reason : a clause without its end, such as "no view shows a polarized region".
     """
 
     reason: str
@@ -504,12 +504,12 @@ def _no_hull(views: Sequence[SurfaceView]) -> str | None:
     """Why silhouettes do not bound the objects, if they do not."""
     outlined = [view for view in views if view.has_outline]
     if not any(view.silhouette.certain.any() for view in views):
-        return "no view shows a polarised region"
+        return "no view shows a polarized region"
     if len(outlined) < MIN_VIEWS:
         return f"{len(outlined)} views show an outline of an object, of {MIN_VIEWS} needed"
     borders = [_border_share(view.silhouette.certain) for view in outlined]
     if float(np.median(borders)) > MAX_FILLED_SHARE:
-        return "the polarised object fills the images"
+        return "the polarized object fills the images"
     return None
 
 

@@ -1,4 +1,4 @@
-"""Integration: range and normal of every pixel of a polarised region, coarse to fine.
+"""Integration: range and normal of every pixel of a polarized region, coarse to fine.
 
 Each view's lattice is one sparse least-squares problem for the logarithm of its ranges: normals
 from the phases of all views say how it changes from pixel to pixel, seeds where it lies, and what
@@ -101,7 +101,7 @@ def integrate(
     on_progress: OnProgress = no_progress,
     tolerances: IntegrationTolerances = IntegrationTolerances(),
 ) -> list[DenseView | None]:
-    """Range and normal over the polarised region of every view.
+    """Range and normal over the polarized region of every view.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The points of the depth maps that COLMAP itself made, where no polarised surface was found."""
+"""The points of the depth maps that COLMAP itself made, where no polarized surface was found."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class KeptDepthTolerances:
     Attributes
     ----------
     stride_px : every how many-th pixel is used, and the side of the voxel in which a second view
-        must have a point. Derived: as dense as the polarised surface.
+        must have a point. Derived: as dense as the polarized surface.
     min_agreement : share of the points that have a second view, below which the maps are doubted;
         a guess: COLMAP keeps what other views confirm, so that most have one, and hardly one by
         chance where the maps are of another unit or frame than the poses.
     normal_sigma_deg : that COLMAP's fusion allows between views. Derived: its own default.
-    clearance_px : from the polarised surface; a guess.
+    clearance_px : from the polarized surface; a guess.
     """
 
     stride_px: int = PropagationOptions.stride_px
@@ -48,12 +48,12 @@ def kept_cloud(
     *,
     tolerances: KeptDepthTolerances = KeptDepthTolerances(),
 ) -> FusedCloud:
-    """Fuse the maps of a workspace, leaving out what lies on a polarised surface.
+    """Fuse the maps of a workspace, leaving out what lies on a polarized surface.
 
     Parameters
     ----------
     workspace : with maps of some views; one view is in memory at a time.
-    surface_points : (N, 3), world, of the polarised surfaces, which have their own points.
+    surface_points : (N, 3), world, of the polarized surfaces, which have their own points.
 
     Returns
     -------

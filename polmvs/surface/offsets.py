@@ -443,7 +443,7 @@ def border_of_steps(
 ) -> Image:
     """Signed distance (H, W) in cells to the border of a region on a face, negative inside.
 
-    Labels follow lines of polarisation, too, which the phases' smoothing draws outwards. The border
+    Labels follow lines of polarization, too, which the phases' smoothing draws outwards. The border
     is where the views together show the step of intensity that is nearest.
 
     Parameters
@@ -729,10 +729,10 @@ def _continued(
 
 
 def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
-    """Images (H, W, 4): root of intensity, polarisation (2), and 1 off printed marks.
+    """Images (H, W, 4): root of intensity, polarization (2), and 1 off printed marks.
 
     The first three show borders by their steps. A mark is smaller than ``mark_px``, brighter than
-    what is about it, and less polarised.
+    what is about it, and less polarized.
     """
     intensity = np.asarray(phase_map.intensity, np.float32)
     scale = phase_map.view.camera.mean_focal_px / REFERENCE_FOCAL_PX

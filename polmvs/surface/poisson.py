@@ -1,4 +1,4 @@
-"""A mesh of the polarised surface: Poisson reconstruction, cut back to where points support it.
+"""A mesh of the polarized surface: Poisson reconstruction, cut back to where points support it.
 
 Poisson reconstruction closes every surface: beyond the last point and across holes it makes one
 up. What no point supports is cut off again, so that the mesh ends where the cloud ends and holes

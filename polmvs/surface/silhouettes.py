@@ -1,7 +1,7 @@
-"""Silhouettes of the polarised objects with doubt: on, off or unknown, for each pixel of each view.
+"""Silhouettes of the polarized objects with doubt: on, off or unknown, for each pixel of each view.
 
-The polarised region of a view is on the objects. Where they are dark, frontal or show mixed light
-they are hardly polarised, and the region ends too early: pixels that continue it and look like it
+The polarized region of a view is on the objects. Where they are dark, frontal or show mixed light
+they are hardly polarized, and the region ends too early: pixels that continue it and look like it
 rather than like the surroundings (a cut of the graph of pixels by intensity) are unknown. Views
 check one another: what a view alone claims, or alone denies, is unknown as well.
 """
@@ -41,7 +41,7 @@ class SilhouetteTolerances:
         with the two before.
     cut_rounds : of the graph cut; a fourth changes under 0.5 % of the pixels (mug).
     edge_reach_px : of the search for a step of intensity about an outline. The region's Stokes
-        images are smoothed over 2 px, so that strong polarisation leaks by about as much.
+        images are smoothed over 2 px, so that strong polarization leaks by about as much.
     edge_prior_px : deviation of that step from the region's border. Guess.
     edge_contrast : least step, as a share of the brighter side. Guess.
     edge_smoothing_px : of the shifts along the outline. Guess.

@@ -286,9 +286,9 @@ class Contradictions:
             )
         if self.uncovered_share > MAX_SHARE:
             found.append(
-                f"{self.uncovered_share:.0%} of the polarised regions are not covered by the "
+                f"{self.uncovered_share:.0%} of the polarized regions are not covered by the "
                 "surface: views contradict each other, or a part is missing; one that hardly "
-                "polarises (bright, matt) needs `region.mask`"
+                "polarizes (bright, matt) needs `region.mask`"
             )
         if abs(self.point_offset_sigmas) > MAX_SIGMAS:
             side = "outside" if self.point_offset_px > 0 else "inside"

@@ -27,7 +27,7 @@ FAR_PX = 1000.0  # distance to a silhouette that the view does not have
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Outline of the polarised objects in one view, with doubt.
+    """Outline of the polarized objects in one view, with doubt.
 
     Attributes
     ----------

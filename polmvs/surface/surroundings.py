@@ -1,6 +1,6 @@
-"""What lies about the polarised parts: sparse points, and stereo of textured surfaces.
+"""What lies about the polarized parts: sparse points, and stereo of textured surfaces.
 
-The surroundings are textured and unpolarised, so that matching features and patches works there
+The surroundings are textured and unpolarized, so that matching features and patches works there
 and on the parts it does not: a glossy surface shows mirror images, which make sparse points as
 good as any, behind it. Where a view shows a part is known, and what is seen there is left out.
 
@@ -103,7 +103,7 @@ class SurroundingsTolerances:
 
 @dataclass(frozen=True)
 class SparseSurroundings:
-    """Sparse points that lie on no polarised part.
+    """Sparse points that lie on no polarized part.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ def sparse_surroundings(
     *,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> SparseSurroundings:
-    """Sparse points that are certain in place and neither on a polarised part nor mirrored in one.
+    """Sparse points that are certain in place and neither on a polarized part nor mirrored in one.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def stereo_surroundings(
     workers: Workers | None = None,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> FusedCloud:
-    """Dense cloud of the textured surroundings of the polarised parts, from pairs of views.
+    """Dense cloud of the textured surroundings of the polarized parts, from pairs of views.
 
     Parameters
     ----------
@@ -311,7 +311,7 @@ def _match_view(
     """Match the first view with the others and store what comes of it."""
     # A match may leak over a part's outline by its patch and a neighbour's.
     excluded = grow_mask(maps[0].region.inside, 2 * tolerances.border_px)
-    stride_px = PropagationOptions.stride_px  # as dense as the polarised surface
+    stride_px = PropagationOptions.stride_px  # as dense as the polarized surface
     dense = stereo_view(maps[0], maps[1:], points, excluded, stride_px, tolerances=tolerances)
     return store_dense_view(dense, folder / f"{maps[0].view.name}.stereo")
 
@@ -578,7 +578,7 @@ def stereo_view(
     phase_map : of the view; its intensity is matched.
     partners : of the views to match it with.
     points : (N, 3), world, that the view sees; they bound the depths to search.
-    part : (H, W) bool, pixels to leave out: polarised parts and what is beside them.
+    part : (H, W) bool, pixels to leave out: polarized parts and what is beside them.
     stride_px : of the lattice.
     tolerances : of this step.
     """

@@ -1,7 +1,7 @@
 """Analytic captures for tests, examples and experiments: exact phase, depth, normals and noise.
 
 Planes, spheres and cylinders under a uniform sky. What is rendered is the light's geometry, not
-its radiance: every visible point has the same ``s0``, and its polarisation follows Fresnel's
+its radiance: every visible point has the same ``s0``, and its polarization follows Fresnel's
 equations, so each quantity has a closed form. Three sensors: ``ppa`` and ``opa`` obey the models
 of :mod:`polmvs.polarization.angle_models` exactly; ``tilted`` is a polarizer in the image plane
 that absorbs the
@@ -42,7 +42,7 @@ class SyntheticView:
     normals_in_cam : (H, W, 3), unit, facing the camera.
     mask : (H, W) bool, True on the surface.
     phase, aolp : rad in [0, pi), as the sensor measures them without noise; NaN too where the
-        light is unpolarised (the ray meets the surface head on).
+        light is unpolarized (the ray meets the surface head on).
     dolp : of the light itself, by Fresnel.
     intensities : (4, H, W), behind polarizers at 0, 45, 90, 135 degrees, share of full scale;
         half of ``background`` beside the surface.
@@ -73,10 +73,10 @@ def render_view(
 
     Parameters
     ----------
-    light : which reflection polarises: "specular" across the plane of incidence, "diffuse" in it.
+    light : which reflection polarizes: "specular" across the plane of incidence, "diffuse" in it.
     sensor : "ppa", "opa" or "tilted".
-    ior : refractive index of the surface; sets the degree of polarisation.
-    s0, background : ``I0 + I90`` of the surface and of the unpolarised rest, in full scales.
+    ior : refractive index of the surface; sets the degree of polarization.
+    s0, background : ``I0 + I90`` of the surface and of the unpolarized rest, in full scales.
     """
     xy = pixel_centers(view.camera.width, view.camera.height)
     return _render(view, surface, xy, light, sensor, ior, s0, background)
@@ -203,7 +203,7 @@ def _render(
     distance = np.where(mask, distance, np.nan)
     normals = normals @ rotation.T
     dolp = fresnel_dolp(-(rays * normals).sum(axis=-1), light, ior)
-    across = unit(np.cross(rays, normals))  # the light's polarisation if it is specular
+    across = unit(np.cross(rays, normals))  # the light's polarization if it is specular
     axis = across if light == "specular" else np.cross(rays, across)
     if sensor == "tilted":
         intensities = _tilted_intensities(rays, axis, dolp, s0)

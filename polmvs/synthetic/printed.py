@@ -1,7 +1,7 @@
 """Captures with printed texture, cheap enough for hundreds of views: SfM finds their poses.
 
-A dark glossy part lies in printed surroundings. Light from the print is unpolarised and the same
-from every side, that from the part polarised as Fresnel's equations say; labels on the part are
+A dark glossy part lies in printed surroundings. Light from the print is unpolarized and the same
+from every side, that from the part polarized as Fresnel's equations say; labels on the part are
 printed too, so that sparse points lie on it. Every ray has a closed form, as in
 :mod:`polmvs.synthetic.captures`; the print is sampled at the resolution that a pixel covers, so
 that features are found again from other distances.
@@ -44,7 +44,7 @@ class PrintedScene:
 
     Attributes
     ----------
-    part : polarises the light.
+    part : polarizes the light.
     surroundings : what is printed, by x and y.
     labels : (L, 3), centres of round printed labels on the part, world.
     label_radius : of each label.

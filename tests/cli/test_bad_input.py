@@ -216,7 +216,7 @@ def test_sparse_model_of_two_views(cli, demo_run: Path, demo_capture: Path, tmp_
     assert not (tmp_path / "out" / "maps").exists()
 
 
-# No polarised region, no seeds
+# No polarized region, no seeds
 
 
 def without_points(model_folder: Path, target: Path) -> Path:
@@ -243,7 +243,7 @@ def assert_finished_but_empty(out: Path) -> None:
     assert result_of(out, "densify_ppa")["num_points"] == 0
 
 
-def test_no_polarised_region(cli, demo_run: Path, demo_capture: Path, tmp_path: Path) -> None:
+def test_no_polarized_region(cli, demo_run: Path, demo_capture: Path, tmp_path: Path) -> None:
     """The bundled capture with each cell's four samples made equal."""
     capture, out = tmp_path / "capture", tmp_path / "out"
     capture.mkdir()
@@ -256,7 +256,7 @@ def test_no_polarised_region(cli, demo_run: Path, demo_capture: Path, tmp_path: 
     assert status == 3
     assert text.startswith(f"{out / 'ppa.ply'}: 0 points")
     last = err.splitlines()[-1]
-    assert last.startswith("polmvs: no polarised region: ")
+    assert last.startswith("polmvs: no polarized region: ")
     assert "--min-dolp" in last
     assert_finished_but_empty(out)
 

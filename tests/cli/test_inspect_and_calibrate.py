@@ -49,10 +49,10 @@ def test_inspect_warns_of_bad_captures(cli, tmp_path):
         cv2.imwrite(str(folder / f"{name}.png"), np.rint(blurred).astype(np.uint8))
     status, out, _ = cli("inspect", folder)
     assert status == 0
-    for words in ("too little polarised light", "expose more", "factor of"):
+    for words in ("too little polarized light", "expose more", "factor of"):
         assert words in out, words
     assert out.splitlines()[-1].startswith("This capture will not do, because it has 2 views")
-    assert "pixels are polarised" in out.splitlines()[-1]
+    assert "pixels are polarized" in out.splitlines()[-1]
 
 
 def test_clipped_spots_of_the_part_count(cli, demo_capture, tmp_path):
@@ -201,7 +201,7 @@ def test_calibrate_camera_writes_a_colmap_camera(cli, tmp_path):
     folder = tmp_path / "capture"
     folder.mkdir()
     for name, picture in pictures(CHECKER).items():
-        # An unpolarised mosaic: every sample of a cell is the picture's.
+        # An unpolarized mosaic: every sample of a cell is the picture's.
         cv2.imwrite(str(folder / name), np.kron(picture, np.ones((2, 2), np.uint8)))
     out = tmp_path / "camera.txt"
     status, text, err = cli("calibrate", "camera", folder, out, "--cols", 9, "--rows", 7)

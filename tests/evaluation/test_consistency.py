@@ -42,7 +42,7 @@ def measure(scene: Scene, cloud: Cloud) -> Consistency:
 
 
 @pytest.mark.parametrize("kind", [PointKind.SPARSE, PointKind.STEREO])
-def test_only_the_polarised_surface_counts(scene: Scene, kind: PointKind) -> None:
+def test_only_the_polarized_surface_counts(scene: Scene, kind: PointKind) -> None:
     surface = surface_of(scene)
     alone = measure(scene, surface)
     assert alone.num_points == 2000

@@ -47,7 +47,7 @@ def names(trust: Trust) -> list[str]:
 def test_a_right_surface_is_normal(scene):
     trust = measure_trust(AngleModel.PPA, cloud_of(scene), NO_TRACKS, scene.maps)
     # No more than the border of the region is in doubt, and a part of it has no points.
-    assert names(trust) in ([], ["part of the polarised regions determined"])
+    assert names(trust) in ([], ["part of the polarized regions determined"])
     assert trust.inside > 0.99
     assert trust.residual_deg < 0.1
     assert trust.sigma_share == pytest.approx(5e-4 / 0.5, rel=0.2)
@@ -196,7 +196,7 @@ def test_the_first_of_several_reasons_is_told_and_the_others_counted():
 def test_a_part_that_is_missing_is_a_reservation():
     found = replace(RIGHT, determined=0.3).judged()
     assert found.is_trusted
-    assert "But part of the polarised regions determined, %: 30 " in found.verdict
+    assert "But part of the polarized regions determined, %: 30 " in found.verdict
 
 
 def test_views_integrated_one_by_one_say_that_none_was_left_out():

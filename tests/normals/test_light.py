@@ -27,7 +27,7 @@ def board():
 
 
 def dome_scene(light: str) -> Scene:
-    """A ball, whose light is polarised all round its rim under either kind of reflection."""
+    """A ball, whose light is polarized all round its rim under either kind of reflection."""
     views = board_scene(6).views
     ball = Sphere(center=np.zeros(3), radius=0.2)
     rendered = [
@@ -73,14 +73,14 @@ def test_the_light_of_a_curved_thing_is_told(light):
     assert diffuse_share(scene, tracks_at(scene, points)) == pytest.approx(expected, abs=0.05)
 
 
-def test_without_points_strong_polarisation_means_specular(board):
+def test_without_points_strong_polarization_means_specular(board):
     none = tracks_at(board, np.zeros((0, 3)))
     assert not any(mask.any() for mask in diffuse_masks(none, board.maps))
 
 
 @pytest.mark.parametrize("light", ["specular", "diffuse"])
 def test_a_part_without_points_is_told_by_its_own_phases(light):
-    """Weak polarisation, which alone would pass for diffuse, on a thing without sparse points."""
+    """Weak polarization, which alone would pass for diffuse, on a thing without sparse points."""
     scene = dome_scene(light)
     weak = [replace(m, samples=m.samples * np.float32([0.3, 0.3, 1])) for m in scene.maps]
     assert max(np.linalg.norm(m.samples[..., :2], axis=-1).max() for m in weak) < 0.4

@@ -14,7 +14,7 @@ OTHER = {Light.SPECULAR: Light.DIFFUSE, Light.DIFFUSE: Light.SPECULAR}
 
 
 def ball_scene(light: Light, sensor: str) -> Scene:
-    """A ball, whose light is polarised all round its rim under either kind of reflection."""
+    """A ball, whose light is polarized all round its rim under either kind of reflection."""
     views, ball = board_scene(6).views, Sphere(center=np.zeros(3), radius=0.2)
     rendered = [
         render_view(v, ball, light=light.value, sensor=sensor, s0=0.3, background=0.9)

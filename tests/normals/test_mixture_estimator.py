@@ -91,7 +91,7 @@ def test_wrong_observations_are_neither():
     assert estimate.row_weights[wrong].mean() < 0.1 < 0.9 < estimate.row_weights[~wrong].mean()
 
 
-def test_nothing_polarised_tells_nothing():
+def test_nothing_polarized_tells_nothing():
     rows, rays, _, rng = scene(10, 50)
     found = observe(rows, rays, dolp=NOISE * np.sqrt(2) * 1.05, rng=rng)
     estimate = solve_mixture(found, everyone(found))

@@ -51,7 +51,7 @@ def test_tilted_rows_take_back_what_ppa_leaves_out(scenes, light):
 
 
 def test_a_mark_in_the_window_hardly_counts():
-    """Half of it unpolarised and bright, so of less noise: the phase is that of the rest."""
+    """Half of it unpolarized and bright, so of less noise: the phase is that of the rest."""
     image = flat(0.5, 0.01)
     image[:, 20:, :2] = 0, 0.004
     image[:, 20:, 2] = 0.001**2
@@ -87,7 +87,7 @@ def test_clipped_pixels_do_not_count():
 
 
 def without_regions(maps):
-    """The maps as if nothing were polarised strongly enough for a region."""
+    """The maps as if nothing were polarized strongly enough for a region."""
     nothing = np.zeros_like(maps[0].region.inside)
     region = Region(nothing, nothing, nothing)
     return [m.changed(region=region, samples=np.zeros_like(m.samples)) for m in maps]

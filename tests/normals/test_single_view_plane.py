@@ -271,7 +271,7 @@ def test_a_sphere_beside_a_plane_leaves_the_plane_alone():
 
 
 def focal_samples(sensor, light=Light.SPECULAR, seed=0):
-    # Weakly polarised light needs the blur or, here, the more light.
+    # Weakly polarized light needs the blur or, here, the more light.
     full_well = 1e4 if light is Light.SPECULAR else 1e6
     view = View(name="a", camera=CAMERA, cam_from_world=look_at([0.1, 0.5, 0.5], [0.0, 0.1, 0.0]))
     rendered = render_view(view, Plane([0, 0, 0], [0.1, 0.0, 1]), sensor=sensor, light=str(light))

@@ -158,7 +158,7 @@ def test_a_mirror_image_behind_the_surface_is_no_seed(scene):
     assert select_seeds(tracks, estimate, marked(scene.maps))[1].sum() < 6
 
 
-def test_what_is_polarised_like_the_surface_about_it_is_no_mark(scene):
+def test_what_is_polarized_like_the_surface_about_it_is_no_mark(scene):
     points, _ = scene.surface_points(20)
     tracks = tracks_at(scene, points)
     assert np.median(dolp_shares(tracks, scene.maps)) > 0.9

@@ -813,7 +813,7 @@ def test_meshes_have_colours_or_a_texture(run: Path, tmp_path: Path, cli) -> Non
     assert "in the model's own unit, of no known scale" in text
     coloured = read_mesh(tmp_path / "part.ply")
     top = np.abs(coloured.vertices[:, 2] - BOARD_HEIGHT_M) < TOLERANCE_M
-    # Black lacquer, whose reflections are polarised, with some printed marks.
+    # Black lacquer, whose reflections are polarized, with some printed marks.
     assert np.median(coloured.colors[top]) < 80
     assert coloured.colors[top].max() > 150
     flags = ("--texture", "--texture-px", 256)

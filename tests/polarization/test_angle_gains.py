@@ -1,4 +1,4 @@
-"""Gains between the images of a view, told from polarised light."""
+"""Gains between the images of a view, told from polarized light."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ FOUR = (0.0, 45.0, 90.0, 135.0)
 
 
 def scene(angles, gains, *, ground_dolp=0.0, part=0.4, seed=0):
-    """A polarised part of every angle on a ground, with 1 % of noise."""
+    """A polarized part of every angle on a ground, with 1 % of noise."""
     rng = np.random.default_rng(seed)
     shape = (120, 160)
     s0 = rng.uniform(0.2, 0.8, shape)
@@ -39,7 +39,7 @@ def test_gains_of_any_angles_are_found(angles, part):
 
 
 @pytest.mark.parametrize("dolp", [0.0, 0.1, 0.3])
-def test_a_ground_that_is_polarised_is_no_gain(dolp):
+def test_a_ground_that_is_polarized_is_no_gain(dolp):
     images, usable = scene(FOUR, np.ones(4), ground_dolp=dolp)
     assert not find_angle_gains(images, FOUR, usable).differ
 
@@ -48,5 +48,5 @@ def test_too_little_to_go_by():
     images, usable = scene(FOUR, [0.2, 1, 1, 1])
     found = find_angle_gains(images, FOUR, np.zeros_like(usable))
     assert (found.gains, found.differ) == ((1.0,) * 4, False)
-    images, usable = scene(FOUR, [0.2, 1, 1, 1], part=0.97)  # hardly any unpolarised place
+    images, usable = scene(FOUR, [0.2, 1, 1, 1], part=0.97)  # hardly any unpolarized place
     assert not find_angle_gains(images, FOUR, usable).differ

@@ -228,7 +228,7 @@ def test_rows_from_axial_take_any_length_and_keep_float32():
     assert_same_up_to_sign(rows, expected, 1e-6)
 
 
-def test_no_polarisation_gives_a_nan_row():
+def test_no_polarization_gives_a_nan_row():
     zero = np.zeros(1)
     assert np.isnan(rows_from_axial(AngleModel.PPA, zero, zero, np.array([[0.0, 0.0, 1.0]]))).all()
 

@@ -1,4 +1,4 @@
-"""Edges of unpolarised things must not look polarised, at half and at full resolution."""
+"""Edges of unpolarized things must not look polarized, at half and at full resolution."""
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ SPLITS = {"half": split_mosaic, "full": split_mosaic_full}
 
 
 def edges(blur_px: float, noise: float = 0.003) -> np.ndarray:
-    """A mosaic of unpolarised polygons of random brightness, with a lens's blur."""
+    """A mosaic of unpolarized polygons of random brightness, with a lens's blur."""
     rng = np.random.default_rng(7)
     fine = np.full((768, 1024), 0.25, np.float32)
     for _ in range(60):
@@ -27,7 +27,7 @@ def edges(blur_px: float, noise: float = 0.003) -> np.ndarray:
 
 @pytest.mark.parametrize("resolution", SPLITS)
 @pytest.mark.parametrize("blur_px", [0.5, 1.0])
-def test_no_edge_is_a_polarised_region(resolution, blur_px):
+def test_no_edge_is_a_polarized_region(resolution, blur_px):
     images = SPLITS[resolution](edges(blur_px), PATTERN)
     nothing = np.zeros(images.shape[1:], bool)
     stokes = stokes_from_intensities(images, nothing)

@@ -140,7 +140,7 @@ def test_a_swapped_pattern_is_refused_with_one_that_fits(tmp_path, mosaics, patt
         open_capture(tmp_path, CaptureOptions(pattern=pattern))
 
 
-def test_an_unpolarised_capture_says_nothing_of_its_pattern(tmp_path):
+def test_an_unpolarized_capture_says_nothing_of_its_pattern(tmp_path):
     flat = np.random.default_rng(0).poisson(90, (240, 320)).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "a.png"), flat)
     for pattern in (PATTERN, (0, 45, 90, 135)):

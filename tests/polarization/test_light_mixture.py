@@ -50,7 +50,7 @@ def test_each_light_is_told_by_its_plane():
         assert sum(found[:3]) == pytest.approx(1)
 
 
-def test_unpolarised_light_tells_nothing():
+def test_unpolarized_light_tells_nothing():
     found = shares(normal_at(1.0), 0.005)
     t = LightMixtureTolerances()
     assert found.neither == pytest.approx(t.neither_share, abs=5e-3)
@@ -103,7 +103,7 @@ def test_labels_obey_what_is_given():
 
 
 def test_noise_of_the_angle_is_as_stated():
-    """Simulated noise of (s1, s2): the residual's z is normal, from sure to hardly polarised."""
+    """Simulated noise of (s1, s2): the residual's z is normal, from sure to hardly polarized."""
     rng = np.random.default_rng(1)
     exact = LightMixtureTolerances(model_sigma=0, mixture_sigma=0)
     for dolp in (0.4, 0.1, 0.06):

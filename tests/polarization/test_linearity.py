@@ -45,18 +45,18 @@ def test_the_message_names_the_setting_and_its_value():
     assert message.endswith("Give `capture.gamma` 1")
 
 
-def test_unpolarised_light_tells_nothing():
+def test_unpolarized_light_tells_nothing():
     nothing = [np.full((200, 240), 0.4, np.float32)] * 2
     rng = np.random.default_rng(0)
     noisy = [image + rng.normal(0, 0.01, image.shape).astype(np.float32) for image in nothing]
     for raws in (nothing, noisy, []):
         check = check_linearity(raws, PATTERN, 0.98, 2.2)
         assert check.fits is None
-        assert "too little polarised light" in check.message
+        assert "too little polarized light" in check.message
 
 
 def test_images_that_contradict_each_other_tell_nothing():
-    """As of different scenes, in one of which the polarisation itself follows the intensity."""
+    """As of different scenes, in one of which the polarization itself follows the intensity."""
     raws = mosaics()
     check = check_linearity([raws[0], raws[1], raws[2] ** 0.4545], PATTERN, 0.98, 1.0)
     assert check.fits is None

@@ -46,9 +46,9 @@ def test_gains_of_the_channels_stay_after_smoothing():
     """Phases of sensors with 2 % gain errors are within the stated deviation as often as normal."""
     rng = np.random.default_rng(3)
     height, width, dolp = 64, 128, 0.3
-    polarised = np.arange(height) >= 24
+    polarized = np.arange(height) >= 24
     aolp = np.tile(np.linspace(0, np.pi, width), (height, 1))
-    share = np.where(polarised, dolp, 0.0)[:, None]
+    share = np.where(polarized, dolp, 0.0)[:, None]
     within, unaware = [], []
     for _ in range(80):
         images = [

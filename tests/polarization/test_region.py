@@ -8,7 +8,7 @@ RNG = np.random.default_rng(0)
 
 
 def stokes_scene(dolp=0.6, phase=0.3):
-    """A dark polarised rectangle on a bright textured unpolarised ground."""
+    """A dark polarized rectangle on a bright textured unpolarized ground."""
     s0 = 0.5 + 0.3 * RNG.standard_normal(SHAPE)
     s1, s2 = np.zeros(SHAPE), np.zeros(SHAPE)
     part = np.zeros(SHAPE, bool)
@@ -24,14 +24,14 @@ def find(s0, s1, s2, valid=None, **options):
     return find_region(*images, valid, min_dolp=0.1, **options)
 
 
-def test_the_polarised_part_is_found():
+def test_the_polarized_part_is_found():
     s0, s1, s2, part = stokes_scene()
     region = find(s0, s1, s2)
     assert (region.inside & part).sum() > 0.95 * part.sum()
     assert (region.inside & part).sum() > 0.9 * region.inside.sum()
 
 
-def test_no_polarisation_no_region():
+def test_no_polarization_no_region():
     s0, _, _, _ = stokes_scene()
     assert not find(s0, np.zeros(SHAPE), np.zeros(SHAPE)).inside.any()
 
@@ -46,7 +46,7 @@ def test_a_mark_is_inside_but_not_reliable():
     assert not region.reliable[mark].any()
 
 
-def test_a_textureless_unpolarised_spot_belongs_to_the_region_without_being_reliable():
+def test_a_textureless_unpolarized_spot_belongs_to_the_region_without_being_reliable():
     s0, s1, s2, _ = stokes_scene()
     spot = np.zeros(SHAPE, bool)
     spot[40:80, 60:110] = True
@@ -59,7 +59,7 @@ def test_a_textureless_unpolarised_spot_belongs_to_the_region_without_being_reli
 @pytest.mark.parametrize(
     ("factor", "joins"), [(1.0, True), (1.3, True), (0.77, True), (2.5, False), (0.4, False)]
 )
-def test_an_unpolarised_side_joins_if_it_is_as_bright(factor, joins):
+def test_an_unpolarized_side_joins_if_it_is_as_bright(factor, joins):
     s0, s1, s2, _ = stokes_scene()
     side = np.zeros(SHAPE, bool)
     side[30:90, 95:130] = True
@@ -106,7 +106,7 @@ def test_the_users_mask_replaces_the_search():
 
 @pytest.mark.parametrize("shade", [1.0, 0.97])
 def test_growth_does_not_run_into_an_open_textureless_background(shade):
-    """A small polarised patch before a flat background of like brightness keeps its own extent."""
+    """A small polarized patch before a flat background of like brightness keeps its own extent."""
     s0 = np.full(SHAPE, 0.1 * shade)
     s1, s2 = np.zeros(SHAPE), np.zeros(SHAPE)
     s0[50:70, 70:90], s1[50:70, 70:90] = 0.1, 0.06

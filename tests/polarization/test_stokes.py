@@ -113,7 +113,7 @@ def test_noise_matches_the_simulation_at_every_intensity(read_noise):
 
 @pytest.mark.parametrize("spread", [0.0, 0.02])
 def test_sigma_covers_gain_errors(spread):
-    """Uniform AoLP over a sky that is half unpolarised; gains drawn anew for each sensor."""
+    """Uniform AoLP over a sky that is half unpolarized; gains drawn anew for each sensor."""
     rng = np.random.default_rng(3)
     height, width = 96, 192
     s0 = np.broadcast_to(np.linspace(0.4, 1.2, width), (height, width))

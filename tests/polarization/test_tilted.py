@@ -93,7 +93,7 @@ def test_on_the_axis_nothing_is_corrected(light):
     np.testing.assert_allclose(corrected, parameters, rtol=1e-12)
 
 
-def test_unpolarised_light_stays_so(light):
+def test_unpolarized_light_stays_so(light):
     parameters = np.array([0.8, 0.0, 0.0])[:, None, None] * np.ones(RAYS.shape[:2])
     s0, s1, s2 = corrected(np.full((4, *RAYS.shape[:2]), 0.4), light)
     np.testing.assert_allclose(s0, 0.8, rtol=1e-12)

@@ -144,7 +144,7 @@ def test_frames_of_boxes_begin_with_the_model_s() -> None:
     np.testing.assert_allclose(found[:3], turn @ point + [1, 2, 3])
 
 
-def test_the_target_is_on_the_polarised_surface() -> None:
+def test_the_target_is_on_the_polarized_surface() -> None:
     rng = np.random.default_rng(0)
     surface, around = rng.normal(0, 0.1, (50, 3)), rng.normal(9, 0.1, (500, 3))
     kind = np.r_[np.full(50, PointKind.SURFACE), np.full(500, PointKind.SPARSE)]

@@ -183,7 +183,7 @@ def test_views_that_agree_are_all_kept(surface):
     assert not surface.left_out.any()
 
 
-def half_unpolarised(phase_map):
+def half_unpolarized(phase_map):
     """The phase map of a view that shows half of the object only, and nothing wrong."""
     inside = phase_map.region.inside.copy()
     inside[:, inside.shape[1] // 2 :] = False
@@ -191,7 +191,7 @@ def half_unpolarised(phase_map):
 
 
 def test_a_view_that_shows_half_of_the_object_takes_no_half_away(maps):
-    found = reconstruct([*maps[:7], half_unpolarised(maps[7]), *maps[8:]], masks_given=True)
+    found = reconstruct([*maps[:7], half_unpolarized(maps[7]), *maps[8:]], masks_given=True)
     assert not found.left_out.any()
     assert np.ptp(found.mesh.vertices, axis=0).min() > 1.8
 
@@ -199,7 +199,7 @@ def test_a_view_that_shows_half_of_the_object_takes_no_half_away(maps):
 def test_outlines_are_held_against_a_mesh(maps):
     views = [surface_view(one, find_silhouette(one, mask_given=True)) for one in maps[:3]]
     views[1] = surface_view(
-        half_unpolarised(maps[1]), find_silhouette(half_unpolarised(maps[1]), mask_given=True)
+        half_unpolarized(maps[1]), find_silhouette(half_unpolarized(maps[1]), mask_given=True)
     )
     ball = extracted(sphere(), step=0.05)
     whole, half, also_whole = outline_mismatch(ball, views)

@@ -40,7 +40,7 @@ class Annulus:
 
 
 def vessel_maps(bore=RADIUS - WALL, offset=0.0, dark=0.02):
-    """Phase maps of a vessel with a bore, dark inside, on an unpolarised bright ground."""
+    """Phase maps of a vessel with a bore, dark inside, on an unpolarized bright ground."""
     middle = HEIGHT / 2
     surfaces = [
         Cylinder([0, 0, middle], [0, 0, 1], RADIUS, middle),

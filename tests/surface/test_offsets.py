@@ -131,7 +131,7 @@ def test_space_above_the_faces_of_a_step_is_free(height, tilt_deg):
 def test_walls_stand_where_the_intensity_steps(top_gain, most):
     """To a tenth of a pixel; without a step, the labels' cells end at most half of one beside it.
 
-    Polarisation alone shows the border then, whose steps the regions' smoothing widens.
+    Polarization alone shows the border then, whose steps the regions' smoothing widens.
     """
     scene = step_scene(0.03, top_gain=top_gain)
     (group,) = stepped_faces(

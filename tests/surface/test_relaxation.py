@@ -227,7 +227,7 @@ def test_nodes_of_unknown_place_take_no_rows(board):
     above = ring_of_views(
         5, CAMERA, target=board.views[0].center_in_world, distance=0.4, elevation_deg=60
     )
-    watching = [_polarised(board.maps[0], view) for view in above]
+    watching = [_polarized(board.maps[0], view) for view in above]
     surface = relaxed(board, [*board.maps, *watching], nodes).surface
     assert (surface.confidence[lost] == 0).all()
     assert (surface.normal_sigma[lost] > 0.05).all()  # filled from the neighbours
@@ -235,8 +235,8 @@ def test_nodes_of_unknown_place_take_no_rows(board):
     assert (surface.normals[lost] * nodes.surface.normals[lost]).sum(-1).min() > 0.99
 
 
-def _polarised(phase_map, view):
-    """Map of a view whose image shows polarised light all over."""
+def _polarized(phase_map, view):
+    """Map of a view whose image shows polarized light all over."""
     everywhere = np.ones_like(phase_map.region.inside)
     # Planes of incidence that hold the vertical: all views agree on it as a normal.
     samples = np.dstack([-0.3 * everywhere, 0.0 * everywhere, 1e4 * everywhere])
@@ -352,7 +352,7 @@ def test_the_tilted_model_knows_no_such_doubt(oblique):
     np.testing.assert_array_equal(
         aware, sigma_at_own_pixels(tilted, AngleModel.TILTED, tilt_aware=False)
     )
-    # The row turns about its ray as the direction of polarisation does, whose phase was measured.
+    # The row turns about its ray as the direction of polarization does, whose phase was measured.
     np.testing.assert_allclose(aware[some], oblique.samples[..., 2][some] ** -0.5, rtol=2e-2)
 
 

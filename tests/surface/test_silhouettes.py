@@ -81,7 +81,7 @@ def _bright_hole(ball):
 def test_dark_pixels_that_go_on_are_unknown(ball):
     inside = ball.region.inside
     left = inside.copy()
-    left[:, 86:] = False  # unpolarised there, as dark as the rest
+    left[:, 86:] = False  # unpolarized there, as dark as the rest
     silhouette = found_silhouette(with_region(ball, left))
     missing = inside & ~left
     assert (silhouette.possible & missing).sum() > 0.4 * missing.sum()  # up to the blurred edge
@@ -112,7 +112,7 @@ def test_how_far_a_region_leaks_does_not_move_the_outline(leak):
     assert shift[20:40, 40] == pytest.approx(-leak, abs=0.03)
 
 
-def test_nothing_polarised_gives_an_empty_silhouette(ball):
+def test_nothing_polarized_gives_an_empty_silhouette(ball):
     silhouette = found_silhouette(with_region(ball, np.zeros_like(ball.region.inside)))
     assert not silhouette.possible.any()
 

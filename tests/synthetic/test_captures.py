@@ -168,7 +168,7 @@ def test_dolp_by_fresnel():
 
 
 @pytest.mark.parametrize("sensor", ["ppa", "opa", "tilted"])
-def test_head_on_the_phase_is_undefined_and_the_light_unpolarised(sensor):
+def test_head_on_the_phase_is_undefined_and_the_light_unpolarized(sensor):
     rendered = render_view(*frontal_plane(0.0), sensor=sensor)
     assert rendered.mask.all()
     assert np.isnan(rendered.phase).all()

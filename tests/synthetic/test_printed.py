@@ -29,7 +29,7 @@ def half_size(mosaic):
     return mosaic.reshape(CAMERA.height, 2, CAMERA.width, 2).mean(axis=(1, 3))
 
 
-def test_only_the_part_is_polarised(views) -> None:
+def test_only_the_part_is_polarized(views) -> None:
     mosaic = render_printed_mosaic(views[0], SCENE)
     i90, i0 = mosaic[::2, ::2], mosaic[1::2, 1::2]
     part, _ = render_printed_truth(views[0], SCENE)

@@ -8,8 +8,8 @@ one leaves the least phase residual.
 Light that no single normal explains (mixed with that from under the surface, or from a second
 reflection) shifts the minimum by more than its deviation: on a real pond of nominally 870 px it
 was 837 +- 22, 880 +- 22 and 908 +- 25 px from the pixels with a DoLP over 0.35, 0.45 and 0.55. The
-correction is not linear in noise: blur images of weak polarisation (noise over a tenth of the
-polarised intensity) first.
+correction is not linear in noise: blur images of weak polarization (noise over a tenth of the
+polarized intensity) first.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ def _pick(
     sigma: Floats,
     light: Light,
 ) -> _View:
-    """Evenly spaced ones of the polarised pixels that are known."""
+    """Evenly spaced ones of the polarized pixels that are known."""
     if parameters.shape != (3, len(sigma)) or offsets_px.shape != (2, len(sigma)):
         raise ValueError(
             f"{parameters.shape=}, {offsets_px.shape=}, {sigma.shape=} but expected (3, N), "

@@ -209,7 +209,7 @@ def select_pixels(
         raise DataError(
             source,
             f"only {np.count_nonzero(mask)} pixels have a DoLP above {options.min_dolp} there; "
-            "lower `plane.min_dolp` or choose a polarised area.",
+            "lower `plane.min_dolp` or choose a polarized area.",
         )
     return np.asarray(mask)
 

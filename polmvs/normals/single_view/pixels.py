@@ -46,7 +46,7 @@ class PlaneView:
 
         Returns
         -------
-        axial : (2, H, W), ``(cos 2 phase, sin 2 phase)`` times the polarised intensity.
+        axial : (2, H, W), ``(cos 2 phase, sin 2 phase)`` times the polarized intensity.
         rays : (3, H, W), unit, camera frame.
         sigma : (H, W), standard deviation of the phase, rad.
         """
@@ -103,7 +103,7 @@ def phase_sigma(stokes: Stokes, *, tolerances: PhaseTolerances | None = None) ->
     """Deviation of the phase (H, W), rad: noise, the model's error, and light of the other kind.
 
     As in :mod:`polmvs.polarization.phase_map`, for single pixels; infinite or NaN where there is
-    no polarisation.
+    no polarization.
     """
     t = tolerances or PhaseTolerances()
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -124,7 +124,7 @@ def plane_normal(
     Returns
     -------
     Not valid for fewer than two pixels, or where their rows have rank 1. Pixels that are not
-    finite or have no polarisation are left out.
+    finite or have no polarization are left out.
     """
     samples = stack_samples(angle_model, axial, rays, sigma)
     num = samples.shape[1]
@@ -288,7 +288,7 @@ class NormalEquations(NamedTuple):
 
 
 def stack_samples(angle_model: AngleModel, axial: Floats, rays: Floats, sigma: Floats) -> Floats:
-    """Samples (5, N) of the pixels that count: polarised, finite, with a sigma.
+    """Samples (5, N) of the pixels that count: polarized, finite, with a sigma.
 
     Parameters
     ----------

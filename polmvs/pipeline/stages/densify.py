@@ -1,6 +1,6 @@
 """Stage ``densify_MODEL``: the dense cloud of a scene, and the dense depth of its views.
 
-The cloud holds the polarised surfaces and their surroundings, told apart by the kind of a point.
+The cloud holds the polarized surfaces and their surroundings, told apart by the kind of a point.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class DensifyResult:
 
     Attributes
     ----------
-    num_points : of the cloud, on polarised surfaces.
+    num_points : of the cloud, on polarized surfaces.
     num_surroundings : of the cloud, beside them.
     method : by which the points were made: the views one by one where there is no surface from all.
     tilt_share : of the turn by tilted polarizers that the surface of all views took back; None by
@@ -132,7 +132,7 @@ class _Inputs:
 
 @dataclass(frozen=True, kw_only=True)
 class _Surface:
-    """The polarised surfaces, and how they were made; ``points`` are of a surface of all views."""
+    """The polarized surfaces, and how they were made; ``points`` are of a surface of all views."""
 
     cloud: FusedCloud
     method: Method
@@ -461,12 +461,12 @@ def _surroundings_cloud(
     workspace: DenseWorkspace | None,
     folder: Path,
 ) -> Cloud:
-    """Points of the scene beside its polarised parts, of the kind that the options ask for.
+    """Points of the scene beside its polarized parts, of the kind that the options ask for.
 
     Parameters
     ----------
     tracks : of the COLMAP model.
-    surface : of the polarised parts; what COLMAP saw there is left out.
+    surface : of the polarized parts; what COLMAP saw there is left out.
     workspace : the user's of COLMAP, if there is one; its points are the surroundings.
     folder : for what is kept on disk meanwhile.
     """

@@ -1,4 +1,4 @@
-"""Stages ``maps`` and ``maps_tilted``: where each view shows a polarised surface, and its phase.
+"""Stages ``maps`` and ``maps_tilted``: where each view shows a polarized surface, and its phase.
 
 The maps of OPA and PPA are the same; those of the tilted model are corrected for the tilt of the
 sensor's polarizers and lie in a folder of their own.
@@ -59,7 +59,7 @@ class MapsResult:
 
     Attributes
     ----------
-    num_region_px : pixels of all views that show a polarised surface.
+    num_region_px : pixels of all views that show a polarized surface.
     num_diffuse_px : those of them whose light is diffuse.
     complaints : settings that the phases contradict, a clause each.
     cut_share : of the bands outside of the user's masks, how much is polarized as a surface is,
@@ -72,7 +72,7 @@ class MapsResult:
     cut_share: float | None = None
 
     def __str__(self) -> str:
-        return f"{self.num_region_px:,} polarised pixels, {self.num_diffuse_px:,} of them diffuse"
+        return f"{self.num_region_px:,} polarized pixels, {self.num_diffuse_px:,} of them diffuse"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Stage ``mesh_MODEL``: a mesh of the polarised surfaces, that of all views or Poisson's."""
+"""Stage ``mesh_MODEL``: a mesh of the polarized surfaces, that of all views or Poisson's."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class MeshResult:
 
 
 def make_mesh(cloud: Path, views: Path, target: Path) -> MeshResult:
-    """Mesh of the polarised surfaces: what cloud and views were made from, or Poisson's of a cloud.
+    """Mesh of the polarized surfaces: what cloud and views were made from, or Poisson's of a cloud.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Stage ``seeds``: the points of known place from which surfaces grow, one set for all models.
 
-They are the sparse points that lie on a polarised surface. PPA chooses them, so that a comparison
+They are the sparse points that lie on a polarized surface. PPA chooses them, so that a comparison
 of models starts from the same.
 """
 
