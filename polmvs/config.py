@@ -573,13 +573,17 @@ class FusionOptions(OptionGroup, group="fusion"):
 
     min_views: int = option(2, "views that must agree on a point, its own included", least=1)
     max_range_difference_px: float = option(
-        2.0, "disagreement of two views' distances, in footprints of a pixel", above=0
+        2.0,
+        "disagreement of two views' distances, in GSD (length of a pixel at the surface)",
+        above=0,
     )
     max_normal_difference_deg: float = option(
         15.0, "disagreement of two views' normals, degrees", above=0, most=90
     )
     voxel_px: float = option(
-        0.5, "edge of the merging voxel, in footprints of a pixel; 0: no merging", least=0
+        0.5,
+        "edge of the merging voxel, in GSD (length of a pixel at the surface); 0: no merging",
+        least=0,
     )
     voxel: float | None = option(
         None,

@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 
 KEYPOINT_SIGMA_PX = 0.5  # of a keypoint of SfM: the usual reprojection error after adjustment
 # Between a normal and the direction to the camera. A surface seen flatter than 6 degrees shows a
-# tenth of its pixels, and its range changes by ten footprints a pixel.
+# tenth of its pixels, and its range changes by ten GSDs a pixel.
 MIN_FACING_COSINE = 0.1
 # Of a coordinate in any unit, and of a point from a camera that sees it. Guesses: beyond them
 # squares lose all that matters, or overflow, and no measurement lies there.
@@ -253,7 +253,7 @@ def without_views(model: SparseModel, names: Collection[str]) -> tuple[SparseMod
 class PointKind(IntEnum):
     """What a point of a cloud is: on a polarized part, or how it was found beside one.
 
-    ``PRESUMED`` is on a part where no phase shows it: the inner wall of a vessel, presumed to be
+    ``INFERRED`` is on a part where no phase shows it: the inner wall of a vessel, inferred to be
     as thick as its rim.
     """
 
@@ -261,4 +261,4 @@ class PointKind(IntEnum):
     SPARSE = 1
     STEREO = 2
     COLMAP = 3
-    PRESUMED = 4
+    INFERRED = 4

@@ -214,7 +214,7 @@ def test_cloud_and_mesh_are_open3ds(result: polmvs.Reconstruction) -> None:
 
 
 def test_maps_show_the_cloud(result: polmvs.Reconstruction, demo_capture: Path) -> None:
-    """Where a point of the cloud projects, the map has its depth: less than a pixel's footprint."""
+    """Where a point of the cloud projects, the map has its depth: less than a pixel's gsd."""
     assert len(result.view_names) == 10
     view = result._view("003")
     depth, normals = result.depth_map("003.png"), result.normal_map("003")

@@ -100,7 +100,7 @@ def deviation_lines(found: Deviation) -> list[str]:
     ]
     if np.isfinite(f.median_sigma):
         lines.append(
-            f"stated deviation of a distance {f.median_sigma:.4f} mm (median); "
+            f"uncertainty (1 sigma) of a distance {f.median_sigma:.4f} mm (median); "
             f"{100 * f.significant_share:.1f} % of the points are farther off than three of theirs"
         )
     if f.repeatability is not None:

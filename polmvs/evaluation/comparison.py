@@ -317,7 +317,7 @@ def comparison_rows(comparison: Comparison) -> tuple[list[str], list[list[str]]]
 
     rows = [
         row("points", lambda m: f"{m.consistency.num_points:,}"),
-        row("part of the region covered, %", lambda m: number(m.consistency.coverage, 100, 1)),
+        row("coverage, %", lambda m: number(m.consistency.coverage, 100, 1)),
         row(
             "agreement of the views that see a point, %",
             lambda m: number(m.consistency.agreement, 100, 1),
@@ -361,7 +361,7 @@ def _truth_rows(
             *[number(m.depth_within_1mm if m else None, 100, 1) for m in maps],
         ],
         [
-            "depths within one / two stated deviations, %",
+            "depths within one / two sigma, %",
             *[_within_sigmas(m) if m else number(None) for m in maps],
         ],
         [

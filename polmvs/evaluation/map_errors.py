@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 
 # These define the figures; they are no tolerances of an algorithm.
 WHOLE_SHARE = 0.999  # of the pixels about a lattice point; interpolation rounds
-MAX_SLOPE = 20.0  # depth per width of a pixel's footprint: a surface seen under 3 deg, or a step
+MAX_SLOPE = 20.0  # depth per width of a pixel's gsd: a surface seen under 3 deg, or a step
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -63,5 +63,5 @@ def cloud_rows(cloud: CloudMetrics) -> list[list[str]]:
     rows.append(
         ["normal error, mean / median, deg", pair(cloud.normal_mean_deg, cloud.normal_median_deg)]
     )
-    rows.append(["points off every surface, %", number(cloud.off_surface_share, 100, 1)])
+    rows.append(["outliers, %", number(cloud.off_surface_share, 100, 1)])
     return rows

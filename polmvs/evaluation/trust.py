@@ -284,7 +284,7 @@ class Trust:
                 True,
             ),
             (
-                "phase residual, median, stated deviations",
+                "phase residual, median, sigma",
                 self.residual_sigmas,
                 ranges.residual_sigmas,
                 1.0,
@@ -316,7 +316,7 @@ class Trust:
                 False,
             ),
             (
-                "stated deviation of the places, median, % of the distance",
+                "position uncertainty (1 sigma), median, % of the distance",
                 self.sigma_share,
                 ranges.sigma_share,
                 100.0,

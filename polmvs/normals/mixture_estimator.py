@@ -44,7 +44,7 @@ class MixtureTolerances:
 
     Attributes
     ----------
-    light : what is presumed of the light.
+    light : what is assumed of the light.
     num_directions : all over the sphere, that are tried. Derived: neighbours are 9 deg apart.
     direction_sigma : rad, of a direction tried. Derived: half the distance of neighbours, and more.
     num_modes : best directions that are refined. Guess.

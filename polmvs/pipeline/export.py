@@ -219,7 +219,7 @@ def part_of(cloud: Cloud) -> Cloud:
     kinds = cloud.scalars.get("kind")
     if kinds is None:
         return cloud
-    return cloud.only(np.isin(kinds, (PointKind.SURFACE, PointKind.PRESUMED)))
+    return cloud.only(np.isin(kinds, (PointKind.SURFACE, PointKind.INFERRED)))
 
 
 def _export_cameras(

@@ -8,7 +8,7 @@ Tilted polarizers
 -----------------
 A polarizer in the image plane with absorbing axis A lets through ``I = tr J - a' J a`` of light
 with the transverse coherency J, ``a = normalise(A - (A . v) v)`` for the ray v (Korger et al.
-2013; Pistellato and Bergamasco 2024). This presumes that rays meet the sensor at the angle at
+2013; Pistellato and Bergamasco 2024). This infers that rays meet the sensor at the angle at
 which they enter the lens; for other lenses see below.
 
 The basis of a ray's transverse plane is the image's x and upward y, turned by the shortest
@@ -41,7 +41,7 @@ Telecentric lenses
 A lens that is telecentric on the image side turns each ray, and the field with it, in the plane
 of ray and axis until it meets the sensor straight. The polarizers are not tilted then, and the
 sensor measures the Stokes parameters ``S`` of the ray's transverse plane. PPA is not exact here
-either: it presumes the projections above. Its phase is off by up to ``arcsin((1 - v_z) / (1 +
+either: it infers the projections above. Its phase is off by up to ``arcsin((1 - v_z) / (1 +
 v_z))``, 4.1 degrees at 30 degrees off the axis, about as much as behind tilted polarizers, because
 tilt changes ``S`` only to second order in g. For the same reason the tilted model is nearly right
 behind such a lens: it is off by up to 0.2 degrees at 30 and 1.2 degrees at 45 degrees off the axis.

@@ -46,7 +46,7 @@ LOGISTIC_SCALE = 1.702  # of a logistic distribution that comes nearest to the n
 
 @dataclass(frozen=True, kw_only=True)
 class LightMixtureTolerances:
-    """What is presumed of light and surface before any phase is seen.
+    """What is assumed of light and surface before any phase is seen.
 
     Attributes
     ----------

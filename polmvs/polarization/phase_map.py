@@ -311,7 +311,7 @@ def _lowest_dolp(stokes: Image, *, tolerances: PhaseTolerances) -> NDArray[np.ui
 def as_tilted(phase_map: PhaseMap) -> PhaseMap:
     """The phase map that a sensor obeying PPA would have given, not stored.
 
-    Presumes that the polarizers are tilted for oblique rays
+    infers that the polarizers are tilted for oblique rays
     (:mod:`polmvs.polarization.angle_models`). The correction is linear in the Stokes parameters
     and varies slowly over the image, so that it may follow the smoothing.
     """

@@ -27,8 +27,7 @@ _MEANINGS = {
     "scale": "Whether lengths are true: by known cameras, markers or a distance.",
     "size": "Of the part, along its three main directions, without the outermost half per cent.",
     # the comparison
-    "part of the region covered": "Share of the polarized pixels, over all views, in which the "
-    "cloud has a point.",
+    "coverage": "Share of the polarized pixels, over all views, in which the cloud has a point.",
     "agreement of the views": "Of all views that see a point, the share that agree with its place "
     "and normal.",
     "phase residual over all views": "Angle between the measured phase and the one that the "
@@ -48,18 +47,18 @@ _MEANINGS = {
     "completeness": "Share of the true surface that has a point of the cloud so near to it.",
     "Chamfer distance": "Mean distance from the cloud to the true surface and back.",
     "normal error": "Angle between the cloud's normals and the true ones.",
-    "points off every surface": "Share of the points that lie near no surface of the scene.",
+    "outliers": "Share of the points that lie near no surface of the scene.",
     # trust
     "phase residual, median, deg": "Angle between measured phases and those that the surface "
     "predicts.",
-    "phase residual, median, stated": "The same in the standard deviations that the phases are "
+    "phase residual, median, sigma": "The same in the standard deviations that the phases are "
     "stated with.",
     "views that agree": "Of all views that see a point, the share that agree with its place and "
     "normal.",
     "points within the silhouettes": "Share of the points that fall inside the outline of the part "
     "in the views that see them.",
     "part of the polarized regions": "Share of the polarized pixels that the surface explains.",
-    "stated deviation of the places": "How uncertain places are by their own statement, as a share "
+    "position uncertainty (1 sigma)": "How uncertain places are by their own statement, as a share "
     "of their distance.",
     # deviation
     "compared points": "Points of the part that were compared with the reference.",
@@ -67,7 +66,7 @@ _MEANINGS = {
     "standard deviation": "Of the signed distances about their mean.",
     "RMS": "Root mean square of the signed distances.",
     "percentile": "That share of the points has a smaller signed distance.",
-    "stated deviation of a distance": "Median of the standard deviations that the result states.",
+    "uncertainty (1 sigma) of a distance": "Median over the points.",
     "farther off than three": "Share of the points whose distance is no chance, by their stated "
     "deviations.",
     "within the tolerance": "Share of the points whose distance is at most the tolerance.",

@@ -74,7 +74,7 @@ MAX_POINTS = 150_000  # of each cloud on the page: two clouds turn smoothly, and
 ANGLE_BINS_DEG = np.arange(0.0, 91.0, 5.0)
 # Rows of the comparison that tell the models apart at a glance.
 HEADLINE = (
-    "part of the region covered, %",
+    "coverage, %",
     "phase residual over all views, RMSE / median, deg",
     "depth maps, RMSE, mm",
     "F-score at 1 mm, %",
@@ -412,7 +412,7 @@ def _mesh_layer(model: AngleModel, mesh: Mesh, layers: Sequence[Layer]) -> Layer
     of_cloud = next((layer for layer in layers if layer.label == f"{label} cloud"), None)
     if of_cloud is not None:
         kind = of_cloud.values.get("kind", np.zeros(len(of_cloud.points)))
-        own = np.flatnonzero(np.isin(kind, (PointKind.SURFACE, PointKind.PRESUMED)))
+        own = np.flatnonzero(np.isin(kind, (PointKind.SURFACE, PointKind.INFERRED)))
         if len(own):
             nearest = own[cKDTree(of_cloud.points[own]).query(mesh.vertices)[1]]
             # Kinds are names, which cannot change gradually over a triangle.
@@ -704,7 +704,7 @@ def _deviation_section(given: ReportInput) -> DeviationSection | None:
         ["standard deviation, mm", number(f.standard_deviation, 1, 4)],
         ["RMS, mm", number(f.rms, 1, 4)],
         *[[f"percentile {p} %, mm", f"{value:+.3f}"] for p, value in f.percentiles.items()],
-        ["stated deviation of a distance, median, mm", number(f.median_sigma, 1, 4)],
+        ["uncertainty (1 sigma) of a distance, median, mm", number(f.median_sigma, 1, 4)],
         ["farther off than three of these, %", number(f.significant_share, 100, 1)],
     ]
     if f.share_within is not None:
@@ -845,7 +845,7 @@ def _against_views(given: ReportInput) -> list[Plot]:
     if not any(len(values) for values in sigma.values()):
         return []
     edges = np.arange(0.5, len(given.sparse.views) + 1.5)
-    names = ("views that agree on a point", "stated deviation of its normal, deg")
+    names = ("views that agree on a point", "uncertainty (1 sigma) of its normal, deg")
     return [
         Plot(
             svg=plots.error_against(sigma, count, edges, names),

@@ -175,7 +175,7 @@ def wall_normals(
 ) -> tuple[Array, Mask]:
     """Normals ``(F, 3)``, those of carved walls as they were carved, and which faces ``(F,)`` are.
 
-    Walls of steps and of hollows see what stands beside them, and their phases are those of its
+    Walls of steps and of cavities see what stands beside them, and their phases are those of its
     mirror image.
 
     Parameters

@@ -32,7 +32,7 @@ class FusionTolerances:
     ----------
     min_tolerance : share of the tolerance that is left to views however certain they are.
         Guess.
-    min_sigma_px : of a range, in footprints: no view is trusted more than that. Guess.
+    min_sigma_px : of a range, in GSDs: no view is trusted more than that. Guess.
     """
 
     min_tolerance: float = 0.5
@@ -83,7 +83,7 @@ def fuse(
 
     A point stays if enough views agree with it in distance and normal and if not most of the
     views that should see it see through it or show no polarized surface there. Distances may
-    differ by what their deviations explain, at most by as many footprints as the options say and
+    differ by what their deviations explain, at most by as many GSDs as the options say and
     never by less than half of it. The point moves along its ray to the mean of the places that the
     agreeing views give it, weighted by their deviations. Points closer than the merging voxel
     become one; lone points go.
@@ -92,7 +92,7 @@ def fuse(
     ----------
     maps : phase maps of the views.
     dense : per view its dense result.
-    options : thresholds, in footprints of a pixel.
+    options : thresholds, in GSD (length of a pixel at the surface).
     max_neighbors : other views that are asked about a view's points, nearest first.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done.
@@ -108,29 +108,29 @@ def fuse(
         order = np.argsort(((centers - centers[i]) ** 2).sum(axis=-1), kind="stable")
         near = [used[j] for j in order if j != i][:max_neighbors]
         tasks.append([(maps[j], dense[j]) for j in [k, *near]])
-    clouds, footprints = [], []
+    clouds, gsds = [], []
     for k, part in zip(
         used, workers.map(partial(_confirm, options, tolerances=tolerances), tasks), strict=True
     ):
         clouds.append(part.cloud)
-        footprints.append(part.footprint)
+        gsds.append(part.gsd)
         on_confirmed(k, part.confirmed)
         on_progress(1)
     cloud = concatenate(clouds)
     if not len(cloud.points):
         return cloud
-    footprint = float(np.median(np.concatenate(footprints)))
-    voxel = options.voxel if options.voxel is not None else options.voxel_px * footprint
+    gsd = float(np.median(np.concatenate(gsds)))
+    voxel = options.voxel if options.voxel is not None else options.voxel_px * gsd
     cloud = merge(cloud, voxel)
     return cloud[are_usual(point_spacings(cloud.points))]
 
 
 @dataclass(frozen=True)
 class _Confirmed:
-    """Confirmed points of a view, their pixels' footprints, and where (h, w) they lie in it."""
+    """Confirmed points of a view, their pixels' GSDs, and where (h, w) they lie in it."""
 
     cloud: FusedCloud
-    footprint: NDArray[np.float32]
+    gsd: NDArray[np.float32]
     confirmed: Mask
 
 
@@ -149,18 +149,18 @@ def _confirm(
     normals = dense.normals_in_world[known].astype(np.float64)
     rays = view.rays_in_world(xy)
     center = view.center_in_world
-    footprint = distance / view.camera.mean_focal_px
+    gsd = distance / view.camera.mean_focal_px
     # As the others' deviations: grazing sight counts less.
     cosine = np.maximum(np.abs((rays * normals).sum(axis=-1)), MIN_FACING_COSINE)
-    sigma = _finite_sigma(dense.sigma[known] / cosine, footprint, tolerances=tolerances)
-    tolerance = options.max_range_difference_px * footprint
+    sigma = _finite_sigma(dense.sigma[known] / cosine, gsd, tolerances=tolerances)
+    tolerance = options.max_range_difference_px * gsd
     total = 1 / sigma**2
     place, normal = total * distance, total[:, None] * normals
     votes, conflicts = np.ones(len(distance), np.int32), np.zeros(len(distance), np.int32)
     min_cosine = np.cos(np.radians(options.max_normal_difference_deg))
     for other_map, other in views[1:]:
         seen = sight(other_map, other, center, rays, distance, normals)
-        other_sigma = _finite_sigma(seen.sigma, footprint, tolerances=tolerances)
+        other_sigma = _finite_sigma(seen.sigma, gsd, tolerances=tolerances)
         explained = MAX_DEVIATIONS * np.hypot(sigma, other_sigma)
         allowed = np.clip(explained, tolerances.min_tolerance * tolerance, tolerance)
         agrees = (np.abs(seen.place - distance) < allowed) & (seen.cosine > min_cosine)
@@ -183,13 +183,13 @@ def _confirm(
     )
     confirmed = known.copy()
     confirmed[known] = keep
-    return _Confirmed(cloud[keep], footprint[keep].astype(np.float32), confirmed)
+    return _Confirmed(cloud[keep], gsd[keep].astype(np.float32), confirmed)
 
 
-def _finite_sigma(sigma: Floats, footprint: Array, *, tolerances: FusionTolerances) -> Array:
-    """Deviations of ranges, no smaller than a share of the footprint; large where unknown."""
+def _finite_sigma(sigma: Floats, gsd: Array, *, tolerances: FusionTolerances) -> Array:
+    """Deviations of ranges, no smaller than a share of the gsd; large where unknown."""
     known = np.isfinite(sigma)
-    return np.where(known, np.maximum(sigma, tolerances.min_sigma_px * footprint), footprint)
+    return np.where(known, np.maximum(sigma, tolerances.min_sigma_px * gsd), gsd)
 
 
 def concatenate(clouds: Sequence[FusedCloud]) -> FusedCloud:

@@ -26,6 +26,7 @@ from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, View
+from polmvs.surface.cavities import Cavity, SurfaceFaces, find_cavities
 from polmvs.surface.creases import (
     corner_normals,
     sharpened,
@@ -35,7 +36,6 @@ from polmvs.surface.creases import (
 )
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
-from polmvs.surface.hollows import Hollow, SurfaceFaces, find_hollows
 from polmvs.surface.mesh_geometry import (
     BAND_CELLS,
     RayScene,
@@ -116,9 +116,9 @@ class GlobalSurface:
         have their own.
     sigma_deg : (F,) standard deviation of the normal, degrees; inf where unknown.
     sigma : (V,) standard deviation of the place along the normal, world units; inf where unknown.
-    footprint : length that a pixel covers at the surface, world units.
+    gsd : length that a pixel covers at the surface, world units.
     contradictions : with the data.
-    presumed : (F,) bool, faces that no phase shows: walls of hollows, presumed as thick inside as
+    inferred : (F,) bool, faces that no phase shows: walls of cavities, inferred as thick inside as
         the rim shows them.
     tilt_share : as in :class:`polmvs.surface.observations.Looking`.
     left_out : (K,) bool, views that contradict the others; the surface is made without them.
@@ -131,9 +131,9 @@ class GlobalSurface:
     normals: Array
     sigma_deg: Array
     sigma: Array
-    footprint: float
+    gsd: float
     contradictions: Contradictions
-    presumed: Mask
+    inferred: Mask
     tilt_share: float
     left_out: Mask
 
@@ -212,11 +212,11 @@ def reconstruct_surface(
     if steps:
         logger.info("%d groups of planar patches that silhouettes do not part.", len(steps))
         hull = hull.carved([group.values for group in steps])
-    hollows = _hollows(given.scene, hull.mesh, hull.footprint)
+    cavities = _cavities(given.scene, hull.mesh, hull.gsd)
     fit = first_fit(
         views,
         Looking(angle_model=angle_model, tilt_aware=tilt_aware),
-        hull.footprint,
+        hull.gsd,
         known=KnownPoints(seeds.points_in_world, seeds.sigma),
         light=light,
         tolerances=tolerances,
@@ -235,12 +235,12 @@ def reconstruct_surface(
         return Undetermined("the surface vanishes under the phases of the views")
     given = replace(given, scene=given.scene.of(~refined.left_out))
     # Refined walls place a cavity better than the hull's, and may hide its opening.
-    hollows = _hollows(given.scene, refined.mesh, hull.footprint, before=hollows) or hollows
-    mesh = _carved(refined.mesh, hull.mesh, steps, hollows)
+    cavities = _cavities(given.scene, refined.mesh, hull.gsd, before=cavities) or cavities
+    mesh = _carved(refined.mesh, hull.mesh, steps, cavities)
     if not len(mesh.faces):
         return Undetermined("the surface vanishes under the cavities found in it")
-    polished = _polished(given, mesh, refined, [*steps, *hollows])
-    return _supported(given, polished, steps, hollows, refined.left_out)
+    polished = _polished(given, mesh, refined, [*steps, *cavities])
+    return _supported(given, polished, steps, cavities, refined.left_out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -311,17 +311,17 @@ def _carved(
     mesh: TriangleMesh,
     hull: TriangleMesh,
     steps: Sequence[SteppedFaces],
-    hollows: Sequence[Hollow],
+    cavities: Sequence[Cavity],
 ) -> TriangleMesh:
     """A refined mesh with height steps and cavities carved, their walls sharp."""
-    if not steps and not hollows:
+    if not steps and not cavities:
         return mesh
     # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
     return remeshed(
         mesh,
         mesh.mean_edge / REMESHED_EDGE,
         solid=[_within(group.solid, hull, mesh.mean_edge) for group in steps],
-        free=[*(group.values for group in steps), *(hollow.values for hollow in hollows)],
+        free=[*(group.values for group in steps), *(cavity.values for cavity in cavities)],
         smoothing=0,
     )
 
@@ -350,7 +350,7 @@ def _polished(
     given: _Given,
     mesh: TriangleMesh,
     refined: Refined,
-    carvings: Sequence[SteppedFaces | Hollow],
+    carvings: Sequence[SteppedFaces | Cavity],
 ) -> _Polished:
     """A carved mesh with the sides of its edges sharp, moved until it has converged."""
     fit = refined.fit
@@ -386,7 +386,7 @@ def _supported(
     given: _Given,
     polished: _Polished,
     steps: Sequence[SteppedFaces],
-    hollows: Sequence[Hollow],
+    cavities: Sequence[Cavity],
     left_out: Mask,
 ) -> GlobalSurface:
     """A surface with the part of it that the views support."""
@@ -395,13 +395,13 @@ def _supported(
     supported = supported_faces(mesh, evidence, min_views=given.min_views)
     seen = evidence.num_views >= given.min_views
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
-    presumed = seen & ~supported & _lie_on(mesh, [hollow.values for hollow in hollows])
-    supported |= presumed
+    inferred = seen & ~supported & _lie_on(mesh, [cavity.values for cavity in cavities])
+    supported |= inferred
     given.on_progress(1)
     sigma = _deviations(mesh, fit)
     given.on_progress(1)
     known = fit.known or KnownPoints(np.zeros((0, 3)), np.zeros(0))
-    offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, fit.footprint)
+    offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, fit.gsd)
     residual, _ = labelled.residuals(mesh)
     contradictions = replace(
         find_contradictions(
@@ -422,9 +422,9 @@ def _supported(
         normals=corner_normals(mesh, polished.normals),
         sigma_deg=polished.sigma_deg,
         sigma=sigma,
-        footprint=fit.footprint,
+        gsd=fit.gsd,
         contradictions=contradictions,
-        presumed=presumed,
+        inferred=inferred,
         tilt_share=fit.looking.tilt_share,
         left_out=left_out,
     )
@@ -442,23 +442,23 @@ def _converged(
         mesh, has_converged = polish(mesh)
         mesh, steps_left = sharpened(mesh, normals), steps_left - 1
         # Phases read by a model that their camera does not follow sink it, OPA's by millimetres.
-        if fit.known is not None and points_deny(mesh, sharp, fit.known, fit.footprint):
+        if fit.known is not None and points_deny(mesh, sharp, fit.known, fit.gsd):
             return sharp
     return mesh
 
 
-def _hollows(
-    scene: FaceScene, mesh: TriangleMesh, footprint: float, before: Sequence[Hollow] = ()
-) -> tuple[Hollow, ...]:
+def _cavities(
+    scene: FaceScene, mesh: TriangleMesh, gsd: float, before: Sequence[Cavity] = ()
+) -> tuple[Cavity, ...]:
     """Cavities of a mesh that see only themselves, ``before`` of an earlier state of it."""
     faces = SurfaceFaces(
         mesh.centers,
         mesh.face_normals,
         mesh.face_areas,
         RayScene(mesh).inside_along,
-        footprint,
+        gsd,
     )
-    return tuple(find_hollows(faces, scene, before=before))
+    return tuple(find_cavities(faces, scene, before=before))
 
 
 def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:
@@ -520,7 +520,7 @@ def _border_share(mask: Mask) -> float:
 
 def _deviations(mesh: TriangleMesh, fit: Fit) -> Array:
     """Deviations of the vertices, sampled on a coarser mesh if that saves time."""
-    coarse = remeshed(mesh, DEVIATION_EDGE_PX * fit.footprint)
+    coarse = remeshed(mesh, DEVIATION_EDGE_PX * fit.gsd)
     if not len(coarse.faces):
         coarse = mesh
     sigma = place_deviations(coarse, fit)
@@ -556,13 +556,13 @@ class SurfacePoints:
     Attributes
     ----------
     cloud : N points.
-    presumed : (N,) bool, those that no phase shows.
+    inferred : (N,) bool, those that no phase shows.
     light : (3, N) probabilities that a view shows specular and diffuse light there, and the degree
         of polarization: means over the views.
     """
 
     cloud: FusedCloud
-    presumed: Mask
+    inferred: Mask
     light: Array
 
     def scalars(self) -> dict[str, NDArray[np.float32]]:
@@ -604,7 +604,7 @@ def surface_points(
         sigma_deg=_finite(surface.sigma_deg[face]),
         sigma=_finite(_interpolated(surface.sigma, mesh, face, barycentric)),
     )
-    return SurfacePoints(cloud, surface.presumed[face], surface.light[:, face])
+    return SurfacePoints(cloud, surface.inferred[face], surface.light[:, face])
 
 
 def _finite(values: Array) -> NDArray[np.float32]:

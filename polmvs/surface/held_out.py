@@ -151,9 +151,7 @@ def predict_left_out(
         mesh = hull.mesh
         if len(mesh.faces):
             solver = replace(SolverTolerances(), levels=levels)
-            fit = first_fit(
-                used, looking, hull.footprint, known=known, light=light, tolerances=solver
-            )
+            fit = first_fit(used, looking, hull.gsd, known=known, light=light, tolerances=solver)
             mesh = refine(mesh, fit).mesh
         return predict(mesh, others, looking, light=light, outside=outside, width_px=tol.width_px)
 

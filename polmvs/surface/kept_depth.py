@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class KeptDepthTolerances:
-    """Which points of COLMAP's depth maps are kept; lengths in footprints of a pixel.
+    """Which points of COLMAP's depth maps are kept; lengths in GSD.
 
     Attributes
     ----------
@@ -59,17 +59,17 @@ def kept_cloud(
     -------
     Points that two views or more put into one voxel.
     """
-    clouds, footprints = [], []
+    clouds, gsds = [], []
     for item in workspace.views:
-        cloud, footprint = _view_cloud(item, tolerances)
+        cloud, gsd = _view_cloud(item, tolerances)
         if len(cloud.points):
             clouds.append(cloud)
-            footprints.append(footprint)
+            gsds.append(gsd)
     if not clouds:
         return no_points()
-    cloud, footprint = concatenate(clouds), float(np.median(footprints))
+    cloud, gsd = concatenate(clouds), float(np.median(gsds))
     owner = np.repeat(np.arange(len(clouds)), [len(part.points) for part in clouds])
-    num_views = _views_in_voxel(cloud.points, owner, tolerances.stride_px * footprint)
+    num_views = _views_in_voxel(cloud.points, owner, tolerances.stride_px * gsd)
     cloud = replace(cloud, num_views=num_views)
     keep = num_views > 1
     if keep.mean() < tolerances.min_agreement:
@@ -80,10 +80,10 @@ def kept_cloud(
             100 * keep.mean(),
         )
     if len(surface_points):
-        reach = tolerances.clearance_px * footprint
+        reach = tolerances.clearance_px * gsd
         distance = cKDTree(surface_points).query(cloud.points, distance_upper_bound=reach)[0]
         keep &= ~np.isfinite(distance)
-    return merge(cloud[keep], footprint)
+    return merge(cloud[keep], gsd)
 
 
 def _views_in_voxel(points: Array, owner: NDArray[np.int64], voxel: float) -> NDArray[np.int32]:
@@ -94,7 +94,7 @@ def _views_in_voxel(points: Array, owner: NDArray[np.int64], voxel: float) -> ND
 
 
 def _view_cloud(item: WorkspaceView, tolerances: KeptDepthTolerances) -> tuple[FusedCloud, float]:
-    """Points of one view's maps, and the footprint of a pixel there."""
+    """Points of one view's maps, and the gsd of a pixel there."""
     maps = item.load_maps()
     if maps is None or not (maps.depth > 0).any():
         return no_points(), 0.0

@@ -206,7 +206,7 @@ def observe(
     images: Sequence[Image],
     looking: Looking,
     *,
-    footprint: float | None = None,
+    gsd: float | None = None,
 ) -> Observations:
     """All observations of the faces of a mesh.
 
@@ -215,9 +215,9 @@ def observe(
     mesh, scene : the mesh, and the same to cast rays on.
     views, images : what each view shows, smoothed (:func:`level_image`).
     looking : how.
-    footprint : length that a pixel covers, for the slopes; None: they are 0.
+    gsd : length that a pixel covers, for the slopes; None: they are 0.
     """
-    look = partial(_observe_view, mesh, scene, looking, footprint)
+    look = partial(_observe_view, mesh, scene, looking, gsd)
     # Threads, for products of large arrays and the casting of rays let go of Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
         found = list(pool.map(look, range(len(views)), views, images))
@@ -232,7 +232,7 @@ def _observe_view(
     mesh: TriangleMesh,
     scene: RayScene,
     looking: Looking,
-    footprint: float | None,
+    gsd: float | None,
     index: int,
     view: SurfaceView,
     image: Image,
@@ -253,15 +253,15 @@ def _observe_view(
     face, rays, cosine = face[known], rays[known], cosine[known]
     rows = found.rows[:, known]
     slope = np.zeros((2, len(known)))
-    if footprint is not None and len(known):
-        reach = min(0.5 * mesh.mean_edge, 1.5 * footprint)
+    if gsd is not None and len(known):
+        reach = min(0.5 * mesh.mean_edge, 1.5 * gsd)
         normals, centers = mesh.face_normals.take(face, axis=0), mesh.centers.take(face, axis=0)
         aside = own(centers + reach * normals)
         same = np.where(np.einsum("lki,lki->lk", aside.rows, rows) < 0, -1.0, 1.0)
         ahead = same * np.einsum("lki,ki->lk", aside.rows, normals)
         change = ahead - np.einsum("lki,ki->lk", rows, normals)
         slope = np.where(np.isfinite(aside.turn_variance), change / reach, 0.0)
-        slope = np.clip(slope, -0.5 / footprint, 0.5 / footprint)
+        slope = np.clip(slope, -0.5 / gsd, 0.5 / gsd)
     return Observations(
         face=face,
         view=np.full(len(face), index),

@@ -86,7 +86,7 @@ class OffsetTolerances:
         part is seen by half of them. Measured, 0.5: F at 1 mm of an analytic bracket falls by 0.9
         points.
     seed_cells : radius about a sparse point that belongs to its face, and distance of a face's
-        points to the given surface from which it does not explain them; a cell is a footprint.
+        points to the given surface from which it does not explain them; a cell is a gsd.
         Guess: a point's uncertainty, and the size of a first surface's cells.
     leak : conductance to nowhere of a place that contradicts its face. Measured, 0.2: F at 1 mm of
         an analytic bracket falls by 0.2 points.
@@ -410,12 +410,12 @@ def stepped_faces(
     found = []
     for group in _grouped(faces):
         points = seeds.points_in_world[np.concatenate([face.members for face in group])]
-        footprint = _footprint(points, scene.maps)
+        gsd = _gsd(points, scene.maps)
         if signed_distance is not None and not any(
-            _is_off(face, seeds, signed_distance, tol.seed_cells * footprint) for face in group
+            _is_off(face, seeds, signed_distance, tol.seed_cells * gsd) for face in group
         ):
             continue
-        grid = _grid_over(group, points, scene.maps, footprint, tol)
+        grid = _grid_over(group, points, scene.maps, gsd, tol)
         if grid is None:
             continue
         labels, shown = _labels(group, seeds, grid, scene, first_hit, tol)
@@ -502,7 +502,7 @@ def _is_off(face: Face, seeds: Seeds, signed_distance: SignedDistance, limit: fl
     return bool(np.median(np.abs(distance)) > limit)
 
 
-def _footprint(points: Array, maps: Sequence[PhaseMap]) -> float:
+def _gsd(points: Array, maps: Sequence[PhaseMap]) -> float:
     """Length that a pixel covers at the points, median over the views."""
     center = np.median(points, axis=0)
     return float(
@@ -519,7 +519,7 @@ def _grid_over(
     group: Sequence[Face],
     points: Array,
     maps: Sequence[PhaseMap],
-    footprint: float,
+    gsd: float,
     tol: OffsetTolerances,
 ) -> FaceGrid | None:
     """A grid over all that the views' regions show in the plane of the group's largest face."""
@@ -546,10 +546,10 @@ def _grid_over(
         return None
     # A region may run to the horizon in one view: what half of the views show is enough.
     own = np.stack([(points - center) @ first, (points - center) @ second], axis=1)
-    margin = tol.min_radius_cells * footprint
+    margin = tol.min_radius_cells * gsd
     start = np.minimum(np.nanmedian(low, axis=0), own.min(axis=0)) - margin
     size = np.maximum(np.nanmedian(high, axis=0), own.max(axis=0)) + margin - start
-    step = max(footprint, float(np.sqrt(np.prod(size) / tol.max_cells)))
+    step = max(gsd, float(np.sqrt(np.prod(size) / tol.max_cells)))
     rows_cols = np.ceil(size / step).astype(np.int64) + 1
     origin = center + start[0] * first + start[1] * second
     return FaceGrid(

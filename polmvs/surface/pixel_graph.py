@@ -240,9 +240,7 @@ def tie_seeds(
         alike = ~((seed_normals * node_normals).sum(axis=-1) < np.cos(tolerances.filled_sigma))
     ok = visible[seed] & alike & (gap < REACH * nodes.spacing_px) & np.isfinite(step)
     seed, node, gap, step = seed[ok], node[ok], gap[ok], step[ok]
-    footprint = 1 / phase_map.view.camera.mean_focal_px
-    sigma = np.sqrt(
-        k * (seeds.sigma[seed] / distance[seed]) ** 2 + (0.02 * (1 + gap) * footprint) ** 2
-    )
+    gsd = 1 / phase_map.view.camera.mean_focal_px
+    sigma = np.sqrt(k * (seeds.sigma[seed] / distance[seed]) ** 2 + (0.02 * (1 + gap) * gsd) ** 2)
     value = np.log(distance[seed]) + step
     return SeedTies(node=node, seed=seed, value=value, sigma=sigma, common=np.zeros(len(node)))

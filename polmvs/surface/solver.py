@@ -173,7 +173,7 @@ class Fit:
     images : the same, smoothed for the level in work.
     looking : angle model and share of the tilt.
     scales : of the views' rows.
-    footprint : length that a pixel covers at the surface, world units.
+    gsd : length that a pixel covers at the surface, world units.
     known : points of the surface.
     light : of all observations; None: inferred for each.
     tol : numbers.
@@ -183,7 +183,7 @@ class Fit:
     images: Sequence[Image]
     looking: Looking
     scales: Scales
-    footprint: float
+    gsd: float
     known: KnownPoints | None
     light: Light | None
     tol: SolverTolerances
@@ -215,7 +215,7 @@ class Fit:
 def first_fit(
     views: Sequence[SurfaceView],
     looking: Looking,
-    footprint: float,
+    gsd: float,
     *,
     known: KnownPoints | None = None,
     light: Light | None = None,
@@ -224,7 +224,7 @@ def first_fit(
     """What a first surface is fitted by; parameters as of :class:`Fit`."""
     tol = tolerances or SolverTolerances()
     rows = np.full((len(views), 2), tol.terms.row_sigma)
-    return Fit(views, [], looking, Scales(rows), footprint, known, light, tol)
+    return Fit(views, [], looking, Scales(rows), gsd, known, light, tol)
 
 
 @dataclass(frozen=True)
@@ -296,7 +296,7 @@ def _through_levels(
     left_out = np.zeros(len(fit.views), np.bool_)
     unexplained = np.full(len(fit.views), np.nan)
     for number, level in enumerate(levels):
-        edge = level.edge_px * fit.footprint
+        edge = level.edge_px * fit.gsd
         if number and 1.2 * mesh.face_areas.sum() / edge**2 > tol.max_vertices:
             edge = float(np.sqrt(1.2 * mesh.face_areas.sum() / tol.max_vertices))
         fit = fit.at_width(level.width_px)
@@ -375,9 +375,9 @@ def _refined_at(
         logger.info(
             "edges of %.1f px, %d vertices: moved by %.3f px; light %.0f %% specular, %.0f %% "
             "diffuse; %.2f of the polarizers' tilt.",
-            edge / fit.footprint,
+            edge / fit.gsd,
             len(mesh.vertices),
-            change / fit.footprint,
+            change / fit.gsd,
             *(100 * energy.light),
             fit.looking.tilt_share,
         )
@@ -483,7 +483,7 @@ def linearize(
         views,
         fit.images,
         fit.looking,
-        footprint=fit.footprint if with_slope else None,
+        gsd=fit.gsd if with_slope else None,
     )
     is_seen = np.zeros(len(mesh.faces), np.bool_)
     is_seen[observations.face] = True
@@ -508,8 +508,8 @@ def linearize(
         tolerances=tol.labels,
     )
     variances = observations.variances(mesh.face_normals, row_sigma)
-    face_area_px = float(mesh.face_areas.mean()) / fit.footprint**2
-    independent_area = terms.independent_px * level.width_px**2 * fit.footprint**2
+    face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
+    independent_area = terms.independent_px * level.width_px**2 * fit.gsd**2
 
     def outline(view: SurfaceView) -> OutlineRows | None:
         if not view.has_outline:
@@ -567,7 +567,7 @@ def linearize(
             fit.known,
             terms,
             num_views=len(views),
-            footprint=fit.footprint,
+            gsd=fit.gsd,
             face_area_px=face_area_px,
             gate_px=level.gate_px,
         )
@@ -799,7 +799,7 @@ def place_deviations(
     if not num:
         return np.zeros(0)
     edge, num_views = mesh.mean_edge, len(fit.views)
-    face_area_px = float(mesh.face_areas.mean()) / fit.footprint**2
+    face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
 
     def energy_of(mesh: TriangleMesh) -> Energy:
         return linearize(mesh, fit, edge, level, normal_sigma=tol.annealing[1], with_slope=True)

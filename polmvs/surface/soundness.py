@@ -64,12 +64,12 @@ def find_soundness(
             xy = xy[~outside[view.name][rows, cols]]
         rays = view.rays_in_world(xy)
         found = scene.crossings(view.center_in_world, rays)
-        footprint = found.distance / camera.mean_focal_px
+        gsd = found.distance / camera.mean_focal_px
         follows = found.ray[1:] == found.ray[:-1]
         enters, steep = found.cosine < 0, np.abs(found.cosine) > MIN_COSINE
-        near = np.diff(found.distance) < SHEET_PX * footprint[1:]
+        near = np.diff(found.distance) < SHEET_PX * gsd[1:]
         # Two faces that meet on an edge are both crossed by a ray through it.
-        apart = np.diff(found.distance) > 0.05 * footprint[1:]
+        apart = np.diff(found.distance) > 0.05 * gsd[1:]
         both_steep = follows & steep[1:] & steep[:-1]
         met += len(np.unique(found.ray))
         layered += len(np.unique(found.ray[1:][both_steep & near & apart]))

@@ -260,7 +260,7 @@ class Contradictions:
     uncovered_share : mean over the views of the share of the silhouette that the surface leaves
         uncovered.
     point_offset_px : by which the surface lies outside of the known points on it, in the median
-        and in footprints of a pixel.
+        and in GSD (length of a pixel at the surface).
     point_offset_sigmas : the same in standard deviations of it.
     """
 
@@ -379,16 +379,14 @@ def stand_apart(unexplained: Array, least: float) -> Mask:
     return odd if (~odd).sum() >= MIN_VIEWS else np.zeros_like(odd)
 
 
-def points_deny(
-    moved: TriangleMesh, mesh: TriangleMesh, known: KnownPoints, footprint: float
-) -> bool:
+def points_deny(moved: TriangleMesh, mesh: TriangleMesh, known: KnownPoints, gsd: float) -> bool:
     """Whether known points lie nearer to a mesh than to the same mesh moved.
 
     By the signed-rank test (Wilcoxon 1945), at 5 %. What few points say is no objection. (The test
     of scipy.stats takes most of a second to be imported.)
     """
     (far, _, on_moved), (near, _, on_mesh) = (
-        _offsets(surface, known, footprint) for surface in (moved, mesh)
+        _offsets(surface, known, gsd) for surface in (moved, mesh)
     )
     both = on_moved & on_mesh
     if both.sum() < MIN_POINTS:
@@ -402,7 +400,7 @@ def points_deny(
 
 
 def _offsets(
-    mesh: TriangleMesh, known: KnownPoints, footprint: float
+    mesh: TriangleMesh, known: KnownPoints, gsd: float
 ) -> tuple[Array, NDArray[np.int64], Mask]:
     """By how much (N,) a surface lies outside of points, at which face, and which are on it."""
     if not len(known.points):
@@ -410,11 +408,11 @@ def _offsets(
     place, face, _ = RayScene(mesh).closest(known.points)
     offset = dots(place - known.points, mesh.face_normals[face])
     # What lies farther than the hull's cells are wide is not on the surface.
-    return offset, face, np.abs(offset) < HullTolerances.step_px * footprint
+    return offset, face, np.abs(offset) < HullTolerances.step_px * gsd
 
 
 def point_offset(
-    mesh: TriangleMesh, supported: Mask, sigma: Array, known: KnownPoints, footprint: float
+    mesh: TriangleMesh, supported: Mask, sigma: Array, known: KnownPoints, gsd: float
 ) -> tuple[float, float]:
     """By how much a surface lies outside of the known points on it.
 
@@ -423,16 +421,16 @@ def point_offset(
     mesh, supported : the surface, with V vertices and F faces; (F,) those that are kept.
     sigma : (V,) its stated deviation, world units.
     known : points of the surface.
-    footprint : length that a pixel covers, world units.
+    gsd : length that a pixel covers, world units.
 
     Returns
     -------
-    The median, in footprints, and the same in standard deviations; 0 where few points are near.
+    The median, in GSDs, and the same in standard deviations; 0 where few points are near.
     """
     if len(known.points) < MIN_POINTS or not supported.any():
         return 0.0, 0.0
     mesh = TriangleMesh(mesh.vertices, mesh.faces[supported])
-    offset, face, near = _offsets(mesh, known, footprint)
+    offset, face, near = _offsets(mesh, known, gsd)
     stated = np.median(sigma[mesh.faces[face]], axis=1)
     near &= np.isfinite(stated)
     if near.sum() < MIN_POINTS:
@@ -441,4 +439,4 @@ def point_offset(
     # A median of normal errors is known to 1.25 deviations over the root of their number.
     own = max(robust_deviation(offset - middle), float(np.median(known.sigma[near])))
     noise = np.hypot(1.25 * own / np.sqrt(len(offset)), np.median(stated[near]))
-    return middle / footprint, middle / max(float(noise), 1e-300)
+    return middle / gsd, middle / max(float(noise), 1e-300)

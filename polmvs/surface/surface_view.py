@@ -155,7 +155,7 @@ class SurfaceView:
         """Which image coordinates ``(N, 2)`` lie in the image; not those that are NaN."""
         return in_frame(xy, self.width, self.height, margin_px)
 
-    def footprint(self, points: Floats) -> Array:
+    def gsd(self, points: Floats) -> Array:
         """Length ``(N,)`` in space that a pixel covers at points, across the optical axis."""
         return np.abs(self.to_camera(points)[:, 2]) / self.view.camera.mean_focal_px
 

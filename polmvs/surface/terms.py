@@ -506,7 +506,7 @@ def add_points(
     tol: TermTolerances,
     *,
     num_views: int,
-    footprint: float,
+    gsd: float,
     face_area_px: float,
     gate_px: float,
 ) -> None:
@@ -516,12 +516,12 @@ def add_points(
     face = np.flatnonzero(seen)[face]
     normals = mesh.face_normals[face]
     residual = dots(place - known.points, normals)
-    sigma = np.hypot(known.sigma, tol.place_sigma_px * footprint)
-    near = lengths(place - known.points) < gate_px * footprint
+    sigma = np.hypot(known.sigma, tol.place_sigma_px * gsd)
+    near = lengths(place - known.points) < gate_px * gsd
     face, residual, sigma = face[near], residual[near], sigma[near]
     along = dots(mesh.vertex_normals[mesh.faces[face]], normals[near][:, None])
     jacobian = barycentric[near] * along
-    scale = np.maximum(4 * sigma, 0.1 * gate_px * footprint) ** 2
+    scale = np.maximum(4 * sigma, 0.1 * gate_px * gsd) ** 2
     weights = geman_mcclure_weights(residual, scale) / sigma**2
     weights *= tol.point_weight(num_views, face_area_px)
     equations.add(mesh.faces[face], jacobian, residual, weights)

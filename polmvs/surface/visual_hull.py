@@ -33,7 +33,7 @@ class HullTolerances:
 
     Attributes
     ----------
-    step_px : of the finest grid, in footprints of a pixel. Two thirds of the first mesh's edges.
+    step_px : of the finest grid, in GSD. Two thirds of the first mesh's edges.
         Below the supporting plane, where no view sees it, the hull reaches down by three of the
         usual ones: two edges of that mesh. Measured: a plate on the demo's table vanishes without,
         and with half of it a thin bowl loses 0.3 points of F at 1 mm.
@@ -129,13 +129,13 @@ class VisualHull:
     values : (X, Y, Z) float32 on a grid, negative inside; see :func:`hull_values`.
     origin : (3,), place of the first grid point.
     step : distance of neighbours.
-    footprint : length that a pixel covers at the objects, world units.
+    gsd : length that a pixel covers at the objects, world units.
     """
 
     values: NDArray[np.float32]
     origin: Array
     step: float
-    footprint: float
+    gsd: float
 
     @cached_property
     def mesh(self) -> TriangleMesh:
@@ -187,7 +187,7 @@ def visual_hull(
     on_grid = partial(_values_on_grid, used, wrong, plane, tol)
     center = _meeting_point(used)
     distance = float(np.median([np.linalg.norm(view.center - center) for view in used]))
-    footprint = float(np.median([distance / view.view.camera.mean_focal_px for view in used]))
+    gsd = float(np.median([distance / view.view.camera.mean_focal_px for view in used]))
     low, high = center - distance, center + distance
     for num_cells in (32, 48, 64):
         step = float((high - low).max() / num_cells)
@@ -196,10 +196,10 @@ def visual_hull(
         if not len(near):
             return nothing
         low, high = low + (near.min(axis=0) - 1) * step, low + (near.max(axis=0) + 1) * step
-    fine = max(tol.step_px * footprint, float(np.prod(high - low) / MAX_CELLS) ** (1 / 3))
+    fine = max(tol.step_px * gsd, float(np.prod(high - low) / MAX_CELLS) ** (1 / 3))
     low, high = low - 3 * fine, high + 3 * fine
     values = _cleaned(_refined(on_grid, low, high, fine), fine, tol)
-    return VisualHull(values, low, fine, footprint)
+    return VisualHull(values, low, fine, gsd)
 
 
 def _meeting_point(views: Sequence[SurfaceView]) -> Array:
@@ -238,7 +238,7 @@ def hull_values(
     values = np.where(num_seen < max(2, tol.min_seen_share * len(views)), OUTSIDE, values)
     if plane is not None:
         # Deeper than the plane: a thin plate on it must not be thinner than a coarse mesh's edges.
-        z = np.median([view.footprint(points) for view in views], axis=0)
+        z = np.median([view.gsd(points) for view in views], axis=0)
         floor = -plane.height(points) - 3 * HullTolerances.step_px * z
         values = np.maximum(values, floor).astype(np.float32)
     return values

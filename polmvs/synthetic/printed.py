@@ -156,10 +156,10 @@ def _print_seen(view: View, scene: PrintedScene, xy: Array) -> tuple[Mask, Array
     printed = np.isfinite(distance) & (labelled | ~is_part)
     # Sides of a pixel on the surface, the geometric mean of the long and the short one.
     facing = np.abs(np.einsum("...i,...i", np.nan_to_num(normals), rays))
-    footprint = distance / view.camera.mean_focal_px / np.sqrt(np.maximum(facing, 0.05))
+    gsd = distance / view.camera.mean_focal_px / np.sqrt(np.maximum(facing, 0.05))
     scale = np.where(labelled, 4.0, 1.0) / scene.texel
     place = points[..., :2] * scale[..., None]
-    level = np.log2(np.maximum(np.where(printed, footprint * scale, 1.0), 1e-3))
+    level = np.log2(np.maximum(np.where(printed, gsd * scale, 1.0), 1e-3))
     return printed, _sample_levels(_print_levels(scene.seed), place, level)
 
 

@@ -79,7 +79,7 @@ def assert_same(one, other):
 
 
 def test_unordered_orbit(capture, retrieved):
-    """All views are found. 0.4 mm at 600 mm when written: a third of a pixel's footprint."""
+    """All views are found. 0.4 mm at 600 mm when written: a third of a pixel's gsd."""
     model, database = retrieved
     assert np.median(center_errors_mm(model, capture[1])) < 1.0
     assert matched_pairs(database) < NUM_VIEWS * (NUM_VIEWS - 1) / 2

@@ -52,11 +52,11 @@ def test_half_a_pixel_of_a_plane_after_fusion(camera, tmp_path):
 
 @CAMERAS
 def test_fusion_of_a_board_and_a_sphere(camera, tmp_path):
-    footprint = 0.5 / 120
+    gsd = 0.5 / 120
     board = board_scene(camera)
     cloud = fuse(board.write(tmp_path / "board"), min_num_pixels=3)
     assert len(cloud.points) > 500
-    assert np.abs(cloud.points @ NORMAL).max() < footprint / 2
+    assert np.abs(cloud.points @ NORMAL).max() < gsd / 2
     assert angles_deg(cloud.normals, NORMAL).max() < 0.1
     radius = 0.1
     views = ring_of_views(8, camera, distance=0.5, elevation_deg=50)
@@ -67,8 +67,8 @@ def test_fusion_of_a_board_and_a_sphere(camera, tmp_path):
     length = np.linalg.norm(cloud.points, axis=1)
     assert len(cloud.points) > 300
     # Fusion takes medians over pixels up to 2 px apart, which lie on an arc.
-    sagitta = (2 * footprint) ** 2 / (2 * radius)
-    assert np.abs(length - radius).max() < footprint
+    sagitta = (2 * gsd) ** 2 / (2 * radius)
+    assert np.abs(length - radius).max() < gsd
     assert np.median(np.abs(length - radius)) < sagitta
     assert np.median(angles_deg(cloud.normals, cloud.points / length[:, None])) < 1.0
 

@@ -40,9 +40,9 @@ def resolve(name: str) -> None:
 
 
 def test_there_are_some() -> None:
-    assert "polmvs.surface.hollows.find_hollows" in NAMES
+    assert "polmvs.surface.cavities.find_cavities" in NAMES
     with pytest.raises(AttributeError):
-        resolve("polmvs.surface.hollows.find_nothing")
+        resolve("polmvs.surface.cavities.find_nothing")
 
 
 @pytest.mark.parametrize("name", NAMES)

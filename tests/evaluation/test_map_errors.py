@@ -212,8 +212,8 @@ def test_curved_surface_up_to_its_outline() -> None:
     """Inverse depth of a sphere is interpolated to a share of the sagitta of half a pixel."""
     sphere = Sphere(center=np.zeros(3), radius=0.1)
     errors = map_errors(scrambled(1.0), [dense_of(sphere, v) for v in VIEWS], ExactTruth(sphere))
-    footprint_m = 0.5 / CAMERA.fx
-    assert errors.depth_median_m < footprint_m**2 / 0.1
+    gsd_m = 0.5 / CAMERA.fx
+    assert errors.depth_median_m < gsd_m**2 / 0.1
     assert errors.normals.median_deg < 0.1
     assert errors.coverage == 1
 
@@ -244,7 +244,7 @@ def test_comparison_tells_of_the_maps(demo_run: Path) -> None:
     for name in (
         "depth maps, RMSE, mm",
         "depth maps within 1 mm, %",
-        "depths within one / two stated deviations, %",
+        "depths within one / two sigma, %",
         "normal maps, mean / median error, deg",
     ):
         assert any(digit in rows[name] for digit in "0123456789")

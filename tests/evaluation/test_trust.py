@@ -71,7 +71,7 @@ def test_views_that_disagree_and_wide_deviations(scene):
     cloud = cloud_of(scene)
     scalars = {**cloud.scalars, "num_views": np.full(3000, 1.0), "sigma": np.full(3000, 0.01)}
     trust = measure_trust(AngleModel.PPA, replace(cloud, scalars=scalars), NO_TRACKS, scene.maps)
-    assert {"views that agree with a point they see", "stated deviation of the places"} <= set(
+    assert {"views that agree with a point they see", "position uncertainty (1 sigma)"} <= set(
         names(trust)
     )
 

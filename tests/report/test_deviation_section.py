@@ -82,7 +82,7 @@ def test_the_layer_lies_where_the_cloud_does(call, compared) -> None:
     call()
     layer, channel = report._deviation_layer(opened(run).deviation)
     cloud = read_cloud(run / "ppa.ply")
-    part = cloud.points[np.isin(cloud.scalars["kind"], (PointKind.SURFACE, PointKind.PRESUMED))]
+    part = cloud.points[np.isin(cloud.scalars["kind"], (PointKind.SURFACE, PointKind.INFERRED))]
     # Each is a point of the cloud: it was thinned and laid, and comes back.
     near = trimesh.proximity.cKDTree(part).query(layer.points)[0]
     assert near.max() < 1e-6

@@ -124,7 +124,7 @@ def test_the_others_surface_starts_a_view_that_knows_nothing():
     # At the rim, where the range changes by much from pixel to pixel, it is a guess indeed.
     error = np.abs(np.exp(guess.log_range) - np.exp(samples.log_range))[found]
     slant = -(samples.rays_in_world * samples.normals).sum(axis=-1)[found]
-    assert error[slant > 0.4].max() < 0.004  # a footprint of half a metre
+    assert error[slant > 0.4].max() < 0.004  # a gsd of half a metre
     assert (guess.normals[found] * samples.normals[found]).sum(-1)[slant > 0.4].min() > 0.99
 
 

@@ -197,19 +197,19 @@ def test_the_surer_view_has_the_greater_weight(scene):
 
 
 def test_the_tolerance_narrows_for_certain_views_but_not_below_half(scene):
-    """A footprint is 4 mm, the tolerance two of them: 8 mm along the ray, 4 mm where certain."""
-    footprint = 0.5 / CAMERA.fx
-    certain, doubtful = footprint / 100, 2 * footprint
+    """A gsd is 4 mm, the tolerance two of them: 8 mm along the ray, 4 mm where certain."""
+    gsd = 0.5 / CAMERA.fx
+    certain, doubtful = gsd / 100, 2 * gsd
 
     def votes(off, sigma):
         cloud = one_view_off(scene, off, sigma, sigma=sigma, min_views=5)
         return np.median(cloud.num_views)
 
     # Offsets along the normal; along rays 45 degrees off it they are 1.4 times as large.
-    assert votes(0.5 * footprint, certain) == 6
-    assert votes(1.0 * footprint, certain) == 5
-    assert votes(1.0 * footprint, doubtful) == 6
-    assert votes(2.0 * footprint, doubtful) == 5
+    assert votes(0.5 * gsd, certain) == 6
+    assert votes(1.0 * gsd, certain) == 5
+    assert votes(1.0 * gsd, doubtful) == 6
+    assert votes(2.0 * gsd, doubtful) == 5
 
 
 def test_the_fused_deviation_is_that_of_a_view_and_along_the_normal(scene):
@@ -222,7 +222,7 @@ def test_the_fused_deviation_is_that_of_a_view_and_along_the_normal(scene):
     assert np.median(mixed.sigma[mixed.num_views == 6]) == pytest.approx(expected, rel=0.1)
 
 
-def test_an_unknown_deviation_is_that_of_a_footprint(scene):
+def test_an_unknown_deviation_is_that_of_a_gsd(scene):
     cloud = one_view_off(scene, 1e-3, np.nan, sigma=np.nan)
     everywhere = cloud.num_views == 6
     assert np.median(distances(scene, cloud.points[everywhere])) == pytest.approx(1e-3 / 6, rel=0.1)

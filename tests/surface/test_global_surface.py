@@ -69,7 +69,7 @@ def test_the_cloud_lies_on_the_object_with_its_normals(surface, maps):
     found = surface_points(surface, maps, 0.5 * FOOTPRINT)
     cloud = found.cloud
     radii = np.linalg.norm(cloud.points, axis=1)
-    assert not found.presumed.any()
+    assert not found.inferred.any()
     specular, diffuse, dolp = found.light
     assert np.median(specular) > 0.9 > 0.1 > np.median(diffuse)
     assert np.median(dolp) == pytest.approx(DOLP, rel=0.05)

@@ -101,7 +101,7 @@ def unit_rows(vectors):
 
 
 def column_points(num=4000, seed=0):
-    """Points above and below the plate and the box, off the borders by three footprints."""
+    """Points above and below the plate and the box, off the borders by three GSDs."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (num, 3)) * [0.9 * PLATE, 0.9 * PLATE, 0.06]
     from_wall = np.abs(np.abs(points[:, :2]).max(axis=1) - BOX)

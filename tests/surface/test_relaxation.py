@@ -189,7 +189,7 @@ def test_a_round_leaves_the_true_surface_where_it_is(board):
     before = nodes_of(board).surface
     after = relaxed(board, board.maps).surface
     error = np.exp(after.log_range) - np.exp(before.log_range)
-    assert np.sqrt((error**2).mean()) < 0.04 * 0.5 / 120  # footprints; seeds are tied to 0.02
+    assert np.sqrt((error**2).mean()) < 0.04 * 0.5 / 120  # GSDs; seeds are tied to 0.02
     turn = np.degrees(np.arccos(np.clip((after.normals * before.normals).sum(-1), -1, 1)))
     assert np.median(turn) < 0.1
     assert turn.max() < 3  # the phase is smoothed up to the region's edge

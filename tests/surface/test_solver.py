@@ -64,12 +64,12 @@ def views_of(distance, views=None, **kwargs):
     ]
 
 
-def fit_of(views, footprint=FOOTPRINT, *, tilt_aware=False, **kwargs):
-    return first_fit(views, Looking(angle_model=PPA, tilt_aware=tilt_aware), footprint, **kwargs)
+def fit_of(views, gsd=FOOTPRINT, *, tilt_aware=False, **kwargs):
+    return first_fit(views, Looking(angle_model=PPA, tilt_aware=tilt_aware), gsd, **kwargs)
 
 
 def refined(hull, views, *, tolerances=QUICK, **kwargs):
-    return refine(hull.mesh, fit_of(views, hull.footprint, tolerances=tolerances, **kwargs))
+    return refine(hull.mesh, fit_of(views, hull.gsd, tolerances=tolerances, **kwargs))
 
 
 def deviations(mesh, views, **kwargs):
@@ -369,7 +369,7 @@ def test_outlines_that_known_points_contradict_are_told(ball):
         mesh = refined(hull, views, known=known).mesh
         sigma = deviations(mesh, views, known=known)
         all_faces = np.ones(len(mesh.faces), np.bool_)
-        found.append(point_offset(mesh, all_faces, sigma, known, hull.footprint))
+        found.append(point_offset(mesh, all_faces, sigma, known, hull.gsd))
     (fine_px, fine_sigmas), (wide_px, wide_sigmas) = found
     assert abs(fine_sigmas) < 3
     assert abs(fine_px) < 0.3
@@ -391,7 +391,7 @@ def test_many_views_that_err_alike_do_not_outweigh_known_points(ball):
     for views in (2 * wide, 6 * wide):
         mesh = refined(hull, views, known=known).mesh
         radius = np.linalg.norm(mesh.vertices, axis=1)
-        off_px.append((np.median(radius) - 1) / hull.footprint)
+        off_px.append((np.median(radius) - 1) / hull.gsd)
     few, many = off_px
     assert many == pytest.approx(few, rel=0.1)  # without the count of views 0.26 and 0.64 px
 
@@ -437,7 +437,7 @@ def test_the_better_of_two_ways_is_taken():
 def test_progress_is_whole(ball):
     hull = visual_hull(ball, num_wrong=0)
     steps = []
-    refine(hull.mesh, fit_of(ball, hull.footprint, tolerances=QUICK), on_progress=steps.append)
+    refine(hull.mesh, fit_of(ball, hull.gsd, tolerances=QUICK), on_progress=steps.append)
     assert sum(steps) == QUICK.num_steps
 
 

@@ -145,7 +145,7 @@ def test_dense_surroundings_lie_on_the_plane_and_beside_the_part(tmp_path):
     cloud = stereo_surroundings(tracks_of(points, [m.view for m in maps]), maps, tmp_path)
     assert len(cloud.points) > 3000
     assert (cloud.num_views >= 3).all()
-    # A pixel's footprint is 3.3 mm here.
+    # A pixel's gsd is 3.3 mm here.
     assert np.median(np.abs(cloud.points[:, 2])) < 0.002
     assert (np.abs(cloud.points[:, 2]) > 0.01).mean() < 0.01
     inside = np.abs(cloud.points[:, :2]).max(axis=-1) < PART_SIDE

@@ -29,10 +29,10 @@ def ball():
 def test_the_hull_holds_the_object_and_little_more(ball):
     hull = visual_hull(ball, num_wrong=0)
     radii = np.linalg.norm(hull.mesh.vertices, axis=1)
-    assert radii.min() > 1 - 1.5 * hull.footprint
+    assert radii.min() > 1 - 1.5 * hull.gsd
     assert np.median(radii) < 1.08
     assert euler_number(hull.mesh) == 2
-    assert hull.footprint == pytest.approx(5 / 150, rel=0.05)
+    assert hull.gsd == pytest.approx(5 / 150, rel=0.05)
 
 
 def test_one_wrong_mask_does_no_harm(ball):

@@ -83,7 +83,9 @@ UNUSED: Mapping[Method, tuple[str, ...]] = {
 }
 
 OUTSIDE = "{name}.outside.npy"  # among dense views: pixels that show nothing within the box
-FINEST_SPACING_PX = 0.25  # of points that are not to be merged, in footprints of a pixel
+FINEST_SPACING_PX = (
+    0.25  # of points that are not to be merged, in GSD (length of a pixel at the surface)
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +201,7 @@ def densify(
         widen_by_poses(sparse.views, load_floats(folder.pose_covariances), new_views)
         surface = surface_cloud(modes.widened(found.cloud))
         if found.points is not None:
-            surface.scalars["kind"][found.points.presumed] = PointKind.PRESUMED
+            surface.scalars["kind"][found.points.inferred] = PointKind.INFERRED
             surface = replace(surface, scalars={**surface.scalars, **found.points.scalars()})
         around = _surroundings_cloud(sparse.tracks, found.cloud, given, workspace, kept / "around")
         if box is not None:
@@ -319,9 +321,9 @@ def _global_surface(given: _Inputs, tracks: Tracks, views: Path, kept: Path) -> 
         if dense is not None:
             store_dense_view(dense, views / phase_map.view.name)
         given.on_progress(1)
-    spacing = fusion.voxel if fusion.voxel is not None else fusion.voxel_px * surface.footprint
+    spacing = fusion.voxel if fusion.voxel is not None else fusion.voxel_px * surface.gsd
     believed = list(compress(maps, ~surface.left_out))
-    points = surface_points(surface, believed, spacing or FINEST_SPACING_PX * surface.footprint)
+    points = surface_points(surface, believed, spacing or FINEST_SPACING_PX * surface.gsd)
     write_mesh(views / SURFACE_MESH, supported_mesh(surface))
     for number, mesh in enumerate(levels):
         faces = mesh.faces.astype(np.int32)

@@ -1,13 +1,13 @@
-"""Hollows that see only themselves: the inside of a mug.
+"""Cavities that see only themselves: the inside of a mug.
 
 A vessel's mouth is dark: light that comes out of it has been reflected several times, and its
 phase says nothing of a normal. Silhouettes close the mouth with a flat cap, which no view's phase
 supports, in the middle of a ring in the same plane that the phases do support: the rim. It lies at
 the offset at which its lines in the views meet, and its inner line is the mouth's border. How
 thick the wall is shows at the rim; where it is of one thickness all around, a wall of that
-thickness is presumed to go on below, and the inside follows the outside. That is a presumption,
-not a measurement: each hollow carries its thickness and how much it varies, and points on its
-walls should be labelled accordingly. Where the rim's width varies nothing is presumed.
+thickness is inferred to go on below, and the inside follows the outside. That is an inference,
+not a measurement: each cavity carries its thickness and how much it varies, and points on its
+walls should be labelled accordingly. Where the rim's width varies nothing is inferred.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-SAME_PLANE_PX = HullTolerances.step_px  # footprints within which a rim is known: a cell of the hull
+SAME_PLANE_PX = HullTolerances.step_px  # GSDs within which a rim is known: a cell of the hull
 
 
 @dataclass(frozen=True, kw_only=True)
-class HollowTolerances:
-    """Numbers of the search for hollows; lengths in footprints of a pixel.
+class CavityTolerances:
+    """Numbers of the search for cavities; lengths in GSD (length of a pixel at the surface).
 
     Attributes
     ----------
@@ -71,8 +71,8 @@ class HollowTolerances:
         of it the rim's brightness is taken, and what is no wider is no mouth. Three of the
         surface's cells; 3 and 12 alike.
     thickness_spread : robust deviation of the wall's thickness around the rim, as a share of it;
-        one footprint is always allowed. Guess.
-    growth : of a hollow's half width per depth. A bottle's shoulders are not presumed. Guess.
+        one gsd is always allowed. Guess.
+    growth : of a cavity's half width per depth. A bottle's shoulders are not inferred. Guess.
     """
 
     max_planes: int = 8
@@ -86,7 +86,7 @@ class HollowTolerances:
 
 
 @dataclass(frozen=True)
-class Hollow:
+class Cavity:
     """Free space inside of a vessel.
 
     Attributes
@@ -95,8 +95,8 @@ class Hollow:
     grid : across the mouth.
     thickness : of the wall, world units.
     thickness_sigma : its robust deviation around the rim, world units.
-    field : (D, H, W) float32, signed distance to the hollow's walls in layers across the mouth,
-        positive in the hollow.
+    field : (D, H, W) float32, signed distance to the cavity's walls in layers across the mouth,
+        positive in the cavity.
     layer_step : distance of the layers, world units.
     first_layer : depth of the first layer below the rim, in layers (negative: above).
     """
@@ -110,7 +110,7 @@ class Hollow:
     first_layer: int
 
     def values(self, points: Floats) -> Array:
-        """Signed distance ``(N,)`` of points, positive in the hollow's free space."""
+        """Signed distance ``(N,)`` of points, positive in the cavity's free space."""
         points = np.asarray(points, np.float64)
         depth = -self.rim.height(points) / self.layer_step - self.first_layer
         cells = self.grid.cells(points)
@@ -130,68 +130,68 @@ class SurfaceFaces:
     areas : (F,).
     inside_along : which places ``(D, N)`` lie inside, on rays from origins ``(N, 3)`` along one
         direction ``(3,)``, at ascending distances ``(D,)``.
-    footprint : length that a pixel covers at the surface, world units.
+    gsd : length that a pixel covers at the surface, world units.
     """
 
     centers: Array
     normals: Array
     areas: Array
     inside_along: Callable[[Array, Array, Array], Mask]
-    footprint: float
+    gsd: float
 
 
-def find_hollows(
+def find_cavities(
     surface: SurfaceFaces,
     scene: FaceScene,
     *,
-    tolerances: HollowTolerances | None = None,
+    tolerances: CavityTolerances | None = None,
     offset_tolerances: OffsetTolerances | None = None,
-    before: Sequence[Hollow] = (),
-) -> tuple[Hollow, ...]:
-    """Mouths that a surface closes with a cap, and the hollows presumed behind them.
+    before: Sequence[Cavity] = (),
+) -> tuple[Cavity, ...]:
+    """Mouths that a surface closes with a cap, and the cavities inferred behind them.
 
     Parameters
     ----------
-    surface : the visual hull or better; its outside decides where the hollow's walls are.
+    surface : the visual hull or better; its outside decides where the cavity's walls are.
     scene : the views.
     tolerances, offset_tolerances : numbers of the search, and of the borders.
-    before : hollows of an earlier state of the surface, whose mouths are looked for first: a cap
+    before : cavities of an earlier state of the surface, whose mouths are looked for first: a cap
         that phases have bent lies in no plane by itself.
     """
-    tol, face_tol = tolerances or HollowTolerances(), offset_tolerances or OffsetTolerances()
+    tol, face_tol = tolerances or CavityTolerances(), offset_tolerances or OffsetTolerances()
     if not len(surface.centers) or len(scene.maps) < MIN_VIEWS:
         return ()
-    found: list[Hollow] = []
-    known = [_on_surface(hollow.rim, surface) for hollow in before]
+    found: list[Cavity] = []
+    known = [_on_surface(cavity.rim, surface) for cavity in before]
     for flat in [*known, *_flat_pieces(surface, tol, face_tol)]:
         rim = _rim(surface, flat, scene, tol, face_tol)
         if rim is None or any(_is_same(rim, other.rim, surface) for other in found):
             continue
         grid = _grid_about(surface, rim, tol)
-        rim = _in_focus(rim, grid, scene, surface.footprint, tol, face_tol)
+        rim = _in_focus(rim, grid, scene, surface.gsd, tol, face_tol)
         mouth = _mouth(rim, grid, scene, tol, face_tol)
         inner = ndimage.binary_erosion(mouth, iterations=3)
         places = grid.points(rim)
         if not _is_dark(places[inner], places[_ring_about(mouth, tol)], scene.maps, tol):
             continue
         beside = border_of_steps(mouth, mouth, rim, grid, scene, face_tol)
-        hollow = _hollow(surface, rim, grid, mouth, beside, tol)
-        if hollow is not None:
-            found.append(hollow)
+        cavity = _cavity(surface, rim, grid, mouth, beside, tol)
+        if cavity is not None:
+            found.append(cavity)
     return tuple(found)
 
 
 def _flat_pieces(
-    surface: SurfaceFaces, tol: HollowTolerances, face_tol: OffsetTolerances
+    surface: SurfaceFaces, tol: CavityTolerances, face_tol: OffsetTolerances
 ) -> tuple[Face, ...]:
     """The largest planes of a surface, with the faces (of all) that lie in them."""
     rng = np.random.default_rng(0)
     share = surface.areas / surface.areas.sum()
     num = min(face_tol.num_trials, len(share))
     chosen = np.sort(rng.choice(len(share), num, replace=False, p=share))
-    sigma = np.full(num, KEYPOINT_SIGMA_PX * surface.footprint)
+    sigma = np.full(num, KEYPOINT_SIGMA_PX * surface.gsd)
     seeds = Seeds(surface.centers[chosen], surface.normals[chosen], sigma)
-    least = np.pi * (tol.rounding * surface.footprint) ** 2 / surface.areas.sum()
+    least = np.pi * (tol.rounding * surface.gsd) ** 2 / surface.areas.sum()
     search = replace(
         face_tol,
         min_points=max(int(least * num), 10),
@@ -204,7 +204,7 @@ def _flat_pieces(
 
 def _on_surface(rim: Face, surface: SurfaceFaces) -> Face:
     """A rim's plane with the faces of a surface that lie in it."""
-    near = np.abs(rim.height(surface.centers)) < SAME_PLANE_PX * surface.footprint
+    near = np.abs(rim.height(surface.centers)) < SAME_PLANE_PX * surface.gsd
     near &= surface.normals @ rim.normal > np.cos(np.radians(CreaseTolerances.crease_deg))
     return replace(rim, members=np.flatnonzero(near))
 
@@ -213,7 +213,7 @@ def _rim(
     surface: SurfaceFaces,
     flat: Face,
     scene: FaceScene,
-    tol: HollowTolerances,
+    tol: CavityTolerances,
     face_tol: OffsetTolerances,
 ) -> Face | None:
     """The plane turned to the normal that the phases of its faces have; None for no mouth.
@@ -254,11 +254,11 @@ def _rim(
 
 def _is_same(rim: Face, other: Face, surface: SurfaceFaces) -> bool:
     """Whether two rims are of the same mouth."""
-    near = np.abs(other.height(surface.centers[rim.members])) < SAME_PLANE_PX * surface.footprint
+    near = np.abs(other.height(surface.centers[rim.members])) < SAME_PLANE_PX * surface.gsd
     return bool(near.mean() > 0.5)
 
 
-def _grid_about(surface: SurfaceFaces, rim: Face, tol: HollowTolerances) -> FaceGrid:
+def _grid_about(surface: SurfaceFaces, rim: Face, tol: CavityTolerances) -> FaceGrid:
     """A grid across the rim that holds all of the surface below it."""
     tangents = np.linalg.svd(rim.normal[None])[2][1:]
     first, second = tangents[0], np.cross(rim.normal, tangents[0])
@@ -267,8 +267,8 @@ def _grid_about(surface: SurfaceFaces, rim: Face, tol: HollowTolerances) -> Face
     center = center - rim.height(center) * rim.normal
     radius = float(np.linalg.norm(members - center, axis=1).max())
     # Below its mouth a vessel may be wider: half as wide again at most.
-    half = int(np.ceil(1.5 * radius / surface.footprint))
-    step = surface.footprint
+    half = int(np.ceil(1.5 * radius / surface.gsd))
+    step = surface.gsd
     origin = center - half * step * (first + second)
     return FaceGrid(origin, first, second, rim.normal, step, (2 * half + 1, 2 * half + 1))
 
@@ -277,14 +277,14 @@ def _in_focus(
     rim: Face,
     grid: FaceGrid,
     scene: FaceScene,
-    footprint: float,
-    tol: HollowTolerances,
+    gsd: float,
+    tol: CavityTolerances,
     face_tol: OffsetTolerances,
 ) -> Face:
     """The rim at the offset at which its lines in the views meet (a sweep)."""
 
     def strength(shift: float) -> float:
-        face = replace(rim, offset=rim.offset + shift * footprint)
+        face = replace(rim, offset=rim.offset + shift * gsd)
         return float(
             face_lines(grid.points(face), face, scene, face_tol, 1 - face_tol.view_share).sum()
         )
@@ -295,14 +295,14 @@ def _in_focus(
     below, here, above = sums[best - 1 : best + 2]
     bend = below - 2 * here + above
     vertex = np.clip(0.5 * (below - above) / bend, -1, 1) if bend < 0 else 0.0
-    return replace(rim, offset=rim.offset + float(shifts[best] + vertex) * footprint)
+    return replace(rim, offset=rim.offset + float(shifts[best] + vertex) * gsd)
 
 
 def _mouth(
     rim: Face,
     grid: FaceGrid,
     scene: FaceScene,
-    tol: HollowTolerances,
+    tol: CavityTolerances,
     face_tol: OffsetTolerances,
 ) -> Mask:
     """Cells (H, W) that the supported cells of the rim enclose, up to the rim's inner line."""
@@ -324,7 +324,7 @@ def _mouth(
     return np.asarray(snapped == 0)
 
 
-def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: HollowTolerances) -> bool:
+def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: CavityTolerances) -> bool:
     """Whether points ``(N, 3)`` are much darker than others in most views that show both."""
     ratios = []
     for phase_map in maps:
@@ -341,22 +341,22 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: HollowTol
     return len(ratios) >= MIN_VIEWS and float(np.median(ratios)) < tol.max_brightness
 
 
-def _ring_about(mouth: Mask, tol: HollowTolerances) -> Mask:
+def _ring_about(mouth: Mask, tol: CavityTolerances) -> Mask:
     """Cells (H, W) of the rim about a mouth, off the line between them."""
     line = ndimage.binary_dilation(mouth, iterations=2)
     ring = ndimage.binary_dilation(line, iterations=max(round(0.5 * tol.rounding), 1))
     return np.asarray(ring & ~line, np.bool_)
 
 
-def _hollow(
+def _cavity(
     surface: SurfaceFaces,
     rim: Face,
     grid: FaceGrid,
     mouth: Mask,
     beside: Floats,
-    tol: HollowTolerances,
-) -> Hollow | None:
-    """The hollow under a mouth, its wall as thick as at the rim; None where that varies.
+    tol: CavityTolerances,
+) -> Cavity | None:
+    """The cavity under a mouth, its wall as thick as at the rim; None where that varies.
 
     The mouth's border lies ``beside`` (H, W) cells off the cells, negative inside.
     """
@@ -386,8 +386,8 @@ def _hollow(
             break
         # At the rim its line is known; below it the wall's thickness takes over.
         known = min(depth / tol.rounding, 1.0)
-        presumed = known * (-outside_of(inside) - thickness) + (1 - known) * layers[0]
-        free = np.minimum(presumed, layers[-1] + tol.growth * spacing)
+        inferred = known * (-outside_of(inside) - thickness) + (1 - known) * layers[0]
+        free = np.minimum(inferred, layers[-1] + tol.growth * spacing)
         pieces = ndimage.label(free > 0)[0]
         linked = np.unique(pieces[(layers[-1] > 0) & (pieces > 0)])
         free = np.where((pieces > 0) & ~np.isin(pieces, linked), -0.5, free)
@@ -404,7 +404,7 @@ def _hollow(
     field = np.minimum(np.stack(layers), floor[:, None, None])
     field = np.concatenate([np.repeat(field[:1], above, axis=0), field])
     field = ndimage.gaussian_filter(field, (0.5, 1.0, 1.0), mode="nearest") * grid.step
-    return Hollow(
+    return Cavity(
         rim=rim,
         grid=grid,
         thickness=thickness * grid.step,

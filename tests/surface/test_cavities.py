@@ -1,4 +1,4 @@
-"""The hollow of an analytic vessel, and bodies that have none."""
+"""The cavity of an analytic vessel, and bodies that have none."""
 
 from dataclasses import dataclass, replace
 
@@ -10,7 +10,7 @@ from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import build_phase_map
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
-from polmvs.surface.hollows import HollowTolerances, SurfaceFaces, find_hollows
+from polmvs.surface.cavities import CavityTolerances, SurfaceFaces, find_cavities
 from polmvs.surface.offsets import face_scene
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Cylinder, Group, Plane
@@ -98,32 +98,32 @@ def closed_cylinder():
     return SurfaceFaces(centers, normals, areas, inside_along, FOOTPRINT)
 
 
-def test_a_dark_mouth_with_a_rim_of_one_width_opens_into_a_hollow():
+def test_a_dark_mouth_with_a_rim_of_one_width_opens_into_a_cavity():
     maps = vessel_maps()
-    (hollow,) = find_hollows(closed_cylinder(), face_scene(maps, AngleModel.PPA))
-    assert hollow.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
-    assert hollow.thickness_sigma < 0.7 * FOOTPRINT
-    np.testing.assert_allclose(hollow.rim.normal, [0, 0, 1], atol=0.01)
+    (cavity,) = find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA))
+    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
+    assert cavity.thickness_sigma < 0.7 * FOOTPRINT
+    np.testing.assert_allclose(cavity.rim.normal, [0, 0, 1], atol=0.01)
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.07, -0.07, 0.03], [0.07, 0.07, HEIGHT - 0.003], (3000, 3))
     inwards = RADIUS - WALL - np.hypot(points[:, 0], points[:, 1])
-    values = hollow.values(points)
+    values = cavity.values(points)
     clear = np.abs(inwards) > 1e-3
     assert np.mean((values > 0)[clear] == (inwards > 0)[clear]) > 0.99
     near = np.abs(inwards) < 4e-3
     assert np.quantile(np.abs(values - inwards)[near], 0.9) < 1e-3
     # Nothing under the bottom, nor beside the vessel above its rim.
-    assert (hollow.values(np.array([[0, 0, 0.004], [0.055, 0, HEIGHT + 0.002]])) < 0).all()
+    assert (cavity.values(np.array([[0, 0, 0.004], [0.055, 0, HEIGHT + 0.002]])) < 0).all()
 
 
 def test_a_mouth_is_round_though_its_cells_are_not():
     """To a tenth of a pixel; cut at whole cells it goes in and out by 0.15."""
-    (hollow,) = find_hollows(closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA))
+    (cavity,) = find_cavities(closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA))
     around = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     radii = RADIUS - WALL + np.arange(3, -3, -0.02) * FOOTPRINT
     across = np.stack([np.cos(around), np.sin(around)], axis=-1) * radii[:, None, None]
     points = np.dstack([across, np.full(across.shape[:2], HEIGHT - 0.001)])
-    free = hollow.values(points.reshape(-1, 3)).reshape(points.shape[:2]) > 0
+    free = cavity.values(points.reshape(-1, 3)).reshape(points.shape[:2]) > 0
     off = (radii[free.argmax(axis=0)] - (RADIUS - WALL)) / FOOTPRINT
     assert abs(off.mean()) < 0.15
     assert off.std() < 0.1
@@ -131,34 +131,34 @@ def test_a_mouth_is_round_though_its_cells_are_not():
 
 def test_a_mouth_once_found_is_looked_for_at_its_place():
     surface, scene = closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA)
-    before = find_hollows(surface, scene)
+    before = find_cavities(surface, scene)
     x, y, z = surface.centers.T
     # Phases have bent one side of the cap up, and no plane is found in it.
     bent_up = (surface.normals[:, 2] > 0.5) & (x > 0)
     height = np.where(bent_up, z + 3.5 * FOOTPRINT, z)
     bent = replace(surface, centers=np.stack([x, y, height], axis=1))
-    no_plane = HollowTolerances(max_planes=0)
-    assert find_hollows(bent, scene, tolerances=no_plane) == ()
-    (hollow,) = find_hollows(bent, scene, tolerances=no_plane, before=before)
-    assert hollow.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
-    assert hollow.rim.offset == pytest.approx(HEIGHT, abs=0.5 * FOOTPRINT)
+    no_plane = CavityTolerances(max_planes=0)
+    assert find_cavities(bent, scene, tolerances=no_plane) == ()
+    (cavity,) = find_cavities(bent, scene, tolerances=no_plane, before=before)
+    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
+    assert cavity.rim.offset == pytest.approx(HEIGHT, abs=0.5 * FOOTPRINT)
 
 
-def test_a_closed_body_has_no_hollow():
+def test_a_closed_body_has_no_cavity():
     maps = vessel_maps(bore=1e-4)
-    assert find_hollows(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
+    assert find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
 
 
-def test_a_rim_of_varying_width_presumes_nothing():
+def test_a_rim_of_varying_width_infers_nothing():
     maps = vessel_maps(bore=0.035, offset=0.015)
-    assert find_hollows(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
+    assert find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
 
 
 def test_a_bright_label_without_phase_is_no_mouth():
     maps = vessel_maps(dark=1.0)
-    assert find_hollows(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
+    assert find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
 
 
 def test_too_few_views_find_nothing():
     maps = vessel_maps()[:2]
-    assert find_hollows(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
+    assert find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
