@@ -57,6 +57,6 @@ def test_no_points(tmp_path: Path, form: str) -> None:
 
 def test_the_library_for_las_is_named(tmp_path: Path, cloud: Cloud, monkeypatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "laspy", None)
-    with pytest.raises(PolmvsError, match="extra 'las'"):
+    with pytest.raises(PolmvsError, match=r"pip install '\.\[las\]'"):
         write_cloud_file(tmp_path / "c.las", cloud, "las")
     assert not list(tmp_path.iterdir())

@@ -139,8 +139,11 @@ def other_value(info: FieldInfo) -> tuple[str, object]:
     return (str(value) if info.kind is int else f"{value:g}"), value
 
 
-# A marker without a box is refused.
-@pytest.mark.parametrize("path", sorted({*option_paths()} - {"crop.box_marker"}))
+# A marker without a box is refused, and so are weights of features without those of their matcher.
+ONLY_TOGETHER = {"crop.box_marker", "sfm.aliked", "sfm.lightglue"}
+
+
+@pytest.mark.parametrize("path", sorted({*option_paths()} - ONLY_TOGETHER))
 def test_every_option_can_be_one_capture_s(tmp_path, path: str) -> None:
     group, name = path.split(".")
     info = next(i for i in describe_fields(groups_of(Options)[group]) if i.name == name)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from polmvs.colmap import sfm
-from polmvs.config import FusionOptions, Surroundings
+from polmvs.config import FusionOptions, Options, Surroundings
 from polmvs.evaluation.comparison import best_fit_lines
 from polmvs.parallel import Workers
 from polmvs.pipeline.stages import densify
@@ -52,15 +52,13 @@ def test_stereo_that_finds_nothing_says_so_and_keeps_the_sparse_points(
     caplog, tmp_path, monkeypatch
 ) -> None:
     kept = object()
-    monkeypatch.setattr(densify, "read_model", lambda folder: SimpleNamespace(tracks=None))
     nothing = SimpleNamespace(points=[])
     monkeypatch.setattr(densify, "stereo_surroundings", lambda *given, **others: nothing)
     monkeypatch.setattr(densify, "sparse_surroundings", lambda tracks, maps: kept)
     monkeypatch.setattr(densify, "_sparse_cloud", lambda found: found)
-    options = FusionOptions(surroundings=Surroundings.STEREO)
-    cloud = densify._surroundings_cloud(
-        tmp_path, None, [], options, None, tmp_path, workers=Workers(1)
-    )
+    options = Options(fusion=FusionOptions(surroundings=Surroundings.STEREO))
+    given = SimpleNamespace(maps=[], options=options, workers=Workers(1))
+    cloud = densify._surroundings_cloud(None, None, given, None, tmp_path)
     assert cloud is kept
     assert "`fusion.surroundings` stereo finds no points: too few views" in caplog.text
     assert "record more views" in caplog.text
