@@ -30,7 +30,7 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 MAX_ODDS = 4.0  # logarithm, of one pixel: whatever it shows, something else may be wrong
-LEAST_SIGMA = 1e-3  # of a logarithm of intensity; images without noise would be held to nothing
+LEAST_SIGMA = 1e-3  # of a logarithm of intensity, and its least spread: what no image shows
 LEAST_ODDS = 0.7  # of what shows the plane, on the average of neighbours: two to one
 
 
@@ -610,8 +610,9 @@ def _shows_beyond(view: _Working, mask: Mask, tol: SearchTolerances) -> Mask:
 
 def _odds(residual: Image, sigma: Image, spread: float) -> Image:
     """Logarithm, that an image shows what was predicted rather than anything of a spread."""
-    sigma = np.maximum(sigma, LEAST_SIGMA)
-    odds = np.log(spread / (np.sqrt(2 * np.pi) * sigma)) - 0.5 * (residual / sigma) ** 2
+    sigma, spread = np.maximum(sigma, LEAST_SIGMA), max(spread, LEAST_SIGMA)
+    # The noise is infinite where no place beside the object is predicted: then nothing is told.
+    odds = np.log(spread / np.sqrt(2 * np.pi)) - np.log(sigma) - 0.5 * (residual / sigma) ** 2
     return np.asarray(np.clip(odds, -MAX_ODDS, MAX_ODDS), np.float32)
 
 
