@@ -115,7 +115,8 @@ class SolverTolerances:
     damping : deviation of a step, in edges; it holds what neither outlines nor points place.
     unseen_damping : of a vertex that no view sees, in edges; smoothness alone would melt it. Guess.
     remesh_after : displacement of a fiftieth of the vertices after which a mesh is made anew, in
-        edges. Guess: triangles of a mesh that moves by less stay usable.
+        edges. Measured on a public ceramic: normals err by 8.3 deg with 2.0, 7.3 with 0.7, 5.9 with
+        0.3 and 6.6 with 0.1: folds of a mesh that is not made anew stay.
     converged : root mean square of displacements of what is seen that ends a level, in edges.
     max_lost : share of the silhouettes by which a surface may cover less than its hull before it is
         made again without coarse levels. Guess: more than the corners that edges round.
@@ -134,7 +135,7 @@ class SolverTolerances:
     last_steps: int = 5
     damping: float = 0.5
     unseen_damping: float = 0.02
-    remesh_after: float = 2.0
+    remesh_after: float = 0.3
     converged: float = 0.01
     max_lost: float = 0.05
     max_vertices: int = 120_000
@@ -299,8 +300,11 @@ def _through_levels(
         edge = level.edge_px * fit.gsd
         if number and 1.2 * mesh.face_areas.sum() / edge**2 > tol.max_vertices:
             edge = float(np.sqrt(1.2 * mesh.face_areas.sum() / tol.max_vertices))
-        fit = fit.at_width(level.width_px)
-        mesh, fit = _refined_at(mesh, fit, level, edge, (done, total), on_progress)
+        mesh, found = _refined_at(
+            mesh, fit.at_width(level.width_px), level, edge, (done, total), on_progress
+        )
+        # Residuals of a mesh that is still far off show its own error, not that of the rows.
+        fit = found if number >= len(levels) - 2 else replace(found, scales=fit.scales)
         done += level.num_steps
         meshes.append(mesh)
         if not len(mesh.faces):
