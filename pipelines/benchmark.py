@@ -565,10 +565,11 @@ def _scalings(given: Arguments, num_views: int, terminal: Terminal) -> list[Scal
 def _per_view(capture: Capture, model: Path, workers: Workers) -> float:
     """Seconds that the images and maps of a capture take."""
     with tempfile.TemporaryDirectory(dir=capture.folder.parent) as scratch:
-        target = Path(scratch)
+        folder = RunFolder(Path(scratch))
+        shutil.copytree(model, folder.sparse)
         start = time.perf_counter()
-        write_images(capture, target / "images", workers=workers)
-        build_maps(capture, model, target / "maps", workers=workers)
+        write_images(capture, folder.images, workers=workers)
+        build_maps(capture, folder, workers=workers)
         return time.perf_counter() - start
 
 

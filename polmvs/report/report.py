@@ -285,8 +285,8 @@ def _view_pages(
     given: ReportInput, samples: Mapping[AngleModel, ErrorSamples]
 ) -> Iterator[ViewPage]:
     folder = given.folder
-    maps = {m: open_maps(folder.sparse, folder.maps(m), m) for m in given.models}
-    dense = {m: open_dense_views(folder.sparse, folder.views(m)) for m in given.models}
+    maps = {m: open_maps(folder, m) for m in given.models}
+    dense = {m: open_dense_views(folder, m) for m in given.models}
     raw = image_names(given.capture) if given.capture is not None else {}
     first = next(iter(maps.values()))
     white = max(float(np.percentile(one.intensity, WHITE_PERCENTILE)) for one in first)
@@ -501,7 +501,7 @@ def _residuals(given: ReportInput, model: AngleModel, layer: Layer) -> Floats:
     total, count = np.zeros(len(layer.points)), np.zeros(len(layer.points))
     on_surface = np.flatnonzero(np.linalg.norm(layer.normals, axis=1) > 0.5)
     points, normals = layer.points[on_surface], layer.normals[on_surface]
-    for phase_map in open_maps(given.folder.sparse, given.folder.maps(model), model):
+    for phase_map in open_maps(given.folder, model):
         visible, _ = first_seen(points, normals, phase_map.view, phase_map.shows_surface)
         found = phase_residuals_deg(model, points[visible], normals[visible], phase_map)
         known = np.isfinite(found)
