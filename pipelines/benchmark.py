@@ -36,8 +36,7 @@ from numpy.typing import NDArray
 
 from polmvs.cli.call import Call
 from polmvs.cli.commands import EXECUTION, TO_CLOUD
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.colmap.models import write_model
 from polmvs.config import (
@@ -157,18 +156,6 @@ def _stage_cells(name: str, records: Mapping[str, Record]) -> list[str]:
         else:
             cells += [number(stage.seconds), number(stage.cpu_s), number(stage.peak_rss_mb, 1, 0)]
     return cells
-
-
-COMMAND = Command(
-    help_text="times and memory of runs by stage, of single steps, and their growth",
-    run=_benchmark,
-    groups=(Arguments, *TO_CLOUD, ExportOptions, EvaluationOptions, *EXECUTION),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the script; the exit status."""
-    return run((COMMAND,), "benchmark.py", argv)
 
 
 def _folder(path: Path) -> Path:
@@ -591,6 +578,13 @@ def _median_seconds(work: Callable[[], object]) -> float:
         seconds.append(time.process_time() - start)
     return float(np.median(seconds))
 
+
+main = script(
+    __file__,
+    __doc__,
+    _benchmark,
+    (Arguments, *TO_CLOUD, ExportOptions, EvaluationOptions, *EXECUTION),
+)
 
 if __name__ == "__main__":
     raise SystemExit(main())

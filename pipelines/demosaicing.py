@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import (
     CaptureOptions,
@@ -236,17 +235,7 @@ def _demosaicing(call: Call, terminal: Terminal) -> int:
     return 0
 
 
-COMMAND = Command(
-    help_text="ways to interpolate a polarizer mosaic, compared in error and time",
-    run=_demosaicing,
-    groups=(Arguments, TerminalOptions),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the script; the exit status."""
-    return run((COMMAND,), "demosaicing.py", argv)
-
+main = script(__file__, __doc__, _demosaicing, (Arguments, TerminalOptions))
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -6,12 +6,15 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.exit_status import INTERRUPTED, interrupts
 from polmvs.cli.flags import Command, UsageError, in_flags, parse
+from polmvs.config import OptionGroup
 from polmvs.errors import OptionError, PolmvsError, final_name, printable
 
 logger = logging.getLogger(__name__)
@@ -44,6 +47,24 @@ def run(
     assert parsed.command is not None
     assert parsed.call is not None
     return _execute(parsed.command, parsed.call, parsed.prog)
+
+
+def script(
+    file: str,
+    doc: str | None,
+    function: Callable[[Call, Any], int],
+    groups: tuple[type[OptionGroup], ...],
+) -> Callable[..., int]:
+    """The ``main`` of a program of one command, which takes the arguments or finds them itself.
+
+    Parameters
+    ----------
+    file, doc : of its module; they give its name and, by the first line, its help.
+    function, groups : as of :class:`polmvs.cli.flags.Command`.
+    """
+    help_text = (doc or "").partition("\n")[0].removesuffix(".")
+    command = Command(help_text=help_text, run=function, groups=groups)
+    return partial(run, (command,), Path(file).name)
 
 
 def _execute(command: Command, call: Call, prog: str) -> int:
