@@ -34,6 +34,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.cli.call import Call
 from polmvs.cli.commands import EXECUTION, TO_CLOUD
 from polmvs.cli.running import script
@@ -64,8 +65,6 @@ from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
 from polmvs.polarization.capture import Capture, open_capture
 from polmvs.polarization.kinds import AngleModel
 from polmvs.synthetic.printed_capture import Part, printed_model, scene_of, write_printed_capture
-
-Array = NDArray[np.float64]
 
 NUM_PIXELS = 250_000
 NUM_TRACKS, NUM_VIEWS = 10_000, 10

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import PinholeCamera
 from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.running import script
@@ -31,8 +32,6 @@ from polmvs.polarization.stokes import axial_difference
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.sensor import FaultySensor, faulty_sensor
 from polmvs.synthetic.surfaces import Sphere
-
-Array = NDArray[np.float64]
 
 PATTERN = CaptureOptions.pattern
 POLARIZER_DEG = (0, 20, 45, 70, 90, 110, 135, 160)

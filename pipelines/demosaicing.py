@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Image, Mask
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.running import script
@@ -37,8 +38,6 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.mosaic import ANGLES_DEG, split_mosaic, split_mosaic_full
 from polmvs.polarization.stokes import Stokes, axial_difference, stokes_from_intensities
 
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Way = Callable[[Image], Image]
 
 PATTERN = CaptureOptions.pattern

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Image, Mask
 from polmvs.camera import Camera, PinholeCamera
 from polmvs.config import (
     CaptureOptions,
@@ -57,9 +58,6 @@ if TYPE_CHECKING:  # heavy
     from polmvs.surface.dense_view import DenseView
 
 PathArg = str | PathLike[str]
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 T = TypeVar("T")
 Groups = TypeVar("Groups", Options, Simulation)
 Group = TypeVar("Group", bound=OptionGroup)

@@ -17,8 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from polmvs.arrays import Mask
 
 
 @dataclass(frozen=True, kw_only=True)

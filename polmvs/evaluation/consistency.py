@@ -9,6 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Floats, Mask
 from polmvs.camera import depth_buffer, sample_image
 from polmvs.evaluation.metrics import MIN_DOLP, AngleStats, axial_errors_deg
 from polmvs.geometry import unit
@@ -18,9 +19,6 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import Region
 from polmvs.scene import PointKind, View
-
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 # These define the figures; they are no tolerances of an algorithm.
 MAX_RESIDUAL_POINTS = 100_000  # of a cloud, evenly spread, that phase residuals are taken from

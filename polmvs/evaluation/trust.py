@@ -13,8 +13,8 @@ from functools import partial
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Floats, Mask
 from polmvs.camera import in_image, sample_image
 from polmvs.config import PropagationOptions
 from polmvs.evaluation.consistency import (
@@ -38,9 +38,6 @@ LIGHT_OPTIONS = "`region.light`, `capture.pattern`, `capture.gamma`"
 MIN_CHECKED = 4  # views: three make a surface, and one checks it
 # Phases that a prediction is measured by, under which it tells nothing.
 MIN_PHASES = 50
-
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)

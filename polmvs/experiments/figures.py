@@ -10,16 +10,14 @@ import numpy as np
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.experiments.contours import CONTOUR_LABELS, METHODS, ViewContours
 from polmvs.experiments.data import MODEL_LABELS
 from polmvs.experiments.phase import ANGLE_LIMITS_DEG, ANGLES, PhaseImages, PhaseResult
 from polmvs.experiments.plane import ESTIMATES, PLANE_LABELS, PlaneResult
 from polmvs.experiments.tracks import ESTIMATORS, TRACK_LABELS, TrackResult
 from polmvs.polarization.kinds import FORMULAS
-
-Array = NDArray[np.float64]
 
 # Okabe and Ito's palette, which people with any kind of colour blindness tell apart.
 VERMILLION, ORANGE, SKY, BLUE, GREEN, GREY = (

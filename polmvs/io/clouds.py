@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.errors import DataError, PolmvsError, as_data_error
 from polmvs.io.open3d_import import import_open3d
 from polmvs.io.ply import read_ply, read_ply_header, write_ply
 from polmvs.scene import MAX_COORDINATE
 from polmvs.unprinted import unprinted
-
-Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Mask
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation, unit
@@ -32,8 +33,6 @@ from polmvs.scene import View, find_name, stem_of
 
 MAX_SIDE = 1 << 16  # px
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 DEPTH_UNIT_M = 20e-6
 PART_SPACING_M = 0.0005

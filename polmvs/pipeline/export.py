@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import pixel_centers
 from polmvs.colmap.camera_exports import CAMERA_FORMATS, CameraExport
 from polmvs.colmap.dense_workspace import open_dense_workspace
@@ -39,7 +40,6 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 CLOUDS = {
     ExportFormat.CLOUD_PLY: "ply",

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Image
 from polmvs.config import BayerOrder, CaptureOptions
 from polmvs.errors import DataError, as_data_error
 from polmvs.io.arrays import map_array, save_array
@@ -40,8 +41,6 @@ from polmvs.polarization.mosaic import (
     split_mosaic_full,
 )
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 Pattern = tuple[int, int, int, int]
 
 VERSION = 1

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Image
 from polmvs.config import CaptureKind, RegionOptions, Resolution
 from polmvs.errors import printable
 from polmvs.parallel import OnProgress, no_progress
@@ -23,7 +24,6 @@ from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
 from polmvs.scene import short_list
 
-Image = NDArray[np.float32]
 Picture = NDArray[np.uint8]
 
 SHOWN_DOLP = 0.5  # DoLP that is shown white, and AoLP in full colour

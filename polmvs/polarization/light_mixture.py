@@ -31,13 +31,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats
 from polmvs.polarization.fresnel import fresnel_dolp
 from polmvs.polarization.kinds import Light
-
-Floats = NDArray[np.floating]
-Array = NDArray[np.float64]
 
 TABLE_SIZE = 512  # steps of the cosine that bounds are tabulated at
 NUM_IORS = 7

@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.fitting import BEYOND_CHANCE, cauchy_weights, robust_deviation
 from polmvs.polarization.mosaic import clipped_cells, split_mosaic
 from polmvs.polarization.stokes import patch_means
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

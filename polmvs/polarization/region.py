@@ -6,11 +6,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
+from polmvs.arrays import Floats, Image, Mask
 
 
 @dataclass(frozen=True, kw_only=True)

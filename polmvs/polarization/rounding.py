@@ -18,10 +18,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from polmvs.arrays import Image, Mask
 
 NUM_TERMS = 4
 BLURRED = 0.12  # squared steps of noise, from which less than 0.0005 squared steps are shared

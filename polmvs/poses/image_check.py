@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.colmap.dense_workspace import MatchTolerances
 from polmvs.errors import DataError
 from polmvs.polarization.capture import WHITE_PERCENTILE, Capture, intensity_image_8bit
 from polmvs.scene import View
 
-Array = NDArray[np.float64]
 ImageLoader = Callable[[str], NDArray[np.uint8]]
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.arrays import Floats
 from polmvs.colmap.models import read_model
 from polmvs.config import (
     Options,
@@ -68,7 +69,6 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
 logger = logging.getLogger(__name__)
 
-Floats = NDArray[np.floating]
 
 MAX_POINTS = 150_000  # of each cloud on the page: two clouds turn smoothly, and 2 MB each
 ANGLE_BINS_DEG = np.arange(0.0, 91.0, 5.0)
