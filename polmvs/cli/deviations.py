@@ -24,7 +24,7 @@ from polmvs.pipeline.run_folder import RunFolder, replacing
 from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.polarization.kinds import AngleModel
-from polmvs.report.deviation_files import color_limit, write_deviation
+from polmvs.report.deviation_files import write_deviation
 from polmvs.surface.mesh_geometry import TriangleMesh
 
 MIN_POINTS = 100
@@ -66,12 +66,12 @@ def deviation(call: Call, terminal: Terminal) -> int:
     lines = deviation_lines(found)
     if given.out is not None:
         with new_folder(given.out) as folder:
-            write_deviation(folder, found, color_limit(found))
+            write_deviation(folder, found)
         lines.append(f"{given.out}: deviation.ply, .png, .svg, .json")
     if given.report:
         run_folder = RunFolder(given.result)
         with replacing(run_folder.deviation) as folder:
-            write_deviation(folder, found, color_limit(found))
+            write_deviation(folder, found)
         lines.append(make_report(run_folder, terminal))
     terminal.show([in_flags(line) for line in lines], found.figures)
     return OUT_OF_TOLERANCE if found.figures.passed is False else 0
