@@ -77,7 +77,7 @@ def _execute(command: Command, call: Call, prog: str) -> int:
     from polmvs.cli.terminal import Terminal
 
     with Terminal(options) as terminal:
-        return _guarded(lambda: _function(command)(call, terminal), terminal, prog)
+        return guarded(lambda: _function(command)(call, terminal), terminal, prog)
 
 
 def _function(command: Command) -> Callable[[Call, Any], int]:
@@ -89,7 +89,7 @@ def _function(command: Command) -> Callable[[Call, Any], int]:
     return function
 
 
-def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
+def guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
     """Run a command; its exit status, or that of what went wrong."""
     try:
         return _interruptible(command)

@@ -118,7 +118,7 @@ def fit_to_images(
     for (first, a), (second, b) in combinations(zip(chosen, found, strict=True), 2):
         matches = _consistent_matches(a, b, t)
         if matches is not None:
-            distances.append(_epipolar_distances(first, second, *matches))
+            distances.append(epipolar_distances(first, second, *matches))
     shares = np.concatenate(distances)
     if len(shares) < 2 * t.min_matches:  # one pair alone tells little
         return ImageFit(num_matches=len(shares), fitting=float("nan"), fits=None)
@@ -187,7 +187,7 @@ def _consistent_matches(
     return a[kept], b[kept]
 
 
-def _epipolar_distances(first: View, second: View, a: Array, b: Array) -> Array:
+def epipolar_distances(first: View, second: View, a: Array, b: Array) -> Array:
     """Distances (N,) of matches from each other's epipolar plane, shares of the diagonal.
 
     The larger of an angle at either camera, times its focal length. A match behind a camera does

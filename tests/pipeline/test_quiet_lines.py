@@ -55,10 +55,10 @@ def test_stereo_that_finds_nothing_says_so_and_keeps_the_sparse_points(
     nothing = SimpleNamespace(points=[])
     monkeypatch.setattr(densify, "stereo_surroundings", lambda *given, **others: nothing)
     monkeypatch.setattr(densify, "sparse_surroundings", lambda tracks, maps: kept)
-    monkeypatch.setattr(densify, "_sparse_cloud", lambda found: found)
+    monkeypatch.setattr(densify, "sparse_part", lambda found: found)
     options = Options(fusion=FusionOptions(surroundings=Surroundings.STEREO))
     given = SimpleNamespace(maps=[], options=options, workers=Workers(1))
-    cloud = densify._surroundings_cloud(None, None, given, None, tmp_path)
+    cloud = densify.surroundings_cloud(None, None, given, None, tmp_path)
     assert cloud is kept
     assert "`fusion.surroundings` stereo finds no points: too few views" in caplog.text
     assert "record more views" in caplog.text

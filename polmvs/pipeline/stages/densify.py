@@ -203,7 +203,7 @@ def densify(
         if found.points is not None:
             surface.scalars["kind"][found.points.inferred] = PointKind.INFERRED
             surface = replace(surface, scalars={**surface.scalars, **found.points.scalars()})
-        around = _surroundings_cloud(sparse.tracks, found.cloud, given, workspace, kept / "around")
+        around = surroundings_cloud(sparse.tracks, found.cloud, given, workspace, kept / "around")
         if box is not None:
             inside = box.require_some(surface.points)
             if not inside.all():
@@ -446,7 +446,7 @@ def surface_cloud(cloud: FusedCloud, kind: PointKind = PointKind.SURFACE) -> Clo
     )
 
 
-def _surroundings_cloud(
+def surroundings_cloud(
     tracks: Tracks,
     surface: FusedCloud,
     given: _Inputs,
@@ -474,11 +474,11 @@ def _surroundings_cloud(
             "other to be matched and confirmed. The sparse points are kept; record more views."
         )
     if wanted is not Surroundings.NONE:
-        return _sparse_cloud(sparse_surroundings(tracks, maps))
+        return sparse_part(sparse_surroundings(tracks, maps))
     return surface_cloud(surface[np.zeros(len(surface.points), np.bool_)])
 
 
-def _sparse_cloud(sparse: SparseSurroundings) -> Cloud:
+def sparse_part(sparse: SparseSurroundings) -> Cloud:
     """Sparse points as they are written; they have no normals, which is zero in a PLY file."""
     num = len(sparse.points)
     unknown = np.full(num, np.nan)
