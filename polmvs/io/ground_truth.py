@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.arrays import Array, Mask
-from polmvs.camera import PinholeCamera, pixel_centers
+from polmvs.camera import MAX_SIDE, PinholeCamera, pixel_centers
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation, unit
 from polmvs.io.image_size import PNG_SIGNATURE
@@ -31,7 +31,6 @@ from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import in_cells_beside, voxel_representatives
 from polmvs.scene import View, find_name, stem_of
 
-MAX_SIDE = 1 << 16  # px
 
 
 DEPTH_UNIT_M = 20e-6
