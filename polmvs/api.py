@@ -371,7 +371,7 @@ class Reconstruction:
 
         cloud = self.cloud
         if not surroundings:
-            cloud = cloud.only(cloud.scalars.get("kind", np.zeros(0)) == PointKind.SURFACE)
+            cloud = cloud.only(cloud.are(PointKind.SURFACE))
         return to_open3d(cloud).to_legacy()
 
     def mesh(self) -> open3d.geometry.TriangleMesh:

@@ -67,7 +67,7 @@ def measure_consistency(
     outside : pixels (H, W) of each view, by its name, that show what lies outside the box that the
         cloud was cut to: they count for nothing.
     """
-    cloud = _polarized_surface(cloud)
+    cloud = cloud.only(cloud.are(PointKind.SURFACE))
     num = len(cloud.points)
     step = -(-num // MAX_RESIDUAL_POINTS) or 1
     covered = inside = 0
@@ -110,14 +110,6 @@ def within_box(phase_map: PhaseMap, outside: Mapping[str, Mask]) -> PhaseMap:
     inside = region.inside & ~outside[phase_map.view.name]
     kept = Region(inside=inside, reliable=region.reliable & inside, edges=region.edges)
     return phase_map.changed(region=kept)
-
-
-def _polarized_surface(cloud: Cloud) -> Cloud:
-    """The points of the polarized surface, as a cloud of their own."""
-    kind = cloud.scalars.get("kind")
-    if kind is None:
-        return cloud
-    return cloud.only(kind == PointKind.SURFACE)
 
 
 def _track_residual(tracks: Cloud) -> float:

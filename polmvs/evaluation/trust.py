@@ -302,7 +302,7 @@ def measure_trust(
     outside : as :func:`polmvs.evaluation.consistency.measure_consistency` takes it.
     """
     consistency = measure_consistency(angle_model, cloud, tracks, maps, outside)
-    surface = cloud.only(cloud.scalars["kind"] == PointKind.SURFACE)
+    surface = cloud.only(cloud.are(PointKind.SURFACE))
     nothing = np.zeros((0, 3))
     points, normals = surface.points, nothing if surface.normals is None else surface.normals
     step = -(-len(points) // MAX_RESIDUAL_POINTS) or 1

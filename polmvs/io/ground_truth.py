@@ -31,8 +31,6 @@ from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import in_cells_beside, voxel_representatives
 from polmvs.scene import View, find_name, stem_of
 
-
-
 DEPTH_UNIT_M = 20e-6
 PART_SPACING_M = 0.0005
 OTHER_SPACING_M = 0.002

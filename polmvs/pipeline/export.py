@@ -216,10 +216,7 @@ def _existing(path: Path, what: str) -> Path:
 
 def part_of(cloud: Cloud) -> Cloud:
     """The points of a cloud that lie on the part, without its surroundings."""
-    kinds = cloud.scalars.get("kind")
-    if kinds is None:
-        return cloud
-    return cloud.only(np.isin(kinds, (PointKind.SURFACE, PointKind.INFERRED)))
+    return cloud.only(cloud.are(PointKind.SURFACE, PointKind.INFERRED))
 
 
 def _export_cameras(

@@ -294,7 +294,7 @@ def _mesh_of(given: ReportInput, model: AngleModel) -> Mesh | None:
 def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColoring]]:
     """Clouds and meshes of all models, and what they can be coloured by."""
     sigmas = [
-        np.asarray(cloud.scalars["sigma"])[_on_surface(cloud)]
+        np.asarray(cloud.scalars["sigma"])[cloud.are(PointKind.SURFACE)]
         for cloud in given.clouds.values()
         if "sigma" in cloud.scalars
     ]
@@ -451,13 +451,6 @@ def _residuals(given: ReportInput, model: AngleModel, layer: Layer) -> Floats:
     return mean
 
 
-def _on_surface(cloud: Cloud) -> NDArray[np.bool_]:
-    kind = cloud.scalars.get("kind")
-    if kind is None:
-        return np.ones(len(cloud.points), np.bool_)
-    return np.asarray(kind == PointKind.SURFACE)
-
-
 def _scene(
     given: ReportInput, layers: Sequence[Layer], channels: Mapping[str, PointColoring]
 ) -> Scene3D | None:
@@ -536,7 +529,7 @@ def _size_words(given: ReportInput) -> list[str]:
 def _size(given: ReportInput) -> str | None:
     """Extents of the part along its main directions; None where lengths have no unit."""
     surface = given.clouds[given.main]
-    points = surface.points[_on_surface(surface)]
+    points = surface.points[surface.are(PointKind.SURFACE)]
     if not (given.is_metric or given.truth is not None) or len(points) < MIN_SIZED:
         return None
     sides = " x ".join(f"{given.length.factor * side:.0f}" for side in _sides(points))
@@ -597,7 +590,7 @@ def _uncertainty_words(given: ReportInput) -> list[str]:
     """What the points state of themselves."""
     cloud = given.clouds[given.main]
     sigma = np.asarray(cloud.scalars.get("sigma", ()), np.float64)
-    known = sigma[_on_surface(cloud)] if len(sigma) else sigma
+    known = sigma[cloud.are(PointKind.SURFACE)] if len(sigma) else sigma
     known = known[np.isfinite(known)]
     if not len(known):
         return []
@@ -736,7 +729,7 @@ def _against_views(given: ReportInput) -> list[Plot]:
         if "sigma_deg" not in cloud.scalars or "num_views" not in cloud.scalars:
             continue
         values = np.asarray(cloud.scalars["sigma_deg"], np.float64)
-        chosen = _on_surface(cloud) & np.isfinite(values)
+        chosen = cloud.are(PointKind.SURFACE) & np.isfinite(values)
         sigma[model] = values[chosen]
         count[model] = np.asarray(cloud.scalars["num_views"], np.float64)[chosen]
     if not any(len(values) for values in sigma.values()):
