@@ -1,4 +1,4 @@
-"""What arrays hold, as annotations name it."""
+"""Array types used in annotations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What estimated cameras and poses leave uncertain.
+"""Uncertainty of estimated cameras and poses.
 
 Few views fix a camera badly, and an error of its focal length or principal point bends the whole
 model while every image fits. Bundle adjustment's covariance says how well each combination of the

@@ -1,4 +1,4 @@
-"""What is tried where SfM leaves views out: matching harder, by steps, for these views alone.
+"""Harder matching, in steps, of the views that SfM leaves without a pose.
 
 Steps keep the keypoints and all matches between views that have a pose. Each is slower than the
 one before, and they end when no view is left out.

@@ -1,4 +1,4 @@
-"""Features inside masks alone."""
+"""Removal of features outside masks."""
 
 from __future__ import annotations
 

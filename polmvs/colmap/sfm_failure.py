@@ -1,4 +1,4 @@
-"""Why SfM found no model, by its database: no texture, no overlap, or a camera that is none."""
+"""Diagnosis of a failed SfM from its database: no texture, no overlap, or a wrong camera."""
 
 from __future__ import annotations
 

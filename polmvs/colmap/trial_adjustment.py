@@ -1,4 +1,4 @@
-"""Which cameras would fit a model's matches better than those that were given with it.
+"""Trial adjustments: whether other cameras fit a model's matches better than the given ones.
 
 A focal length or a principal point that is wrong bends the whole model while every image fits, and
 normals with it; a pose that is wrong has all rows of its view wrong. The matches know both. They

@@ -1,4 +1,4 @@
-"""How well a cloud fits the capture that it was made from; no truth is needed."""
+"""Consistency of a cloud with the capture that it was made from; needs no ground truth."""
 
 from __future__ import annotations
 

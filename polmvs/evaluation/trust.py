@@ -1,4 +1,4 @@
-"""What a reconstruction says about itself: one verdict, and figures with the range that is normal.
+"""Self-assessment of a reconstruction: one verdict, and figures with their normal ranges.
 
 No truth is needed. What can be derived is; the rest was measured on reconstructions that are right
 and on wrong ones: see :class:`NormalRanges`. Some figures are of what the surface was fitted to;

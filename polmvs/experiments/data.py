@@ -1,4 +1,4 @@
-"""What the experiments measure on: a capture, its truth, and poses in the truth's world."""
+"""Scene of the experiments: a capture, its ground truth, and poses in the truth's world."""
 
 from __future__ import annotations
 

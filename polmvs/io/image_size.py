@@ -1,4 +1,4 @@
-"""Headers of images: sizes as they are declared, told before anything is decoded, and tags.
+"""Image headers: declared sizes and tags, read before anything is decoded.
 
 A compressed file of a megabyte may declare an image of a terabyte. Only containers whose header is
 read here are decoded.

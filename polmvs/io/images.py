@@ -1,4 +1,4 @@
-"""Image files at the edge: decoding, masks in, PNG out; every fault is a ``DataError``."""
+"""Image files: decoding, masks, PNG output; every fault is a ``DataError``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The import of Open3D: what its wheels lack is found, or named with its remedy."""
+"""Import of Open3D; a library that its wheel lacks is found, or named with its remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLY files as columns of numbers, read as what they are: a stranger's word.
+"""Reader and writer of PLY files as columns of numbers; input is untrusted.
 
 Open3D's readers abort, crash or fill up with zeros where a header promises what the file does not
 hold. Here every count is checked against the length of the file before memory is taken for it, and

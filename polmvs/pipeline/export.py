@@ -1,4 +1,4 @@
-"""What a finished run holds as files of other programs: mesh, cloud, or posed images."""
+"""Export of a finished run for other programs: mesh, cloud, or posed images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Polarizer calibration: what each sample of a sensor truly measures.
+"""Polarizer calibration: gain, angle and diattenuation of each sample of a sensor.
 
 A sample of gain g behind a polarizer of angle a and extinction ratio E measures
 ``I = g / 2 (s0 + d (cos 2a s1 + sin 2a s2))`` with the diattenuation ``d = (E - 1) / (E + 1)``.

@@ -1,4 +1,4 @@
-r"""Which light an observation shows: specular, diffuse, or neither; a label that nobody gives.
+r"""Classification of each observation as specular light, diffuse light or neither.
 
 An observation is what one view measures of one place: ``p = (s1, s2) / s0``, noise of variance v in
 either. Its angle fits a normal n as specular light, ``m_s . n = 0``, or as diffuse light, ``m_d . n

@@ -1,4 +1,4 @@
-"""Which encoding gamma the samples of a mosaic have, told by polarized light itself.
+"""Estimate of the encoding gamma of a mosaic from its polarized light.
 
 Behind an analyzer at ``a`` stands ``I = s0 / 2 (1 + q cos 2a + u sin 2a)``. Whatever gains, angles
 and extinction ratios the four analyzers have, and however oblique rays tilt them, the redundancy

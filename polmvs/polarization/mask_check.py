@@ -1,4 +1,4 @@
-"""Whether a user's mask ends where the polarized surface ends, or within it.
+"""Check that a user's mask ends where the polarized surface ends, not within it.
 
 A mask of a part's top alone leaves its sides out, which are polarized as well. The surface of all
 views is a solid: its sides would show where the masks say that there is nothing, so that it bends

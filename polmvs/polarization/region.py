@@ -1,4 +1,4 @@
-"""Where to densify: the polarized, textureless region of a view, and the edges inside it."""
+"""Region to densify in a view: polarized and textureless, with the edges inside it."""
 
 from __future__ import annotations
 

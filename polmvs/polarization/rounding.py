@@ -1,4 +1,4 @@
-"""What rounding to whole samples does to Stokes images where noise does not blur it.
+"""Rounding error of Stokes images where noise is too small to dither it.
 
 Rounding adds a variance of a twelfth of a step. Where a sample's noise before it is half a step or
 more, that is white: neighbours are rounded independently. Where the noise is less, as in the dark

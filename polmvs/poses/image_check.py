@@ -1,4 +1,4 @@
-"""Whether given cameras can be those of given images.
+"""Check of given cameras against the images by epipolar distances of matches.
 
 Features of the images are matched with no camera known. Matches that some epipolar geometry of a
 pair explains are mostly right ones; under the given poses they lie on each other's epipolar lines,

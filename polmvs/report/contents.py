@@ -1,4 +1,4 @@
-"""What a report shows, gathered from a finished run: figures, pictures of the views, the 3D scene.
+"""Contents of a report: figures, pictures of the views and the 3D scene of a finished run.
 
 Views are taken one after another and leave nothing but their coded pictures behind, so that the
 memory does not grow with them.

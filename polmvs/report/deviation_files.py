@@ -1,4 +1,4 @@
-"""What people look at of a deviation: a coloured cloud, a picture with its scale, a histogram."""
+"""Files of a deviation: a coloured cloud, a picture with its scale, a histogram, figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``OUT/report.html``: what a finished run came to, in one file that needs nothing beside it."""
+"""``OUT/report.html``: the results of a finished run in one self-contained file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A mesh as a view sees it."""
+"""Reprojection of a mesh into a view."""
 
 from __future__ import annotations
 

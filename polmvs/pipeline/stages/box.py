@@ -1,4 +1,4 @@
-"""Stage ``box``: whether the box that a result is to be cut to holds any of the scene.
+"""Stage ``box``: check that the crop box holds part of the scene.
 
 It is asked as soon as there are poses, before the surface is made.
 """

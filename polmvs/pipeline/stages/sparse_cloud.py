@@ -1,4 +1,4 @@
-"""Stage ``sparse_cloud_MODEL``: the sparse points with their normals, as people look at them."""
+"""Stage ``sparse_cloud_MODEL``: the sparse points with their normals, for a viewer."""
 
 from __future__ import annotations
 
