@@ -80,9 +80,7 @@ def hero(capture: Path, run: RunFolder, path: Path) -> None:
 def phases(capture: Path, run: RunFolder, path: Path) -> None:
     """The measured phase, those that OPA and PPA predict of the true normals, and their errors."""
     truth = open_ground_truth(capture / "gt")
-    phase_map = next(
-        m for m in open_maps(run.sparse, run.maps(AngleModel.PPA)) if m.view.name == VIEW
-    )
+    phase_map = next(m for m in open_maps(run, AngleModel.PPA) if m.view.name == VIEW)
     camera = truth.views[VIEW].camera
     rays = camera.rays(pixel_centers(camera.width, camera.height))
     samples = np.asarray(phase_map.samples)

@@ -34,10 +34,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.cli.call import Call
 from polmvs.cli.commands import EXECUTION, TO_CLOUD
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.colmap.models import write_model
 from polmvs.config import (
@@ -65,8 +65,6 @@ from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
 from polmvs.polarization.capture import Capture, open_capture
 from polmvs.polarization.kinds import AngleModel
 from polmvs.synthetic.printed_capture import Part, printed_model, scene_of, write_printed_capture
-
-Array = NDArray[np.float64]
 
 NUM_PIXELS = 250_000
 NUM_TRACKS, NUM_VIEWS = 10_000, 10
@@ -157,18 +155,6 @@ def _stage_cells(name: str, records: Mapping[str, Record]) -> list[str]:
         else:
             cells += [number(stage.seconds), number(stage.cpu_s), number(stage.peak_rss_mb, 1, 0)]
     return cells
-
-
-COMMAND = Command(
-    help_text="times and memory of runs by stage, of single steps, and their growth",
-    run=_benchmark,
-    groups=(Arguments, *TO_CLOUD, ExportOptions, EvaluationOptions, *EXECUTION),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the script; the exit status."""
-    return run((COMMAND,), "benchmark.py", argv)
 
 
 def _folder(path: Path) -> Path:
@@ -565,10 +551,11 @@ def _scalings(given: Arguments, num_views: int, terminal: Terminal) -> list[Scal
 def _per_view(capture: Capture, model: Path, workers: Workers) -> float:
     """Seconds that the images and maps of a capture take."""
     with tempfile.TemporaryDirectory(dir=capture.folder.parent) as scratch:
-        target = Path(scratch)
+        folder = RunFolder(Path(scratch))
+        shutil.copytree(model, folder.sparse)
         start = time.perf_counter()
-        write_images(capture, target / "images", workers=workers)
-        build_maps(capture, model, target / "maps", workers=workers)
+        write_images(capture, folder.images, workers=workers)
+        build_maps(capture, folder, workers=workers)
         return time.perf_counter() - start
 
 
@@ -590,6 +577,13 @@ def _median_seconds(work: Callable[[], object]) -> float:
         seconds.append(time.process_time() - start)
     return float(np.median(seconds))
 
+
+main = script(
+    __file__,
+    __doc__,
+    _benchmark,
+    (Arguments, *TO_CLOUD, ExportOptions, EvaluationOptions, *EXECUTION),
+)
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -11,7 +11,6 @@ angles, with photon and read noise; then it sees the ball once, 12 bits.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,10 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import PinholeCamera
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import CaptureOptions, OptionGroup, option
 from polmvs.polarization.calibration import measure_response, write_calibration
@@ -33,8 +32,6 @@ from polmvs.polarization.stokes import axial_difference
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.sensor import FaultySensor, faulty_sensor
 from polmvs.synthetic.surfaces import Sphere
-
-Array = NDArray[np.float64]
 
 PATTERN = CaptureOptions.pattern
 POLARIZER_DEG = (0, 20, 45, 70, 90, 110, 135, 160)
@@ -64,18 +61,6 @@ def _calibration(call: Call, terminal: Terminal) -> int:
     draw(call.get(Arguments).figure, errors)
     terminal.show("\n".join(lines), {name: _rms(error) for name, error in errors.items()})
     return 0
-
-
-COMMAND = Command(
-    help_text="AoLP error of a faulty sensor before and after its calibration",
-    run=_calibration,
-    groups=(Arguments, TerminalOptions),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the script; the exit status."""
-    return run((COMMAND,), "calibration.py", argv)
 
 
 def measure() -> tuple[dict[str, Array], Array]:
@@ -166,6 +151,8 @@ def _rms(error: Array) -> float:
     known = error[np.isfinite(error)]
     return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
+
+main = script(__file__, __doc__, _calibration, (Arguments, TerminalOptions))
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Image, Mask
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import (
     CaptureOptions,
@@ -38,8 +38,6 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.mosaic import ANGLES_DEG, split_mosaic, split_mosaic_full
 from polmvs.polarization.stokes import Stokes, axial_difference, stokes_from_intensities
 
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Way = Callable[[Image], Image]
 
 PATTERN = CaptureOptions.pattern
@@ -236,17 +234,7 @@ def _demosaicing(call: Call, terminal: Terminal) -> int:
     return 0
 
 
-COMMAND = Command(
-    help_text="ways to interpolate a polarizer mosaic, compared in error and time",
-    run=_demosaicing,
-    groups=(Arguments, TerminalOptions),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the script; the exit status."""
-    return run((COMMAND,), "demosaicing.py", argv)
-
+main = script(__file__, __doc__, _demosaicing, (Arguments, TerminalOptions))
 
 if __name__ == "__main__":
     raise SystemExit(main())

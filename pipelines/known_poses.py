@@ -7,13 +7,11 @@ For calibrated rigs and robot arms: give the result to ``polmvs`` as ``--sparse 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import OptionGroup, option
 from polmvs.poses.known_poses import write_known_poses
@@ -43,17 +41,7 @@ def _known_poses(call: Call, terminal: Terminal) -> int:
     return 0
 
 
-COMMAND = Command(
-    help_text="write a COLMAP model with known poses, its points triangulated anew",
-    run=_known_poses,
-    groups=(Arguments, TerminalOptions),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the script; the exit status."""
-    return run((COMMAND,), "known_poses.py", argv)
-
+main = script(__file__, __doc__, _known_poses, (Arguments, TerminalOptions))
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -9,15 +9,13 @@ page is ``OUT/paper.md``, its figures lie in ``OUT/CAPTURE/``, all numbers in ``
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Any
 
 from polmvs.cli.call import Call, FileOptions, TerminalOptions
 from polmvs.cli.commands import ExperimentRun
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import (
     CaptureOptions,
@@ -93,26 +91,6 @@ def _paper(call: Call, terminal: Terminal) -> int:
     return 0
 
 
-COMMAND = Command(
-    help_text="all experiments of the paper over a list of captures: one page with figures",
-    run=_paper,
-    groups=(
-        Arguments,
-        ExperimentOptions,
-        CaptureOptions,
-        RegionOptions,
-        ExperimentRun,
-        FileOptions,
-        TerminalOptions,
-    ),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the experiments; the exit status."""
-    return run((COMMAND,), "paper.py", argv)
-
-
 def _page(
     reports: dict[str, list[Report]],
     seconds: dict[str, dict[str, float]],
@@ -141,6 +119,21 @@ def _page(
     }
     return {"paper.md": "\n".join(lines).encode(), "paper.json": json_bytes(content)}
 
+
+main = script(
+    __file__,
+    __doc__,
+    _paper,
+    (
+        Arguments,
+        ExperimentOptions,
+        CaptureOptions,
+        RegionOptions,
+        ExperimentRun,
+        FileOptions,
+        TerminalOptions,
+    ),
+)
 
 if __name__ == "__main__":
     raise SystemExit(main())

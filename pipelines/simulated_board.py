@@ -10,7 +10,6 @@ each seed, whose spread is what figures may differ by. Captures and runs stay in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 
@@ -19,8 +18,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import (
     EvaluationOptions,
@@ -140,17 +138,7 @@ def _trajectory(truth: GroundTruth) -> str:
     return "\n".join(lines) + "\n"
 
 
-COMMAND = Command(
-    help_text="measure a rendered board beside that of another program",
-    run=_run,
-    groups=(Arguments, TerminalOptions),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Render, measure, and print the table."""
-    return run((COMMAND,), "simulated_board.py", argv)
-
+main = script(__file__, __doc__, _run, (Arguments, TerminalOptions))
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -8,7 +8,6 @@ second folder.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 
@@ -17,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import CaptureOptions, OptionGroup, option
 from polmvs.io.images import write_bytes
@@ -94,17 +92,7 @@ def _row(arguments: Arguments, light: LightName, material: MaterialName) -> Pict
     return np.concatenate([caption, row])
 
 
-COMMAND = Command(
-    help_text="pictures of materials under lights",
-    run=_render,
-    groups=(Arguments, TerminalOptions),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Render, and write the pictures."""
-    return run((COMMAND,), "simulated_gallery.py", argv)
-
+main = script(__file__, __doc__, _render, (Arguments, TerminalOptions))
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -19,8 +19,7 @@ from functools import partial
 from pathlib import Path
 
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import OptionGroup, option
 from polmvs.errors import PolmvsError
@@ -184,17 +183,7 @@ def _trial(arguments: Arguments, row: Row) -> TrialResult:
     return trial
 
 
-COMMAND = Command(
-    help_text="reconstruct rendered captures of each material under each light",
-    run=_run,
-    groups=(Arguments, TerminalOptions),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, and print the table."""
-    return run((COMMAND,), "simulated_table.py", argv)
-
+main = script(__file__, __doc__, _run, (Arguments, TerminalOptions))
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -10,13 +10,11 @@ masks. Its SfM has a known answer, so that pairs, mappers and growth can be meas
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import OptionGroup, default_num_workers, option
 from polmvs.parallel import Workers
@@ -60,17 +58,7 @@ def _make(call: Call, terminal: Terminal) -> int:
     return 0
 
 
-COMMAND = Command(
-    help_text="make a capture with printed texture and true cameras",
-    run=_make,
-    groups=(Arguments, TerminalOptions),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the script; the exit status."""
-    return run((COMMAND,), "synthetic.py", argv)
-
+main = script(__file__, __doc__, _make, (Arguments, TerminalOptions))
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -17,8 +17,7 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import OptionGroup, option
 from polmvs.errors import DataError
@@ -105,17 +104,7 @@ def _measure(call: Call, terminal: Terminal) -> int:
     return 0
 
 
-COMMAND = Command(
-    help_text="verdicts of finished runs beside their true errors",
-    run=_measure,
-    groups=(Arguments, TerminalOptions),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Judge the runs, and print the table."""
-    return run((COMMAND,), "trust_table.py", argv)
-
+main = script(__file__, __doc__, _measure, (Arguments, TerminalOptions))
 
 if __name__ == "__main__":
     raise SystemExit(main())

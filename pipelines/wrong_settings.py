@@ -30,8 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from polmvs.camera import PinholeCamera
 from polmvs.cli.call import Call, TerminalOptions
-from polmvs.cli.flags import Command
-from polmvs.cli.running import run
+from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.colmap.models import read_model, write_model
 from polmvs.config import OptionGroup, option
@@ -412,17 +411,7 @@ def _measure(call: Call, terminal: Terminal) -> int:
     return 0
 
 
-COMMAND = Command(
-    help_text="what wrong settings do, and what is said of them",
-    run=_measure,
-    groups=(Arguments, TerminalOptions),
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the settings, and print the table."""
-    return run((COMMAND,), "wrong_settings.py", argv)
-
+main = script(__file__, __doc__, _measure, (Arguments, TerminalOptions))
 
 if __name__ == "__main__":
     raise SystemExit(main())

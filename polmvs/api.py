@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Image, Mask
 from polmvs.camera import Camera, PinholeCamera
 from polmvs.config import (
     CaptureOptions,
@@ -57,9 +58,6 @@ if TYPE_CHECKING:  # heavy
     from polmvs.surface.dense_view import DenseView
 
 PathArg = str | PathLike[str]
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 T = TypeVar("T")
 Groups = TypeVar("Groups", Options, Simulation)
 Group = TypeVar("Group", bound=OptionGroup)
@@ -264,6 +262,7 @@ def track_normals(
     """
     from polmvs.colmap.models import write_model
     from polmvs.parallel import Workers
+    from polmvs.pipeline.run_folder import RunFolder
     from polmvs.pipeline.stages.maps import build_maps, tilt_maps
     from polmvs.pipeline.stages.normals import load_track_normals, solve_track_normals
     from polmvs.polarization.capture import open_capture
@@ -277,16 +276,13 @@ def track_normals(
         _lost_workers_told(num),
         Workers(num) as pool,
     ):
-        folder = Path(scratch)
-        write_model(fitted, folder / "sparse")
-        maps = folder / "maps"
-        build_maps(opened, folder / "sparse", maps, options.region, workers=pool)
+        folder = RunFolder(Path(scratch))
+        write_model(fitted, folder.sparse)
+        build_maps(opened, folder, options.region, workers=pool)
         if angle_model is AngleModel.TILTED:
-            maps = folder / "maps_tilted"
-            tilt_maps(folder / "sparse", folder / "maps", maps, workers=pool)
-        target = folder / "normals.npy"
-        solve_track_normals(angle_model, folder / "sparse", maps, target, options.normals)
-        estimate = load_track_normals(target)
+            tilt_maps(folder, workers=pool)
+        solve_track_normals(angle_model, folder, options.normals)
+        estimate = load_track_normals(folder, angle_model)
     tracks = fitted.tracks
     return TrackNormals(
         point3D_ids=tracks.point3D_ids,
@@ -375,7 +371,7 @@ class Reconstruction:
 
         cloud = self.cloud
         if not surroundings:
-            cloud = cloud.only(cloud.scalars.get("kind", np.zeros(0)) == PointKind.SURFACE)
+            cloud = cloud.only(cloud.are(PointKind.SURFACE))
         return to_open3d(cloud).to_legacy()
 
     def mesh(self) -> open3d.geometry.TriangleMesh:
@@ -453,7 +449,7 @@ class Reconstruction:
     def _views(self) -> Mapping[str, View]:
         from polmvs.pipeline.stages.maps import posed_views
 
-        return {view.name: view for view in posed_views(self._run_folder.sparse)}
+        return {view.name: view for view in posed_views(self._run_folder)}
 
     def _maps(self, name: str) -> tuple[Image, Image]:
         """Depth, 0 where unknown, and normals of a view."""

@@ -14,11 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
+from polmvs.arrays import Array
 
 MAX_OPENCV_COORDINATE = 32000.0  # of cv2.remap, px
-MAX_SIDE = 1 << 16  # of an image, px; a guess, more is damage
+MAX_SIDE = 1 << 16  # of an image, px: a JPEG has no larger one; more is damage
 OUTSIDE = np.float32(-10.0)
 
 

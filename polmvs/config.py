@@ -475,6 +475,12 @@ class SfmOptions(OptionGroup, group="sfm"):
             object.__setattr__(self, "pairs", str(self.pairs_file.absolute()))
 
     @property
+    def known_camera(self) -> str | None:
+        """The option that tells the camera; None: it is estimated."""
+        given = "sfm.camera" if self.camera is not None else None
+        return given if self.intrinsics is None else "sfm.intrinsics"
+
+    @property
     def pairs_file(self) -> Path | None:
         """The list of pairs, if ``pairs`` names one."""
         is_file = self.pairs is not None and self.pairs not in set(PairChoice)

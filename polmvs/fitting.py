@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
+from polmvs.arrays import Array, Floats, Mask
 
 CAUCHY_SCALE = 2.385  # deviations; 95 % efficiency on normal residuals (Holland & Welsch 1977)
 MEDIAN_OF_NORMAL = 0.6745  # median of |x|, x normal of unit deviation

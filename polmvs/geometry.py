@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from polmvs.arrays import Array
+
 Float = TypeVar("Float", bound=np.floating[Any])
 
 ROTATION_TOLERANCE = 1e-3  # of R R^T from the identity: poses are often written with few digits

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-Array = NDArray[np.float64]
+from polmvs.arrays import Array
 
 _AXIS_BITS = 21
 NUM_NEIGHBORS = 8  # by which the density about a point is told; a guess

@@ -12,12 +12,9 @@ from pathlib import PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Mask
 from polmvs.camera import Camera
 from polmvs.geometry import RigidTransform, dots, lengths
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 KEYPOINT_SIGMA_PX = 0.5  # of a keypoint of SfM: the usual reprojection error after adjustment
 # Between a normal and the direction to the camera. A surface seen flatter than 6 degrees shows a

@@ -24,7 +24,7 @@ from polmvs.pipeline.run_folder import RunFolder, replacing
 from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.polarization.kinds import AngleModel
-from polmvs.report.deviation_files import color_limit, write_deviation
+from polmvs.report.deviation_files import write_deviation
 from polmvs.surface.mesh_geometry import TriangleMesh
 
 MIN_POINTS = 100
@@ -37,10 +37,11 @@ def deviation(call: Call, terminal: Terminal) -> int:
         raise OptionError(f"{given.out}: exists. Give another folder.")
     if given.report and not given.result.is_dir():
         raise OptionError("is of a finished run.", field="arguments.report")
-    cloud_file = given.result
-    if given.result.is_dir():
-        cloud_file = _cloud_of_run(given.result, given.model)
-    cloud, is_metric = _result(given.result, given.model)
+    cloud_file, cloud, is_metric = _cloud(given.result, given.model)
+    if len(cloud.points) < MIN_POINTS:
+        raise DataError(
+            given.result, f"has {len(cloud.points)} points; {MIN_POINTS} or more are needed."
+        )
     reference, unit, other_run = _reference(given.reference, given.model)
     with terminal.stage("registration", None):
         found = measure_deviation(
@@ -65,12 +66,12 @@ def deviation(call: Call, terminal: Terminal) -> int:
     lines = deviation_lines(found)
     if given.out is not None:
         with new_folder(given.out) as folder:
-            write_deviation(folder, found, color_limit(found))
+            write_deviation(folder, found)
         lines.append(f"{given.out}: deviation.ply, .png, .svg, .json")
     if given.report:
         run_folder = RunFolder(given.result)
         with replacing(run_folder.deviation) as folder:
-            write_deviation(folder, found, color_limit(found))
+            write_deviation(folder, found)
         lines.append(make_report(run_folder, terminal))
     terminal.show([in_flags(line) for line in lines], found.figures)
     return OUT_OF_TOLERANCE if found.figures.passed is False else 0
@@ -120,28 +121,15 @@ def _usable(normals: np.ndarray | None) -> np.ndarray | None:
     return normals if (np.linalg.norm(normals, axis=1) > 0.5).all() else None
 
 
-def _result(path: Path, model: AngleModel | None) -> tuple[Cloud, bool]:
-    """The points to compare, and whether they are in metres."""
-    if not path.is_dir():
-        cloud = part_of(read_cloud(path))
-        is_metric = False
-    else:
-        cloud, is_metric = _surface_of_run(path, model)
-    if len(cloud.points) < MIN_POINTS:
-        raise DataError(path, f"has {len(cloud.points)} points; {MIN_POINTS} or more are needed.")
-    return cloud, is_metric
-
-
-def _cloud_of_run(path: Path, model: AngleModel | None) -> Path:
-    """The file of a run's cloud."""
-    run_folder = RunFolder(path)
-    return run_folder.cloud(surface_of(run_folder, dense_models(load_record(run_folder)), model))
-
-
-def _surface_of_run(path: Path, model: AngleModel | None) -> tuple[Cloud, bool]:
-    record = load_record(RunFolder(path))
-    cloud = part_of(read_cloud(_cloud_of_run(path, model)))
-    return cloud, record.result(PosesResult).is_metric
+def _cloud(path: Path, model: AngleModel | None) -> tuple[Path, Cloud, bool]:
+    """The file of a cloud or of a run's, its points to compare, whether they are in metres."""
+    file, is_metric = path, False
+    if path.is_dir():
+        run_folder = RunFolder(path)
+        record = load_record(run_folder)
+        file = run_folder.cloud(surface_of(run_folder, dense_models(record), model))
+        is_metric = record.result(PosesResult).is_metric
+    return file, part_of(read_cloud(file)), is_metric
 
 
 def _reference(
@@ -149,10 +137,8 @@ def _reference(
 ) -> tuple[Reference, str | None, tuple[np.ndarray, np.ndarray] | None]:
     """The reference, its unit where that is known, and of a run its points and their deviations."""
     if path.is_dir():
-        run_folder = RunFolder(path)
-        models = dense_models(load_record(run_folder))
-        mesh_file = run_folder.mesh(surface_of(run_folder, models, model))
-        cloud, is_metric = _surface_of_run(path, model)
+        file, cloud, is_metric = _cloud(path, model)
+        mesh_file = RunFolder(path).mesh(AngleModel(file.stem))
         unit = "m" if is_metric else None
         sigma = cloud.scalars.get("sigma", np.full(len(cloud.points), np.nan))
         own = (cloud.points, np.nan_to_num(sigma))

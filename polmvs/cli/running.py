@@ -6,12 +6,15 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from polmvs.cli.call import Call, TerminalOptions
 from polmvs.cli.exit_status import INTERRUPTED, interrupts
 from polmvs.cli.flags import Command, UsageError, in_flags, parse
+from polmvs.config import OptionGroup
 from polmvs.errors import OptionError, PolmvsError, final_name, printable
 
 logger = logging.getLogger(__name__)
@@ -46,6 +49,24 @@ def run(
     return _execute(parsed.command, parsed.call, parsed.prog)
 
 
+def script(
+    file: str,
+    doc: str | None,
+    function: Callable[[Call, Any], int],
+    groups: tuple[type[OptionGroup], ...],
+) -> Callable[..., int]:
+    """The ``main`` of a program of one command, which takes the arguments or finds them itself.
+
+    Parameters
+    ----------
+    file, doc : of its module; they give its name and, by the first line, its help.
+    function, groups : as of :class:`polmvs.cli.flags.Command`.
+    """
+    help_text = (doc or "").partition("\n")[0].removesuffix(".")
+    command = Command(help_text=help_text, run=function, groups=groups)
+    return partial(run, (command,), Path(file).name)
+
+
 def _execute(command: Command, call: Call, prog: str) -> int:
     try:
         options = call.get(TerminalOptions)
@@ -56,7 +77,7 @@ def _execute(command: Command, call: Call, prog: str) -> int:
     from polmvs.cli.terminal import Terminal
 
     with Terminal(options) as terminal:
-        return _guarded(lambda: _function(command)(call, terminal), terminal, prog)
+        return guarded(lambda: _function(command)(call, terminal), terminal, prog)
 
 
 def _function(command: Command) -> Callable[[Call, Any], int]:
@@ -68,7 +89,7 @@ def _function(command: Command) -> Callable[[Call, Any], int]:
     return function
 
 
-def _guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
+def guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
     """Run a command; its exit status, or that of what went wrong."""
     try:
         return _interruptible(command)

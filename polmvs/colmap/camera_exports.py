@@ -19,6 +19,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Mask
 from polmvs.camera import PinholeCamera
 from polmvs.colmap.dense_workspace import DenseWorkspace, WorkspaceView
 from polmvs.io.arrays import save_array
@@ -26,9 +27,6 @@ from polmvs.io.clouds import Cloud, write_cloud
 from polmvs.io.images import write_bytes, write_png
 from polmvs.io.typed_json import write_json
 from polmvs.scene import View, stem_of
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes x right, y up, z backwards
 # nerfstudio multiplies depths by 0.001 where nothing else is set, so that they are written in

@@ -1,4 +1,4 @@
-"""What estimated cameras and poses leave uncertain.
+"""Uncertainty of estimated cameras and poses.
 
 Few views fix a camera badly, and an error of its focal length or principal point bends the whole
 model while every image fits. Bundle adjustment's covariance says how well each combination of the
@@ -17,14 +17,12 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.colmap.models import read_reconstruction, registered
 from polmvs.colmap.sfm import SfmTolerances, bundle_of
 from polmvs.geometry import align_points
 from polmvs.scene import KEYPOINT_SIGMA_PX
-
-Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

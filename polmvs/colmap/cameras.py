@@ -14,9 +14,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import Camera, PinholeCamera
-
-Array = NDArray[np.float64]
 
 # Models that are a pinhole camera where all their distortion is zero. Fisheye models are not.
 PERSPECTIVE_MODELS = frozenset(

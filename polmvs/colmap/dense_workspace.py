@@ -20,6 +20,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy import sparse
 
+from polmvs.arrays import Array
 from polmvs.camera import PinholeCamera
 from polmvs.colmap.cameras import rescaled_camera
 from polmvs.colmap.maps import (
@@ -40,7 +41,6 @@ from polmvs.io.images import read_gray, write_bytes, write_png
 from polmvs.scene import KEYPOINT_SIGMA_PX, SparseModel, Tracks, View, short_list
 
 PathArg = str | PathLike[str]
-Array = NDArray[np.float64]
 Gray = NDArray[np.float32]
 ImageLoader = Callable[[str], NDArray[np.uint8]]
 # Maps of a view at the pixels of its undistorted camera, None for none.

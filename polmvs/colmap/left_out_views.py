@@ -1,4 +1,4 @@
-"""What is tried where SfM leaves views out: matching harder, by steps, for these views alone.
+"""Harder matching, in steps, of the views that SfM leaves without a pose.
 
 Steps keep the keypoints and all matches between views that have a pose. Each is slower than the
 one before, and they end when no view is left out.
@@ -78,8 +78,8 @@ def try_harder(
             break
         pairs = tuple(pair for pair in trial.pairs if missing & set(pair))
         if step is Step.POOLED:
-            _pool(trial)
-        _forget(trial.database, pairs)
+            pool_descriptors(trial)
+        forget_matches(trial.database, pairs)
         match_pairs(trial.database, pairs, seed=trial.seed, guided=True)
         model = trial.map()
         gained = missing - _missing(model, names)
@@ -103,7 +103,7 @@ def _missing(model: pycolmap.Reconstruction | None, names: Sequence[str]) -> set
     return set(names) - {model.images[number].name for number in model.reg_image_ids()}
 
 
-def _forget(database: Path, pairs: Pairs) -> None:
+def forget_matches(database: Path, pairs: Pairs) -> None:
     """Take the matches of pairs out of a database."""
     numbers = image_numbers(database)
     with opened(database) as content:
@@ -115,7 +115,7 @@ def _forget(database: Path, pairs: Pairs) -> None:
                 content.delete_two_view_geometry(*pair)
 
 
-def _pool(trial: Trial) -> None:
+def pool_descriptors(trial: Trial) -> None:
     """Replace the descriptors of a database by pooled ones of the same keypoints."""
     pooled = trial.database.with_name("pooled.db")
     trial.describe(pooled)

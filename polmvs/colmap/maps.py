@@ -20,13 +20,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Image
 from polmvs.camera import PinholeCamera
 from polmvs.errors import DataError, as_data_error
 from polmvs.geometry import dots, lengths
 from polmvs.io.images import write_bytes
 from polmvs.io.plain_files import open_plain
 
-Image = NDArray[np.float32]
 PathArg = str | PathLike[str]
 
 HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")

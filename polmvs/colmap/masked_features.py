@@ -1,4 +1,4 @@
-"""Features inside masks alone."""
+"""Removal of features outside masks."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Mask
 from polmvs.colmap.database import image_numbers, opened
 from polmvs.colmap.static_features import keep_features
-
-Mask = NDArray[np.bool_]
 
 
 def keep_inside(database: Path, masks: Mapping[str, Mask]) -> int:

@@ -13,9 +13,10 @@ from __future__ import annotations
 import copy
 import logging
 import shutil
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pycolmap
@@ -115,6 +116,225 @@ class SfmTolerances:
     focal_range: tuple[float, float] = (0.2, 10.0)
 
 
+@dataclass(frozen=True, kw_only=True)
+class SfmWork:
+    """Images whose poses are to be found, by what options, in what database.
+
+    Attributes
+    ----------
+    images : folder of 8-bit intensity images.
+    names : of the images that count, in order; a given database may have more.
+    database : COLMAP's. The mapper's own files lie beside it while it works.
+    reader : the camera that COLMAP starts from.
+    """
+
+    images: Path
+    names: Sequence[str]
+    database: Path
+    reader: pycolmap.ImageReaderOptions
+    options: SfmOptions
+    tolerances: SfmTolerances = SfmTolerances()
+
+    def describe(self, database: Path, *, pooled: bool = False) -> None:
+        """Affine-adapted SIFT of all images into a new database, or the features asked for.
+
+        ``pooled``: descriptors are means over sizes of the domain (DSP-SIFT), which takes three
+        times as long.
+        """
+        single, each = pycolmap.CameraMode.SINGLE, pycolmap.CameraMode.PER_IMAGE
+        mode = single if self.options.single_camera else each
+        names = list(self.names)
+        # Images first, in order: left to the extractor's threads their ids change from run to run,
+        # and with them the order of everything after.
+        pycolmap.Database.open(database).close()  # creates the file
+        pycolmap.import_images(database, self.images, mode, names, self.reader)
+        learned = learned_features(self.options)
+        if learned is not None:
+            extraction = learned.extraction()
+        else:
+            extraction = pycolmap.FeatureExtractionOptions()
+            extraction.sift.estimate_affine_shape = True
+            extraction.sift.domain_size_pooling = pooled
+        pycolmap.extract_features(
+            database, self.images, names, mode, self.reader, extraction, pycolmap.Device.cpu
+        )
+
+    def pairs(self) -> Pairs:
+        """The pairs of images that are asked for, or that are likely to show the same."""
+        numbers = image_numbers(self.database)
+        with opened(self.database) as content:
+            return choose_pairs(
+                sorted(self.names),
+                self.options.pairs,
+                lambda name: read_descriptors(content, numbers[name]),
+                seed=self.options.seed,
+            )
+
+    def match(self) -> None:
+        """Match these pairs."""
+        learned = learned_features(self.options)
+        match_pairs(self.database, self.pairs(), seed=self.options.seed, learned=learned)
+
+    def map_all(self) -> pycolmap.Reconstruction:
+        """The largest model of the images, after harder matching where it leaves some out."""
+        unable: list[NoModelError] = []
+
+        def map_once() -> pycolmap.Reconstruction | None:
+            if self.options.known_camera and (num := drop_contradicting(self.database)):
+                logger.info("SfM: %d pairs match as no pair of this camera can; not used.", num)
+            try:
+                return self.map()
+            except NoModelError as error:
+                unable.append(error)
+                return None
+
+        found = map_once()
+        # The steps are SIFT's; a given database's features may be of another kind.
+        is_sift = self.options.database is None and self.options.aliked is None
+        if is_sift and len(self.names) <= MAX_IMAGES:
+            trial = Trial(
+                database=self.database,
+                pairs=self.pairs(),
+                describe=partial(self.describe, pooled=True),
+                map=map_once,
+                seed=self.options.seed,
+            )
+            found = try_harder(found, self.names, trial)
+        if found is None:
+            raise unable[0]
+        return found
+
+    def map(self) -> pycolmap.Reconstruction:
+        """The largest model of the images that the mapper makes.
+
+        Where matches abound it finds the poses from a part of them, if that registers every image.
+        """
+        thinned = self.database.with_name("mapping.db")
+        thinned.unlink(missing_ok=True)
+        least = self.tolerances.min_pair_matches
+        if thin_database(self.database, thinned, least, seed=self.options.seed):
+            found = self._models(thinned)
+            thinned.unlink()
+            if found and found[0].num_reg_images() == len(self.names):
+                return self.triangulate(found[0])
+        found = self._models(self.database)
+        if not found:
+            raise NoModelError(
+                self.images, f"SfM finds no model of these images. {NO_MODEL_REMEDY}"
+            )
+        largest = found[0]
+        if largest.num_reg_images() < 2:
+            raise NoModelError(self.images, f"SfM registers one image only. {NO_MODEL_REMEDY}")
+        if len(found) > 1 and largest.num_reg_images() < len(self.names):
+            logger.warning(
+                "SfM: the images fall into %d models; the largest is used and has %d of %d images.",
+                len(found),
+                largest.num_reg_images(),
+                len(self.names),
+            )
+        return largest
+
+    def triangulate(self, known: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        """A model of known poses with the points of all matches."""
+        with self._place_for_models() as models:
+            return pycolmap.triangulate_points(
+                known, self.database, self.images, models, options=self._incremental()
+            )
+
+    def _models(self, database: Path) -> list[pycolmap.Reconstruction]:
+        """What the mapper makes of a database, the largest model first."""
+        with self._place_for_models() as models:
+            if self.options.mapper is Mapper.GLOBAL:
+                found = pycolmap.global_mapping(database, self.images, models, self._global())
+            else:
+                found = pycolmap.incremental_mapping(
+                    database, self.images, models, self._incremental()
+                )
+        return sorted(
+            found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), reverse=True
+        )
+
+    @contextmanager
+    def _place_for_models(self) -> Iterator[Path]:
+        """An empty folder where COLMAP leaves models, which are not read again."""
+        models = self.database.with_name("models")
+        shutil.rmtree(models, ignore_errors=True)
+        models.mkdir()
+        yield models
+        shutil.rmtree(models)
+
+    def _incremental(self) -> pycolmap.IncrementalPipelineOptions:
+        """Options of the incremental mapper."""
+        num_images = len(self.names)
+        pipeline = pycolmap.IncrementalPipelineOptions()
+        pipeline.image_names = list(self.names)  # a given database may have more
+        pipeline.min_model_size = min(3, num_images)
+        pipeline.random_seed = self.options.seed
+        pipeline.mapper.random_seed = self.options.seed
+        pipeline.triangulation.random_seed = self.options.seed
+        # With more threads one capture's model changes from run to run, and nothing is won: 0.6 s
+        # for ten views either way. Extraction and matching are the larger part and use all cores.
+        pipeline.num_threads = 1
+        pipeline.mapper.num_threads = 1
+        pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = (
+            self.tolerances.model_growth
+        )
+        pipeline.ba_global_function_tolerance = self.tolerances.max_cost_change
+        pipeline.ba_local_function_tolerance = self.tolerances.max_cost_change
+        pipeline.ba_global_max_refinements = self.tolerances.max_refinements
+        pipeline.ba_local_max_refinements = self.tolerances.max_refinements
+        two_view_tracks = num_images <= self.tolerances.max_images_two_view_tracks
+        pipeline.triangulation.ignore_two_view_tracks = not two_view_tracks
+        if self.options.known_camera:
+            pipeline.ba_refine_focal_length = False
+            pipeline.ba_refine_extra_params = False
+            pipeline.mapper.abs_pose_refine_focal_length = False
+            pipeline.mapper.abs_pose_refine_extra_params = False
+            # With a camera still to be found the errors are larger at first: COLMAP's 4 px stay.
+            error_px = self.tolerances.max_reproj_error_px
+            pipeline.mapper.filter_max_reproj_error = error_px
+            pipeline.triangulation.complete_max_reproj_error = error_px
+            pipeline.triangulation.merge_max_reproj_error = error_px
+        return pipeline
+
+    def _global(self) -> pycolmap.GlobalPipelineOptions:
+        """Options of the global mapper.
+
+        Raises
+        ------
+        OptionError
+            This version of pycolmap has none.
+        """
+        if not hasattr(pycolmap, "global_mapping"):
+            raise OptionError(
+                f"global needs pycolmap 4.1 or newer; this is {pycolmap.__version__}.",
+                field="sfm.mapper",
+            )
+        pipeline = pycolmap.GlobalPipelineOptions()
+        pipeline.image_names = list(self.names)
+        pipeline.min_model_size = min(3, len(self.names))
+        pipeline.num_threads = pipeline.mapper.num_threads = 1  # as of the incremental mapper
+        mapper = pipeline.mapper
+        for seeded in (
+            pipeline,
+            mapper,
+            mapper.rotation_averaging,
+            mapper.global_positioning,
+            mapper.retriangulation,
+        ):
+            seeded.random_seed = self.options.seed
+        solver = mapper.bundle_adjustment.ceres.solver_options
+        solver.num_threads = 1
+        solver.function_tolerance = self.tolerances.max_cost_change
+        if self.options.known_camera:
+            mapper.bundle_adjustment.refine_focal_length = False
+            mapper.bundle_adjustment.refine_extra_params = False
+            error_px = self.tolerances.max_reproj_error_px
+            mapper.retriangulation.complete_max_reproj_error = error_px
+            mapper.retriangulation.merge_max_reproj_error = error_px
+        return pipeline
+
+
 def run_sfm(
     image_folder: Path,
     image_names: Sequence[str],
@@ -157,17 +377,24 @@ def run_sfm(
     to_match = names if given is None else list(given.ids)
     if options.pairs_file is not None:  # before the features, which take longer
         read_pairs(options.pairs_file, to_match)
-    database = _place_of_database(work_folder)
+    work = SfmWork(
+        images=image_folder,
+        names=to_match,
+        database=_place_of_database(work_folder),
+        reader=reader,
+        options=options,
+        tolerances=tolerances,
+    )
     pycolmap.set_random_seed(options.seed)
     with quiet_colmap(), nullcontext() if given is None else sound(given.path):
         on_step("features")
         if given is None:
-            _extract_features(database, image_folder, names, reader, options)
+            work.describe(work.database)
             if masks is not None:
                 inside = {name: read_mask(masks[name], (height, width)) for name in names}
-                num_inside = keep_inside(database, inside)
+                num_inside = keep_inside(work.database, inside)
                 logger.info("SfM: %d features inside the masks.", num_inside)
-            static = take_out_static(database) if options.static_background else None
+            static = take_out_static(work.database) if options.static_background else None
             if static is not None:
                 logger.warning(
                     "a background stands still while the part turns: its features, %.0f %% of all, "
@@ -177,20 +404,18 @@ def run_sfm(
                     100 * static,
                 )
         else:
-            _take_database(given, database, reader, width, height, options)
+            _take_database(given, work, width, height)
         on_step("matching")
         if given is None or not given.has_matches or options.pairs is not None:
-            _match(database, to_match, options)
+            work.match()
         on_step("mapping")
-        reconstruction = _map_all(
-            database, image_folder, work_folder, to_match, reader, options, tolerances
-        )
+        reconstruction = work.map_all()
         on_step("bundle adjustment")
         single = options.single_camera if given is None else given.num_cameras == 1
         reconstruction = _refine(
             reconstruction,
             tolerances,
-            free_intrinsics=options.intrinsics is None and options.camera is None,
+            free_intrinsics=options.known_camera is None,
             single_camera=single,
         )
     write_reconstruction(reconstruction, sparse_folder)
@@ -230,18 +455,19 @@ def triangulate_views(
     camera = camera_to_colmap(ordered[0].camera)
     reader.camera_model = camera.model.name
     reader.camera_params = camera.params_to_string()
-    database = _place_of_database(work_folder)
+    work = SfmWork(
+        images=image_folder,
+        names=names,
+        database=_place_of_database(work_folder),
+        reader=reader,
+        options=options,
+    )
     pycolmap.set_random_seed(options.seed)
     with quiet_colmap():
-        _extract_features(database, image_folder, names, reader, options)
-        _match(database, names, options)
+        work.describe(work.database)
+        work.match()
         # Images were imported in the order of names, so their ids are those of the views here.
-        known = reconstruction_of_views(ordered, single_camera=single)
-        mapper = _mapper_options(names, options, SfmTolerances())
-        output = work_folder / "triangulated"
-        output.mkdir(exist_ok=True)
-        found = pycolmap.triangulate_points(known, database, image_folder, output, options=mapper)
-    shutil.rmtree(output)
+        found = work.triangulate(reconstruction_of_views(ordered, single_camera=single))
     write_reconstruction(found, sparse_folder)
     model = model_from_reconstruction(found, names)
     _log_result(model, found.compute_mean_reprojection_error())
@@ -349,249 +575,14 @@ def _reader_options(
     return reader
 
 
-def _extract_features(
-    database: Path,
-    image_folder: Path,
-    names: list[str],
-    reader: pycolmap.ImageReaderOptions,
-    options: SfmOptions,
-    *,
-    pooled: bool = False,
-) -> None:
-    """Affine-adapted SIFT of all images into a new database, or the features that are asked for.
-
-    ``pooled``: descriptors are means over sizes of the domain (DSP-SIFT), which takes three times
-    as long.
-    """
-    single, each = pycolmap.CameraMode.SINGLE, pycolmap.CameraMode.PER_IMAGE
-    mode = single if options.single_camera else each
-    # Images first, in order: left to the extractor's threads their ids change from run to run,
-    # and with them the order of everything after.
-    pycolmap.Database.open(database).close()  # creates the file
-    pycolmap.import_images(database, image_folder, mode, names, reader)
-    learned = learned_features(options)
-    if learned is not None:
-        extraction = learned.extraction()
-    else:
-        extraction = pycolmap.FeatureExtractionOptions()
-        extraction.sift.estimate_affine_shape = True
-        extraction.sift.domain_size_pooling = pooled
-    pycolmap.extract_features(
-        database, image_folder, names, mode, reader, extraction, pycolmap.Device.cpu
-    )
-
-
-def _take_database(
-    given: GivenDatabase,
-    database: Path,
-    reader: pycolmap.ImageReaderOptions,
-    width: int,
-    height: int,
-    options: SfmOptions,
-) -> None:
+def _take_database(given: GivenDatabase, work: SfmWork, width: int, height: int) -> None:
     """Copy a given database, with the given camera if there is one."""
-    copy_database(given, database)
-    if options.intrinsics is not None or options.camera is not None:
-        params = [float(value) for value in reader.camera_params.split(",")]
-        replace_cameras(
-            database,
-            pycolmap.Camera(model=reader.camera_model, width=width, height=height, params=params),
-        )
-
-
-def _match(database: Path, names: Sequence[str], options: SfmOptions) -> None:
-    """Match the pairs of images that are asked for, or that are likely to show the same."""
-    pairs = _pairs(database, names, options)
-    match_pairs(database, pairs, seed=options.seed, learned=learned_features(options))
-
-
-def _pairs(database: Path, names: Sequence[str], options: SfmOptions) -> Pairs:
-    """The pairs of images that are asked for, or that are likely to show the same."""
-    numbers = image_numbers(database)
-    with opened(database) as content:
-        return choose_pairs(
-            sorted(names),
-            options.pairs,
-            lambda name: read_descriptors(content, numbers[name]),
-            seed=options.seed,
-        )
-
-
-def _mapper_options(
-    names: Sequence[str], options: SfmOptions, tolerances: SfmTolerances
-) -> pycolmap.IncrementalPipelineOptions:
-    """Options of the incremental mapper."""
-    num_images = len(names)
-    pipeline = pycolmap.IncrementalPipelineOptions()
-    pipeline.image_names = list(names)  # a given database may have more
-    pipeline.min_model_size = min(3, num_images)
-    pipeline.random_seed = options.seed
-    pipeline.mapper.random_seed = options.seed
-    pipeline.triangulation.random_seed = options.seed
-    # With more threads one capture's model changes from run to run, and nothing is won: 0.6 s for
-    # ten views either way. Extraction and matching are the larger part and use all cores.
-    pipeline.num_threads = 1
-    pipeline.mapper.num_threads = 1
-    pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = tolerances.model_growth
-    pipeline.ba_global_function_tolerance = tolerances.max_cost_change
-    pipeline.ba_local_function_tolerance = tolerances.max_cost_change
-    pipeline.ba_global_max_refinements = tolerances.max_refinements
-    pipeline.ba_local_max_refinements = tolerances.max_refinements
-    two_view_tracks = num_images <= tolerances.max_images_two_view_tracks
-    pipeline.triangulation.ignore_two_view_tracks = not two_view_tracks
-    if options.intrinsics is not None or options.camera is not None:
-        pipeline.ba_refine_focal_length = False
-        pipeline.ba_refine_extra_params = False
-        pipeline.mapper.abs_pose_refine_focal_length = False
-        pipeline.mapper.abs_pose_refine_extra_params = False
-        # With a camera still to be found the errors are larger at first: COLMAP's 4 px stay.
-        error_px = tolerances.max_reproj_error_px
-        pipeline.mapper.filter_max_reproj_error = error_px
-        pipeline.triangulation.complete_max_reproj_error = error_px
-        pipeline.triangulation.merge_max_reproj_error = error_px
-    return pipeline
-
-
-def _global_options(
-    names: Sequence[str], options: SfmOptions, tolerances: SfmTolerances
-) -> pycolmap.GlobalPipelineOptions:
-    """Options of the global mapper.
-
-    Raises
-    ------
-    OptionError
-        This version of pycolmap has none.
-    """
-    if not hasattr(pycolmap, "global_mapping"):
-        raise OptionError(
-            f"global needs pycolmap 4.1 or newer; this is {pycolmap.__version__}.",
-            field="sfm.mapper",
-        )
-    pipeline = pycolmap.GlobalPipelineOptions()
-    pipeline.image_names = list(names)
-    pipeline.min_model_size = min(3, len(names))
-    pipeline.num_threads = pipeline.mapper.num_threads = 1  # as of the incremental mapper
-    mapper = pipeline.mapper
-    for seeded in (
-        pipeline,
-        mapper,
-        mapper.rotation_averaging,
-        mapper.global_positioning,
-        mapper.retriangulation,
-    ):
-        seeded.random_seed = options.seed
-    solver = mapper.bundle_adjustment.ceres.solver_options
-    solver.num_threads = 1
-    solver.function_tolerance = tolerances.max_cost_change
-    if options.intrinsics is not None or options.camera is not None:
-        mapper.bundle_adjustment.refine_focal_length = False
-        mapper.bundle_adjustment.refine_extra_params = False
-        error_px = tolerances.max_reproj_error_px
-        mapper.retriangulation.complete_max_reproj_error = error_px
-        mapper.retriangulation.merge_max_reproj_error = error_px
-    return pipeline
-
-
-def _map_all(
-    database: Path,
-    image_folder: Path,
-    work_folder: Path,
-    names: Sequence[str],
-    reader: pycolmap.ImageReaderOptions,
-    options: SfmOptions,
-    tolerances: SfmTolerances,
-) -> pycolmap.Reconstruction:
-    """The largest model of the images, after harder matching where it leaves some out."""
-    is_known = options.intrinsics is not None or options.camera is not None
-    unable: list[NoModelError] = []
-
-    def map_once() -> pycolmap.Reconstruction | None:
-        if is_known and (num := drop_contradicting(database)):
-            logger.info("SfM: %d pairs match as no pair of this camera can; not used.", num)
-        try:
-            return _map(database, image_folder, work_folder, names, options, tolerances)
-        except NoModelError as error:
-            unable.append(error)
-            return None
-
-    def describe(target: Path) -> None:
-        _extract_features(target, image_folder, list(names), reader, options, pooled=True)
-
-    found = map_once()
-    # The steps are SIFT's; a given database's features may be of another kind.
-    if options.database is None and options.aliked is None and len(names) <= MAX_IMAGES:
-        pairs = _pairs(database, names, options)
-        trial = Trial(
-            database=database, pairs=pairs, describe=describe, map=map_once, seed=options.seed
-        )
-        found = try_harder(found, names, trial)
-    if found is None:
-        raise unable[0]
-    return found
-
-
-def _map(
-    database: Path,
-    image_folder: Path,
-    work_folder: Path,
-    names: Sequence[str],
-    options: SfmOptions,
-    tolerances: SfmTolerances,
-) -> pycolmap.Reconstruction:
-    """The largest model of the images that the mapper makes.
-
-    Where matches abound it finds the poses from a part of them, if that registers every image.
-    """
-    thinned = work_folder / "mapping.db"
-    thinned.unlink(missing_ok=True)
-    models = work_folder / "models"
-    if thin_database(database, thinned, tolerances.min_pair_matches, seed=options.seed):
-        found = _models(thinned, image_folder, models, names, options, tolerances)
-        thinned.unlink()
-        if found and found[0].num_reg_images() == len(names):
-            models.mkdir()
-            mapper = _mapper_options(names, options, tolerances)
-            whole = pycolmap.triangulate_points(
-                found[0], database, image_folder, models, options=mapper
-            )
-            shutil.rmtree(models)
-            return whole
-    found = _models(database, image_folder, models, names, options, tolerances)
-    if not found:
-        raise NoModelError(image_folder, f"SfM finds no model of these images. {NO_MODEL_REMEDY}")
-    largest = found[0]
-    if largest.num_reg_images() < 2:
-        raise NoModelError(image_folder, f"SfM registers one image only. {NO_MODEL_REMEDY}")
-    if len(found) > 1 and largest.num_reg_images() < len(names):
-        logger.warning(
-            "SfM: the images fall into %d models; the largest is used and has %d of %d images.",
-            len(found),
-            largest.num_reg_images(),
-            len(names),
-        )
-    return largest
-
-
-def _models(
-    database: Path,
-    image_folder: Path,
-    models: Path,
-    names: Sequence[str],
-    options: SfmOptions,
-    tolerances: SfmTolerances,
-) -> list[pycolmap.Reconstruction]:
-    """What the mapper makes of a database, the largest model first."""
-    shutil.rmtree(models, ignore_errors=True)
-    models.mkdir()
-    paths = (database, image_folder, models)
-    if options.mapper is Mapper.GLOBAL:
-        found = pycolmap.global_mapping(*paths, _global_options(names, options, tolerances))
-    else:
-        found = pycolmap.incremental_mapping(*paths, _mapper_options(names, options, tolerances))
-    shutil.rmtree(models)
-    return sorted(
-        found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), reverse=True
-    )
+    copy_database(given, work.database)
+    if work.options.known_camera:
+        model = work.reader.camera_model
+        params = [float(value) for value in work.reader.camera_params.split(",")]
+        camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
+        replace_cameras(work.database, camera)
 
 
 def _refine(

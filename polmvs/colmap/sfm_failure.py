@@ -1,4 +1,4 @@
-"""Why SfM found no model, by its database: no texture, no overlap, or a camera that is none."""
+"""Diagnosis of a failed SfM from its database: no texture, no overlap, or a wrong camera."""
 
 from __future__ import annotations
 
@@ -59,9 +59,8 @@ def why_no_model(database: Path, options: SfmOptions) -> str:
 
 
 def _camera_remedy(options: SfmOptions) -> str:
-    if options.intrinsics is not None or options.camera is not None:
-        name = "intrinsics" if options.intrinsics is not None else "camera"
-        return f"Check `sfm.{name}`, or leave it out, so that the camera is estimated."
+    if options.known_camera is not None:
+        return f"Check `{options.known_camera}`, or leave it out, so that the camera is estimated."
     if options.camera_model != SfmOptions().camera_model:
         return (
             f"Check `sfm.camera_model` {options.camera_model}; a normal lens has "

@@ -17,8 +17,8 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from polmvs.arrays import Mask
+from polmvs.colmap.database import opened
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +55,7 @@ def take_out_static(
     -------
     The share of the features that went, if there is such a background; None: nothing was changed.
     """
-    content = pycolmap.Database.open(database)
-    try:
+    with opened(database) as content:
         ids = [image.image_id for image in content.read_all_images()]
         keypoints = [np.asarray(content.read_keypoints(number)) for number in ids]
         found = [content.read_descriptors(number) for number in ids]
@@ -66,8 +65,6 @@ def take_out_static(
             return None
         keep_features(content, {n: ~out for n, out in zip(ids, still, strict=True)})
         return float(np.concatenate(still).mean())
-    finally:
-        content.close()
 
 
 def keep_features(content: pycolmap.Database, kept: Mapping[int, Mask]) -> None:

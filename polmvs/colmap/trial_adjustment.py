@@ -1,4 +1,4 @@
-"""Which cameras would fit a model's matches better than those that were given with it.
+"""Trial adjustments: whether other cameras fit a model's matches better than the given ones.
 
 A focal length or a principal point that is wrong bends the whole model while every image fits, and
 normals with it; a pose that is wrong has all rows of its view wrong. The matches know both. They
@@ -15,15 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from polmvs.colmap.camera_uncertainty import CameraTolerances, adjuster_of, parameter_covariance
 from polmvs.colmap.cameras import quiet_colmap
 from polmvs.colmap.models import read_reconstruction, registered
 from polmvs.colmap.sfm import bundle_of
 from polmvs.geometry import align_points, nearest_rotation
-
-Array = NDArray[np.float64]
 
 ADJUSTMENT = CameraTolerances()
 

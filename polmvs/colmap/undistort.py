@@ -14,13 +14,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Image, Mask
 from polmvs.camera import Camera, PinholeCamera, in_frame, pixel_centers, sample_image
 from polmvs.colmap.cameras import camera_from_colmap, camera_to_colmap
 from polmvs.scene import SparseModel, some_tracks
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 
 def undistorted_camera(

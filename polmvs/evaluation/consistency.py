@@ -1,4 +1,4 @@
-"""How well a cloud fits the capture that it was made from; no truth is needed."""
+"""Consistency of a cloud with the capture that it was made from; needs no ground truth."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Floats, Mask
 from polmvs.camera import depth_buffer, sample_image
 from polmvs.evaluation.metrics import MIN_DOLP, AngleStats, axial_errors_deg
 from polmvs.geometry import unit
@@ -18,9 +19,6 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import Region
 from polmvs.scene import PointKind, View
-
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 # These define the figures; they are no tolerances of an algorithm.
 MAX_RESIDUAL_POINTS = 100_000  # of a cloud, evenly spread, that phase residuals are taken from
@@ -69,7 +67,7 @@ def measure_consistency(
     outside : pixels (H, W) of each view, by its name, that show what lies outside the box that the
         cloud was cut to: they count for nothing.
     """
-    cloud = _polarized_surface(cloud)
+    cloud = cloud.only(cloud.are(PointKind.SURFACE))
     num = len(cloud.points)
     step = -(-num // MAX_RESIDUAL_POINTS) or 1
     covered = inside = 0
@@ -112,14 +110,6 @@ def within_box(phase_map: PhaseMap, outside: Mapping[str, Mask]) -> PhaseMap:
     inside = region.inside & ~outside[phase_map.view.name]
     kept = Region(inside=inside, reliable=region.reliable & inside, edges=region.edges)
     return phase_map.changed(region=kept)
-
-
-def _polarized_surface(cloud: Cloud) -> Cloud:
-    """The points of the polarized surface, as a cloud of their own."""
-    kind = cloud.scalars.get("kind")
-    if kind is None:
-        return cloud
-    return cloud.only(kind == PointKind.SURFACE)
 
 
 def _track_residual(tracks: Cloud) -> float:

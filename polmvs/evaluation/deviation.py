@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.arrays import Array
 from polmvs.errors import OptionError
 from polmvs.evaluation.registration import IDENTITY, Reference, register
 from polmvs.geometry import SimilarityTransform, dots, lengths
-
-Array = NDArray[np.float64]
 
 UNITS_M: Mapping[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254, "um": 1e-6}
 PERCENTILES = (1, 5, 25, 50, 75, 95, 99)

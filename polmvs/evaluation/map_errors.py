@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Image, Mask
 from polmvs.camera import sample_image
 from polmvs.errors import DataError
 from polmvs.evaluation.metrics import THRESHOLDS_M, AngleStats, angular_errors_deg
@@ -22,10 +22,6 @@ from polmvs.io.ground_truth import GroundTruth
 from polmvs.poses.alignment import align_views
 from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView, lattice_xy
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # These define the figures; they are no tolerances of an algorithm.
 WHOLE_SHARE = 0.999  # of the pixels about a lattice point; interpolation rounds

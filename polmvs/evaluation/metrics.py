@@ -35,13 +35,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats
 from polmvs.config import RegionOptions
 from polmvs.io.ground_truth import PART_SPACING_M
 from polmvs.neighbors import nearest_points
 from polmvs.polarization.stokes import axial_difference
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating]
 
 # These define the figures; they are no tolerances of an algorithm.
 THRESHOLDS_M = (0.001, 0.002, 0.005)

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from polmvs.arrays import Array
 from polmvs.fitting import geman_mcclure_weights, robust_deviation
 from polmvs.geometry import SimilarityTransform, dots, lengths
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
-
-Array = NDArray[np.float64]
 
 IDENTITY = SimilarityTransform(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
 

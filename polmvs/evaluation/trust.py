@@ -1,4 +1,4 @@
-"""What a reconstruction says about itself: one verdict, and figures with the range that is normal.
+"""Self-assessment of a reconstruction: one verdict, and figures with their normal ranges.
 
 No truth is needed. What can be derived is; the rest was measured on reconstructions that are right
 and on wrong ones: see :class:`NormalRanges`. Some figures are of what the surface was fitted to;
@@ -7,14 +7,14 @@ those of views that were left out, and of the mesh as such, can contradict it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Floats, Mask
 from polmvs.camera import in_image, sample_image
 from polmvs.config import PropagationOptions
 from polmvs.evaluation.consistency import (
@@ -38,10 +38,6 @@ LIGHT_OPTIONS = "`region.light`, `capture.pattern`, `capture.gamma`"
 MIN_CHECKED = 4  # views: three make a surface, and one checks it
 # Phases that a prediction is measured by, under which it tells nothing.
 MIN_PHASES = 50
-
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
-_Row = tuple[str, float, tuple[float, float], float, str, bool]  # as TrustFigure, unscaled
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +122,26 @@ class TrustFigure:
         return text if self.is_normal else text + f"; check {self.remedy}"
 
 
+def _figure(
+    name: str,
+    value: float,
+    normal: tuple[float, float],
+    remedy: str,
+    *,
+    scale: float = 100.0,
+    decides: bool = True,
+) -> TrustFigure:
+    """A share as per cent, or with a scale of 1 what it is; unknown where it is not finite."""
+    return TrustFigure(
+        name=name,
+        value=scale * value if np.isfinite(value) else None,
+        least=scale * normal[0],
+        most=scale * normal[1],
+        remedy=remedy,
+        decides=decides,
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Trust:
     """How far a cloud of one angle model is to be trusted.
@@ -172,23 +188,9 @@ class Trust:
 
     def figures(self, ranges: NormalRanges = NormalRanges()) -> tuple[TrustFigure, ...]:
         """The figures with their normal ranges, for people; first those that can contradict."""
-        return tuple(
-            TrustFigure(
-                name=name,
-                value=scale * value if np.isfinite(value) else None,
-                least=scale * low,
-                most=scale * high,
-                remedy=remedy,
-                decides=decides,
-            )
-            for name, value, (low, high), scale, remedy, decides in [
-                *self._contradicting(ranges),
-                *self._fitted(ranges),
-            ]
-        )
+        return (*self._contradicting(ranges), *self._fitted(ranges))
 
-    def _contradicting(self, ranges: NormalRanges) -> list[_Row]:
-        rows: list[_Row] = []
+    def _contradicting(self, ranges: NormalRanges) -> Iterator[TrustFigure]:
         if self.predicted is not None:
             enough = self.predicted.num_phases >= MIN_PHASES
             remedy = (
@@ -198,132 +200,53 @@ class Trust:
             odd = self.predicted.odd_view(ranges.predicted_deg[1])
             if odd is not None:
                 remedy = f"pose, image and mask of {odd}"
-            rows += [
-                (
-                    "planes of incidence of views left out, from a surface of the others, median "
-                    f"error, deg ({self.predicted.chance_deg:g} by chance)",
-                    self.predicted.error_deg if enough else float("nan"),
-                    ranges.predicted_deg,
-                    1.0,
-                    remedy,
-                    True,
-                ),
-                (
-                    "silhouettes of views left out, overlap with their prediction, %",
-                    self.predicted.overlap,
-                    ranges.overlap,
-                    100.0,
-                    "`region.mask`, `capture.gamma`, poses",
-                    True,
-                ),
-            ]
-        if self.fitted is not None:
-            rows.append(
-                (
-                    "phases that neither kind of light explains, %",
-                    self.fitted.unexplained,
-                    ranges.unexplained,
-                    100.0,
-                    LIGHT_OPTIONS,
-                    True,
-                )
+            name = (
+                "planes of incidence of views left out, from a surface of the others, median "
+                f"error, deg ({self.predicted.chance_deg:g} by chance)"
             )
+            error = self.predicted.error_deg if enough else float("nan")
+            yield _figure(name, error, ranges.predicted_deg, remedy, scale=1.0)
+            name = "silhouettes of views left out, overlap with their prediction, %"
+            remedy = "`region.mask`, `capture.gamma`, poses"
+            yield _figure(name, self.predicted.overlap, ranges.overlap, remedy)
+        if self.fitted is not None:
+            name = "phases that neither kind of light explains, %"
+            yield _figure(name, self.fitted.unexplained, ranges.unexplained, LIGHT_OPTIONS)
         if self.soundness is not None:
             views = "views that contradict each other: poses, `region.mask`"
-            rows += [
-                (
-                    "lines of sight through two sheets of surface upon each other, %",
-                    self.soundness.layered,
-                    ranges.layered,
-                    100.0,
-                    views,
-                    True,
-                ),
-                (
-                    "lines of sight through a surface that intersects itself, %",
-                    self.soundness.overlapping,
-                    ranges.overlapping,
-                    100.0,
-                    views,
-                    True,
-                ),
-            ]
+            name = "lines of sight through two sheets of surface upon each other, %"
+            yield _figure(name, self.soundness.layered, ranges.layered, views)
+            name = "lines of sight through a surface that intersects itself, %"
+            yield _figure(name, self.soundness.overlapping, ranges.overlapping, views)
         if self.num_views:
-            rows.append(
-                (
-                    "views without a pose or that contradict the others, %",
-                    self.left_out / self.num_views,
-                    ranges.left_out,
-                    100.0,
-                    "the images of these views, `sfm.intrinsics`, `region.mask`",
-                    True,
-                )
-            )
+            name = "views without a pose or that contradict the others, %"
+            remedy = "the images of these views, `sfm.intrinsics`, `region.mask`"
+            yield _figure(name, self.left_out / self.num_views, ranges.left_out, remedy)
         if self.cut_share is not None:
-            rows.append(
-                (
-                    "polarized surface along the masks, outside of them, %",
-                    self.cut_share,
-                    ranges.cut,
-                    100.0,
-                    "`region.mask`, which ends within a surface: its edge is frayed there; masks "
-                    "of the whole object, its sides too, or none",
-                    False,
-                )
+            name = "polarized surface along the masks, outside of them, %"
+            remedy = (
+                "`region.mask`, which ends within a surface: its edge is frayed there; masks "
+                "of the whole object, its sides too, or none"
             )
-        return rows
+            yield _figure(name, self.cut_share, ranges.cut, remedy, decides=False)
 
-    def _fitted(self, ranges: NormalRanges) -> list[_Row]:
-        return [
-            (
-                "phase residual, median, deg",
-                self.residual_deg,
-                ranges.residual_deg,
-                1.0,
-                LIGHT_OPTIONS,
-                True,
-            ),
-            (
-                "phase residual, median, sigma",
-                self.residual_sigmas,
-                ranges.residual_sigmas,
-                1.0,
-                LIGHT_OPTIONS,
-                False,
-            ),
-            (
-                "views that agree with a point they see, %",
-                self.agreement,
-                ranges.agreement,
-                100.0,
-                "poses: `sfm.intrinsics`, `sfm.sparse`",
-                True,
-            ),
-            (
-                "points within the silhouettes of the views, %",
-                self.inside,
-                ranges.inside,
-                100.0,
-                "`region.mask`, poses",
-                True,
-            ),
-            (
-                "part of the polarized regions determined, %",
-                self.determined,
-                ranges.determined,
-                100.0,
-                "marks on the part; more views",
-                False,
-            ),
-            (
-                "position uncertainty (1 sigma), median, % of the distance",
-                self.sigma_share,
-                ranges.sigma_share,
-                100.0,
-                "`sfm.intrinsics`; more views",
-                False,
-            ),
-        ]
+    def _fitted(self, ranges: NormalRanges) -> Iterator[TrustFigure]:
+        name = "phase residual, median, deg"
+        yield _figure(name, self.residual_deg, ranges.residual_deg, LIGHT_OPTIONS, scale=1.0)
+        name = "phase residual, median, sigma"
+        sigmas = ranges.residual_sigmas
+        yield _figure(name, self.residual_sigmas, sigmas, LIGHT_OPTIONS, scale=1.0, decides=False)
+        name = "views that agree with a point they see, %"
+        remedy = "poses: `sfm.intrinsics`, `sfm.sparse`"
+        yield _figure(name, self.agreement, ranges.agreement, remedy)
+        name = "points within the silhouettes of the views, %"
+        yield _figure(name, self.inside, ranges.inside, "`region.mask`, poses")
+        name = "part of the polarized regions determined, %"
+        remedy = "marks on the part; more views"
+        yield _figure(name, self.determined, ranges.determined, remedy, decides=False)
+        name = "position uncertainty (1 sigma), median, % of the distance"
+        remedy = "`sfm.intrinsics`; more views"
+        yield _figure(name, self.sigma_share, ranges.sigma_share, remedy, decides=False)
 
     def doubts(self) -> tuple[str, ...]:
         """A line for each figure that is not normal."""
@@ -379,7 +302,7 @@ def measure_trust(
     outside : as :func:`polmvs.evaluation.consistency.measure_consistency` takes it.
     """
     consistency = measure_consistency(angle_model, cloud, tracks, maps, outside)
-    surface = cloud.only(cloud.scalars["kind"] == PointKind.SURFACE)
+    surface = cloud.only(cloud.are(PointKind.SURFACE))
     nothing = np.zeros((0, 3))
     points, normals = surface.points, nothing if surface.normals is None else surface.normals
     step = -(-len(points) // MAX_RESIDUAL_POINTS) or 1

@@ -8,8 +8,8 @@ from itertools import product
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Image, Mask
 from polmvs.camera import in_image, pixel_centers
 from polmvs.evaluation.metrics import (
     MIN_DOLP,
@@ -28,11 +28,6 @@ from polmvs.polarization.phase_map import PhaseMap, as_tilted, view_rays
 from polmvs.polarization.stokes import Stokes
 from polmvs.poses.alignment import Alignment, align_views
 from polmvs.scene import View, match_names
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 # Of a sparse point that counts as one of the part; definitions, see `track_normal_errors`.
 ON_PART_M = 0.003

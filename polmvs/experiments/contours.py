@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Image, Indices, Mask
 from polmvs.camera import sample_image
 from polmvs.config import ExperimentOptions
 from polmvs.errors import DataError
@@ -43,12 +44,6 @@ from polmvs.polarization.phase_map import PhaseMap, open_phase_map, store_phase_
 from polmvs.scene import MIN_DISTANCE
 from polmvs.surface.contour import Contours, direction_field, trace_contours
 from polmvs.surface.log_range import log_range_increment
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
-Image = NDArray[np.float32]
-Indices = NDArray[np.int64]
 
 # What the experiment measures; these define the figures.
 INSET_PX = 4  # of the seeds: nearer to the edge the blurred light of the background is mixed in

@@ -1,4 +1,4 @@
-"""What the experiments measure on: a capture, its truth, and poses in the truth's world."""
+"""Scene of the experiments: a capture, its ground truth, and poses in the truth's world."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Image, Mask
 from polmvs.colmap.models import match_model_to_capture, read_model
 from polmvs.config import (
     CaptureOptions,
@@ -32,11 +32,6 @@ from polmvs.polarization.stokes import Stokes
 from polmvs.poses.alignment import Alignment, align_views
 from polmvs.poses.image_check import intensity_loader, require_cameras_of_images
 from polmvs.scene import View, find_name, match_names, short_list
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-
 
 EXACT_SIGMA = 1e-3  # rad; stands for no noise, far below that of any phase
 BLUR_REACH = 2.0  # deviations of the blur within which a mark spoils a pixel

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.experiments.contours import CONTOUR_LABELS, METHODS, ViewContours
 from polmvs.experiments.data import MODEL_LABELS
 from polmvs.experiments.phase import ANGLE_LIMITS_DEG, ANGLES, PhaseImages, PhaseResult
@@ -19,34 +19,24 @@ from polmvs.experiments.plane import ESTIMATES, PLANE_LABELS, PlaneResult
 from polmvs.experiments.tracks import ESTIMATORS, TRACK_LABELS, TrackResult
 from polmvs.polarization.kinds import FORMULAS
 
-Array = NDArray[np.float64]
-
 # Okabe and Ito's palette, which people with any kind of colour blindness tell apart.
 VERMILLION, ORANGE, SKY, BLUE, GREEN, GREY = (
     "#D55E00", "#E69F00", "#56B4E9", "#0072B2", "#009E73", "#666666",
 )  # fmt: skip
-PLANE_COLORS = {
-    "algebraic": SKY,
-    "weighted_noise": GREY,
-    "weighted": BLUE,
-    "tilted_algebraic": ORANGE,
-    "tilted": GREEN,
+PLANE_STYLES = {  # marker and colour
+    "algebraic": ("o", SKY),
+    "weighted_noise": ("x", GREY),
+    "weighted": ("s", BLUE),
+    "tilted_algebraic": ("v", ORANGE),
+    "tilted": ("D", GREEN),
 }
-PLANE_MARKERS = {
-    "algebraic": "o", "weighted_noise": "x", "weighted": "s", "tilted_algebraic": "v",
-    "tilted": "D",
-}  # fmt: skip
-TRACK_COLORS = {
-    "opa": VERMILLION,
-    "opa_weighted": ORANGE,
-    "ppa_algebraic": SKY,
-    "ppa_weighted": BLUE,
-    "tilted_weighted": GREEN,
+TRACK_STYLES = {  # line and colour
+    "opa": ("-", VERMILLION),
+    "opa_weighted": ("--", ORANGE),
+    "ppa_algebraic": ("--", SKY),
+    "ppa_weighted": ("-", BLUE),
+    "tilted_weighted": ("-", GREEN),
 }
-TRACK_STYLES = {
-    "opa": "-", "opa_weighted": "--", "ppa_algebraic": "--", "ppa_weighted": "-",
-    "tilted_weighted": "-",
-}  # fmt: skip
 CONTOUR_COLORS = {
     "opa": VERMILLION,
     "ppa_normals": SKY,
@@ -144,11 +134,12 @@ def draw_plane(result: PlaneResult) -> bytes:
     left, right = figure.subplots(1, 2, width_ratios=(2.4, 1))
     for name in ESTIMATES:
         errors = [image.error_deg[name] for image in result.per_image]
+        marker, color = PLANE_STYLES[name]
         left.plot(
             np.arange(len(errors)),
             errors,
-            PLANE_MARKERS[name],
-            color=PLANE_COLORS[name],
+            marker,
+            color=color,
             label=f"{PLANE_LABELS[name]}: mean {result.stats[name].mean_deg:.2f}°",
             markersize=5,
         )
@@ -181,13 +172,13 @@ def draw_track_distribution(result: TrackResult, k: int = 3) -> bytes:
     bins = np.linspace(0, 40, 81)
     for name in ESTIMATORS:
         errors = result.estimators[name].errors_deg[index]
-        kwargs = {"color": TRACK_COLORS[name], "linestyle": TRACK_STYLES[name]}
+        line, color = TRACK_STYLES[name]
         counts = np.histogram(errors[np.isfinite(errors)], bins)[0]
         share = 100 * counts / max(len(errors), 1)
-        left.stairs(share, bins, label=TRACK_LABELS[name], linewidth=1.5, **kwargs)
+        left.stairs(share, bins, label=TRACK_LABELS[name], lw=1.5, color=color, ls=line)
         ordered = np.sort(errors[np.isfinite(errors)])
         rank = 100 * np.arange(1, len(ordered) + 1) / max(len(errors), 1)
-        right.plot(ordered, rank, linewidth=1.8, label=TRACK_LABELS[name], **kwargs)
+        right.plot(ordered, rank, label=TRACK_LABELS[name], lw=1.8, color=color, ls=line)
     left.set_yscale("log")
     left.yaxis.set_major_formatter("{x:g}")
     right.set_xscale("log")
@@ -215,14 +206,9 @@ def draw_track_means(result: TrackResult) -> bytes:
     statistics: dict[str, Callable[[Array], np.floating]] = {"mean": np.mean, "median": np.median}
     for ax, (label, statistic) in zip(axes, statistics.items(), strict=True):
         for name in ESTIMATORS:
-            ax.plot(
-                result.k,
-                result.estimators[name].over(statistic),
-                marker=".",
-                color=TRACK_COLORS[name],
-                linestyle=TRACK_STYLES[name],
-                label=TRACK_LABELS[name],
-            )
+            line, color = TRACK_STYLES[name]
+            errors = result.estimators[name].over(statistic)
+            ax.plot(result.k, errors, marker=".", color=color, ls=line, label=TRACK_LABELS[name])
         ax.set_yscale("log")
         ax.set_xlabel("number of views K")
         ax.set_ylabel(f"{label} angular error (°)")
@@ -253,7 +239,7 @@ def draw_track_boxes(result: TrackResult) -> bytes:
             manage_ticks=False,
         )
         for box in boxes["boxes"]:
-            box.set_facecolor(TRACK_COLORS[name])
+            box.set_facecolor(TRACK_STYLES[name][1])
         boxes["boxes"][0].set_label(TRACK_LABELS[name])
     ax.set_yscale("log")
     ax.yaxis.set_major_formatter("{x:g}")

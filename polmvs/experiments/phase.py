@@ -10,22 +10,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Image, Mask
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.kinds import FORMULAS, AngleModel
 from polmvs.polarization.stokes import axial_difference
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Density = NDArray[np.float64]
-Floats = NDArray[np.floating[Any]]
 Counts = NDArray[np.int64]
 
 ANGLES = ("viewing", "azimuth", "zenith")

@@ -13,11 +13,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Mask
 from polmvs.config import ExperimentOptions
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
@@ -26,10 +25,6 @@ from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, pla
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.kinds import FORMULAS, AngleModel
 from polmvs.polarization.stokes import Stokes
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating[Any]]
-Mask = NDArray[np.bool_]
 
 NUM_CANDIDATES = 64  # normals tried as the middle of a patch
 MAX_SPREAD_DEG = 0.2  # of the true normals of a plane; 16-bit maps have less

@@ -17,8 +17,8 @@ from enum import StrEnum
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Indices, Mask
 from polmvs.config import ExperimentOptions, Selection
 from polmvs.errors import OptionError
 from polmvs.evaluation.metrics import angular_errors_deg
@@ -28,11 +28,6 @@ from polmvs.normals.rows import Rows, gather_rows
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.kinds import AngleModel
 from polmvs.surface.surface_quality import MIN_POINTS
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 UNDER_DEG = 25.0  # the paper's limit
 CHUNK_ROWS = 200_000  # solved at a time: bounds the memory of many views

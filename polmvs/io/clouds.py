@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Mask
 from polmvs.errors import DataError, PolmvsError, as_data_error
 from polmvs.io.open3d_import import import_open3d
 from polmvs.io.ply import read_ply, read_ply_header, write_ply
-from polmvs.scene import MAX_COORDINATE
+from polmvs.scene import MAX_COORDINATE, PointKind
 from polmvs.unprinted import unprinted
-
-Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +51,12 @@ class Cloud:
             colors=None if self.colors is None else self.colors[kept],
             scalars={name: values[kept] for name, values in self.scalars.items()},
         )
+
+    def are(self, *kinds: PointKind) -> Mask:
+        """Which points (N,) are of these kinds; all where the cloud tells none."""
+        if "kind" not in self.scalars:
+            return np.ones(len(self.points), np.bool_)
+        return np.isin(self.scalars["kind"], kinds)
 
 
 @dataclass(frozen=True)

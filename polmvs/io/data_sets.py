@@ -38,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import rq
 
+from polmvs.arrays import Array, Image, Mask
 from polmvs.camera import PinholeCamera
 from polmvs.config import (
     BayerOrder,
@@ -57,10 +58,6 @@ from polmvs.io.plain_files import open_plain
 from polmvs.io.raw_formats import read_npy, read_raw
 from polmvs.polarization.kinds import Light
 from polmvs.scene import stem_of
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 BAYER = BayerOrder.RGGB  # of raw colour mosaics, where nothing else is given
 CAMERA_FILES = ("cameras.npz", "cameras_sphere.npz", "cameras_new.npz")

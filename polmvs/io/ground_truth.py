@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.camera import PinholeCamera, pixel_centers
+from polmvs.arrays import Array, Mask
+from polmvs.camera import MAX_SIDE, PinholeCamera, pixel_centers
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation, unit
 from polmvs.io.image_size import PNG_SIGNATURE
@@ -29,11 +30,6 @@ from polmvs.io.raw_formats import read_npy
 from polmvs.io.typed_json import parse_json
 from polmvs.neighbors import in_cells_beside, voxel_representatives
 from polmvs.scene import View, find_name, stem_of
-
-MAX_SIDE = 1 << 16  # px
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 DEPTH_UNIT_M = 20e-6
 PART_SPACING_M = 0.0005

@@ -1,4 +1,4 @@
-"""Headers of images: sizes as they are declared, told before anything is decoded, and tags.
+"""Image headers: declared sizes and tags, read before anything is decoded.
 
 A compressed file of a megabyte may declare an image of a terabyte. Only containers whose header is
 read here are decoded.
@@ -23,7 +23,7 @@ SCALE_DOWN = "Scale it down, or check that it is the right file."
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
 BIG_TIFF_SIGNATURES = (b"II+\0", b"MM\0+")
-_PNG_CHANNELS = {2: 3, 4: 2, 6: 4}  # by colour type; 1 of all others
+PNG_CHANNELS = {2: 3, 4: 2, 6: 4}  # by colour type; 1 of all others
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES = 256, 257, 258, 277
 _TIFF_TILE_WIDTH, _TIFF_TILE_HEIGHT = 322, 323
@@ -120,7 +120,7 @@ def require_size(
 def _declared(data: bytes) -> ImageSize | None:
     if data.startswith(PNG_SIGNATURE):
         width, height, bits, colour = struct.unpack_from(">IIBB", data, 16)
-        samples = 4 if colour == 3 else _PNG_CHANNELS.get(colour, 1)  # a palette may have alpha
+        samples = 4 if colour == 3 else PNG_CHANNELS.get(colour, 1)  # a palette may have alpha
         return ImageSize(width, height, width * height * samples * (2 if bits == 16 else 1))
     if data[:4] in (*TIFF_SIGNATURES, *BIG_TIFF_SIGNATURES):
         return _of_tiff(data)

@@ -1,4 +1,4 @@
-"""Image files at the edge: decoding, masks in, PNG out; every fault is a ``DataError``."""
+"""Image files: decoding, masks, PNG output; every fault is a ``DataError``."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from polmvs.config import MAX_PIXELS
 from polmvs.errors import DataError, as_data_error
 from polmvs.io.image_size import (
     BROKEN,
+    PNG_CHANNELS,
     PNG_SIGNATURE,
     SCALE_DOWN,
     declared_size,
@@ -28,7 +29,6 @@ from polmvs.io.temporary import remove_temporary, temporary_path
 PathArg: TypeAlias = str | PathLike[str]
 
 SILENT = 0  # OpenCV's log level
-PNG_CHANNELS = {2: 3, 4: 2, 6: 4}  # by colour type; 1 of all others
 DEFLATE_RATIO = 1032  # by which zlib compresses at the very best
 
 
@@ -75,46 +75,6 @@ def read_gray(path: PathArg) -> NDArray[np.uint8]:
         raise DataError(path, "is no 8-bit image.")
     gray = image if image.ndim == 2 else np.rint(image[..., :3].mean(axis=-1))
     return np.asarray(gray, np.uint8)
-
-
-def read_radiance(path: PathArg) -> NDArray[np.float32]:
-    """Read an image of radiances (.hdr, .exr, .tif), ``(H, W, 3)`` float32, red green blue.
-
-    Raises
-    ------
-    DataError
-        The file is missing, truncated or no image of floats, or EXR lacks its package.
-    """
-    if Path(path).suffix.lower() == ".exr":
-        return _read_exr(path)
-    image = decode_image(path, read_bytes(path))
-    if image.dtype != np.float32:
-        raise DataError(path, "is no image of radiances; give .hdr, .exr or a .tif of floats.")
-    if image.ndim == 2:
-        image = np.repeat(image[..., None], 3, axis=-1)
-    return np.ascontiguousarray(image[..., 2::-1], np.float32)
-
-
-def _read_exr(path: PathArg) -> NDArray[np.float32]:
-    data = read_bytes(path)  # names what is missing
-    try:
-        import OpenEXR
-    except ImportError as error:
-        raise DataError(path, "needs OpenEXR; install the extra: pip install '.[exr]'.") from error
-    try:
-        with OpenEXR.File(str(path)) as file:
-            channels = {name: np.asarray(c.pixels) for name, c in file.channels().items()}
-    except Exception as error:  # whatever the library stumbles over
-        raise DataError(path, f"is damaged: no OpenEXR of {len(data)} bytes. {BROKEN}") from error
-    packed = channels.get("RGB", channels.get("RGBA"))
-    if packed is not None:
-        return np.ascontiguousarray(packed[..., :3], np.float32)
-    grey = channels.get("Y")
-    if grey is not None:
-        channels = dict.fromkeys("RGB", grey)
-    if not set("RGB") <= set(channels):
-        raise DataError(path, f"has channels {', '.join(channels)}, not R, G, B or Y.")
-    return np.ascontiguousarray(np.stack([channels[c] for c in "RGB"], -1), np.float32)
 
 
 def write_png(path: PathArg, image: NDArray[Any]) -> None:

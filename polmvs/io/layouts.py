@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Image, Mask
 from polmvs.camera import PinholeCamera, pixel_centers, xy_from_opencv
 from polmvs.config import CaptureOptions
 from polmvs.errors import DataError
@@ -31,10 +31,6 @@ from polmvs.io.images import read_bytes
 from polmvs.io.plain_files import read_text
 from polmvs.io.raw_formats import read_npy
 from polmvs.scene import View, stem_of
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 AUTHOR_OPTIONS = CaptureOptions(pattern=(90, 45, 135, 0), gamma=0.5)
 MAX_OFF_PLANE = 0.02  # of the corners from the plane, in sizes of the board; a guess

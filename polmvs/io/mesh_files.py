@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs._version import __version__
+from polmvs.arrays import Array
 from polmvs.errors import DataError, OptionError
 from polmvs.io.clouds import Mesh, write_mesh
 from polmvs.io.images import encode_png, write_bytes
-
-Array = NDArray[np.float64]
 
 GLB_MAGIC, GLB_VERSION, GLB_JSON, GLB_BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 FLOAT, UNSIGNED_INT = 5126, 5125  # component types of glTF

@@ -1,4 +1,4 @@
-"""The import of Open3D: what its wheels lack is found, or named with its remedy."""
+"""Import of Open3D; a library that its wheel lacks is found, or named with its remedy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def import_open3d() -> Any:
         It cannot be imported; the message says what to install.
     """
     if "open3d" not in sys.modules:
-        _find_libusb()
+        find_libusb()
     try:
         import open3d
     except (ImportError, OSError) as error:  # OSError: it loads its library by ctypes
@@ -50,7 +50,7 @@ def remedy(reason: str) -> str:
     return f"install the system library {found[1]} (Debian, Ubuntu: apt install {package})"
 
 
-def _find_libusb() -> None:
+def find_libusb() -> None:
     """Load libusb from its wheel where the system has none.
 
     Open3D 0.20, the only one for Python 3.13, is linked against it for depth cameras. A library

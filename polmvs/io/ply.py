@@ -1,4 +1,4 @@
-"""PLY files as columns of numbers, read as what they are: a stranger's word.
+"""Reader and writer of PLY files as columns of numbers; input is untrusted.
 
 Open3D's readers abort, crash or fill up with zeros where a header promises what the file does not
 hold. Here every count is checked against the length of the file before memory is taken for it, and
@@ -11,6 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -202,8 +203,29 @@ class _Lists(NamedTuple):
     values: NDArray[Any]
 
 
-class _Binary:
-    """Rows of numbers, element by element."""
+class _Reader:
+    """Elements one after the other."""
+
+    path: Path
+
+    def row(self, element: Element) -> list[Any]:
+        """The values of each column in the next row."""
+        raise NotImplementedError
+
+    def lists(self, element: Element) -> dict[str, _Lists]:
+        """Columns of lists of an element, by name."""
+        if element.num == 0:
+            return {}
+        columns = zip(*(self.row(element) for _ in range(element.num)), strict=True)
+        return {
+            kind.name: _Lists(np.array([*map(len, rows)], np.int64), np.concatenate(rows))
+            for kind, rows in zip(element.properties, columns, strict=True)
+            if kind.length
+        }
+
+
+class _Binary(_Reader):
+    """Rows of numbers."""
 
     def __init__(self, path: Path, header: PlyHeader) -> None:
         self.path, self.order = path, header.order
@@ -211,91 +233,59 @@ class _Binary:
 
     def columns(self, element: Element) -> dict[str, NDArray[Any]]:
         """Columns of an element without lists, by name."""
-        if element.num == 0:
-            return {c.name: np.zeros(0, c.type) for c in element.properties}
         kinds = [(str(i), self.order + c.type) for i, c in enumerate(element.properties)]
-        rows = self._rows(np.dtype(kinds), element.num)
+        rows = self.take(np.dtype(kinds), element.num)
         return {
             c.name: np.ascontiguousarray(rows[str(i)], c.type)
             for i, c in enumerate(element.properties)
         }
 
-    def _rows(self, kind: np.dtype[Any], num: int) -> NDArray[Any]:
-        """So many rows of one length."""
-        if len(self.data) - self.position < num * kind.itemsize:
+    def take(self, kind: np.dtype[Any], num: int) -> NDArray[Any]:
+        """The next values of one type."""
+        if num < 0 or num * kind.itemsize > len(self.data) - self.position:
             raise DataError(self.path, _TRUNCATED)
-        rows = np.frombuffer(self.data, kind, num, self.position)
+        values = np.frombuffer(self.data, kind, num, self.position)
         self.position += num * kind.itemsize
-        return rows
+        return values
+
+    def row(self, element: Element) -> list[Any]:
+        """The values of each column in the next row."""
+        values = []
+        for column in element.properties:
+            num = 1
+            if column.length:
+                num = int(self.take(np.dtype(self.order + column.length), 1)[0])
+            values.append(self.take(np.dtype(self.order + column.type), num))
+        return values
 
     def lists(self, element: Element) -> dict[str, _Lists]:
-        """Columns of lists of an element, by name."""
+        """Columns of lists: nearly always all faces have as many corners as the first."""
         if element.num == 0:
             return {}
         start = self.position
-        lengths, end = self._lengths_at(element, start)
-        # Nearly always all faces have as many corners as the first.
-        if end - start <= (len(self.data) - start) // element.num:
-            kinds: list[tuple[str, str] | tuple[str, str, int]] = []
+        lengths = [len(values) for values in self.row(element)]
+        row_bytes, self.position = self.position - start, start
+        if row_bytes * element.num <= len(self.data) - start:
+            kinds: list[tuple[Any, ...]] = []
             for i, column in enumerate(element.properties):
-                if column.length:
-                    kinds.append((f"n{i}", self.order + column.length))
-                    kinds.append((str(i), self.order + column.type, lengths[i]))
-                else:
-                    kinds.append((str(i), self.order + column.type))
-            rows = self._rows(np.dtype(kinds), element.num)
-            if all((rows[f"n{i}"] == num).all() for i, num in lengths.items()):
+                kinds += [(f"n{i}", self.order + column.length)] if column.length else []
+                kinds += [(str(i), self.order + column.type, (lengths[i],))]
+            rows = self.take(np.dtype(kinds), element.num)
+            found = [i for i, column in enumerate(element.properties) if column.length]
+            if all((rows[f"n{i}"] == lengths[i]).all() for i in found):
                 return {
                     element.properties[i].name: _Lists(
-                        np.full(element.num, num),
+                        np.full(element.num, lengths[i]),
                         rows[str(i)].astype(element.properties[i].type).reshape(-1),
                     )
-                    for i, num in lengths.items()
+                    for i in found
                 }
             self.position = start
-        return self._uneven(element)
-
-    def _uneven(self, element: Element) -> dict[str, _Lists]:
-        """Lists of different lengths, row by row."""
-        found: dict[int, list[NDArray[Any]]] = {}
-        for _ in range(element.num):
-            position = self.position
-            lengths, self.position = self._lengths_at(element, position)
-            for i, column in enumerate(element.properties):
-                if column.length:
-                    position += np.dtype(column.length).itemsize
-                kind = np.dtype(self.order + column.type)
-                num = lengths.get(i, 1)
-                if column.length:
-                    values = self.data[position : position + num * kind.itemsize]
-                    found.setdefault(i, []).append(np.frombuffer(values, kind))
-                position += num * kind.itemsize
-        return {
-            element.properties[i].name: _Lists(
-                np.array([len(row) for row in rows], np.int64), np.concatenate(rows)
-            )
-            for i, rows in found.items()
-        }
-
-    def _lengths_at(self, element: Element, position: int) -> tuple[dict[int, int], int]:
-        """Lengths of the lists of the row at a place, by column, and where it ends."""
-        lengths = {}
-        for i, column in enumerate(element.properties):
-            num = 1
-            if column.length:
-                kind = np.dtype(self.order + column.length)
-                if position + kind.itemsize > len(self.data):
-                    raise DataError(self.path, _TRUNCATED)
-                num = lengths[i] = int(np.frombuffer(self.data, kind, 1, position)[0])
-                position += kind.itemsize
-            position += num * np.dtype(column.type).itemsize
-            if num < 0 or position > len(self.data):
-                raise DataError(self.path, _TRUNCATED)
-        return lengths, position
+        return super().lists(element)
 
 
-class _Ascii:
-    """Lines of numbers, element by element."""
+class _Ascii(_Reader):
+    """Lines of numbers."""
 
     def __init__(self, path: Path, header: PlyHeader) -> None:
         self.path = path
@@ -318,33 +308,18 @@ class _Ascii:
         with np.errstate(invalid="ignore", over="ignore"):
             return {c.name: rows[:, i].astype(c.type) for i, c in enumerate(names)}
 
-    def lists(self, element: Element) -> dict[str, _Lists]:
-        """Columns of lists of an element, by name."""
-        found: dict[str, list[list[float]]] = {
-            column.name: [] for column in element.properties if column.length
-        }
-        for _ in range(element.num):
-            words = self.stream.readline().split()
-            at = 0
+    def row(self, element: Element) -> list[Any]:
+        """The values of each column in the next line."""
+        words, values = iter(self.stream.readline().split()), []
+        try:
             for column in element.properties:
-                try:
-                    num = int(words[at][:9]) if column.length else 1
-                    at += 1 if column.length else 0
-                    values = [float(word) for word in words[at : at + num]]
-                except (ValueError, IndexError) as error:
-                    raise DataError(self.path, _TRUNCATED) from error
-                if num < 0 or len(values) != num:
+                num = int(next(words)[:9]) if column.length else 1
+                values.append([float(word) for word in islice(words, num)])
+                if len(values[-1]) != num:
                     raise DataError(self.path, _TRUNCATED)
-                at += num
-                if column.length:
-                    found[column.name].append(values)
-        return {
-            name: _Lists(
-                np.array([len(row) for row in rows], np.int64),
-                np.array([value for row in rows for value in row], np.float64),
-            )
-            for name, rows in found.items()
-        }
+        except (ValueError, StopIteration) as error:
+            raise DataError(self.path, _TRUNCATED) from error
+        return values
 
 
 def _triangles(path: Path, lists: Mapping[str, _Lists], num_vertices: int) -> NDArray[np.int64]:

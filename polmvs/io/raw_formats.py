@@ -184,6 +184,22 @@ def read_raw(
     return RawImage(samples)
 
 
+def read_radiance(path: PathArg) -> NDArray[np.float32]:
+    """Read an image of radiances (.hdr, .exr, .tif), ``(H, W, 3)`` float32, red green blue.
+
+    Raises
+    ------
+    DataError
+        The file is missing, truncated or no image of floats, or EXR lacks its package.
+    """
+    image = read_raw(path).samples
+    if image.dtype != np.float32:
+        raise DataError(path, "is no image of radiances; give .hdr, .exr or a .tif of floats.")
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, axis=-1)
+    return np.ascontiguousarray(image[..., :3], np.float32)
+
+
 def probe_raw(path: PathArg, *, max_pixels: int | None = None) -> RawHeader | None:
     """Size and type of a monochrome PNG without decoding it; None of all other files.
 

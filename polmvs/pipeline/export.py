@@ -1,4 +1,4 @@
-"""What a finished run holds as files of other programs: mesh, cloud, or posed images."""
+"""Export of a finished run for other programs: mesh, cloud, or posed images."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import pixel_centers
 from polmvs.colmap.camera_exports import CAMERA_FORMATS, CameraExport
 from polmvs.colmap.dense_workspace import open_dense_workspace
@@ -39,7 +40,6 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 CLOUDS = {
     ExportFormat.CLOUD_PLY: "ply",
@@ -216,10 +216,7 @@ def _existing(path: Path, what: str) -> Path:
 
 def part_of(cloud: Cloud) -> Cloud:
     """The points of a cloud that lie on the part, without its surroundings."""
-    kinds = cloud.scalars.get("kind")
-    if kinds is None:
-        return cloud
-    return cloud.only(np.isin(kinds, (PointKind.SURFACE, PointKind.INFERRED)))
+    return cloud.only(cloud.are(PointKind.SURFACE, PointKind.INFERRED))
 
 
 def _export_cameras(

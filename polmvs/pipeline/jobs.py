@@ -24,7 +24,6 @@ from polmvs.pipeline.stage_table import (
     StageSpec,
     sparse_figures,
     stage_table,
-    trust_of,
     with_needed,
 )
 from polmvs.pipeline.stages.densify import DensifyResult
@@ -32,6 +31,7 @@ from polmvs.pipeline.stages.evaluation import evaluate_models
 from polmvs.pipeline.stages.maps import MapsResult
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import SeedsResult
+from polmvs.pipeline.stages.trust import find_trust
 from polmvs.polarization.capture import open_capture
 from polmvs.polarization.kinds import COMPARED_MODELS, AngleModel
 from polmvs.scene import MIN_VIEWS, short_list
@@ -147,7 +147,7 @@ def judge(run_folder: RunFolder, model: AngleModel = AngleModel.PPA) -> Trust:
     options = options_from_plain(record.options, str(run_folder.run_file))
     if record.find(DensifyResult, model) is None:
         raise DataError(run_folder.cloud(model), "is not made yet; run `polmvs densify` first.")
-    return trust_of(model, run_folder, record, options)
+    return find_trust(model, run_folder, record, options)
 
 
 def measure(run_folder: RunFolder, models: Sequence[AngleModel]) -> Comparison:

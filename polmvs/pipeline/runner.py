@@ -225,7 +225,7 @@ class Run(StageInput):
         start, cpu_start, memory = time.perf_counter(), cpu_seconds(), PeakMemory()
         with (
             self.monitor.stage(spec.name, spec.num_steps(self)) as self.on_progress,
-            _collected_warnings() as warned,
+            _kept(logging.WARNING) as said,
         ):
             result = spec.work(self)
             peak_mb = memory.mb()
@@ -238,7 +238,7 @@ class Run(StageInput):
                     self.budget_gb,
                 )
         done = _Done(result, time.perf_counter() - start, cpu_seconds() - cpu_start)
-        self._record(spec, done, peak_mb, warned)
+        self._record(spec, done, peak_mb, said)
 
     def _carry_out_side_by_side(
         self, specs: Sequence[StageSpec], calls: Sequence[Callable[[], Any]]
@@ -257,13 +257,15 @@ class Run(StageInput):
         ):
             work = self.workers.map(partial(_done_apart, TOKEN), calls)
             for spec, done in zip(specs, work, strict=True):
-                with _collected_warnings() as warned:
+                with _kept(logging.WARNING) as said:
                     for logged in done.logged:
                         logging.getLogger(logged.logger).log(logged.level, "%s", logged.text)
-                self._record(spec, done, memory.mb(), warned)
+                self._record(spec, done, memory.mb(), said)
                 on_progress(1)
 
-    def _record(self, spec: StageSpec, done: _Done, peak_mb: float, warned: Sequence[str]) -> None:
+    def _record(
+        self, spec: StageSpec, done: _Done, peak_mb: float, said: Sequence[_Logged]
+    ) -> None:
         """Record a stage that is done, and tell of it."""
         result, seconds = done.result, round(done.seconds, 3)
         logger.info("%s: %.1f s, %s", spec.name, seconds, result, extra=FILE_ONLY)
@@ -281,7 +283,7 @@ class Run(StageInput):
             seconds=seconds,
             cpu_s=round(done.cpu_s, 3),
             peak_rss_mb=round(peak_mb, 1),
-            warnings=tuple(dict.fromkeys(warned)),
+            warnings=tuple(dict.fromkeys(one.text for one in said if one.level == logging.WARNING)),
             result=result,
         )
         order = [other.name for other in self.table]
@@ -404,58 +406,40 @@ class _Done:
     logged: Sequence[_Logged] = ()
 
 
-class _LogKeeper(logging.Handler):
-    """Keeps what a process says, for the one that it works for."""
+class _Keeper(logging.Handler):
+    """Keeps what is said."""
 
-    def __init__(self) -> None:
-        super().__init__(logging.INFO)
-        self.logged: list[_Logged] = []
+    def __init__(self, level: int) -> None:
+        super().__init__(level)
+        self.said: list[_Logged] = []
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a record."""
-        self.logged.append(_Logged(record.name, record.levelno, record.getMessage()))
+        self.said.append(_Logged(record.name, record.levelno, record.getMessage()))
+
+
+@contextmanager
+def _kept(level: int) -> Iterator[list[_Logged]]:
+    """What this package says meanwhile, from a level on."""
+    keeper, package = _Keeper(level), logging.getLogger("polmvs")
+    package.addHandler(keeper)
+    try:
+        yield keeper.said
+    finally:
+        package.removeHandler(keeper)
 
 
 def _done_apart(token: str, call: Callable[[], Any]) -> _Done:
     """Do a stage's work in this process, which is a worker of the run with a token."""
     work_for(token)
-    keeper, package = _LogKeeper(), logging.getLogger("polmvs")
+    package = logging.getLogger("polmvs")
     package.setLevel(logging.INFO)
     package.propagate = False
-    package.addHandler(keeper)
     start, cpu_start = time.perf_counter(), cpu_seconds()
-    try:
-        with quiet_colmap():
-            result = call()
-    finally:
-        package.removeHandler(keeper)
+    with _kept(logging.INFO) as said, quiet_colmap():
+        result = call()
     seconds, cpu_s = time.perf_counter() - start, cpu_seconds() - cpu_start
-    return _Done(result, seconds, cpu_s, keeper.logged)
-
-
-class _Collector(logging.Handler):
-    """Keeps the texts of warnings."""
-
-    def __init__(self, texts: list[str]) -> None:
-        super().__init__(logging.WARNING)
-        self.texts = texts
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep a text."""
-        if record.levelno == logging.WARNING:
-            self.texts.append(record.getMessage())
-
-
-@contextmanager
-def _collected_warnings() -> Iterator[list[str]]:
-    """What this package warns of meanwhile."""
-    texts: list[str] = []
-    handler, package = _Collector(texts), logging.getLogger("polmvs")
-    package.addHandler(handler)
-    try:
-        yield texts
-    finally:
-        package.removeHandler(handler)
+    return _Done(result, seconds, cpu_s, said)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ command runs, which are stale when another is done again, the files that go with
 finished one may be taken over. A new stage is one entry here and one file in ``stages/``.
 
 A stage reads files that other stages write, and options; it writes files that no other stage
-writes. An entry's function hands a stage its paths and options, nothing else.
+writes. An entry's function hands a stage the run's folder and options, nothing else.
 """
 
 from __future__ import annotations
@@ -118,13 +118,7 @@ class StageSpec:
     is_redone: bool = False
 
 
-# What each stage is given
-
-
-def _write_images(run: StageInput) -> images.ImagesResult:
-    return images.write_images(
-        run.capture, run.run_folder.images, workers=run.workers, on_progress=run.on_progress
-    )
+# What the stages that take more than a line are given
 
 
 def _find_model(run: StageInput) -> sfm.SfmResult:
@@ -135,130 +129,20 @@ def _find_model(run: StageInput) -> sfm.SfmResult:
     return sfm.find_model(folder.images, names, folder.sfm, options, on_progress=run.on_progress)
 
 
-def _place_model(run: StageInput) -> poses.PosesResult:
-    folder = run.run_folder
-    return poses.place_model(
-        folder.sfm,
-        folder.images,
-        images.image_names(run.capture),
-        folder.sparse,
-        folder.camera_modes,
-        folder.pose_covariances,
-        run.options.reference,
-        run.options.sfm.without,
-    )
-
-
-def _check_box(run: StageInput) -> box.BoxResult:
-    folder, aruco = run.run_folder, run.options.reference.aruco
-    return box.check_box(folder.sparse, folder.images, run.options.crop, aruco)
-
-
-def _build_maps(run: StageInput) -> maps.MapsResult:
-    return maps.build_maps(
-        run.capture,
-        run.run_folder.sparse,
-        run.run_folder.maps(AngleModel.PPA),
-        run.options.region,
-        max_rows=run.max_rows,
-        workers=run.workers,
-        on_progress=run.on_progress,
-    )
-
-
-def _tilt_maps(run: StageInput) -> maps.TiltedMapsResult:
-    folder = run.run_folder
-    return maps.tilt_maps(
-        folder.sparse,
-        folder.maps(AngleModel.PPA),
-        folder.maps(AngleModel.TILTED),
-        workers=run.workers,
-        on_progress=run.on_progress,
-    )
-
-
-def _solve_normals(model: AngleModel, run: StageInput) -> normals.NormalsResult:
-    folder = run.run_folder
-    return normals.solve_track_normals(
-        model,
-        folder.sparse,
-        folder.maps(model),
-        folder.track_normals(model),
-        run.options.normals,
-        run.options.region.light,
-        max_rows=run.max_rows,
-    )
-
-
-def _find_seeds(run: StageInput) -> seeds.SeedsResult:
-    folder = run.run_folder
-    return seeds.find_seeds(
-        folder.sparse,
-        folder.maps(AngleModel.PPA),
-        folder.track_normals(AngleModel.PPA),
-        folder.seeds,
-    )
-
-
-def _write_sparse_cloud(model: AngleModel, run: StageInput) -> sparse_cloud.SparseCloudResult:
-    folder = run.run_folder
-    return sparse_cloud.write_sparse_cloud(
-        folder.sparse, folder.track_normals(model), folder.seeds, folder.sparse_cloud(model)
-    )
-
-
-def _densify(model: AngleModel, run: StageInput) -> densify.DensifyResult:
-    return densify.densify(
-        model, run.run_folder, run.options, workers=run.workers, on_progress=run.on_progress
-    )
-
-
 def _densify_apart(model: AngleModel, run: StageInput) -> Callable[[], Any] | None:
     """The surface of all views is one process's work, the views one by one are many's."""
     whole = run.options.propagation.method is Method.SURFACE
     return partial(densify.densify, model, run.run_folder, run.options) if whole else None
 
 
-def _find_trust(model: AngleModel, run: StageInput) -> Trust:
-    return trust_of(model, run.run_folder, run.record, run.options)
-
-
-def trust_of(model: AngleModel, folder: RunFolder, record: Record, options: Options) -> Trust:
-    """Whether a dense cloud is to be trusted; nothing is written."""
-    dense = record.result(densify.DensifyResult, model)
-    found, mapped = record.find(sfm.SfmResult), record.find(maps.MapsResult)
-    unregistered = record.result(poses.PosesResult).unregistered
-    cameras = () if found is None else found.complaints
-    gone = {*unregistered, *dense.left_out}
-    made = trust.Made(
-        tilt_share=dense.tilt_share,
-        left_out=dense.left_out,
-        num_unregistered=len(unregistered),
-        tilt_aware=options.normals.tilt_aware_weights,
-        masks_given=options.region.mask is not None,
-        cut_share=None if mapped is None else mapped.cut_share,
-        light=options.region.light,
-        complaints=[
-            *(one.text for one in cameras if one.view not in gone),
-            *(mapped.complaints if mapped is not None else ()),
-        ],
-    )
-    return trust.find_trust(model, made, folder)
-
-
-def _make_mesh(model: AngleModel, run: StageInput) -> mesh.MeshResult:
-    folder = run.run_folder
-    return mesh.make_mesh(folder.cloud(model), folder.views(model), folder.mesh(model))
-
-
 def _write_workspace(model: AngleModel, run: StageInput) -> dense_workspace.DenseWorkspaceResult:
     folder, given = run.run_folder, run.options.fusion.workspace
     if run.record.result(densify.DensifyResult, model).num_points == 0:
         return dense_workspace.DenseWorkspaceResult(folder=None)
-    paths = (folder.sparse, folder.images, folder.views(model), folder.dense(model))
     if given is None:
-        return dense_workspace.write_workspace(*paths)
-    return dense_workspace.fill_given(*paths, given, in_place=run.options.export.in_place)
+        return dense_workspace.write_workspace(model, folder)
+    in_place = run.options.export.in_place
+    return dense_workspace.fill_given(model, folder, given, in_place=in_place)
 
 
 def _evaluate(models: Sequence[AngleModel], run: StageInput) -> evaluation.EvaluationResult:
@@ -302,7 +186,12 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             command=SFM,
             writes=(HERE.images,),
             decides=("capture",),
-            work=_write_images,
+            work=lambda run: images.write_images(
+                run.capture,
+                run.run_folder.images,
+                workers=run.workers,
+                on_progress=run.on_progress,
+            ),
             result=images.ImagesResult,
             num_steps=lambda run: len(run.capture.names),
         ),
@@ -322,7 +211,12 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             reads=(HERE.images, HERE.sfm),
             writes=(HERE.sparse, HERE.camera_modes, HERE.pose_covariances),
             decides=("reference", WITHOUT),
-            work=_place_model,
+            work=lambda run: poses.place_model(
+                run.run_folder,
+                images.image_names(run.capture),
+                run.options.reference,
+                run.options.sfm.without,
+            ),
             result=poses.PosesResult,
         ),
         StageSpec(
@@ -331,7 +225,9 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             reads=(HERE.images, HERE.sparse),
             writes=(),
             decides=CROPPING,
-            work=_check_box,
+            work=lambda run: box.check_box(
+                run.run_folder, run.options.crop, run.options.reference.aruco
+            ),
             result=box.BoxResult,
             is_wanted=lambda options: options.crop.box is not None,
             is_redone=True,
@@ -342,7 +238,14 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             reads=(HERE.sparse,),
             writes=(HERE.maps(ppa),),
             decides=("capture", "region"),
-            work=_build_maps,
+            work=lambda run: maps.build_maps(
+                run.capture,
+                run.run_folder,
+                run.options.region,
+                max_rows=run.max_rows,
+                workers=run.workers,
+                on_progress=run.on_progress,
+            ),
             result=maps.MapsResult,
             num_steps=lambda run: run.num_views,
         ),
@@ -352,7 +255,9 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             angle_model=AngleModel.TILTED,
             reads=(HERE.sparse, HERE.maps(ppa)),
             writes=(HERE.maps(AngleModel.TILTED),),
-            work=_tilt_maps,
+            work=lambda run: maps.tilt_maps(
+                run.run_folder, workers=run.workers, on_progress=run.on_progress
+            ),
             result=maps.TiltedMapsResult,
             num_steps=lambda run: run.num_views,
         ),
@@ -365,7 +270,7 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             command=NORMALS,
             reads=(HERE.sparse, HERE.maps(ppa), HERE.track_normals(ppa)),
             writes=(HERE.seeds,),
-            work=_find_seeds,
+            work=lambda run: seeds.find_seeds(run.run_folder),
             result=seeds.SeedsResult,
         ),
         StageSpec(
@@ -401,7 +306,13 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             reads=(HERE.sparse, HERE.maps(model)),
             writes=(track_normals,),
             decides=("normals.estimator", "normals.window_px", "region.light", TILT_AWARE),
-            work=partial(_solve_normals, model),
+            work=lambda run: normals.solve_track_normals(
+                model,
+                run.run_folder,
+                run.options.normals,
+                run.options.region.light,
+                max_rows=run.max_rows,
+            ),
             result=normals.NormalsResult,
         ),
         StageSpec(
@@ -410,7 +321,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             angle_model=model,
             reads=(HERE.sparse, track_normals, HERE.seeds),
             writes=(HERE.sparse_cloud(model),),
-            work=partial(_write_sparse_cloud, model),
+            work=lambda run: sparse_cloud.write_sparse_cloud(model, run.run_folder),
             result=sparse_cloud.SparseCloudResult,
         ),
         StageSpec(
@@ -423,7 +334,13 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             ),
             writes=(cloud, views),
             decides=(TILT_AWARE, "region.mask", "region.light", "propagation", "fusion", *CROPPING),
-            work=partial(_densify, model),
+            work=lambda run: densify.densify(
+                model,
+                run.run_folder,
+                run.options,
+                workers=run.workers,
+                on_progress=run.on_progress,
+            ),
             call=partial(_densify_apart, model),
             result=densify.DensifyResult,
             num_steps=lambda run: densify.num_densify_steps(run.num_views, run.options.propagation),
@@ -444,7 +361,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             ),
             writes=(),
             decides=("region.mask", "region.light", "normals.tilt_aware_weights"),
-            work=partial(_find_trust, model),
+            work=lambda run: trust.find_trust(model, run.run_folder, run.record, run.options),
             result=Trust,
         ),
         StageSpec(
@@ -453,7 +370,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             angle_model=model,
             reads=(cloud, views),
             writes=(HERE.mesh(model),),
-            work=partial(_make_mesh, model),
+            work=lambda run: mesh.make_mesh(model, run.run_folder),
             result=mesh.MeshResult,
             is_wanted=lambda options: options.export.mesh,
         ),

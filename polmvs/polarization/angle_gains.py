@@ -17,9 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.polarization.stokes import ideal_analyzers
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

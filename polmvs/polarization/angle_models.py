@@ -52,14 +52,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Mask
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.stokes import Stokes, wrap_axial
-
-Floats = NDArray[np.floating]
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
 

@@ -1,4 +1,4 @@
-"""Polarizer calibration: what each sample of a sensor truly measures.
+"""Polarizer calibration: gain, angle and diattenuation of each sample of a sensor.
 
 A sample of gain g behind a polarizer of angle a and extinction ratio E measures
 ``I = g / 2 (s0 + d (cos 2a s1 + sin 2a s2))`` with the diattenuation ``d = (E - 1) / (E + 1)``.
@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Image
 from polmvs.config import BayerOrder, CaptureOptions
 from polmvs.errors import DataError, as_data_error
 from polmvs.io.arrays import map_array, save_array
@@ -40,8 +41,6 @@ from polmvs.polarization.mosaic import (
     split_mosaic_full,
 )
 
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 Pattern = tuple[int, int, int, int]
 
 VERSION = 1

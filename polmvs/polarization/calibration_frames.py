@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Image
 from polmvs.config import CaptureKind, CaptureOptions
 from polmvs.errors import DataError
 from polmvs.polarization.calibration import (
@@ -25,8 +26,6 @@ from polmvs.polarization.calibration import (
     measure_response,
 )
 from polmvs.polarization.capture import Capture, open_capture
-
-Image = NDArray[np.float32]
 
 POLARIZED, UNPOLARIZED, DARK = "polarized", "unpolarized", "dark"
 MAX_CLIPPED = 0.001  # share of a frame's samples that may be clipped: dust and hot samples

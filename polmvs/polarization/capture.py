@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Image, Mask
 from polmvs.config import CaptureKind, CaptureOptions, Channel, Resolution
 from polmvs.errors import DataError, OptionError
 from polmvs.io.capture_files import CaptureFiles, ViewFiles, find_capture
@@ -60,8 +61,6 @@ logger = logging.getLogger(__name__)
 
 _scratch = threading.local()
 
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 DISPLAY_GAMMA = 2.2
 WHITE_PERCENTILE = 99.5

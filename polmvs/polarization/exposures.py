@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from polmvs.arrays import Image, Mask
 
 # Variance of reading a sample, over that of its photons at full scale. A full well of 10,000
 # electrons with a read noise of 2.5 (IMX250), measured in neither file; wrong by ten it costs a few

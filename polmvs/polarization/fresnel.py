@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats
 from polmvs.polarization.kinds import Light
-
-Floats = NDArray[np.floating]
-Array = NDArray[np.float64]
 
 
 def fresnel_dolp(cosines: Floats, light: Light | str, ior: Floats | float) -> Array:

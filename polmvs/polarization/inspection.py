@@ -15,15 +15,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Image
 from polmvs.config import CaptureKind, RegionOptions, Resolution
 from polmvs.errors import printable
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.capture import Capture, intensity_image_8bit
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
-from polmvs.scene import short_list
+from polmvs.scene import MIN_VIEWS, short_list
 
-Image = NDArray[np.float32]
 Picture = NDArray[np.uint8]
 
 SHOWN_DOLP = 0.5  # DoLP that is shown white, and AoLP in full colour
@@ -43,7 +43,7 @@ class InspectionLimits:
     ----------
     saturated : share of the part's pixels that are clipped, in a view.
     noisy_deg : deviation of the AoLP on the part, the median of the views.
-    few_views, least_views : under which a surface is carried by little, or by nothing.
+    few_views : under which a surface is carried by little.
     dark_white : brightest 0.5 % of the capture, share of full scale.
     polarized : share of the capture's pixels that are polarized.
     edge_px : width of the sharpest edges of a view.
@@ -54,7 +54,6 @@ class InspectionLimits:
     saturated: float = 0.1
     noisy_deg: float = 15.0
     few_views: int = 10
-    least_views: int = 3
     dark_white: float = 0.2
     polarized: float = 0.01
     edge_px: float = 6.0
@@ -356,7 +355,7 @@ def _obstacles(
 ) -> list[str]:
     """Why nothing is to be had from a capture, as clauses after "because"."""
     lines = []
-    if len(views) < limits.least_views:
+    if len(views) < MIN_VIEWS:
         lines.append(
             f"it has {len(views)} view{'s' * (len(views) != 1)}: a surface takes three or more"
         )
@@ -403,7 +402,7 @@ def _warnings(
         )
     if white < limits.dark_white:
         lines.append(f"the brightest 0.5 % are at {100 * white:.0f} % of full scale; expose more")
-    if limits.least_views <= len(views) < limits.few_views:
+    if MIN_VIEWS <= len(views) < limits.few_views:
         lines.append(f"{len(views)} views carry little; record ten or more, from all around")
     blurred = [v.name for v in views if v.edge_px > limits.edge_px]
     if blurred:

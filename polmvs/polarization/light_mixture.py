@@ -1,4 +1,4 @@
-r"""Which light an observation shows: specular, diffuse, or neither; a label that nobody gives.
+r"""Classification of each observation as specular light, diffuse light or neither.
 
 An observation is what one view measures of one place: ``p = (s1, s2) / s0``, noise of variance v in
 either. Its angle fits a normal n as specular light, ``m_s . n = 0``, or as diffuse light, ``m_d . n
@@ -31,13 +31,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats
 from polmvs.polarization.fresnel import fresnel_dolp
 from polmvs.polarization.kinds import Light
-
-Floats = NDArray[np.floating]
-Array = NDArray[np.float64]
 
 TABLE_SIZE = 512  # steps of the cosine that bounds are tabulated at
 NUM_IORS = 7

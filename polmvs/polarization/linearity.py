@@ -1,4 +1,4 @@
-"""Which encoding gamma the samples of a mosaic have, told by polarized light itself.
+"""Estimate of the encoding gamma of a mosaic from its polarized light.
 
 Behind an analyzer at ``a`` stands ``I = s0 / 2 (1 + q cos 2a + u sin 2a)``. Whatever gains, angles
 and extinction ratios the four analyzers have, and however oblique rays tilt them, the redundancy
@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.fitting import BEYOND_CHANCE, cauchy_weights, robust_deviation
 from polmvs.polarization.mosaic import clipped_cells, split_mosaic
 from polmvs.polarization.stokes import patch_means
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Whether a user's mask ends where the polarized surface ends, or within it.
+"""Check that a user's mask ends where the polarized surface ends, not within it.
 
 A mask of a part's top alone leaves its sides out, which are polarized as well. The surface of all
 views is a solid: its sides would show where the masks say that there is nothing, so that it bends
@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Mask
 from polmvs.polarization.region import RegionTolerances, smooth
 from polmvs.polarization.stokes import Stokes
-
-Mask = NDArray[np.bool_]
 
 # Band outside of the mask that is looked at: polarization leaks by twice the smoothing's width.
 BAND_SIGMAS = (2.0, 3.0)

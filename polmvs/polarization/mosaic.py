@@ -8,15 +8,14 @@ Bayer pattern, so its cell has 4x4 samples.
 
 from __future__ import annotations
 
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Image
 from polmvs.config import BayerOrder
-
-Image: TypeAlias = NDArray[np.float32]
 
 ANGLES_DEG: Final = (0, 45, 90, 135)
 # A sample lies 0.25 half-size px from the centre of its cell and its next neighbour 0.75 px on

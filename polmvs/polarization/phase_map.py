@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Floats, Image, Mask
 from polmvs.camera import pixel_centers, sample_image
 from polmvs.errors import DataError
 from polmvs.io.arrays import map_array, save_array
@@ -18,11 +19,6 @@ from polmvs.polarization.kinds import Light
 from polmvs.polarization.region import Region, smooth
 from polmvs.polarization.stokes import Stokes
 from polmvs.scene import View
-
-Floats = NDArray[np.floating]
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-
 
 MIN_SHARE = 0.02  # of a window that must count
 TINY = 1e-12  # variance of a polarization without noise, which is known all the same

@@ -1,4 +1,4 @@
-"""Where to densify: the polarized, textureless region of a view, and the edges inside it."""
+"""Region to densify in a view: polarized and textureless, with the edges inside it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
+from polmvs.arrays import Floats, Image, Mask
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""What rounding to whole samples does to Stokes images where noise does not blur it.
+"""Rounding error of Stokes images where noise is too small to dither it.
 
 Rounding adds a variance of a twelfth of a step. Where a sample's noise before it is half a step or
 more, that is white: neighbours are rounded independently. Where the noise is less, as in the dark
@@ -18,10 +18,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from polmvs.arrays import Image, Mask
 
 NUM_TERMS = 4
 BLURRED = 0.12  # squared steps of noise, from which less than 0.0005 squared steps are shared

@@ -53,14 +53,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import stdtrit
 
+from polmvs.arrays import Image, Mask
 from polmvs.config import CaptureOptions, RegionOptions
 from polmvs.polarization.kinds import Light
 from polmvs.polarization.lossy import BLOCK
 from polmvs.polarization.mosaic import INTERPOLATION_NOISE_GAIN
 from polmvs.polarization.rounding import shared_rounding
 
-Image: TypeAlias = NDArray[np.float32]
-Mask: TypeAlias = NDArray[np.bool_]
 Angles: TypeAlias = NDArray[np.floating[Any]]
 
 UNIFORM_SIGMA = np.pi / np.sqrt(12.0)  # deviation of an axial angle of which nothing is known, rad

@@ -9,15 +9,12 @@ from math import comb
 from os import PathLike
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Mask
 from polmvs.errors import DataError
 from polmvs.fitting import like_most
 from polmvs.geometry import SimilarityTransform, align_points, rotation_angle
 from polmvs.scene import View, match_names
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MIN_CAMERAS = 3  # that fix a similarity
 # Of a search for the majority: the fewest that fix a fit, drawn anew. A guess, bounds the time; of

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.io.intrinsics import Intrinsics, from_opencv_matrix
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 MIN_VIEWS = 4  # with a corner grid each; below, focal length and distortion cannot be told apart

@@ -10,15 +10,13 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
+from polmvs.arrays import Array, Mask
 from polmvs.camera import pixel_centers
 from polmvs.config import CropOptions
 from polmvs.errors import OptionError
 from polmvs.geometry import RigidTransform, align_points
 from polmvs.poses.markers import detect_markers, parse_marker_option, triangulate_together
 from polmvs.scene import View, short_list
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MOST = (2, 98)  # percentiles of the coordinates of sparse points that a message names
 # Corners of a marker of unit side in its own frame, clockwise from its first, as OpenCV has them.

@@ -1,4 +1,4 @@
-"""Whether given cameras can be those of given images.
+"""Check of given cameras against the images by epipolar distances of matches.
 
 Features of the images are matched with no camera known. Matches that some epipolar geometry of a
 pair explains are mostly right ones; under the given poses they lie on each other's epipolar lines,
@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.colmap.dense_workspace import MatchTolerances
 from polmvs.errors import DataError
 from polmvs.polarization.capture import WHITE_PERCENTILE, Capture, intensity_image_8bit
 from polmvs.scene import View
 
-Array = NDArray[np.float64]
 ImageLoader = Callable[[str], NDArray[np.uint8]]
 
 
@@ -118,7 +118,7 @@ def fit_to_images(
     for (first, a), (second, b) in combinations(zip(chosen, found, strict=True), 2):
         matches = _consistent_matches(a, b, t)
         if matches is not None:
-            distances.append(_epipolar_distances(first, second, *matches))
+            distances.append(epipolar_distances(first, second, *matches))
     shares = np.concatenate(distances)
     if len(shares) < 2 * t.min_matches:  # one pair alone tells little
         return ImageFit(num_matches=len(shares), fitting=float("nan"), fits=None)
@@ -187,7 +187,7 @@ def _consistent_matches(
     return a[kept], b[kept]
 
 
-def _epipolar_distances(first: View, second: View, a: Array, b: Array) -> Array:
+def epipolar_distances(first: View, second: View, a: Array, b: Array) -> Array:
     """Distances (N,) of matches from each other's epipolar plane, shares of the diagonal.
 
     The larger of an angle at either camera, times its focal length. A match behind a camera does

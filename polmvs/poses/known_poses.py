@@ -12,16 +12,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.colmap.models import match_model_to_capture, read_model, write_model
 from polmvs.colmap.sfm import SfmTolerances
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import intersect_rays
 from polmvs.io.ground_truth import read_views as read_known_views
 from polmvs.scene import SparseModel, Tracks, View, match_names, some_tracks
-
-Array = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
+from polmvs.arrays import Array, Mask
 from polmvs.camera import Camera, sample_image, xy_from_opencv
 from polmvs.colmap.sfm import COLMAP_DEFAULTS
 from polmvs.errors import DataError, OptionError
@@ -28,8 +29,6 @@ from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.poses.alignment import MAX_STARTS
 from polmvs.scene import KEYPOINT_SIGMA_PX, View, short_list
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Gray = NDArray[np.uint8]
 
 logger = logging.getLogger(__name__)

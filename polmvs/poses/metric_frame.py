@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.config import ReferenceOptions
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import SimilarityTransform, nearest_rotation
@@ -41,7 +42,6 @@ from polmvs.scene import (
     some_tracks,
 )
 
-Array = NDArray[np.float64]
 ImageLoader = Callable[[str], NDArray[np.uint8]]
 
 logger = logging.getLogger(__name__)

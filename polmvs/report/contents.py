@@ -1,4 +1,4 @@
-"""What a report shows, gathered from a finished run: figures, pictures of the views, the 3D scene.
+"""Contents of a report: figures, pictures of the views and the 3D scene of a finished run.
 
 Views are taken one after another and leave nothing but their coded pictures behind, so that the
 memory does not grow with them.
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Floats
 from polmvs.camera import sample_image
 from polmvs.evaluation.map_errors import LatticeErrors, lattice_errors
 from polmvs.evaluation.metrics import THRESHOLDS_M, axial_errors_deg
@@ -28,8 +29,6 @@ from polmvs.report.reprojection import mesh_normals_in_cam
 from polmvs.scene import View
 from polmvs.surface.dense_view import DenseView
 from polmvs.surface.mesh_geometry import RayScene
-
-Floats = NDArray[np.floating]
 
 MAX_ERROR_DEG = 20.0  # top of the colour scales: OPA's phase errors on oblique surfaces
 MAX_ERROR_M = max(THRESHOLDS_M)  # of distances from the truth

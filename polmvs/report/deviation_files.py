@@ -1,4 +1,4 @@
-"""What people look at of a deviation: a coloured cloud, a picture with its scale, a histogram."""
+"""Files of a deviation: a coloured cloud, a picture with its scale, a histogram, figures."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polmvs.errors import DataError
 from polmvs.evaluation.deviation import Deviation, DeviationFigures
-from polmvs.io.clouds import Cloud, read_cloud, write_cloud
+from polmvs.io.clouds import Cloud, write_cloud
 from polmvs.io.images import write_bytes, write_png
-from polmvs.io.plain_files import read_text
-from polmvs.io.typed_json import from_json, parse_json, write_json
+from polmvs.io.typed_json import write_json
 from polmvs.report.pictures import palette
 from polmvs.report.plots import deviation_histogram
 from polmvs.report.rendering import Viewpoint, contact_sheet
@@ -22,13 +20,9 @@ VIEWPOINTS = tuple(Viewpoint(elevation_deg=35.0, azimuth_deg=turn) for turn in (
 BAR_PX = 18
 
 
-def write_deviation(folder: Path, found: Deviation, limit_mm: float) -> tuple[Path, ...]:
-    """Write ``deviation.ply``, ``.png``, ``.svg`` and ``.json`` into a folder that is there.
-
-    Parameters
-    ----------
-    limit_mm : distance of the strongest colours.
-    """
+def write_deviation(folder: Path, found: Deviation) -> None:
+    """Write ``deviation.ply``, ``.png``, ``.svg`` and ``.json`` into a folder that is there."""
+    limit_mm = color_limit(found.figures, found.distance)
     colors = deviation_colors(found.distance, limit_mm)
     cloud = Cloud(
         points=found.points,
@@ -43,31 +37,13 @@ def write_deviation(folder: Path, found: Deviation, limit_mm: float) -> tuple[Pa
     svg = deviation_histogram(found.distance, found.figures.tolerance, limit_mm)
     write_bytes(names[2], svg.encode())
     write_json(names[3], found.figures)
-    return tuple(names)
 
 
-def read_deviation(folder: Path) -> tuple[DeviationFigures, Cloud, str]:
-    """The figures, the coloured cloud, laid on the reference, and the histogram, as SVG text.
-
-    Raises
-    ------
-    DataError
-        A file is missing or damaged.
-    """
-    path = folder / "deviation.json"
-    try:
-        figures = from_json(DeviationFigures, parse_json(read_text(path)))
-        svg = read_text(folder / "deviation.svg")
-    except (OSError, ValueError) as error:
-        raise DataError(path, f"is no result of 'polmvs deviation' ({error}).") from error
-    return figures, read_cloud(folder / "deviation.ply"), svg
-
-
-def color_limit(found: Deviation) -> float:
+def color_limit(figures: DeviationFigures, distance: NDArray[np.floating]) -> float:
     """The distance of the strongest colours, mm: the tolerance, else the 99th percentile."""
-    if found.figures.tolerance is not None:
-        return found.figures.tolerance
-    return max(float(np.percentile(np.abs(found.distance), 99)), 1e-9)
+    if figures.tolerance is not None:
+        return figures.tolerance
+    return max(float(np.percentile(np.abs(distance), 99)), 1e-9)
 
 
 def deviation_colors(distance: NDArray[np.floating], limit_mm: float) -> NDArray[np.uint8]:

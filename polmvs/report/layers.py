@@ -17,12 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.arrays import Array, Floats
 from polmvs.geometry import RigidTransform
 from polmvs.report.pictures import hex_palette
 from polmvs.scene import PointKind, View
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating]
 
 FULL = np.iinfo(np.uint16).max  # of a place, as the page holds it
 FRUSTUM_SHARE = 0.08  # depth of a drawn camera, of the distance from the target

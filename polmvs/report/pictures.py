@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Floats, Mask
+
 Rgb = NDArray[np.uint8]
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 CYCLIC, SEQUENTIAL, ERROR = "twilight", "viridis", "plasma"
 NOTHING = 236  # grey of pixels without a value; reads on light and dark pages

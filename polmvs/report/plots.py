@@ -8,15 +8,14 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Floats
 from polmvs.polarization.kinds import AngleModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.floating]
 
 # Okabe and Ito's colours, with a dash each, so that colour is never the only sign.
 COLORS = {

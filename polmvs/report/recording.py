@@ -164,7 +164,7 @@ class _Recorder:
 
     def phases(self, model: AngleModel, on_progress: OnProgress) -> None:
         """Phase maps in cyclic colours."""
-        maps = open_maps(self.folder.sparse, self.folder.maps(model), model)
+        maps = open_maps(self.folder, model)
         for phase_map in maps:
             cos2, sin2 = phase_map.samples[..., 0], phase_map.samples[..., 1]
             phase = np.where(phase_map.samples[..., 2] > 0, 0.5 * np.arctan2(sin2, cos2), np.nan)

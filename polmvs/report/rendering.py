@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats
 from polmvs.camera import PinholeCamera
 from polmvs.geometry import RigidTransform
 from polmvs.io.clouds import Cloud, Mesh
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating]
 Rgb = NDArray[np.uint8]
 
 PAPER, SURFACE = 255, (214, 219, 224)  # colours of the background, and of points without one

@@ -1,10 +1,9 @@
-"""``OUT/report.html``: what a finished run came to, in one file that needs nothing beside it."""
+"""``OUT/report.html``: the results of a finished run in one self-contained file."""
 
 from __future__ import annotations
 
-import base64
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.arrays import Floats
 from polmvs.colmap.models import read_model
 from polmvs.config import (
     Options,
@@ -27,17 +27,15 @@ from polmvs.evaluation.comparison import (
     read_comparison,
 )
 from polmvs.evaluation.consistency import first_seen, phase_residuals_deg
-from polmvs.evaluation.deviation import DeviationFigures
 from polmvs.evaluation.metrics import angular_errors_deg
 from polmvs.evaluation.tables import number
 from polmvs.evaluation.trust import Trust
 from polmvs.geometry import SimilarityTransform
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
 from polmvs.io.ground_truth import GroundTruth, open_ground_truth
-from polmvs.io.images import read_bytes, read_gray, write_bytes
+from polmvs.io.images import read_gray, write_bytes
 from polmvs.neighbors import nearest_points
 from polmvs.parallel import OnProgress, no_progress
-from polmvs.pipeline.checks import digest_of
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import SURFACE_MESH, RunFolder
 from polmvs.pipeline.runner import dense_models, load_record
@@ -59,16 +57,19 @@ from polmvs.report.contents import (
     ViewInput,
     view_page,
 )
-from polmvs.report.deviation_files import COLORS as DEVIATION_COLORS
-from polmvs.report.deviation_files import read_deviation
+from polmvs.report.deviation_section import (
+    FoundDeviation,
+    deviation_layer,
+    deviation_section,
+    open_deviation,
+)
 from polmvs.report.layers import KIND, BoxFrame, Layer, PointColoring, Scene3D, pack_scene, thinned
-from polmvs.report.page import DeviationSection, Page, Plot, Table, ViewPage, page_text
+from polmvs.report.page import Page, Plot, Table, ViewPage, page_text
 from polmvs.scene import PointKind, SparseModel, View
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
 logger = logging.getLogger(__name__)
 
-Floats = NDArray[np.floating]
 
 MAX_POINTS = 150_000  # of each cloud on the page: two clouds turn smoothly, and 2 MB each
 ANGLE_BINS_DEG = np.arange(0.0, 91.0, 5.0)
@@ -117,7 +118,7 @@ class ReportInput:
     capture: Capture | None
     truth: tuple[GroundTruth, SimilarityTransform] | None
     comparison: Comparison | None
-    deviation: _FoundDeviation | None
+    deviation: FoundDeviation | None
 
     @property
     def main(self) -> AngleModel:
@@ -135,25 +136,6 @@ class ReportInput:
         if self.truth is not None:
             return DisplayUnit("mm", 1e3 * self.truth[1].scale)
         return DisplayUnit("mm", 1e3) if self.is_metric else DisplayUnit("model units")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _FoundDeviation:
-    """What ``polmvs deviation --report`` left in the run folder.
-
-    Attributes
-    ----------
-    cloud : the compared points, laid on the reference.
-    histogram : SVG text.
-    picture : coded.
-    is_stale : the run's cloud is another one now.
-    """
-
-    figures: DeviationFigures
-    cloud: Cloud
-    histogram: str
-    picture: str
-    is_stale: bool
 
 
 def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress) -> Path:
@@ -186,12 +168,12 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
             title=_title(given),
             sentence=" ".join([*_verdict(given), _sentence(given)]),
             facts=_facts(given),
-            warnings=_warnings(given),
+            warnings=warnings_of(given),
             tables=_tables(given),
-            trust=_trust(given),
+            trust=trust_table(given),
             views=views,
             plots=_plots(given, samples),
-            deviation=_deviation_section(given),
+            deviation=deviation_section(given.deviation),
             scene=scene,
             thinned=MAX_POINTS if _is_thinned(given) else 0,
             stages=[
@@ -233,27 +215,7 @@ def _open(folder: RunFolder) -> ReportInput:
         capture=_open_capture(record, options),
         truth=truth,
         comparison=comparison,
-        deviation=_open_deviation(folder, clouds),
-    )
-
-
-def _open_deviation(folder: RunFolder, models: Iterable[AngleModel]) -> _FoundDeviation | None:
-    """The comparison with a reference, if there is a whole one."""
-    if not folder.deviation.is_dir():
-        return None
-    try:
-        figures, cloud, histogram = read_deviation(folder.deviation)
-        picture = read_bytes(folder.deviation / "deviation.png")
-        digests = {digest_of(folder.cloud(model)) for model in models}
-    except PolmvsError as error:
-        logger.warning("the report shows no deviation: %s", error)
-        return None
-    return _FoundDeviation(
-        figures=figures,
-        cloud=cloud,
-        histogram=histogram,
-        picture="data:image/png;base64," + base64.b64encode(picture).decode("ascii"),
-        is_stale=figures.result_digest not in digests,
+        deviation=open_deviation(folder, clouds),
     )
 
 
@@ -285,8 +247,8 @@ def _view_pages(
     given: ReportInput, samples: Mapping[AngleModel, ErrorSamples]
 ) -> Iterator[ViewPage]:
     folder = given.folder
-    maps = {m: open_maps(folder.sparse, folder.maps(m), m) for m in given.models}
-    dense = {m: open_dense_views(folder.sparse, folder.views(m)) for m in given.models}
+    maps = {m: open_maps(folder, m) for m in given.models}
+    dense = {m: open_dense_views(folder, m) for m in given.models}
     raw = image_names(given.capture) if given.capture is not None else {}
     first = next(iter(maps.values()))
     white = max(float(np.percentile(one.intensity, WHITE_PERCENTILE)) for one in first)
@@ -332,7 +294,7 @@ def _mesh_of(given: ReportInput, model: AngleModel) -> Mesh | None:
 def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColoring]]:
     """Clouds and meshes of all models, and what they can be coloured by."""
     sigmas = [
-        np.asarray(cloud.scalars["sigma"])[_on_surface(cloud)]
+        np.asarray(cloud.scalars["sigma"])[cloud.are(PointKind.SURFACE)]
         for cloud in given.clouds.values()
         if "sigma" in cloud.scalars
     ]
@@ -396,8 +358,8 @@ def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColori
         if (mesh := _mesh_of(given, model)) is not None:
             layers.append(_mesh_layer(model, mesh, layers))
     if given.deviation is not None and not given.deviation.is_stale:
-        layer, channels["deviation"] = _deviation_layer(given.deviation)
-        layers.append(layer)
+        layer, channels["deviation"] = deviation_layer(given.deviation)
+        layers.append(thinned(layer, MAX_POINTS))
     for name, limit in ADAPTED.items():
         if name in channels:
             channels[name] = replace(channels[name], high=_top(layers, name, limit))
@@ -441,31 +403,6 @@ def _top(layers: Sequence[Layer], name: str, limit: float) -> float:
     return float(steps[steps >= 0.999 * wanted].min())
 
 
-def _deviation_layer(found: _FoundDeviation) -> tuple[Layer, PointColoring]:
-    """The compared points in the model's frame, and the colours of their distances."""
-    matrix = np.linalg.inv(np.asarray(found.figures.reference_from_result))
-    limit = found.figures.tolerance
-    distance = np.asarray(found.cloud.scalars["distance_mm"], np.float64)
-    if limit is None:
-        limit = float(np.percentile(np.abs(distance), 99)) or 1.0
-    turned = np.asarray(found.cloud.normals) @ matrix[:3, :3].T
-    layer = Layer(
-        label="deviation from the reference",
-        points=found.cloud.points @ matrix[:3, :3].T + matrix[:3, 3],
-        normals=turned / np.linalg.norm(turned, axis=1, keepdims=True),
-        values={"deviation": distance},
-    )
-    channel = PointColoring(
-        label="deviation from the reference",
-        unit="mm",
-        low=-limit,
-        high=limit,
-        colors=DEVIATION_COLORS,
-        note="Signed distance: blue is inside the reference, red outside.",
-    )
-    return thinned(layer, MAX_POINTS), channel
-
-
 def _cloud_layer(given: ReportInput, model: AngleModel, cloud: Cloud, factor: float) -> Layer:
     num = len(cloud.points)
     shown = {"intensity": np.full(num, 0.7) if cloud.colors is None else cloud.colors[:, 0] / 255}
@@ -501,7 +438,7 @@ def _residuals(given: ReportInput, model: AngleModel, layer: Layer) -> Floats:
     total, count = np.zeros(len(layer.points)), np.zeros(len(layer.points))
     on_surface = np.flatnonzero(np.linalg.norm(layer.normals, axis=1) > 0.5)
     points, normals = layer.points[on_surface], layer.normals[on_surface]
-    for phase_map in open_maps(given.folder.sparse, given.folder.maps(model), model):
+    for phase_map in open_maps(given.folder, model):
         visible, _ = first_seen(points, normals, phase_map.view, phase_map.shows_surface)
         found = phase_residuals_deg(model, points[visible], normals[visible], phase_map)
         known = np.isfinite(found)
@@ -512,13 +449,6 @@ def _residuals(given: ReportInput, model: AngleModel, layer: Layer) -> Floats:
     seen = count > 0
     mean[seen] = total[seen] / count[seen]
     return mean
-
-
-def _on_surface(cloud: Cloud) -> NDArray[np.bool_]:
-    kind = cloud.scalars.get("kind")
-    if kind is None:
-        return np.ones(len(cloud.points), np.bool_)
-    return np.asarray(kind == PointKind.SURFACE)
 
 
 def _scene(
@@ -599,7 +529,7 @@ def _size_words(given: ReportInput) -> list[str]:
 def _size(given: ReportInput) -> str | None:
     """Extents of the part along its main directions; None where lengths have no unit."""
     surface = given.clouds[given.main]
-    points = surface.points[_on_surface(surface)]
+    points = surface.points[surface.are(PointKind.SURFACE)]
     if not (given.is_metric or given.truth is not None) or len(points) < MIN_SIZED:
         return None
     sides = " x ".join(f"{given.length.factor * side:.0f}" for side in _sides(points))
@@ -660,7 +590,7 @@ def _uncertainty_words(given: ReportInput) -> list[str]:
     """What the points state of themselves."""
     cloud = given.clouds[given.main]
     sigma = np.asarray(cloud.scalars.get("sigma", ()), np.float64)
-    known = sigma[_on_surface(cloud)] if len(sigma) else sigma
+    known = sigma[cloud.are(PointKind.SURFACE)] if len(sigma) else sigma
     known = known[np.isfinite(known)]
     if not len(known):
         return []
@@ -671,7 +601,7 @@ def _uncertainty_words(given: ReportInput) -> list[str]:
     ]
 
 
-def _warnings(given: ReportInput) -> tuple[str, ...]:
+def warnings_of(given: ReportInput) -> tuple[str, ...]:
     """Those of the run, and of what stands beside it."""
     warnings = [w for stage in given.record.stages for w in stage.warnings]
     if given.deviation is not None and given.deviation.is_stale:
@@ -680,46 +610,6 @@ def _warnings(given: ReportInput) -> tuple[str, ...]:
             "'polmvs deviation' makes it anew."
         )
     return tuple(warnings)
-
-
-def _deviation_section(given: ReportInput) -> DeviationSection | None:
-    """The part against its reference, in words, figures and pictures."""
-    if given.deviation is None or given.deviation.is_stale:
-        return None
-    f = given.deviation.figures
-    name = Path(f.reference).name
-    sentence = (
-        f"Against {name} the part is {number(f.rms, 1, 3)} mm off in the root mean square, "
-        f"{number(abs(f.mean), 1, 3)} mm {'outside' if f.mean >= 0 else 'inside'} in the mean."
-    )
-    if f.passed is not None and f.share_within is not None:
-        verdict = "passes" if f.passed else "fails"
-        sentence = (
-            f"The part {verdict}: {number(f.share_within, 100, 2)} % of its points are within "
-            f"{f.tolerance:g} mm of {name}, {100 * f.least_share:g} % are asked for. " + sentence
-        )
-    rows = [
-        ["compared points", f"{f.num_points:,}"],
-        ["mean, mm", f"{f.mean:+.4f}"],
-        ["standard deviation, mm", number(f.standard_deviation, 1, 4)],
-        ["RMS, mm", number(f.rms, 1, 4)],
-        *[[f"percentile {p} %, mm", f"{value:+.3f}"] for p, value in f.percentiles.items()],
-        ["uncertainty (1 sigma) of a distance, median, mm", number(f.median_sigma, 1, 4)],
-        ["farther off than three of these, %", number(f.significant_share, 100, 1)],
-    ]
-    if f.share_within is not None:
-        rows.append(["within the tolerance, %", number(f.share_within, 100, 2)])
-    if f.repeatability is not None:
-        rows.append(["repeatability of one run, mm", number(f.repeatability, 1, 4)])
-    if f.scale != 1:
-        rows.append(["scale that was fitted", f"{f.scale:.6g}"])
-    return DeviationSection(
-        sentence=sentence,
-        passed=f.passed,
-        table=Table(header=["", "value"], rows=rows),
-        picture=given.deviation.picture,
-        histogram=given.deviation.histogram.replace("#555555", "currentColor"),
-    )
 
 
 def _facts(given: ReportInput) -> list[tuple[str, str]]:
@@ -765,7 +655,7 @@ def _verdict(given: ReportInput) -> list[str]:
     return [f"{plots.LABELS[main]}: {found.verdict.replace('`', '')}"]
 
 
-def _trust(given: ReportInput) -> Table | None:
+def trust_table(given: ReportInput) -> Table | None:
     """What the main result says about itself, with what is normal."""
     main = next(m for m in MAIN if m in given.models)
     found = given.record.find(Trust, main)
@@ -839,7 +729,7 @@ def _against_views(given: ReportInput) -> list[Plot]:
         if "sigma_deg" not in cloud.scalars or "num_views" not in cloud.scalars:
             continue
         values = np.asarray(cloud.scalars["sigma_deg"], np.float64)
-        chosen = _on_surface(cloud) & np.isfinite(values)
+        chosen = cloud.are(PointKind.SURFACE) & np.isfinite(values)
         sigma[model] = values[chosen]
         count[model] = np.asarray(cloud.scalars["num_views"], np.float64)[chosen]
     if not any(len(values) for values in sigma.values()):

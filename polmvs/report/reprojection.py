@@ -1,15 +1,13 @@
-"""A mesh as a view sees it."""
+"""Reprojection of a mesh into a view."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import pixel_centers
 from polmvs.scene import View
 from polmvs.surface.mesh_geometry import RayScene
-
-Array = NDArray[np.float64]
 
 MAX_RAYS = 160_000  # a picture, which a thumbnail and half a screen show; 0.1 s
 

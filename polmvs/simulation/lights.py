@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError, OptionError
-from polmvs.io.images import read_radiance
+from polmvs.io.raw_formats import read_radiance
 from polmvs.simulation.options import LightingOptions, LightName
 
 Array = NDArray[np.float32]

@@ -11,11 +11,12 @@ field along the projection of its absorbing axis on the plane transverse to the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import Camera, pixel_centers
 from polmvs.config import CaptureOptions
 from polmvs.geometry import RigidTransform, unit
@@ -24,8 +25,6 @@ from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.polarization.stokes import wrap_axial
 from polmvs.scene import View
 from polmvs.synthetic.surfaces import Surface
-
-Array: TypeAlias = NDArray[np.float64]
 
 LIGHTS = ("specular", "diffuse")
 SENSORS = ("ppa", "opa", "tilted")

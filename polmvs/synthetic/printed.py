@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
+from polmvs.arrays import Array, Mask
 from polmvs.camera import Camera, sample_image
 from polmvs.geometry import points_on_rays
 from polmvs.scene import View
@@ -30,9 +31,6 @@ from polmvs.synthetic.captures import (
     rolled,
 )
 from polmvs.synthetic.surfaces import Group, Surface
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 DARKEST, BRIGHTEST = 0.15, 0.85  # of a print, s0 in full scales
 STRIP = 32  # rows of a mosaic that are rendered at a time

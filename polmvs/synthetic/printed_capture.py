@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, in_image
 from polmvs.io.folders import new_folder
@@ -25,8 +24,6 @@ from polmvs.synthetic.printed import (
     render_printed_truth,
 )
 from polmvs.synthetic.surfaces import Group, Plane, Sphere
-
-Array = NDArray[np.float64]
 
 SAME_PLACE = 1e-4  # relative: of a point and of what its view sees there
 

@@ -12,10 +12,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.geometry import unit, unit_or_zero
 from polmvs.io.clouds import Mesh
 
-Array = NDArray[np.float64]
 Triangles = NDArray[np.int32]
 
 MAX_SAG = 5e-5  # of the largest side: 10 um at 0.2 m, half a step of the stored depth

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from polmvs.arrays import Array
 from polmvs.geometry import unit
 from polmvs.scene import MIN_DISTANCE
-
-Array: TypeAlias = NDArray[np.float64]
 
 
 class Surface(Protocol):

@@ -156,8 +156,8 @@ def test_what_goes_wrong_after_an_interrupt_is_the_interrupt(monkeypatch, capsys
 
     shown: list[str] = []
     monkeypatch.setattr(running, "_complain", lambda terminal, prog, text: shown.append(text))
-    assert running._guarded(command, Silent(), "polmvs") == 1
+    assert running.guarded(command, Silent(), "polmvs") == 1
     monkeypatch.setitem(vars(running), "interrupts", [15])
     assert interrupts == []
-    assert running._guarded(command, Silent(), "polmvs") == 130
+    assert running.guarded(command, Silent(), "polmvs") == 130
     assert shown[-1] == "interrupted"

@@ -91,8 +91,13 @@ def test_what_colmap_is_told(with_onnx, weights, tmp_path, monkeypatch) -> None:
     for name in names:
         write_png(tmp_path / name, np.zeros((24, 32), np.uint8))
     database = tmp_path / "database.db"
-    reader = pycolmap.ImageReaderOptions()
-    sfm_module._extract_features(database, tmp_path, names, reader, weights)
+    sfm_module.SfmWork(
+        images=tmp_path,
+        names=names,
+        database=database,
+        reader=pycolmap.ImageReaderOptions(),
+        options=weights,
+    ).describe(database)
     match_pairs(database, (("a.png", "b.png"),), learned=learned_features(weights))
     extraction, matching = told
     assert extraction.type == pycolmap.FeatureExtractorType.ALIKED_N16ROT

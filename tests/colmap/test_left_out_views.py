@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,17 @@ import pycolmap
 import pytest
 from printed_images import INTRINSICS, write_printed_images
 
-from polmvs.colmap import contradicting_pairs, left_out_views, sfm
+from polmvs.colmap import contradicting_pairs
 from polmvs.colmap.contradicting_pairs import drop_contradicting
 from polmvs.colmap.database import image_numbers, match_pairs, opened
-from polmvs.colmap.left_out_views import Step, Trial, try_harder
+from polmvs.colmap.left_out_views import (
+    Step,
+    Trial,
+    forget_matches,
+    pool_descriptors,
+    try_harder,
+)
+from polmvs.colmap.sfm import SfmWork, run_sfm
 from polmvs.config import SfmOptions
 
 NUM_VIEWS = 5
@@ -28,7 +36,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, list[s
     (folder / "images").mkdir()
     names = [view.name for view in write_printed_images(folder / "images", NUM_VIEWS)]
     options = SfmOptions(intrinsics=INTRINSICS)
-    sfm.run_sfm(folder / "images", names, folder / "work", folder / "sparse", options)
+    run_sfm(folder / "images", names, folder / "work", folder / "sparse", options)
     return folder / "images", folder / "work" / "database.db", names
 
 
@@ -39,6 +47,17 @@ def database(solved, tmp_path: Path) -> Path:
 
 def pairs_of(names: list[str]) -> tuple[tuple[str, str], ...]:
     return tuple((a, b) for i, a in enumerate(names) for b in names[i + 1 :])
+
+
+def work_on(images: Path, names: list[str], database: Path) -> SfmWork:
+    camera = ",".join(map(repr, INTRINSICS))
+    return SfmWork(
+        images=images,
+        names=names,
+        database=database,
+        reader=pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params=camera),
+        options=SfmOptions(intrinsics=INTRINSICS),
+    )
 
 
 def matches(database: Path, pair: tuple[str, str]) -> np.ndarray:
@@ -52,12 +71,10 @@ def test_views_without_matches_are_matched_again_and_no_others(solved, database,
     caplog.set_level("WARNING")
     last, pairs = names[-1], pairs_of(names)
     of_last = tuple(pair for pair in pairs if last in pair)
-    left_out_views._forget(database, of_last)
+    forget_matches(database, of_last)
     before = {pair: matches(database, pair) for pair in pairs if last not in pair}
 
-    def map_once() -> pycolmap.Reconstruction | None:
-        options, tolerances = SfmOptions(intrinsics=INTRINSICS), sfm.SfmTolerances()
-        return sfm._map(database, images, database.parent, names, options, tolerances)
+    map_once = work_on(images, names, database).map
 
     def never(path: Path) -> None:
         raise AssertionError("the first step is enough")
@@ -74,20 +91,16 @@ def test_views_without_matches_are_matched_again_and_no_others(solved, database,
         assert np.array_equal(matches(database, pair), kept)
     # Along a known geometry more is found than by looks alone.
     guided = sum(len(matches(database, pair)) for pair in of_last)
-    left_out_views._forget(database, of_last)
+    forget_matches(database, of_last)
     match_pairs(database, of_last)
     assert guided >= sum(len(matches(database, pair)) for pair in of_last) > 0
 
 
 def test_pooling_changes_the_descriptors_of_the_same_keypoints(solved, tmp_path: Path) -> None:
     images, _, names = solved
-    database, options = tmp_path / "database.db", SfmOptions(intrinsics=INTRINSICS)
-    reader = sfm._reader_options(options, 300, 250, sfm.SfmTolerances())
-
-    def describe(target: Path, *, pooled: bool = True) -> None:
-        sfm._extract_features(target, images, names[:2], reader, options, pooled=pooled)
-
-    describe(database, pooled=False)
+    database = tmp_path / "database.db"
+    work = work_on(images, names[:2], database)
+    work.describe(database)
     with opened(database) as content:  # one is gone, as after a static background has
         keypoints, looks = content.read_keypoints(1)[1:], content.read_descriptors(1)
         looks.data = np.ascontiguousarray(looks.data[1:])
@@ -97,8 +110,9 @@ def test_pooling_changes_the_descriptors_of_the_same_keypoints(solved, tmp_path:
         for number, found in enumerate(((keypoints, looks), others), 1):
             content.write_keypoints(number, np.ascontiguousarray(found[0]))
             content.write_descriptors(number, found[1])
+    describe = partial(work.describe, pooled=True)
     trial = Trial(database=database, pairs=(), describe=describe, map=lambda: None, seed=0)
-    left_out_views._pool(trial)
+    pool_descriptors(trial)
     with opened(database) as content:
         assert np.array_equal(content.read_keypoints(1), keypoints)
         now = np.asarray(content.read_descriptors(1).data, float)

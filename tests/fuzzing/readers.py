@@ -58,6 +58,7 @@ from polmvs.pipeline.runner import load_record
 from polmvs.pipeline.stages.normals import NORMALS_TYPE
 from polmvs.pipeline.stages.seeds import SEEDS_TYPE, load_seeds, seed_tracks
 from polmvs.polarization.capture import open_capture
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import open_phase_map, store_phase_map
 from polmvs.poses.known_poses import retriangulate
 from polmvs.poses.metric_frame import read_centers
@@ -349,10 +350,12 @@ def write_stage_files(folder: Path) -> None:
     store_dense_view(
         DenseView(2, flat, np.dstack([flat] * 3), flat, flat, flat), folder / view.name
     )
-    np.save(folder / "normals.npy", np.zeros(4, NORMALS_TYPE))
+    run = RunFolder(folder)
+    run.seeds.parent.mkdir()
+    np.save(run.track_normals(AngleModel.PPA), np.zeros(4, NORMALS_TYPE))
     seeds = np.zeros(3, SEEDS_TYPE)
     seeds["track"] = (1, 0, 3)
-    np.save(folder / "seeds.npy", seeds)
+    np.save(run.seeds, seeds)
 
 
 def use_stage_files(folder: Path) -> None:
@@ -361,8 +364,8 @@ def use_stage_files(folder: Path) -> None:
     found = find_dense_view(folder / view.name)
     assert found is not None
     found.known.sum()
-    load_seeds(folder / "seeds.npy", folder / "normals.npy")
-    seed_tracks(folder / "seeds.npy", 4)
+    load_seeds(RunFolder(folder), AngleModel.PPA)
+    seed_tracks(RunFolder(folder).seeds, 4)
 
 
 def write_marked(folder: Path) -> None:

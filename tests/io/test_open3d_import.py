@@ -33,13 +33,13 @@ def test_libusb_comes_from_its_wheel_where_the_system_has_none(
 ) -> None:
     wheel = SimpleNamespace(get_library_path=lambda: Path("/wheel/libusb-1.0.so"))
     monkeypatch.setitem(sys.modules, "libusb_package", wheel)
-    open3d_import._find_libusb()
+    open3d_import.find_libusb()
     assert loaded == [("/wheel/libusb-1.0.so", ctypes.RTLD_GLOBAL)]
 
 
 def test_without_that_wheel_nothing_is_loaded(loaded, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "libusb_package", None)
-    open3d_import._find_libusb()
+    open3d_import.find_libusb()
     assert loaded == []
 
 

@@ -32,6 +32,7 @@ from polmvs.io.ground_truth import OTHER_SPACING_M, GroundTruth, open_ground_tru
 from polmvs.pipeline.jobs import judge
 from polmvs.pipeline.run_folder import DENSE_MARKER, SURFACE_MESH, RunFolder
 from polmvs.pipeline.stages.densify import crop_views, open_dense_views, unused_options
+from polmvs.polarization.kinds import AngleModel
 from polmvs.poses.crop_box import CropBox
 from polmvs.poses.metric_frame import transform_model
 from polmvs.scene import PointKind
@@ -350,7 +351,7 @@ def test_a_box_cuts_cloud_maps_and_mesh(go_on: Continue, run: Path, demo_capture
     assert len(surface_of(cloud)) > 1000
     for view, dense in zip(
         read_model(out / "sparse").views,
-        open_dense_views(out / "sparse", out / "views_ppa"),
+        open_dense_views(RunFolder(out), AngleModel.PPA),
         strict=True,
     ):
         assert dense is not None

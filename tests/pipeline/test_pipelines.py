@@ -1,5 +1,4 @@
 import importlib.util
-import json
 import shutil
 import sys
 from pathlib import Path
@@ -26,7 +25,7 @@ def load(name: str) -> ModuleType:
 
 
 def test_there_are_scripts() -> None:
-    assert {"reconstruct", "compare", "benchmark"} <= set(SCRIPTS)
+    assert {"benchmark", "paper"} <= set(SCRIPTS)
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
@@ -41,27 +40,6 @@ def help_status(script: ModuleType) -> int:
         return script.main(["--help"])
     except SystemExit as stop:
         return int(stop.code or 0)
-
-
-def test_reconstruct_goes_on_with_a_run(
-    demo_run: Path, demo_capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    intrinsics = json.loads((demo_run / "run.json").read_text())["options"]["sfm"]["intrinsics"]
-    out = tmp_path / "out"
-    shutil.copytree(demo_run, out)
-    flags = ["--intrinsics", ",".join(map(str, intrinsics)), "--resume", "--no-mesh", "--no-colmap"]
-    assert load("reconstruct").main([str(demo_capture), str(out), *flags]) == 0
-    assert f"{out / 'ppa.ply'}: " in capsys.readouterr().out
-
-
-def test_compare_takes_truth_from_the_capture(
-    demo_run: Path, demo_capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    intrinsics = json.loads((demo_run / "run.json").read_text())["options"]["sfm"]["intrinsics"]
-    shutil.copytree(demo_run, tmp_path / demo_capture.name)
-    flags = ["--intrinsics", ",".join(map(str, intrinsics)), "--resume"]
-    assert load("compare").main([str(tmp_path), str(demo_capture), *flags]) == 0
-    assert "Chamfer" in capsys.readouterr().out
 
 
 def test_benchmark_prints_stages_of_several_runs(

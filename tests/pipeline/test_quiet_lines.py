@@ -24,14 +24,14 @@ def test_several_models_are_said_only_where_images_are_left_out(
     monkeypatch.setattr(sfm.pycolmap, "incremental_mapping", lambda *arguments: found)
     names = [f"{number}.png" for number in range(5)]
     with caplog.at_level(logging.WARNING, logger="polmvs"):
-        largest = sfm._map(
-            tmp_path / "db",
-            tmp_path,
-            tmp_path,
-            names,
-            sfm.SfmOptions(),
-            sfm.SfmTolerances(),
+        work = sfm.SfmWork(
+            images=tmp_path,
+            names=names,
+            database=tmp_path / "db",
+            reader=sfm.pycolmap.ImageReaderOptions(),
+            options=sfm.SfmOptions(),
         )
+        largest = work.map()
     assert largest.num_reg_images() == registered
     assert [record.getMessage() for record in caplog.records] == (
         ["SfM: the images fall into 2 models; the largest is used and has 4 of 5 images."] * warns
@@ -55,10 +55,10 @@ def test_stereo_that_finds_nothing_says_so_and_keeps_the_sparse_points(
     nothing = SimpleNamespace(points=[])
     monkeypatch.setattr(densify, "stereo_surroundings", lambda *given, **others: nothing)
     monkeypatch.setattr(densify, "sparse_surroundings", lambda tracks, maps: kept)
-    monkeypatch.setattr(densify, "_sparse_cloud", lambda found: found)
+    monkeypatch.setattr(densify, "sparse_part", lambda found: found)
     options = Options(fusion=FusionOptions(surroundings=Surroundings.STEREO))
     given = SimpleNamespace(maps=[], options=options, workers=Workers(1))
-    cloud = densify._surroundings_cloud(None, None, given, None, tmp_path)
+    cloud = densify.surroundings_cloud(None, None, given, None, tmp_path)
     assert cloud is kept
     assert "`fusion.surroundings` stereo finds no points: too few views" in caplog.text
     assert "record more views" in caplog.text

@@ -7,7 +7,7 @@ from polmvs.camera import PinholeCamera
 from polmvs.geometry import RigidTransform
 from polmvs.poses.image_check import (
     ImageCheckTolerances,
-    _epipolar_distances,
+    epipolar_distances,
     feature_detector,
     find_features,
 )
@@ -39,15 +39,15 @@ def test_true_matches_lie_on_their_epipolar_lines_and_before_both_cameras() -> N
     first, second = side_by_side()
     points = np.random.default_rng(0).uniform([-0.3, -0.2, 0.8], [0.3, 0.2, 1.5], (30, 3))
     a, b = first.project(points), second.project(points)
-    np.testing.assert_allclose(_epipolar_distances(first, second, a, b), 0, atol=1e-9)
+    np.testing.assert_allclose(epipolar_distances(first, second, a, b), 0, atol=1e-9)
     # Seen the other way round their lines would meet behind the cameras.
-    assert np.isinf(_epipolar_distances(first, second, b, a)).all()
+    assert np.isinf(epipolar_distances(first, second, b, a)).all()
     # What is very far is before them, whatever rounding makes of it.
-    np.testing.assert_allclose(_epipolar_distances(first, second, a, a), 0, atol=1e-9)
+    np.testing.assert_allclose(epipolar_distances(first, second, a, a), 0, atol=1e-9)
 
 
 def test_distances_from_epipolar_lines_are_shares_of_the_diagonal() -> None:
     first, second = side_by_side()
     point = np.array([[0.0, 0.0, 1.0]])
     a, b = first.project(point), second.project(point) + np.array([0.0, 5.0])
-    assert _epipolar_distances(first, second, a, b)[0] == pytest.approx(5 / 500, rel=0.01)
+    assert epipolar_distances(first, second, a, b)[0] == pytest.approx(5 / 500, rel=0.01)

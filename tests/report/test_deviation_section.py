@@ -16,7 +16,8 @@ from polmvs.cli import deviations
 from polmvs.io.clouds import read_cloud
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.polarization.kinds import AngleModel
-from polmvs.report import report
+from polmvs.report.deviation_section import deviation_layer, deviation_section, open_deviation
+from polmvs.report.report import warnings_of
 from polmvs.scene import PointKind
 
 PPA = AngleModel.PPA
@@ -52,7 +53,7 @@ def call(compared, cli, monkeypatch):
 
 def opened(run: Path) -> SimpleNamespace:
     """As much of a run as the section needs."""
-    return SimpleNamespace(deviation=report._open_deviation(RunFolder(run), [PPA]))
+    return SimpleNamespace(deviation=open_deviation(RunFolder(run), [PPA]))
 
 
 def test_a_comparison_is_kept_in_the_run_and_shown(call, compared) -> None:
@@ -64,7 +65,7 @@ def test_a_comparison_is_kept_in_the_run_and_shown(call, compared) -> None:
     }
     given = opened(run)
     assert not given.deviation.is_stale
-    section = report._deviation_section(given)
+    section = deviation_section(given.deviation)
     assert section is not None
     assert section.passed is False
     assert section.sentence.startswith("The part fails: ")
@@ -74,13 +75,13 @@ def test_a_comparison_is_kept_in_the_run_and_shown(call, compared) -> None:
     assert float(rows["mean, mm"]) == pytest.approx(-2.0, abs=0.3)
     assert "repeatability of one run, mm" not in rows
     assert call("--tolerance", 5)[0] == 0  # again, in the place of the last one
-    assert report._deviation_section(opened(run)).sentence.startswith("The part passes: ")
+    assert deviation_section(opened(run).deviation).sentence.startswith("The part passes: ")
 
 
 def test_the_layer_lies_where_the_cloud_does(call, compared) -> None:
     run = compared[0]
     call()
-    layer, channel = report._deviation_layer(opened(run).deviation)
+    layer, channel = deviation_layer(opened(run).deviation)
     cloud = read_cloud(run / "ppa.ply")
     part = cloud.points[np.isin(cloud.scalars["kind"], (PointKind.SURFACE, PointKind.INFERRED))]
     # Each is a point of the cloud: it was thinned and laid, and comes back.
@@ -97,11 +98,11 @@ def test_of_another_cloud_it_is_not_shown_but_told(call, compared, tmp_path: Pat
     (run / "ppa.ply").write_bytes((run / "opa.ply").read_bytes())
     given = opened(run)
     given.record = SimpleNamespace(stages=[])
-    assert report._deviation_section(given) is None
-    (warning,) = report._warnings(given)
+    assert deviation_section(given.deviation) is None
+    (warning,) = warnings_of(given)
     assert "of an earlier cloud of this run" in warning
     (run / "deviation" / "deviation.json").write_text("{}")
-    assert report._open_deviation(RunFolder(run), [PPA]) is None
+    assert open_deviation(RunFolder(run), [PPA]) is None
 
 
 def test_two_runs_repeat(compared, demo_run: Path, cli, tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def test_trust_names_what_to_check(monkeypatch) -> None:
     )
     monkeypatch.setattr(Record, "find", lambda self, kind, model: found)
     given = type("Given", (), {"models": report.MAIN, "record": Record()})
-    table = report._trust(given)
+    table = report.trust_table(given)
     odd = [row for row in table.rows if row[3]]
     assert [row[0] for row in odd] == ["views that agree with a point they see, %"]
     assert odd[0][1:] == ["50.00", "80 to 100", "check poses: sfm.intrinsics, sfm.sparse"]

@@ -1,4 +1,4 @@
-"""Stage ``box``: whether the box that a result is to be cut to holds any of the scene.
+"""Stage ``box``: check that the crop box holds part of the scene.
 
 It is asked as soon as there are poses, before the surface is made.
 """
@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from polmvs.colmap.models import read_model
 from polmvs.config import CropOptions
 from polmvs.io.images import read_gray
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.poses.crop_box import crop_box
 
 logger = logging.getLogger(__name__)
@@ -38,12 +38,12 @@ class BoxResult:
         return f"{self.num_points:,} of {self.num_all:,} sparse points in the box"
 
 
-def check_box(sparse: Path, images: Path, crop: CropOptions, aruco: str | None) -> BoxResult:
+def check_box(folder: RunFolder, crop: CropOptions, aruco: str | None) -> BoxResult:
     """Hold a box against the sparse points.
 
     Parameters
     ----------
-    sparse, images : folders of the COLMAP model and of its images.
+    folder : of a run with images and model.
     crop, aruco : the box, and the markers (``DICT:SIZE``) that it may be relative to.
 
     Raises
@@ -51,8 +51,8 @@ def check_box(sparse: Path, images: Path, crop: CropOptions, aruco: str | None) 
     OptionError
         The box lies beside all that the cameras see, or its marker is not found.
     """
-    model = read_model(sparse)
-    box = crop_box(crop, aruco, model.views, lambda name: read_gray(images / name))
+    model = read_model(folder.sparse)
+    box = crop_box(crop, aruco, model.views, lambda name: read_gray(folder.images / name))
     points = model.tracks.points_in_world
     if box is None:
         return BoxResult(num_points=None, num_all=len(points))

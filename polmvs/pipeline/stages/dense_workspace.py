@@ -13,8 +13,9 @@ from polmvs.colmap.maps import DepthNormals
 from polmvs.colmap.models import read_model
 from polmvs.errors import DataError
 from polmvs.io.images import read_gray
-from polmvs.pipeline.run_folder import mark_own_workspace, replace_folder, scratch
+from polmvs.pipeline.run_folder import RunFolder, mark_own_workspace, replace_folder, scratch
 from polmvs.pipeline.stages.densify import open_checked, open_dense_views
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import SparseModel
 from polmvs.surface.dense_view import DenseView
 from polmvs.surface.map_export import export_dense_workspace, warp_dense_view
@@ -37,49 +38,49 @@ class DenseWorkspaceResult:
         return "no workspace, for want of points" if self.folder is None else str(self.folder)
 
 
-def write_workspace(sparse: Path, images: Path, views: Path, target: Path) -> DenseWorkspaceResult:
+def write_workspace(model: AngleModel, folder: RunFolder) -> DenseWorkspaceResult:
     """A COLMAP workspace of the run's own undistorted images and maps.
 
     Parameters
     ----------
-    sparse, images : folders of the COLMAP model and of its images.
-    views : folder of the dense views, see :func:`polmvs.pipeline.stages.densify.densify`.
-    target : folder of the workspace, whole or not at all.
+    model : angle model.
+    folder : of a run with images, sparse model and dense views; the workspace is written whole or
+        not at all.
 
     Raises
     ------
     DataError
-        There are no dense views, or ``target`` holds files that no run wrote.
+        There are no dense views, or the workspace's place holds files that no run wrote.
     """
-    model = read_model(sparse)
-    dense = _by_name(model, sparse, views)
-    with _new_workspace(target) as folder:
+    sparse, target = read_model(folder.sparse), folder.dense(model)
+    dense = _by_name(sparse, model, folder)
+    with _new_workspace(target) as new:
         export_dense_workspace(
-            folder, model, lambda name: read_gray(images / name), dense.__getitem__
+            new, sparse, lambda name: read_gray(folder.images / name), dense.__getitem__
         )
     return DenseWorkspaceResult(folder=target.absolute())
 
 
 def fill_given(
-    sparse: Path, images: Path, views: Path, target: Path, given: Path, *, in_place: bool
+    model: AngleModel, folder: RunFolder, given: Path, *, in_place: bool
 ) -> DenseWorkspaceResult:
     """A copy of the user's workspace, or that one itself, with the holes of its maps filled.
 
     Parameters
     ----------
-    sparse, images, views, target : as in :func:`write_workspace`.
+    model, folder : as in :func:`write_workspace`.
     given : the user's workspace.
-    in_place : fill that one, after a backup of its maps, and write no ``target``.
+    in_place : fill that one, after a backup of its maps, and write no other.
 
     Raises
     ------
     DataError
         The workspace is unusable, or not of these images and this model.
     """
-    model = read_model(sparse)
-    dense = _by_name(model, sparse, views)
-    source = open_checked(given, sparse, images)
-    pairs = {pair.item.view.name: pair for pair in common_views(source, model)}
+    sparse, target = read_model(folder.sparse), folder.dense(model)
+    dense = _by_name(sparse, model, folder)
+    source = open_checked(given, folder)
+    pairs = {pair.item.view.name: pair for pair in common_views(source, sparse)}
 
     def load_fill(name: str) -> DepthNormals | None:
         pair = pairs.get(name)
@@ -91,8 +92,8 @@ def fill_given(
     if in_place:
         backup = fill_workspace(source, None, load_fill, in_place=True)
         return DenseWorkspaceResult(folder=given.absolute(), backup=backup)
-    with _new_workspace(target) as folder:
-        fill_workspace(source, folder, load_fill)
+    with _new_workspace(target) as new:
+        fill_workspace(source, new, load_fill)
     return DenseWorkspaceResult(folder=target.absolute())
 
 
@@ -106,7 +107,9 @@ def _new_workspace(target: Path) -> Iterator[Path]:
         replace_folder(workspace, target)
 
 
-def _by_name(model: SparseModel, sparse: Path, views: Path) -> dict[str, DenseView | None]:
+def _by_name(
+    sparse: SparseModel, model: AngleModel, folder: RunFolder
+) -> dict[str, DenseView | None]:
     """Dense views by image name.
 
     Raises
@@ -114,11 +117,11 @@ def _by_name(model: SparseModel, sparse: Path, views: Path) -> dict[str, DenseVi
     DataError
         There are none.
     """
-    names = [view.name for view in model.views]
-    dense = dict(zip(names, open_dense_views(sparse, views), strict=True))
+    names = [view.name for view in sparse.views]
+    dense = dict(zip(names, open_dense_views(folder, model), strict=True))
     if not any(dense.values()):
         raise DataError(
-            views,
+            folder.views(model),
             "holds no depth maps, so that there is no COLMAP workspace to write. "
             "Look at the warnings in polmvs.log.",
         )

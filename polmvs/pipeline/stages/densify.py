@@ -171,13 +171,13 @@ def densify(
     """
     given = _Inputs(
         model=model,
-        maps=open_maps(folder.sparse, folder.maps(model), model),
-        seeds=load_seeds(folder.seeds, folder.track_normals(model)),
+        maps=open_maps(folder, model),
+        seeds=load_seeds(folder, model),
         options=options,
         workers=workers or Workers(),
         on_progress=on_progress,
     )
-    workspace = _open_given(options.fusion, folder.sparse, folder.images)
+    workspace = _open_given(options.fusion, folder)
     sparse = read_model(folder.sparse)
     box = crop_box(
         options.crop,
@@ -203,7 +203,7 @@ def densify(
         if found.points is not None:
             surface.scalars["kind"][found.points.inferred] = PointKind.INFERRED
             surface = replace(surface, scalars={**surface.scalars, **found.points.scalars()})
-        around = _surroundings_cloud(sparse.tracks, found.cloud, given, workspace, kept / "around")
+        around = surroundings_cloud(sparse.tracks, found.cloud, given, workspace, kept / "around")
         if box is not None:
             inside = box.require_some(surface.points)
             if not inside.all():
@@ -384,29 +384,19 @@ def num_densify_steps(num_views: int, options: PropagationOptions) -> int:
     return (options.num_rounds + 2) * num_views
 
 
-def open_dense_views(sparse: Path, views: Path) -> list[DenseView | None]:
-    """Dense results of all posed views, None where a view has none.
-
-    Parameters
-    ----------
-    sparse : folder of the COLMAP model.
-    views : folder that :func:`densify` wrote.
-    """
-    return [find_dense_view(views / view.name) for view in posed_views(sparse)]
+def open_dense_views(folder: RunFolder, model: AngleModel) -> list[DenseView | None]:
+    """Dense results of all posed views of a run, None where a view has none."""
+    return [find_dense_view(folder.views(model) / view.name) for view in posed_views(folder)]
 
 
-def open_outside(sparse: Path, views: Path) -> dict[str, NDArray[np.bool_]]:
-    """Pixels (H, W) of views, by name, that show what lies outside a box; none without a box.
-
-    Parameters
-    ----------
-    sparse, views : as of :func:`open_dense_views`.
-    """
-    paths = {v.name: views / OUTSIDE.format(name=v.name) for v in posed_views(sparse)}
+def open_outside(folder: RunFolder, model: AngleModel) -> dict[str, NDArray[np.bool_]]:
+    """Pixels (H, W) of views, by name, that show what lies outside a box; none without a box."""
+    names = [view.name for view in posed_views(folder)]
+    paths = {name: folder.views(model) / OUTSIDE.format(name=name) for name in names}
     return {n: map_array(path, np.bool_) for n, path in paths.items() if path.is_file()}
 
 
-def open_checked(folder: Path, sparse: Path, images: Path) -> DenseWorkspace:
+def open_checked(workspace: Path, folder: RunFolder) -> DenseWorkspace:
     """A user's COLMAP workspace, found to be of the run's images and model.
 
     Raises
@@ -414,17 +404,17 @@ def open_checked(folder: Path, sparse: Path, images: Path) -> DenseWorkspace:
     DataError
         It is unusable, or not of these.
     """
-    given, model = open_dense_workspace(folder), read_model(sparse)
+    given, model = open_dense_workspace(workspace), read_model(folder.sparse)
     require_same_frame(given, model)
-    require_matching_images(given, model, lambda name: read_gray(images / name))
+    require_matching_images(given, model, lambda name: read_gray(folder.images / name))
     return given
 
 
-def _open_given(options: FusionOptions, sparse: Path, images: Path) -> DenseWorkspace | None:
+def _open_given(options: FusionOptions, folder: RunFolder) -> DenseWorkspace | None:
     """The COLMAP workspace of the options, if they name one."""
     if options.workspace is None:
         return None
-    given = open_checked(options.workspace, sparse, images)
+    given = open_checked(options.workspace, folder)
     if backups := previous_backups(given):
         logger.warning(
             "%s: was filled before, and what filled it counts as COLMAP's; the maps from before "
@@ -456,7 +446,7 @@ def surface_cloud(cloud: FusedCloud, kind: PointKind = PointKind.SURFACE) -> Clo
     )
 
 
-def _surroundings_cloud(
+def surroundings_cloud(
     tracks: Tracks,
     surface: FusedCloud,
     given: _Inputs,
@@ -484,11 +474,11 @@ def _surroundings_cloud(
             "other to be matched and confirmed. The sparse points are kept; record more views."
         )
     if wanted is not Surroundings.NONE:
-        return _sparse_cloud(sparse_surroundings(tracks, maps))
+        return sparse_part(sparse_surroundings(tracks, maps))
     return surface_cloud(surface[np.zeros(len(surface.points), np.bool_)])
 
 
-def _sparse_cloud(sparse: SparseSurroundings) -> Cloud:
+def sparse_part(sparse: SparseSurroundings) -> Cloud:
     """Sparse points as they are written; they have no normals, which is zero in a PLY file."""
     num = len(sparse.points)
     unknown = np.full(num, np.nan)

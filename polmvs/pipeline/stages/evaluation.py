@@ -49,9 +49,9 @@ def load_estimate(run_folder: RunFolder, model: AngleModel) -> ModelEstimate:
     return ModelEstimate(
         cloud=read_cloud(run_folder.cloud(model)),
         tracks=read_cloud(run_folder.sparse_cloud(model)),
-        maps=open_maps(run_folder.sparse, run_folder.maps(model), model),
-        dense=open_dense_views(run_folder.sparse, run_folder.views(model)),
-        outside=open_outside(run_folder.sparse, run_folder.views(model)),
+        maps=open_maps(run_folder, model),
+        dense=open_dense_views(run_folder, model),
+        outside=open_outside(run_folder, model),
     )
 
 
@@ -77,7 +77,7 @@ def evaluate_models(
     estimates: Mapping[AngleModel, ModelEstimate] = {
         model: load_estimate(run_folder, model) for model in models
     }
-    maps = open_maps(run_folder.sparse, run_folder.maps(AngleModel.PPA))
+    maps = open_maps(run_folder, AngleModel.PPA)
     truth = open_ground_truth(gt) if gt is not None else None
     return compare_models(capture, sparse, maps, estimates, truth, workers=workers)
 

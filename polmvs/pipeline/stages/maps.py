@@ -26,7 +26,7 @@ from polmvs.normals.light import diffuse_pixels, find_diffuse_parts
 from polmvs.normals.light_check import check_light
 from polmvs.normals.tracks import MAX_ROWS
 from polmvs.parallel import OnProgress, Workers, no_progress
-from polmvs.pipeline.run_folder import replacing
+from polmvs.pipeline.run_folder import RunFolder, replacing
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import Capture
 from polmvs.polarization.kinds import AngleModel, Light
@@ -92,8 +92,7 @@ class TiltedMapsResult:
 
 def build_maps(
     capture: Capture,
-    sparse: Path,
-    target: Path,
+    run_folder: RunFolder,
     options: RegionOptions | None = None,
     *,
     max_rows: int = MAX_ROWS,
@@ -105,8 +104,7 @@ def build_maps(
     Parameters
     ----------
     capture : raw mosaics.
-    sparse : folder of the COLMAP model.
-    target : folder of the maps, whole or not at all.
+    run_folder : with the sparse model; the maps are written whole or not at all.
     options : defaults where None.
     max_rows : of points and views together, that normals are solved from at a time.
 
@@ -116,10 +114,11 @@ def build_maps(
         Fewer than three views have a pose, or a mosaic or mask is unusable.
     """
     options = options or RegionOptions()
-    model = read_model(sparse)
-    views, tracks = _enough(model.views, sparse), model.tracks
+    model = read_model(run_folder.sparse)
+    views, tracks = _enough(model.views, run_folder.sparse), model.tracks
     names = image_names(capture)
     workers = workers or Workers()
+    target = run_folder.maps(AngleModel.PPA)
     with replacing(target) as folder, workers.stopped_on_error():
         build = partial(_build_map, capture, options, folder)
         raw_names = [names[view.name] for view in views]
@@ -173,35 +172,22 @@ def _cut_by_masks(built: Sequence[_Built]) -> float | None:
 
 
 def tilt_maps(
-    sparse: Path,
-    maps: Path,
-    target: Path,
+    run_folder: RunFolder,
     *,
     workers: Workers | None = None,
     on_progress: OnProgress = no_progress,
 ) -> TiltedMapsResult:
-    """Correct phase maps for tilted polarizers.
-
-    Parameters
-    ----------
-    sparse, maps : folders of the COLMAP model and of the maps as :func:`build_maps` wrote them.
-    target : folder of the corrected maps, whole or not at all.
-    """
-    stored = open_maps(sparse, maps)
+    """Correct the phase maps of a run for tilted polarizers."""
+    stored = open_maps(run_folder, AngleModel.PPA)
     workers = workers or Workers()
-    with replacing(target) as folder, workers.stopped_on_error():
+    with replacing(run_folder.maps(AngleModel.TILTED)) as folder, workers.stopped_on_error():
         for _ in workers.map(partial(_tilt_map, folder), stored):
             on_progress(1)
     return TiltedMapsResult(num_maps=len(stored))
 
 
-def open_maps(sparse: Path, maps: Path, model: AngleModel = AngleModel.PPA) -> list[PhaseMap]:
-    """Phase maps of all posed views; their pixels stay on disk.
-
-    Parameters
-    ----------
-    sparse : folder of the COLMAP model.
-    maps : folder of the maps for ``model``.
+def open_maps(folder: RunFolder, model: AngleModel) -> list[PhaseMap]:
+    """Phase maps of all posed views of a run for an angle model; their pixels stay on disk.
 
     Raises
     ------
@@ -209,18 +195,19 @@ def open_maps(sparse: Path, maps: Path, model: AngleModel = AngleModel.PPA) -> l
         Fewer than three views have a pose, or a map is missing or damaged.
     """
     tilted = model is AngleModel.TILTED
-    return [open_phase_map(view, maps, tilted=tilted) for view in posed_views(sparse)]
+    maps = folder.maps(model)
+    return [open_phase_map(view, maps, tilted=tilted) for view in posed_views(folder)]
 
 
-def posed_views(sparse: Path) -> tuple[View, ...]:
-    """Views of a COLMAP model.
+def posed_views(folder: RunFolder) -> tuple[View, ...]:
+    """Views of a run's COLMAP model.
 
     Raises
     ------
     DataError
         There are too few for normals.
     """
-    return _enough(read_views(sparse), sparse)
+    return _enough(read_views(folder.sparse), folder.sparse)
 
 
 def _enough(views: tuple[View, ...], sparse: Path) -> tuple[View, ...]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from polmvs.io.clouds import read_cloud, read_mesh, write_mesh
-from polmvs.pipeline.run_folder import SURFACE_MESH
+from polmvs.pipeline.run_folder import SURFACE_MESH, RunFolder
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import PointKind
 from polmvs.surface.poisson import MIN_POINTS, poisson_mesh
 
@@ -26,19 +26,21 @@ class MeshResult:
         return f"{self.num_triangles:,} triangles"
 
 
-def make_mesh(cloud: Path, views: Path, target: Path) -> MeshResult:
+def make_mesh(model: AngleModel, folder: RunFolder) -> MeshResult:
     """Mesh of the polarized surfaces: what cloud and views were made from, or Poisson's of a cloud.
 
     Parameters
     ----------
-    cloud : PLY that :func:`polmvs.pipeline.stages.densify.densify` wrote.
-    views : folder that it wrote; holds a mesh where one surface came from all views.
-    target : PLY of the mesh; not written where a cloud has too few points.
+    model : angle model.
+    folder : of a run with a dense cloud of it; its views hold a mesh where one surface came from
+        all of them. The mesh is not written where a cloud has too few points.
     """
-    if (views / SURFACE_MESH).is_file():
-        surface = read_mesh(views / SURFACE_MESH)
+    found, target = folder.views(model) / SURFACE_MESH, folder.mesh(model)
+    if found.is_file():
+        surface = read_mesh(found)
         write_mesh(target, surface)
         return MeshResult(num_triangles=len(surface.triangles))
+    cloud = folder.cloud(model)
     loaded = read_cloud(cloud)
     kinds = loaded.scalars.get("kind")
     if kinds is None or int((kinds == PointKind.SURFACE).sum()) < MIN_POINTS:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from polmvs.config import NormalOptions
 from polmvs.io.arrays import map_array, save_array
 from polmvs.normals.mixture_estimator import MixtureEstimate
 from polmvs.normals.tracks import MAX_ROWS, track_normals
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.polarization.kinds import AngleModel, Light
 
@@ -51,9 +51,7 @@ class NormalsResult:
 
 def solve_track_normals(
     model: AngleModel,
-    sparse: Path,
-    maps: Path,
-    target: Path,
+    folder: RunFolder,
     options: NormalOptions | None = None,
     light: Light | None = None,
     *,
@@ -64,14 +62,14 @@ def solve_track_normals(
     Parameters
     ----------
     model : angle model.
-    sparse, maps : folders of the COLMAP model and of the phase maps for ``model``.
-    target : file of the normals, ``.npy`` with rows of ``NORMALS_TYPE``, one for each track.
+    folder : of a run with model and phase maps; a row of ``NORMALS_TYPE`` for each track is
+        written.
     options : defaults where None.
     light : of everything, where it is known.
     max_rows : of points and views together, that are solved at a time.
     """
-    tracks = read_model(sparse).tracks
-    phase_maps = open_maps(sparse, maps, model)
+    tracks, target = read_model(folder.sparse).tracks, folder.track_normals(model)
+    phase_maps = open_maps(folder, model)
     stored = np.zeros(len(tracks.point3D_ids), NORMALS_TYPE)
     if len(stored):
         options = options or NormalOptions()
@@ -87,7 +85,7 @@ def solve_track_normals(
     return NormalsResult(num_tracks=len(stored), num_normals=int(stored["valid"].sum()))
 
 
-def load_track_normals(source: Path) -> MixtureEstimate:
+def load_track_normals(folder: RunFolder, model: AngleModel) -> MixtureEstimate:
     """The normals that :func:`solve_track_normals` stored; nothing of single rows is kept.
 
     Raises
@@ -95,7 +93,7 @@ def load_track_normals(source: Path) -> MixtureEstimate:
     DataError
         The file is missing or damaged.
     """
-    stored: NDArray[np.void] = np.array(map_array(source, NORMALS_TYPE))
+    stored: NDArray[np.void] = np.array(map_array(folder.track_normals(model), NORMALS_TYPE))
     scalars = {name: stored[name].copy() for name in NORMALS_TYPE.names or () if name != "normal"}
     none = np.zeros((0, len(stored)))
     return MixtureEstimate(

@@ -15,7 +15,13 @@ from polmvs.config import ReferenceOptions
 from polmvs.errors import OptionError
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.images import read_bytes, read_gray, write_bytes
-from polmvs.pipeline.run_folder import CAMERA_MODES, POSE_COVARIANCES, replace_folder, scratch
+from polmvs.pipeline.run_folder import (
+    CAMERA_MODES,
+    POSE_COVARIANCES,
+    RunFolder,
+    replace_folder,
+    scratch,
+)
 from polmvs.poses.metric_frame import Frame, metric_frame, transform_model
 from polmvs.scene import match_names, without_views
 
@@ -75,12 +81,8 @@ class PosesResult:
 
 
 def place_model(
-    source: Path,
-    images: Path,
+    run_folder: RunFolder,
     names: Iterable[str],
-    target: Path,
-    camera: Path,
-    poses: Path,
     reference: ReferenceOptions | None = None,
     without: Sequence[str] = (),
 ) -> PosesResult:
@@ -88,12 +90,9 @@ def place_model(
 
     Parameters
     ----------
-    source : folder of the model in its own frame, with ``CAMERA_MODES`` and
-        ``POSE_COVARIANCES``.
-    images : folder of the intensity images, in which markers are looked for.
-    names : of the images in it.
-    target : folder of the COLMAP model, whole or not at all.
-    camera, poses : files for the camera's modes and the poses' covariances in the same frame.
+    run_folder : with the images, in which markers are looked for, and the model of SfM in its own
+        frame; the model, the camera's modes and the poses' covariances are written.
+    names : of the images.
     reference : defaults where None.
     without : names of images to take out of the model, with or without suffix.
 
@@ -102,7 +101,8 @@ def place_model(
     DataError, OptionError
         A source of the frame, or a name, is unusable; the model of SfM stays.
     """
-    model, names = read_model(source), tuple(names)
+    source, names = run_folder.sfm, tuple(names)
+    model = read_model(source)
     modes = load_floats(source / CAMERA_MODES)
     covariances = load_floats(source / POSE_COVARIANCES)
     if without:
@@ -110,7 +110,7 @@ def place_model(
         modes = modes[:, points]
         covariances = covariances[kept] if len(covariances) else covariances
     frame = metric_frame(
-        model, reference or ReferenceOptions(), lambda name: read_gray(images / name)
+        model, reference or ReferenceOptions(), lambda name: read_gray(run_folder.images / name)
     )
     if frame is not None:
         similarity = frame.metric_from_world
@@ -119,17 +119,17 @@ def place_model(
         modes = similarity.scale * modes @ rotation.T
         both = block_diag(rotation, similarity.scale * rotation)
         covariances = both @ covariances @ both.T
-    with scratch(target) as folder:
+    with scratch(run_folder.sparse) as folder:
         if frame is None and not without:  # bit for bit what SfM wrote
             (folder / "sparse").mkdir()
             for file in source.glob("*.bin"):
                 write_bytes(folder / "sparse" / file.name, read_bytes(file))
         else:
             write_model(model, folder / "sparse")
-        replace_folder(folder / "sparse", target)
-    camera.parent.mkdir(exist_ok=True)
-    save_array(camera, modes)
-    save_array(poses, covariances)
+        replace_folder(folder / "sparse", run_folder.sparse)
+    run_folder.camera_modes.parent.mkdir(exist_ok=True)
+    save_array(run_folder.camera_modes, modes)
+    save_array(run_folder.pose_covariances, covariances)
     return PosesResult(
         num_views=len(model.views),
         unregistered=tuple(sorted(set(names) - {view.name for view in model.views})),

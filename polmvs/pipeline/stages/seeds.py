@@ -16,8 +16,10 @@ from polmvs.colmap.models import read_model
 from polmvs.errors import DataError
 from polmvs.io.arrays import MADE_AGAIN, map_array, save_array
 from polmvs.normals.tracks import select_seeds
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.normals import load_track_normals
+from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
 
 SEEDS_TYPE = np.dtype(
@@ -44,44 +46,38 @@ class SeedsResult:
         return f"{self.num_seeds:,} sparse points are seeds"
 
 
-def find_seeds(sparse: Path, maps: Path, track_normals: Path, target: Path) -> SeedsResult:
+def find_seeds(folder: RunFolder) -> SeedsResult:
     """Choose the seeds among the sparse points.
 
     Parameters
     ----------
-    sparse, maps : folders of the COLMAP model and of PPA's phase maps.
-    track_normals : file of PPA's normals of the sparse points.
-    target : file of the seeds, ``.npy`` with rows of ``SEEDS_TYPE``.
+    folder : of a run with model, PPA's phase maps and PPA's normals of the sparse points; rows of
+        ``SEEDS_TYPE`` are written.
     """
-    tracks = read_model(sparse).tracks
+    tracks = read_model(folder.sparse).tracks
     rows = np.zeros(0, SEEDS_TYPE)
     if len(tracks.point3D_ids):
-        normals = load_track_normals(track_normals)
-        seeds, is_seed = select_seeds(tracks, normals, open_maps(sparse, maps))
+        normals = load_track_normals(folder, AngleModel.PPA)
+        seeds, is_seed = select_seeds(tracks, normals, open_maps(folder, AngleModel.PPA))
         rows = np.zeros(len(seeds.sigma), SEEDS_TYPE)
         rows["point"], rows["sigma"] = seeds.points_in_world, seeds.sigma
         rows["track"] = np.flatnonzero(is_seed)
-    target.parent.mkdir(exist_ok=True)
-    save_array(target, rows)
+    folder.seeds.parent.mkdir(exist_ok=True)
+    save_array(folder.seeds, rows)
     return SeedsResult(num_seeds=len(rows))
 
 
-def load_seeds(source: Path, track_normals: Path) -> Seeds:
+def load_seeds(folder: RunFolder, model: AngleModel) -> Seeds:
     """Seeds with the normals of a model; which points they are is the same for all models.
-
-    Parameters
-    ----------
-    source : file that :func:`find_seeds` wrote.
-    track_normals : file of the model's normals of the sparse points.
 
     Raises
     ------
     DataError
         A file is missing or damaged.
     """
-    stored: NDArray[np.void] = np.array(map_array(source, SEEDS_TYPE))
-    solved = load_track_normals(track_normals).normals
-    _require_tracks(source, stored["track"], len(solved))
+    stored: NDArray[np.void] = np.array(map_array(folder.seeds, SEEDS_TYPE))
+    solved = load_track_normals(folder, model).normals
+    _require_tracks(folder.seeds, stored["track"], len(solved))
     return Seeds(np.array(stored["point"]), solved[stored["track"]], np.array(stored["sigma"]))
 
 

@@ -132,15 +132,15 @@ def find_model(
             reason = why_no_model(work / "database.db", options)
             raise DataError(images, f"SfM finds no model: {reason}") from error
         found = None
-        if options.intrinsics is None and options.camera is None:
+        if options.known_camera is None:
             found = camera_uncertainty(new)
         _store_uncertainty(new, model, found, pose_uncertainty(new))
         replace_folder(new, target)
     _warn_of_missing(model, images)
     _warn_of_few(len(model.views))
     complaints: tuple[Complaint, ...] = ()
-    if options.intrinsics is not None or options.camera is not None:
-        given = "`sfm.intrinsics`" if options.intrinsics is not None else "`sfm.camera`"
+    if options.known_camera is not None:
+        given = f"`{options.known_camera}`"
         complaints = _warn_of_cameras(target, given, "Leave it out, or give a camera that fits.")
     if found is None:
         return replace(_result(model), complaints=complaints)

@@ -1,14 +1,15 @@
-"""Stage ``sparse_cloud_MODEL``: the sparse points with their normals, as people look at them."""
+"""Stage ``sparse_cloud_MODEL``: the sparse points with their normals, for a viewer."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from polmvs.colmap.models import read_model
 from polmvs.io.clouds import Cloud, write_cloud
+from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.normals import load_track_normals
 from polmvs.pipeline.stages.seeds import seed_tracks
+from polmvs.polarization.kinds import AngleModel
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,20 +29,11 @@ class SparseCloudResult:
         return f"{self.num_points:,} points, {self.num_seeds:,} of them seeds"
 
 
-def write_sparse_cloud(
-    sparse: Path, track_normals: Path, seeds: Path, target: Path
-) -> SparseCloudResult:
-    """Write the sparse points with normal, quality, and whether they are seeds.
-
-    Parameters
-    ----------
-    sparse : folder of the COLMAP model.
-    track_normals, seeds : files of the normals of a model and of the seeds of all.
-    target : PLY.
-    """
-    tracks = read_model(sparse).tracks
-    estimate = load_track_normals(track_normals)
-    is_seed = seed_tracks(seeds, len(tracks.point3D_ids))
+def write_sparse_cloud(model: AngleModel, folder: RunFolder) -> SparseCloudResult:
+    """Write the sparse points with normal, quality, and whether they are seeds."""
+    tracks = read_model(folder.sparse).tracks
+    estimate = load_track_normals(folder, model)
+    is_seed = seed_tracks(folder.seeds, len(tracks.point3D_ids))
     cloud = Cloud(
         points=tracks.points_in_world,
         normals=estimate.normals,
@@ -58,5 +50,5 @@ def write_sparse_cloud(
             "seed": is_seed,
         },
     )
-    write_cloud(target, cloud)
+    write_cloud(folder.sparse_cloud(model), cloud)
     return SparseCloudResult(num_points=len(cloud.points), num_seeds=int(is_seed.sum()))

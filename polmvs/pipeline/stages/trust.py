@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -13,14 +13,17 @@ from pathlib import Path
 import numpy as np
 
 from polmvs.colmap.models import read_model
-from polmvs.config import default_num_workers
+from polmvs.config import Options, default_num_workers
 from polmvs.evaluation.trust import Trust, measure_trust
 from polmvs.io.clouds import read_cloud, read_mesh
+from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
-from polmvs.pipeline.stages.densify import open_outside
-from polmvs.pipeline.stages.maps import open_maps
+from polmvs.pipeline.stages.densify import DensifyResult, open_outside
+from polmvs.pipeline.stages.maps import MapsResult, open_maps
+from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import load_seeds
-from polmvs.polarization.kinds import AngleModel, Light
+from polmvs.pipeline.stages.sfm import SfmResult
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind
 from polmvs.surface.held_out import predict, predict_left_out
@@ -39,53 +42,35 @@ logger = logging.getLogger(__name__)
 MAX_TRIED_VIEWS = 24
 
 
-@dataclass(frozen=True, kw_only=True)
-class Made:
-    """How a surface was made.
-
-    Attributes
-    ----------
-    tilt_share, left_out : as of :class:`polmvs.pipeline.stages.densify.DensifyResult`.
-    num_unregistered : views without a pose.
-    tilt_aware : as ``NormalOptions.tilt_aware_weights``.
-    masks_given : the regions of the phase maps are the user's masks.
-    cut_share : as of :class:`polmvs.pipeline.stages.maps.MapsResult`.
-    light : that the user states; None: inferred.
-    complaints : what earlier stages found wrong, a clause each.
-    """
-
-    tilt_share: float | None
-    left_out: tuple[str, ...] = ()
-    num_unregistered: int = 0
-    tilt_aware: bool = True
-    masks_given: bool = False
-    cut_share: float | None = None
-    light: Light | None = None
-    complaints: Sequence[str] = ()
-
-
-def find_trust(model: AngleModel, made: Made, folder: RunFolder) -> Trust:
+def find_trust(model: AngleModel, folder: RunFolder, record: Record, options: Options) -> Trust:
     """Measure a dense cloud against its capture, and warn if it is not to be trusted.
 
     Parameters
     ----------
     model : angle model.
-    made : how the surface was made.
-    folder : of the run.
+    folder, record, options : of the run; nothing is written.
     """
+    made, sfm = record.result(DensifyResult, model), record.find(SfmResult)
+    mapped = record.find(MapsResult)
+    unregistered = record.result(PosesResult).unregistered
+    gone = {*unregistered, *made.left_out}
+    cameras = () if sfm is None else sfm.complaints
     dense = read_cloud(folder.cloud(model))
-    phase_maps = open_maps(folder.sparse, folder.maps(model), model)
-    outside = open_outside(folder.sparse, folder.views(model))
+    phase_maps = open_maps(folder, model)
+    outside = open_outside(folder, model)
     trust = measure_trust(model, dense, read_cloud(folder.sparse_cloud(model)), phase_maps, outside)
     trust = replace(
         trust,
-        num_views=len(phase_maps) + made.num_unregistered,
-        left_out=len(made.left_out) + made.num_unregistered,
-        complaints=tuple(made.complaints),
-        cut_share=made.cut_share,
+        num_views=len(phase_maps) + len(unregistered),
+        left_out=len(made.left_out) + len(unregistered),
+        complaints=(
+            *(one.text for one in cameras if one.view not in gone),
+            *(mapped.complaints if mapped is not None else ()),
+        ),
+        cut_share=None if mapped is None else mapped.cut_share,
     )
     if made.tilt_share is not None and (folder.views(model) / SURFACE_MESH).is_file():
-        trust = _contradicted(trust, model, made, phase_maps, folder)
+        trust = _contradicted(trust, model, made, phase_maps, folder, options)
     trust = trust.judged()
     if (dense.scalars["kind"] == PointKind.SURFACE).any():  # else the job says what is missing
         if not trust.is_trusted:
@@ -96,7 +81,12 @@ def find_trust(model: AngleModel, made: Made, folder: RunFolder) -> Trust:
 
 
 def _contradicted(
-    trust: Trust, model: AngleModel, made: Made, maps: Sequence[PhaseMap], folder: RunFolder
+    trust: Trust,
+    model: AngleModel,
+    made: DensifyResult,
+    maps: Sequence[PhaseMap],
+    folder: RunFolder,
+    options: Options,
 ) -> Trust:
     """With the figures of a surface of all views that it was not fitted to."""
     views = folder.views(model)
@@ -106,10 +96,11 @@ def _contradicted(
     maps = [one for one in maps if one.view.name not in made.left_out]
     chosen = np.linspace(0, len(maps) - 1, min(len(maps), MAX_TRIED_VIEWS)).round().astype(int)
     maps = [maps[index] for index in chosen]
-    known = load_seeds(folder.seeds, folder.track_normals(model))
-    outside = open_outside(folder.sparse, folder.views(model))
-    looking = Looking(angle_model=model, tilt_aware=made.tilt_aware, tilt_share=made.tilt_share)
-    look = partial(_surface_view, masks_given=made.masks_given)
+    known = load_seeds(folder, model)
+    outside, light = open_outside(folder, model), options.region.light
+    tilt_aware = options.normals.tilt_aware_weights
+    looking = Looking(angle_model=model, tilt_aware=tilt_aware, tilt_share=made.tilt_share)
+    look = partial(_surface_view, masks_given=options.region.mask is not None)
     with ThreadPoolExecutor(default_num_workers()) as pool:
         seen = list(pool.map(look, maps))
     return replace(
@@ -119,11 +110,11 @@ def _contradicted(
             plane,
             looking,
             KnownPoints(known.points_in_world, known.sigma),
-            light=made.light,
+            light=light,
             outside=outside,
         ),
         fitted=predict(
-            _read_mesh(views / SURFACE_MESH), seen, looking, light=made.light, outside=outside
+            _read_mesh(views / SURFACE_MESH), seen, looking, light=light, outside=outside
         ),
         soundness=find_soundness(
             _read_mesh(_last_level(views)), [phase_map.view for phase_map in maps], outside
