@@ -74,23 +74,12 @@ class LabelTolerances:
     max_cost: float = 9.0
 
 
-@dataclass(frozen=True)
-class Neighbors:
-    """Pairs of observations of one view on faces that share an edge.
+def neighbors(
+    observations: Observations, pairs: tuple[Indices, Indices], num: int
+) -> sparse.csr_array:
+    """How surely the labels of two observations are the same (K, K), in [0, 1].
 
-    Attributes
-    ----------
-    one, other : (P,) indices of observations; each pair stands in both orders.
-    alike : (P,) in [0, 1], how surely their labels are the same.
-    """
-
-    one: Indices
-    other: Indices
-    alike: Array
-
-
-def neighbors(observations: Observations, pairs: tuple[Indices, Indices], num: int) -> Neighbors:
-    """Neighbouring observations.
+    It is not 0 for observations of one view on faces that share an edge.
 
     Parameters
     ----------
@@ -98,28 +87,30 @@ def neighbors(observations: Observations, pairs: tuple[Indices, Indices], num: i
     pairs : faces that share an edge, each pair once.
     """
     o = observations
-    ones, others, alike = [], [], []
+    ones, others = [], []
     starts = np.searchsorted(o.view, np.arange(int(o.view.max(initial=-1)) + 2))
     for start, stop in pairwise(starts):
-        index = np.full(num, -1, np.int64)
+        index = np.full(num, -1, np.int32)
         index[o.face[start:stop]] = np.arange(start, stop)
         one, other = index[pairs[0]], index[pairs[1]]
         both = (one >= 0) & (other >= 0)
-        one, other = one[both], other[both]
-        first, second = o.dolp[one], o.dolp[other]
-        cosine = dots(o.axial[one], o.axial[other]) / np.maximum(first * second, 1e-12)
-        noise = np.maximum(o.sigma_dolp[one], o.sigma_dolp[other])
-        # A vector as short as its noise has no direction.
-        known = np.clip(np.minimum(first, second) / np.maximum(4 * noise, 1e-12), 0, 1)
-        ones += [one, other]
-        others += [other, one]
-        alike += 2 * [np.clip(cosine, 0, 1) * known]
-    nothing = np.zeros(0, np.int64)
-    return Neighbors(
-        np.concatenate([nothing, *ones]),
-        np.concatenate([nothing, *others]),
-        np.concatenate([np.zeros(0), *alike]),
-    )
+        ones.append(one[both])
+        others.append(other[both])
+    nothing = np.zeros(0, np.int32)
+    one, other = np.concatenate([nothing, *ones]), np.concatenate([nothing, *others])
+    axial = o.axial.astype(np.float32)
+    first, second = axial.take(one, axis=0), axial.take(other, axis=0)
+    length = o.dolp.astype(np.float32)
+    near, far = length.take(one), length.take(other)
+    cosine = np.einsum("pi,pi->p", first, second) / np.maximum(near * far, 1e-12)
+    sigma = o.sigma_dolp.astype(np.float32)
+    noise = np.maximum(sigma.take(one), sigma.take(other))
+    # A vector as short as its noise has no direction.
+    known = np.clip(np.minimum(near, far) / np.maximum(4 * noise, 1e-12), 0, 1)
+    alike = np.clip(cosine, 0, 1) * known
+    size = len(o.face)
+    upper = sparse.csr_array((alike, (one, other)), shape=(size, size))
+    return sparse.csr_array(upper + upper.T)
 
 
 def _excess(dolp: Floats, sigma_dolp: Floats, angle: Floats, tol: LabelTolerances) -> Array:
@@ -136,7 +127,7 @@ def responsibilities(
     *,
     normal_sigma: float,
     row_sigma: Floats,
-    near: Neighbors | None = None,
+    near: sparse.csr_array | None = None,
     weights: tuple[float, float] = (0.5, 0.5),
     tolerances: LabelTolerances | None = None,
 ) -> Array:
@@ -148,7 +139,7 @@ def responsibilities(
     normals : (F, 3) unit, assumed.
     normal_sigma : rad, error of these.
     row_sigma : (2, K) of ``m . n``, that noise does not explain.
-    near : neighbouring observations; None: they do not count.
+    near : as of :func:`neighbors`; None: neighbouring observations do not count.
     weights : shares of specular and of diffuse light among all; 0 for one that is known not to be.
     """
     tol = tolerances or LabelTolerances()
@@ -162,10 +153,10 @@ def responsibilities(
     score[DIFFUSE] -= np.minimum(_excess(o.dolp, o.sigma_dolp, angle + margin, tol), 30)
     own = np.clip(score[SPECULAR] - score[DIFFUSE], -60, 60)
     odds = own
-    if near is not None and len(near.one):
+    if near is not None:
         for _ in range(tol.coupling_rounds):
-            said = near.alike * np.tanh(0.5 * odds[near.other])
-            odds = own + tol.coupling * np.bincount(near.one, said, len(own))
+            said = near @ np.tanh(0.5 * odds.astype(np.float32))
+            odds = own + tol.coupling * said
     specular = 1 / (1 + np.exp(-np.clip(odds, -40, 40)))
     fit = np.where(specular > 0.5, fits[SPECULAR], fits[DIFFUSE])
     inlier = 1 / (1 + np.exp(np.clip(np.log(tol.outlier) - fit, -40, 40)))

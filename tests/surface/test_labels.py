@@ -67,9 +67,9 @@ def test_neighbours_decide_where_an_observation_alone_does_not():
     mesh, seen = scene(dolp=0.009)
     pairs = pairs_of(mesh)
     near = neighbors(seen, pairs, len(mesh.faces))
-    assert (near.alike >= 0).all()
-    assert (near.alike <= 1).all()
-    assert np.median(near.alike) > 0.9  # a smooth ball turns its phases slowly
+    assert (near.data >= 0).all()
+    assert (near.data <= 1).all()
+    assert np.median(near.data) > 0.9  # a smooth ball turns its phases slowly
     # One face in ten with a normal that says nothing of its light: along its ray in this view.
     normals = mesh.face_normals.copy()
     blind = np.zeros(len(normals), bool)
