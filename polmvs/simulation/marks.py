@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
 Array = NDArray[np.float64]
 
@@ -16,6 +17,8 @@ PRINT_CELLS = 8  # along a mark's side
 CELL_TEXELS = 8
 CANDIDATES = 4000
 LOWEST = -0.3  # z of a mark's normal: what faces further down is seen by few views
+MAX_GAP = 0.25  # radii that the flat disc of a mark may stand off the surface
+EDGE_POINTS = 12  # of the disc's circle, where that is tested
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +42,9 @@ class Marks:
 def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
     """Marks spread evenly over what of a surface faces the sky or sideways.
 
+    They lie where they fit: on a plate that is lower than a mark is wide, none lies on its sides or
+    over its edges. Where a mark fits nowhere, they lie anywhere.
+
     Parameters
     ----------
     mesh : of the object, metres.
@@ -48,10 +54,10 @@ def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
     """
     rng = np.random.default_rng(seed)
     points, normals = _on_surface(mesh, rng)
-    usable = normals[:, 2] > LOWEST
-    usable &= points[:, 2] > 0.5 * diameter
-    if not usable.any():
-        usable = normals[:, 2] > LOWEST
+    seen = normals[:, 2] > LOWEST
+    fitting = seen & _fits(mesh, points, normals, 0.5 * diameter)
+    above = points[:, 2] > 0.5 * diameter
+    usable = next((s for s in (fitting & above, fitting, seen & above) if s.any()), seen)
     points, normals = points[usable], normals[usable]
     chosen = _far_apart(points, normals, number if len(points) else 0, rng)
     axes = [_axes(normals[index], rng.uniform(0, 2 * np.pi)) for index in chosen]
@@ -80,6 +86,17 @@ def _on_surface(mesh: Mesh, rng: np.random.Generator) -> tuple[Array, Array]:
     return points, unit(normals)
 
 
+def _fits(mesh: Mesh, points: Array, normals: Array, radius: float) -> NDArray[np.bool_]:
+    """Where the surface follows the flat disc of a mark up to its edge."""
+    angle = np.linspace(0, 2 * np.pi, EDGE_POINTS, endpoint=False)
+    x, y, _ = (axis[:, None, :] for axis in np.moveaxis(_axes(normals, 0.0), -2, 0))
+    edge = points[:, None] + radius * (np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * y)
+    surface = RayScene(TriangleMesh(mesh.vertices, mesh.triangles))
+    closest = surface.closest(edge.reshape(-1, 3))[0].reshape(edge.shape)
+    gap = np.linalg.norm(closest - edge, axis=-1).max(axis=1)
+    return np.asarray(gap <= MAX_GAP * radius)
+
+
 def _far_apart(points: Array, normals: Array, number: int, rng: np.random.Generator) -> list[int]:
     """Indices of points each as far from those before it as can be, normals counted as well."""
     if not number:
@@ -94,12 +111,13 @@ def _far_apart(points: Array, normals: Array, number: int, rng: np.random.Genera
     return chosen
 
 
-def _axes(normal: Array, turn: float) -> Array:
-    side = np.eye(3)[int(np.abs(normal).argmin())]
-    x = unit(side - (side @ normal) * normal)
-    y = np.cross(normal, x)
+def _axes(normals: Array, turn: float) -> Array:
+    """Axes (..., 3, 3) of prints on a surface, a row each, from its normals (..., 3)."""
+    side = np.eye(3)[np.abs(normals).argmin(axis=-1)]
+    x = unit(side - (side * normals).sum(axis=-1, keepdims=True) * normals)
+    y = np.cross(normals, x)
     cos, sin = np.cos(turn), np.sin(turn)
-    return np.stack([cos * x + sin * y, cos * y - sin * x, normal])
+    return np.stack([cos * x + sin * y, cos * y - sin * x, normals], axis=-2)
 
 
 def _print(rng: np.random.Generator) -> NDArray[np.float32]:
