@@ -17,7 +17,9 @@ PRINT_CELLS = 8  # along a mark's side
 CELL_TEXELS = 8
 CANDIDATES = 4000
 LOWEST = -0.3  # z of a mark's normal: what faces further down is seen by few views
-MAX_GAP = 0.25  # radii that the flat disc of a mark may stand off the surface
+# The surface about a mark is flat: a disc of this radius stands off it by this gap at most, in radii
+# of the mark. So a mark is half a radius from an edge: at an edge it would break the outline.
+FLAT_RADIUS, MAX_GAP = 2.0, 0.5
 EDGE_POINTS = 12  # of the disc's circle, where that is tested
 
 
@@ -87,10 +89,11 @@ def _on_surface(mesh: Mesh, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def _fits(mesh: Mesh, points: Array, normals: Array, radius: float) -> NDArray[np.bool_]:
-    """Where the surface follows the flat disc of a mark up to its edge."""
+    """Where the surface is flat enough about a mark."""
     angle = np.linspace(0, 2 * np.pi, EDGE_POINTS, endpoint=False)
     x, y, _ = (axis[:, None, :] for axis in np.moveaxis(_axes(normals, 0.0), -2, 0))
-    edge = points[:, None] + radius * (np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * y)
+    circle = FLAT_RADIUS * radius * np.stack([np.cos(angle), np.sin(angle)])[..., None]
+    edge = points[:, None] + circle[0] * x + circle[1] * y
     surface = RayScene(TriangleMesh(mesh.vertices, mesh.triangles))
     closest = surface.closest(edge.reshape(-1, 3))[0].reshape(edge.shape)
     gap = np.linalg.norm(closest - edge, axis=-1).max(axis=1)

@@ -14,13 +14,13 @@ def _box(sides: tuple[float, float, float]) -> Mesh:
     return Mesh(corners.reshape(-1, 3), normals, np.arange(36, dtype=np.int32).reshape(-1, 3))
 
 
-def test_all_marks_of_a_low_board_lie_on_its_top_and_not_over_its_edges():
+def test_all_marks_of_a_low_board_lie_on_its_top_away_from_its_edges():
     for seed in range(3):
         marks = marks_on(_box((0.3, 0.4, 0.012)), 9, 0.024, seed)
         assert len(marks.centers) == 9
         np.testing.assert_allclose(marks.axes[:, 2], [[0, 0, 1]] * 9, atol=1e-6)
         from_edge = [0.15, 0.2] - np.abs(marks.centers[:, :2])
-        assert from_edge.min() > 0.7 * 0.012
+        assert from_edge.min() > 1.45 * 0.012
 
 
 def test_marks_lie_on_the_sides_of_a_high_box_too():
