@@ -17,8 +17,8 @@ PRINT_CELLS = 8  # along a mark's side
 CELL_TEXELS = 8
 CANDIDATES = 4000
 LOWEST = -0.3  # z of a mark's normal: what faces further down is seen by few views
-# The surface about a mark is flat: a disc of this radius stands off it by this gap at most, in radii
-# of the mark. So a mark is half a radius from an edge: at an edge it would break the outline.
+# The surface about a mark is flat: a disc of this radius stands off it by this gap at most, both in
+# radii of the mark. So a mark is half a radius from an edge: at an edge it would break the outline.
 FLAT_RADIUS, MAX_GAP = 2.0, 0.5
 EDGE_POINTS = 12  # of the disc's circle, where that is tested
 
@@ -44,8 +44,8 @@ class Marks:
 def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
     """Marks spread evenly over what of a surface faces the sky or sideways.
 
-    They lie where they fit: on a plate that is lower than a mark is wide, none lies on its sides or
-    over its edges. Where a mark fits nowhere, they lie anywhere.
+    They lie where the surface is flat enough for them: of a plate that is lower than a mark is
+    wide, on its top, away from its edges. Where that is nowhere, they lie anywhere.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
     seen = normals[:, 2] > LOWEST
     fitting = seen & _fits(mesh, points, normals, 0.5 * diameter)
     above = points[:, 2] > 0.5 * diameter
-    usable = next((s for s in (fitting & above, fitting, seen & above) if s.any()), seen)
+    usable = next((w for w in (fitting & above, fitting, seen & above) if w.any()), seen)
     points, normals = points[usable], normals[usable]
     chosen = _far_apart(points, normals, number if len(points) else 0, rng)
     axes = [_axes(normals[index], rng.uniform(0, 2 * np.pi)) for index in chosen]

@@ -9,7 +9,8 @@ from polmvs.simulation.marks import marks_on
 
 def _box(sides: tuple[float, float, float]) -> Mesh:
     box = trimesh.creation.box(sides)
-    corners = np.asarray(box.triangles) + [0, 0, 0.5 * sides[2]]
+    corners = np.asarray(box.triangles)
+    corners = corners + np.array([0, 0, 0.5 * sides[2]])
     normals = np.repeat(np.asarray(box.face_normals), 3, axis=0)
     return Mesh(corners.reshape(-1, 3), normals, np.arange(36, dtype=np.int32).reshape(-1, 3))
 
