@@ -4,8 +4,10 @@
 
 BOARD is a capture with ground truth of a black glossy board of 300 x 400 x 12 mm, turned by 12
 degrees on a textured table, that another program rendered. The board here has the same place,
-size, index and number of marks, the same cameras and sensor; prints, clutter and noise differ with
-each seed, whose spread is what figures may differ by. Captures and runs stay in WORK.
+size, index and number of marks, the same cameras and sensor; prints, their places, clutter and
+noise differ with each seed, whose spread is what figures may differ by. The shared capture's truth
+is the top of the board, so the masks of the rendered truth are cut to it. Captures and runs stay in
+WORK.
 """
 
 from __future__ import annotations
@@ -28,10 +30,11 @@ from polmvs.config import (
     option,
 )
 from polmvs.io.clouds import Mesh, write_mesh
-from polmvs.io.ground_truth import GroundTruth, open_ground_truth
+from polmvs.io.ground_truth import GroundTruth, open_ground_truth, write_true_maps
 from polmvs.io.images import write_bytes
 from polmvs.io.intrinsics import Intrinsics, write_intrinsics
 from polmvs.polarization.kinds import AngleModel
+from polmvs.scene import stem_of
 from polmvs.simulation.camera_model import pinhole_of
 from polmvs.simulation.capture import simulate_capture
 from polmvs.simulation.options import (
@@ -71,7 +74,7 @@ def _run(call: Call, terminal: Terminal) -> int:
     write_mesh(mesh, _board())
     write_intrinsics(camera, _intrinsics(truth), "of the polarization images")
     write_bytes(poses, _trajectory(truth).encode())
-    captures = [("shared", arguments.board)]
+    captures = [("shared", arguments.board, truth.folder)]
     with terminal.stage("render", len(arguments.seeds)) as on_progress:
         for seed in arguments.seeds:
             made = simulate_capture(
@@ -86,13 +89,15 @@ def _run(call: Call, terminal: Terminal) -> int:
                 ),
                 SimulationRun(resume=True),
             )
-            captures.append((f"simulated, seed {seed}", made.folder))
+            top = arguments.work / f"top_{seed}"
+            _write_top(open_ground_truth(made.folder), top)
+            captures.append((f"simulated, seed {seed}", made.folder, top))
             on_progress(1)
     trials: list[TrialResult] = []
     with terminal.stage("measure", len(captures)) as on_progress:
-        for name, capture in captures:
+        for name, capture, judged_by in captures:
             options = Options(
-                sfm=SfmOptions(camera=camera), evaluation=EvaluationOptions(gt=capture / "gt")
+                sfm=SfmOptions(camera=camera), evaluation=EvaluationOptions(gt=judged_by)
             )
             found = measure(
                 name,
@@ -117,6 +122,17 @@ def _board() -> Mesh:
     normals = np.zeros_like(vertices)  # those of its facets are taken
     normals[:, 2] = 1
     return Mesh(vertices, normals, np.asarray(box.faces, np.int32))
+
+
+def _write_top(truth: GroundTruth, folder: Path) -> None:
+    """Ground truth whose part is what faces upwards."""
+    folder.mkdir(exist_ok=True)
+    write_bytes(folder / truth.cameras.name, truth.cameras.read_bytes())
+    for name, view in truth.views.items():
+        normals = truth.normals(name)
+        upwards = normals @ view.cam_from_world.rotation[:, 2] > 0.5  # not where they are NaN
+        depth = np.nan_to_num(truth.depth(name))
+        write_true_maps(folder / stem_of(name), depth, normals, upwards)
 
 
 def _turn() -> np.ndarray:

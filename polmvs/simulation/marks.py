@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
 Array = NDArray[np.float64]
 
@@ -16,6 +17,10 @@ PRINT_CELLS = 8  # along a mark's side
 CELL_TEXELS = 8
 CANDIDATES = 4000
 LOWEST = -0.3  # z of a mark's normal: what faces further down is seen by few views
+# The surface about a mark is flat: a disc of this radius stands off it by this gap at most, both in
+# radii of the mark. So a mark is half a radius from an edge: at an edge it would break the outline.
+FLAT_RADIUS, MAX_GAP = 2.0, 0.5
+EDGE_POINTS = 12  # of the disc's circle, where that is tested
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +44,9 @@ class Marks:
 def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
     """Marks spread evenly over what of a surface faces the sky or sideways.
 
+    They lie where the surface is flat enough for them: of a plate that is lower than a mark is
+    wide, on its top, away from its edges. Where that is nowhere, they lie anywhere.
+
     Parameters
     ----------
     mesh : of the object, metres.
@@ -48,10 +56,10 @@ def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
     """
     rng = np.random.default_rng(seed)
     points, normals = _on_surface(mesh, rng)
-    usable = normals[:, 2] > LOWEST
-    usable &= points[:, 2] > 0.5 * diameter
-    if not usable.any():
-        usable = normals[:, 2] > LOWEST
+    seen = normals[:, 2] > LOWEST
+    fitting = seen & _fits(mesh, points, normals, 0.5 * diameter)
+    above = points[:, 2] > 0.5 * diameter
+    usable = next((w for w in (fitting & above, fitting, seen & above) if w.any()), seen)
     points, normals = points[usable], normals[usable]
     chosen = _far_apart(points, normals, number if len(points) else 0, rng)
     axes = [_axes(normals[index], rng.uniform(0, 2 * np.pi)) for index in chosen]
@@ -80,6 +88,18 @@ def _on_surface(mesh: Mesh, rng: np.random.Generator) -> tuple[Array, Array]:
     return points, unit(normals)
 
 
+def _fits(mesh: Mesh, points: Array, normals: Array, radius: float) -> NDArray[np.bool_]:
+    """Where the surface is flat enough about a mark."""
+    angle = np.linspace(0, 2 * np.pi, EDGE_POINTS, endpoint=False)
+    x, y, _ = (axis[:, None, :] for axis in np.moveaxis(_axes(normals, 0.0), -2, 0))
+    circle = FLAT_RADIUS * radius * np.stack([np.cos(angle), np.sin(angle)])[..., None]
+    edge = points[:, None] + circle[0] * x + circle[1] * y
+    surface = RayScene(TriangleMesh(mesh.vertices, mesh.triangles))
+    closest = surface.closest(edge.reshape(-1, 3))[0].reshape(edge.shape)
+    gap = np.linalg.norm(closest - edge, axis=-1).max(axis=1)
+    return np.asarray(gap <= MAX_GAP * radius)
+
+
 def _far_apart(points: Array, normals: Array, number: int, rng: np.random.Generator) -> list[int]:
     """Indices of points each as far from those before it as can be, normals counted as well."""
     if not number:
@@ -94,12 +114,13 @@ def _far_apart(points: Array, normals: Array, number: int, rng: np.random.Genera
     return chosen
 
 
-def _axes(normal: Array, turn: float) -> Array:
-    side = np.eye(3)[int(np.abs(normal).argmin())]
-    x = unit(side - (side @ normal) * normal)
-    y = np.cross(normal, x)
+def _axes(normals: Array, turn: float) -> Array:
+    """Axes (..., 3, 3) of prints on a surface, a row each, from its normals (..., 3)."""
+    side = np.eye(3)[np.abs(normals).argmin(axis=-1)]
+    x = unit(side - (side * normals).sum(axis=-1, keepdims=True) * normals)
+    y = np.cross(normals, x)
     cos, sin = np.cos(turn), np.sin(turn)
-    return np.stack([cos * x + sin * y, cos * y - sin * x, normal])
+    return np.stack([cos * x + sin * y, cos * y - sin * x, normals], axis=-2)
 
 
 def _print(rng: np.random.Generator) -> NDArray[np.float32]:

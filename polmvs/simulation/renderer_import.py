@@ -1,7 +1,8 @@
 """The only place that imports Mitsuba: which variant runs here, and what to install for one.
 
 Mitsuba's variants that compute many rays at once compile themselves with LLVM, a library of the
-system. Where it is not found in the usual folders, the scalar variant serves, which is slower.
+system. Where it is not found in the usual folders, or is too old, the scalar variant serves, which
+is slower.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ HOW_TO_GET_LLVM = (
     "libllvm19; macOS: brew install llvm), or name it by the environment variable "
     "DRJIT_LIBLLVM_PATH."
 )
-NO_LLVM = (
-    f"LLVM's library was not found, so that the slow scalar renderer is used. {HOW_TO_GET_LLVM}"
-)
+# Older ones cannot compile Dr.Jit 1.5's `llvm.maximum` for x86, and end the whole process.
+OLDEST_LLVM = 17
+UNUSABLE = "Dr.Jit cannot use LLVM's library"
 LLVM_FOLDERS = (
     "/usr/lib/*-linux-gnu",
     "/usr/lib64",
@@ -75,6 +76,7 @@ def import_renderer(*, colour: bool = False, variant: str | None = None) -> Rend
     llvm = find_llvm()
     if llvm is not None:
         os.environ.setdefault("DRJIT_LIBLLVM_PATH", llvm)
+    fault = _fault_of(llvm)
     try:
         with unprinted("Dr.Jit"):  # which libraries it cannot load, as is said below
             import drjit
@@ -83,21 +85,21 @@ def import_renderer(*, colour: bool = False, variant: str | None = None) -> Rend
         raise OptionError(INSTALL) from error
     mi: Any = mitsuba
     dr: Any = drjit
-    chosen = variant or _best(dr, has_llvm=llvm is not None, colour=colour)
+    chosen = variant or _best(dr, fault, colour=colour)
     if chosen not in mi.variants():
         raise OptionError(
             f"must be one of {', '.join(v for v in mi.variants() if 'polarized' in v)}, not "
             f"{chosen}.",
             field="rendering.variant",
         )
-    _require_backend(dr, chosen)
+    _require_backend(dr, chosen, fault)
     mi.set_variant(chosen)
     mi.set_log_level(mi.LogLevel.Error)
     return Renderer(mi, dr, chosen)
 
 
 def find_llvm() -> str | None:
-    """Path of the newest library of LLVM in the usual folders; None where there is none."""
+    """Path of the newest library of LLVM in the usual folders, be it too old; None of none."""
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         return given if os.path.exists(given) else None
@@ -107,34 +109,49 @@ def find_llvm() -> str | None:
     return max(found, key=_version, default=None)
 
 
-def _require_backend(dr: Any, variant: str) -> None:
+def _fault_of(llvm: str | None) -> str | None:
+    """Why LLVM's library does not serve; None if it does, as far as its name tells."""
+    if llvm is None:
+        return "LLVM's library was not found"
+    major = _version(llvm)[0]
+    if 0 < major < OLDEST_LLVM:
+        return f"{llvm} is LLVM {major}, older than {OLDEST_LLVM}"
+    return None
+
+
+def _require_backend(dr: Any, variant: str, fault: str | None) -> None:
     """Refuse a variant whose machine or library is not here.
+
+    Parameters
+    ----------
+    fault : why LLVM's library does not serve.
 
     Raises
     ------
     OptionError
         Which that is.
     """
-    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+    if variant.startswith("llvm") and (fault or not dr.has_backend(dr.JitBackend.LLVM)):
+        reason = fault or UNUSABLE
         raise OptionError(
-            f"{variant} needs LLVM's library, which was not found. {HOW_TO_GET_LLVM}",
-            field="rendering.variant",
+            f"{variant} needs LLVM, but {reason}. {HOW_TO_GET_LLVM}", field="rendering.variant"
         )
     if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise OptionError(f"{variant} needs a GPU of NVIDIA.", field="rendering.variant")
 
 
 def _version(path: str) -> tuple[int, ...]:
-    """Numbers of a library's name."""
-    return tuple(map(int, re.findall(r"\d+", os.path.basename(path)))) or (0,)
+    """Numbers of a library's name, of a link that of its target."""
+    return tuple(map(int, re.findall(r"\d+", os.path.basename(os.path.realpath(path))))) or (0,)
 
 
-def _best(dr: Any, *, has_llvm: bool, colour: bool) -> str:
+def _best(dr: Any, fault: str | None, *, colour: bool) -> str:
     """The fastest variant that runs here."""
     kind = "spectral" if colour else "mono"
     if dr.has_backend(dr.JitBackend.CUDA):
         return f"cuda_ad_{kind}_polarized"
-    if has_llvm and dr.has_backend(dr.JitBackend.LLVM):
+    if not fault and dr.has_backend(dr.JitBackend.LLVM):
         return f"llvm_ad_{kind}_polarized"
-    logger.warning(NO_LLVM)
+    reason = fault or UNUSABLE
+    logger.warning("%s, so that the slow scalar renderer is used. %s", reason, HOW_TO_GET_LLVM)
     return "scalar_spectral_polarized"

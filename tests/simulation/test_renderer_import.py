@@ -70,6 +70,18 @@ def test_a_variant_that_cannot_run_here_is_refused(modules):
         assert found.value.field == "rendering.variant"
 
 
+def test_an_llvm_that_is_too_old_is_not_used(modules, monkeypatch, caplog):
+    """It cannot compile what Dr.Jit sends it, and ends the process."""
+    modules("llvm")
+    monkeypatch.setattr(renderer_import, "find_llvm", lambda: "/usr/lib/libLLVM-15.so.1")
+    assert import_renderer().is_scalar
+    (message,) = caplog.messages
+    assert "libLLVM-15.so.1 is LLVM 15, older than 17" in message
+    assert "libllvm19" in message
+    with pytest.raises(OptionError, match="older than 17"):
+        import_renderer(variant="llvm_ad_mono_polarized")
+
+
 def test_without_mitsuba_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     with pytest.raises(OptionError, match=r"'\.\[simulate\]'"):
