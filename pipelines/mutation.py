@@ -195,13 +195,14 @@ def _is_of_types(node: ast.BinOp) -> bool:
 
 
 class LineMap:
-    """Plugin of pytest: which lines of the package each test runs, its fixtures' included."""
+    """Plugin of pytest: which lines each test runs, its fixtures' included, if it passes."""
 
     def __init__(self, package: Path) -> None:
         self.package = f"{package}{os.sep}"
         self.tests: dict[str, tuple[float, set[tuple[str, int]]]] = {}
         self._of_fixtures: dict[Any, set[tuple[str, int]]] = {}
         self._seen: set[tuple[str, int]] = set()
+        self._failed: set[str] = set()
         self._ours: dict[CodeType, bool] = {}
 
     def _trace(self, frame: FrameType, event: str, argument: Any) -> Any:
@@ -247,7 +248,12 @@ def _line_map_hooks() -> type[LineMap]:
                 for definitions in item._fixtureinfo.name2fixturedefs.values():
                     for definition in definitions:
                         lines |= self._of_fixtures.get(definition, set())
-                self.tests[item.nodeid] = (time.process_time() - begin, lines)
+                if item.nodeid not in self._failed:
+                    self.tests[item.nodeid] = (time.process_time() - begin, lines)
+
+        def pytest_runtest_logreport(self, report: Any) -> None:
+            if report.failed:
+                self._failed.add(report.nodeid)
 
     return Hooks
 
