@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import compileall
 import contextlib
 import hashlib
 import json
@@ -319,6 +320,7 @@ class Copy:
                 shutil.copytree(ROOT / part, self.folder / part, ignore=ignored)
         for part in ("pyproject.toml", "README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
             shutil.copy(ROOT / part, self.folder / part)
+        compileall.compile_dir(self.folder / "polmvs", quiet=2)
 
     def run(self, arguments: Sequence[str], limit_s: float, plugins: Sequence[object] = ()) -> int:
         """Status of pytest, 1 if it does not come to its end."""
@@ -354,10 +356,11 @@ class Copy:
 
         os.chdir(self.folder)
         os.environ["PYTHONPATH"] = str(self.folder)
-        os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
         # The run that many tests look at is made once, by the sound package.
         os.environ["PYTEST_XDIST_WORKER"] = "gw0"
-        sys.dont_write_bytecode = True
+        if not plugins:  # a fault is in the package, and must not stay in what is compiled of it
+            os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+            sys.dont_write_bytecode = True
         sys.path[:] = [str(self.folder), *(p for p in sys.path if Path(p) != ROOT / "pipelines")]
         shown = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
         status = int(
@@ -429,7 +432,7 @@ def fate_of(copy: Copy, fault: Fault, coverage: Coverage, limits: Limits) -> str
     if not tests:
         return "no test"
     target = copy.folder / fault.path
-    source = target.read_text(encoding="utf-8")
+    source, stat = target.read_text(encoding="utf-8"), target.stat()
     target.write_text(fault.planted(source), encoding="utf-8")
     try:
         for batch in (tests[:15], tests[15:]):
@@ -441,6 +444,7 @@ def fate_of(copy: Copy, fault: Fault, coverage: Coverage, limits: Limits) -> str
         return f"survived {len(tests)} of {len(coverage.tests(fault))} tests"
     finally:
         target.write_text(source, encoding="utf-8")
+        os.utime(target, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # what is compiled of it counts
 
 
 def _last_failure(log: Path) -> str:
