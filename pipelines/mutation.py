@@ -17,11 +17,13 @@ import argparse
 import ast
 import compileall
 import contextlib
+import gc
 import hashlib
 import json
 import os
 import random
 import re
+import resource
 import shutil
 import signal
 import sys
@@ -29,11 +31,12 @@ import threading
 import time
 import traceback
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from types import CodeType, FrameType
+from types import CodeType, FrameType, FunctionType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -90,7 +93,8 @@ class Fault:
         """Place, change and line, in words."""
         old = " ".join(source[self.start : self.end].split())
         line = source.splitlines()[self.line - 1].strip()
-        return f"{self.path}:{self.line}: {old} -> {self.text}   in   {line}"
+        column = self.start - source.rfind("\n", 0, self.start)
+        return f"{self.path}:{self.line}:{column}: {old} -> {self.text}   in   {line}"
 
 
 def faults_of(path: Path, source: str) -> Iterator[Fault]:
@@ -315,41 +319,31 @@ class Copy:
         self.temporary.mkdir(parents=True, exist_ok=True)
         ignored = shutil.ignore_patterns("__pycache__")
         for part in ("polmvs", "tests", "pipelines", "data", "docs", "notebooks"):
-            shutil.rmtree(self.folder / part, ignore_errors=True)
             if (ROOT / part).exists():
-                shutil.copytree(ROOT / part, self.folder / part, ignore=ignored)
+                shutil.copytree(ROOT / part, self.folder / part, ignore=ignored, dirs_exist_ok=True)
         for part in ("pyproject.toml", "README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
             shutil.copy(ROOT / part, self.folder / part)
         compileall.compile_dir(self.folder / "polmvs", quiet=2)
 
     def run(self, arguments: Sequence[str], limit_s: float, plugins: Sequence[object] = ()) -> int:
-        """Status of pytest, 1 if it does not come to its end."""
-        child = os.fork()
-        if child == 0:
-            status = 1
-            try:
-                os.setsid()
-                output = os.open(self.log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-                os.dup2(output, 1)
-                os.dup2(output, 2)
-                status = self._tested(arguments, plugins)
-            except BaseException:
-                traceback.print_exc()
-                sys.stderr.flush()
-            finally:
-                os._exit(status)
-        end = time.monotonic() + limit_s
-        while True:
-            done, status = os.waitpid(child, os.WNOHANG)
-            if done or time.monotonic() > end:
-                break
-            time.sleep(0.02)
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(child, signal.SIGKILL)  # with what it started
-        if not done:
-            os.waitpid(child, 0)
-            return 1
-        return os.waitstatus_to_exitcode(status)
+        """Status of pytest in a fork; see :func:`forked`."""
+        return forked(lambda: self._tested(arguments, plugins), limit_s, self.log)
+
+    def planting(self, arguments: Sequence[str], planter: Planter) -> None:
+        """The tests of a planter, collected in a fork."""
+        forked(lambda: self._tested(arguments, [planter]), None, self.log)
+
+    @contextlib.contextmanager
+    def planted(self, fault: Fault) -> Iterator[None]:
+        """The copy with a fault in it."""
+        target = self.folder / fault.path
+        source, stat = target.read_text(encoding="utf-8"), target.stat()
+        target.write_text(fault.planted(source), encoding="utf-8")
+        try:
+            yield
+        finally:
+            target.write_text(source, encoding="utf-8")
+            os.utime(target, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # so what is compiled counts
 
     def _tested(self, arguments: Sequence[str], plugins: Sequence[object]) -> int:
         import pytest
@@ -358,7 +352,8 @@ class Copy:
         os.environ["PYTHONPATH"] = str(self.folder)
         # The run that many tests look at is made once, by the sound package.
         os.environ["PYTEST_XDIST_WORKER"] = "gw0"
-        if not plugins:  # a fault is in the package, and must not stay in what is compiled of it
+        if not any(isinstance(plugin, LineMap) for plugin in plugins):
+            # A fault is in the package, and must not stay in what is compiled of it.
             os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
             sys.dont_write_bytecode = True
         sys.path[:] = [str(self.folder), *(p for p in sys.path if Path(p) != ROOT / "pipelines")]
@@ -377,6 +372,45 @@ class Copy:
                 ]
                 (self.temporary / "map.json").write_text(json.dumps(plugin_tests))
         return status
+
+
+def forked(call: Callable[[], int], limit_s: float | None, log: Path | None = None) -> int:
+    """Status of a call in a fork of this process, 1 if it does not come to its end.
+
+    Parameters
+    ----------
+    limit_s : of processor time; of the clock ten times that, for the machine may be busy.
+    log : takes what it prints.
+    """
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            os.setsid()
+            if limit_s is not None:
+                resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1, int(limit_s) + 6))
+            if log is not None:
+                output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+                os.dup2(output, 1)
+                os.dup2(output, 2)
+            status = call()
+        except BaseException:
+            traceback.print_exc()
+            sys.stderr.flush()
+        finally:
+            os._exit(status)
+    end = time.monotonic() + (10 * limit_s if limit_s is not None else float("inf"))
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done or time.monotonic() > end:
+            break
+        time.sleep(0.02)
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGKILL)  # with what it started
+    if not done:
+        os.waitpid(child, 0)
+        return 1
+    return os.waitstatus_to_exitcode(status)
 
 
 def _by_file(root: Path, lines: Iterable[tuple[str, int]]) -> dict[str, list[int]]:
@@ -420,8 +454,8 @@ class Limits:
     start_s: float = 30.0
 
 
-def fate_of(copy: Copy, fault: Fault, coverage: Coverage, limits: Limits) -> str:
-    """``noticed`` with the first test that failed or hung, ``no test`` or ``survived``."""
+def chosen_tests(fault: Fault, coverage: Coverage, limits: Limits) -> list[str]:
+    """A fault's tests, as many as its time allows."""
     tests: list[str] = []
     spent = 0.0
     for test in coverage.tests(fault):
@@ -429,22 +463,105 @@ def fate_of(copy: Copy, fault: Fault, coverage: Coverage, limits: Limits) -> str
         if spent > limits.tests_s and tests:
             break
         tests.append(test)
-    if not tests:
-        return "no test"
-    target = copy.folder / fault.path
-    source, stat = target.read_text(encoding="utf-8"), target.stat()
-    target.write_text(fault.planted(source), encoding="utf-8")
-    try:
-        for batch in (tests[:15], tests[15:]):
-            limit = limits.start_s + limits.slowdown * sum(coverage.seconds[t] for t in batch)
-            status = copy.run(batch, limit) if batch else 0
-            # 2 to 4: the module cannot be imported any more; negative: the process crashed.
-            if status != 0:
-                return f"noticed {_last_failure(copy.log)}"
-        return f"survived {len(tests)} of {len(coverage.tests(fault))} tests"
-    finally:
-        target.write_text(source, encoding="utf-8")
-        os.utime(target, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # what is compiled of it counts
+    return tests
+
+
+def fate_of(copy: Copy, fault: Fault, tests: Sequence[str], time_s: float, limits: Limits) -> str:
+    """``noticed`` with the first test that failed or hung, or ``survived``; by processes anew."""
+    with copy.planted(fault):
+        status = copy.run(tests, limits.start_s + limits.slowdown * time_s)
+    # 2 to 4: the module cannot be imported any more; negative: the process crashed.
+    return f"noticed {_last_failure(copy.log)}" if status else f"survived {len(tests)} tests"
+
+
+class Planter:
+    """Plugin of pytest: collects tests once; those of a fault run in a fork that has the fault.
+
+    Parameters
+    ----------
+    copy : whose tests they are.
+    work : faults, their tests, and the seconds that these take without a fault.
+    limits : of a fault's tests.
+    told : takes a fault and what became of it; nothing of those that need a new process.
+    """
+
+    def __init__(
+        self,
+        copy: Copy,
+        work: Sequence[tuple[Fault, Sequence[str], float]],
+        limits: Limits,
+        told: Callable[[Fault, str], None],
+    ) -> None:
+        self.copy, self.work, self.limits, self.told = copy, work, limits, told
+        self._failed = ""
+        self._functions: dict[str, list[FunctionType]] = defaultdict(list)
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Remember the first test that failed."""
+        if report.failed:
+            self._failed = self._failed or report.nodeid
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        """Plant one fault after the other, in place of a run of all tests."""
+        items = {item.nodeid: item for item in session.items}
+        for one in gc.get_objects():
+            if isinstance(one, FunctionType):
+                self._functions[one.__code__.co_filename].append(one)
+        for fault, names, time_s in self.work:
+            tests = [items[name] for name in names if name in items]
+            failed = self.copy.temporary / "failed.txt"
+            failed.unlink(missing_ok=True)
+            limit_s = self.limits.start_s + self.limits.slowdown * time_s
+            with self.copy.planted(fault):
+                status = forked(partial(self._run, fault, tests, failed), limit_s)
+            if status == CANNOT:
+                continue
+            by = failed.read_text() if failed.exists() else "at its end"
+            fate = f"noticed {by}" if status else f"survived {len(tests)} tests"
+            self.told(fault, fate)
+        return True
+
+    def _run(self, fault: Fault, items: Sequence[Any], failed: Path) -> int:
+        functions = self._functions[str(self.copy.folder / fault.path)]
+        if not functions or not _changed(fault, functions):
+            return CANNOT
+        for item, after in zip(items, [*items[1:], None], strict=True):
+            factory = item.config._tmp_path_factory
+            factory._basetemp = None
+            item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+            if self._failed:
+                failed.write_text(self._failed)
+                return 1
+        return 0
+
+
+CANNOT = 77  # status of a fork whose fault cannot be planted into what is imported
+
+
+def _changed(fault: Fault, functions: Sequence[FunctionType]) -> bool:
+    """Give a module's functions the code that they have with the fault, if they can take it."""
+    source = (ROOT / fault.path).read_text(encoding="utf-8")
+    old = _codes(compile(source, "", "exec"))
+    new = _codes(compile(fault.planted(source), functions[0].__code__.co_filename, "exec"))
+    for function in functions:
+        code = function.__code__
+        lines = [one.co_firstlineno for one in old.get(code.co_qualname, ())]
+        if code.co_firstlineno not in lines:
+            continue  # made by a decorator of another module
+        changed = new[code.co_qualname][lines.index(code.co_firstlineno)]
+        if changed.co_freevars != code.co_freevars:
+            return False
+        function.__code__ = changed
+    return True
+
+
+def _codes(code: CodeType) -> dict[str, list[CodeType]]:
+    found = defaultdict(list, {code.co_qualname: [code]})
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            for name, codes in _codes(constant).items():
+                found[name] += codes
+    return found
 
 
 def _last_failure(log: Path) -> str:
@@ -497,20 +614,45 @@ def main(argv: Sequence[str] | None = None) -> int:
     coverage = coverage_of(copy, work / "lines", tests, given.map_limit)
     kept = work / "fates.json"
     fates: dict[str, str] = json.loads(kept.read_text()) if kept.exists() else {}
-    names = []
-    for fault in drawn(given.folders, given.num, given.seed, given.skip):
+    faults = drawn(given.folders, given.num, given.seed, given.skip)
+    names = {fault: fault.named((ROOT / fault.path).read_text("utf-8")) for fault in faults}
+    limits = Limits(given.limit)
+
+    output = os.dup(1)  # forks write to their log
+
+    def told(fault: Fault, fate: str) -> None:
+        fates[names[fault]] = fate
+        kept.write_text(json.dumps(fates, indent=1))
+        if not fate.startswith("noticed"):
+            os.write(output, f"{names[fault]}   {fate}\n".encode())
         if time.monotonic() - begin > 60 * given.until:
-            break
-        source = (ROOT / fault.path).read_text(encoding="utf-8")
-        name = fault.named(source)
-        names.append(name)
-        if not fates.get(name, "").startswith("noticed"):
-            fates[name] = fate_of(copy, fault, coverage, Limits(given.limit))
-            kept.write_text(json.dumps(fates, indent=1))
-            if not fates[name].startswith("noticed"):
-                print(f"{name}   {fates[name]}", flush=True)
+            raise TimeoutError
+
+    # Tests may have been added since: what survived is planted again.
+    fates = {name: fate for name, fate in fates.items() if fate.startswith("noticed")}
+    kept.write_text(json.dumps(fates, indent=1))
+    work = []
+    for fault in faults:
+        if names[fault] in fates:
+            continue
+        chosen = chosen_tests(fault, coverage, limits)
+        work.append((fault, chosen, sum(coverage.seconds[test] for test in chosen)))
+        if not chosen:
+            told(fault, "no test")
+    # Faults of functions are planted into what is imported, by a fork that collects the tests once.
+    fast = [row for row in work if row[0].in_function and row[1]]
+    with contextlib.suppress(TimeoutError):
+        if fast:
+            files = sorted({test.split("::")[0] for row in fast for test in row[1]})
+            copy.planting(files, Planter(copy, fast, limits, told))
+            fates.update(json.loads(kept.read_text()))
+        for fault, chosen, time_s in work:
+            if names[fault] not in fates:
+                told(fault, fate_of(copy, fault, chosen, time_s, limits))
     for folder in given.folders:
-        of_it = [fates[name] for name in names if name.startswith(f"polmvs/{folder}/")]
+        of_it = [
+            fates[n] for n in names.values() if n.startswith(f"polmvs/{folder}/") and n in fates
+        ]
         lost = sum(not fate.startswith("noticed") for fate in of_it)
         print(f"{folder}: {len(of_it)} faults planted, {lost} survived")
     print(f"{time.monotonic() - begin:.0f} s")
