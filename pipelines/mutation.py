@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import builtins
 import compileall
 import contextlib
 import gc
@@ -193,7 +194,7 @@ def _is_of_types(node: ast.BinOp) -> bool:
     sides = (node.left, node.right)
     return any(
         (isinstance(side, ast.Constant) and side.value is None)
-        or (isinstance(side, ast.Name) and (side.id[0].isupper() or side.id in dir(__builtins__)))
+        or (isinstance(side, ast.Name) and (side.id[0].isupper() or side.id in dir(builtins)))
         or isinstance(side, ast.Subscript)
         for side in sides
     )

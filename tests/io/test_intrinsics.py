@@ -85,6 +85,16 @@ def test_all_dialects_give_the_same_camera(tmp_path, write):
     np.testing.assert_allclose(camera.params, OPENCV[1], rtol=1e-12)
 
 
+def test_the_older_head_of_opencv_is_no_yaml(tmp_path):
+    """OpenCV 4 and before write ``%YAML:1.0``, which no parser of YAML takes."""
+    text = opencv_yaml(tmp_path).read_text()
+    body = text.partition("\n")[2]
+    assert text.startswith("%YAML")
+    assert "---" in body
+    found = read_intrinsics(saved(tmp_path, "%YAML:1.0\n" + body))
+    assert (found.model, found.params) == OPENCV
+
+
 def test_opencv_projects_the_same_point(tmp_path):
     """Half a pixel more than OpenCV, by its own projection."""
     point = np.array([[0.2, -0.15, 1.0]])
