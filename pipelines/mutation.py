@@ -586,6 +586,10 @@ def drawn(folders: Sequence[str], num: int, seed: int, skip: Sequence[str]) -> l
     return [fault for _, _, fault in sorted(rows, key=lambda row: row[:2])]
 
 
+def _test_files(place: Path) -> list[Path]:
+    return [place] if place.is_file() else sorted(place.rglob("test_*.py"))
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Plant faults, and print what survived."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -594,7 +598,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folders", nargs="+", default=FOLDERS, help="of polmvs/")
     parser.add_argument(
-        "--tests", nargs="+", help="folders of tests/; those of --folders if not given"
+        "--tests", nargs="+", help="folders and files of tests/; those of --folders if not given"
     )
     parser.add_argument("--skip", nargs="*", default=(), help="modules, such as normals/light.py")
     parser.add_argument("--limit", type=float, default=60.0, help="seconds of a fault's tests")
@@ -610,7 +614,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     tests = [
         path
         for folder in given.tests or given.folders
-        for path in sorted((ROOT / "tests" / folder).rglob("test_*.py"))
+        for path in _test_files(ROOT / "tests" / folder)
     ]
     coverage = coverage_of(copy, work / "lines", tests, given.map_limit)
     kept = work / "fates.json"

@@ -75,6 +75,12 @@ def test_polygons_of_different_sizes_beside_other_columns(write) -> None:
     np.testing.assert_array_equal(mesh.triangles, [*SQUARE, [0, 2, 3]])
 
 
+def test_what_has_no_faces_is_no_mesh(write) -> None:
+    assert not has_triangles(write(ascii_ply(ROWS)))
+    header = f"element vertex 4\n{FLOATS}element face 0\nproperty list uchar int vertex_indices\n"
+    assert not has_triangles(write(ply("ascii", header, ROWS.encode())))
+
+
 def test_lists_of_an_ascii_file_may_be_empty(write) -> None:
     """Strips and groups of other programs: each row of its own length, none as well."""
     header = f"element vertex 4\n{FLOATS}element strip 3\nproperty list uchar int indices\n"

@@ -86,6 +86,19 @@ def test_rounding_of_exact_phases_makes_no_negative_weight(scale):
         assert (np.diag(matrix) >= 0).all()
 
 
+def test_a_start_chooses_between_two_planes():
+    """Half of the pixels are of either: each is found from a start that is near it."""
+    other = np.array([-0.5, 0.1, -0.8]) / np.linalg.norm([-0.5, 0.1, -0.8])
+    axial = np.where(np.arange(RAYS.shape[1]) % 2, plane_axial(), plane_axial(other))
+    sigma = np.full(RAYS.shape[1], 0.02)
+    for truth in (NORMAL, other):
+        start = truth + 0.05 * np.array([1, -1, 0.5])
+        start /= np.linalg.norm(start)
+        found = plane_normal(AngleModel.PPA, axial, RAYS, sigma, initial_normal=start)
+        assert error_deg(found.normal, truth) < 3
+        assert found.outlier_share > 0.3
+
+
 def test_random_planes_and_turned_cameras():
     rng = np.random.default_rng(0)
     sigma = np.full(RAYS.shape[1], 0.02)
