@@ -8,6 +8,7 @@ import pytest
 
 from polmvs.errors import DataError
 from polmvs.io.intrinsics import (
+    MAX_BYTES,
     Intrinsics,
     from_opencv_matrix,
     read_intrinsics,
@@ -259,4 +260,14 @@ def test_matrices_may_be_nested_and_not_without_end(tmp_path, depth):
     assert read_intrinsics(path).params == (1, 1, 2.5, 2.5)
     path = saved(tmp_path, "image_size: [5, 5]\ncamera_matrix: &a [*a]\n")
     with pytest.raises(DataError, match="nested too deeply"):
+        read_intrinsics(path)
+
+
+def test_files_of_a_size_that_no_calibration_has_are_not_read(tmp_path):
+    line = "PINHOLE 80 60 50 50 40 30"
+    path = saved(tmp_path, "#" + "x" * (MAX_BYTES - len(line) - 2) + f"\n{line}")
+    assert path.stat().st_size == MAX_BYTES
+    assert read_intrinsics(path).params == (50, 50, 40, 30)
+    path.write_text(path.read_text() + "\n")
+    with pytest.raises(DataError, match="too large for a calibration file"):
         read_intrinsics(path)
