@@ -427,8 +427,8 @@ def coverage_of(copy: Copy, folder: Path, tests: Sequence[Path], limit_s: float)
     lines: dict[tuple[str, int], set[str]] = defaultdict(set)
     seconds: dict[str, float] = {}
     for path in tests:
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
         name = path.relative_to(ROOT).as_posix()
+        digest = hashlib.sha256((copy.folder / name).read_bytes()).hexdigest()[:12]
         kept = folder / f"{name.replace('/', '.')}.{digest}.json"
         if not kept.exists():
             made = copy.temporary / "map.json"
