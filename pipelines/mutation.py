@@ -24,7 +24,6 @@ import json
 import os
 import random
 import re
-import resource
 import shutil
 import signal
 import sys
@@ -389,6 +388,8 @@ def forked(call: Callable[[], int], limit_s: float | None, log: Path | None = No
         try:
             os.setsid()
             if limit_s is not None:
+                import resource  # of POSIX, as forks are
+
                 resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1, int(limit_s) + 6))
             if log is not None:
                 output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
