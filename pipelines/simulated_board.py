@@ -131,8 +131,8 @@ def _write_top(truth: GroundTruth, folder: Path) -> None:
     for name, view in truth.views.items():
         normals = truth.normals(name)
         upwards = normals @ view.cam_from_world.rotation[:, 2] > 0.5  # not where they are NaN
-        depth = np.nan_to_num(truth.depth(name))
-        write_true_maps(folder / stem_of(name), depth, normals, upwards)
+        depth = np.nan_to_num(truth.depth(name)).astype(np.float64)
+        write_true_maps(folder / stem_of(name), depth, normals.astype(np.float64), upwards)
 
 
 def _turn() -> np.ndarray:

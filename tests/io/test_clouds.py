@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from polmvs.errors import DataError
-from polmvs.io.clouds import Cloud, read_cloud, write_cloud
+from polmvs.io.clouds import Cloud, Mesh, mesh_to_open3d, read_cloud, write_cloud
 
 RNG = np.random.default_rng(0)
 
@@ -73,3 +73,40 @@ def test_a_truncated_cloud_is_named(tmp_path):
 def test_a_missing_cloud_is_named(tmp_path):
     with pytest.raises(DataError, match=r"nothing\.ply"):
         read_cloud(tmp_path / "nothing.ply")
+
+
+@pytest.mark.parametrize(
+    ("kind", "colors", "expected"),
+    [
+        ("uchar", "0 127 255", [0, 127, 255]),
+        ("ushort", "0 32896 65535", [0, 128, 255]),
+        ("float", "0 0.5 1", [0, 128, 255]),
+        ("float", "-1 nan 2", [0, 0, 255]),
+        ("double", "0.25 inf -inf", [64, 255, 0]),
+    ],
+)
+def test_colours_of_any_type_are_shares_of_their_range(tmp_path, kind, colors, expected):
+    """Half of 255 is rounded to the even 128."""
+    lines = [
+        *("ply", "format ascii 1.0", "element vertex 1"),
+        *(f"property float {name}" for name in "xyz"),
+        *(f"property {kind} {name}" for name in ("red", "green", "blue")),
+        *("end_header", f"0 0 0 {colors}"),
+    ]
+    (tmp_path / "a.ply").write_text("\n".join(lines) + "\n")
+    assert read_cloud(tmp_path / "a.ply").colors.tolist() == [expected]
+
+
+def test_open3d_shows_a_mesh_in_its_colours():
+    colors = np.array([[0, 51, 255], [255, 0, 102], [1, 2, 3]], np.uint8)
+    mesh = Mesh(
+        vertices=np.eye(3),
+        normals=np.full((3, 3), np.sqrt(1 / 3)),
+        triangles=np.array([[0, 1, 2]], np.int32),
+        colors=colors,
+    )
+    shown = mesh_to_open3d(mesh)
+    np.testing.assert_allclose(np.asarray(shown.vertex_colors), colors / 255, atol=1e-12)
+    np.testing.assert_array_equal(np.asarray(shown.vertices), mesh.vertices)
+    np.testing.assert_array_equal(np.asarray(shown.triangles), mesh.triangles)
+    np.testing.assert_allclose(np.asarray(shown.vertex_normals), mesh.normals)

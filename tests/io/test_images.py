@@ -2,11 +2,19 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from polmvs.errors import DataError
-from polmvs.io.images import write_bytes, write_png
+from polmvs.io.images import (
+    read_bytes,
+    read_gray,
+    read_mask,
+    read_radiance,
+    write_bytes,
+    write_png,
+)
 from polmvs.io.raw_formats import read_raw
 
 
@@ -43,3 +51,92 @@ def test_a_pgm_says_of_how_many_bits_it_is(tmp_path: Path, largest: int, bits: i
     found = read_raw(tmp_path / "a.pgm")
     assert found.declared_bits == bits
     np.testing.assert_array_equal(found.samples, samples)
+
+
+def test_masks_are_what_is_not_black_in_any_colour(tmp_path: Path) -> None:
+    image = np.zeros((2, 3, 4), np.uint8)
+    image[..., 3] = 255  # alpha says nothing
+    image[0, 1, 0] = image[1, 2, 2] = 1
+    expected = [[False, True, False], [False, False, True]]
+    for name, pixels in (
+        ("rgba", image),
+        ("rgb", image[..., :3]),
+        ("gray", image[..., :3].max(-1)),
+    ):
+        write_png(tmp_path / f"{name}.png", pixels)
+        assert read_mask(tmp_path / f"{name}.png", (2, 3)).tolist() == expected
+    with pytest.raises(DataError, match="the mask is 3x2 px, the polarization image 2x3 px"):
+        read_mask(tmp_path / "gray.png", (3, 2))
+
+
+def test_gray_is_the_mean_of_the_colours(tmp_path: Path) -> None:
+    image = np.array([[[10, 20, 60, 7], [0, 0, 1, 255], [255, 255, 255, 0]]], np.uint8)
+    for name, pixels in (("rgba", image), ("rgb", image[..., :3])):
+        write_png(tmp_path / f"{name}.png", pixels)
+        assert read_gray(tmp_path / f"{name}.png").tolist() == [[30, 0, 255]]
+    write_png(tmp_path / "gray.png", image[..., 0])
+    assert read_gray(tmp_path / "gray.png").tolist() == [[10, 0, 255]]
+    write_png(tmp_path / "deep.png", image.astype(np.uint16))
+    with pytest.raises(DataError, match="no 8-bit image"):
+        read_gray(tmp_path / "deep.png")
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".hdr"])
+def test_radiances_are_red_green_blue(tmp_path: Path, suffix: str) -> None:
+    image = np.zeros((2, 3, 3), np.float32)
+    image[...] = [0.25, 2.0, 16.0]  # exact in each format
+    assert cv2.imwrite(str(tmp_path / f"a{suffix}"), np.ascontiguousarray(image[..., ::-1]))
+    found = read_radiance(tmp_path / f"a{suffix}")
+    np.testing.assert_allclose(found, image, rtol=0.01)
+    assert found.dtype == np.float32
+
+
+def test_gray_radiances_are_of_all_colours(tmp_path: Path) -> None:
+    image = np.linspace(0, 5, 6, dtype=np.float32).reshape(2, 3)
+    assert cv2.imwrite(str(tmp_path / "a.tif"), image)
+    np.testing.assert_array_equal(read_radiance(tmp_path / "a.tif"), np.dstack([image] * 3))
+    write_png(tmp_path / "a.png", np.zeros((2, 3), np.uint8))
+    with pytest.raises(DataError, match="no image of radiances"):
+        read_radiance(tmp_path / "a.png")
+
+
+RED, GREEN, BLUE = (np.full((2, 3), value, np.float32) for value in (0.5, 1.5, 2.5))
+ALL = np.dstack([RED, GREEN, BLUE])
+
+
+@pytest.mark.parametrize(
+    ("channels", "expected"),
+    [
+        ({"RGB": ALL}, ALL),
+        ({"RGBA": np.dstack([ALL, RED])}, ALL),
+        ({"B": BLUE, "G": GREEN, "R": RED, "Z": RED}, ALL),
+        ({"Y": GREEN}, np.dstack([GREEN] * 3)),
+        ({"Z": GREEN}, None),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
+)
+def test_openexr_of_every_kind_of_channels(
+    tmp_path: Path, channels: dict[str, np.ndarray], expected: np.ndarray | None
+) -> None:
+    exr = pytest.importorskip("OpenEXR")
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    with exr.File(header, channels) as file:
+        file.write(str(tmp_path / "a.exr"))
+    if expected is None:
+        with pytest.raises(DataError, match="has channels Z, not R, G, B or Y"):
+            read_radiance(tmp_path / "a.exr")
+    else:
+        np.testing.assert_array_equal(read_radiance(tmp_path / "a.exr"), expected)
+
+
+def test_files_are_read_whole_or_named(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"12345")
+    assert read_bytes(path, most=5) == b"12345"
+    with pytest.raises(DataError, match="the limit is"):
+        read_bytes(path, most=4)
+    path.write_bytes(b"")
+    with pytest.raises(DataError, match="is empty"):
+        read_bytes(path)
+    with pytest.raises(DataError, match="no such file"):
+        read_bytes(tmp_path / "b")

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from polmvs.errors import DataError
-from polmvs.io.intrinsics import Intrinsics, read_intrinsics, write_intrinsics
+from polmvs.io.intrinsics import (
+    MAX_BYTES,
+    Intrinsics,
+    from_opencv_matrix,
+    read_intrinsics,
+    write_intrinsics,
+)
 
 K = [[890.5, 0, 611.25], [0, 891.75, 511.5], [0, 0, 1]]
 D = [-0.21, 0.09, 0.001, -0.0005, 0.0]
@@ -78,6 +84,16 @@ def test_all_dialects_give_the_same_camera(tmp_path, write):
     assert (camera.width, camera.height) == SIZE
     assert camera.model == OPENCV[0]
     np.testing.assert_allclose(camera.params, OPENCV[1], rtol=1e-12)
+
+
+def test_the_older_head_of_opencv_is_no_yaml(tmp_path):
+    """OpenCV 4 and before write ``%YAML:1.0``, which no parser of YAML takes."""
+    text = opencv_yaml(tmp_path).read_text()
+    body = text.partition("\n")[2]
+    assert text.startswith("%YAML")
+    assert "---" in body
+    found = read_intrinsics(saved(tmp_path, "%YAML:1.0\n" + body))
+    assert (found.model, found.params) == OPENCV
 
 
 def test_opencv_projects_the_same_point(tmp_path):
@@ -167,3 +183,91 @@ def test_lenses_that_colmap_lacks(tmp_path):
             read_intrinsics(path)
     with pytest.raises(DataError, match="cannot be read"):
         read_intrinsics(tmp_path / "gone.yaml")
+
+
+@pytest.mark.parametrize(
+    ("camera", "focal"),
+    [
+        (
+            Intrinsics(model="SIMPLE_RADIAL", width=80, height=60, params=(50, 40, 30, 0.1)),
+            (50, 50),
+        ),
+        (Intrinsics(model="PINHOLE", width=80, height=60, params=(50, 52, 40, 30)), (50, 52)),
+    ],
+)
+def test_the_camera_without_its_distortion(camera, focal):
+    pinhole = camera.pinhole
+    assert (pinhole.width, pinhole.height) == (80, 60)
+    assert (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy) == (*focal, 40, 30)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "fisheye", "model", "kept"),
+    [
+        ([], False, "PINHOLE", ()),
+        ([0, 0, 0, 0, 0], False, "PINHOLE", ()),
+        ([0.1, 0.0], False, "OPENCV", (0.1, 0, 0, 0)),
+        ([0, 0, 0, 0.2, 0], False, "OPENCV", (0, 0, 0, 0.2)),
+        ([0, 0, 0, 0, 0.3], False, "FULL_OPENCV", (0, 0, 0, 0, 0.3, 0, 0, 0)),
+        ([0.1] * 8, False, "FULL_OPENCV", (0.1,) * 8),
+        ([0.1] * 8 + [0.0] * 4, False, "FULL_OPENCV", (0.1,) * 8),
+        ([0.1, 0.2], True, "OPENCV_FISHEYE", (0.1, 0.2, 0, 0)),
+    ],
+)
+def test_the_smallest_model_that_holds_all_coefficients(distortion, fisheye, model, kept):
+    found = from_opencv_matrix(K, distortion, *SIZE, fisheye=fisheye)
+    assert found.model == model
+    assert found.params == (890.5, 891.75, 611.75, 512.0, *kept)
+
+
+def matrix_of(cx, cy, skew=0.0, fx=100.0):
+    return [[fx, skew, cx], [0, 100.0, cy], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("matrix", "distortion", "words"),
+    [
+        (matrix_of(40, 30, skew=1e-6), [], "skewed"),
+        (matrix_of(40, 30), [0.1] * 9, "9 distortion coefficients"),
+        (matrix_of(40, 30, fx=0.0), [], "focal lengths must be positive"),
+        (matrix_of(-0.6, 30), [], "principal point -0.1,30.5 lies outside"),
+        (matrix_of(40, -0.6), [], "lies outside"),
+        (matrix_of(79.6, 30), [], "lies outside"),
+        (matrix_of(40, 59.6), [], "lies outside"),
+        (matrix_of(40, np.nan), [], "not finite"),
+    ],
+)
+def test_cameras_that_are_none(matrix, distortion, words):
+    with pytest.raises(ValueError, match=words):
+        from_opencv_matrix(matrix, distortion, 80, 60)
+
+
+@pytest.mark.parametrize("corner", [(-0.5, -0.5), (79.5, -0.5), (-0.5, 59.5), (79.5, 59.5)])
+def test_principal_points_may_lie_in_the_corners(corner):
+    assert from_opencv_matrix(matrix_of(*corner, skew=1e-8), [], 80, 60).model == "PINHOLE"
+
+
+@pytest.mark.parametrize("size", [(0, 60), (80, 0), (1 << 16, 60), (80, 1 << 16)])
+def test_sizes_that_are_none(size):
+    with pytest.raises(ValueError, match="its size is none"):
+        from_opencv_matrix(matrix_of(0, 0), [], *size)
+
+
+@pytest.mark.parametrize("depth", [0, 3])
+def test_matrices_may_be_nested_and_not_without_end(tmp_path, depth):
+    matrix = "[" * depth + "1,0,2,0,1,2,0,0,1" + "]" * depth
+    path = saved(tmp_path, f"image_size: [5, 5]\ncamera_matrix: [{matrix}]\n")
+    assert read_intrinsics(path).params == (1, 1, 2.5, 2.5)
+    path = saved(tmp_path, "image_size: [5, 5]\ncamera_matrix: &a [*a]\n")
+    with pytest.raises(DataError, match="nested too deeply"):
+        read_intrinsics(path)
+
+
+def test_files_of_a_size_that_no_calibration_has_are_not_read(tmp_path):
+    line = "PINHOLE 80 60 50 50 40 30"
+    path = saved(tmp_path, "#" + "x" * (MAX_BYTES - len(line) - 2) + f"\n{line}")
+    assert path.stat().st_size == MAX_BYTES
+    assert read_intrinsics(path).params == (50, 50, 40, 30)
+    path.write_text(path.read_text() + "\n")
+    with pytest.raises(DataError, match="too large for a calibration file"):
+        read_intrinsics(path)

@@ -75,6 +75,20 @@ def test_polygons_of_different_sizes_beside_other_columns(write) -> None:
     np.testing.assert_array_equal(mesh.triangles, [*SQUARE, [0, 2, 3]])
 
 
+def test_what_has_no_faces_is_no_mesh(write) -> None:
+    assert not has_triangles(write(ascii_ply(ROWS)))
+    header = f"element vertex 4\n{FLOATS}element face 0\nproperty list uchar int vertex_indices\n"
+    assert not has_triangles(write(ply("ascii", header, ROWS.encode())))
+
+
+def test_lists_of_an_ascii_file_may_be_empty(write) -> None:
+    """Strips and groups of other programs: each row of its own length, none as well."""
+    header = f"element vertex 4\n{FLOATS}element strip 3\nproperty list uchar int indices\n"
+    header += "element face 1\nproperty list uchar int vertex_indices\n"
+    path = write(ply("ascii", header, f"{ROWS}0\n2 1 2\n0\n3 0 1 2\n".encode()))
+    assert read_mesh(path).triangles.tolist() == [[0, 1, 2]]
+
+
 def test_colours_of_other_programs(write) -> None:
     for kind, values in (("uchar", "255 0 128"), ("float", "1 0 0.5"), ("ushort", "65535 0 32768")):
         names = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))

@@ -176,6 +176,27 @@ def test_three_outliers_in_ten_are_tolerated(num_rows, max_failures):
     assert np.median(estimate.row_weights[:, errors < 1]) > 0.5
 
 
+@pytest.mark.parametrize("num_unseen", [3, 30])
+def test_rows_that_do_not_count_waste_no_start(num_unseen):
+    """Views that do not see a point change nothing where others are wrong: each start is the same.
+
+    A third of the rows is wrong, so that points are started again from pairs of rows.
+    """
+    rng = np.random.default_rng(5)
+    rows, rays, sigma, normals = simulate(9, 300, (0.3, 1), rng, outliers=0.33)
+    alone = solve_normals(rows, rays, sigma)
+    shape = (3, num_unseen, 300)
+    unseen = np.full(shape, np.nan), np.broadcast_to(rays[:, :1], shape)
+    among = solve_normals(
+        np.concatenate([unseen[0], rows], axis=1),
+        np.concatenate([unseen[1], rays], axis=1),
+        np.concatenate([np.full(shape[1:], np.inf), sigma]),
+    )
+    np.testing.assert_array_equal(among.valid, alone.valid)
+    np.testing.assert_allclose(among.normals, alone.normals, atol=1e-9)
+    assert np.nanmedian(errors_deg(alone, normals)) < 1
+
+
 def test_row_weights_tell_the_outlier():
     rows, rays, sigma, normals = simulate(10, 200, (0.5, 1), np.random.default_rng(6))
     rows[:, 3] = np.cross(rays[:, 3], rows[:, 3], axis=0)  # a quarter turn

@@ -11,7 +11,12 @@ from polmvs.config import NormalOptions
 from polmvs.evaluation.comparison import Consistency, best_fitting_model
 from polmvs.evaluation.metrics import AngleStats
 from polmvs.normals import light as light_module
-from polmvs.normals.light import LightTolerances, diffuse_pixels, find_diffuse_parts
+from polmvs.normals.light import (
+    LightTolerances,
+    _place_pixels,
+    diffuse_pixels,
+    find_diffuse_parts,
+)
 from polmvs.normals.rows import gather_rows
 from polmvs.normals.tracks import track_normals
 from polmvs.polarization.kinds import AngleModel, Light
@@ -117,6 +122,27 @@ def test_what_one_view_says_of_a_thing_yields_to_the_others_that_show_it():
     for found, own in zip(pooled, of_balls, strict=True):
         assert found[own[0]] > 60
         assert found[own[1]] < -60
+
+
+def test_pixels_are_tried_from_the_near_to_the_far_side_of_the_hull(board):
+    """As many views show the first and the last depth of a pixel, and none more than these."""
+    points, _ = board.surface_points(60)
+    tolerances = LightTolerances()
+    slots = _place_pixels(board.maps, points, tolerances)
+    shown = np.sum([m.shows_surface(m.view.project(slots.points)) for m in board.maps], axis=0)
+    num_tried = tolerances.num_ranges
+    per_view = np.bincount(slots.view, minlength=len(board.maps)) // num_tried
+    begin = 0
+    for num, phase_map in zip(per_view, board.maps, strict=True):
+        here = slice(begin, begin + num * num_tried)
+        support = shown[here].reshape(num_tried, num)
+        np.testing.assert_array_equal(support[0], support[-1])
+        assert (support[0] >= support.max(axis=0) - 1).all()
+        offsets = slots.points[here] - phase_map.view.center_in_world
+        distances = np.linalg.norm(offsets, axis=-1).reshape(num_tried, num)
+        assert (np.diff(distances, axis=0) >= -1e-12).all()
+        begin += num * num_tried
+    assert begin == len(slots.points)
 
 
 def test_turning_twice_changes_nothing(board):

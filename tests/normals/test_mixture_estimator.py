@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from rows_of_points import errors_deg, simulate, tangents_of, unit
 
-from polmvs.normals.mixture_estimator import MixtureTolerances, row_scales, solve_mixture
+from polmvs.normals.mixture_estimator import (
+    MixtureTolerances,
+    _middle_directions,
+    row_scales,
+    solve_mixture,
+)
 from polmvs.normals.observations import Observations
 from polmvs.polarization.light_mixture import phase_variance
 
@@ -189,3 +194,17 @@ def test_conditioning_is_the_spread_of_the_rows():
     estimate = solve_mixture(found, everyone(found))
     expected = np.sqrt((np.sin(angle) ** 2).mean(axis=0) / (np.cos(angle) ** 2).mean(axis=0))
     np.testing.assert_allclose(estimate.conditioning, expected, rtol=0.1)
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1e-20, 1.0, 1e20])
+def test_the_least_known_direction_has_no_unit(scale):
+    """Moments of known axes: the direction of the middle one, whatever the weights are."""
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(rng.normal(size=(40, 3, 3)))[0]
+    values = scale * np.array([1e-3, 1.0, 5.0])
+    matrices = np.einsum("nik,k,njk->nij", axes, values, axes)
+    moments = np.array(
+        [matrices[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    )
+    along = _middle_directions(moments, axes[:, :, 0].T, np.full(40, values[1]))
+    np.testing.assert_allclose(np.abs((along.T * axes[:, :, 1]).sum(axis=1)), 1, atol=1e-9)

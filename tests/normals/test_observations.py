@@ -118,3 +118,27 @@ def test_light_that_is_given_is_obeyed():
     assert right.valid.mean() > 0.9
     assert np.nan_to_num(wrong.diffuse).max() == 0
     assert wrong.log_likelihood.sum() < right.log_likelihood.sum() - 50
+
+
+@pytest.mark.parametrize("light", [0, 1])
+def test_the_variance_of_an_orthographic_row_holds_its_angle_to_the_perspective_one(scenes, light):
+    """That angle, from both models' rows, on top of what the phase's noise and a tilt make."""
+    scene = scenes["ppa"]
+    points, _ = scene.surface_points(40)
+
+    def of(model, aware):
+        return gather_observations(model, points, scene.maps, window_px=WINDOW, tilt_aware=aware)
+
+    opa, opa_aware = of(AngleModel.OPA, False), of(AngleModel.OPA, True)
+    ppa, ppa_aware = of(AngleModel.PPA, False), of(AngleModel.PPA, True)
+    counted = np.isfinite(opa.turn_variances[light])
+    assert counted.mean() > 0.8
+    cosine = np.abs((opa.rows[light] * ppa.rows[light]).sum(axis=0))[counted]
+    sine2 = 1 - np.clip(cosine, 0, 1) ** 2
+    assert sine2.max() > 0.01
+    variances = [one.turn_variances[light][counted] for one in (opa, opa_aware, ppa, ppa_aware)]
+    # PPA's rows turn by a factor of their own, and add no angle.
+    of_tilt = (variances[3] - variances[2]) * variances[0] / variances[2]
+    np.testing.assert_allclose(
+        variances[1] - variances[0] - of_tilt, sine2, atol=2e-3 * sine2.max()
+    )

@@ -10,7 +10,13 @@ from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.normals.single_view.focal import estimate_focal
 from polmvs.normals.single_view.pixels import PlaneView, phase_sigma, polygon_mask
-from polmvs.normals.single_view.plane import phase_residuals, plane_normal
+from polmvs.normals.single_view.plane import (
+    EXACT,
+    normal_equations,
+    phase_residuals,
+    plane_normal,
+    stack_samples,
+)
 from polmvs.normals.single_view.search import find_planes
 from polmvs.polarization.angle_models import phase_from_normal
 from polmvs.polarization.capture import open_capture
@@ -68,6 +74,29 @@ def test_few_pixels_are_enough(robust, num):
     estimate = plane_normal(AngleModel.PPA, axial, RAYS[:, some], np.full(num, 0.01), robust=robust)
     np.testing.assert_allclose(estimate.normal, NORMAL, atol=1e-7)
     assert 0.1 < estimate.sigma_deg < 10
+
+
+@pytest.mark.parametrize("scale", [EXACT, 1e-3, 1.0])
+def test_rounding_of_exact_phases_makes_no_negative_weight(scale):
+    """Sums of squares are never negative, however small the scale of the loss."""
+    num = RAYS.shape[1]
+    samples = stack_samples(AngleModel.PPA, plane_axial(), RAYS, np.full(num, 0.01))
+    for first in range(0, num, 97):
+        matrix = normal_equations(NORMAL, samples[:, first : first + 3], scale).matrix
+        assert (np.diag(matrix) >= 0).all()
+
+
+def test_a_start_chooses_between_two_planes():
+    """Half of the pixels are of either: each is found from a start that is near it."""
+    other = np.array([-0.5, 0.1, -0.8]) / np.linalg.norm([-0.5, 0.1, -0.8])
+    axial = np.where(np.arange(RAYS.shape[1]) % 2, plane_axial(), plane_axial(other))
+    sigma = np.full(RAYS.shape[1], 0.02)
+    for truth in (NORMAL, other):
+        start = truth + 0.05 * np.array([1, -1, 0.5])
+        start /= np.linalg.norm(start)
+        found = plane_normal(AngleModel.PPA, axial, RAYS, sigma, initial_normal=start)
+        assert error_deg(found.normal, truth) < 3
+        assert found.outlier_share > 0.3
 
 
 def test_random_planes_and_turned_cameras():

@@ -165,3 +165,34 @@ def test_what_is_polarized_like_the_surface_about_it_is_no_mark(scene):
     assert np.nanmax(dolp_shares(tracks, marked(scene.maps))) == 0
     nowhere = tracks_at(scene, points + np.array([0.5, 0.0, 0.0]))
     assert np.isnan(dolp_shares(nowhere, scene.maps)).all()
+
+
+def test_views_that_a_point_does_not_face_do_not_count(scene):
+    """The ring sees the board from above: of its normals laid flat some half of the views."""
+    points, normals = scene.surface_points(60)
+    inner = seen_shares(points, normals, scene.maps) == 1  # the others lie at a region's border
+    assert inner.sum() > 20
+    points, normals = points[inner], normals[inner]
+    np.testing.assert_array_equal(seen_shares(points, -normals, scene.maps), 0)
+    flat = np.tile([1.0, 0.0, 0.0], (len(points), 1))
+    facing = np.array([view.faces(points, flat) for view in scene.views])
+    assert (facing.sum(axis=0) == 3).all()
+    np.testing.assert_array_equal(seen_shares(points, flat, scene.maps), 1)
+    # A view without a region counts where it is faced, and nowhere else.
+    first = scene.maps[0]
+    empty = replace(first.region, inside=np.zeros_like(first.region.inside))
+    found = seen_shares(points, flat, [first.changed(region=empty), *scene.maps[1:]])
+    np.testing.assert_allclose(found, 1 - facing[0] / facing.sum(axis=0))
+    assert len(set(facing[0].tolist())) == 1
+
+
+def test_all_views_that_show_a_point_count_not_only_those_that_match_it(scene):
+    """A point of a weak mark matches in two views; the phases about it are seen in six."""
+    points, truth = scene.surface_points(30)
+    options = NormalOptions(window_px=5)
+    some = track_normals(AngleModel.PPA, tracks_at(scene, points, [0, 1]), scene.maps, options)
+    every = track_normals(AngleModel.PPA, tracks_at(scene, points), scene.maps, options)
+    assert some.valid.all()
+    assert (some.num_rows > 2).all()
+    np.testing.assert_array_equal(some.num_rows, every.num_rows)
+    assert errors_deg(some.normals, truth).mean() < 0.4

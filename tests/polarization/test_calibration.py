@@ -62,6 +62,8 @@ def test_channels_are_found():
     )
     np.testing.assert_allclose(response.dark, 0.01, atol=1e-3)
     assert response.residual < 2e-3
+    # What varies over the sensor is measured where it is asked for only.
+    assert response.flat is response.angle_map is response.diattenuation_map is None
 
 
 def test_gains_follow_from_the_polarizer_alone():

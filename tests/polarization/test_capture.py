@@ -10,12 +10,18 @@ import cv2
 import numpy as np
 import pytest
 
-from polmvs.config import CaptureKind, CaptureOptions
+from polmvs.config import BayerOrder, CaptureKind, CaptureOptions, Resolution
 from polmvs.errors import DataError
 from polmvs.io.capture_files import find_capture
 from polmvs.io.images import read_mask, write_bytes, write_png
 from polmvs.io.raw_formats import read_raw
-from polmvs.polarization.capture import Capture, intensity_image_8bit, open_capture, open_image
+from polmvs.polarization.capture import (
+    Capture,
+    _share,
+    intensity_image_8bit,
+    open_capture,
+    open_image,
+)
 from polmvs.polarization.stokes import stokes_from_intensities
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -371,3 +377,33 @@ def test_an_odd_angle_makes_no_set(tmp_path):
         for angle in (0, 30, 61, 90, 120, 150):
             save(tmp_path / f"{view}_{angle:g}.png", mosaic())
     assert find_capture(tmp_path).kind is not CaptureKind.ANGLES
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"bayer": BayerOrder.RGGB},
+        {"resolution": Resolution.FULL},
+        {"bayer": BayerOrder.RGGB, "resolution": Resolution.FULL},
+    ],
+    ids=lambda changes: " ".join(changes) or "plain",
+)
+def test_the_white_level_is_that_of_the_images_that_are_read(tmp_path, changes):
+    """Mosaics that are brighter to one side; colours differ by a factor of four."""
+    rows, cols = np.mgrid[:96, :128]
+    gains = [1.0, 0.5, 0.5, 0.25] if "bayer" in changes else [1.0] * 4
+    gain = np.choose(2 * (rows // 2 % 2) + cols // 2 % 2, gains)
+    mosaic = np.rint(40000 * gain * (0.5 + cols / 256)).astype(np.uint16)
+    for name in ("a", "b"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), mosaic)
+    capture = open_capture(tmp_path, CaptureOptions(full_scale=65535, **changes))
+    expected = np.percentile(capture.load("a.png").s0, 99.5)
+    assert capture.exposure() == pytest.approx(expected, rel=0.02)
+
+
+def test_shares_of_colours_are_their_mean():
+    image = np.array([[[0, 30, 60], [255, 255, 255]]], np.uint8)
+    np.testing.assert_allclose(_share(None, 0, image), [[30 / 255, 1]], rtol=1e-6)
+    np.testing.assert_allclose(_share(None, 0, image[..., 1]), [[30 / 255, 1]], rtol=1e-6)
+    np.testing.assert_allclose(_share(None, 0, np.float32(image) / 255), [[30 / 255, 1]], rtol=1e-6)

@@ -1,5 +1,6 @@
 """Smoothing of the Stokes images into a phase map."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,10 +9,16 @@ import pytest
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.config import CaptureOptions
+from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
 from polmvs.polarization.capture import open_capture
 from polmvs.polarization.kinds import Light
-from polmvs.polarization.phase_map import PhaseTolerances, build_phase_map
+from polmvs.polarization.phase_map import (
+    PhaseTolerances,
+    build_phase_map,
+    open_phase_map,
+    store_phase_map,
+)
 from polmvs.polarization.region import Region, find_region
 from polmvs.polarization.stokes import Stokes
 from polmvs.scene import View
@@ -132,3 +139,21 @@ def test_dark_8_bit_mosaics_state_their_noise(level, bounds, tmp_path: Path):
     ratio = np.abs(turn) * np.sqrt(precision)
     assert bounds[0] < (ratio < 1).mean() < bounds[1]
     assert (ratio < 2).mean() > 0.92
+
+
+@pytest.mark.parametrize("part", ["samples", "intensity", "region", "dolp", "polarization"])
+def test_stored_files_of_another_size_are_refused(tmp_path: Path, part: str) -> None:
+    flat = np.ones((HEIGHT, WIDTH))
+    phase_map = build(flat, 0.2 * flat, 0.1 * flat, 1e-3 * flat, disc(15.0))
+    store_phase_map(phase_map, tmp_path)
+    assert open_phase_map(phase_map.view, tmp_path).samples.shape == (HEIGHT, WIDTH, 3)
+    path = tmp_path / f"{phase_map.view.name}.{part}.npy"
+    whole = np.load(path)
+    for cut in (whole[1:], whole[:, :-1], *([whole[..., :-1]] if whole.ndim == 3 else [])):
+        np.save(path, cut)
+        with pytest.raises(DataError, match="has another size than its camera"):
+            open_phase_map(phase_map.view, tmp_path)
+    np.save(path, whole)
+    smaller = replace(phase_map.view.camera, width=WIDTH - 1)
+    with pytest.raises(DataError, match="has another size"):
+        open_phase_map(replace(phase_map.view, camera=smaller), tmp_path)

@@ -353,6 +353,9 @@ def test_colours_weigh_by_their_noise(noise: float, share: float) -> None:
 
     merged = combine([colour(0.2, 0.01), colour(-0.2, noise)])
     assert merged.s1.mean() == pytest.approx(0.2 * (2 * share - 1), abs=1e-6)
+    # Of even images no noise is seen: it is what their own noise makes, by the weights' squares.
+    expected = np.hypot(share * 0.01, (1 - share) * noise)
+    np.testing.assert_allclose(merged.sigma, expected, rtol=1e-5)
     # The matched filter: a colour of half the polarization has half the weight.
     weaker = combine([colour(0.2, 0.01), colour(0.1, 0.01)])
     assert weaker.s1.mean() == pytest.approx((2 * 0.2 + 0.1) / 3, abs=1e-6)

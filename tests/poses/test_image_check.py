@@ -1,17 +1,28 @@
 """Whether cameras are those of images: places of features, and what wrong cameras do to them."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from printed_images import CAMERA, noisy_mosaics
 
 from polmvs.camera import PinholeCamera
+from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
 from polmvs.poses.image_check import (
     ImageCheckTolerances,
     epipolar_distances,
     feature_detector,
     find_features,
+    fit_to_images,
+    require_cameras_of_images,
 )
 from polmvs.scene import View
+from polmvs.synthetic.captures import quantize
+from polmvs.synthetic.printed import orbit_views
+
+Images = dict[str, np.ndarray]
 
 
 @pytest.mark.parametrize("center", [(40.0, 30.0), (40.5, 30.5), (37.25, 44.75)])
@@ -51,3 +62,62 @@ def test_distances_from_epipolar_lines_are_shares_of_the_diagonal() -> None:
     point = np.array([[0.0, 0.0, 1.0]])
     a, b = first.project(point), second.project(point) + np.array([0.0, 5.0])
     assert epipolar_distances(first, second, a, b)[0] == pytest.approx(5 / 500, rel=0.01)
+
+
+@pytest.fixture(scope="module")
+def printed() -> tuple[list[View], Images]:
+    """Views of printed surfaces, neighbours of which share most, and their images."""
+    views = orbit_views(12, CAMERA, seed=0)[:3]
+    cells = (m.reshape(CAMERA.height, 2, CAMERA.width, 2) for m in noisy_mosaics(views, 0))
+    images = [quantize(2 * cell.mean(axis=(1, 3))) for cell in cells]
+    return views, {view.name: image for view, image in zip(views, images, strict=True)}
+
+
+def test_cameras_of_the_images_fit_and_those_of_others_do_not(
+    printed: tuple[list[View], Images],
+) -> None:
+    views, images = printed
+    fit = require_cameras_of_images(views, images.__getitem__, "cameras.txt", "Give others.")
+    assert fit.fits
+    assert fit.num_matches > 100
+    assert fit.fitting > 0.95
+    # The same cameras, each with the name of the next one's image.
+    names = [view.name for view in views]
+    others = [
+        replace(view, name=name) for view, name in zip(views, names[1:] + names[:1], strict=True)
+    ]
+    with pytest.raises(DataError, match=r"cameras\.txt: its cameras do not fit .* Give others\."):
+        require_cameras_of_images(others, images.__getitem__, "cameras.txt", "Give others.")
+
+
+@pytest.mark.parametrize(
+    "image_of",
+    [
+        lambda rng: np.full((250, 300), 90, np.uint8),
+        lambda rng: rng.integers(0, 255, (250, 300)).astype(np.uint8),
+    ],
+    ids=["blank", "unrelated"],
+)
+def test_images_that_share_nothing_do_not_tell(
+    printed: tuple[list[View], Images], image_of: Callable[[np.random.Generator], np.ndarray]
+) -> None:
+    views, _ = printed
+    rng = np.random.default_rng(0)
+    images = {view.name: image_of(rng) for view in views}
+    fit = require_cameras_of_images(views, images.__getitem__, "cameras.txt", "Give others.")
+    assert fit.fits is None
+    assert fit.num_matches == 0
+    assert np.isnan(fit.fitting)
+
+
+def test_views_that_are_compared_are_spread_over_all(printed: tuple[list[View], Images]) -> None:
+    views, images = printed
+    many = [replace(views[k % 3], name=f"{k}") for k in range(9)]
+    seen: list[str] = []
+
+    def load(name: str) -> np.ndarray:
+        seen.append(name)
+        return images[views[int(name) % 3].name]
+
+    fit_to_images(many, load, tolerances=ImageCheckTolerances(max_views=3))
+    assert seen == ["0", "4", "8"]

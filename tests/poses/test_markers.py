@@ -28,6 +28,10 @@ from polmvs.errors import DataError, OptionError
 from polmvs.geometry import intersect_rays
 from polmvs.poses.markers import (
     Detection,
+    ScaleTolerances,
+    TriangulationTolerances,
+    _require_one_size,
+    _Square,
     detect_markers,
     find_markers,
     measure_markers,
@@ -103,11 +107,14 @@ def test_standard_deviation_is_that_of_repeated_noise() -> None:
     assert np.mean(sides) == pytest.approx(SIDE, rel=1e-3)
 
 
-def test_a_wrong_view_is_rejected() -> None:
+def test_a_wrong_view_is_rejected(caplog: pytest.LogCaptureFixture) -> None:
     views = views_of(PINHOLE)
     detections = exact(views, ONE)
+    measure_markers(views, detections, source="test")
+    assert not caplog.records
     detections[2] = replace(detections[2], corners=detections[2].corners + 9.0)
     measure = measure_markers(views, detections, source="test")
+    assert f"left out: marker 7 in {views[2].name}." in caplog.text
     assert measure.dropped == (f"marker 7 in {views[2].name}",)
     assert measure.num_views == 4
     assert measure.side == pytest.approx(SIDE, rel=1e-9)
@@ -234,3 +241,50 @@ def test_points_behind_the_cameras_do_not_triangulate() -> None:
     xy = np.full((2, 4, 2), 100.0)
     assert triangulate_together(away, xy) is None
     assert triangulate_together(views[:1], xy[:1]) is None
+
+
+def test_a_corner_that_errs_more_pulls_no_more() -> None:
+    """Huber's loss: beyond its limit the pull of an error is the same, whatever its size is."""
+    limit_px = TriangulationTolerances().huber_px
+    views = views_of(PINHOLE)
+    corners = np.array([d.corners for d in exact(views, ONE)])
+
+    def moved(error_px: float) -> np.ndarray:
+        xy = corners.copy()
+        xy[1, 0] += [error_px, 0.0]  # one corner of a view, which is kept
+        found = triangulate_together(views, xy)
+        assert found is not None
+        assert found.used.all()
+        return found.points - true_corners(ONE[0])
+
+    small, large = moved(1.5 * limit_px), moved(1.9 * limit_px)
+    assert np.linalg.norm(small[0]) > 2e-5
+    np.testing.assert_allclose(large[0], small[0], rtol=0.05, atol=2e-6)
+    np.testing.assert_allclose(large[1:], 0, atol=1e-9)
+
+
+def square_of(side: float, side_sigma: float, marker_id: int) -> _Square:
+    return _Square(
+        marker_id=marker_id,
+        views=(0, 1),
+        rejected=(),
+        rms_px=0.1,
+        side=side,
+        side_sigma=side_sigma,
+        lengths=np.full(6, side),
+        sigmas=np.full(6, side_sigma),
+    )
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.05, 20.0])
+@pytest.mark.parametrize("order", [1, -1])
+def test_sizes_may_differ_by_what_chance_makes_in_any_unit(unit: float, order: int) -> None:
+    """One is exact; the other, known to 2 %, may differ by some 6 to 8 % and not by 12."""
+    exactly = square_of(unit, 0.0, 3)
+    for factor, fits in ((1.05, True), (1.12, False)):
+        pair = [exactly, square_of(factor * unit, 0.02 * factor * unit, 5)][::order]
+        if fits:
+            _require_one_size(pair, "test", ScaleTolerances())
+        else:
+            with pytest.raises(DataError, match="differ in size"):
+                _require_one_size(pair, "test", ScaleTolerances())

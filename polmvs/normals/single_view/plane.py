@@ -392,8 +392,8 @@ def _weights(rows: list[Floats], cos: Floats, precision: Floats, scale: float | 
     """Weights of the squared phase errors; ``cos`` is that of twice the error."""
     if scale is None:  # rows of unit length weigh alike
         return 1 / (rows[0] * rows[0] + rows[1] * rows[1] + rows[2] * rows[2])
-    # 1 - cos is 2 sin^2 of the error.
-    return precision / (1 + (1 - cos) * precision * (0.5 / scale**2))
+    # 1 - cos is 2 sin^2 of the error; rounding can make it negative.
+    return precision / (1 + np.maximum(1 - cos, 0) * precision * (0.5 / scale**2))
 
 
 def _products(left: Sequence[Floats], right: Sequence[Floats]) -> Array:
