@@ -129,10 +129,10 @@ def _write_top(truth: GroundTruth, folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     write_bytes(folder / truth.cameras.name, truth.cameras.read_bytes())
     for name, view in truth.views.items():
-        normals = truth.normals(name)
+        normals = truth.normals(name).astype(np.float64)
         upwards = normals @ view.cam_from_world.rotation[:, 2] > 0.5  # not where they are NaN
         depth = np.nan_to_num(truth.depth(name)).astype(np.float64)
-        write_true_maps(folder / stem_of(name), depth, normals.astype(np.float64), upwards)
+        write_true_maps(folder / stem_of(name), depth, normals, upwards)
 
 
 def _turn() -> np.ndarray:

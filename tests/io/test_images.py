@@ -11,11 +11,10 @@ from polmvs.io.images import (
     read_bytes,
     read_gray,
     read_mask,
-    read_radiance,
     write_bytes,
     write_png,
 )
-from polmvs.io.raw_formats import read_raw
+from polmvs.io.raw_formats import read_radiance, read_raw
 
 
 @pytest.mark.parametrize("write", [lambda path: write_bytes(path, b"new"), None], ids=["b", "png"])
