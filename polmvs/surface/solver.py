@@ -85,18 +85,12 @@ class Level:
     num_steps : Gauss-Newton iterations at most.
     loss_scale : of the phase rows' loss, in their standard deviations.
     gate_px : outlines farther from a silhouette than this are not drawn to it.
-    remesh_after : displacement of a fiftieth of the vertices after which the mesh is made anew, in
-        edges. A mesh that is kept stays folded where the hull was far off; one that is made anew
-        has its creases rounded. Measured on a public ceramic: normals err
-        by 8.4 deg with 2.0 on all levels, by 6.5 with 0.7 and 0.3 on the first two; 0.3 on the
-        first costs a mug 1.6 points of F at 1 mm, on the last ones it doubles the error of a ledge.
     """
 
     edge_px: float
     num_steps: int
     loss_scale: float
     gate_px: float
-    remesh_after: float = 2.0
 
     @property
     def width_px(self) -> float:
@@ -120,6 +114,8 @@ class SolverTolerances:
     last_steps : iterations without a vote, at the end.
     damping : deviation of a step, in edges; it holds what neither outlines nor points place.
     unseen_damping : of a vertex that no view sees, in edges; smoothness alone would melt it. Guess.
+    remesh_after : displacement of a fiftieth of the vertices after which a mesh is made anew, in
+        edges. Guess: triangles of a mesh that moves by less stay usable.
     converged : root mean square of displacements of what is seen that ends a level, in edges.
     max_lost : share of the silhouettes by which a surface may cover less than its hull before it is
         made again without coarse levels. Guess: more than the corners that edges round.
@@ -128,8 +124,8 @@ class SolverTolerances:
     """
 
     levels: tuple[Level, ...] = (
-        Level(edge_px=10.0, num_steps=12, loss_scale=12.0, gate_px=25.0, remesh_after=0.7),
-        Level(edge_px=5.0, num_steps=12, loss_scale=8.0, gate_px=8.0, remesh_after=0.3),
+        Level(edge_px=10.0, num_steps=12, loss_scale=12.0, gate_px=25.0),
+        Level(edge_px=5.0, num_steps=12, loss_scale=8.0, gate_px=8.0),
         Level(edge_px=3.0, num_steps=8, loss_scale=6.0, gate_px=4.0),
         Level(edge_px=2.0, num_steps=3, loss_scale=4.0, gate_px=4.0),
     )
@@ -138,6 +134,7 @@ class SolverTolerances:
     last_steps: int = 5
     damping: float = 0.5
     unseen_damping: float = 0.02
+    remesh_after: float = 2.0
     converged: float = 0.01
     max_lost: float = 0.05
     max_vertices: int = 120_000
@@ -280,9 +277,7 @@ def refine(
     *coarse, fine, last = tol.levels
     # The way is as long, and a step no longer than an edge.
     steps = fine.num_steps + sum(level.num_steps * level.edge_px for level in coarse) / fine.edge_px
-    first = replace(
-        fine, num_steps=round(steps), loss_scale=coarse[0].loss_scale, gate_px=coarse[0].gate_px
-    )
+    first = replace(coarse[0], edge_px=fine.edge_px, num_steps=round(steps))
     again = _through_levels(mesh, fit, (first, last), stands_apart, no_progress)
     return again if covered_share(again.mesh, again.fit.views) > share else found
 
@@ -304,11 +299,8 @@ def _through_levels(
         edge = level.edge_px * fit.gsd
         if number and 1.2 * mesh.face_areas.sum() / edge**2 > tol.max_vertices:
             edge = float(np.sqrt(1.2 * mesh.face_areas.sum() / tol.max_vertices))
-        mesh, found = _refined_at(
-            mesh, fit.at_width(level.width_px), level, edge, (done, total), on_progress
-        )
-        # Residuals of a mesh that is still far off show its own error, not that of the rows.
-        fit = found if number >= len(levels) - 2 else replace(found, scales=fit.scales)
+        fit = fit.at_width(level.width_px)
+        mesh, fit = _refined_at(mesh, fit, level, edge, (done, total), on_progress)
         done += level.num_steps
         meshes.append(mesh)
         if not len(mesh.faces):
@@ -359,12 +351,10 @@ def _refined_at(
     for step in range(level.num_steps):
         # A mesh that has moved far is uneven and may intersect itself; one that has not is
         # left alone, for the grid rounds its creases.
-        if step == 0 or np.quantile(np.abs(moved), 0.98) > level.remesh_after * edge:
-            # A mesh from a grid is smooth already; smoothed each time, thin plates wear away.
-            mesh = remeshed(mesh, edge, smoothing=0.5 if step == 0 else 0.0)
+        if step == 0 or np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge:
+            mesh = remeshed(mesh, edge)
             moved = np.zeros(len(mesh.vertices))
         if not len(mesh.faces):
-            on_progress(total - done - step)
             return mesh, fit
         share = (done + step) / max(total - 1, 1)
         with_vote = step % tol.vote_every == 0 and done + step < total - tol.last_steps
