@@ -231,10 +231,33 @@ class RayScene:
             return np.zeros(0, np.float32)
         local = self._local(points)
         distance = np.asarray(self._scene.compute_distance(self._tensor(local)).numpy(), np.float32)
-        votes = np.zeros(len(points), np.int64)
+        return np.where(self.is_inside(points, num_rays=num_rays), -distance, distance)
+
+    def is_inside(self, points: Floats, *, num_rays: int = len(SIGN_DIRECTIONS)) -> Mask:
+        """Which points ``(N, 3)`` the mesh winds about; parameters of :meth:`signed_distance`."""
+        local, votes = self._local(points), np.zeros(len(points), np.int64)
         for direction in SIGN_DIRECTIONS[:num_rays]:
             votes += self._windings(local, direction) > 0
-        return np.where(2 * votes > num_rays, -distance, distance)
+        return np.asarray(2 * votes > num_rays)
+
+    def crossed_faces(self, depth: float) -> NDArray[np.int64]:
+        """Faces that do not part inside from outside: sheets of the mesh have crossed.
+
+        Parameters
+        ----------
+        depth : distance of the points on both sides of a face that are compared.
+        """
+        suspects = np.arange(len(self.mesh.faces))
+        # One ray clears nearly all faces; the others are looked at by three.
+        for num_rays in (1, len(SIGN_DIRECTIONS)):
+            if not len(suspects):
+                break
+            centers = self.mesh.centers[suspects]
+            step = depth * self.mesh.face_normals[suspects]
+            inner = self.is_inside(centers - step, num_rays=num_rays)
+            outer = self.is_inside(centers + step, num_rays=num_rays)
+            suspects = suspects[outer | ~inner]
+        return suspects
 
     def inside_along(self, origins: Floats, direction: Array, distances: Array) -> Mask:
         """Which places ``(D, N)`` on parallel rays lie inside.

@@ -67,6 +67,7 @@ from polmvs.surface.terms import (
 logger = logging.getLogger(__name__)
 
 POLISHING_STEPS = 2  # until a mesh made anew, which shrinks by some tenths of a pixel, converges
+CROSSED_DEPTH = 0.05  # of an edge: far above rounding, far below what a mesh resolves
 MIN_LEVELS = 3  # of which the coarse ones can be left out
 MIN_RESIDUALS = 100  # of one view and kind of light, for a deviation of their own
 
@@ -349,12 +350,18 @@ def _refined_at(
     moved, energy = np.zeros(len(mesh.vertices)), None
     first, last = tol.annealing
     for step in range(level.num_steps):
-        # A mesh that has moved far is uneven and may intersect itself; one that has not is
-        # left alone, for the grid rounds its creases.
-        if step == 0 or np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge:
-            mesh = remeshed(mesh, edge)
+        # A mesh that has moved far is uneven, and one that intersects itself shows views its
+        # inside. Others are left alone, for the grid rounds their creases.
+        if (
+            step == 0
+            or np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge
+            or len(RayScene(mesh).crossed_faces(CROSSED_DEPTH * edge))
+        ):
+            # A mesh from a grid is smooth already; smoothed each time, thin plates wear away.
+            mesh = remeshed(mesh, edge, smoothing=0.5 if step == 0 else 0.0)
             moved = np.zeros(len(mesh.vertices))
         if not len(mesh.faces):
+            on_progress(total - done - step)
             return mesh, fit
         share = (done + step) / max(total - 1, 1)
         with_vote = step % tol.vote_every == 0 and done + step < total - tol.last_steps

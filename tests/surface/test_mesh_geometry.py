@@ -94,6 +94,22 @@ def test_what_lies_inside_along_rays_is_what_their_crossings_enclose():
     assert not inside[:, 2].any()
 
 
+def test_sheets_that_have_crossed_are_found():
+    shift = np.array([1.2, 0, 0])
+    sphere_mesh = extracted(sphere())
+    beside = TriangleMesh(sphere_mesh.vertices + 2 * shift, sphere_mesh.faces)
+    assert not len(RayScene(side_by_side(sphere_mesh, beside)).crossed_faces(0.004))
+    crossed = TriangleMesh(sphere_mesh.vertices + shift, sphere_mesh.faces)
+    both = side_by_side(sphere_mesh, crossed)
+    found = np.isin(np.arange(len(both.faces)), RayScene(both).crossed_faces(0.004))
+    other = np.repeat([shift, 0 * shift], len(sphere_mesh.faces), axis=0)
+    depth = 1 - np.linalg.norm(both.centers - other, axis=1)  # in the other sphere
+    assert found[depth > 0.02].all()
+    assert not found[depth < -0.02].any()
+    inside_out = TriangleMesh(sphere_mesh.vertices, sphere_mesh.faces[:, ::-1])
+    assert len(RayScene(inside_out).crossed_faces(0.004)) == len(sphere_mesh.faces)
+
+
 def test_a_camera_sees_the_near_side_only():
     mesh = extracted(union(sphere(0.5), sphere(0.5, (-1.05, 0, 0))))
     center = np.array([4.0, 0, 0])

@@ -18,7 +18,7 @@ from polmvs.polarization.angle_models import tilt_turn
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import view_rays
 from polmvs.surface.creases import crease_vertices, sharpened
-from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed
 from polmvs.surface.observations import Looking, level_image, observe
 from polmvs.surface.solver import (
     Level,
@@ -495,14 +495,28 @@ def test_waves_are_as_high_as_they_are():
 
 def test_a_shoulder_on_which_views_agree_becomes_a_ledge():
     """A box on a plate, whose top no outline bounds where the box stands on it."""
-
-    def stack(p):
-        return union(box((0.85, 0.7, 0.15)), lambda q: box((0.4, 0.3, 0.1))(q - [0, 0, 0.25]))(p)
-
+    stack = union(box((0.85, 0.7, 0.15)), lambda q: box((0.6, 0.45, 0.2))(q - [0, 0, 0.35]))
     views = views_of(stack, ring_of_views(12, elevations=(25.0, 45.0, 60.0)))
     hull = visual_hull(views)
     mesh = refined(hull, views, tolerances=None).mesh
-    seen = mesh.only(mesh.centers[:, 2] > -0.05)
-    error = np.abs(stack(seen.centers)) @ seen.face_areas / seen.face_areas.sum()
-    # 0.26 px; 0.97 where rows that agree on another normal than the mesh's are outliers.
-    assert error < 0.5 * FOOTPRINT
+    # From the true surface to the found one: the distance to the object is 0 inside of it, too,
+    # where plate and box meet, so that a plate without its box would pass.
+    true = extracted(stack, half=1.0, step=0.03)
+    true = true.only(true.centers[:, 2] > -0.05)
+    error = np.linalg.norm(RayScene(mesh).closest(true.centers)[0] - true.centers, axis=1)
+    # 0.53 px, most of it at the edges; 1.77 without votes.
+    assert error @ true.face_areas / true.face_areas.sum() < 0.8 * FOOTPRINT
+
+
+@pytest.mark.parametrize(("crossed", "num_meshes"), [(0, 1), (1, 8)])
+def test_a_mesh_whose_sheets_have_crossed_is_made_anew(ball, monkeypatch, crossed, num_meshes):
+    made = []
+
+    def counted(*args, **kwargs):
+        made.append(kwargs)
+        return remeshed(*args, **kwargs)
+
+    monkeypatch.setattr("polmvs.surface.solver.remeshed", counted)
+    monkeypatch.setattr(RayScene, "crossed_faces", lambda self, depth: np.zeros(crossed))
+    refined(visual_hull(ball), ball, tolerances=replace(QUICK, levels=QUICK.levels[:1]))
+    assert len(made) == num_meshes
