@@ -274,8 +274,11 @@ def refine(
     share = covered_share(found.mesh, found.fit.views)
     if share >= covered_share(mesh, found.fit.views) - tol.max_lost or len(tol.levels) < MIN_LEVELS:
         return found
-    logger.info("walls are thinner than coarse edges; the surface is made again by fine ones.")
     *coarse, fine, last = tol.levels
+    if _num_vertices(mesh, fine.edge_px * fit.gsd) > tol.max_vertices:
+        logger.info("walls are thinner than coarse edges, and too large to be made by fine ones.")
+        return found
+    logger.info("walls are thinner than coarse edges; the surface is made again by fine ones.")
     # The way is as long, and a step no longer than an edge.
     steps = fine.num_steps + sum(level.num_steps * level.edge_px for level in coarse) / fine.edge_px
     first = replace(coarse[0], edge_px=fine.edge_px, num_steps=round(steps))
@@ -298,8 +301,8 @@ def _through_levels(
     unexplained = np.full(len(fit.views), np.nan)
     for number, level in enumerate(levels):
         edge = level.edge_px * fit.gsd
-        if number and 1.2 * mesh.face_areas.sum() / edge**2 > tol.max_vertices:
-            edge = float(np.sqrt(1.2 * mesh.face_areas.sum() / tol.max_vertices))
+        if number:
+            edge *= max(float(np.sqrt(_num_vertices(mesh, edge) / tol.max_vertices)), 1.0)
         fit = fit.at_width(level.width_px)
         mesh, fit = _refined_at(mesh, fit, level, edge, (done, total), on_progress)
         done += level.num_steps
@@ -311,6 +314,11 @@ def _through_levels(
             left_out = stands_apart(unexplained)
             fit = fit.of(~left_out)
     return Refined(mesh, fit, left_out, unexplained, meshes)
+
+
+def _num_vertices(mesh: TriangleMesh, edge: float) -> float:
+    """How many vertices a mesh has once its edges are of this length."""
+    return 1.2 * float(mesh.face_areas.sum()) / edge**2
 
 
 def covered_shares(
