@@ -368,12 +368,13 @@ def stand_apart(unexplained: Array, least: float) -> Mask:
 
     Returns
     -------
-    (K,) bool. None of them where fewer than three would be left: two agree by chance.
+    (K,) bool. None of them where fewer than three would be left: two agree by chance; nor where
+    more than half of the median view is unexplained: such a surface is itself wrong.
     """
     explained = 1 - unexplained
     known = np.isfinite(explained)
     odd = np.zeros(len(explained), np.bool_)
-    if known.any():
+    if known.any() and np.median(explained[known]) > 0.5:
         odd[known] = explained[known] < least * np.median(explained[known])
         odd[known] |= ~like_most(unexplained[known], floor=MAX_SHARE)
     return odd if (~odd).sum() >= MIN_VIEWS else np.zeros_like(odd)
