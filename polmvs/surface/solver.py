@@ -68,6 +68,9 @@ logger = logging.getLogger(__name__)
 
 POLISHING_STEPS = 2  # until a mesh made anew, which shrinks by some tenths of a pixel, converges
 CROSSED_DEPTH = 0.05  # of an edge: far above rounding, far below what a mesh resolves
+# Of what views show, that a mesh made anew may cover less. Measured: 0.011 and less where walls are
+# thicker than edges, 0.036 to 0.6 where they are thinner.
+REMESHING_LOSS = 0.02
 MIN_LEVELS = 3  # of which the coarse ones can be left out
 MIN_RESIDUALS = 100  # of one view and kind of light, for a deviation of their own
 
@@ -355,19 +358,21 @@ def _refined_at(
     ``progress`` are the iterations done before it, and of all levels.
     """
     tol, (done, total) = fit.tol, progress
-    moved, energy = np.zeros(len(mesh.vertices)), None
+    moved, energy = np.zeros(0), None
     first, last = tol.annealing
     for step in range(level.num_steps):
         # A mesh that has moved far is uneven, and one that intersects itself shows views its
         # inside. Others are left alone, for the grid rounds their creases.
-        if (
-            step == 0
-            or np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge
-            or len(RayScene(mesh).crossed_faces(CROSSED_DEPTH * edge))
-        ):
-            # A mesh from a grid is smooth already; smoothed each time, thin plates wear away.
-            mesh = remeshed(mesh, edge, smoothing=0.5 if step == 0 else 0.0)
+        if step == 0:
+            mesh = remeshed(mesh, edge)
             moved = np.zeros(len(mesh.vertices))
+        elif np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge or len(
+            RayScene(mesh).crossed_faces(CROSSED_DEPTH * edge)
+        ):
+            # It is smooth already, and walls thinner than the grid's cells are lost.
+            again = remeshed(mesh, edge, smoothing=0)
+            if covered_share(again, fit.views) > covered_share(mesh, fit.views) - REMESHING_LOSS:
+                mesh, moved = again, np.zeros(len(again.vertices))
         if not len(mesh.faces):
             on_progress(total - done - step)
             return mesh, fit
