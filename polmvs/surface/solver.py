@@ -68,7 +68,7 @@ logger = logging.getLogger(__name__)
 
 POLISHING_STEPS = 2  # until a mesh made anew, which shrinks by some tenths of a pixel, converges
 CROSSED_DEPTH = 0.05  # of an edge: far above rounding, far below what a mesh resolves
-# Of what views show, that a mesh made anew may cover less. Measured: 0.011 and less where walls are
+# Share of the silhouettes that a remeshed surface may lose. Measured: up to 0.011 where walls are
 # thicker than edges, 0.036 to 0.6 where they are thinner.
 REMESHING_LOSS = 0.02
 MIN_LEVELS = 3  # of which the coarse ones can be left out
@@ -279,7 +279,7 @@ def refine(
         return found
     *coarse, fine, last = tol.levels
     if _num_vertices(mesh, fine.edge_px * fit.gsd) > tol.max_vertices:
-        logger.info("walls are thinner than coarse edges, and too large to be made by fine ones.")
+        logger.info("walls are thinner than coarse edges; fine edges need too many vertices.")
         return found
     logger.info("walls are thinner than coarse edges; the surface is made again by fine ones.")
     # The way is as long, and a step no longer than an edge.
@@ -361,15 +361,15 @@ def _refined_at(
     moved, energy = np.zeros(0), None
     first, last = tol.annealing
     for step in range(level.num_steps):
-        # A mesh that has moved far is uneven, and one that intersects itself shows views its
-        # inside. Others are left alone, for the grid rounds their creases.
+        # A mesh that has moved far is uneven. In one that intersects itself views see the inside.
+        # Others stay as they are, because the grid rounds their creases.
         if step == 0:
             mesh = remeshed(mesh, edge)
             moved = np.zeros(len(mesh.vertices))
         elif np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge or len(
             RayScene(mesh).crossed_faces(CROSSED_DEPTH * edge)
         ):
-            # It is smooth already, and walls thinner than the grid's cells are lost.
+            # No smoothing: the mesh is smooth. The grid loses walls thinner than its cells.
             again = remeshed(mesh, edge, smoothing=0)
             if covered_share(again, fit.views) > covered_share(mesh, fit.views) - REMESHING_LOSS:
                 mesh, moved = again, np.zeros(len(again.vertices))

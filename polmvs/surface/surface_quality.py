@@ -368,8 +368,8 @@ def stand_apart(unexplained: Array, least: float) -> Mask:
 
     Returns
     -------
-    (K,) bool. None of them where fewer than three would be left: two agree by chance; nor where
-    more than half of the median view is unexplained: such a surface is itself wrong.
+    (K,) bool. No view stands apart if fewer than three would be left (two agree by chance), or if
+    half of the median view or more is unexplained (the surface itself is wrong).
     """
     explained = 1 - unexplained
     known = np.isfinite(explained)
