@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
 
 from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
@@ -21,6 +23,7 @@ LOWEST = -0.3  # z of a mark's normal: what faces further down is seen by few vi
 # radii of the mark. So a mark is half a radius from an edge: at an edge it would break the outline.
 FLAT_RADIUS, MAX_GAP = 2.0, 0.5
 EDGE_POINTS = 12  # of the disc's circle, where that is tested
+KMEANS_ITERATIONS = 50
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,10 +61,12 @@ def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
     points, normals = _on_surface(mesh, rng)
     seen = normals[:, 2] > LOWEST
     fitting = seen & _fits(mesh, points, normals, 0.5 * diameter)
-    above = points[:, 2] > 0.5 * diameter
-    usable = next((w for w in (fitting & above, fitting, seen & above) if w.any()), seen)
+    above_ground = points[:, 2] > 0.5 * diameter * np.hypot(normals[:, 0], normals[:, 1])
+    usable = next(
+        (w for w in (fitting & above_ground, fitting, seen & above_ground) if w.any()), seen
+    )
     points, normals = points[usable], normals[usable]
-    chosen = _far_apart(points, normals, number if len(points) else 0, rng)
+    chosen = _spread(points, normals, number, seed)
     axes = [_axes(normals[index], rng.uniform(0, 2 * np.pi)) for index in chosen]
     prints = [_print(rng) for _ in chosen]
     side = PRINT_CELLS * CELL_TEXELS
@@ -100,18 +105,19 @@ def _fits(mesh: Mesh, points: Array, normals: Array, radius: float) -> NDArray[n
     return np.asarray(gap <= MAX_GAP * radius)
 
 
-def _far_apart(points: Array, normals: Array, number: int, rng: np.random.Generator) -> list[int]:
-    """Indices of points each as far from those before it as can be, normals counted as well."""
+def _spread(points: Array, normals: Array, number: int, seed: int) -> list[int]:
+    """Indices of points in the middle of parts of equal spread (k-means), normals counted as well.
+
+    A mark then lies about half its distance to the next one from an edge. Points as far apart as
+    can be would lie at the edges, in the corners first, and there a print breaks the outline.
+    """
+    number = min(number, len(points))
     if not number:
         return []
     size = float(np.ptp(points, axis=0).max())
     places = np.concatenate([points / size, 0.15 * normals], axis=1)
-    chosen = [int(rng.integers(len(points)))]
-    nearest = np.linalg.norm(places - places[chosen[0]], axis=1)
-    while len(chosen) < number:
-        chosen.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, np.linalg.norm(places - places[chosen[-1]], axis=1))
-    return chosen
+    middles, _ = kmeans2(places, number, iter=KMEANS_ITERATIONS, minit="++", rng=seed)
+    return [int(index) for index in cKDTree(places).query(middles)[1]]
 
 
 def _axes(normals: Array, turn: float) -> Array:
