@@ -169,7 +169,7 @@ def find_cavities(
             continue
         grid = _grid_about(surface, rim, tol)
         rim = _in_focus(rim, grid, scene, surface.gsd, tol, face_tol)
-        mouth = _mouth(rim, grid, scene, tol, face_tol)
+        mouth = _mouth(rim, surface.centers[rim.members], grid, scene, tol, face_tol)
         inner = ndimage.binary_erosion(mouth, iterations=3)
         places = grid.points(rim)
         if not _is_dark(places[inner], places[_ring_about(mouth, tol)], scene.maps, tol):
@@ -300,15 +300,24 @@ def _in_focus(
 
 def _mouth(
     rim: Face,
+    on_rim: Array,
     grid: FaceGrid,
     scene: FaceScene,
     tol: CavityTolerances,
     face_tol: OffsetTolerances,
 ) -> Mask:
-    """Cells (H, W) that the supported cells of the rim enclose, up to the rim's inner line."""
+    """Cells (H, W) that the bright cells of the rim enclose, up to the rim's inner line.
+
+    ``on_rim`` are centres (N, 3) of the surface's faces on the rim. Phases of the inside may
+    agree with the rim's normal by chance, its darkness tells it from the rim.
+    """
     nothing_near = np.zeros(grid.shape, np.bool_)
-    evidence = face_evidence(grid.points(rim), rim, scene, nothing_near, None, face_tol)
-    supported = evidence.possible & (evidence.cost < MAX_COST)
+    places = grid.points(rim)
+    evidence = face_evidence(places, rim, scene, nothing_near, None, face_tol)
+    brightness = _brightness(places.reshape(-1, 3), on_rim, scene.maps).reshape(grid.shape)
+    supported = (brightness > tol.max_brightness) & (
+        evidence.cost < MAX_COST
+    )  # also where outlines have cut off the rim
     closed = ndimage.binary_closing(supported, iterations=round(tol.max_gap))
     enclosed = np.asarray(ndimage.binary_fill_holes(closed), np.bool_) & ~closed
     enclosed = np.asarray(ndimage.binary_opening(enclosed, iterations=2), np.bool_)
@@ -325,20 +334,35 @@ def _mouth(
 
 
 def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: CavityTolerances) -> bool:
-    """Whether points ``(N, 3)`` are much darker than others in most views that show both."""
-    ratios = []
-    for phase_map in maps:
-        medians = []
-        for points in (inner, ring):
-            xy = phase_map.view.camera.project(phase_map.view.cam_from_world * points)
-            camera = phase_map.view.camera
-            shown = in_frame(xy, camera.width, camera.height, 1)
-            if len(points) and shown.mean() > 0.5:
-                intensity = np.asarray(phase_map.intensity, np.float32)
-                medians.append(float(np.median(sample_image(intensity, xy[shown]))))
-        if len(medians) == 2:
-            ratios.append(medians[0] / max(medians[1], 1e-9))
-    return len(ratios) >= MIN_VIEWS and float(np.median(ratios)) < tol.max_brightness
+    """Whether half of points ``(N, 3)`` are much darker than a ring ``(R, 3)``."""
+    dark = _brightness(inner, ring, maps) < tol.max_brightness
+    return bool(len(dark) and dark.mean() > 0.5)
+
+
+def _brightness(points: Array, ring: Array, maps: Sequence[PhaseMap]) -> Array:
+    """Intensity ``(N,)`` of points over the median of a ring's, median over the views.
+
+    Views that show less than half of the ring do not count. NaN where fewer than ``MIN_VIEWS``
+    views show a point.
+    """
+    ratios = np.full((len(maps), len(points)), np.nan)
+    for ratio, phase_map in zip(ratios, maps, strict=True):
+        of_ring = _intensities(ring, phase_map)
+        if np.isfinite(of_ring).sum() > 0.5 * len(ring):
+            ratio[:] = _intensities(points, phase_map) / max(float(np.nanmedian(of_ring)), 1e-9)
+    enough = np.isfinite(ratios).sum(axis=0) >= MIN_VIEWS
+    brightness = np.full(len(points), np.nan)
+    brightness[enough] = np.nanmedian(ratios[:, enough], axis=0)
+    return brightness
+
+
+def _intensities(points: Array, phase_map: PhaseMap) -> Array:
+    """Intensity ``(N,)`` of points in a view; NaN beyond its image."""
+    camera = phase_map.view.camera
+    xy = camera.project(phase_map.view.cam_from_world * points)
+    shown = in_frame(xy, camera.width, camera.height, 1)
+    sampled = sample_image(np.asarray(phase_map.intensity, np.float32), xy)
+    return np.where(shown, sampled, np.nan)
 
 
 def _ring_about(mouth: Mask, tol: CavityTolerances) -> Mask:

@@ -758,6 +758,8 @@ def row_losses(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Loss in [0, 1] of each row (K, N), NaN where it does not count, and cosines to the views.
 
+    A row counts if a random phase would contradict it as often as not: others agree with anything.
+
     Parameters
     ----------
     rows : of N points.
@@ -772,7 +774,10 @@ def row_losses(
         variance = (1 - cosine**2) * np.square(rows.sigma) + floor
         z2 = np.square(residual) / (variance * np.float32(tol.sigmas**2))
         loss = z2 / (1 + z2)
-    counts = np.isfinite(rows.sigma) & (cosine > MIN_FACING_COSINE)
+        tells = (
+            rows.sigma < np.sqrt(0.5) / tol.sigmas
+        )  # a random phase's median residual: sin 45 deg
+    counts = tells & (cosine > MIN_FACING_COSINE)
     return np.where(counts, loss, np.nan).astype(np.float32), cosine
 
 

@@ -39,8 +39,12 @@ class Annulus:
         return np.where(hit, distance, np.inf), np.where(hit[..., None], normals, np.nan)
 
 
-def vessel_maps(bore=RADIUS - WALL, offset=0.0, dark=0.02):
-    """Phase maps of a vessel with a bore, dark inside, on an unpolarized bright ground."""
+def vessel_maps(bore=RADIUS - WALL, offset=0.0, dark=0.02, weak_inside=False, rim_cut_in=0):
+    """Phase maps of a vessel with a bore, dark inside, on an unpolarized bright ground.
+
+    The inside has no phases, or those of its noise (``weak_inside``). The outlines of some views
+    (``rim_cut_in``) leave out the rim.
+    """
     middle = HEIGHT / 2
     surfaces = [
         Cylinder([0, 0, middle], [0, 0, 1], RADIUS, middle),
@@ -53,7 +57,8 @@ def vessel_maps(bore=RADIUS - WALL, offset=0.0, dark=0.02):
     )
     rng = np.random.default_rng(0)
     maps = []
-    for view in views:
+    darkest = 0.0 if weak_inside else 0.04
+    for index, view in enumerate(views):
         seen = render_view(view, Group(surfaces), s0=0.2, background=0.8)
         xy = np.stack(np.meshgrid(np.arange(280) + 0.5, np.arange(240) + 0.5), axis=-1)
         rays = view.camera.rays(xy) @ view.cam_from_world.rotation
@@ -65,12 +70,15 @@ def vessel_maps(bore=RADIUS - WALL, offset=0.0, dark=0.02):
         images = np.rint(255 * (images + rng.normal(0, 2e-4, images.shape))) / 255
         i0, i45, i90, i135 = images.astype(np.float32)
         s0, s1, s2 = 0.5 * (i0 + i45 + i90 + i135), i0 - i90, i45 - i135
-        region = find_region(s0, s1, s2, s0 > 0.04, min_dolp=0.1, mask=seen.mask)
-        sigma = np.full(s0.shape, 2e-3, np.float32)
-        stokes = Stokes(s0=s0, s1=s1, s2=s2, sigma=sigma, valid=s0 > 0.04)
+        on_rim = seen.mask & ~below
+        outline = seen.mask & ~on_rim if index < rim_cut_in else seen.mask
+        region = find_region(s0, s1, s2, s0 > darkest, min_dolp=0.1, mask=outline)
+        sigma = np.where(inside & weak_inside, 0.05, 2e-3).astype(np.float32)
+        stokes = Stokes(s0=s0, s1=s1, s2=s2, sigma=sigma, valid=s0 > darkest)
         made = build_phase_map(view, stokes, region, Light.SPECULAR)
         known = made.samples.copy()
-        known[inside] = 0
+        if not weak_inside:
+            known[inside] = 0
         maps.append(replace(made, samples=known))
     return maps
 
@@ -114,6 +122,14 @@ def test_a_dark_mouth_with_a_rim_of_one_width_opens_into_a_cavity():
     assert np.quantile(np.abs(values - inwards)[near], 0.9) < 1e-3
     # Nothing under the bottom, nor beside the vessel above its rim.
     assert (cavity.values(np.array([[0, 0, 0.004], [0.055, 0, HEIGHT + 0.002]])) < 0).all()
+
+
+@pytest.mark.parametrize("harm", [{"weak_inside": True, "dark": 0.1}, {"rim_cut_in": 4}])
+def test_a_mouth_is_found_by_its_darkness(harm):
+    """With a mask the dark inside has phases, and some of them agree with the rim's normal."""
+    maps = vessel_maps(**harm)
+    (cavity,) = find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA))
+    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
 
 
 def test_a_mouth_is_round_though_its_cells_are_not():
