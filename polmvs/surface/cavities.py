@@ -315,9 +315,8 @@ def _mouth(
     places = grid.points(rim)
     evidence = face_evidence(places, rim, scene, nothing_near, None, face_tol)
     brightness = _brightness(places.reshape(-1, 3), on_rim, scene.maps).reshape(grid.shape)
-    supported = (brightness > tol.max_brightness) & (
-        evidence.cost < MAX_COST
-    )  # also where outlines have cut off the rim
+    # Outlines may have cut off a part of the rim: what they leave possible does not count.
+    supported = (brightness > tol.max_brightness) & (evidence.cost < MAX_COST)
     closed = ndimage.binary_closing(supported, iterations=round(tol.max_gap))
     enclosed = np.asarray(ndimage.binary_fill_holes(closed), np.bool_) & ~closed
     enclosed = np.asarray(ndimage.binary_opening(enclosed, iterations=2), np.bool_)
