@@ -359,7 +359,7 @@ def read_npy(path: PathArg, data: bytes) -> NDArray[Any]:
 
 
 def _read_exr(path: PathArg, limit: _Limit) -> NDArray[Any]:
-    """The image of an OpenEXR file: its only channel but depth, or red, green and blue."""
+    """The image of an OpenEXR file: its only channel, or red, green and blue."""
     try:
         import OpenEXR
     except ImportError as error:
@@ -381,13 +381,11 @@ def _read_exr(path: PathArg, limit: _Limit) -> NDArray[Any]:
     for name in ("RGB", "RGBA"):
         if name in channels:
             return channels[name][..., :3]
-    if len(channels) == 1 and "Z" not in channels:  # Z is the depth
+    if len(channels) == 1:
         return next(iter(channels.values()))
     if "Y" in channels:
         return channels["Y"]
-    raise DataError(
-        path, f"has the channels {', '.join(sorted(channels))}; RGB or one of intensities is read."
-    )
+    raise DataError(path, f"has the channels {', '.join(sorted(channels))}; one or RGB is read.")
 
 
 def _size_of_part(part: Any) -> ImageSize:

@@ -51,3 +51,31 @@ def test_what_is_no_intensity_is_refused(tmp_path: Path, values: np.ndarray, wor
 def test_the_largest_integers_are_samples(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", ROWS + 65535 - 23)
     assert read_raw(tmp_path / "a.npy").samples.max() == 65535
+
+
+RED, GREEN = (np.full((4, 6), value, np.float32) for value in (0.5, 1.5))
+
+
+@pytest.mark.parametrize(
+    ("channels", "expected"),
+    [
+        ({"RGB": np.dstack([RED, GREEN, RED])}, np.dstack([RED, GREEN, RED])),
+        ({"RGBA": np.dstack([RED, GREEN, RED, RED])}, np.dstack([RED, GREEN, RED])),
+        ({"Y": GREEN, "Z": RED}, GREEN),
+        ({"Z": RED}, RED),
+        ({"V": RED, "W": GREEN}, None),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
+)
+def test_channels_of_openexr(
+    tmp_path: Path, channels: dict[str, np.ndarray], expected: np.ndarray | None
+) -> None:
+    exr = pytest.importorskip("OpenEXR")
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    with exr.File(header, channels) as file:
+        file.write(str(tmp_path / "a.exr"))
+    if expected is None:
+        with pytest.raises(DataError, match="has the channels V, W; one or RGB is read"):
+            read_raw(tmp_path / "a.exr")
+    else:
+        np.testing.assert_array_equal(read_raw(tmp_path / "a.exr").samples, expected)
