@@ -309,13 +309,13 @@ def _mouth(
     """Cells (H, W) that the bright cells of the rim enclose, up to the rim's inner line.
 
     ``on_rim`` are centres (N, 3) of the surface's faces on the rim. Phases of the inside may
-    agree with the rim's normal by chance, its darkness tells it from the rim.
+    agree with the rim's normal by chance; darkness tells the inside from the rim.
     """
     nothing_near = np.zeros(grid.shape, np.bool_)
     places = grid.points(rim)
     evidence = face_evidence(places, rim, scene, nothing_near, None, face_tol)
     brightness = _brightness(places.reshape(-1, 3), on_rim, scene.maps).reshape(grid.shape)
-    # Outlines may have cut off a part of the rim: what they leave possible does not count.
+    # Outlines may have cut off a part of the rim, so `evidence.possible` is not asked for.
     supported = (brightness > tol.max_brightness) & (evidence.cost < MAX_COST)
     closed = ndimage.binary_closing(supported, iterations=round(tol.max_gap))
     enclosed = np.asarray(ndimage.binary_fill_holes(closed), np.bool_) & ~closed

@@ -758,7 +758,7 @@ def row_losses(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Loss in [0, 1] of each row (K, N), NaN where it does not count, and cosines to the views.
 
-    A row counts if a random phase would contradict it as often as not: others agree with anything.
+    A row counts if it would contradict at least half of all phases; others agree with anything.
 
     Parameters
     ----------
@@ -774,10 +774,9 @@ def row_losses(
         variance = (1 - cosine**2) * np.square(rows.sigma) + floor
         z2 = np.square(residual) / (variance * np.float32(tol.sigmas**2))
         loss = z2 / (1 + z2)
-        tells = (
-            rows.sigma < np.sqrt(0.5) / tol.sigmas
-        )  # a random phase's median residual: sin 45 deg
-    counts = tells & (cosine > MIN_FACING_COSINE)
+    # The median residual of a random phase is sin 45 deg.
+    informative = rows.sigma < np.sqrt(0.5) / tol.sigmas
+    counts = informative & (cosine > MIN_FACING_COSINE)
     return np.where(counts, loss, np.nan).astype(np.float32), cosine
 
 
