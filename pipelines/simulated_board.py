@@ -4,8 +4,8 @@
 
 BOARD is a capture with ground truth of a black glossy board of 300 x 400 x 12 mm, turned by 12
 degrees on a textured table, that another program rendered. The board here has the same place,
-size, index and number of marks, the same cameras and sensor; prints, their places, clutter and
-noise differ with each seed, whose spread is what figures may differ by. The shared capture's truth
+size and index, marks at the same places, the same cameras and sensor; prints, clutter and noise
+differ with each seed, whose spread is what figures may differ by. The shared capture's truth
 is the top of the board, so the masks of the rendered truth are cut to it. Captures and runs stay in
 WORK.
 """
@@ -52,6 +52,19 @@ from polmvs.simulation.trial import TrialResult, measure, trial_table
 
 SIDES_M = (0.3, 0.4, 0.012)
 TURN_DEG = 12.0
+# x, y of the middles of the shared board's prints, in its own axes: of what is light in the median
+# of its views, each warped onto the top.
+MARKS_MM = (
+    (-124, -170),
+    (112, -153),
+    (-1, -115),
+    (9, 3),
+    (78, 15),
+    (-93, 27),
+    (-88, 127),
+    (111, 124),
+    (-13, 150),
+)
 LONGEST_EDGE_M = 0.02
 MODELS = (AngleModel.OPA, AngleModel.PPA)
 
@@ -70,10 +83,13 @@ def _run(call: Call, terminal: Terminal) -> int:
     arguments = call.get(Arguments)
     arguments.work.mkdir(parents=True, exist_ok=True)
     truth = open_ground_truth(arguments.board)
-    mesh, camera, poses = (arguments.work / n for n in ("board.ply", "camera.txt", "poses.txt"))
+    mesh, camera, poses, marks = (
+        arguments.work / n for n in ("board.ply", "camera.txt", "poses.txt", "marks.txt")
+    )
     write_mesh(mesh, _board())
     write_intrinsics(camera, _intrinsics(truth), "of the polarization images")
     write_bytes(poses, _trajectory(truth).encode())
+    write_bytes(marks, _mark_places().encode())
     captures = [("shared", arguments.board, truth.folder)]
     with terminal.stage("render", len(arguments.seeds)) as on_progress:
         for seed in arguments.seeds:
@@ -81,7 +97,7 @@ def _run(call: Call, terminal: Terminal) -> int:
                 mesh,
                 arguments.work / f"simulated_{seed}",
                 Simulation(
-                    object=ObjectOptions(material=MaterialName.BLACK_PLASTIC),
+                    object=ObjectOptions(material=MaterialName.BLACK_PLASTIC, mark_places=marks),
                     lighting=LightingOptions(light=arguments.light),
                     path=PathOptions(cameras=poses),
                     sensor=SensorOptions(image_size=(1224, 1024), camera_file=camera),
@@ -122,6 +138,12 @@ def _board() -> Mesh:
     normals = np.zeros_like(vertices)  # those of its facets are taken
     normals[:, 2] = 1
     return Mesh(vertices, normals, np.asarray(box.faces, np.int32))
+
+
+def _mark_places() -> str:
+    """Lines ``x y z`` on the top of the board, metres."""
+    on_top = np.column_stack([1e-3 * np.array(MARKS_MM), np.full(len(MARKS_MM), SIDES_M[2])])
+    return "".join(" ".join(f"{v:.6f}" for v in row) + "\n" for row in on_top @ _turn().T)
 
 
 def _write_top(truth: GroundTruth, folder: Path) -> None:

@@ -41,11 +41,12 @@ from polmvs.simulation.camera_model import (
 from polmvs.simulation.camera_path import camera_views
 from polmvs.simulation.irradiance import bake
 from polmvs.simulation.lights import environment
-from polmvs.simulation.marks import marks_on
+from polmvs.simulation.marks import Marks, marks_at, marks_on
 from polmvs.simulation.materials import material_of
 from polmvs.simulation.mesh_input import ObjectMesh, object_mesh
 from polmvs.simulation.options import (
     LightName,
+    ObjectOptions,
     SensorKind,
     SensorOptions,
     Simulation,
@@ -225,7 +226,7 @@ class _Plan:
             part=mesh.mesh,
             material=material,
             vertex_albedo=None if options.object.albedo is not None else mesh.vertex_albedo,
-            marks=marks_on(mesh.mesh, options.object.marks, options.object.mark_size * size, seed),
+            marks=_marks(mesh.mesh, options.object, size, seed),
             surroundings=surroundings(
                 options.scenery,
                 size,
@@ -244,6 +245,13 @@ class _Plan:
             description=description,
             channels=draw_channels(options.sensor, seed),
         )
+
+
+def _marks(mesh: Mesh, options: ObjectOptions, size: float, seed: int) -> Marks:
+    diameter = options.mark_size * size
+    if options.mark_places is not None:
+        return marks_at(mesh, options.mark_places, diameter, seed)
+    return marks_on(mesh, options.marks, diameter, seed)
 
 
 class _Studio:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
+from polmvs.errors import DataError, as_data_error
 from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
@@ -67,11 +69,68 @@ def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
     )
     points, normals = points[usable], normals[usable]
     chosen = _spread(points, normals, number, seed)
-    axes = [_axes(normals[index], rng.uniform(0, 2 * np.pi)) for index in chosen]
-    prints = [_print(rng) for _ in chosen]
+    return _printed(points[chosen], normals[chosen], diameter, rng)
+
+
+def marks_at(mesh: Mesh, file: Path, diameter: float, seed: int) -> Marks:
+    """Marks at given places.
+
+    Parameters
+    ----------
+    mesh : of the object, metres.
+    file : text, a line ``x y z`` for each mark, in the mesh's frame, metres; a mark lies on the
+        surface's closest point.
+    diameter : of a mark, metres.
+    seed : of their prints.
+
+    Raises
+    ------
+    DataError
+        The file is missing or malformed, or a place is further than a mark's radius from the
+        surface.
+    """
+    places = _read_places(file)
+    surface = RayScene(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64)))
+    points, triangles, weights = surface.closest(places)
+    away = np.linalg.norm(points - places, axis=1)
+    if away.max() > 0.5 * diameter:
+        first = int(away.argmax())
+        raise DataError(
+            file,
+            f"place {first + 1} is {away[first]:.3g} m from the object's surface; places are in "
+            "metres, in the object's frame (gt/mesh.ply).",
+        )
+    corners = mesh.normals[mesh.triangles[triangles]]
+    normals = unit(np.einsum("nk,nkd->nd", weights, corners))
+    return _printed(points, normals, diameter, np.random.default_rng(seed))
+
+
+def _read_places(file: Path) -> Array:
+    with as_data_error(file, "read"):
+        data = file.read_bytes()
+    places = []
+    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            place = [float(word) for word in words]
+        except ValueError:
+            place = []
+        if len(place) != 3 or not np.isfinite(place).all():
+            raise DataError(file, f"line {number} needs: x y z.")
+        places.append(place)
+    if not places:
+        raise DataError(file, "has no places; lines are: x y z.")
+    return np.array(places)
+
+
+def _printed(points: Array, normals: Array, diameter: float, rng: np.random.Generator) -> Marks:
+    axes = [_axes(normal, rng.uniform(0, 2 * np.pi)) for normal in normals]
+    prints = [_print(rng) for _ in points]
     side = PRINT_CELLS * CELL_TEXELS
     return Marks(
-        centers=points[chosen].reshape(-1, 3),
+        centers=points.reshape(-1, 3),
         axes=np.array(axes, np.float64).reshape(-1, 3, 3),
         radius=0.5 * diameter,
         print_atlas=np.concatenate([np.zeros((side, 0), np.float32), *prints], axis=1),

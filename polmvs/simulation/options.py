@@ -122,6 +122,11 @@ class ObjectOptions(OptionGroup, group="object"):
     mark_size: float = option(
         0.06, "diameter of a mark as a share of the object's size", above=0, most=0.5
     )
+    mark_places: Path | None = option(
+        None,
+        "text file of the marks' places, lines 'x y z' in metres, in the object's frame, instead "
+        "of `object.marks` evenly spread ones",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
