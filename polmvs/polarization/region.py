@@ -31,6 +31,8 @@ class RegionTolerances:
     max_growth_rounds : Guess.
     mark_area_px : holes of up to this area are filled whatever they show (printed marks).
         Guess.
+    gap_px : width of a gap between a hole and the background that does not open it: a mark's
+        margin beside an outline. Derived: twice the smoothing, which widens both.
     mark_reach_px : marks are told from the mean intensity of the surface about them; deviation of
         the window. Guess.
     min_phase_jump : change of (cos 2 phase, sin 2 phase) per px that counts as a crease; the
@@ -46,6 +48,7 @@ class RegionTolerances:
     growth_px: float = 15.0
     max_growth_rounds: int = 6
     mark_area_px: float = 1500.0
+    gap_px: int = 4
     mark_reach_px: float = 8.0
     min_phase_jump: float = 0.12
     reference_area_px: float = 612.0 * 512.0
@@ -202,7 +205,17 @@ def _substantial(
 
 
 def _fill_holes(mask: Mask, texture: Image, *, tolerances: RegionTolerances) -> Mask:
-    """Fill holes that are small or show no texture."""
+    """Fill holes that are small or show no texture, also those that a narrow gap opens."""
+    filled = mask | _holes(mask, texture, tolerances=tolerances)
+    size = np.ones((tolerances.gap_px + 1, tolerances.gap_px + 1), np.uint8)
+    without_gaps = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_CLOSE, size) > 0
+    opened = _holes(without_gaps, texture, tolerances=tolerances)
+    # Closing gaps has taken the margin of such a hole as well.
+    return filled | opened | (without_gaps & grow_mask(opened, tolerances.gap_px // 2))
+
+
+def _holes(mask: Mask, texture: Image, *, tolerances: RegionTolerances) -> Mask:
+    """Holes of a mask that are small or show no texture."""
     num, labels, stats, _ = cv2.connectedComponentsWithStats(
         (~mask).astype(np.uint8), connectivity=4
     )
@@ -218,7 +231,7 @@ def _fill_holes(mask: Mask, texture: Image, *, tolerances: RegionTolerances) -> 
     flat = np.bincount(labels.ravel(), (texture < tolerances.low_texture).ravel(), minlength=num)
     fill = closed & ((area <= tolerances.mark_area_px) | (flat > 0.7 * area))
     fill[0] = False
-    return np.asarray(mask | fill[labels])
+    return np.asarray(fill[labels])
 
 
 def _marks(s0: Image, polarized: Mask, reach_px: float) -> Mask:

@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from polmvs.camera import sample_image
 from polmvs.polarization.phase_map import PhaseMap
+from polmvs.polarization.region import RegionTolerances
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX, Silhouette, signed_distance_px
 
 Array = NDArray[np.float64]
@@ -34,6 +35,8 @@ class SilhouetteTolerances:
     min_piece_px : least area of a piece of the region, and of a hole in it: smaller ones are marks.
         Guess.
     closing_px : width of gaps that are closed. Guess.
+    mark_area_px : greatest area of what lies between an object and the image's border and is
+        unknown: it may be a mark that the border cuts. That of the region's.
     near_px : reach of the continuation in pixels that resemble the region a little. Measured with
         the next two on an analytic vase: both factors of two within 0.07 points of F at 1 mm.
     far_px : reach in pixels that resemble it much: the inside of a mug is 60 px across.
@@ -49,6 +52,7 @@ class SilhouetteTolerances:
 
     min_piece_px: int = 60
     closing_px: int = 5
+    mark_area_px: float = RegionTolerances.mark_area_px
     near_px: int = 10
     far_px: int = 40
     object_quantile: float = 0.85
@@ -81,6 +85,7 @@ def find_silhouette(
         return Silhouette(certain, certain)
     intensity = np.asarray(phase_map.intensity, np.float32)
     possible = _continued(certain, intensity, scale, tol)
+    possible = possible | _cut_by_the_border(possible, tol.mark_area_px * scale**2)
     inner = _outline_shift(certain, intensity, scale, tol)
     sharp = bool((possible == certain).all())
     outer = inner if sharp else _outline_shift(possible, intensity, scale, tol)
@@ -103,6 +108,11 @@ def _without_small(mask: Mask, min_area: float, *, connectivity: int) -> Mask:
     kept = stats[:, cv2.CC_STAT_AREA] >= min_area
     kept[0] = False
     return np.asarray(kept[labels]) if num > 1 else np.zeros(mask.shape, np.bool_)
+
+
+def _cut_by_the_border(mask: Mask, max_area: float) -> Mask:
+    """Small pieces beside a mask that only it and the image's border enclose."""
+    return ~mask & ~_without_small(~mask, max_area, connectivity=4)
 
 
 def _ellipse(radius: int) -> NDArray[np.uint8]:
