@@ -112,7 +112,10 @@ def _without_small(mask: Mask, min_area: float, *, connectivity: int) -> Mask:
 
 def _cut_by_the_border(mask: Mask, max_area: float) -> Mask:
     """Small pieces beside a mask that only it and the image's border enclose."""
-    return ~mask & ~_without_small(~mask, max_area, connectivity=4)
+    small = ~mask & ~_without_small(~mask, max_area, connectivity=4)
+    labels = cv2.connectedComponents(small.astype(np.uint8), connectivity=4)[1]
+    at_border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    return np.isin(labels, at_border[at_border > 0])
 
 
 def _ellipse(radius: int) -> NDArray[np.uint8]:

@@ -46,6 +46,16 @@ def test_a_mark_is_inside_but_not_reliable():
     assert not region.reliable[mark].any()
 
 
+def test_a_mark_that_a_narrow_gap_joins_with_the_background_is_inside():
+    s0, s1, s2, _ = stokes_scene()
+    mark = np.zeros(SHAPE, bool)
+    mark[50:66, 105:121] = True
+    mark[56:60, 121:130] = True  # to the outline
+    mark[50:66:2, 105:121:3] = False
+    s0[mark], s1[mark], s2[mark] = 0.6, 0, 0
+    assert find(s0, s1, s2).inside[50:66, 105:121].all()
+
+
 def test_a_textureless_unpolarized_spot_belongs_to_the_region_without_being_reliable():
     s0, s1, s2, _ = stokes_scene()
     spot = np.zeros(SHAPE, bool)

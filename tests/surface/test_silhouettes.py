@@ -65,6 +65,18 @@ def test_specks_gaps_and_marks_are_cleaned(ball):
     assert (found_silhouette(with_region(ball, inside)).certain == clean).all()
 
 
+def test_what_the_border_of_the_image_and_the_object_enclose_is_unknown(ball):
+    """It may be a mark that the border cuts, or background."""
+    inside = np.zeros_like(ball.region.inside)
+    inside[20:, 30:90] = True
+    inside[-10:, 50:60] = False
+    intensity = np.where(inside, 0.1, 0.6).astype(np.float32)
+    silhouette = found_silhouette(with_region(replace(ball, intensity=intensity), inside))
+    assert silhouette.possible[-10:, 50:60].all()
+    assert not silhouette.certain[-8:, 52:58].any()
+    assert not silhouette.possible[-10:, :25].any()  # all of the background, not a small piece
+
+
 def test_a_large_hole_stays(ball):
     inside = ball.region.inside.copy()
     inside[48:62, 60:72] = False
