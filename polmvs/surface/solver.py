@@ -366,20 +366,23 @@ def _refined_at(
         if step == 0:
             mesh = remeshed(mesh, edge)
             moved = np.zeros(len(mesh.vertices))
-        elif np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge or len(
-            RayScene(mesh).crossed_faces(CROSSED_DEPTH * edge)
+        scene = RayScene(mesh)
+        if step > 0 and (
+            np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge
+            or len(scene.crossed_faces(CROSSED_DEPTH * edge))
         ):
             # No smoothing: the mesh is smooth. The grid loses walls thinner than its cells.
             again = remeshed(mesh, edge, smoothing=0)
             if covered_share(again, fit.views) > covered_share(mesh, fit.views) - REMESHING_LOSS:
                 mesh, moved = again, np.zeros(len(again.vertices))
+                scene = RayScene(mesh)
         if not len(mesh.faces):
             on_progress(total - done - step)
             return mesh, fit
         share = (done + step) / max(total - 1, 1)
         with_vote = step % tol.vote_every == 0 and done + step < total - tol.last_steps
         energy = linearize(
-            mesh,
+            scene,
             fit,
             edge,
             level,
@@ -472,7 +475,7 @@ class Energy:
 
 
 def linearize(
-    mesh: TriangleMesh,
+    scene: RayScene,
     fit: Fit,
     edge: float,
     level: Level,
@@ -486,6 +489,7 @@ def linearize(
 
     Parameters
     ----------
+    scene : of the mesh.
     edge : length of its edges.
     normal_sigma : rad, assumed error of its normals in the labels.
     with_vote : try other normals for the labels, and turn faces towards those that win.
@@ -494,8 +498,8 @@ def linearize(
     sides : of a sharpened mesh, whose very outline is then held against the silhouettes.
     """
     views, tol = fit.views, fit.tol
-    terms = tol.terms
-    scene, edges = RayScene(mesh), shared_edges(mesh)
+    terms, mesh = tol.terms, scene.mesh
+    edges = shared_edges(mesh)
     pairs = edges.faces[:, 0], edges.faces[:, 1]
     observations = observe(
         mesh,
@@ -739,7 +743,9 @@ def polishing_step(mesh: TriangleMesh, fit: Fit, sides: KnownSides) -> tuple[Tri
     The mesh, and whether it has converged.
     """
     tol, edge = fit.tol, mesh.mean_edge
-    energy = linearize(mesh, fit, edge, tol.levels[-1], normal_sigma=tol.annealing[1], sides=sides)
+    energy = linearize(
+        RayScene(mesh), fit, edge, tol.levels[-1], normal_sigma=tol.annealing[1], sides=sides
+    )
     moved, displacement = _step(mesh, energy, edge, tol)
     free = np.abs(displacement[energy.free & ~energy.sharp])
     return moved, not len(free) or float(np.median(free)) < 0.03 * edge
@@ -822,7 +828,9 @@ def place_deviations(
     face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
 
     def energy_of(mesh: TriangleMesh) -> Energy:
-        return linearize(mesh, fit, edge, level, normal_sigma=tol.annealing[1], with_slope=True)
+        return linearize(
+            RayScene(mesh), fit, edge, level, normal_sigma=tol.annealing[1], with_slope=True
+        )
 
     energy = energy_of(mesh)
     for _ in range(POLISHING_STEPS):
