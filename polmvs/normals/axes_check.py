@@ -113,7 +113,7 @@ def check_axes(
     on_parts = tracks_on_parts(tracks, maps)
     chosen = evenly_chosen(len(on_parts.points_in_world), t.max_points)
     some, options = some_tracks(on_parts, chosen), NormalOptions()
-    # Under either light, which a quarter turn of all angles exchanges.
+    # Under both kinds of light, which a rotation of all angles by 90 degrees exchanges.
     readings = [r for way in (AS_MEASURED, *CHANGES) for r in (way, _other_light(way))]
     observed = gather_observations_under(
         readings, AngleModel.PPA, some.points_in_world, maps, window_px=options.window_px
@@ -122,9 +122,9 @@ def check_axes(
     num_rows = (matched & np.isfinite(observed[0].turn_variances[0])).sum(axis=0)
     found = np.stack([solve_mixture(one, matched).log_likelihood for one in observed])
     found /= np.maximum(num_rows, 1)
-    likelihoods = np.maximum(found[::2], found[1::2])  # (ways to count, N), of a row
+    likelihoods = np.maximum(found[::2], found[1::2])  # (conventions, N), of a row
     given, *changed = likelihoods
-    # What no way to count explains has no say.
+    # A point that no convention explains does not vote.
     voting = (num_rows >= t.min_rows) & (np.max(likelihoods, axis=0) > t.min_gain)
     best = AxesCheck(num_votes=int(voting.sum()), share=0.0, change=None)
     most = t.min_gain

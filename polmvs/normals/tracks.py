@@ -30,8 +30,8 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-MAX_SCALE_POINTS = 600  # that tell how far rows are off. Guess: more cost time only
-MAX_ROWS = MemoryNeeds.max_rows  # of points and views together, at a time, without a budget
+MAX_SCALE_POINTS = 600  # points for the scales of the rows. Guess: more cost time only
+MAX_ROWS = MemoryNeeds.max_rows  # rows of points and views at a time, without a budget
 # A region's border is that uncertain, by marks and smoothing: points nearer to it may lie on the
 # background. Guess.
 BORDER_MARGIN_PX = 3
