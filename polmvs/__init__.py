@@ -1,16 +1,16 @@
 """polmvs: multi-view reconstruction of glossy, textureless surfaces from polarization cameras.
 
-Conventions (each is pinned by a test in ``tests/test_conventions.py``)
-------------------------------------------------------------------------
+Conventions (``tests/test_conventions.py`` tests each of them)
+--------------------------------------------------------------
 Camera
     x right, y down, z forward (OpenCV and COLMAP). ``p_in_cam = cam_from_world * p_in_world``.
     A ray ``v`` is unit and leaves the camera, ``v_z > 0``; a visible surface normal has
     ``n . v < 0``. Points and vectors are rows of ``(..., 3)`` arrays.
 Pixels
     COLMAP's: the origin is the corner of the image, so pixel ``(row, col)`` has its centre at
-    ``xy = (col + 0.5, row + 0.5)``. OpenCV counts from pixel centres; the shift lives in
-    :mod:`polmvs.camera` and nowhere else. A 2x2 polarizer cell of the raw mosaic is one pixel of
-    the polarization image: ``K_half[:2] = K_raw[:2] / 2``.
+    ``xy = (col + 0.5, row + 0.5)``. OpenCV counts from pixel centres; only
+    :mod:`polmvs.camera` converts between the two. A 2x2 polarizer cell of the raw mosaic is one
+    pixel of the polarization image: ``K_half[:2] = K_raw[:2] / 2``.
 Polarization
     ``aolp``: direction of greatest transmitted intensity, anticlockwise from +x as displayed,
     modulo pi. ``phase``: direction in which the plane of incidence cuts the image plane, same
@@ -25,7 +25,7 @@ World
 
 Use
 ---
-Importing this is light and changes nothing; what a function needs is imported when it is used::
+The import is quick and has no side effects; a function imports what it needs when it is called::
 
     stokes = polmvs.read_stokes("frame.png")              # .aolp, .dolp, .phase(), .sigma_aolp
     picture = polmvs.aolp_colors(polmvs.read_stokes(array))  # of a frame that a camera's SDK gives
@@ -37,7 +37,7 @@ Importing this is light and changes nothing; what a function needs is imported w
 """
 
 # pycolmap >= 4.1 exports its own deflate symbols: imported before zlib it makes PNG and npz
-# writing abort. Loading zlib first, before anything else of this package, cures it.
+# writing abort. Loading zlib before anything else of this package prevents that.
 import zlib  # noqa: F401
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -86,7 +86,7 @@ __all__ = [
     "track_normals",
 ]
 
-# Where the names are that are not in polmvs.api; each is imported when it is first used.
+# Modules of the public names that are not in polmvs.api; each is imported at its first use.
 _ELSEWHERE = {
     "AngleModel": "polmvs.polarization.kinds",
     "DataError": "polmvs.errors",

@@ -5,7 +5,7 @@ import sys
 
 import polmvs
 
-# Python puts the current directory first: what lies there is data, unless this package does.
+# Python puts the current directory first on its path. It holds data, unless it is this package's.
 if (
     not sys.flags.safe_path
     and sys.path[0] == os.getcwd()

@@ -1,3 +1,3 @@
-"""Version of the package; the one place it is written."""
+"""Version of the package; it is written only here."""
 
 __version__ = "0.2.0"

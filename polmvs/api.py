@@ -1,7 +1,7 @@
-"""The public API: what a notebook needs, as ``polmvs.NAME``.
+"""The public API, as ``polmvs.NAME``, for notebooks and scripts.
 
-Functions take paths and options by name, and give results that read their files when they are
-asked. What they do is imported when they are called.
+Functions take paths and options by name. Results read their files when an attribute is used. The
+modules behind a function are imported when it is called.
 """
 
 from __future__ import annotations
@@ -77,12 +77,12 @@ def read_stokes(
     ----------
     image : raw mosaic of a polarization camera, a file or an array (H, W) as its SDK gives it; or
         a dictionary of images by polarizer angle in degrees, or Stokes images (3, H, W).
-    options : how it is read; defaults where None.
+    options : how to read the image; defaults if None.
     **changes : single options by name instead, such as ``pattern=(90, 45, 135, 0)``.
 
     Returns
     -------
-    ``s0``, ``s1``, ``s2`` (H, W) with ``sigma`` and ``valid``, and what follows from them:
+    ``s0``, ``s1``, ``s2`` (H, W) with ``sigma`` and ``valid``, and what is derived from them:
     ``aolp``, ``dolp``, ``sigma_aolp`` and ``phase(light)``.
 
     Raises
@@ -105,13 +105,13 @@ def read_stokes(
 
 
 def aolp_colors(stokes: Stokes, *, hue: bool = False) -> NDArray[np.uint8]:
-    """The angle of linear polarization as colours, fainter where the degree is under 0.5.
+    """The angle of linear polarization as colours, fainter where the DoLP is below 0.5.
 
     Parameters
     ----------
     stokes : from :func:`read_stokes`.
-    hue : the colours of the rainbow on black, as cameras' viewers and ``polmvs inspect`` show it;
-        else those of the report: twice round the wheel, evenly for the eye, on grey.
+    hue : hue on black, as the viewers of cameras and ``polmvs inspect`` show it; else the colours
+        of the report: perceptually uniform, twice round the colour wheel, on grey.
 
     Returns
     -------
@@ -151,21 +151,21 @@ def plane_normal(
     camera : of the polarization images, or ``fx, fy, cx, cy`` of a pinhole camera, px, COLMAP's
         convention.
     model : angle model.
-    light : reflection that dominates on the plane.
-    mask : (H, W) bool, True on the plane; None where all that is polarized is of it.
+    light : kind of light that dominates on the plane.
+    mask : (H, W) bool, True on the plane; None: all polarized pixels show the plane.
     estimator : weighted robust, or the paper's eigenvector.
     **changes : further options of ``polmvs plane`` by name: ``min_dolp``, ``min_intensity``,
         ``drop_clipped``, ``polygon``.
 
     Returns
     -------
-    ``normal`` (3,), camera frame, facing the camera, with its ``covariance`` (3, 3), whether it is
-    determined (``valid``), and its phase residual.
+    ``normal`` (3,), camera frame, facing the camera; its ``covariance`` (3, 3); ``valid``, whether
+    the pixels determine it; and its phase residual.
 
     Raises
     ------
     DataError
-        Too few pixels count.
+        Too few usable pixels.
     OptionError
         An option is unusable or unknown.
     """
@@ -213,11 +213,11 @@ class TrackNormals:
     point3D_ids : (T,) int64, of the COLMAP model.
     points : (T, 3) float64, world.
     normals : (T, 3) float64, unit, world, facing the cameras; NaN where not valid.
-    valid : (T,) bool, where the views determine a normal.
+    valid : (T,) bool, True where the views determine a normal.
     sigma_deg : (T,) larger standard deviation of the normal, degrees.
     residual : (T,) sine of the angle between normal and planes of incidence.
     num_views : (T,) int64, views that see the point.
-    angle_model : of the normals.
+    angle_model : angle model of the normals.
     """
 
     point3D_ids: NDArray[np.int64]
@@ -251,7 +251,7 @@ def track_normals(
     capture : folder of the raw images.
     sparse : folder of a COLMAP model of the same images, or the model itself.
     model : angle model.
-    options : of all stages; ``capture``, ``region`` and ``normals`` count. Defaults where None.
+    options : of all stages; only ``capture``, ``region`` and ``normals`` count. Defaults if None.
     workers : processes, as in :func:`reconstruct`.
     **changes : single options by name, such as ``min_dolp=0.2``.
 
@@ -314,12 +314,12 @@ def _fitted(capture: Any, sparse: Any) -> SparseModel:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reconstruction:
-    """What one angle model came to in a run; its files are read when they are asked for.
+    """Result of one angle model in a run; its files are read when an attribute is used.
 
     Attributes
     ----------
-    folder : of the run.
-    angle_model : of this result.
+    folder : folder of the run.
+    angle_model : angle model of this result.
     """
 
     folder: Path
@@ -336,21 +336,21 @@ class Reconstruction:
 
     @property
     def is_metric(self) -> bool:
-        """Whether a reference that was given makes metres of the unit."""
+        """Whether the unit is metres, by a given reference."""
         from polmvs.pipeline.stages.poses import PosesResult
 
         return self.record.result(PosesResult).is_metric
 
     @property
     def trust(self) -> Trust | None:
-        """What the result says about itself without any truth; None where no stage measured it."""
+        """Quality checks without ground truth; None if no stage measured them."""
         from polmvs.evaluation.trust import Trust
 
         return self.record.find(Trust, self.angle_model)
 
     @cached_property
     def record(self) -> Record:
-        """The record of the run: its options, and its stages with what they found."""
+        """The record of the run: its options, and its stages with their results."""
         from polmvs.pipeline.runner import load_record
 
         return load_record(self._run_folder)
@@ -365,7 +365,7 @@ class Reconstruction:
 
         Parameters
         ----------
-        surroundings : with the points beside the polarized surfaces, whose normals are zero.
+        surroundings : include the points of the surroundings, whose normals are zero.
         """
         from polmvs.scene import PointKind
 
@@ -380,7 +380,7 @@ class Reconstruction:
         Raises
         ------
         DataError
-            The run made none: options said so, or the cloud has too few points.
+            The run made no mesh: its options exclude it, or the cloud has too few points.
         """
         path = self._run_folder.mesh(self.angle_model)
         if not path.is_file():
@@ -421,7 +421,7 @@ class Reconstruction:
 
     @cached_property
     def metrics(self) -> ModelFigures:
-        """How well the result fits its own images and, where there is one, the ground truth."""
+        """How well the result fits its images and, if there is one, the ground truth."""
         from polmvs.pipeline.jobs import measure
 
         return measure(self._run_folder, (self.angle_model,)).models[self.angle_model]
@@ -480,7 +480,7 @@ class RunResult:
     Attributes
     ----------
     folder : of the run.
-    models : the results by angle model.
+    models : results by angle model.
     """
 
     folder: Path
@@ -508,7 +508,7 @@ class RunResult:
         return measure(run_folder, tuple(self.models))
 
     def table(self) -> str:
-        """The figures, a column for each model, in Markdown."""
+        """The metrics as a Markdown table with one column for each model."""
         return self.metrics.table()
 
 
@@ -530,15 +530,15 @@ def reconstruct(
     Parameters
     ----------
     capture : folder of the raw images; or frames as :func:`read_stokes` takes them, by name or in
-        order, which are kept beside the run, in ``OUT_frames``.
+        order. Frames are stored beside the run, in ``OUT_frames``.
     out : run folder, a new one.
     model : angle model.
     options : of all stages; defaults where None.
-    overwrite, resume : delete an earlier run in ``out`` first, or go on with it.
-    workers : processes; one for each core where None. They run the script again, so that with
-        more than one it needs ``if __name__ == "__main__":``.
+    overwrite, resume : delete an earlier run in ``out`` first, or continue it.
+    workers : number of processes; None: one for each core. Each process runs the script again, so
+        with more than one the script needs ``if __name__ == "__main__":``.
     scheduler : address of a Dask scheduler, whose workers do the per-view work instead.
-    monitor : who follows the run, if anybody.
+    monitor : receives the progress of the run, if given.
     **changes : single options by name, such as ``intrinsics=(fx, fy, cx, cy)``.
 
     Raises
@@ -617,7 +617,7 @@ def simulate(
     material, light : presets.
     cameras : COLMAP model or file of poses in metres, instead of a path.
     options : all options; defaults where None.
-    overwrite, resume : what is done where there is an earlier capture in ``out``.
+    overwrite, resume : delete an earlier capture in ``out`` first, or continue it.
     on_progress : called with 1 after each view.
     **changes : single options by their names, as on the command line: ``views=20``.
 
@@ -689,7 +689,7 @@ def _job(
             path
         ):  # which would be the current directory
             raise ValueError(f"{name}={path!r} is no path.")
-    if resume and options is None:  # those of the run, as the command line does
+    if resume and options is None:  # the options of the run, as on the command line
         options = options_from_plain(read_options(RunFolder(Path(out))), str(out))
     chosen = change_options(options, changes)
     if not isinstance(capture, str | PathLike):
@@ -709,7 +709,7 @@ def _kept_frames(
 ) -> tuple[Path, Options]:
     """Frames as a capture beside a run, and the options that it is read with.
 
-    Frames that are there are replaced by ``overwrite`` alone: a run that goes on has the same.
+    Only ``overwrite`` replaces existing frames: a run that is continued has the same frames.
     """
     if not are_frames(frames):
         raise OptionError("needs a folder, or frames by name or in order.", field="capture")
@@ -729,7 +729,7 @@ def _run_options(workers: int | None, **given: Any) -> RunOptions:
 
 @contextmanager
 def _lost_workers_told(num: int) -> Iterator[None]:
-    """What to do where ``num`` processes end before their work is done, as an OptionError."""
+    """Raise an OptionError with the remedy if any of ``num`` processes ends before its work."""
     from concurrent.futures.process import BrokenProcessPool
 
     try:
@@ -750,8 +750,8 @@ def change_options(options: Options | None, changes: Mapping[str, Any]) -> Optio
 
     Parameters
     ----------
-    options : to start from; defaults where None.
-    changes : values by the option's name, which no two groups share.
+    options : to start from; defaults if None.
+    changes : values by option name; no two groups share a name.
 
     Raises
     ------
@@ -780,7 +780,7 @@ def _with_changes(options: Groups, changes: Mapping[str, Any]) -> Groups:
 
 
 def _given(cls: type[T], options: T | None) -> T:
-    """Options that a caller gave, or the defaults; OptionError where they are something else."""
+    """Options that a caller gave, or the defaults; OptionError for another type."""
     if options is not None and not isinstance(options, cls):
         raise OptionError(
             f"must be {cls.__name__}, not {type(options).__name__}; single options are given by "

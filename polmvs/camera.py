@@ -1,4 +1,4 @@
-"""Cameras and posed views: rays, projection and the one place of the half-pixel shift.
+"""Cameras: rays, projection, and the conversion to OpenCV's pixel origin.
 
 OpenCV counts pixels from their centres, COLMAP from the corner of the image. This is the only
 file that converts between the two; all other code uses COLMAP's and calls
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from polmvs.arrays import Array
 
 MAX_OPENCV_COORDINATE = 32000.0  # of cv2.remap, px
-MAX_SIDE = 1 << 16  # of an image, px: a JPEG has no larger one; more is damage
+MAX_SIDE = 1 << 16  # largest side of an image, px, as in a JPEG; a larger value is damage
 OUTSIDE = np.float32(-10.0)
 
 
@@ -101,7 +101,7 @@ def depth_buffer(
 
 
 class Camera(Protocol):
-    """What the rest of the package needs of a camera: rays of pixels and pixels of points."""
+    """Interface of a camera: rays of pixels and pixels of points."""
 
     @property
     def width(self) -> int:
@@ -133,11 +133,11 @@ def in_frame(
 ) -> NDArray[np.bool_]:
     """Whether coordinates ``(..., 2)`` lie in an image, its border included; not where NaN.
 
-    Column by column, in a tenth of the time of a test along rows.
+    It tests column by column, ten times as fast as row by row.
 
     Parameters
     ----------
-    margin_px : so much smaller on each side.
+    margin_px : width of a margin to exclude on each side.
     """
     x, y = xy[..., 0], xy[..., 1]
     across = (x >= margin_px) & (x <= width - margin_px)

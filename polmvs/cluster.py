@@ -1,15 +1,14 @@
 """Work on a ``dask.distributed`` cluster behind the interface of an executor.
 
-The cluster is the user's: a scheduler and its workers, on any machines, that see the same storage
-under the same paths and run the same versions. All of that is checked before work starts. Lost
-workers are Dask's to replace; what a lost scheduler has forgotten is submitted again to the one
-that follows it at the same address. Tasks are safe to repeat: each depends on its arguments alone
-and writes its files whole.
+The user provides the cluster: a scheduler and its workers, on any machines that see the same
+storage under the same paths and run the same versions. All of this is checked before work starts.
+Dask replaces lost workers. If the scheduler is lost, the unfinished tasks are submitted again to
+its successor at the same address. Tasks are safe to repeat: each depends on its arguments alone and
+writes its files whole.
 
-Tasks and results are pickled, as Dask does with all that it moves: whoever runs the scheduler or a
-worker can run code in this program, and whoever reaches the scheduler can run code on the workers.
-An address ``tcp://`` is for a network of which all machines are trusted; ``tls://`` asks both sides
-for certificates.
+Dask pickles tasks and results: whoever runs the scheduler or a worker can run code in this program,
+and whoever reaches the scheduler can run code on the workers. An address ``tcp://`` is for a
+network of trusted machines; with ``tls://`` both sides need certificates.
 """
 
 from __future__ import annotations
@@ -32,19 +31,19 @@ from polmvs.errors import DataError, OptionError
 from polmvs.threads import keep_to_one_core
 
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "pycolmap")
-SCATTERED_BYTES = 100_000  # of arguments, from which they do not pass through the scheduler's graph
+SCATTERED_BYTES = 100_000  # size of arguments above which they bypass the scheduler's graph
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClusterPatience:
-    """Seconds and repetitions that a cluster is given.
+    """Time limits, in seconds, and numbers of repetitions for a cluster.
 
     Attributes
     ----------
     connect_s : for the scheduler to answer. A guess.
-    workers_s : for the first worker to come. A guess.
-    return_s : for a lost scheduler to be there again. A guess: longer than a restart by hand.
-    max_losses : of the scheduler during one map; a guess.
+    workers_s : for the first worker to connect. A guess.
+    return_s : for a lost scheduler to return. A guess: longer than a restart by hand.
+    max_losses : losses of the scheduler during one map; a guess.
     """
 
     connect_s: float = 10.0
@@ -55,12 +54,12 @@ class ClusterPatience:
 
 @dataclass(frozen=True, kw_only=True)
 class TlsFiles:
-    """What this program shows to a scheduler at ``tls://``, and asks of it. PEM files.
+    """Certificates for a scheduler at ``tls://``, PEM files.
 
     Attributes
     ----------
-    ca : certificate that all others are signed by.
-    cert, key : of this program.
+    ca : certificate that signs all others.
+    cert, key : certificate and key of this program.
     """
 
     ca: Path
@@ -69,7 +68,7 @@ class TlsFiles:
 
     @classmethod
     def of(cls, options: RunOptions) -> TlsFiles | None:
-        """Those of a run; without any Dask's own configuration holds."""
+        """Those of a run; without any, Dask's own configuration is used."""
         if options.tls_ca is None or options.tls_cert is None or options.tls_key is None:
             return None
         return cls(ca=options.tls_ca, cert=options.tls_cert, key=options.tls_key)
@@ -81,10 +80,10 @@ class Cluster:
     Parameters
     ----------
     address : of the scheduler, such as ``tcp://10.0.0.1:8786``.
-    storage : folders that every worker must see under the same path; written to for a moment.
+    storage : folders that every worker must see under the same path; a test file is written there.
     sources : files and folders that every worker must be able to read.
-    tls : of an encrypted connection; None for what Dask's own configuration says.
-    patience : see there.
+    tls : certificates of an encrypted connection; None for Dask's own configuration.
+    patience : time limits.
 
     Raises
     ------
@@ -120,7 +119,7 @@ class Cluster:
 
     @property
     def num_threads(self) -> int:
-        """Tasks that the workers of now do at a time."""
+        """Number of tasks that the current workers run at a time."""
         return sum(self._client.nthreads().values())
 
     def result(
@@ -130,12 +129,12 @@ class Cluster:
         futures: list[Any],
         index: int,
     ) -> Any:
-        """Result of a task, as the workers' interface asks for it.
+        """Result of a task; part of the interface of workers.
 
         Raises
         ------
         DataError
-            The task cost several workers their lives, or the scheduler does not come back.
+            Several workers died during the task, or the scheduler does not return.
         """
         from distributed import KilledWorker
 
@@ -170,7 +169,7 @@ class Cluster:
         self._client.close()
 
     def submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Any:
-        """One task; large arguments go to the workers past the scheduler's graph."""
+        """Submit a task; large arguments go to the workers, not through the scheduler's graph."""
         import cloudpickle  # comes with Dask; a script's own functions travel whole
 
         packed = cloudpickle.dumps((function, task))
@@ -264,12 +263,12 @@ class Cluster:
 
 @lru_cache(maxsize=1)
 def own_versions() -> dict[str, str]:
-    """Versions that decide a task's result."""
+    """Versions on which the result of a task depends."""
     return installed_versions(PACKAGES)
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
-    """Versions of this package and of others by their names, "unknown" of what is missing."""
+    """Versions of this package and of others by name; "unknown" if one is missing."""
     found = {"polmvs": __version__}
     for name in packages:
         try:

@@ -1,7 +1,7 @@
-"""Errors that a user can act on; the command turns each into one line and an exit status.
+"""Errors that a user can act on; a command turns each into one line and an exit status.
 
-A message names an option by its path between backquotes, as in "Give `run.overwrite`.": the
-command line puts the flag in its place, a notebook sees the field.
+A message names an option by its path between backquotes, as in "Give `run.overwrite`.". The
+command line replaces the path by the flag; a notebook shows the path.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ MAX_QUOTED = 120  # of these, of words that are a file's or another library's
 _ACTED_ON = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-# What polmvs.io.temporary puts before the name that a file is to have in the end.
+# Prefix of polmvs.io.temporary before the final name of a file.
 _UNFINISHED = re.compile(r"\.polmvs-[0-9a-f]{16}-\d+-\d+-")
 
 
 def printable(text: object, *, keep: str = "") -> str:
-    r"""Text as it may be shown: what a terminal would act on is written out, as in ``\x1b[31m``.
+    r"""Text that is safe to show: control characters are escaped, as in ``\x1b[31m``.
 
     Parameters
     ----------
     text : such as a path; names of files may hold anything.
-    keep : characters that stay, such as a newline where the text has lines.
+    keep : characters that are not escaped, such as a newline.
     """
     return _ACTED_ON.sub(lambda found: _written_out(found[0], keep), str(text))
 
 
 def final_name(path: object) -> str:
-    """A path with the names that a user knows, in place of those of unfinished files."""
+    """A path with final names instead of the temporary names of unfinished files."""
     return _UNFINISHED.sub("", str(path))
 
 
@@ -46,7 +46,7 @@ def _written_out(character: str, keep: str) -> str:
 
 
 class PolmvsError(Exception):
-    """A run cannot go on; the message is one line that says why and what to do."""
+    """A run cannot continue; the message is one line with the reason and the remedy."""
 
     exit_status: ClassVar[int] = 1
 
@@ -102,12 +102,12 @@ class OptionError(PolmvsError):
 
 @contextmanager
 def as_data_error(path: str | PathLike[str], done: str) -> Iterator[None]:
-    """Name the file or folder that the system refuses: it cannot be read, or whatever is done.
+    """Turn an ``OSError`` into a DataError that names the file or folder and the failed action.
 
     Raises
     ------
     DataError
-        In place of an ``OSError`` from within.
+        In place of an ``OSError`` in the block.
     """
     try:
         yield
@@ -116,7 +116,7 @@ def as_data_error(path: str | PathLike[str], done: str) -> Iterator[None]:
 
 
 def _short(text: str) -> str:
-    """A text without its middle where a file names or quotes something far too long."""
+    """A text with its middle cut out if it is far too long."""
     if len(text) <= MAX_SHOWN:
         return text
     half = MAX_SHOWN // 2

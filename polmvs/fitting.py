@@ -1,4 +1,4 @@
-"""Robust weights and thresholds that several fits share."""
+"""Robust weights and thresholds that several fits use."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BEYOND_CHANCE = 4.0
 
 
 def cauchy_weights(squares: Floats, scale: float | Floats = CAUCHY_SCALE) -> Floats:
-    """Weights of least squares that stand for a Cauchy loss, 1 at 0.
+    """Least-squares weights of a Cauchy loss, 1 at 0.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def cauchy_weights(squares: Floats, scale: float | Floats = CAUCHY_SCALE) -> Flo
 
 
 def geman_mcclure_weights(residuals: Array, square: float | Array) -> Array:
-    """Weights of least squares that stand for a loss of Geman and McClure (1985), 1 at 0.
+    """Least-squares weights of the loss of Geman and McClure (1985), 1 at 0.
 
     Parameters
     ----------
@@ -43,9 +43,9 @@ def geman_mcclure_weights(residuals: Array, square: float | Array) -> Array:
 def annealed_scales(
     num_rounds: int, *, num_final: int = 3, last: float = CAUCHY_SCALE
 ) -> Iterator[float]:
-    """Scales of a Cauchy loss for the rounds of a fit: wide first, halved down to the final one.
+    """Scales of a Cauchy loss for the rounds of a fit: wide first, then halved down to the last.
 
-    A wide loss is nearly convex and lets the fit find the place that most data agree on.
+    A wide loss is nearly convex, so the fit finds the minimum on which most data agree.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def annealed_scales(
 
 
 def robust_deviation(residuals: Floats) -> float:
-    """Standard deviation of residuals about 0, from their median size; NaN of none."""
+    """Standard deviation of residuals about 0, from their median absolute value; NaN of none."""
     return float(np.median(np.abs(residuals))) / MEDIAN_OF_NORMAL if len(residuals) else np.nan
 
 
@@ -67,7 +67,7 @@ def like_most(residuals: Floats, *, floor: float, ceiling: float = np.inf) -> Ma
 
     Parameters
     ----------
-    floor, ceiling : a residual under the one always is, above the other it never is.
+    floor, ceiling : a residual below ``floor`` always is, one above ``ceiling`` never is.
     """
     limit = np.clip(OUTLIER_RATIO * np.median(residuals), floor, ceiling)
     return np.asarray(residuals <= limit, np.bool_)

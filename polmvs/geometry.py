@@ -29,14 +29,14 @@ def lengths(vectors: NDArray[Float]) -> NDArray[Float]:
 
 
 def unit(vectors: ArrayLike) -> Array:
-    """Vectors ``(..., 3)`` scaled to unit length; NaN where they have none."""
+    """Vectors ``(..., 3)`` scaled to unit length; NaN for zero vectors."""
     array = np.asarray(vectors, np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(array / np.linalg.norm(array, axis=-1, keepdims=True))
 
 
 def unit_or_zero(vectors: NDArray[Float]) -> NDArray[Float]:
-    """Vectors ``(..., D)`` scaled to unit length; 0 where they have none."""
+    """Vectors ``(..., D)`` scaled to unit length; 0 for zero vectors."""
     return np.asarray(vectors / np.maximum(lengths(vectors)[..., None], 1e-300))
 
 
@@ -48,9 +48,9 @@ def points_on_rays(
 
 
 def nearest_rotation(matrix: Array) -> Array | None:
-    """The rotation ``(3, 3)`` nearest to a matrix that is one up to a text file's rounding.
+    """The rotation ``(3, 3)`` nearest to a matrix, which may have the rounding of a text file.
 
-    None where it is none: not finite, not orthonormal to 1e-3, or a mirror.
+    None if the matrix is not finite, not orthonormal to 1e-3, or a reflection.
     """
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return None
@@ -106,7 +106,7 @@ class SimilarityTransform:
         return self.scale * (np.asarray(points, np.float64) @ self.rotation.T) + self.translation
 
     def pose(self, cam_from_source: RigidTransform) -> RigidTransform:
-        """``cam_from_target`` of a camera of the source; its frame takes the target's unit."""
+        """``cam_from_target`` of a camera in the source; its frame gets the target's unit."""
         rotation = cam_from_source.rotation @ self.rotation.T
         translation = self.scale * cam_from_source.translation - rotation @ self.translation
         return RigidTransform(rotation, translation)

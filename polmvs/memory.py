@@ -1,7 +1,7 @@
-"""Memory and processor time: what a run's processes took, and what a budget allows.
+"""Memory and CPU time: what the processes of a run used, and what a budget allows.
 
-The kernel keeps the largest resident memory of each process (``VmHWM``), which can be set back, so
-that the peak of one stage is told from that of those before. Only Linux tells it.
+The kernel keeps the largest resident memory of each process (``VmHWM``). Resetting it gives the
+peak of one stage alone. Only Linux has it.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ RESET_PEAK = "5"  # see proc(5), clear_refs
 
 @dataclass(frozen=True, kw_only=True)
 class MemoryNeeds:
-    """What a process of a run takes.
+    """Memory that a process of a run takes.
 
     Attributes
     ----------
     process_mb : with its libraries. Measured on Linux with Open3D not loaded.
-    bytes_per_px : of the polarization image that a process is at work on, all its Stokes images,
+    bytes_per_px : of the current polarization image of a process: all its Stokes images,
         masks and smoothed copies. Measured with 0.3 and 1.3 million pixels.
     bytes_per_row : of points and views that normals are solved from. Derived: rows and rays of
         two kinds of light, in single precision, and as much again in the solver.
-    max_rows : that are solved at a time where the budget leaves more; more hardly saves time.
+    max_rows : rows solved at a time if the budget allows more; more hardly saves time.
     """
 
     process_mb: float = 170.0
@@ -44,8 +44,8 @@ class MemoryPlan:
 
     Attributes
     ----------
-    num_workers : processes that share the views; one: the run's own does all.
-    max_rows : of points and views that normals are solved from at a time.
+    num_workers : processes that share the views; 1: the run's own process does all of them.
+    max_rows : rows of points and views from which normals are solved at a time.
     """
 
     num_workers: int
@@ -79,7 +79,7 @@ def plan_memory(
             f"{least_mb / 1e3:.2f} GB. Give more, or smaller images (`capture.resolution` half).",
             field="run.memory",
         )
-    # With workers the run's own process waits, and solves when they are done.
+    # The run's own process waits for the workers, then solves.
     fitting = int(left_mb / least_mb)
     max_rows = int((left_mb + view_mb) * 1e6 / needs.bytes_per_row)
     return MemoryPlan(
@@ -89,10 +89,10 @@ def plan_memory(
 
 
 class PeakMemory:
-    """Largest resident memory of a run's processes from now on, summed.
+    """Sum of the largest resident memory of a run's processes from now on.
 
-    An upper bound: the processes need not have had their peaks at the same time, and what they
-    share counts for each. Where the system cannot set a peak back it is that since the start.
+    This is an upper bound: the peaks need not coincide, and shared memory counts for each process.
+    If the system cannot reset a peak, it is the peak since the start.
     """
 
     def __init__(self) -> None:
@@ -111,9 +111,9 @@ class PeakMemory:
 
 
 def cpu_seconds() -> float:
-    """Processor time so far of this process, its workers, and children that have ended.
+    """CPU time so far of this process, its workers and its ended children, seconds, all cores.
 
-    Of living workers only Linux tells it. Seconds, of all cores together.
+    Only Linux gives the time of workers that still run.
     """
     total = sum(os.times()[:4])
     for pid in _living():
@@ -139,7 +139,7 @@ def _own_peak_mb() -> float:
 
 
 def _largest_ended_mb() -> float:
-    """Of the processes that this one has started and seen end, the largest."""
+    """Largest peak of the ended children of this process, MB."""
     return _rusage_mb("RUSAGE_CHILDREN")
 
 
@@ -153,7 +153,7 @@ def _rusage_mb(who: str) -> float:
 
 
 def _peak_mb(pid: int) -> float:
-    """High-water mark of a process, MB; 0 where the system does not tell."""
+    """Peak memory of a process, MB; 0 if the system does not provide it."""
     try:
         status = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace")
     except OSError:

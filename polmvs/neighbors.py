@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 from polmvs.arrays import Array
 
 _AXIS_BITS = 21
-NUM_NEIGHBORS = 8  # by which the density about a point is told; a guess
-LONE_SPACINGS = 4.0  # the usual one: a point with a larger one is an outlier; a guess
-_SHIFT = 0.37  # surfaces like to lie at round coordinates: shifted voxels do not split them in two
+NUM_NEIGHBORS = 8  # neighbours from which the density about a point is estimated; a guess
+LONE_SPACINGS = 4.0  # of the usual spacing: a point with a larger one is an outlier; a guess
+_SHIFT = 0.37  # surfaces often have round coordinates: shifted voxels do not split them in two
 
 
 def voxel_of_each(points: Array, side: float) -> NDArray[np.intp]:
@@ -27,7 +27,7 @@ def voxel_of_each(points: Array, side: float) -> NDArray[np.intp]:
 
 
 def voxel_representatives(points: Array, side: float) -> NDArray[np.intp]:
-    """Indices of one point per occupied voxel, the nearest to the voxel's centre, in order.
+    """Indices of the point nearest to the centre of each occupied voxel, in ascending order.
 
     Parameters
     ----------
@@ -44,27 +44,27 @@ def voxel_representatives(points: Array, side: float) -> NDArray[np.intp]:
 
 
 def point_spacings(points: Array) -> Array:
-    """Distance ``(N,)`` between points ``(N, 3)`` of a surface as their density about each tells.
+    """Spacing ``(N,)`` of points ``(N, 3)`` of a surface, from their local density.
 
-    The side of the square that each point would have to itself; the nearest neighbour alone
-    would be that of a pair that noise has brought together.
+    It is the side of the square that each point has to itself. The distance to the nearest
+    neighbour would be too small where noise brings two points together.
     """
     k = min(NUM_NEIGHBORS, len(points) - 1)
     radius = cKDTree(points).query(points, k=[k + 1], workers=-1)[0][:, 0]
-    # The disc to the k-th neighbour holds it by half, k - 1 others and the point itself.
+    # The disc up to the k-th neighbour holds half of it, k - 1 others and the point itself.
     return np.asarray(radius * np.sqrt(np.pi / (k + 0.5)), np.float64)
 
 
 def are_usual(spacings: Array) -> NDArray[np.bool_]:
-    """Which points ``(N,)`` are not far from their neighbours, by the spacing usual among them."""
+    """Which points ``(N,)`` are not far from their neighbours, compared with the usual spacing."""
     return np.asarray(spacings <= LONE_SPACINGS * np.median(spacings), np.bool_)
 
 
 def in_cells_beside(points: Array, others: Array, side: float) -> NDArray[np.bool_]:
-    """Whether a point's cell of the given side, or one of its 26 neighbours, holds an other.
+    """Whether the cell of a point, or one of its 26 neighbours, holds one of the others.
 
-    True within ``side`` of an other and false beyond ``2 sqrt(3) side``, for ``(N, 3)`` points
-    and ``(M, 3)`` others.
+    True within ``side`` of one of the others and False beyond ``2 sqrt(3) side``, for ``(N, 3)``
+    points and ``(M, 3)`` others.
     """
     occupied = others[voxel_representatives(others, side)]
     steps = np.stack(np.meshgrid(*3 * [np.arange(-1.0, 2.0)]), axis=-1).reshape(-1, 1, 3)
@@ -78,16 +78,16 @@ def in_cells_beside(points: Array, others: Array, side: float) -> NDArray[np.boo
 def nearest_points(points: Array, queries: Array, *, far: float) -> tuple[Array, NDArray[np.intp]]:
     """Nearest point of each query; exact within ``far``, beyond it among a thinned sampling.
 
-    A search from afar has to look at a large part of a surface, since all of it is about as
-    near; a few floaters would otherwise take most of the time.
+    An exact search from far away visits a large part of the surface, since all of it is about
+    equally near. A few far outliers would take most of the time.
 
     Parameters
     ----------
     points : (N, 3)
     queries : (M, 3)
-    far : distance from which the search is coarse, among points about ``far / 5`` apart. There
-        the distance found is too long by ``0.35 far`` at the very most, by ``0.02 far`` from a
-        point above a surface.
+    far : distance beyond which the search is coarse, among points about ``far / 5`` apart. There
+        the distance is too long by at most ``0.35 far``, and by ``0.02 far`` for a point above a
+        surface.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def nearest_points(points: Array, queries: Array, *, far: float) -> tuple[Array,
 
 
 def _query(points: Array, queries: Array, bound: float) -> tuple[Array, NDArray[np.intp]]:
-    # Neighbours in a row visit the same leaves while these are in the cache: 3 times faster.
+    # Consecutive neighbours visit the same leaves, which are in the cache: 3 times faster.
     cell = max(float(np.median(np.ptp(points, axis=0))), 1e-12) / 100.0
     order = np.argsort(_cell_keys(np.floor(queries * (1.0 / cell))))
     # The sliding midpoint tree is built several times faster than the balanced one.

@@ -1,12 +1,12 @@
-"""One interface to parallel work over views, with three backends of the same results.
+"""One interface to parallel work over views, with three backends that give the same results.
 
-This process itself; processes on this machine; and a ``dask.distributed`` cluster
-(:mod:`polmvs.cluster`). What is given to :meth:`Workers.map` depends on its arguments alone and
-writes its files whole, so that it may be done anywhere, and again.
+The backends are this process, processes on this machine, and a ``dask.distributed`` cluster
+(:mod:`polmvs.cluster`). A function given to :meth:`Workers.map` depends only on its arguments and
+writes its files whole, so it may run anywhere and again.
 
-On one machine processes rather than threads: the sparse solver and many small array operations
-hold Python's lock. They are spawned, not forked, because forking after OpenCV, OpenBLAS and COLMAP
-have started threads may hang.
+On one machine polmvs uses processes and not threads: the sparse solver and many small array
+operations hold Python's lock. They are spawned, not forked, because a fork after OpenCV, OpenBLAS
+and COLMAP have started threads may hang.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ POSIX = hasattr(signal, "pthread_sigmask")
 
 
 def no_progress(count: int) -> None:
-    """Nobody is told of the steps."""
+    """Ignore the progress."""
 
 
 def no_step(name: str) -> None:
-    """Nobody is told of the step that begins."""
+    """Ignore the step that begins."""
 
 
 class Backend(Protocol):
-    """Where work is done that is handed over."""
+    """Where submitted tasks run."""
 
     def submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Any:
-        """Hand over a task; what stands for its result."""
+        """Submit a task; return a handle of its result."""
 
     def result(
         self,
@@ -60,22 +60,22 @@ class Backend(Protocol):
         futures: list[Any],
         index: int,
     ) -> Any:
-        """Result of a task, of all that were submitted in order; lost ones are submitted again."""
+        """Result of a task of those submitted, in order; lost tasks are submitted again."""
 
     def close(self, *, cancel: bool) -> None:
-        """End what is under way, with ``cancel`` before its end; a later map begins anew."""
+        """Finish the running tasks, or cancel them with ``cancel``; a later map starts anew."""
 
 
 class Workers:
-    """Who does parallel work.
+    """The workers that run tasks in parallel.
 
     Functions and arguments given to :meth:`map` must be picklable. As with any spawned process, a
     script that asks for more than one worker needs ``if __name__ == "__main__":``.
 
     Parameters
     ----------
-    num : processes, started at the first use; one means this process itself.
-    backend : something else that does the work, ``num`` tasks at a time.
+    num : number of processes, started at the first use; 1 means this process itself.
+    backend : other backend that runs the tasks, ``num`` at a time.
     """
 
     def __init__(self, num: int = 1, backend: Backend | None = None) -> None:
@@ -86,7 +86,7 @@ class Workers:
 
     @property
     def are_processes_here(self) -> bool:
-        """Whether tasks are done side by side in processes of this machine."""
+        """Whether tasks run in parallel processes of this machine."""
         return isinstance(self._backend, _Processes)
 
     @classmethod
@@ -104,14 +104,14 @@ class Workers:
         return cls(cluster.num_threads, cluster)
 
     def map(self, function: Callable[..., T], *iterables: Any) -> Iterator[T]:
-        """Results in order, as ``map`` gives them; the first error ends it."""
+        """Results in order, as of ``map``; the first error stops it."""
         return (outcome() for outcome in self.outcomes(function, *iterables))
 
     def outcomes(self, function: Callable[..., T], *iterables: Any) -> Iterator[Callable[[], T]]:
-        """Of each task, in order, what gives its result or raises its error, to be called once.
+        """For each task, in order, a function to call once; it returns the result or raises.
 
-        The error of one stops no other. A task whose worker is lost is done again; that which
-        loses every worker raises ``BrokenProcessPool`` or a ``DataError``.
+        An error of one task does not stop the others. A task whose worker is lost runs again. A
+        task that loses every worker raises ``BrokenProcessPool`` or a ``DataError``.
         """
         if self._backend is None:  # done here, when it is asked for
             return map(partial(partial, function), *iterables)
@@ -122,7 +122,7 @@ class Workers:
 
     @contextmanager
     def stopped_on_error(self) -> Iterator[None]:
-        """Stop what is under way when an error comes, before its files are taken away."""
+        """Stop the running tasks on an error, before their files are deleted."""
         try:
             yield
         except BaseException:
@@ -159,7 +159,7 @@ class _Processes:
         futures: list[Future[T]],
         index: int,
     ) -> T:
-        """Result of a task; one that was lost with its worker is done again while no other is.
+        """Result of a task; a task that was lost with its worker runs again alone.
 
         A killed worker takes all tasks with it, and which one killed it is not known.
         """

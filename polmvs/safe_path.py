@@ -1,8 +1,8 @@
-"""Processes that this program starts import nothing from the current directory.
+"""Child processes of this program import nothing from the current directory.
 
-Python puts the current directory first on the path of what is started with ``-c``, as
-:mod:`multiprocessing` and :mod:`polmvs.separate` start theirs. In a capture's folder a file
-``numpy.py`` or ``polmvs.py`` would run. PYTHONSAFEPATH forbids that, in their children as well.
+For a process started with ``-c``, as :mod:`multiprocessing` and :mod:`polmvs.separate` do, Python
+puts the current directory first on the path. A file ``numpy.py`` or ``polmvs.py`` in the folder of
+a capture would run. PYTHONSAFEPATH prevents that, also in their children.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ def safe_environment() -> dict[str, str]:
 
 @contextmanager
 def safe_path() -> Iterator[None]:
-    """Have processes that start meanwhile inherit a safe path; for those that take no environment.
+    """Processes that start in this block inherit a safe path; for those that take no environment.
 
-    The variable is as before when the last of the threads inside has left.
+    The variable is restored when the last thread leaves the block.
     """
     with _lock:
         _inside.append(os.environ.get(VARIABLE) if not _inside else _inside[0])

@@ -1,4 +1,4 @@
-"""The nouns that all stages share: views, names of images, sparse points, seeds, point kinds."""
+"""Types that all stages use: views, names of images, sparse points, seeds, kinds of points."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MIN_FACING_COSINE = 0.1
 # squares lose all that matters, or overflow, and no measurement lies there.
 MAX_COORDINATE = 1e12
 MIN_DISTANCE = 1e-12
-MIN_VIEWS = 3  # of a point, a normal, a shape: two always agree, right or wrong
+MIN_VIEWS = 3  # views of a point, a normal, a shape: two always agree, right or wrong
 MAX_NAMES_SHOWN = 5
 
 
@@ -91,7 +91,7 @@ def stem_of(name: str) -> str:
 def match_names(names: Sequence[str], known: Iterable[str]) -> dict[str, str]:
     """Which of the known names each image has; images without one are left out.
 
-    The same name goes before the only one of the same stem. A known name is used once, so that
+    An equal name goes before the only name with the same stem. A known name is used once, so that
     ``a/0.png`` and ``b/0.png`` do not share a ``0.png``.
 
     Parameters
@@ -114,7 +114,7 @@ def match_names(names: Sequence[str], known: Iterable[str]) -> dict[str, str]:
 
 
 def find_name(name: str, known: Iterable[str]) -> str | None:
-    """The one of some names that is meant: the same, else the only one with the same stem."""
+    """The equal name among some names, else the only one with the same stem."""
     return match_names([name], known).get(name)
 
 
@@ -186,13 +186,13 @@ def point_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
 
 @dataclass(frozen=True)
 class Seeds:
-    """Points of known place on the surface.
+    """Points of the surface with known position.
 
     Attributes
     ----------
     points_in_world : (S, 3) float64
     normals_in_world : (S, 3) float64, unit; NaN where unknown.
-    sigma : (S,) float64, standard deviation of the place, world units.
+    sigma : (S,) float64, standard deviation of the position, world units.
     """
 
     points_in_world: Array
@@ -217,15 +217,15 @@ class SparseModel:
 
 
 def without_views(model: SparseModel, names: Collection[str]) -> tuple[SparseModel, Mask, Mask]:
-    """A model without some of its views, and without points that less than two others see.
+    """A model without some of its views, and without points that fewer than two other views see.
 
     Parameters
     ----------
-    names : of views to take out; they count as not registered.
+    names : names of the views to remove; they count as not registered.
 
     Returns
     -------
-    The model; which views (V,) and which tracks (T,) it has of the former one.
+    The model; which views (V,) and which tracks (T,) of the former model it has.
     """
     kept = np.array([view.name not in names for view in model.views], np.bool_)
     tracks = model.tracks
@@ -248,10 +248,10 @@ def without_views(model: SparseModel, names: Collection[str]) -> tuple[SparseMod
 
 
 class PointKind(IntEnum):
-    """What a point of a cloud is: on a polarized part, or how it was found beside one.
+    """Kind of a point of a cloud: on a polarized surface, or how it was found in the surroundings.
 
-    ``INFERRED`` is on a part where no phase shows it: the inner wall of a vessel, inferred to be
-    as thick as its rim.
+    ``INFERRED`` is surface that no phase shows: the inner wall of a cavity, inferred to be as
+    thick as the wall at its opening.
     """
 
     SURFACE = 0

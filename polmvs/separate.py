@@ -1,8 +1,8 @@
-"""A function in a process of its own, for libraries that end the process when they fail.
+"""Run a function in its own process, for libraries that end the process when they fail.
 
-COLMAP aborts where its database cannot be written, and hears no Ctrl-C while it works. Here such an
-end is an error, and an interrupt ends the work at once. Not by `multiprocessing`, which imports a
-script once more that asks for it: the function must be one of an importable module.
+COLMAP aborts if it cannot write its database, and ignores Ctrl-C while it runs. Here an abort
+becomes an error, and an interrupt stops the work at once. This does not use `multiprocessing`,
+which imports the calling script again. The function must belong to an importable module.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ package_logger = logging.getLogger("polmvs")
 
 
 class CrashError(PolmvsError):
-    """The process of a function ended before the function did.
+    """The process of a function ended before the function returned.
 
     Parameters
     ----------
     status : of the process; the negative number of a signal.
-    said : the last words on its standard error.
+    said : the last lines on its standard error.
     """
 
     def __init__(self, status: int, said: str) -> None:
@@ -55,20 +55,20 @@ def run_separately(
     *arguments: Any,
     on_message: Callable[[str], None] = lambda text: None,
 ) -> T:
-    """What a function returns that is called in a process of its own.
+    """Call a function in its own process and return its result.
 
-    Its log records and errors arrive here as its own.
+    Its log records and errors arrive here unchanged.
 
     Parameters
     ----------
-    function : of a module; called with the arguments and, after them, a function that takes texts.
+    function : of a module; called with the arguments and then a function that takes texts.
     arguments : picklable.
-    on_message : is called here with each text.
+    on_message : called here with each text.
 
     Raises
     ------
     CrashError
-        The process ended before.
+        The process ended before the function returned.
     """
     with (
         tempfile.TemporaryFile() as complaints,

@@ -1,4 +1,4 @@
-"""What libraries print on stderr by themselves, past Python, is for the log."""
+"""Redirect to the log what libraries print on stderr past Python."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ logger = logging.getLogger(__name__)
 
 @contextmanager
 def unprinted(library: str) -> Iterator[None]:
-    """Keep what a library writes on stderr by itself for the log: it alarms and helps no one."""
+    """Redirect to the log what a library writes on stderr; users cannot act on it."""
     with tempfile.TemporaryFile() as said:
         own = os.dup(2)
         os.dup2(said.fileno(), 2)

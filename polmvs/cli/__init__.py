@@ -13,7 +13,7 @@ __all__ = ["entry_point", "main"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``polmvs`` with these arguments, those of the process by default; the exit status."""
+    """Run ``polmvs`` with these arguments, or those of the process; return the exit status."""
     from polmvs.cli.commands import ABOUT, COMMANDS
     from polmvs.cli.running import run
 
@@ -21,7 +21,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def entry_point() -> None:
-    """Run the console command; a plain kill ends it as cleanly as Ctrl-C does."""
+    """Run the console command; SIGTERM ends it as cleanly as Ctrl-C."""
     try:
         signal.signal(signal.SIGTERM, _interrupt)
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored

@@ -1,4 +1,4 @@
-"""One call of a command: what was given, and the options that it comes to."""
+"""One call of a command: the given values, and the options that result."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ class Call:
 
     Attributes
     ----------
-    given : values of the arguments and flags that were given, by path.
-    tables : groups that the file of ``--config`` may have tables of.
+    given : values of the given arguments and flags, by path.
+    tables : groups that may be tables of the file of ``--config``.
     command_line : as it was typed, for the record.
     """
 
@@ -76,12 +76,12 @@ class Call:
     command_line: list[str] = field(default_factory=list)
 
     def get(self, cls: type[Group], recorded: Mapping[str, Any] | None = None) -> Group:
-        """A group of options from, each before the next: flags, the file, an earlier run, defaults.
+        """A group of options. Precedence: flags, the file, an earlier run, defaults.
 
         Parameters
         ----------
         cls : the group.
-        recorded : of an earlier run, in terms of JSON, by field; checked.
+        recorded : values of an earlier run as JSON, by field; checked.
 
         Raises
         ------
@@ -104,11 +104,11 @@ class Call:
             raise
 
     def options(self, recorded: Mapping[str, Any] | None = None) -> Options:
-        """Options of all stages, in the same order of precedence.
+        """Options of all stages, with the same precedence.
 
         Parameters
         ----------
-        recorded : those of an earlier run, in terms of JSON, by group and field; checked.
+        recorded : those of an earlier run as JSON, by group and field; checked.
         """
         before = recorded or {}
         groups = groups_of(Options)
@@ -117,7 +117,7 @@ class Call:
 
     @cached_property
     def file(self) -> dict[str, dict[str, Any]]:
-        """Values in the tables of the file of ``--config``; empty where none is given."""
+        """Values in the tables of the file of ``--config``; empty without one."""
         path = self.given.get("file.config")
         return {} if path is None else read_config(path, self.tables)
 
@@ -128,15 +128,15 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
     Parameters
     ----------
     path : the file.
-    groups : those that it may have tables of.
+    groups : allowed tables.
 
     Raises
     ------
     DataError
         It cannot be read.
     OptionError
-        It is no TOML, or has an unknown or repeated table or key or a value of a wrong type, which
-        is named.
+        It is not TOML, or it has an unknown or repeated table or key or a value of a wrong type.
+        The message names it.
     """
     import tomllib  # not for --help
 
@@ -162,7 +162,7 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
 
 
 def require_new(path: Path, *, overwrite: bool) -> None:
-    """Refuse to replace a file that is there already, unless the user asks for it.
+    """Refuse to replace an existing file unless the user asks for it.
 
     Raises
     ------

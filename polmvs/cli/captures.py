@@ -1,4 +1,4 @@
-"""The commands on a capture's files alone: inspect it, and calibrate its camera."""
+"""The commands on the files of a capture: inspect, import and calibrate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands on a cloud: measure it, and make a mesh of it."""
+"""The commands on a cloud: evaluate it, and make a mesh of it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The commands: what each is called with, and where its function is.
+"""The commands: the arguments and options of each, and the path of its function.
 
-Nothing here imports what the commands do, so that ``--help`` is quick.
+This module does not import the functions, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -367,7 +367,7 @@ class PolarizerFrames(OptionGroup, group="polarizers"):
     )
 
 
-# Options in the order in which data meets them.
+# Groups of options in the order of the stages.
 TO_POSES = (CaptureOptions, SfmOptions, ReferenceOptions)
 TO_NORMALS = (*TO_POSES, RegionOptions, NormalOptions)
 TO_CLOUD = (*TO_NORMALS, PropagationOptions, FusionOptions, CropOptions)

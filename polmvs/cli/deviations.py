@@ -78,7 +78,7 @@ def deviation(call: Call, terminal: Terminal) -> int:
 
 
 def deviation_lines(found: Deviation) -> list[str]:
-    """The figures in lines of text."""
+    """The results as lines of text."""
     f = found.figures
     told = "inferred from the sizes" if f.unit_inferred else "given"
     lines = [f"reference in {f.unit} ({told}); {f.num_points:,} points compared"]

@@ -1,4 +1,4 @@
-"""``polmvs doctor``: what this machine has, and whether the parts of polmvs work on it."""
+"""``polmvs doctor``: a description of this machine, and tests of the parts of polmvs on it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from polmvs.config import default_num_workers
 from polmvs.errors import PolmvsError
 from polmvs.io.open3d_import import import_open3d
 
-# Distributions by the modules that they bring.
+# Distributions by their modules.
 PACKAGES = {
     "numpy": "numpy",
     "scipy": "scipy",
@@ -42,9 +42,9 @@ class Finding:
 
     Attributes
     ----------
-    what : was looked at.
-    text : what was found.
-    works : whether polmvs can work with it.
+    what : subject of the check.
+    text : its result.
+    works : whether polmvs can use it.
     """
 
     what: str
@@ -53,7 +53,7 @@ class Finding:
 
 
 def doctor(call: Call, terminal: Terminal) -> int:
-    """Run ``polmvs doctor``; the exit status is 1 if something does not work."""
+    """Run ``polmvs doctor``; the exit status is 1 if a check fails."""
     findings = [*machine(), *(package(*names) for names in PACKAGES.items())]
     checks: dict[str, Callable[[Path], str]] = {
         "plane of a mosaic": _check_plane,
@@ -120,7 +120,7 @@ def _tried(
 
 
 def _memory() -> str:
-    """Memory of the machine; from the system's table where there is one."""
+    """Memory of the machine, from the system's table if there is one."""
     try:
         text = Path("/proc/meminfo").read_text(encoding="ascii")
     except OSError:

@@ -1,4 +1,4 @@
-"""``polmvs experiment``: one of the paper's experiments on a capture with truth."""
+"""``polmvs experiment``: one of the paper's experiments on a capture with ground truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from polmvs.parallel import Workers
 
 
 def experiment(call: Call, terminal: Terminal) -> int:
-    """Run ``polmvs experiment``; nothing is written unless it comes to its end."""
+    """Run ``polmvs experiment``; results are written only if it completes."""
     arguments, run = call.get(ExperimentArguments), call.get(ExperimentRun)
     name, out = arguments.name, arguments.out
     options = call.get(ExperimentOptions)

@@ -1,4 +1,4 @@
-"""The command that hands a finished run to other programs."""
+"""The command that exports a finished run for other programs."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The command line's grammar: flags, help and usage errors, made by cyclopts from the options.
 
-cyclopts gets one signature for each command, made of the fields of the command's groups. It parses
-and names what is wrong; values reach the dataclasses, which check them.
+cyclopts gets one signature for each command, made of the fields of the command's groups. cyclopts
+parses and reports errors of the syntax; the dataclasses check the values.
 """
 
 from __future__ import annotations
@@ -73,13 +73,13 @@ class Command:
 
     Attributes
     ----------
-    help_text : what it does, one line.
+    help_text : description, one line.
     run : a function of the call and the terminal that gives the exit status, or
         ``"module:function"``, which is imported when the command is run.
     groups : its options, in the order of its help; the first may hold its arguments.
-    earlier : options of the stages before, which its help shows on request.
-    more : what its help says beside.
-    name : as it is typed; none where the program has this command alone.
+    earlier : options of earlier stages, which its help shows on request.
+    more : further text of its help.
+    name : as it is typed; empty if the program has only this command.
     """
 
     help_text: str
@@ -91,17 +91,17 @@ class Command:
 
     @property
     def tables(self) -> tuple[type[OptionGroup], ...]:
-        """Groups that a file of options may have tables of."""
+        """Groups that may be tables of a file of options."""
         return tuple(cls for cls in (*self.groups, *self.earlier) if cls.in_files)
 
 
 class UsageError(Exception):
-    """The command line is not understood.
+    """The command line is invalid.
 
     Attributes
     ----------
-    prog : program and command that it was for.
-    message : one line that says why.
+    prog : program and command.
+    message : the reason, one line.
     """
 
     def __init__(self, prog: str, message: str) -> None:
@@ -112,14 +112,14 @@ class UsageError(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class Parsed:
-    """What a command line asks for.
+    """A parsed command line.
 
     Attributes
     ----------
     prog : program and command, for messages.
-    command : to be run with ``call``; None where the help or the version is asked for.
-    call : what was given to it.
-    show : shows the help or the version.
+    command : to be run with ``call``; None for the help or the version.
+    call : its arguments and options.
+    show : function that shows the help or the version.
     """
 
     prog: str
@@ -133,10 +133,10 @@ def parse(commands: Sequence[Command], tokens: Sequence[str], prog: str, about: 
 
     Parameters
     ----------
-    commands : all there are; a single one without a name is the program itself.
+    commands : all commands; a single one without a name is the program itself.
     tokens : the command line after the program's name.
     prog : name of the program.
-    about : what it does, for its help.
+    about : description of the program, for its help.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def parse(commands: Sequence[Command], tokens: Sequence[str], prog: str, about: 
     infos = [info for cls in (*chosen.groups, *chosen.earlier) for info in describe_fields(cls)]
     values = bound.arguments
     given = {info.path: values[_key(info)] for info in infos if _key(info) in values}
-    for info in infos:  # cyclopts lets several arguments be none
+    for info in infos:  # cyclopts accepts an empty list of arguments
         if info.default is dataclasses.MISSING and info.path not in given:
             raise UsageError(name, f"{metavar_of(info)} is missing")
     call = Call(given=given, tables=chosen.tables, command_line=[prog, *tokens])
@@ -176,7 +176,7 @@ def parse(commands: Sequence[Command], tokens: Sequence[str], prog: str, about: 
 
 
 def in_flags(text: str) -> str:
-    """A message with each option's path, between backquotes, replaced by its flag."""
+    """A message in which each option's path, between backquotes, is replaced by its flag."""
     flags = {info.path: info.flag for cls in _NAMED_IN_MESSAGES for info in describe_fields(cls)}
 
     def flag(found: re.Match[str]) -> str:
@@ -236,7 +236,7 @@ def _complete(app: App, command: Command, prog: str, *, show_all: bool) -> None:
 
 
 def arguments_line(command: Command) -> str:
-    """The command's arguments as its usage line has them."""
+    """The command's arguments in its usage line."""
     infos = [info for cls in command.groups for info in describe_fields(cls) if info.positional]
     texts = [metavar_of(info) + " ..." * _is_list(info.kind) for info in infos]
     required = [info.default is dataclasses.MISSING for info in infos]
@@ -302,14 +302,14 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
         numbers = elements[0] in (int, float)  # the first of them may be negative
         common |= {"converter": _one_list(kind), "n_tokens": 1}
         common |= {"allow_leading_hyphen": numbers}
-        # Of what length it is is the converter's to say.
+        # The converter checks the length.
         kind = types.GenericAlias(tuple, (elements[0], ...))
     has_default = not is_required and place is not inspect.Parameter.VAR_POSITIONAL
     return inspect.Parameter(
         _key(info),
         place,
         default=None if has_default else inspect.Parameter.empty,
-        # Where pydantic happens to be loaded, cyclopts has it check the default as well.
+        # If pydantic is loaded, cyclopts uses it to check the default as well.
         annotation=Annotated[kind | None if has_default else kind, Parameter(**common)],
     )
 
@@ -378,7 +378,7 @@ def _read_list(kind: Any, text: str) -> tuple[Any, ...]:
 
 
 def metavar_of(info: FieldInfo) -> str:
-    """What stands for the value of an option or argument."""
+    """Placeholder for the value of an option or argument."""
     if isinstance(info.metavar, tuple):
         return " ".join(info.metavar)
     return info.metavar or (info.name.upper() if info.positional else _name(info.kind))

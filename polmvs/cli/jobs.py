@@ -147,7 +147,7 @@ def batch(call: Call, terminal: Terminal) -> int:
 
 
 def _reported(outcome: pipeline.JobOutcome, call: Call, terminal: Terminal) -> pipeline.JobOutcome:
-    """Write the page and the recording that show the results, if they are wanted."""
+    """Write the report and the recording, if the options ask for them."""
     recording = call.get(RecordingOptions).rerun
     if call.get(ReportChoice).report or recording is not None:
         from polmvs.cli.pages import make_recording, make_report
@@ -160,7 +160,7 @@ def _reported(outcome: pipeline.JobOutcome, call: Call, terminal: Terminal) -> p
 
 
 def _check_recording(call: Call) -> None:
-    """Refuse a recording that cannot be made before the run, not after it."""
+    """Refuse a recording that cannot be made, before the run starts."""
     recording = call.get(RecordingOptions).rerun
     if recording is not None:
         from polmvs.report.recording import require_rerun
@@ -169,13 +169,13 @@ def _check_recording(call: Call) -> None:
 
 
 def job_of(call: Call, terminal: Terminal, *, continues: bool = False) -> Job:
-    """The job; one that goes on takes the options of the run in OUT where none are given."""
+    """The job; a continued job takes options that are not given from the run in OUT."""
     arguments, run_options = call.get(JobArguments), call.get(RunOptions)
     recorded = None
     if run_options.resume or continues:
         run_folder = RunFolder(arguments.out)
         recorded = read_options(run_folder)
-        # A reference that failed gives way to the one that is given in its stead.
+        # A given reference replaces the one that failed.
         named = any(option.startswith("reference.") for option in call.given)
         if named and not is_finished(run_folder, "poses"):
             recorded = {name: group for name, group in recorded.items() if name != "reference"}

@@ -43,7 +43,7 @@ def report(call: Call, terminal: Terminal) -> int:
 
 
 def make_report(run_folder: RunFolder, terminal: Terminal) -> str:
-    """Write the report with a bar and a line, as for a stage; its path."""
+    """Write the report with a progress bar and a line, as for a stage; return its path."""
     found = load_record(run_folder).find(PosesResult)
     start = time.perf_counter()
     with terminal.stage("report", found.num_views if found is not None else None) as on_progress:
@@ -54,7 +54,7 @@ def make_report(run_folder: RunFolder, terminal: Terminal) -> str:
 
 
 def make_recording(run_folder: RunFolder, path: Path, terminal: Terminal) -> None:
-    """Write a recording with a bar and a line, as for a stage."""
+    """Write a recording with a progress bar and a line, as for a stage."""
     start = time.perf_counter()
     with terminal.stage("recording", num_recorded_steps(run_folder)) as on_progress:
         write_recording(run_folder, path, on_progress=on_progress)
@@ -91,7 +91,7 @@ def _shown(files: Sequence[Path]) -> bool:
     if sys.platform == "linux" and not any(os.environ.get(name) for name in displays):
         return False
     try:
-        # Where the display does not answer Open3D ends the process.
+        # Open3D ends the process if the display does not answer.
         run_separately(_show, files)
     except CrashError:
         return False

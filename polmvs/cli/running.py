@@ -1,4 +1,4 @@
-"""From a command line to an exit status; whatever goes wrong becomes one line on stderr."""
+"""From a command line to an exit status; every error becomes one line on stderr."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def run(
 
     Parameters
     ----------
-    commands : all there are; a single one without a name is the program itself.
+    commands : all commands; a single one without a name is the program itself.
     prog : name of the program.
     argv : the command line after the program's name; by default that of the process.
-    about : what the program does, for its help.
+    about : description of the program, for its help.
 
     Returns
     -------
-    The exit status: 0; 1 the input is unusable; 2 the command line is; others of the command.
+    The exit status: 0; 1: unusable input; 2: unusable command line; others of the command.
     """
     try:
         parsed = parse(commands, sys.argv[1:] if argv is None else argv, prog, about)
@@ -55,12 +55,12 @@ def script(
     function: Callable[[Call, Any], int],
     groups: tuple[type[OptionGroup], ...],
 ) -> Callable[..., int]:
-    """The ``main`` of a program of one command, which takes the arguments or finds them itself.
+    """The ``main`` of a program with one command; it takes arguments or reads those of the process.
 
     Parameters
     ----------
-    file, doc : of its module; they give its name and, by the first line, its help.
-    function, groups : as of :class:`polmvs.cli.flags.Command`.
+    file, doc : of its module, for the name and, from the first line, the help.
+    function, groups : as in :class:`polmvs.cli.flags.Command`.
     """
     help_text = (doc or "").partition("\n")[0].removesuffix(".")
     command = Command(help_text=help_text, run=function, groups=groups)
@@ -90,7 +90,7 @@ def _function(command: Command) -> Callable[[Call, Any], int]:
 
 
 def guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
-    """Run a command; its exit status, or that of what went wrong."""
+    """Run a command; return its exit status or that of its error."""
     try:
         return _interruptible(command)
     except KeyboardInterrupt:
@@ -101,7 +101,7 @@ def guarded(command: Callable[[], int], terminal: Any, prog: str) -> int:
         _trace(logging.DEBUG)
         _complain(terminal, prog, f"error: {error}")
         return error.exit_status
-    except BrokenPipeError:  # the reader of stdout has gone
+    except BrokenPipeError:  # the reader of stdout has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:

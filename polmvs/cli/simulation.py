@@ -1,4 +1,4 @@
-"""``polmvs simulate`` and ``polmvs plan``: rendered captures of a mesh, and what they tell."""
+"""``polmvs simulate`` and ``polmvs plan``: rendered captures of a mesh, and plans from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the user sees of a run: progress, a line for each stage, warnings, and the log file."""
+"""Output of a run for the user: progress, a line for each stage, warnings, and the log file."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ package_logger = logging.getLogger("polmvs")
 
 @dataclass(frozen=True, kw_only=True)
 class StageLine:
-    """A finished stage as it is shown.
+    """The line of a finished stage.
 
     Attributes
     ----------
     stage : its name.
     seconds : wall time.
-    summary : the figure that matters.
+    summary : its main number.
     """
 
     stage: str
@@ -62,7 +62,7 @@ class _TerminalHandler(logging.Handler):
 
 
 class _LogFileHandler(logging.FileHandler):
-    """A log on a full disk is no reason to complain in the middle of a run."""
+    """Log file whose write errors, such as a full disk, do not interrupt a run."""
 
     def _open(self) -> TextIOWrapper:
         """Append to a file, not to what a link or a pipe of its name leads to."""
@@ -86,11 +86,11 @@ class _LogFileHandler(logging.FileHandler):
 
 
 class Terminal:
-    """One call of a command: the monitor of its run, which shows and logs.
+    """Monitor of the run of a command, which shows and logs.
 
     Parameters
     ----------
-    options : what is shown.
+    options : what to show.
     """
 
     def __init__(self, options: TerminalOptions) -> None:
@@ -122,7 +122,7 @@ class Terminal:
         self._handlers.clear()
 
     def say(self, text: str) -> None:
-        """A line on stderr, which does not break the progress bar."""
+        """Print a line on stderr without breaking the progress bar."""
         if self._silent:
             return
         text = printable(text)
@@ -132,13 +132,13 @@ class Terminal:
             print(text, file=sys.stderr)
 
     def warn(self, text: str) -> None:
-        """A warning: shown now, and once more at the end if other lines follow."""
+        """Show a warning now, and again at the end if other lines follow."""
         if text not in self.warnings:
             self.warnings.append(text)
             self.say(f"warning: {text}")
 
     def repeat_warnings(self) -> None:
-        """All warnings once more, if other lines came since; an error is said after them."""
+        """Show all warnings again if other lines followed; an error comes after them."""
         if self._unrepeated:
             sys.stdout.flush()
             self.say(f"{len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}:")
@@ -147,12 +147,12 @@ class Terminal:
         self._unrepeated = []
 
     def show(self, text: str | Sequence[str], content: Any) -> None:
-        """The result of the command, on stdout.
+        """Print the result of the command on stdout.
 
         Parameters
         ----------
-        text : for people; a text keeps its lines, of several each is one, whatever names it holds.
-        content : the same for machines: a dataclass, or what JSON can hold.
+        text : for people. One text keeps its lines; of several texts each becomes one line.
+        content : the same for machines: a dataclass, or JSON values.
         """
         if self.options.json:
             print(json.dumps(to_plain(content), indent=1))
@@ -162,7 +162,7 @@ class Terminal:
             print("\n".join(map(printable, text)))
 
     def opened(self, run_folder: RunFolder) -> None:
-        """Log into the output folder from now on."""
+        """Start to log into the output folder."""
         self.log = run_folder.log
         try:
             handler = _LogFileHandler(run_folder.log, encoding="utf-8")
@@ -174,7 +174,7 @@ class Terminal:
 
     @contextmanager
     def stage(self, name: str, total: int | None) -> Iterator[OnProgress]:
-        """Show a bar with the count and the time that is left, if this is a terminal."""
+        """Show a progress bar with the remaining time, if this is a terminal."""
         if self._silent or not sys.stderr.isatty():
             yield no_progress
             return
@@ -205,13 +205,13 @@ class Terminal:
                 self._console = None
 
     def finished(self, name: str, seconds: float, summary: str) -> None:
-        """One line for a stage."""
+        """Show the line of a finished stage."""
         self.stages.append(StageLine(stage=name, seconds=seconds, summary=summary))
         self.say(f"{name:<20} {seconds:7.1f} s  {summary}".rstrip())
         self._unrepeated = list(self.warnings)
 
     def skipped(self, name: str) -> None:
-        """A stage of an earlier call."""
+        """Show that an earlier call finished a stage."""
         if self.options.verbose:
             self.say(f"{name:<20} finished earlier")
 

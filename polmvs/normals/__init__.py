@@ -1,1 +1,1 @@
-"""Constraint rows, the robust estimator, normals of tracks, and the kind of light."""
+"""Rows, the robust estimator, normals of tracks, and the kind of light."""

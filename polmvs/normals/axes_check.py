@@ -1,9 +1,9 @@
-"""Whether angles of polarization are counted as the planes of incidence of many views say.
+"""Check of the angle convention of the polarization against the planes of incidence of many views.
 
-A wrong order of the polarizers that still pairs perpendicular ones, angles counted clockwise, or
-from another direction, mirrors all phases or turns them by 45 degrees: the sums of the samples
-cannot tell, and one view cannot. Many can: under wrong angles their planes of incidence do not meet
-in one normal. (A turn by 90 degrees is that of the other kind of light.)
+A wrong order of the polarizers that still pairs perpendicular ones, clockwise angles, or another
+zero direction mirrors all phases or turns them by 45 degrees. The sums of the samples and a single
+view do not show it. Many views do: with wrong angles their planes of incidence do not intersect in
+one normal. (A rotation by 90 degrees is equivalent to the other kind of light.)
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ CHANGES = (MIRRORED, TURNED, TURNED_MIRRORED)
 
 @dataclass(frozen=True, kw_only=True)
 class VoteTolerances:
-    """When another setting than the given one, of angles or of light, is said to be the right one.
+    """Tolerances of the decision for another setting of angles or of light than the given one.
 
     Attributes
     ----------
-    max_points : that are asked about angles. Guess: more cost time only.
-    min_rows : of a point that votes on angles. Derived: three rows fix a normal and leave one to
-        tell.
-    min_votes : points. Guess.
-    min_share : of them, that speak for the other setting. Guess.
-    min_gain : mean vote on angles, log-likelihood of a row. Guess: noise alone gives a few
+    max_points : points that vote on angles. Guess: more cost time only.
+    min_rows : of a point that votes on angles. Derived: three rows determine a normal and leave one
+        to check it.
+    min_votes : least number of votes. Guess.
+    min_share : least share of them for the other setting. Guess.
+    min_gain : least mean vote on angles, log-likelihood of a row. Guess: noise alone gives a few
         hundredths.
     """
 
@@ -60,13 +60,13 @@ class VoteTolerances:
 
 @dataclass(frozen=True, kw_only=True)
 class AxesCheck:
-    """Which angles the planes of incidence show.
+    """Angle convention that the planes of incidence show.
 
     Attributes
     ----------
-    num_votes : sparse points that have a say.
-    share : of them that speak for the best of the other ways to count.
-    change : that way; None where the given one is right or nothing tells.
+    num_votes : sparse points that vote.
+    share : share of them for the best of the other conventions.
+    change : that convention; None if the given one is right or the vote is unclear.
     """
 
     num_votes: int
@@ -78,7 +78,7 @@ class AxesCheck:
 
         Parameters
         ----------
-        options : that the capture was opened with.
+        options : of the opened capture.
         kind : of its files.
         """
         begin = (
@@ -102,7 +102,7 @@ class AxesCheck:
 def check_axes(
     tracks: Tracks, maps: Sequence[PhaseMap], *, tolerances: VoteTolerances = VoteTolerances()
 ) -> AxesCheck:
-    """Have the sparse points vote on the angles of polarization.
+    """Let the sparse points vote on the angle convention.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def check_axes(
     on_parts = tracks_on_parts(tracks, maps)
     chosen = evenly_chosen(len(on_parts.points_in_world), t.max_points)
     some, options = some_tracks(on_parts, chosen), NormalOptions()
-    # Under either light, which a quarter turn of all angles exchanges.
+    # Under both kinds of light, which a rotation of all angles by 90 degrees exchanges.
     readings = [r for way in (AS_MEASURED, *CHANGES) for r in (way, _other_light(way))]
     observed = gather_observations_under(
         readings, AngleModel.PPA, some.points_in_world, maps, window_px=options.window_px
@@ -122,9 +122,9 @@ def check_axes(
     num_rows = (matched & np.isfinite(observed[0].turn_variances[0])).sum(axis=0)
     found = np.stack([solve_mixture(one, matched).log_likelihood for one in observed])
     found /= np.maximum(num_rows, 1)
-    likelihoods = np.maximum(found[::2], found[1::2])  # (ways to count, N), of a row
+    likelihoods = np.maximum(found[::2], found[1::2])  # (conventions, N), of a row
     given, *changed = likelihoods
-    # What no way to count explains has no say.
+    # A point that no convention explains does not vote.
     voting = (num_rows >= t.min_rows) & (np.max(likelihoods, axis=0) > t.min_gain)
     best = AxesCheck(num_votes=int(voting.sum()), share=0.0, change=None)
     most = t.min_gain
@@ -137,11 +137,11 @@ def check_axes(
 
 
 def is_clear(votes: Array, t: VoteTolerances) -> bool:
-    """Whether the votes (N,) of points clearly are for another setting: most positive, and far.
+    """Whether the votes (N,) of points are clearly for another setting: most, and strongly.
 
-    Far is not by chance in standard errors of the mean: right settings of nine captures had -2.3
-    to -46. Points on one surface see the same light, so that a guess remains in it: their votes are
-    worth fewer than their number.
+    Strongly means: not by chance, in standard errors of the mean. Right settings of nine captures
+    had -2.3 to -46. Points on one surface see the same light, so their votes are not independent,
+    and the limit remains a guess.
     """
     if len(votes) < t.min_votes:
         return False
@@ -152,10 +152,10 @@ def is_clear(votes: Array, t: VoteTolerances) -> bool:
 def changed_pattern(
     pattern: tuple[int, int, int, int], change: Reading
 ) -> tuple[int, int, int, int]:
-    """The order of polarizers under which the Stokes parameters are the changed ones.
+    """The order of polarizers that gives the changed Stokes parameters.
 
-    Of the two that differ by a quarter turn of all angles, which light cannot tell apart, the
-    sensors' usual one, if it is one of them, else the one that keeps more of the given places.
+    Two orders differ by a rotation of all angles by 90 degrees, which is equivalent to the other
+    kind of light. The sensors' usual order is preferred, else the one nearer to the given order.
     """
     (a, b), (c, d) = change
     # The place of the polarizer at angle x measures s0 + cos 2x s1 + sin 2x s2 in the given Stokes

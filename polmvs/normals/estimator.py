@@ -1,4 +1,4 @@
-"""Normals from stacked constraint rows: the paper's eigenvector and a weighted robust estimator.
+"""Normals from stacked rows: the paper's eigenvector and a weighted robust estimator.
 
 Everything is batched over points: arrays are component first, ``(3, K, N)`` for K rows of N
 points, so that thousands of 3x3 problems are solved by a few vector operations.
@@ -21,26 +21,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorTolerances:
-    """What the robust estimator takes for a good row, and when rows determine a normal.
+    """Tolerances of the robust estimator, and of rows that determine a normal.
 
     Attributes
     ----------
-    min_sin_zenith : a row of a nearly frontal surface says little: its weight is capped here.
-        Guess.
-    counted_weight : robust weight over which a row counts. Derived: four deviations off.
+    min_sin_zenith : sine of the zenith angle that caps the weight of a row of a nearly frontal
+        surface, which has little information. Guess.
+    counted_weight : robust weight above which a row counts. Derived: four deviations off.
     num_rounds : of reweighting. Measured (tests): the change of later ones is below 0.01 deg.
     num_unbiased_rounds : after them. Measured: see ``num_rounds``.
-    doubtful_loss : from which a point is tried again; about 0.12 without outliers. Guess.
-    num_pairs : of rows that a doubtful point is started from again. Derived: with three of ten
-        rows wrong one pair of 24 is right but once in 3,000,000.
-    min_rows_to_doubt : that count; of fewer, some agree by chance. Guess.
+    doubtful_loss : above it a point is tried again; about 0.12 without outliers. Guess.
+    num_pairs : pairs of rows from which a doubtful point starts again. Derived: with three of ten
+        rows wrong, all of 24 pairs contain a wrong row once in 3,000,000.
+    min_rows_to_doubt : least number of counted rows; of fewer, some agree by chance. Guess.
     min_spread : of the rows, over the variance of their noise. Where all planes of incidence are
         one (camera centres and normal in one plane, as on a linear rail) the noise alone spreads
         them. Derived: their mean variance is more than this many times the expected one for fewer
         than 1 in 1000 of three rows (chi-squared of 3, over 3, is 5.4 there).
     min_rows : of a normal. Derived.
-    min_conditioning : ratio of singular values under which rows count as one; that of two rows is
-        half the sine of the small angle between them. Guess.
+    min_conditioning : ratio of singular values below which rows count as parallel; for two rows it
+        is half the sine of the small angle between them. Guess.
     """
 
     min_sin_zenith: float = 0.1
@@ -57,19 +57,19 @@ class EstimatorTolerances:
 
 @dataclass(frozen=True, kw_only=True)
 class NormalEstimate:
-    """Normals of N points with what is known about their quality.
+    """Normals of N points with their quality.
 
     Attributes
     ----------
     normals : (N, 3) float64, unit, frame of the rows, facing the viewers; NaN where not valid.
-    valid : (N,) bool. Not so where fewer than two rows count, or just two of more that were given,
-        which any two do; and where the rows leave a direction open, or only their noise does not.
+    valid : (N,) bool. False if fewer than two rows count; if only two of more given rows do, as any
+        two agree; or if the rows leave a direction open, except for their noise.
     conditioning : (N,) ratio of the middle to the largest singular value of the weighted rows,
         0 for rows of rank 1, at most 1.
     sigma_deg : (N,) standard deviation along the larger axis of the covariance, degrees.
     residual : (N,) weighted root mean square of ``m . n``: sine of the angle to the planes of
         incidence.
-    num_rows : (N,) int, rows that counted, outliers (weight under a quarter) left out.
+    num_rows : (N,) int, rows that count, without outliers (weight below a quarter).
     row_weights : (K, N) robust weights in [0, 1].
     """
 
@@ -94,7 +94,7 @@ def smallest_eigenvectors(matrices: Floats) -> tuple[Array, Array]:
     Returns
     -------
     eigenvalues : (3, N) float64, ascending.
-    eigenvectors : (3, N) float64, unit; an arbitrary one where the smallest eigenvalue is double.
+    eigenvectors : (3, N) float64, unit; arbitrary if the smallest eigenvalue is double.
     """
     xx, yy, zz, xy, xz, yz = np.asarray(matrices, np.float64)
     mean = (xx + yy + zz) / 3
@@ -139,21 +139,21 @@ def solve_normals(
 ) -> NormalEstimate:
     """Normals of N points from K rows each.
 
-    The paper's estimator (``robust=False``): the eigenvector of the smallest eigenvalue of
-    ``M^T M`` over the usable rows, all alike. The robust one: rows weighted by the inverse
-    variance of their residual, ``(sin(theta) sigma)^2`` with theta the angle between normal and
-    ray, and by a Cauchy loss; both re-estimated in ``num_rounds`` rounds. A view from behind the
-    surface cannot see it: its row is left out. A point whose rows disagree is started again from
-    pairs of its rows: of ten rows, three may be wrong.
+    The paper's estimator (``robust=False``) is the eigenvector of the smallest eigenvalue of
+    ``M^T M`` over the usable rows with equal weights. The robust estimator weights rows by the
+    inverse variance of their residual, ``(sin(theta) sigma)^2`` with theta the angle between normal
+    and ray, and by a Cauchy loss. Both are re-estimated in ``num_rounds`` rounds. The row of a view
+    from behind the surface is ignored. A point whose rows disagree starts again from pairs of its
+    rows: of ten rows, three may be wrong.
 
     Parameters
     ----------
     rows : (3, K, N), unit, any one frame per point; NaN rows are left out.
     rays : (3, K, N), unit, same frame, from the cameras towards the points.
-    sigma : (K, N), standard deviation of the row's turn about its ray, radians; infinite or
-        NaN: the row is left out.
+    sigma : (K, N), standard deviation of the row's rotation about its ray, radians; infinite or
+        NaN: the row is ignored.
     robust : weighted robust estimator, or the paper's.
-    initial_normals : (3, N), where known (else NaN): a start that tells which views face the
+    initial_normals : (3, N), NaN where unknown: a start, which decides the views that face the
         point before its first solution.
     tolerances : of this step.
     """
@@ -211,11 +211,11 @@ class _Problem:
         return normals
 
     def unbiased(self, normals: Array) -> Array:
-        """Minimise the squared errors over their variances, which follow the normal themselves.
+        """Minimize the squared errors over their variances, which depend on the normal.
 
-        To reweight and solve alone leaves out that derivative: normals are drawn towards the rays,
-        in short arcs by more than their deviation. The fundamental numerical scheme (Chojnacki et
-        al., PAMI 2000) takes it in.
+        Reweighting alone ignores the derivative of the variances and biases normals towards the
+        rays, for short arcs by more than their deviation. The fundamental numerical scheme
+        (Chojnacki et al., PAMI 2000) includes it.
         """
         for _ in range(self.tolerances.num_unbiased_rounds):
             moments = _moments(self.rows, self.weights(normals, CAUCHY_SCALE)[0])
@@ -223,7 +223,7 @@ class _Problem:
         return normals
 
     def gained(self, normals: Array, scale: float) -> Array:
-        """What the derivative of the variances adds to the moments (6, N)."""
+        """Contribution of the derivative of the variances to the moments (6, N)."""
         z2, sin2, visible = self._errors(normals)
         share = np.where(visible, z2 * cauchy_weights(z2, scale), 0) / sin2
         moments = -_moments(self.rays, share)
@@ -239,7 +239,7 @@ class _Problem:
     def losses(self, normals: Array) -> Floats:
         """Mean of ``z^2 / (z^2 + c^2)`` (N,) over the rows that count, 1 where one is not seen.
 
-        Bounded, unlike the loss that is minimised: it judges by the number of rows that agree.
+        Bounded, unlike the minimized loss: it measures the number of rows that agree.
         """
         z2, _, visible = self._errors(normals)
         counted = self.precision > 0
@@ -260,7 +260,7 @@ class _Problem:
             self.votes[..., where],
             self.tolerances,
         )
-        # A pair of right rows is near enough: no wide loss has to find the place.
+        # A pair of correct rows is near enough to the solution: no wide loss is needed.
         scales = (s for s in annealed_scales(self.tolerances.num_rounds) if s == CAUCHY_SCALE)
         again = some.iterate(some._best_pair(normals[:, where]), scales)
         better = some.losses(again) < losses[where]

@@ -1,13 +1,12 @@
-"""Specular or diffuse: which reflection dominates the polarization of each part of a region.
+"""Specular or diffuse: the dominant kind of light in each connected part of a region.
 
-The two differ by a quarter turn of the phase, so the wrong choice puts every plane of incidence
-at a right angle to the true one. One view cannot tell; three or more can, because wrong planes of
-incidence do not meet in one normal. Every sparse point on a part votes with the likelihoods of
-its two best normals, and so do pixels of the part, placed where the regions of most views have it
-(their visual hull), as deep in it as explains their phases best, for either kind of light. What
-one view says of a thing is doubtful, so that a part is decided by all views that show it. The
-degree of polarization has a say where phases have none (specular light is polarized up to wholly,
-diffuse light of a smooth dielectric hardly over 0.4).
+The phases of the two differ by 90 degrees, so the wrong choice turns every plane of incidence by 90
+degrees. One view does not show it. Three or more do, because wrong planes of incidence do not
+intersect in one normal. Every sparse point on a part votes with the likelihoods of its two best
+normals. Pixels of the part also vote: they are placed in the visual hull of the regions, at the
+depth that best explains their phases, for each kind of light. One view alone is unreliable, so all
+views that show a part decide. The DoLP votes where phases do not decide (specular light may be
+fully polarized, diffuse light of a smooth dielectric hardly over 0.4).
 """
 
 from __future__ import annotations
@@ -39,23 +38,22 @@ LIGHTS = (AS_MEASURED, OTHER_LIGHT)  # that of the maps, and the other
 
 @dataclass(frozen=True, kw_only=True)
 class LightTolerances:
-    """What the choice between specular and diffuse light depends on.
+    """Tolerances of the choice between specular and diffuse light.
 
     Attributes
     ----------
-    min_rows : of a point that votes, and points of a part whose votes count. Derived: two planes
-        of incidence always meet in a normal.
-    max_row_cost : of one row, so that a single one cannot outvote the others. Guess.
+    min_rows : least number of rows of a point that votes, and of points of a part that votes.
+        Derived: two planes of incidence always intersect in a normal.
+    max_row_cost : of one row, so that a single row cannot outvote the others. Guess.
     diffuse_dolp : largest DoLP of diffuse light. Derived: smooth dielectric of ior 1.5, seen at a
         grazing angle.
-    dolp_votes : log-likelihood that twice that DoLP is worth. Guess.
-    max_pixel_views : views, evenly spread over all, that a part's pixels are looked up in. Guess;
-        more cost time only.
-    num_pixels : of a part that are placed in space. Guess; costs time only.
+    dolp_votes : log-likelihood of twice that DoLP. Guess.
+    max_pixel_views : views, evenly spread, in which a part's pixels are looked up. Guess; more cost
+        time only.
+    num_pixels : pixels of a part that are placed in space. Guess; costs time only.
     num_steps : of the search for the hull along their rays. Guess: a step is 2 % of the distance.
-    num_ranges : depths in the hull that they are tried at. Guess; the first is right where it is
-        convex.
-    widening : of the distances beyond those of the scene's points, factor. Guess.
+    num_ranges : tried depths in the hull. Guess; the first is right where the surface is convex.
+    widening : factor of the distances beyond those of the scene's points. Guess.
     """
 
     min_rows: int = MIN_VIEWS
@@ -76,21 +74,21 @@ def find_diffuse_parts(
     *,
     max_rows: int = MAX_ROWS,
 ) -> list[Mask]:
-    """Connected parts of each view's region whose light is diffuse-dominant.
+    """Connected parts of each view's region with mainly diffuse light.
 
-    Every part is decided as a whole: by the votes of its points and pixels, and of the parts of
-    other views that show the same, else with the majority of the capture.
+    Each part is decided as a whole: by the votes of its points and pixels and of the same part in
+    other views, else by the majority of the capture.
 
     Parameters
     ----------
     tracks : sparse points; ``obs_view`` counts in ``maps``.
-    maps : phase maps built under the assumption of specular light; one is held at a time.
-    tolerances : see there.
-    max_rows : of points and views together, that are solved at a time.
+    maps : phase maps built for specular light; one is held at a time.
+    tolerances : of this step.
+    max_rows : rows of points and views that are solved at a time.
 
     Returns
     -------
-    For each map ``(P,)`` bool, of the parts that :func:`diffuse_pixels` takes.
+    For each map ``(P,)`` bool, by part, for :func:`diffuse_pixels`.
     """
     t = tolerances or LightTolerances()
     on_parts = tracks_on_parts(tracks, maps)
@@ -106,7 +104,7 @@ def find_diffuse_parts(
         unknown = np.isnan(known) & np.isnan(dense)
         own.append(np.where(unknown, np.nan, np.nan_to_num(known) + np.nan_to_num(dense)))
         overall += float(np.nansum(dense))
-    # Without any evidence light is specular: what polarizes most.
+    # Without any evidence light is specular, which is polarized most.
     tie = overall if overall != 0 else 1.0
     verdicts = (
         np.where(np.isfinite(pooled), pooled, overall)
@@ -127,12 +125,12 @@ def track_votes(
     *,
     max_rows: int = MAX_ROWS,
 ) -> tuple[Array, Mask]:
-    """Log-likelihood of specular over diffuse light for each track, and which tracks have a say.
+    """Log-likelihood of specular over diffuse light for each track, and which tracks vote.
 
     Parameters
     ----------
     tracks : sparse points; ``obs_view`` counts in ``maps``.
-    maps : phase maps, whatever light they were built for.
+    maps : phase maps, built for either kind of light.
     """
     t = tolerances or LightTolerances()
     votes, voting = [], []

@@ -1,4 +1,4 @@
-"""Whether the light that a user states is the one that the planes of incidence show."""
+"""Check of the kind of light that a user states against the planes of incidence."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from polmvs.scene import Tracks
 
 @dataclass(frozen=True, kw_only=True)
 class LightCheck:
-    """How the sparse points on the polarized surfaces vote on their light.
+    """Votes of the sparse points on the polarized surfaces for the kind of light.
 
     Attributes
     ----------
     given : by the user.
-    num_votes : sparse points that have a say.
-    share : of them that speak for the other light.
-    contradicted : whether they clearly do.
+    num_votes : sparse points that vote.
+    share : share of them that vote for the other kind of light.
+    contradicted : whether the vote against the given light is clear.
     """
 
     given: Light
@@ -34,7 +34,7 @@ class LightCheck:
 
     @property
     def message(self) -> str:
-        """One line for the user, of what is contradicted."""
+        """One line for the user about the contradiction."""
         other = Light.DIFFUSE if self.given is Light.SPECULAR else Light.SPECULAR
         return (
             f"`region.light` {self.given} does not fit: under {other} light the planes of "
@@ -45,7 +45,7 @@ class LightCheck:
 
 
 def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> LightCheck:
-    """Have the sparse points vote on the light that a user gave.
+    """Compare the light that a user gave with the votes of the sparse points.
 
     Parameters
     ----------

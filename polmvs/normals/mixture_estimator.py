@@ -1,13 +1,13 @@
-"""Normals of points of which each observation may be specular, diffuse, or neither.
+"""Normals of points whose observations may be specular, diffuse, or neither.
 
-Many normals are tried with both labels open: directions all over the sphere, by the likelihood of
-the views that surely see the point (:mod:`polmvs.polarization.light_mixture`). The best few that
-lie apart are refined, labels and normal in turn (expectation maximisation), with all views that
-face them. Then they are weighed against each other: where two ways to label the observations
-explain them alike, the normal's deviation says so.
+The search tries directions over the whole sphere with both labels open. It ranks them by the
+likelihood of the views that certainly see the point (:mod:`polmvs.polarization.light_mixture`).
+The best few distinct directions are refined by expectation maximization, labels and normal in turn,
+with all views that face them. Then they are compared: if two labelings explain the observations
+about equally, the deviation of the normal includes both.
 
-Everything is batched over points: arrays are component first, ``(3, K, N)``. The search takes time
-by the observations, the refinement by views times points.
+Everything is batched over points: arrays are component first, ``(3, K, N)``. The time of the search
+grows with the observations, that of the refinement with views times points.
 """
 
 from __future__ import annotations
@@ -40,31 +40,31 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, kw_only=True)
 class MixtureTolerances:
-    """How normals are searched, and when one is known.
+    """Tolerances of the search for normals, and of their validity.
 
     Attributes
     ----------
-    light : what is assumed of the light.
-    num_directions : all over the sphere, that are tried. Derived: neighbours are 9 deg apart.
-    direction_sigma : rad, of a direction tried. Derived: half the distance of neighbours, and more.
-    num_modes : best directions that are refined. Guess.
-    hopeless : log-likelihood of a direction behind the best, under which it is not. Guess: more
-        than refining gains.
-    apart : rad, that modes lie apart. Guess: as wide as the likelihood of a few rows.
-    num_rounds : of refinement; the normal's own error shrinks over the first ones. Guess.
-    prior_rows : rows of stated noise that a point's own scatter is weighed against. Guess.
+    light : prior assumptions about the light.
+    num_directions : tried directions over the whole sphere. Derived: neighbours are 9 deg apart.
+    direction_sigma : rad, error of a tried direction. Derived: over half the neighbours' distance.
+    num_modes : number of best directions that are refined. Guess.
+    hopeless : log-likelihood below the best at which a direction is not refined. Guess: more than
+        refinement gains.
+    apart : rad, least angle between modes. Guess: the width of the likelihood of a few rows.
+    num_rounds : of refinement; the assumed error of the normal shrinks over the first ones. Guess.
+    prior_rows : weight of the stated noise against a point's own scatter, in rows. Guess.
     correlation : of the errors of a point's rows: marks and reflections about it, gains and the
         model are the same for all views. Measured: see ``docs``.
-    clear_turn : rad, deviation of rows that tell how far rows are off. Guess.
-    min_scale_rows : of a point that tells so, and of all. Guess.
-    prior_scale_rows : that a view's own rows are weighed against. Guess.
-    min_rows : of a normal, sum of their labels' certainty. Derived: two planes of incidence meet,
-        neither quite certain.
-    min_explained : share of the observations of views that surely see the point, that one of the
-        two kinds of light explains. Derived: the majority.
+    clear_turn : rad, largest deviation of rows from which scales are estimated. Guess.
+    min_scale_rows : least number of such rows of a point, and of all points. Guess.
+    prior_scale_rows : weight of the common scale against a view's own rows, in rows. Guess.
+    min_rows : of a normal, sum of their labels' certainty. Derived: two planes of incidence
+        intersect, neither quite certain.
+    min_explained : share of the observations of views that certainly see the point which one of
+        the two kinds of light explains. Derived: the majority.
     max_noise_ratio : of the noise in the spread of the rows, in its deviations. Derived: chance of
         1 in 1000.
-    max_sigma_deg : of a normal that counts as known. Guess.
+    max_sigma_deg : of a valid normal. Guess.
     """
 
     light: LightMixtureTolerances = LightMixtureTolerances()
@@ -87,20 +87,20 @@ class MixtureTolerances:
 
 @dataclass(frozen=True, kw_only=True)
 class MixtureEstimate(NormalEstimate):
-    """Normals with what is known about their quality and their light.
+    """Normals with their quality and light.
 
-    ``sigma_deg`` holds noise, the scatter of the point's own rows, and every other normal that
-    explains the observations about as well. ``num_rows`` are observations that one of the two
-    kinds of light explains.
+    ``sigma_deg`` includes noise, the scatter of the point's own rows, and every other normal that
+    explains the observations about as well. ``num_rows`` is the number of observations that one of
+    the two kinds of light explains.
 
     Attributes
     ----------
-    specular, diffuse : (N,) in [0, 1], mean probability of either label over the observations of
-        views that face the normal; what is left is neither. NaN where not valid.
+    specular, diffuse : (N,) in [0, 1], mean probability of the label over the observations of views
+        that the normal faces; the rest is neither. NaN where not valid.
     dolp : (N,) median DoLP of those observations. NaN where not valid.
-    labels : (K, N) probability of specular light less that of diffuse light of each observation, 0
-        of views that do not face the normal.
-    log_likelihood : (N,), of the observations over chance, at the best normal.
+    labels : (K, N) probability of specular light minus that of diffuse light of each observation; 0
+        for views that the normal does not face.
+    log_likelihood : (N,), of the observations relative to chance, at the best normal.
     """
 
     specular: Array
@@ -112,12 +112,12 @@ class MixtureEstimate(NormalEstimate):
 
 @dataclass(frozen=True)
 class RowScales:
-    """Deviations of the rows of a capture over the stated ones.
+    """Factors from the stated deviations of the rows of a capture to the actual ones.
 
     Attributes
     ----------
-    of_views : (K,), at least 1: a view whose pose or image is wrong counts for less.
-    overall : at most 1: of all rows, where they err less than is stated.
+    of_views : (K,), at least 1: a view with a wrong pose or image gets less weight.
+    overall : at most 1: of all rows, if their errors are smaller than stated.
     """
 
     of_views: Array
@@ -132,15 +132,15 @@ def solve_mixture(
     scales: RowScales | None = None,
     tolerances: MixtureTolerances = MixtureTolerances(),
 ) -> MixtureEstimate:
-    """Normals of N points from K observations each, whose light is open.
+    """Normals of N points from K observations each, with unknown light.
 
     Parameters
     ----------
     observations : of the points.
-    matched : (K, N) bool, views that surely see the point. Others are asked once a normal is known
-        that faces them.
-    prior_specular : 0.5; 1 or 0 where the light of everything is known.
-    scales : of the rows' deviations; as stated where None. See :func:`row_scales`.
+    matched : (K, N) bool, views that certainly see the point. Others are used once a normal is
+        known that faces them.
+    prior_specular : 0.5; 1 or 0 if the light of all observations is known.
+    scales : of the rows' deviations, see :func:`row_scales`; None: as stated.
     tolerances : of this step.
     """
     t = tolerances
@@ -159,7 +159,7 @@ def solve_mixture(
         normals[index][:, where], likelihoods[index, where] = mode.normals, mode.log_likelihood
     best = likelihoods.argmax(axis=0)
     chosen = normals[best, :, np.arange(num_points)].T
-    # Modes that met in one normal count once.
+    # Modes that converged to one normal count once.
     angles = np.arccos(np.clip(np.einsum("min,in->mn", normals, chosen), -1, 1))
     weights = np.exp(likelihoods - likelihoods.max(axis=0))
     for index in range(len(starts)):
@@ -177,7 +177,7 @@ def row_scales(
     *,
     tolerances: MixtureTolerances = MixtureTolerances(),
 ) -> RowScales:
-    """How far the rows of views are off normals, over what is stated: of each view, and of all.
+    """Actual over stated deviation of the rows about the normals, of each view and of all.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def row_scales(
         squares = np.nanmin(
             np.nan_to_num(np.square(residuals) / (turns * sin2), nan=np.inf), axis=0
         )
-    # A row that says nothing is off nothing; two rows of each point are always met.
+    # A row without information has no residual; two rows of each point always fit exactly.
     num_rows = (np.abs(estimate.labels) > 0.5).sum(axis=0)
     clear = matched & estimate.valid & (num_rows >= t.min_scale_rows)
     clear &= (turns[0] < t.clear_turn**2) & (cosines > MIN_FACING_COSINE)

@@ -1,7 +1,7 @@
-"""What views measure of the light of points: both planes of incidence that it may show.
+"""Observations of points in views: the planes of incidence under both kinds of light.
 
-Nothing is left out because it is hardly polarized, bright or at an edge: each pixel of a window
-counts by the inverse variance of its phase, and each window by its own.
+Weakly polarized, bright and edge pixels are not excluded: each pixel of a window is weighted by the
+inverse variance of its phase, and each window by its own.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class Observations:
     Attributes
     ----------
     rows : (2, 3, K, N) float32, unit: planes of incidence of specular and of diffuse light; NaN
-        where a view shows nothing.
+        where a view has no measurement.
     rays : (3, K, N) float32, unit, from the cameras to the points.
-    turn_variances : (2, K, N) float32, rad^2, of the rows' turn about their rays; infinite where
-        they count for nothing.
+    turn_variances : (2, K, N) float32, rad^2, of the rows' rotation about their rays; infinite
+        where they have no weight.
     dolp : (K, N) float32, 0 where unknown.
     dolp_variance : (K, N) float32, infinite where unknown.
     """
@@ -71,7 +71,7 @@ def gather_observations(
     window_px: int,
     tilt_aware: bool = True,
 ) -> Observations:
-    """Observations of points in all views that show their place; one map is held at a time.
+    """Observations of points in all views that show them; one map is held at a time.
 
     Parameters are those of :func:`gather_observations_under`.
     """
@@ -95,16 +95,16 @@ def gather_observations_under(
     window_px: int,
     tilt_aware: bool = True,
 ) -> tuple[Observations, ...]:
-    """Observations of points under several readings of the same angles, the maps asked once.
+    """Observations of points under several readings of the same angles; each map is read once.
 
     Parameters
     ----------
-    readings : what becomes of ``(s1, s2)``, for each result.
-    angle_model : whose planes of incidence.
+    readings : linear map of ``(s1, s2)`` for each result.
+    angle_model : model of the planes of incidence.
     points_in_world : (N, 3).
     maps : K phase maps.
     window_px : side of the window about each point.
-    tilt_aware : add to a row's variance what OPA and PPA leave out; see
+    tilt_aware : add to a row's variance the tilt that OPA and PPA ignore; see
         :func:`polmvs.normals.rows.gather_rows_under`.
     """
     points = np.asarray(points_in_world, np.float64)
@@ -161,7 +161,7 @@ def _row(
     sign, diffuse = phase_sign(light), light is Light.DIFFUSE
     if angle_model is AngleModel.TILTED:
         s1, s2 = correct_polarization(polarization[:, 0], polarization[:, 1], rays, diffuse=diffuse)
-        # The turn of a row is that of the light's own direction of polarization.
+        # The rotation of a row is that of the light's direction of polarization.
         return rows_from_axial(angle_model, sign * s1, sign * s2, rays), of_phase
     cos2, sin2 = sign * polarization[:, 0], sign * polarization[:, 1]
     row = rows_from_axial(angle_model, cos2, sin2, rays)
@@ -181,9 +181,9 @@ def _row(
 def window_polarization(polarization: Image, window_px: int) -> Image:
     """Polarization averaged over a window about every pixel (H, W, 4).
 
-    ``s1 / s0`` and ``s2 / s0``, the variance of their mean, and the variance that all pixels
-    share, 0 where no pixel of the window says anything. Pixels count by the inverse variance of
-    their phase: those of a mark, where light is mixed and hardly polarized, for little.
+    ``s1 / s0`` and ``s2 / s0``, the variance of their mean, and the variance that all pixels share;
+    0 where no pixel of the window is usable. Pixels are weighted by the inverse variance of their
+    phase, so those of a mark, where light is mixed and hardly polarized, have little weight.
 
     Parameters
     ----------

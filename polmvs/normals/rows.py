@@ -1,4 +1,4 @@
-"""Constraint rows: what the phases of many views say about the normals of points."""
+"""Rows: constraints on the normals of points from the phases of many views."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from polmvs.scene import MIN_DISTANCE, View
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 
-# Relative distance by which a point lies behind the surface that a view sees, to be hidden by it. A
-# guess: several times the error of a first range map, less than the depth of things that hide.
+# Relative distance behind the surface of a view beyond which a point is occluded. A guess: several
+# times the error of a first range map, less than the depth of occluding objects.
 OCCLUSION_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Constraint rows of N points from K views, world frame, component first.
+    """Rows of N points from K views, world frame, component first.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Rows:
     sigma: NDArray[np.float32]
 
 
-# What becomes of (cos 2 phase, sin 2 phase): rows of a matrix.
+# Linear map of (cos 2 phase, sin 2 phase): rows of a matrix.
 Reading: TypeAlias = tuple[tuple[int, int], tuple[int, int]]
 AS_MEASURED: Reading = ((1, 0), (0, 1))
 OTHER_LIGHT: Reading = ((-1, 0), (0, -1))
@@ -76,20 +76,20 @@ def gather_rows_under(
     *,
     tilt_aware: bool = True,
 ) -> tuple[Rows, ...]:
-    """Rows of points under several readings of the same phases, the maps asked once.
+    """Rows of points under several readings of the same phases; each map is read once.
 
     Parameters
     ----------
-    readings : of the phases, one for each result; their weights are the measured ones'.
-    angle_model : which rows.
+    readings : of the phases, one for each result; all have the weights of the measured phases.
+    angle_model : model of the rows.
     points_in_world : (N, 3).
     maps : K phase maps.
     range_maps : per view ``(h, w)`` distances from the camera centre, 0 where unknown: a point
         that lies behind its view's map by more than ``OCCLUSION_TOLERANCE`` (relative) is occluded.
-    tilt_aware : add to a row's variance the square of what its model leaves out: to OPA's and
-        PPA's phases the turn that a tilt of the polarizers would give them
-        (:func:`polmvs.polarization.angle_models.tilt_turn`), to OPA's rows their angle to PPA's.
-        Oblique rays count less. Without it a row's weight comes from the phase map alone.
+    tilt_aware : add to a row's variance the square of the error of its model: for OPA and PPA the
+        rotation of the phase by tilted polarizers
+        (:func:`polmvs.polarization.angle_models.tilt_turn`), for OPA also the angle to PPA's row.
+        Oblique rays get less weight. Without it, the weight comes from the phase map alone.
     """
     tilt_aware = tilt_aware and angle_model is not AngleModel.TILTED
     points = np.asarray(points_in_world, np.float64)  # the origin may be far
@@ -137,7 +137,7 @@ def gather_rows_under(
 
 
 def sample_range(range_map: Image, view: View, xy: Floats) -> NDArray[np.float32]:
-    """Nearest value of a range map, which may be coarser than the view by a whole factor."""
+    """Nearest value of a range map, which may be coarser than the view by an integer factor."""
     return sample_image(range_map, xy / round(view.camera.width / range_map.shape[1]), nearest=True)
 
 

@@ -1,8 +1,8 @@
 """Normals of sparse points from the phases of all views, and the seeds among them.
 
-SfM features sit on printed marks and edges, where the light is mixed: the phase at a keypoint is
-the worst one near it. Rows therefore come from the reliable pixels in a window about the
-projected point, in every view that sees it, not only in the views that matched it.
+SfM features lie on printed marks and edges, where the light is mixed, so the phase at a keypoint is
+unreliable. Rows therefore come from the reliable pixels in a window about the projected point, in
+every view that sees it and not only in the views that matched it.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-MAX_SCALE_POINTS = 600  # that tell how far rows are off. Guess: more cost time only
-MAX_ROWS = MemoryNeeds.max_rows  # of points and views together, at a time, without a budget
+MAX_SCALE_POINTS = 600  # points for the scales of the rows. Guess: more cost time only
+MAX_ROWS = MemoryNeeds.max_rows  # rows of points and views at a time, without a budget
 # A region's border is that uncertain, by marks and smoothing: points nearer to it may lie on the
 # background. Guess.
 BORDER_MARGIN_PX = 3
@@ -39,17 +39,17 @@ BORDER_MARGIN_PX = 3
 
 @dataclass(frozen=True, kw_only=True)
 class SeedTolerances:
-    """Which tracks are seeds: their phases explained by one normal.
+    """Tolerances of seeds: tracks whose phases one normal explains.
 
     Attributes
     ----------
-    min_inside_share : of a track's views that must see it in their region, and of the views that
-        its point faces, to show the surface at its place. Guess.
+    min_inside_share : share of a track's views that must see it in their region, and of the views
+        that its point faces that must show the surface there. Guess.
     max_dolp_share : of a mark's DoLP in that of the surface about it. Guess.
-    clear_dolp : of the surface, for the comparison to tell. Guess.
+    clear_dolp : least DoLP of the surface for this comparison. Guess.
     max_sigma_deg : of the normal. Guess.
-    min_on_region : seeds on strongly polarized regions, beside which others are surroundings.
-        Derived: three points make a plane.
+    min_on_region : number of seeds on strongly polarized regions above which the other seeds are
+        surroundings. Derived: three points make a plane.
     """
 
     min_inside_share: float = 0.8
@@ -62,7 +62,7 @@ class SeedTolerances:
 def observe(
     angle_model: AngleModel, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
 ) -> tuple[Observations, Mask]:
-    """What all views measure of tracks, and which views (K, T) surely see them: they match."""
+    """Observations of tracks in all views, and the views (K, T) that match them."""
     found = gather_observations(
         angle_model,
         tracks.points_in_world,
@@ -105,12 +105,12 @@ def track_normals(
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps of the views.
     options : window, estimator and weights.
-    light : of everything, where it is known; else each observation has its own.
-    max_rows : of tracks and views together, that are solved at a time.
+    light : of all observations, if known; else each observation has its own.
+    max_rows : rows of tracks and views that are solved at a time.
     """
     prior = {None: 0.5, Light.SPECULAR: 1.0, Light.DIFFUSE: 0.0}[light]
 
-    # Some of the points first: how far the rows of each view are off.
+    # The scales of the rows of each view come from some of the points first.
     limit = min(MAX_SCALE_POINTS, max(1, max_rows // max(len(maps), 1)))
     chosen = evenly_chosen(len(tracks.points_in_world), limit)
     tiles = list(in_tiles(tracks, len(maps), max_rows))
@@ -149,7 +149,7 @@ def _algebraic(found: Observations, estimate: MixtureEstimate) -> MixtureEstimat
 
 
 def in_tiles(tracks: Tracks, num_views: int, max_rows: int) -> Iterator[Tracks]:
-    """The tracks in order, so many at a time that their rows in all views are ``max_rows``."""
+    """The tracks in order, in tiles with at most ``max_rows`` rows in all views."""
     num = max(1, max_rows // max(num_views, 1))
     index = np.arange(len(tracks.points_in_world))
     for start in range(0, max(len(index), 1), num):
@@ -157,7 +157,7 @@ def in_tiles(tracks: Tracks, num_views: int, max_rows: int) -> Iterator[Tracks]:
 
 
 def tracks_on_parts(tracks: Tracks, maps: Sequence[PhaseMap]) -> Tracks:
-    """The tracks that any of their views sees in its region."""
+    """The tracks that at least one of their views sees in its region."""
     return some_tracks(tracks, inside_shares(tracks, maps, margin_px=0) > 0)
 
 
@@ -177,7 +177,7 @@ def inside_shares(
 
 
 def seen_shares(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> Array:
-    """Share ``(T,)`` of the views which a point faces that show the region at its place.
+    """Share ``(T,)`` of the views that a point faces which show the region there.
 
     0 for points that face no view or have no normal.
     """
@@ -196,7 +196,7 @@ def dolp_shares(
 ) -> Array:
     """DoLP at the keypoints over that of the surface about them, the median ``(T,)`` of a track.
 
-    NaN where the surface is nowhere polarized enough to tell.
+    NaN if the surface is nowhere polarized enough.
     """
     ratio = np.full(len(tracks.obs_track), np.nan)
     for phase_map, here in zip(maps, tracks.of_views(len(maps)), strict=True):
@@ -226,18 +226,18 @@ def select_seeds(
     *,
     tolerances: SeedTolerances = SeedTolerances(),
 ) -> tuple[Seeds, Mask]:
-    """Tracks whose normal explains what all views measure of them.
+    """Tracks whose normal explains the observations of all views.
 
-    Where some of them lie on regions that are polarized strongly, these are what is wanted, and the
-    others its surroundings; else all are.
+    If some of them lie on strongly polarized regions, these are the seeds and the others are
+    surroundings; otherwise all are seeds.
 
-    A glossy surface mirrors its surroundings, and on a flat one their mirror images make tracks
-    as good as any, behind the surface. They give themselves away: seen from aside they leave the
-    region, and unlike what is printed on the surface they are polarized as it is.
+    A flat glossy surface mirrors its surroundings, and the mirror images make good tracks behind
+    the surface. They are detected: from oblique views they leave the region, and unlike prints on
+    the surface they have its polarization.
 
     Returns
     -------
-    The seeds, and which tracks ``(T,)`` they are.
+    The seeds, and whether each track ``(T,)`` is one.
     """
     t = tolerances
     good = (
@@ -245,7 +245,7 @@ def select_seeds(
     )
     some = some_tracks(tracks, good)
     good[good] = ~(dolp_shares(some, maps, tolerances=t) > t.max_dolp_share)
-    # The dearest question last, of those that are left: all points are asked of all views.
+    # The slowest test last, on the remaining tracks: it looks up all points in all views.
     on_region = good.copy()
     on_region[good] = inside_shares(some_tracks(tracks, good), maps) >= t.min_inside_share
     points, normals = tracks.points_in_world[on_region], estimate.normals[on_region]

@@ -1,4 +1,4 @@
-"""The jobs: reconstruct, compare, and each stage alone; the stage table says what each runs."""
+"""The jobs: reconstruct, compare, and single stages; the stage table says what each runs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from polmvs.scene import MIN_VIEWS, short_list
 logger = logging.getLogger(__name__)
 
 MIN_SFM_IMAGES = 2
-MAX_REJECTIONS = 2  # rounds in which views are taken out of the model
+MAX_REJECTIONS = 2  # rounds in which views are removed from the model
 
 NO_REGION = (
     "no polarized region: no view shows a surface with polarized light. Lower `region.min_dolp`, "
@@ -62,14 +62,14 @@ NO_POINTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class JobOutcome:
-    """What a job came to.
+    """Outcome of a job.
 
     Attributes
     ----------
-    run_folder : where the results lie.
-    record : of all finished stages, with what they found.
-    empty : why a dense cloud has no points, and what to do; None where none is empty.
-    comparison : figures of the models, of :func:`compare`.
+    run_folder : folder of the results.
+    record : all finished stages with their results.
+    empty : why a dense cloud has no points, and the remedy; None if no cloud is empty.
+    comparison : metrics of the models, of :func:`compare`.
     """
 
     run_folder: RunFolder
@@ -79,7 +79,7 @@ class JobOutcome:
 
 
 def reconstruct(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
-    """The whole chain with one model: ``OUT/ppa.ply`` or another model's.
+    """Run all stages with one model; the cloud is ``OUT/ppa.ply`` or that of another model.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def reconstruct(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
 
 
 def compare(job: Job, models: Sequence[AngleModel] = COMPARED_MODELS) -> JobOutcome:
-    """Several models on the same poses, tracks, seeds and region, with ``OUT/metrics.json``.
+    """Run several models on the same poses, tracks, seeds and region; write ``OUT/metrics.json``.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def compare(job: Job, models: Sequence[AngleModel] = COMPARED_MODELS) -> JobOutc
 
 
 def find_poses(job: Job) -> JobOutcome:
-    """SfM alone: ``OUT/images`` and ``OUT/sparse``."""
+    """Run SfM alone: ``OUT/images`` and ``OUT/sparse``."""
     last = _of_models((SFM,), (), stage_table())
     with _open(job, last, min_images=MIN_SFM_IMAGES) as run:
         _do_all(run, last)
@@ -121,22 +121,22 @@ def find_poses(job: Job) -> JobOutcome:
 
 
 def solve_normals(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> JobOutcome:
-    """Normals of the sparse points of a folder that has poses."""
+    """Estimate normals of the sparse points in a folder that has poses."""
     return _do_alone(job, NORMALS, models, ())
 
 
 def densify(job: Job, models: Sequence[AngleModel] = (AngleModel.PPA,)) -> JobOutcome:
-    """Dense clouds of a folder that has normals."""
+    """Make dense clouds in a folder that has normals."""
     return _do_alone(job, DENSIFY, models, models)
 
 
 def finish(job: Job, model: AngleModel = AngleModel.PPA) -> JobOutcome:
-    """Mesh and COLMAP workspace of a folder that has a dense cloud."""
+    """Make mesh and COLMAP workspace in a folder that has a dense cloud."""
     return _do_alone(job, FINISH, (model,), (model,))
 
 
 def judge(run_folder: RunFolder, model: AngleModel = AngleModel.PPA) -> Trust:
-    """Whether the cloud of a finished run is to be trusted; nothing is written.
+    """Quality checks of the cloud of a finished run; nothing is written.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def judge(run_folder: RunFolder, model: AngleModel = AngleModel.PPA) -> Trust:
 
 
 def measure(run_folder: RunFolder, models: Sequence[AngleModel]) -> Comparison:
-    """Figures of the clouds of a finished run, against the ground truth that its options name.
+    """Metrics of the clouds of a finished run against the ground truth of its options.
 
     Nothing is written.
 
@@ -175,9 +175,9 @@ def measure(run_folder: RunFolder, models: Sequence[AngleModel]) -> Comparison:
 def _do_alone(
     job: Job, command: str, models: Sequence[AngleModel], dense: Sequence[AngleModel]
 ) -> JobOutcome:
-    """The stages of a command, in a folder where those that they need are finished.
+    """Run the stages of a command in a folder where the stages that they need are finished.
 
-    Finished ones are done again only if that is asked for.
+    Finished stages run again only with ``overwrite``.
 
     Raises
     ------
@@ -248,10 +248,9 @@ def _do_all(run: Run, last: Sequence[StageSpec]) -> None:
 
 
 def _take_out_rejected(run: Run, last: Sequence[StageSpec], models: Sequence[AngleModel]) -> None:
-    """Take views whose pose the surface contradicts out of the model, and do all of it again.
+    """Remove views whose pose the surface contradicts from the model, and run all stages again.
 
-    PPA's surface is asked, else that of tilted polarizers: what OPA leaves out contradicts sound
-    views.
+    PPA's surface decides, else that of the tilted model: OPA also leaves out correct views.
     """
     judge = next((m for m in (AngleModel.PPA, AngleModel.TILTED) if m in models), None)
     for _ in range(MAX_REJECTIONS):

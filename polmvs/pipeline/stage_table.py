@@ -1,11 +1,11 @@
-"""The stage table: every stage of a run, what it reads and writes, and what decides its result.
+"""The stage table: every stage of a run, its files, and the options that decide its result.
 
-All that a run knows of its stages follows from :func:`stage_table`: their order, which of them a
-command runs, which are stale when another is done again, the files that go with them, and when a
-finished one may be taken over. A new stage is one entry here and one file in ``stages/``.
+A run derives all from :func:`stage_table`: the order of the stages, which of them a command runs,
+which are stale when another runs again, which files belong to them, and when a finished one may be
+reused. A new stage is one entry here and one file in ``stages/``.
 
-A stage reads files that other stages write, and options; it writes files that no other stage
-writes. An entry's function hands a stage the run's folder and options, nothing else.
+A stage reads files of other stages, and options. It writes files that no other stage writes. The
+function of an entry passes only the run's folder and options to a stage.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from polmvs.polarization.capture import Capture
 from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import SparseModel
 
-# Commands that do stages alone, by the stage; ``compare`` has no command for its own alone.
+# Commands that run single stages, by stage; no command runs the stages of ``compare`` alone.
 SFM, NORMALS, DENSIFY, FINISH, COMPARE = "sfm", "normals", "densify", "finish", "compare"
 WITHOUT = "sfm.without"
 TILT_AWARE = "normals.tilt_aware_weights"
@@ -56,15 +56,15 @@ CROPPING = ("crop", "reference.aruco")
 
 @dataclass(kw_only=True)
 class StageInput:
-    """What a run gives to a stage.
+    """Input of a stage from the run.
 
     Attributes
     ----------
-    run_folder, capture, options, workers : what the run works with.
-    max_rows : of points and views that normals are solved from at a time.
+    run_folder, capture, options, workers : of the run.
+    max_rows : rows of points and views from which normals are solved at a time.
     given_model : the sparse model of the options, fitted to the capture.
-    record : what is finished, as in ``run.json``.
-    on_progress : is told of the steps of the stage in work.
+    record : the finished stages, as in ``run.json``.
+    on_progress : called with the steps of the current stage.
     """
 
     run_folder: RunFolder
@@ -89,19 +89,18 @@ class StageSpec:
     Attributes
     ----------
     name : in ``run.json``.
-    command : the command that does it alone.
-    angle_model : that it is of; None for those of all.
-    reads, writes : files and folders, as paths in the run folder; what other stages write, and
-        what this one does.
-    decides : paths of the options that decide its result; a group's name stands for all its own.
-    work : does it and gives what it found.
-    result : type of what it gives; no other stage of the same angle model gives that type.
-    num_steps : how many steps it will report, known when it begins; None where that is not known.
-    is_wanted : whether the options ask for it, where a command may leave it out.
-    call : what does its work in a process of its own; None where it takes workers itself or is not
-        worth one. Stages that have it and follow each other are done side by side.
-    is_redone : whether it is done again when what decides it has changed, instead of refusing to
-        take it over: for what is quickly done and nothing is made from.
+    command : the command that runs it alone.
+    angle_model : its angle model; None for stages of all models.
+    reads, writes : files and folders of other stages and of this one, as paths in the run folder.
+    decides : paths of the options that decide its result; a group's name stands for all of its.
+    work : function that does the work and returns the result.
+    result : type of the result; no other stage of the same angle model has it.
+    num_steps : number of steps that it will report; None if unknown.
+    is_wanted : whether the options ask for it, if a command may skip it.
+    call : function that does the work in its own process; None if the stage uses workers itself or
+        is too short. Consecutive stages with a call run in parallel.
+    is_redone : whether a change of its options makes it run again instead of an error: for quick
+        stages from which no other stage is made.
     """
 
     name: str
@@ -158,7 +157,7 @@ def _evaluate(models: Sequence[AngleModel], run: StageInput) -> evaluation.Evalu
 
 
 def sparse_figures(record: Record) -> SparseFigures:
-    """What all models of a run start from."""
+    """Numbers of the input that all models of a run share."""
     found, chosen = record.result(poses.PosesResult), record.result(seeds.SeedsResult)
     return SparseFigures(
         num_views=found.num_views,
@@ -177,7 +176,7 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
 
     Parameters
     ----------
-    compared : angle models that the evaluation is of.
+    compared : angle models to evaluate.
     """
     ppa = AngleModel.PPA
     table = [
@@ -392,7 +391,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
 
 
 def in_order(table: Sequence[StageSpec]) -> tuple[StageSpec, ...]:
-    """Each stage after those that it reads from; where that leaves a choice, as they are listed."""
+    """Stages sorted so that each follows those it reads from, otherwise in their listed order."""
     written = {path for spec in table for path in spec.writes}
     waiting, done, ordered = list(table), set[Path](), list[StageSpec]()
     while waiting:
@@ -411,7 +410,7 @@ def needed_by(spec: StageSpec, table: Sequence[StageSpec]) -> list[StageSpec]:
 
 
 def with_needed(names: Iterable[str], table: Sequence[StageSpec]) -> list[StageSpec]:
-    """Stages and all that they need, directly or not, in order."""
+    """Stages and all stages that they need, directly or indirectly, in order."""
     wanted = set(names)
     for spec in reversed(table):  # what is needed comes before
         if spec.name in wanted:
@@ -420,7 +419,7 @@ def with_needed(names: Iterable[str], table: Sequence[StageSpec]) -> list[StageS
 
 
 def with_dependent(names: Iterable[str], table: Sequence[StageSpec]) -> list[StageSpec]:
-    """Stages and all that are made from their files, directly or not, in order."""
+    """Stages and all stages made from their files, directly or indirectly, in order."""
     stale = set(names)
     for spec in table:
         if any(other.name in stale for other in needed_by(spec, table)):

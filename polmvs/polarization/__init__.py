@@ -1,1 +1,1 @@
-"""Raw mosaics to Stokes images, regions and phase maps, and what each angle model makes of them."""
+"""From raw mosaics to Stokes images, regions and phase maps; the angle models."""

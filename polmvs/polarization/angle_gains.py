@@ -1,12 +1,12 @@
-"""Gains between the images of one view that were taken behind a polarizer at several angles.
+"""Gains between the images of one view behind a polarizer at several angles.
 
 A camera that exposes each image anew, or a filter that is turned by hand, makes one image of a view
-brighter than another, which looks like strong polarization everywhere. Where the light is not
-polarized all images are alike: there their ratios are those of the gains, the same at all places,
-while polarized surfaces have ratios of every kind. So the gains are the most frequent ratios.
+brighter than another. This looks like strong polarization everywhere. Where the light is
+unpolarized, the ratios of the images are those of the gains, the same at all pixels. Polarized
+surfaces have all kinds of ratios. So the gains are the most frequent ratios.
 
-Four or more angles tell a gain from light that is polarized alike everywhere: linear images fit
-three Stokes parameters, images of different gains do not.
+Four or more angles separate a gain from uniformly polarized light: linear images fit three Stokes
+parameters, images of different gains do not.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from polmvs.polarization.stokes import ideal_analyzers
 
 @dataclass(frozen=True, kw_only=True)
 class GainTolerances:
-    """When the images of a view are said to differ in exposure.
+    """Tolerances of the test whether the images of a view differ in exposure.
 
     Attributes
     ----------
-    num_samples : pixels that are looked at.
+    num_samples : number of pixels used.
     bin_log : width of a bin of logarithms of ratios. Guess: wider than the noise of a pixel.
-    radius_log : of the pixels about the mode that the gains are the median of. Guess.
+    radius_log : of the pixels about the mode whose median is the gain. Guess.
     min_support : share of the pixels that have these ratios. Guess.
     min_ratio : of the largest gain to the smallest; light that is polarized by 10 % everywhere
         has 1.2. Derived from that.
-    max_misfit_share : of the misfit to three Stokes parameters that may be left once the gains
-        are divided by. Guess.
+    max_misfit_share : share of the misfit to three Stokes parameters that may remain after division
+        by the gains. Guess.
     """
 
     num_samples: int = 40_000
@@ -62,7 +62,7 @@ class AngleGains:
 
     @property
     def ratio(self) -> float:
-        """Of the largest to the smallest."""
+        """Ratio of the largest gain to the smallest."""
         return max(self.gains) / min(self.gains)
 
 
@@ -78,12 +78,12 @@ def find_angle_gains(
     Parameters
     ----------
     images : (K, H, W) linear intensities.
-    angles_deg : of the polarizer, one an image.
+    angles_deg : of the polarizer, one for each image.
     usable : (H, W), neither clipped nor dark in any of them.
 
     Returns
     -------
-    Gains of 1 that do not differ where too few pixels are usable.
+    Gains of 1 if too few pixels are usable.
     """
     num = len(images)
     samples = np.asarray(images, np.float64)[:, usable & (images > 0).all(axis=0)]

@@ -1,4 +1,4 @@
-r"""The angle models: forward phase, constraint rows, and what tilted polarizers do to the phase.
+r"""The angle models: predicted phase, rows, and the effect of tilted polarizers on the phase.
 
 One formula serves all (paper, Table "Summary of the OPA and PPA models"): the PPA model uses the
 pixel's own ray ``v``; the OPA model replaces it by the optical axis ``(0, 0, 1)``. The geometry of
@@ -8,7 +8,7 @@ Tilted polarizers
 -----------------
 A polarizer in the image plane with absorbing axis A lets through ``I = tr J - a' J a`` of light
 with the transverse coherency J, ``a = normalise(A - (A . v) v)`` for the ray v (Korger et al.
-2013; Pistellato and Bergamasco 2024). This infers that rays meet the sensor at the angle at
+2013; Pistellato and Bergamasco 2024). This assumes that rays meet the sensor at the angle at
 which they enter the lens; for other lenses see below.
 
 The basis of a ray's transverse plane is the image's x and upward y, turned by the shortest
@@ -22,26 +22,26 @@ measures
 with S1r, S2r relative to the radial direction. They give the direction e of polarization, a 3D
 vector perpendicular to the ray; the normal of the plane of incidence is e for specular light,
 ``v x e`` for diffuse light. The *corrected* Stokes parameters are those of a sensor that obeys
-PPA, so that all that follows is PPA:
+PPA, so that all later steps are those of PPA:
 
-- specular: the plane of incidence cuts the image plane across the orthogonal projection of e,
-  ``(e_x, e_y)``, so AoLP' is the direction of that projection;
-- diffuse: it cuts the image plane along the projection of e along the ray,
-  ``e - (e_z / v_z) v``, so AoLP' is the direction of this one.
+- specular: the plane of incidence cuts the image plane perpendicular to the orthogonal projection
+  of e, ``(e_x, e_y)``, so AoLP' is the direction of that projection;
+- diffuse: it cuts the image plane parallel to the projection of e along the ray,
+  ``e - (e_z / v_z) v``, so AoLP' is the direction of this projection.
 
 With c, s the cosine and sine of twice the angle between e and the radial direction, the first
 projection shrinks the radial component by ``v_z`` and the second stretches it by ``1 / v_z``:
 
     c' = (c + h) / (1 + h c),   s' = q s / (1 + h c),   h = -+g
 
-with the minus for specular light. The length of ``(s1, s2)`` stays.
+with the minus for specular light. The length of ``(s1, s2)`` does not change.
 
 Telecentric lenses
 ------------------
 A lens that is telecentric on the image side turns each ray, and the field with it, in the plane
-of ray and axis until it meets the sensor straight. The polarizers are not tilted then, and the
-sensor measures the Stokes parameters ``S`` of the ray's transverse plane. PPA is not exact here
-either: it infers the projections above. Its phase is off by up to ``arcsin((1 - v_z) / (1 +
+of ray and axis until it meets the sensor perpendicularly. The polarizers are then not tilted, and
+the sensor measures the Stokes parameters ``S`` of the ray's transverse plane. PPA is not exact here
+either: it assumes the projections above. Its phase is off by up to ``arcsin((1 - v_z) / (1 +
 v_z))``, 4.1 degrees at 30 degrees off the axis, about as much as behind tilted polarizers, because
 tilt changes ``S`` only to second order in g. For the same reason the tilted model is nearly right
 behind such a lens: it is off by up to 0.2 degrees at 30 and 1.2 degrees at 45 degrees off the axis.
@@ -61,7 +61,7 @@ OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 def model_rays(angle_model: AngleModel, rays_in_cam: Floats) -> Floats:
-    """Rays as the model sees them: the optical axis under OPA, themselves under the others."""
+    """Rays of the model: the optical axis under OPA, the pixels' rays under the others."""
     if angle_model.formula is AngleModel.OPA:
         return np.broadcast_to(OPTICAL_AXIS.astype(rays_in_cam.dtype), rays_in_cam.shape)
     return rays_in_cam
@@ -93,8 +93,8 @@ def phase_from_normal(
 
     Returns
     -------
-    (...) float64 radians in [0, pi). Where the normal lies along the model's ray the plane of
-    incidence is undefined and the value is NaN.
+    (...) float64 radians in [0, pi). NaN where the normal is parallel to the model's ray: the plane
+    of incidence is undefined.
     """
     v = model_rays(angle_model, np.asarray(rays_in_cam, np.float64))
     n = np.asarray(normals_in_cam, np.float64)
@@ -153,12 +153,12 @@ def correct_parameters(parameters: Floats, rays_in_cam: Floats, *, diffuse: Mask
     parameters : (3, ...), ``s0 = (I0 + I45 + I90 + I135) / 2``, ``s1 = I0 - I90``,
         ``s2 = I45 - I135``.
     rays_in_cam : (..., 3), unit, camera frame.
-    diffuse : (...) or one for all, whether diffuse reflection dominates; specular else. It decides
-        how the polarization is projected.
+    diffuse : (...) or one for all, whether diffuse reflection dominates, else specular. It selects
+        the projection of the polarization.
 
     Returns
     -------
-    (3, ...). With ``phase = aolp + pi/2`` (specular) or ``aolp`` (diffuse) of them
+    (3, ...). From their ``phase = aolp + pi/2`` (specular) or ``aolp`` (diffuse),
     :func:`rows_from_phase` gives the exact rows.
     """
     if parameters.shape != (3, *rays_in_cam.shape[:-1]) or rays_in_cam.shape[-1] != 3:
@@ -201,11 +201,11 @@ def correct_stokes(stokes: Stokes, rays_in_cam: Floats, *, diffuse: Mask | bool)
 
 
 def sigma_scale(s1: Floats, s2: Floats, rays_in_cam: Floats, *, diffuse: Mask | bool) -> Floats:
-    """How much larger the deviation of corrected s1, s2 is across their direction than before.
+    """Factor by which the correction raises the deviation of s1, s2 across their direction.
 
-    It is ``(1 - (v . d)^2) / v_z``, d the direction of the corrected phase: the inverse of a
-    row's turn about its ray per turn of the phase, which therefore is the turn of e itself. The
-    gain of the inversion (within 6 % of 1 up to 45 degrees off the axis) is left out.
+    It is ``(1 - (v . d)^2) / v_z`` with the direction d of the corrected phase: the inverse of a
+    row's rotation about its ray per rotation of the phase, which therefore equals the rotation of
+    e. The gain of the inversion (within 6 % of 1 up to 45 degrees off the axis) is neglected.
 
     Parameters
     ----------
@@ -229,14 +229,14 @@ def sigma_scale(s1: Floats, s2: Floats, rays_in_cam: Floats, *, diffuse: Mask | 
 def tilt_turn(
     cos2: Floats, sin2: Floats, rays_in_cam: Floats, *, diffuse: Mask | bool = False
 ) -> Floats:
-    """By how much a phase is turned if the polarizers are tilted, rad in [-pi/2, pi/2].
+    """Rotation of a phase by tilted polarizers, rad in [-pi/2, pi/2].
 
-    OPA and PPA leave the tilt out and cannot know whether the lens makes it: the turn is a
-    deviation of their phases.
+    OPA and PPA ignore the tilt, and do not know whether the lens causes it: the rotation counts as
+    a deviation of their phases.
 
     Parameters
     ----------
-    cos2, sin2 : (...), those of twice the phase times any common length.
+    cos2, sin2 : (...), of twice the phase, times any common length.
     rays_in_cam : (..., 3), unit, camera frame.
     diffuse : (...) or one for all, whether diffuse reflection dominates.
     """

@@ -1,16 +1,16 @@
-"""What a sample's value means: full scale, clipping and step, decided from all files at once.
+"""Full scale, clipping and step of samples, decided from all files of a capture.
 
-Cameras write 10, 12 and 14 bits into 16, at the lower end (right-aligned), the upper end, or
-scaled. No file says which. What the samples of a whole capture tell:
+Cameras write 10, 12 and 14 bits into 16, at the lower end (right-aligned), at the upper end, or
+scaled. No file says which. The samples of a whole capture show it:
 
-- the *low bits*: zero in every sample of data shifted to the left by as many;
-- the *gaps* between occupied levels: 16 or 17 where 12 bits were scaled to 16;
-- a *pile* of samples at the highest level: the sensor clips there. At the largest value of some
-  bit depth it decides that depth; elsewhere it is where clipping begins, whatever the depth.
+- the *low bits* are zero in every sample of data shifted to the left;
+- the *gaps* between occupied levels are 16 or 17 if 12 bits were scaled to 16;
+- a *pile* of samples at the highest level: the sensor clips there. At the largest value of a bit
+  depth it decides that depth; elsewhere only the level of clipping.
 
 Without a pile nothing is clipped, and the depth matters only as the unit of the darkness
-threshold: 12 bits where they suffice (no polarization sensor has fewer in a 16-bit format by its
-own choice), else 14 or 16. A dark 12-bit capture so is not taken for a 10-bit one.
+threshold. It is 12 bits if they suffice (no polarization sensor has fewer in a 16-bit format by
+its own choice), else 14 or 16. So a dark 12-bit capture does not pass for a 10-bit one.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 CONTAINER_BITS = 16
 DEPTHS = (8, 10, 12, 14, 16)  # bits that cameras use
-DEFAULT_DEPTHS = (12, 14, 16)  # without a pile that tells
-# A pile holds more samples than each of so many levels below it, which there must be, by this
-# factor: a tail that ends by chance does not double at its last level (derived: a tail falls).
+DEFAULT_DEPTHS = (12, 14, 16)  # bits without a pile
+# A pile has more samples, by this factor, than each of so many levels below it, which must exist:
+# a tail that ends by chance does not double at its last level (derived: a tail falls).
 PILE_FACTOR = 2.0
 PILE_NEIGHBORS = 16
 MIN_PILE = 3  # samples; one or two at the top of a tail are chance
@@ -39,11 +39,11 @@ SCALED_GAP = 3  # least gap of scaled samples: 14 bits scaled to 16 leave 4 and 
 
 @dataclass(frozen=True, kw_only=True)
 class Levels:
-    """What a capture's sample values mean, and why.
+    """Meaning of a capture's sample values, and the reason.
 
     Attributes
     ----------
-    bit_depth : of the samples, 0 for floats.
+    bit_depth : of the samples; 0 for floats.
     full_scale : value of a saturated sample; the unit of all intensities.
     clip_level : value at which samples are clipped; infinite where no sample is.
     step : between neighbouring levels; 0 for floats.
@@ -63,7 +63,7 @@ class Levels:
 
 
 class LevelCounts:
-    """How often each level occurs in the files seen so far; one number a level, no pixels."""
+    """Histogram of the levels in the files read so far."""
 
     def __init__(self) -> None:
         self.counts: NDArray[np.int64] = np.zeros(0, np.int64)
@@ -91,10 +91,10 @@ class LevelCounts:
         self.counts += np.bincount(samples.ravel(), minlength=len(self.counts))
 
     def pile(self, step: float) -> int | None:
-        """The highest level, if samples pile up there; ``step`` is that between levels.
+        """The highest level, if samples pile up there; ``step`` is the spacing of the levels.
 
-        At a largest value of some depth one sample alone is a pile: a tail does not end just
-        there, with nothing close below it.
+        At the largest value of a bit depth a single sample is a pile: a tail does not end exactly
+        there with nothing close below it.
         """
         occupied = np.flatnonzero(self.counts)
         if len(occupied) == 0 or occupied[-1] == 0:
@@ -116,8 +116,8 @@ def decide_levels(counts: LevelCounts, full_scale: float | None = None) -> Level
 
     Parameters
     ----------
-    counts : of all its samples; of none for 8-bit files, which need no decision.
-    full_scale : the user's word, which is not doubted.
+    counts : of all its samples; empty for 8-bit files, which need no decision.
+    full_scale : given by the user; it takes precedence.
     """
     if counts.is_float:
         return _of_floats(counts, full_scale)

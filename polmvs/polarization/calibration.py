@@ -2,18 +2,18 @@
 
 A sample of gain g behind a polarizer of angle a and extinction ratio E measures
 ``I = g / 2 (s0 + d (cos 2a s1 + sin 2a s2))`` with the diattenuation ``d = (E - 1) / (E + 1)``.
-The gain is that for unpolarized light, so frames of a uniform unpolarized source give it alone
-(the flat field), and frames of a linear polarizer at known angles give a and d: behind a polarizer
-at t the sample's value is ``A + B cos 2t + C sin 2t`` with ``tan 2a = C / B`` and
-``d = hypot(B, C) / A``. Each of the three is one number a channel (0, 45, 90, 135 degrees), or an
-array with a value for each sample.
+The gain is that for unpolarized light, so frames of a uniform unpolarized source (the flat field)
+give it. Frames of a linear polarizer at known angles give a and d: behind a polarizer at t the
+sample's value is ``A + B cos 2t + C sin 2t`` with ``tan 2a = C / B`` and ``d = hypot(B, C) / A``.
+Each of the three is one number per channel (0, 45, 90, 135 degrees), or an array with a value for
+each sample.
 
-The four 2x2 blocks of a colour sensor's 4x4 cell are calibrated one by one, as if each were a
-sensor of its own, so that one number a channel is one of each block; gains are 1 in the mean of a
-block, since the colour of the lamp is not the sensor's.
+Each of the four 2x2 blocks of a colour sensor's 4x4 cell is calibrated as a separate sensor, so
+one number per channel becomes one per channel and block. The mean gain of a block is 1, since the
+colour of the lamp is not a property of the sensor.
 
-Extinction ratios themselves are unstable to estimate near d = 1; the diattenuation is what is
-fitted and stored (N. Hagen, S. Shibata, Y. Otani, Calibration and performance assessment of
+Estimates of extinction ratios are unstable near d = 1, so the diattenuation is fitted and stored
+(N. Hagen, S. Shibata, Y. Otani, Calibration and performance assessment of
 microgrid polarization cameras, Opt. Eng. 58(8), 2019).
 """
 
@@ -53,22 +53,22 @@ LEVEL_CHANGE = 1e-10  # of the brightness in one round, at which they agree
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PolarizerCalibration:
-    """What a sensor's samples measure; arrays are kept as files and mapped when used.
+    """Response of a sensor's samples; arrays are stored as files and mapped when used.
 
     Attributes
     ----------
-    pattern : polarizer angles of a 2x2 cell that it is of, row by row, degrees.
+    pattern : polarizer angles of a 2x2 cell of the sensor, row by row, degrees.
     gains : (4,), response to unpolarized light of the channels 0, 45, 90, 135 degrees, mean 1;
-        ones where a flat field has them. Of a colour sensor (16,): those of each 2x2 block of its
-        cell, row by row.
+        ones if a flat field has the gains. Colour sensor: (16,), for each 2x2 block of its cell,
+        row by row.
     angles_deg : (4,) or (16,), true angles of the channels, as displayed.
     diattenuations : (4,) or (16,), ``(E - 1) / (E + 1)``.
     dark : file of (H, W) float32, value of each sample without light, share of full scale.
     flat : file of (H, W) float32, response of each sample to unpolarized light, mean 1.
     angle_map, diattenuation_map : files of (H, W) float32, of each sample; in place of
         ``angles_deg`` and ``diattenuations``.
-    full_scale : value of a saturated sample of the frames, which the dark frame is a share of.
-    bayer : colours of the 2x2 blocks of a colour sensor, row by row; None of a monochrome one.
+    full_scale : value of a saturated sample of the frames, the unit of the dark frame.
+    bayer : colours of the 2x2 blocks of a colour sensor, row by row; None if monochrome.
     """
 
     pattern: Pattern
@@ -88,7 +88,7 @@ class PolarizerCalibration:
         return tuple((1 + d) / (1 - d) if d < 1 else np.inf for d in self.diattenuations)
 
     def correct(self, linear: Image) -> Image:
-        """Take the dark frame off a mosaic (H, W) and divide by the flat field.
+        """Subtract the dark frame from a mosaic (H, W) and divide by the flat field.
 
         Raises
         ------
@@ -106,9 +106,9 @@ class PolarizerCalibration:
 
         Returns
         -------
-        (4, 3), or (4, 3, H/2, W/2), in full resolution (4, 3, H, W), where each sample has its
-        own. Interpolated as the samples are, so exact where the light is uniform. Of a colour
-        sensor one of these for red, green and blue each: (3, 4, 3) and so on.
+        (4, 3); or, if each sample has its own, (4, 3, H/2, W/2), in full resolution (4, 3, H, W).
+        They are interpolated like the samples, so they are exact where the light is uniform. A
+        colour sensor has one for red, green and blue each: (3, 4, 3) and so on.
         """
         if self.angle_map is None and self.diattenuation_map is None:
             twice = 2.0 * np.radians(np.asarray(self.angles_deg))
@@ -141,7 +141,7 @@ class PolarizerCalibration:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PolarizerResponse:
-    """What frames of a source tell of a sensor, before it is stored.
+    """Response of a sensor, measured from frames of a source, before it is stored.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ class PolarizerResponse:
     gains, angles_deg, diattenuations : (4,) or (16,), see :class:`PolarizerCalibration`.
     dark, flat, angle_map, diattenuation_map : (H, W) float32, or None.
     residual : rms of the fit to the frames of the polarizer, share of their mean.
-    full_scale : value of a saturated sample of the frames, if it is known.
+    full_scale : value of a saturated sample of the frames, if known.
     bayer : of a colour sensor.
     """
 
@@ -184,14 +184,14 @@ def measure_response(
         transmission angle in degrees, anticlockwise from +x as displayed; three or more angles.
         The source's brightness may change between them.
     dark : mosaics without light.
-    per_sample : a value for each sample instead of each channel; needs as many frames as its
-        noise is to be small, ten or more.
+    per_sample : a value for each sample instead of each channel; needs ten or more frames against
+        noise.
 
     Raises
     ------
     ValueError
-        No frame of light, fewer than three angles, frames of different sizes, dark or odd ones, or
-        angles that do not fit the pattern.
+        No frame of light, fewer than three angles, frames of different or odd sizes, dark frames,
+        or angles that do not fit the pattern.
     """
     frames = [*unpolarized, *(frame for _, frame in polarized), *dark]
     shapes = {frame.shape for frame in frames}
@@ -261,7 +261,7 @@ def measure_colour_response(
     Raises
     ------
     ValueError
-        As there; or a side is no multiple of 4.
+        As there; or a side is not a multiple of 4.
     """
     frames = [*unpolarized, *(frame for _, frame in polarized), *dark]
     if any(side % 4 for frame in frames for side in frame.shape):
@@ -348,7 +348,7 @@ def read_calibration(path: Path) -> PolarizerCalibration:
     Raises
     ------
     DataError
-        It or an array that it names is missing, damaged, or holds impossible values.
+        The file or one of its arrays is missing, damaged, or has impossible values.
     """
     try:
         with as_data_error(path, "read"):

@@ -1,9 +1,9 @@
-"""Frames for polarizer calibration on disk: folders of darkness, a lamp, and a lamp's polarizer.
+"""Frames for polarizer calibration on disk: dark, unpolarized and polarized frames.
 
 The folder holds ``unpolarized/`` (a uniform unpolarized source: an integrating sphere, or a
 diffuser before the lens), ``polarized/`` (the same behind a linear polarizer, files named by its
 transmission angle in degrees, ``045.png`` or ``045_01.png``, three angles or more) and ``dark/``
-(lens cap on, same exposure). Any may be missing, but one of the first two.
+(lens cap on, same exposure). Any may be missing, except one of the first two.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def calibrate_polarizers(
 
     Parameters
     ----------
-    folder : see the head of this module.
-    options : how its mosaics are read.
+    folder : see the module's docstring.
+    options : how to read its mosaics.
     per_sample : a value for each sample instead of each channel.
 
     Raises

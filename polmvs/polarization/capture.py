@@ -1,8 +1,8 @@
 """A capture: a folder of one camera's polarization images, checked as a whole, loaded one by one.
 
-Which files make which view is told by their names (:mod:`polmvs.io.capture_files`), what a
-sample's value means by the samples of all files (:mod:`polmvs.polarization.bit_depth`). What was
-decided is kept in :class:`Capture` and said by its ``notes``.
+File names give the files of each view (:mod:`polmvs.io.capture_files`); the samples of all files
+give the meaning of their values (:mod:`polmvs.polarization.bit_depth`). :class:`Capture` holds
+these decisions; its ``notes`` describe them.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _scratch = threading.local()
 
 DISPLAY_GAMMA = 2.2
 WHITE_PERCENTILE = 99.5
-WHITE_IMAGES = 32  # images that the white level is taken from, evenly spread over the capture
+WHITE_IMAGES = 32  # images from which the white level is taken, evenly spread over the capture
 WHITE_SAMPLES = 20_000  # cells of each
 # That are looked at for lossy compression, the pattern and the gamma, evenly spread. Fewer do not
 # tell the gamma: in one image the scene's own change of polarization passes for one, found 0.46 to
@@ -78,21 +78,21 @@ EVEN = "Set the camera's region of interest to even offsets and sizes."
 
 @dataclass(frozen=True, kw_only=True)
 class Capture:
-    """Polarization images of one camera at one setting; nothing of their pixels is held.
+    """Polarization images of one camera at one setting; the pixels are not held in memory.
 
     Attributes
     ----------
     folder : as given by the user.
-    files : its views and what their files hold.
+    files : its views and the content of their files.
     header : size and type of each file's samples.
     width, height : of the polarization images, px.
-    levels : what a sample's value means.
-    options : how samples become polarization images.
+    levels : meaning of the sample values.
+    options : how to make polarization images of the samples.
     calibration : of the polarizers, if there is one.
-    lossy_steps : (64,) steps of the JPEG that the samples were, row by row; None if none.
+    lossy_steps : (64,) steps of the JPEG of the samples, row by row; None without one.
     orientations : TIFF orientations that occur; the samples are as stored.
     pattern_check, linearity_check : of a monochrome mosaic's pattern and gamma; None for others.
-    angle_gains : of the views that were looked at, of an ``ANGLES`` capture; empty for others.
+    angle_gains : of the checked views of an ``ANGLES`` capture; empty for others.
     """
 
     folder: Path
@@ -116,12 +116,12 @@ class Capture:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the views: of single mosaics their file names."""
+        """Names of the views; for single mosaics their file names."""
         return tuple(view.name for view in self.files.views)
 
     @property
     def has_colors(self) -> bool:
-        """Whether its files are those of a colour camera."""
+        """Whether its files are from a colour camera."""
         return self.options.bayer is not None or (
             self.files.kind is not CaptureKind.AOLP
             and self.header.channels == 3
@@ -140,7 +140,7 @@ class Capture:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was recognised and decided, one line each."""
+        """What was recognized and decided, one line each."""
         files, header = self.files, self.header
         what = {
             CaptureKind.MOSAIC: "raw mosaics",
@@ -168,7 +168,7 @@ class Capture:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Of the notes those that a user should act on."""
+        """The notes that a user should act on."""
         lines = []
         if self.orientations != (UPRIGHT,):
             tags = ", ".join(map(str, self.orientations))
@@ -189,7 +189,7 @@ class Capture:
 
     @property
     def unequal_exposure(self) -> str | None:
-        """What to say of polarizer angles that differ in exposure; None where they do not."""
+        """A message if the polarizer angles differ in exposure, else None."""
         differing = [found for found in self.angle_gains if found.differ]
         if not differing:
             return None
@@ -206,12 +206,12 @@ class Capture:
         )
 
     def load(self, name: str) -> Stokes:
-        """Read a view and turn it into Stokes images ``(height, width)``.
+        """Read a view and convert it to Stokes images ``(height, width)``.
 
         Raises
         ------
         DataError
-            A file is gone, damaged or has changed since the capture was opened.
+            A file is missing, damaged or has changed since the capture was opened.
         """
         view = self._view(name)
         match self.files.kind:
@@ -249,7 +249,7 @@ class Capture:
     def exposure(self) -> float:
         """White level of s0 for the whole capture, units of full scale: its 99.5 percentile.
 
-        Taken over a spread of at most 32 images and 20,000 cells of each.
+        It is taken from at most 32 images, evenly spread, and 20,000 cells of each.
 
         Raises
         ------
@@ -482,10 +482,10 @@ class Capture:
 
 
 def open_capture(folder: str | PathLike[str], options: CaptureOptions | None = None) -> Capture:
-    """Tell what a folder holds, check every file of it, and describe the capture.
+    """Recognize the content of a folder, check every file, and describe the capture.
 
-    8-bit PNGs are checked without decoding them, but for three; all other files are decoded, one
-    at a time, to see what their samples' values mean.
+    8-bit PNGs are checked without decoding, except three; all other files are decoded, one at a
+    time, to find the meaning of their values.
 
     Parameters
     ----------
@@ -495,9 +495,9 @@ def open_capture(folder: str | PathLike[str], options: CaptureOptions | None = N
     Raises
     ------
     DataError
-        There is no image, one is unusable, two differ in size or type, or a view lacks one.
+        There is no image, one is unusable, two differ in size or type, or a view lacks an image.
     OptionError
-        An option contradicts the files, as a pattern that does not fit.
+        An option contradicts the files, such as a pattern that does not fit.
     """
     chosen = CaptureOptions() if options is None else options
     files = find_capture(Path(folder), kind=chosen.kind, naming=chosen.naming, angles=chosen.angles)
@@ -510,7 +510,7 @@ def open_image(path: Path, options: CaptureOptions | None = None) -> Capture:
     Raises
     ------
     DataError
-        The file is missing, damaged or no monochrome mosaic.
+        The file is missing, damaged or not a monochrome mosaic.
     """
     view = ViewFiles(name=path.name, files=((path,),))
     files = CaptureFiles(
@@ -571,7 +571,7 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
 
 
 def intensity_image_8bit(stokes: Stokes, white: float) -> NDArray[np.uint8]:
-    """Intensity as COLMAP sees it best: one exposure for all views, gamma 2.2.
+    """8-bit intensity for COLMAP: one exposure for all views, gamma 2.2.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from polmvs.arrays import Image, Mask
 
-# Variance of reading a sample, over that of its photons at full scale. A full well of 10,000
+# Variance of the read noise over that of the photons at full scale. A full well of 10,000
 # electrons with a read noise of 2.5 (IMX250), measured in neither file; wrong by ten it costs a few
 # percent of noise in dark pixels.
 READ_VARIANCE = 6e-4
@@ -21,20 +21,20 @@ def merge_exposures(
 ) -> tuple[Image, Mask]:
     """Radiance of one view in full scales of its longest exposure.
 
-    Each exposure ``x_k`` measures ``L = x_k t_max / t_k`` with the variance of its photons and of
-    reading; unclipped ones are averaged by the inverse of it. The photons' share is taken from the
-    pooled samples, not from each sample itself, whose low values would get too much weight.
+    Each exposure ``x_k`` measures ``L = x_k t_max / t_k`` with photon and read noise. Unclipped
+    exposures are averaged with their inverse variance. The photon noise is that of the pooled
+    samples: that of single samples would give low values too much weight.
 
     Parameters
     ----------
     images : of (H, W) float32 or (H, W, 3), linear, units of full scale.
-    clipped : as the images, samples that say nothing but "at least".
+    clipped : as the images, True for samples that are only a lower bound.
     exposures_s : exposure times, any unit.
 
     Returns
     -------
-    merged : as the images; where all are clipped, what the shortest holds.
-    clipped : True there.
+    merged : as the images; the shortest exposure where all are clipped.
+    clipped : True where all are clipped.
     """
     times = np.asarray(exposures_s, np.float64)
     if not len(images) == len(clipped) == len(times) > 0 or not (times > 0).all():

@@ -1,4 +1,4 @@
-"""Degree of linear polarization that unpolarized light has after a smooth dielectric (Fresnel)."""
+"""DoLP of unpolarized light after reflection or refraction at a smooth dielectric (Fresnel)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from polmvs.polarization.kinds import Light
 
 
 def fresnel_dolp(cosines: Floats, light: Light | str, ior: Floats | float) -> Array:
-    """DoLP of unpolarized light that a surface mirrors, or that leaves it from inside.
+    """DoLP of unpolarized light that a surface reflects, or that leaves it from inside.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a capture's files are and how well they were exposed; nothing is reconstructed.
+"""Inspection of a capture: what its files are and how well they are exposed.
 
 :func:`inspect_capture` gives numbers, :func:`contact_sheet` a picture of some views: intensity,
 AoLP as hue with its wheel, DoLP.
@@ -37,18 +37,18 @@ WHITE, GRAY, ORANGE = (255, 255, 255), (160, 160, 160), (60, 160, 255)  # BGR
 
 @dataclass(frozen=True, kw_only=True)
 class InspectionLimits:
-    """Figures beyond which a capture is warned of; all are guesses of what still works.
+    """Limits beyond which a warning is given; all are guesses of what still works.
 
     Attributes
     ----------
     saturated : share of the part's pixels that are clipped, in a view.
-    noisy_deg : deviation of the AoLP on the part, the median of the views.
-    few_views : under which a surface is carried by little.
+    noisy_deg : deviation of the AoLP on the part, median over the views.
+    few_views : number of views below which a surface has little support.
     dark_white : brightest 0.5 % of the capture, share of full scale.
     polarized : share of the capture's pixels that are polarized.
     edge_px : width of the sharpest edges of a view.
     uneven : ratio of the brightest to the darkest view's median intensity.
-    colour : difference of the four 2x2 blocks' brightness, share, of a colour sensor.
+    colour : difference in brightness of the four 2x2 blocks of a colour sensor, share.
     """
 
     saturated: float = 0.1
@@ -72,7 +72,7 @@ class ViewFigures:
     saturated : share of pixels that a clipped sample contributes to, or that are not finite.
     part : share of all pixels that lie on the polarized part.
     part_saturated : share of the part's pixels that are clipped; NaN without a part.
-    dark : share of pixels under the darkness threshold.
+    dark : share of pixels below the darkness threshold.
     polarized : share of all pixels that are valid and have a DoLP of 0.1 and more.
     median_dolp : of the valid pixels.
     sigma_aolp_deg : median over the polarized pixels; NaN without any.
@@ -99,11 +99,11 @@ class Inspection:
 
     Attributes
     ----------
-    capture : as it was opened, with what was recognised and decided.
+    capture : the opened capture, with what was recognized and decided.
     white : s0 / 2 of the brightest 0.5 % of pixels, share of full scale.
     views : figures of each view.
-    warnings : what a user should look at, one line each.
-    obstacles : for which nothing is to be had from it, as clauses.
+    warnings : what a user should check, one line each.
+    obstacles : reasons why the capture is unusable, as clauses.
     """
 
     capture: Capture
@@ -114,7 +114,7 @@ class Inspection:
 
     @property
     def verdict(self) -> str:
-        """One sentence on whether it will do."""
+        """One sentence: whether the capture is usable."""
         if self.obstacles:
             return f"This capture will not do, because {'; and '.join(self.obstacles)}."
         if self.warnings:
@@ -125,7 +125,7 @@ class Inspection:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The whole in lines of text: what it is, a table of the views, warnings."""
+        """The inspection as lines of text: the format, a table of the views, warnings."""
         header = (
             f"{'view':<24} {'intensity':>9} {'part':>6} {'clipped':>8} {'dark':>7} "
             f"{'polarized':>9} {'DoLP':>6} {'sigma AoLP':>10} {'edge':>7}"
@@ -149,11 +149,11 @@ def inspect_capture(
     limits: InspectionLimits = InspectionLimits(),
     on_progress: OnProgress = no_progress,
 ) -> Inspection:
-    """Look at every view of a capture.
+    """Inspect every view of a capture.
 
     Parameters
     ----------
-    limits : beyond which a figure is warned of.
+    limits : limits of the warnings.
     on_progress : called with 1 after each view.
 
     Raises
@@ -180,16 +180,16 @@ def inspect_capture(
 
 
 def contact_sheet(capture: Capture, worded: Callable[[str], str] = str) -> Picture:
-    """Pictures of eight views: intensity, AoLP, DoLP, one view a row, in two columns of rows.
+    """Pictures of eight views in two columns; each row is intensity, AoLP and DoLP of one view.
 
     Parameters
     ----------
-    worded : what is shown of a line that names options by their paths.
+    worded : turns a line that names options by their paths into the shown text.
 
     Returns
     -------
-    (H, W, 3) uint8, BGR. Clipped pixels are red in the intensity; hue is the AoLP, paler and
-    darker where the DoLP is under 0.5.
+    (H, W, 3) uint8, BGR. Clipped pixels are red in the intensity. The hue is the AoLP, paler and
+    darker where the DoLP is below 0.5.
     """
     count = min(SHEET_VIEWS, len(capture.names))
     chosen = np.linspace(0, len(capture.names) - 1, count).round().astype(int)
@@ -209,7 +209,7 @@ def contact_sheet(capture: Capture, worded: Callable[[str], str] = str) -> Pictu
 
 
 def intensity_picture(stokes: Stokes, white: float) -> Picture:
-    """Intensity as a picture (H, W, 3), BGR; pixels that are not valid but bright are red."""
+    """Intensity as a picture (H, W, 3), BGR; bright pixels that are not valid are red."""
     gray = intensity_image_8bit(stokes, white)
     picture = np.dstack([gray, gray, gray])
     picture[~stokes.valid & (stokes.s0 > 0.1 * white)] = (40, 40, 255)
@@ -301,7 +301,7 @@ def _figures_of(name: str, stokes: Stokes, darkness: float) -> ViewFigures:
 
 
 def _part(stokes: Stokes, clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Where light is polarized (H, W), and clipped spots more than half of whose rim is there."""
+    """Polarized pixels (H, W), and clipped spots with more than half of their border polarized."""
     region = find_region(
         stokes.s0, stokes.s1, stokes.s2, stokes.valid, min_dolp=RegionOptions.min_dolp
     ).inside

@@ -1,4 +1,4 @@
-"""The angle models, and the kinds of light, by name: light to import, as the options need them."""
+"""Names of the angle models and of the kinds of light; quick to import, for the options."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from enum import StrEnum
 
 
 class AngleModel(StrEnum):
-    """Relation between the measured angle and the surface normal, and what polmvs adds to it.
+    """Relation between the measured angle and the surface normal, with the additions of polmvs.
 
-    The textbook models are OPA and PPA as published: each row says what its formula says, with the
-    weight of its noise. To the others polmvs adds what formula and camera leave open: rows count
-    less where their formula errs (``NormalOptions.tilt_aware_weights``).
+    The textbook models are OPA and PPA as published: each row has its formula and the weight of
+    its noise. In the others, polmvs gives rows less weight where their formula is inexact
+    (``NormalOptions.tilt_aware_weights``).
     """
 
     OPA = "opa"
@@ -21,12 +21,12 @@ class AngleModel(StrEnum):
 
     @property
     def is_textbook(self) -> bool:
-        """Whether nothing is added to the published model."""
+        """Whether the model is as published."""
         return self in (AngleModel.TEXTBOOK_OPA, AngleModel.TEXTBOOK_PPA)
 
     @property
     def formula(self) -> AngleModel:
-        """OPA, PPA or tilted: the relation alone."""
+        """OPA, PPA or tilted: the relation without the additions."""
         return AngleModel(self.value.removeprefix("textbook-"))
 
     @property

@@ -1,26 +1,28 @@
 r"""Classification of each observation as specular light, diffuse light or neither.
 
-An observation is what one view measures of one place: ``p = (s1, s2) / s0``, noise of variance v in
-either. Its angle fits a normal n as specular light, ``m_s . n = 0``, or as diffuse light, ``m_d . n
-= 0``, the planes of incidence m a quarter turn apart about the ray. With psi the turn about the ray
-between plane and normal, ``m . n = sin(theta) sin(psi)``, theta the angle between normal and ray.
+An observation is the measurement of one point in one view: ``p = (s1, s2) / s0``, with noise of
+variance v in each component. Its angle fits a normal n as specular light, ``m_s . n = 0``, or as
+diffuse light, ``m_d . n = 0``; the two rows m differ by a rotation of 90 degrees about the ray.
+With the rotation psi about the ray between plane of incidence and normal,
+``m . n = sin(theta) sin(psi)``, where theta is the angle between normal and ray.
 
 Likelihood
 ----------
-Gaussian noise of p makes psi von Mises distributed on twice the angle, ``exp(kappa cos 2 psi) / (pi
-I0(kappa))`` with ``kappa = 1 / (4 var(psi))``, and ``kappa cos 2 psi = kappa - (m . n)^2 / (2
-var(m . n))``, ``var(m . n) = sin^2(theta) var(psi)``. So a sure observation has the Gaussian of its
-residual, and the less it is polarized the more even is its density: it neither tells a normal nor a
-label. "Neither" (light reflected twice, marks, polarized surroundings) is even, ``1 / pi``.
+With Gaussian noise of p, psi has a von Mises distribution on twice the angle, ``exp(kappa cos 2
+psi) / (pi I0(kappa))`` with ``kappa = 1 / (4 var(psi))``, and ``kappa cos 2 psi = kappa - (m . n)^2
+/ (2 var(m . n))``, ``var(m . n) = sin^2(theta) var(psi)``. A certain observation has the Gaussian
+density of its residual. With less polarization the density becomes uniform, and the observation
+gives neither a normal nor a label. "Neither" (light reflected twice, marks, polarized surroundings)
+has the uniform density ``1 / pi``.
 
 Degree of polarization
 ----------------------
-Light of both kinds mixes, and they subtract: the measured DoLP lies anywhere between zero and that
-of one kind alone at this theta, which Fresnel's equations give. So a DoLP is evidence by what it
-exceeds alone: ``P(rho <= bound(theta))``, with the noise of rho, theta's own error and a refractive
-index anywhere between two limits.
+Light of both kinds mixes, and their polarizations subtract: the measured DoLP is between zero and
+that of one kind alone at this theta, by Fresnel's equations. So a DoLP is evidence only as an upper
+bound: ``P(rho <= bound(theta))``, with the noise of rho, the error of theta and a refractive index
+between two limits.
 
-Nothing here knows of views, points or meshes: arrays of any one shape go in and come out.
+The functions take and return arrays of any common shape.
 """
 
 from __future__ import annotations
@@ -36,27 +38,27 @@ from polmvs.arrays import Array, Floats
 from polmvs.polarization.fresnel import fresnel_dolp
 from polmvs.polarization.kinds import Light
 
-TABLE_SIZE = 512  # steps of the cosine that bounds are tabulated at
+TABLE_SIZE = 512  # number of cosines in the table of bounds
 NUM_IORS = 7
 LOGISTIC_SCALE = 1.702  # of a logistic distribution that comes nearest to the normal one (Camilli)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LightMixtureTolerances:
-    """What is assumed of light and surface before any phase is seen.
+    """Prior assumptions about light and surface.
 
     Attributes
     ----------
     neither_share : of all observations. Guess.
-    min_ior, max_ior : refractive indices of dielectrics, all alike likely between. Derived: water
-        1.33, plastics, glazes, lacquers and glass 1.45 to 1.6, dense glass 1.7.
-    dolp_margin : by which a bound may be exceeded beside noise: reflections of polarized light,
-        another model of the surface. Guess.
+    min_ior, max_ior : limits of the uniformly distributed refractive index of dielectrics. Derived:
+        water 1.33, plastics, glazes, lacquers and glass 1.45 to 1.6, dense glass 1.7.
+    dolp_margin : by which a bound may be exceeded in addition to noise: reflections of polarized
+        light, another model of the surface. Guess.
     model_sigma : rad; error of the phase of strongly polarized light that noise does not explain.
         Measured on the shared captures.
-    mixture_sigma : rad times DoLP; by which light of a second reflection turns the phase, over the
+    mixture_sigma : rad times DoLP; light of a second reflection turns the phase by this over the
         DoLP. Measured on the shared captures.
-    min_sine : of theta. Seen frontally a surface has no plane of incidence. Guess.
+    min_sine : of theta. A surface seen frontally has no plane of incidence. Guess.
     """
 
     neither_share: float = 0.15
@@ -69,7 +71,7 @@ class LightMixtureTolerances:
 
 
 class LightShares(NamedTuple):
-    """Probabilities of the three labels, which sum to one, and what they make of an observation.
+    """Probabilities of the three labels, which sum to one, and the likelihood of an observation.
 
     Attributes
     ----------
@@ -92,8 +94,8 @@ def phase_variance(
 ) -> Floats:
     """Variance (...) of a phase, rad^2: noise, the model's error and light of other reflections.
 
-    Infinite where the DoLP does not exceed what noise alone makes of no polarization. (The square
-    of a measured DoLP is too large by twice the noise's variance in the mean.)
+    Infinite where the DoLP does not exceed that of unpolarized light with noise. (The mean square
+    of a measured DoLP is too large by twice the variance of the noise.)
 
     Parameters
     ----------
@@ -125,13 +127,13 @@ def light_shares(
     Parameters
     ----------
     residuals : ``m . n`` of the specular and of the diffuse plane of incidence, m and n unit.
-    turn_variances : of either plane's turn about the ray, rad^2: :func:`phase_variance` times the
-        square of the turn per phase. Infinite where nothing is known: there residuals may be NaN.
+    turn_variances : of either plane's rotation about the ray, rad^2: :func:`phase_variance` times
+        the square of the rotation per phase. Infinite where unknown: residuals may be NaN there.
     cosines : of the angle theta between the normal and the direction to the viewer.
     dolp, dolp_variance : measured, and its variance.
-    normal_variance : of the normal along either direction, rad^2; 0 where it is a hypothesis.
-    prior_specular : probability that light is specular, if it is one of the two: 1 where a user
-        says so, else that of the neighbours, say.
+    normal_variance : of the normal along either direction, rad^2; 0 for a hypothesis.
+    prior_specular : probability that light is specular, if it is one of the two: 1 if the user
+        says so, else for example that of the neighbours.
     tolerances : of this step.
     """
     t = tolerances
@@ -165,15 +167,15 @@ def light_shares(
 def residual_variance(
     turn_variance: Floats, sin2: Floats, normal_variance: Floats | float = 0.0
 ) -> Floats:
-    """Variance (...) of ``m . n``: the plane's turn about the ray, and the normal's own error."""
+    """Variance (...) of ``m . n``: the plane's rotation about the ray, and the normal's error."""
     return np.asarray(sin2 * turn_variance + normal_variance)
 
 
 def row_precisions(shares: LightShares, variances: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
     """Weights (...) of the squares of the two residuals in a fit of the normal.
 
-    The residuals' squares sum to ``sin^2(theta)``, whatever the plane: what both labels share draws
-    to the ray and tells nothing of it, so that a label counts by how much it exceeds the other.
+    The squares of the residuals sum to ``sin^2(theta)`` for any plane. The part common to both
+    labels only pulls the normal to the ray, so a label counts by its excess over the other.
 
     Parameters
     ----------
@@ -187,7 +189,7 @@ def row_precisions(shares: LightShares, variances: tuple[Floats, Floats]) -> tup
 def angle_log_density(
     residual: Floats, turn_variance: Floats, sin2: Floats, normal_variance: Floats | float = 0.0
 ) -> Floats:
-    """Log density (...) of a plane's turn about the ray over an even one; 0 of no information."""
+    """Log density (...) of a plane's rotation about the ray over a uniform one; 0 if unknown."""
     variance = residual_variance(turn_variance, sin2, normal_variance)
     known = np.isfinite(variance)
     safe = np.where(known, variance, 1)
@@ -216,7 +218,7 @@ def dolp_log_evidence(
     normal_variance: Floats | float = 0.0,
     tolerances: LightMixtureTolerances = LightMixtureTolerances(),
 ) -> Floats:
-    """Log probability (...) that a measured DoLP is within what light of a kind can have.
+    """Log probability (...) that a measured DoLP is possible for a kind of light.
 
     Parameters are those of :func:`light_shares`.
     """

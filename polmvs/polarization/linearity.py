@@ -1,11 +1,10 @@
 """Estimate of the encoding gamma of a mosaic from its polarized light.
 
-Behind an analyzer at ``a`` stands ``I = s0 / 2 (1 + q cos 2a + u sin 2a)``. Whatever gains, angles
-and extinction ratios the four analyzers have, and however oblique rays tilt them, the redundancy
-``r = (I0 + I90 - I45 - I135) / s0`` is *linear* in ``q, u`` at each place of the image. An encoding
-``I ** p`` adds to it ``(p - 1) / (2 p) (q^2 - u^2)``, to second order, with q and u as they are
-measured. The two are told apart by regression, and the exponent follows without any knowledge of
-the scene.
+The intensity behind an analyzer at ``a`` is ``I = s0 / 2 (1 + q cos 2a + u sin 2a)``. The
+redundancy ``r = (I0 + I90 - I45 - I135) / s0`` is *linear* in ``q, u`` at each image position, for
+any gains, angles, extinction ratios and tilts of the four analyzers. An encoding ``I ** p`` adds
+``(p - 1) / (2 p) (q^2 - u^2)`` to it, to second order, with q and u as measured. A regression
+separates the two and gives the exponent without any knowledge of the scene.
 """
 
 from __future__ import annotations
@@ -25,22 +24,22 @@ from polmvs.polarization.stokes import patch_means
 
 @dataclass(frozen=True, kw_only=True)
 class LinearityTolerances:
-    """What the estimate of an encoding is made from, and when it contradicts the one given.
+    """Tolerances of the estimate of an encoding, and of its contradiction to the given one.
 
     Attributes
     ----------
-    min_level : of a patch's mean, share of full scale. Guess: where samples near nought are cut
+    min_level : of a patch's mean, share of full scale. Guess: where samples near zero are cut
         off, darker ones look encoded.
     max_contrast : deviation of the intensity within a patch over its mean. Guess.
     min_patches : Guess.
-    min_quadratic : deviation of ``q^2 - u^2`` over the patches, for them to tell anything. Guess:
-        that of light polarized by 7 % in all directions.
+    min_quadratic : least deviation of ``q^2 - u^2`` over the patches for an estimate. Guess: that
+        of light polarized by 7 % in all directions.
     num_rounds : of weights and exponents; the exponent converges quadratically.
-    num_groups : of patches, neighbours together, each of which is left out once (jackknife), as is
-        each image.
-    min_ratio : of the two gammas, whatever the certainty. Guess: the degree of polarization is off
-        by as much. Real sensors are linear to some percent.
-    max_log_sigma : of the gamma's logarithm, for an estimate to be named. Guess.
+    num_groups : groups of neighbouring patches. Each group and each image is left out once
+        (jackknife).
+    min_ratio : least ratio of the two gammas for a contradiction, at any certainty. Guess: the
+        degree of polarization is off by as much. Real sensors are linear to some percent.
+    max_log_sigma : largest deviation of the gamma's logarithm for an estimate. Guess.
     """
 
     min_level: float = 0.02
@@ -59,10 +58,10 @@ class LinearityCheck:
 
     Attributes
     ----------
-    given : gamma that the samples are decoded with.
-    found : that they show; None where too little polarized light tells.
+    given : gamma with which the samples are decoded.
+    found : gamma that they show; None if there is too little polarized light.
     log_sigma : standard deviation of its logarithm.
-    fits : whether the two agree; None where nothing tells.
+    fits : whether the two agree; None if unknown.
     """
 
     given: float
@@ -96,14 +95,14 @@ def check_linearity(
     *,
     tolerances: LinearityTolerances = LinearityTolerances(),
 ) -> LinearityCheck:
-    """Compare the gamma that mosaics are to be decoded with and the one that they show.
+    """Compare the given gamma of mosaics with the gamma that their samples show.
 
     Parameters
     ----------
-    mosaics : (H, W), samples as they are stored, shares of full scale.
+    mosaics : (H, W), samples as stored, shares of full scale.
     pattern : polarizer angles of a cell, row by row, degrees.
     clip : share from which a sample is clipped.
-    gamma : that the user gave: linear = sample ** (1 / gamma).
+    gamma : given by the user: linear = sample ** (1 / gamma).
     """
     t = tolerances
     unknown = LinearityCheck(given=gamma, found=None, log_sigma=np.inf, fits=None)

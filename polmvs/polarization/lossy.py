@@ -1,10 +1,10 @@
-"""Traces of lossy compression in a mosaic, and what it does to the Stokes images.
+"""Traces of lossy compression in a mosaic, and its noise in the Stokes images.
 
-A JPEG rounds the coefficients of each 8x8 block of samples to multiples of a step. A mosaic's
-polarization lies at the highest frequencies (the difference of neighbouring samples), where the
-steps are largest, and the redundancy of the four samples shrinks with it: the noise that it shows
-is too small. So the steps are found, and the variance that rounding to them puts into s1 and s2 is
-computed: each coefficient errs uniformly within its step.
+A JPEG rounds the coefficients of each 8x8 block of samples to multiples of a step. The polarization
+of a mosaic is at the highest frequencies (the difference of neighbouring samples), where the steps
+are largest. The redundancy of the four samples shrinks as well, so it shows too little noise.
+Therefore polmvs finds the steps and computes the variance of s1 and s2 that rounding to them adds:
+the error of each coefficient is uniform within its step.
 
 The steps of a JPEG are in its file. In samples that were stored without loss *after* a JPEG, they
 are the spacing of the coefficients' values: for a step q, ``mean cos(2 pi c / q)`` over the
@@ -26,18 +26,18 @@ from polmvs.config import CaptureOptions
 from polmvs.polarization.mosaic import split_mosaic
 
 BLOCK = 8
-MAX_BLOCKS = 1500  # that are looked at, evenly spread
+MAX_BLOCKS = 1500  # blocks that are used, evenly spread
 MIN_BLOCKS = 64
 MAX_STEP = 64
 MIN_STEP = 3  # rounding to whole samples blurs smaller ones (derived: deviation 0.29 of a step)
-MIN_MAGNITUDE = 1.0  # beyond which a coefficient is not the rounding of samples alone
-MIN_NONZERO = 24  # coefficients of one frequency, before their spacing means anything
+MIN_MAGNITUDE = 1.0  # coefficients above this are not only the rounding of samples
+MIN_NONZERO = 24  # least number of coefficients of one frequency for a spacing
 MIN_COMB = 0.6  # comb strength of a step; unrounded coefficients reach 0.3 with so few (simulated)
-MIN_RHYTHMIC = 6  # frequencies with a comb, before samples count as lossy
+MIN_RHYTHMIC = 6  # least number of frequencies with a comb for samples to count as lossy
 
 
 def find_quantization(raw: NDArray[Any]) -> NDArray[np.float64] | None:
-    """Steps of the JPEG that 8-bit samples once were, or None.
+    """Steps of the JPEG from which 8-bit samples were decoded, or None.
 
     Parameters
     ----------
@@ -45,8 +45,8 @@ def find_quantization(raw: NDArray[Any]) -> NDArray[np.float64] | None:
 
     Returns
     -------
-    (8, 8) float64, rows for vertical frequencies: the step; where all coefficients are zero, twice
-    the largest that samples between may have had, a step that would have hidden them.
+    (8, 8) float64, the steps, rows for vertical frequencies. Where all coefficients are zero: twice
+    the largest coefficient that they may have had, the least step that would hide it.
     """
     steps, rhythmic, silent = _rhythm(_blocks(raw))
     if rhythmic < MIN_RHYTHMIC:
@@ -82,7 +82,7 @@ def _rhythm(
 
 
 def lossy_variance(steps: NDArray[np.float64], *, scale: float) -> float:
-    """Variance of s1 and s2 (mean of the two) by rounding coefficients to steps.
+    """Variance of s1 and s2 (mean of the two) by rounding the coefficients to steps.
 
     Parameters
     ----------
@@ -95,10 +95,10 @@ def lossy_variance(steps: NDArray[np.float64], *, scale: float) -> float:
 def lossy_mean_variance(
     steps: NDArray[np.float64], analyzers: NDArray[np.float64], *, scale: float
 ) -> float:
-    """Variance of the mean s1 and s2 of a block (the larger of the two) of images of their own.
+    """Variance of the mean s1 and s2 (the larger of the two) of a block of separate angle images.
 
-    Each angle's image is compressed alone, so that its redundancy shows what rounding does to
-    single pixels. What a block shares is the rounding of its mean. Measured on a public capture of
+    Each angle's image is compressed separately, so the redundancy shows the rounding of single
+    pixels. The pixels of a block share the rounding of its mean. Measured on a public capture of
     30 views, JPEG with steps of 8 to 61, against the redundancy averaged over 17x17 px: a deviation
     of 0.0020 of s0, where this gives 0.0014 for a block and the steps of all frequencies 0.0155.
 

@@ -1,8 +1,8 @@
 """Check that a user's mask ends where the polarized surface ends, not within it.
 
-A mask of a part's top alone leaves its sides out, which are polarized as well. The surface of all
-views is a solid: its sides would show where the masks say that there is nothing, so that it bends
-and frays along the top's edge.
+A mask of only the top of a part excludes its sides, which are also polarized. The surface of all
+views is closed, so its sides appear where the masks exclude them. It then bends and frays along the
+edge of the top.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from polmvs.arrays import Mask
 from polmvs.polarization.region import RegionTolerances, smooth
 from polmvs.polarization.stokes import Stokes
 
-# Band outside of the mask that is looked at: polarization leaks by twice the smoothing's width.
+# Width of the band outside of the mask: polarization leaks by twice the smoothing's width.
 BAND_SIGMAS = (2.0, 3.0)
 # Measured, means over views of true masks: 0.000 to 0.001 of `dome`, `mug`, `step` and eight
 # simulated domes and mugs; 0.08 and 0.17 where they hold the top of a slab alone. The limit is a

@@ -1,9 +1,9 @@
 """Polarizer mosaics: linear samples, and four angle images on one common grid.
 
-A pattern holds the angles of a 2x2 cell as *displayed*. A camera mounted upside down, an image
-turned or mirrored by software, and a region of interest with odd offsets each give another of the
-24 orders; :func:`turned_pattern` says which. In a colour sensor the 2x2 cells are the pixels of a
-Bayer pattern, so its cell has 4x4 samples.
+A pattern holds the angles of a 2x2 cell as *displayed*. There are 24 orders. A camera mounted
+upside down, an image turned or mirrored by software, and a region of interest with odd offsets
+change the order; :func:`turned_pattern` gives the new one. In a colour sensor the 2x2 cells are the
+pixels of a Bayer pattern, so its cell has 4x4 samples.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ INTERPOLATION_NOISE_GAIN: Final = (NEAR**2 + FAR**2) ** 2
 def noise_area_px(*, colour: bool = False, full: bool = False) -> float:
     """Pixels of a polarization image that share an error, since all are interpolated.
 
-    The variance of the mean of many pixels, times their number, over the variance of one: pixels
-    for each sample that they are interpolated from, over the mean square sum of the weights.
+    It is the variance of the mean of many pixels times their number, over the variance of one: the
+    number of pixels per raw sample, over the mean square sum of the weights.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def linearize(raw: NDArray[Any], *, gamma: float = 1.0, full_scale: float | None
     ----------
     raw : (H, W) uint8, uint16 or floats
     gamma : encoding gamma of the camera, 1 for a linear one.
-    full_scale : value of a saturated sample; the largest of the type where it is None, 1 of floats.
+    full_scale : value of a saturated sample; None: the largest of the type, 1 for floats.
 
     Returns
     -------
@@ -78,16 +78,16 @@ def split_mosaic(
 ) -> Image:
     """Four angle images, each interpolated to the centres of the 2x2 cells.
 
-    Bilinear, which is exact on a linear ramp. Measured on the project's captures against the
-    redundancy ``|I0 + I90 - I45 - I135| / s0``: slicing 5.7 %, this 3.4 %, four-tap cubic 4.2 %,
-    guided by a pseudo-intensity 3.4 % (at five times the cost and a wider reach of clipping).
+    Bilinear, which is exact on a linear ramp. Measured, redundancy ``|I0 + I90 - I45 - I135| / s0``
+    on the shared captures: slicing 5.7 %, this 3.4 %, four-tap cubic 4.2 %, guided by a
+    pseudo-intensity 3.4 % (at five times the cost and a wider reach of clipping).
 
     Parameters
     ----------
     raw : (H, W), H and W even, linear.
     pattern : polarizer angles of a 2x2 cell, row by row, degrees.
-    scale : factor to the images, which integer samples get without a pass of their own.
-    out : (4, H/2, W/2) float32 to write them into; None for a new array.
+    scale : factor applied to the images, at no cost for integer samples.
+    out : (4, H/2, W/2) float32 output array; None for a new one.
 
     Returns
     -------
@@ -172,10 +172,10 @@ def split_colour_mosaic(
 def turned_pattern(
     pattern: tuple[int, int, int, int], orientation: int
 ) -> tuple[int, int, int, int]:
-    """Pattern of an image whose samples were turned or mirrored as a TIFF orientation says.
+    """Pattern of an image whose samples were turned or mirrored by a TIFF orientation.
 
-    Angles are those as displayed, so they turn with the image: by 90 degrees the places of the
-    cell turn and each angle changes to its perpendicular; mirrored, 45 becomes 135.
+    Angles are as displayed, so they turn with the image: a rotation by 90 degrees moves the
+    samples of a cell and makes each angle its perpendicular; a reflection makes 45 to 135.
 
     Parameters
     ----------
@@ -217,8 +217,8 @@ def clipped_cells(
 
     Returns
     -------
-    (H/2, W/2) bool, in full (H, W): a sample that is interpolated from is clipped. Of a monochrome
-    mosaic in half resolution that is the 4x4 raw px about the cell's centre.
+    (H/2, W/2) bool, in full (H, W): True if a sample of the interpolation is clipped. For a
+    monochrome mosaic in half resolution these are the 4x4 raw px about the cell's centre.
     """
     _require_cells(raw)
     clipped = np.asarray(raw >= threshold, np.uint8)

@@ -1,9 +1,9 @@
 """Whether the order of the polarizers in a mosaic's cell fits its samples.
 
-Perpendicular polarizers sum to the whole intensity, so ``I0 + I90 = I45 + I135``, whatever the
-light. Of the three ways to part the four places of a cell into two pairs only the right one makes
-the sums agree where light is polarized. That tells 8 of the 24 orders from the other 16. The eight
-are turned and mirrored images of each other, which one picture cannot tell apart: their angles of
+Intensities behind perpendicular polarizers sum to the whole intensity, so ``I0 + I90 = I45 + I135``
+for any light. There are three ways to divide the four samples of a cell into two pairs. Where light
+is polarized, the sums agree only for the correct one. That leaves 8 of the 24 orders. The eight are
+turned and mirrored images of each other. One image cannot distinguish them: their angles of
 polarization differ, their sums do not.
 """
 
@@ -29,9 +29,9 @@ PAIRING_NAMES = ("diagonals", "rows", "columns")
 SMOOTHING_PX = 9
 MIN_LIGHT = 0.02  # share of the brightest
 MIN_PIXELS = 500  # polarized ones
-# A wrong pairing shows polarized light as disagreement: several times what the right one has.
-# Between this ratio and its inverse nothing is said (guess; right patterns of rendered and real
-# captures have 0.1 to 0.4, a swapped one the inverse).
+# With a wrong pairing polarized light makes several times the disagreement of the right one.
+# Between this ratio and its inverse the check is undecided (guess; right patterns of rendered and
+# real captures have 0.1 to 0.4, a swapped one the inverse).
 CLEAR_RATIO = 0.5
 POLARIZED_SHARE = 0.05  # of s0, beyond which the sums of the best pairing count as polarized
 
@@ -42,11 +42,11 @@ class PatternCheck:
 
     Attributes
     ----------
-    pattern : that was checked.
+    pattern : the checked pattern.
     disagreement : of the sums under the three pairings, median over polarized pixels, share of
         s0; in the order of ``PAIRING_NAMES``.
-    num_pixels : polarized ones that were looked at.
-    fits : None where too little light is polarized to tell.
+    num_pixels : number of polarized pixels used.
+    fits : None if too little light is polarized.
     fitting : the eight patterns that fit, the sensor's own and turned ones first; empty if unknown.
     """
 

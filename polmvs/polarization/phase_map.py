@@ -1,4 +1,4 @@
-"""Phase maps: what the geometry needs of one view."""
+"""Phase maps: the phase of one view, with its precision."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from polmvs.polarization.stokes import Stokes
 from polmvs.scene import View
 
 MIN_SHARE = 0.02  # of a window that must count
-TINY = 1e-12  # variance of a polarization without noise, which is known all the same
+TINY = 1e-12  # variance of a polarization without noise
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseTolerances:
-    """How phases are smoothed, and how certain they are beside their noise.
+    """Tolerances of smoothing, and errors of the phase other than noise.
 
     Attributes
     ----------
     sharp_smoothing_px : of the lowest DoLP of single pixels. Guess.
     fine_smoothing_px : of the phase. Measured, F at 1 mm with 1.5 px, 1 px and 0.7 px: of `step`
         97.6, 98.0 and 97.8 %, of `mug` 97.6, 98.2 and 98.0 %.
-    coarse_smoothing_px : of the phase where few pixels count: it bridges clipped spots. Guess.
+    coarse_smoothing_px : of the phase where few pixels are usable: it bridges clipped spots. Guess.
     model_sigma : rad; error of the phase of strongly polarized light that noise does not
         explain. Measured on the shared captures.
     ridge : of the local linear fits, as a share of the window's variance: bounds their slopes
         where few pixels count. Guess.
-    mixture_sigma : rad times DoLP; light of the other kind mixed in turns the phase by this
-        over the DoLP. Measured on the shared captures.
+    mixture_sigma : rad times DoLP; light of the other kind, mixed in, turns the phase by this over
+        the DoLP. Measured on the shared captures.
     """
 
     sharp_smoothing_px: float = 0.7
@@ -61,17 +61,17 @@ class PhaseMap:
     samples : (H, W, 3) float32: ``dolp cos 2 phase``, ``dolp sin 2 phase`` and the phase's inverse
         variance (1 / rad^2; 0: no phase here): noise and mixed light, whatever the angle model.
     intensity : (H, W) float32, s0 in units of full scale.
-    diffuse : (H, W) bool, pixels whose light is diffuse-dominant; the others' is specular.
-    lowest_dolp : (H, W) uint8, lowest DoLP of single pixels next to each pixel, in 1/255: what
-        is printed on a surface is less polarized than it, what is mirrored in it is not.
+    diffuse : (H, W) bool, pixels with mainly diffuse light; the others have specular light.
+    lowest_dolp : (H, W) uint8, lowest DoLP of single pixels next to each pixel, in 1/255: a print
+        on a surface is less polarized than the surface, a mirror image in it is not.
     polarization : (H, W, 4) float32: ``s1 / s0`` and ``s2 / s0`` of each pixel as measured, inside
         and outside of the region, and the variance of either: that of a mean of n pixels is the
-        third channel over n (noise, of which neighbours share some, and lossy compression) plus
-        the fourth, which all pixels share (gains, and rounding that no noise blurs). Both are inf
+        third channel over n (noise, which neighbours share in part, and lossy compression) plus the
+        fourth, which all pixels share (gains, and rounding without dithering noise). Both are inf
         where a pixel is clipped or dark.
-    outline_shift : (H, W) float32 px, by how much the outline of the region lies outside of its
-        border, at each pixel that of the border's nearest place; None where it was not measured.
-    folder : where the arrays are stored, if they are.
+    outline_shift : (H, W) float32 px, distance by which the outline of the region lies outside of
+        its border, at each pixel that of the nearest border pixel; None if not measured.
+    folder : folder of the arrays, if they are stored.
     tilted : the samples are corrected for tilted polarizers (:func:`as_tilted`).
     """
 
@@ -97,10 +97,9 @@ class PhaseMap:
 
 
 class StoredPhaseMap(PhaseMap):
-    """A phase map on disk. Its arrays are mapped into memory when they are asked for, not held.
+    """A phase map on disk; its arrays are mapped into memory when they are used, not held.
 
-    So the maps of a capture take no memory but for those that are being looked at. It is pickled
-    as its place.
+    So only the maps in use take memory. It is pickled as its path.
     """
 
     def __init__(self, view: View, folder: Path, tilted: bool) -> None:
@@ -117,7 +116,7 @@ class StoredPhaseMap(PhaseMap):
 
     @property
     def flags(self) -> NDArray[np.uint8]:
-        """Region and light of each pixel (H, W), a bit each."""
+        """Region and light of each pixel (H, W), one bit each."""
         return self._array(f"{self.view.name}.region.npy", np.unsignedinteger)
 
     @property
@@ -194,22 +193,20 @@ def build_phase_map(
     *,
     tolerances: PhaseTolerances = PhaseTolerances(),
 ) -> PhaseMap:
-    """Smooth the polarization of a region's valid pixels and turn it into phase and precision.
+    """Smooth the polarization of a region's valid pixels and convert it to phase and precision.
 
-    What is smoothed are ``s1 / s0`` and ``s2 / s0``: the Stokes images themselves would carry the
-    phase of a bright face into the dark one beside it. For the same reason printed marks keep their
-    own phase, as weak as it may be, and are not bridged by what is about them: from a view alone
-    they are not told from a wall that turns away from the light. All pixels that count do so alike:
-    to trust those less whose four samples disagree makes phases err by 2 to 13 % more, and differ
-    from those of the same Stokes images in a format that has no four samples.
+    ``s1 / s0`` and ``s2 / s0`` are smoothed: smoothing the Stokes images would spread the phase of
+    a bright patch into the dark one beside it. For the same reason printed marks keep their own
+    weak phase: in one view a mark looks like a wall that turns away from the light. All usable
+    pixels have the same weight. Less weight where the four samples disagree raises phase errors by
+    2 to 13 %, and would depend on the format of the capture.
 
     Parameters
     ----------
-    stokes : of this view. Of its noise smoothing leaves what neighbours do not share; the errors
-        of compression are shared by whole blocks, those of the channels' gains by all pixels, those
-        of rounding by neighbours where no noise blurs them.
+    stokes : of this view. Smoothing does not reduce errors that neighbours share: those of
+        compression within a block, of gains over all pixels, and of rounding without dithering.
     region : of this view.
-    light : which reflection dominates; specular light turns the phase by pi/2 from the AoLP.
+    light : dominant kind of light; specular light turns the phase by pi/2 from the AoLP.
     tolerances : of this step.
     """
     t = tolerances
@@ -249,7 +246,7 @@ def build_phase_map(
 def measured_polarization(stokes: Stokes) -> Image:
     """Normalised Stokes parameters of all pixels (H, W, 4) with their variances.
 
-    No light is chosen. See ``polarization`` of :class:`PhaseMap`.
+    It does not depend on the kind of light. See ``polarization`` of :class:`PhaseMap`.
     """
     known = stokes.valid & (stokes.s0 > 0)
     s0 = np.where(known, stokes.s0, np.float32(1))
@@ -278,11 +275,11 @@ def smoothed_polarization(
     ----------
     polarization : as of :class:`PhaseMap`.
     width_px : of the window.
-    counted : (H, W), pixels that count; None: all.
+    counted : (H, W), pixels to use; None: all.
 
     Returns
     -------
-    The variance is 0 where no pixel in reach counts.
+    The variance is 0 where the window has no usable pixel.
     """
     known = np.isfinite(polarization[..., 2])
     if counted is not None:
@@ -307,9 +304,9 @@ def _lowest_dolp(stokes: Image, *, tolerances: PhaseTolerances) -> NDArray[np.ui
 def as_tilted(phase_map: PhaseMap) -> PhaseMap:
     """The phase map that a sensor obeying PPA would have given, not stored.
 
-    infers that the polarizers are tilted for oblique rays
+    This assumes that the polarizers are tilted for oblique rays
     (:mod:`polmvs.polarization.angle_models`). The correction is linear in the Stokes parameters
-    and varies slowly over the image, so that it may follow the smoothing.
+    and varies slowly over the image, so it may follow the smoothing.
     """
     sign = np.where(phase_map.diffuse, phase_sign(Light.DIFFUSE), phase_sign(Light.SPECULAR))
     cos, sin, precision = np.moveaxis(phase_map.samples, -1, 0)
@@ -322,7 +319,7 @@ def as_tilted(phase_map: PhaseMap) -> PhaseMap:
     )
     corrected = correct_stokes(measured, view_rays(phase_map.view), diffuse=phase_map.diffuse)
     scale = sign / np.maximum(corrected.s0, 1e-6)
-    # The turn of a row about its ray stays as certain as it was; that of the phase changes.
+    # The variance of a row's rotation about its ray stays; that of the phase changes.
     precision = precision / np.square(corrected.sigma)
     samples = np.dstack([scale * corrected.s1, scale * corrected.s2, precision])
     clean = np.nan_to_num(samples, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
@@ -330,7 +327,7 @@ def as_tilted(phase_map: PhaseMap) -> PhaseMap:
 
 
 def turned(phase_map: PhaseMap, where: Mask) -> PhaseMap:
-    """The map with the other kind of light on some pixels, their phase turned; not stored."""
+    """The map with the other kind of light at some pixels, whose phase is turned; not stored."""
     sign = np.where(where, -1, 1).astype(np.float32)[..., None]
     axial, precision = phase_map.samples[..., :2], phase_map.samples[..., 2:]
     samples = np.concatenate([sign * axial, precision], axis=-1)
@@ -338,9 +335,9 @@ def turned(phase_map: PhaseMap, where: Mask) -> PhaseMap:
 
 
 def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:
-    """Write a phase map as ``.npy`` files named after the view; returns the stored one.
+    """Write a phase map as ``.npy`` files named after the view; return the stored map.
 
-    A tilted map shares all files but the samples with the map that it was made from.
+    A tilted map shares all files except the samples with the map from which it was made.
     """
     region, name = phase_map.region, phase_map.view.name
     flags = region.inside * 1 | region.reliable * 2 | region.edges * 4 | phase_map.diffuse * 8
@@ -359,12 +356,12 @@ def _samples_name(name: str, tilted: bool) -> str:
 
 
 def open_phase_map(view: View, folder: Path, *, tilted: bool = False) -> PhaseMap:
-    """Open a stored phase map; its images stay on disk until they are asked for.
+    """Open a stored phase map; its images stay on disk until they are used.
 
     Raises
     ------
     DataError
-        If a file is missing, damaged, or of another size than the view's camera.
+        A file is missing, damaged, or has another size than the view's camera.
     """
     stored = StoredPhaseMap(view, folder, tilted)
     samples = stored.samples
@@ -404,9 +401,9 @@ def _smoothed(
 ) -> _Smoothed:
     """Local linear fits under a Gaussian window (first-order normalized convolution).
 
-    Beside an outline the pixels that count lie on one side. Their mean is that of a place further
-    inside, where a curved surface is less oblique: on the rim of `dome` it turned normals by 2 to 7
-    deg. A linear fit taken at the window's centre has no such bias.
+    Next to an outline, all usable pixels lie on one side. Their mean is that of a point further
+    inside, where a curved surface is less oblique: a bias of 2 to 7 deg at the outline of `dome`.
+    A linear fit, evaluated at the window's centre, has no such bias.
 
     Knutsson & Westin, CVPR 1993.
 

@@ -12,32 +12,33 @@ from polmvs.arrays import Floats, Image, Mask
 
 @dataclass(frozen=True, kw_only=True)
 class RegionTolerances:
-    """What belongs to the polarized region of a view.
+    """Tolerances of the polarized region of a view.
 
-    Lengths that are those of things in the scene hold for images of ``reference_area_px`` pixels;
-    :meth:`at` scales them.
+    Lengths of objects in the scene are for images of ``reference_area_px`` pixels; :meth:`at`
+    scales them.
 
     Attributes
     ----------
-    smoothing_px : over which texture's false polarization (the four samples see different
-        points) averages out. Derived: twice a cell.
-    low_texture : relative intensity gradient per px under which a surface shows no texture.
+    smoothing_px : width over which the false polarization of texture (the four samples see
+        different points) averages out. Derived: twice a cell.
+    low_texture : relative intensity gradient per px below which a surface shows no texture.
         Guess.
     similar_intensity : factor within which unpolarized pixels may belong to a polarized
         region. Guess.
-    min_area_px : of a region, single pixels whatever the resolution. Guess.
-    min_core_share : of a region: less means that it has run into the background. Guess.
-    growth_px : reach of a round of growth is about three times this. Guess.
+    min_area_px : least area of a region, pixels at any resolution. Guess.
+    min_core_share : least share of the core in a region: with less it has grown into the
+        background. Guess.
+    growth_px : a round of growth reaches about three times this. Guess.
     max_growth_rounds : Guess.
-    mark_area_px : holes of up to this area are filled whatever they show (printed marks).
+    mark_area_px : holes up to this area are filled whatever they show (printed marks).
         Guess.
     gap_px : width of a gap between a hole and the background that does not open it: a mark's
         margin beside an outline. Derived: twice the smoothing, which widens both.
-    mark_reach_px : marks are told from the mean intensity of the surface about them; deviation of
-        the window. Guess.
+    mark_reach_px : deviation of the window that gives the mean intensity of the surface about a
+        mark, with which the mark is compared. Guess.
     min_phase_jump : change of (cos 2 phase, sin 2 phase) per px that counts as a crease; the
         smoothing makes it a matter of pixels. Guess.
-    reference_area_px : of the images that these were chosen on.
+    reference_area_px : area of the images for which these were chosen.
     """
 
     smoothing_px: float = 2.0
@@ -56,7 +57,7 @@ class RegionTolerances:
     def at(self, shape: tuple[int, ...]) -> RegionTolerances:
         """The same for a larger image, ``shape`` (H, W), of the same scene.
 
-        For a smaller one they stay: fewer pixels would not tell a surface from what is beside it.
+        For a smaller image they stay: fewer pixels do not separate a surface from its surroundings.
         """
         scale = max(np.sqrt(shape[0] * shape[1] / self.reference_area_px), 1.0)
         return replace(
@@ -74,8 +75,8 @@ class Region:
     Attributes
     ----------
     inside : (H, W) bool, the surface to densify, holes (marks, frontal spots) filled.
-    reliable : (H, W) bool, pixels that averages over windows and votes on the light count:
-        polarized, unsaturated, neither mark nor what passes for one. Phase maps take all.
+    reliable : (H, W) bool, pixels for averages over windows and votes on the light: polarized,
+        unsaturated, and not like a mark. Phase maps use all pixels.
     edges : (H, W) bool, creases and depth edges; contours stop there.
     """
 
@@ -102,16 +103,16 @@ def find_region(
 ) -> Region:
     """Find the polarized, textureless region of a view.
 
-    Polarized pixels are the core. It grows into dark neighbours without texture (a surface seen
-    frontally has no polarization) and its holes are filled where they show no texture or are
-    as small as a printed mark.
+    The polarized pixels are the core. The core grows into dark neighbours without texture (a
+    surface seen frontally has no polarization). Its holes are filled if they show no texture or
+    are as small as a printed mark.
 
     Parameters
     ----------
     s0, s1, s2 : (H, W) float32 Stokes images.
     valid : (H, W) bool, neither clipped nor dark.
     min_dolp : smoothed DoLP from which a pixel belongs to the core.
-    mask : (H, W) bool, the user's region; it replaces the search, edges are still found.
+    mask : (H, W) bool, the user's region; it replaces the search. Edges are still found.
     tolerances : of this step.
     """
     tolerances = tolerances.at(s0.shape)
@@ -134,7 +135,7 @@ def _open(mask: Mask, size: int) -> Mask:
 
 
 def grow_mask(mask: Mask, margin_px: int) -> Mask:
-    """The mask and all that is within the margin of it, in rows, columns and diagonals, px."""
+    """The mask, grown by a margin in rows, columns and diagonals, px."""
     kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
 

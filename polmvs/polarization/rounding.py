@@ -1,14 +1,14 @@
 """Rounding error of Stokes images where noise is too small to dither it.
 
-Rounding adds a variance of a twelfth of a step. Where a sample's noise before it is half a step or
-more, that is white: neighbours are rounded independently. Where the noise is less, as in the dark
-parts of 8-bit images, neighbours of one intensity are rounded alike, and no smoothing reduces what
-they share. For a value ``x`` with noise of deviation ``w``, in steps, the mean of the rounded ones
-is off by
+Rounding adds a variance of a twelfth of a squared step. If the noise of a sample is half a step or
+more, this error is white: neighbours are rounded independently. With less noise, as in the dark
+parts of 8-bit images, neighbours of one intensity have the same rounding error, which no smoothing
+reduces. For a value ``x`` with noise of deviation ``w``, in steps, the mean of the rounded values
+has the error
 
     sum over k > 0 of  (-1)^k / (pi k)  exp(-2 pi^2 k^2 w^2)  sin(2 pi k x)
 
-(Widrow & Kollar, Quantization Noise, 2008, chapter 4), whose variance over ``x`` is the sum of
+(Widrow & Kollar, Quantization Noise, 2008, chapter 4). Its variance over ``x`` is the sum of
 ``exp(-4 pi^2 k^2 w^2) / (2 pi^2 k^2)``: a twelfth without noise, 0.001 at a third of a step. Where
 the intensity changes by ``g`` steps a pixel, a Gaussian window of width ``s`` leaves ``exp(-4 pi^2
 k^2 s^2 g^2)`` of each term.
@@ -22,7 +22,7 @@ import numpy as np
 from polmvs.arrays import Image, Mask
 
 NUM_TERMS = 4
-BLURRED = 0.12  # squared steps of noise, from which less than 0.0005 squared steps are shared
+BLURRED = 0.12  # squared steps of noise above which less than 0.0005 squared steps are shared
 GRADIENT_WINDOW_PX = 9  # over which slopes of rounded samples are known
 
 
@@ -35,20 +35,20 @@ def shared_rounding(
     quantum: float,
     window_px: float = 1.0,
 ) -> Image | None:
-    """Variance that neighbouring pixels share by the rounding of a sample, the images' mean.
+    """Variance that neighbouring pixels share by the rounding of samples, mean over the images.
 
     Parameters
     ----------
     intensities : (n, H, W) float32, linear, units of full scale.
-    valid : (H, W), pixels that count.
-    constant, slope : of the variance of a sample before it is rounded, by its intensity; a lower
-        bound of it overstates the result.
+    valid : (H, W), pixels to use.
+    constant, slope : of the variance of a sample before rounding, by its intensity; a lower bound
+        makes the result too large.
     quantum : step of a sample, units of full scale.
     window_px : width of the smoothing that follows.
 
     Returns
     -------
-    (H, W) float32, squared units of full scale; None where noise blurs all that is valid.
+    (H, W) float32, squared units of full scale; None if noise dithers all valid pixels.
     """
     if quantum <= 0:
         return None

@@ -2,44 +2,44 @@
 
 Noise
 -----
-The four intensities are redundant: ``r = I0 + I90 - I45 - I135`` is zero but for noise and for
-what the four filters see differently. All four are interpolated by the same weights, so
+The four intensities are redundant: ``r = I0 + I90 - I45 - I135`` is zero except for noise and for
+what the four filters see differently. All four are interpolated with the same weights, so
 ``var(r) = var(s1) + var(s2)``; with a variance linear in the intensity (read and quantisation
 noise, and photons) the two are equal: ``var(s1) = var(s2) = a + b s0 = var(r) / 2``, the noise
-reduction of the interpolation included. ``a`` and ``b`` are read from the image itself:
+reduction of the interpolation included. ``a`` and ``b`` are estimated from the image:
 
 1. the variance of r within patches, of which the low quantile of each intensity class is kept
    (smooth patches; texture only adds),
 2. the highest line ``a + b s0``, ``a, b >= 0``, under all classes (a textured class only adds).
 
-Where r is larger than such noise explains (edges, texture finer than a cell), s1 and s2 are
-wrong by as much, and sigma grows with the local mean of ``r^2 / 2``. Measured on ``board`` against
+Where r exceeds this noise (edges, texture finer than a cell), s1 and s2 have errors of the same
+size, and sigma grows with the local mean of ``r^2 / 2``. Measured on ``board`` against
 the phase of the true normals (tilted polarizers, DoLP > 0.1): the median of
-``|error| / sigma_aolp`` is 1.06 of a normal distribution's without that term,
-0.92 with it, and the share of errors beyond 5 sigma falls from 1.6 % to 0.3 %.
+``|error| / sigma_aolp`` is 1.06 times that of a normal distribution without this term and 0.92
+times with it, and the share of errors beyond 5 sigma falls from 1.6 % to 0.3 %.
 
-n images through polarizers at known angles leave n - 3 redundant combinations, which are treated
-alike. Three images, or Stokes images made elsewhere, leave none; there the noise is that of the
-images' second differences. They are those of places two pixels apart: neighbours that were
-interpolated from a mosaic share samples, and differ by 0.36 of the variance.
+n images through polarizers at known angles leave n - 3 redundant combinations, which are used in
+the same way. Three images, or Stokes images made elsewhere, leave none; their noise is estimated
+from second differences of pixels two apart: neighbours that were interpolated from a mosaic share
+samples, and differ by only 0.36 of the variance.
 
-Images that are no mosaic's may agree with each other at an edge and still mix the light of its two
-sides, or come from a mosaic that did. There sigma grows with the part of the second differences
-that is perpendicular to ``(s1, s2)``: what is only brighter beside it turns no phase. So the same
-capture counts alike in every format (`tests/compare_formats.py`); without, OPA's Chamfer distance
-on the demo differs by 5 to 13 %.
+Images that are not from a mosaic may agree at an edge and still mix the light of its two sides, or
+come from a mosaic that did. There sigma grows with the component of the second differences that is
+perpendicular to ``(s1, s2)``: a mere change of brightness turns no phase. With this, a capture has
+the same weights in every format (`tests/compare_formats.py`); without it, OPA's Chamfer distance on
+the demo differs by 5 to 13 %.
 
 Gains
 -----
-Polarizer channels differ in gain, some percent on real sensors. That is an error common to all
-pixels, which no smoothing reduces, so it is kept apart from ``sigma``: ``gain_sigma``. Gains
+Polarizer channels differ in gain, by some percent on real sensors. All pixels share this error and
+no smoothing reduces it, so it is separate from ``sigma``: ``gain_sigma``. Gains
 ``1 + e_k`` of equal spread make ``r / s0 = (e0 + e90 - e45 - e135) / 2`` in unpolarized light, and
 independent of it ``(e0 - e90) / 2`` and ``(e45 - e135) / 2`` of s0 in s1 and s2, each with the
-spread of r / s0 over sqrt(2). One (n - 3) such value known, the error's distribution is Student's.
-The second combination of gains that polarized light would show is not used: what oblique rays do
-in the polarizers looks the same. Measured with gains of 2 % spread on rendered captures, the error
-of the AoLP is within one stated deviation for 33 % of the pixels without this term; the test
-``test_sigma_covers_gain_errors`` holds the figure with it.
+spread of r / s0 over sqrt(2). With one (n - 3) such known value, the error has Student's
+distribution. Polarized light would show a second combination of gains. It is not used, because
+oblique rays in the polarizers have the same effect. Measured with gains of 2 % spread on rendered
+captures: without this term the error of the AoLP is within one sigma for 33 % of the pixels; the
+test ``test_sigma_covers_gain_errors`` has the value with it.
 """
 
 from __future__ import annotations
@@ -62,16 +62,16 @@ from polmvs.polarization.rounding import shared_rounding
 
 Angles: TypeAlias = NDArray[np.floating[Any]]
 
-UNIFORM_SIGMA = np.pi / np.sqrt(12.0)  # deviation of an axial angle of which nothing is known, rad
+UNIFORM_SIGMA = np.pi / np.sqrt(12.0)  # deviation of a uniformly distributed axial angle, rad
 PATCH_PX = 8
 PATCH_QUANTILE = 0.1
 # The quantile of the variance of 8x8 px of bilinearly interpolated white noise, over the true
 # variance (simulated with 65,000 patches).
 PATCH_QUANTILE_OF_NOISE = 0.721
 PATCH_QUANTILE_OF_WHITE = 0.768  # the same of white noise
-# And of its second differences along both axes, of two images together.
+# The same of its second differences along both axes, of two images together.
 PATCH_QUANTILE_OF_CURVATURE = 0.74
-CURVATURE_SPACING_PX = 2  # what a mosaic's interpolation gives neighbours in common is not between
+CURVATURE_SPACING_PX = 2  # distance at which pixels share no samples of a mosaic
 ONE_SIGMA = 0.8413  # one-sided probability of one standard deviation
 MIN_SAMPLES = 40  # patches of a class, or pixels, for their quantile or median to be one
 TINY = 1e-20  # keeps noise-free black images from a division by zero
@@ -89,17 +89,16 @@ class Stokes:
     ----------
     s0 : (H, W) float32, total intensity, half the sum of the four angle images: 0 to 2.
     s1, s2 : (H, W) float32, ``I0 - I90`` and ``I45 - I135``.
-    sigma : (H, W) float32, standard deviation of s1 and of s2. The errors of neighbouring pixels
-        correlate (0.3 at a distance of one), as interpolation makes them.
+    sigma : (H, W) float32, standard deviation of s1 and of s2. Interpolation correlates the errors
+        of neighbouring pixels (0.3 at a distance of one).
     valid : (H, W) bool, False where a contributing sample is clipped or the pixel is dark.
-    gain_sigma : standard deviation of s1 and of s2 that all pixels share, share of s0: what
-        differing gains of the polarizer channels may do.
-    lossy_sigma : the part of ``sigma`` that lossy compression makes, which the pixels of a block
-        share.
+    gain_sigma : standard deviation of s1 and of s2 by different gains of the polarizer channels,
+        which all pixels share, share of s0.
+    lossy_sigma : the part of ``sigma`` by lossy compression, which the pixels of a block share.
     lossy_block_px : side of such a block, px; by default at half the resolution of the samples.
-    rounding : (H, W) float32, variance of s1 and of s2 by rounding that neighbours share, beside
-        ``sigma``: see ``polmvs.polarization.rounding``; None: noise blurs it everywhere.
-    noise_area_px : pixels that share the rest of the noise, as interpolation makes them; see
+    rounding : (H, W) float32, variance of s1 and of s2 by rounding that neighbours share, in
+        addition to ``sigma`` (see ``polmvs.polarization.rounding``); None: noise dithers it.
+    noise_area_px : pixels that share the rest of the noise, by interpolation; see
         :func:`polmvs.polarization.mosaic.noise_area_px`.
     """
 
@@ -129,7 +128,7 @@ class Stokes:
 
         Parameters
         ----------
-        light : reflection that dominates; specular light turns the phase by pi/2 from the AoLP.
+        light : dominant kind of light; specular light turns the phase by pi/2 from the AoLP.
         """
         turn = np.float32(0.5 * np.pi if Light(light) is Light.SPECULAR else 0.0)
         return np.asarray(wrap_axial(self.aolp + turn), np.float32)
@@ -142,7 +141,7 @@ class Stokes:
 
     @property
     def sigma_aolp(self) -> Image:
-        """Standard deviation of the angle (H, W), rad, at most that of a uniform axial angle."""
+        """Standard deviation of the AoLP (H, W), rad, at most that of a uniform axial angle."""
         twice = 2.0 * np.hypot(self.s1, self.s2)
         unknown = np.full_like(self.sigma, UNIFORM_SIGMA)
         total = self.sigma
@@ -155,7 +154,7 @@ class Stokes:
 class NoiseModel(NamedTuple):
     """Variance of s1 and of s2 in smooth areas: ``constant + slope * s0``.
 
-    ``raised`` is by how much the constant was raised to what rounding alone makes.
+    ``raised`` is the increase of the constant to the variance of rounding.
     """
 
     constant: float
@@ -185,7 +184,7 @@ def stokes_from_intensities(
     intensities : (4, H, W) float32, linear, units of full scale; 0, 45, 90, 135 degrees, as
         :func:`polmvs.polarization.mosaic.split_mosaic` makes them.
     clipped : (H, W) bool, True where a clipped sample contributes.
-    darkness : mean of the four under which a pixel counts as dark, share of full scale.
+    darkness : mean of the four below which a pixel counts as dark, share of full scale.
     quantum : step of a raw sample, share of full scale; the noise is at least its rounding.
     lossy_variance : of s1 and s2 by lossy compression, which the redundancy does not show.
     """
@@ -194,7 +193,7 @@ def stokes_from_intensities(
     if clipped.shape != intensities.shape[1:]:
         raise ValueError(f"{clipped.shape=} but expected {intensities.shape[1:]}.")
     i0, i45, i90, i135 = np.asarray(intensities, np.float32)
-    # Half of the time of a frame is memory for new arrays: each is used as often as it can be.
+    # Memory for new arrays takes half of the time of a frame, so arrays are reused.
     even, odd = i0 + i90, i45 + i135
     redundancy = even - odd
     even += odd
@@ -251,8 +250,8 @@ def stokes_by_least_squares(
         :func:`ideal_analyzers`.
     clipped : (H, W) bool, True where a clipped sample contributes.
     darkness, quantum, lossy_variance : see :func:`stokes_from_intensities`.
-    interpolated : the images are bilinear ones of a mosaic.
-    gains_known : the analyzers are calibrated, so that nothing is left of differing gains.
+    interpolated : the images are bilinear interpolations of a mosaic.
+    gains_known : the analyzers are calibrated, so their gains do not differ.
 
     Raises
     ------
@@ -327,7 +326,7 @@ def _shared_rounding(
 def stokes_from_maps(
     s0: Image, s1: Image, s2: Image, valid: Mask, *, quantum: float = 0.0
 ) -> Stokes:
-    """Stokes images that were made elsewhere, with the noise that they show.
+    """Stokes images that were made elsewhere, with noise estimated from them.
 
     Parameters
     ----------
@@ -343,12 +342,12 @@ def stokes_from_maps(
 
 
 def turned_axes(stokes: Stokes, *, zero_deg: float = 0.0, clockwise: bool = False) -> Stokes:
-    """Stokes images whose angles counted from another direction or the other way round.
+    """Convert Stokes images whose angles have another zero direction or sense.
 
     Parameters
     ----------
-    zero_deg : direction that they counted from, anticlockwise from +x as displayed.
-    clockwise : they counted clockwise as displayed.
+    zero_deg : their zero direction, anticlockwise from +x as displayed.
+    clockwise : their angles are clockwise as displayed.
     """
     if not clockwise and zero_deg == 0:
         return stokes
@@ -358,12 +357,12 @@ def turned_axes(stokes: Stokes, *, zero_deg: float = 0.0, clockwise: bool = Fals
 
 
 def combine(images: list[Stokes]) -> Stokes:
-    """Sum of the Stokes images of several colours, weighted by what their noise leaves of them.
+    """Sum of the Stokes images of several colours, weighted by their polarized intensity and noise.
 
-    One weight a colour for the whole image, so that s0 stays an intensity: polarized intensity
-    over the variance, whose weighted sum has the best ratio of the two (matched filter). The
-    weights sum to one. A pixel is valid where it is in every colour with weight. Noise is each
-    colour's own; what an edge mixes they have in common, and their sum shows it.
+    Each colour has one weight for the whole image, so that s0 stays an intensity: polarized
+    intensity over variance, which maximizes the ratio of the two in the sum (matched filter). The
+    weights sum to one. A pixel is valid if it is valid in every colour with weight. Noise is
+    independent between colours; the mixed light of edges is common to them, and the sum shows it.
     """
     strengths = []
     for stokes in images:
@@ -414,14 +413,14 @@ def estimate_noise(
     floor: float,
     quantile_of_noise: float = PATCH_QUANTILE_OF_NOISE,
 ) -> NoiseModel:
-    """Noise of s1 and s2 from the redundancy of one image; see the head of this module.
+    """Noise of s1 and s2 from the redundancy of one image; see the module's docstring.
 
     Parameters
     ----------
     s0, redundancy : (H, W) float32, ``redundancy = I0 + I90 - I45 - I135``; or (k, H, W), several
         combinations with that variance.
-    valid : (H, W) bool, pixels to learn from. With fewer than 40 patches of 8x8 px of them only
-        the rounding of the samples is known, and returned.
+    valid : (H, W) bool, pixels to use. With fewer than 40 patches of 8x8 px of them, only the
+        rounding of the samples is known; it is then returned.
     floor : the least variance of s1 and s2.
     quantile_of_noise : of the variance of a patch, over the variance; of interpolated noise.
     """
@@ -530,14 +529,14 @@ def axial_difference(a: Angles, b: Angles) -> NDArray[np.float64]:
 
 
 def wrap_axial(angle: Any) -> Any:
-    """An axial angle to [0, pi), in its own precision."""
+    """An axial angle wrapped to [0, pi), in its own precision."""
     wrapped = np.mod(angle, np.pi)
     # A tiny negative angle rounds to pi itself.
     return np.where(wrapped >= np.pi, 0, wrapped)
 
 
 def patch_means(image: Image) -> Image:
-    """Means of squares of PATCH_PX, the rest at the image's far sides left out."""
+    """Means over squares of PATCH_PX; the remainder at the right and lower border is left out."""
     rows, cols = image.shape[0] // PATCH_PX, image.shape[1] // PATCH_PX
     if not rows or not cols:
         return np.zeros((rows, cols), np.float32)

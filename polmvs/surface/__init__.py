@@ -1,1 +1,1 @@
-"""From normals to shape."""
+"""From phases and normals to surfaces."""

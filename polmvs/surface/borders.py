@@ -1,9 +1,9 @@
-"""Borders of regions on a grid, as closed curves that are drawn to what is seen across them.
+"""Borders of regions on a grid, as closed curves that are fitted to intensity edges across them.
 
-Labels of cells end at whole cells, and where nothing shows a border they end by chance. A curve
-can lie between cells. It goes to the steps that are found on lines across it, and elsewhere as
-straight as these allow: what it pays for is the sum of its turns. That sum is the same for all
-convex curves, so that neither a corner nor a round border is drawn in.
+Labels end at whole cells, and by chance where nothing shows a border. A curve can lie between
+cells. It moves to the edges that are found on lines across it, and is elsewhere as straight as
+these allow: its penalty is the sum of its turning angles. That sum is the same for all convex
+curves, so neither a corner nor a round border shrinks.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Across = Callable[[Array, Array], tuple[Array, Array]]
 
-MIN_POINTS = 8  # of a curve: with fewer it has no direction
-BEYOND = 12  # cells: farther than steps are looked for
+MIN_POINTS = 8  # points of a curve: with fewer it has no direction
+BEYOND = 12  # cells: farther than edges are searched
 SUBDIVISIONS = 8  # of a curve's pieces, for distances to it
 LEAST_TURN = 1e-4  # radians, of the reweighting: straight for all that is seen
 
 
 @dataclass(frozen=True, kw_only=True)
 class BorderTolerances:
-    """Numbers of the curves; lengths are in cells, which are about a pixel.
+    """Tolerances of the curves; lengths are in cells, which are about a pixel.
 
     Attributes
     ----------
-    turn : of a curve at one of its points, radians, that costs as much as a step a deviation off.
-        Measured on the box of `step`, slope of its walls against the true ones: 1.4, 1.2, 0.9 deg
-        with twice this, this and its half; a round border becomes a polygon of longer sides.
-    sigma : least deviation of the steps' places. An analytic box's are 0.06 px off, and poses add
-        to it. Measured likewise: 0.8, 1.2, 1.5 deg with twice, once, half.
-    sigmas : deviations from which a step counts as a false one. Measured likewise: 1.3 and 1.0 deg
+    turn : turning angle of a curve at a point, radians, that costs as much as an edge one deviation
+        away. Measured on the box of `step`, slope of its walls against the true ones: 1.4, 1.2, 0.9
+        deg with twice this, this and its half; a round border becomes a polygon of longer sides.
+    sigma : least deviation of the edges' positions. Those of an analytic box are 0.06 px off, and
+        poses add to it. Measured likewise: 0.8, 1.2, 1.5 deg with twice, once, half.
+    sigmas : deviations beyond which an edge counts as false. Measured likewise: 1.3 and 1.0 deg
         with twice and half.
-    fit_decay : of the turn that is still squared, from round to round: the square root of it moves
-        those walls by less than 0.1 deg.
-    at_rest : move after which the steps are not looked for again: under the deviation.
-    max_passes : of looking for steps across the curve as it lies. Measured likewise: 1.2 and 1.1
+    fit_decay : factor per round of the turning angle below which the penalty is quadratic: its
+        square root moves those walls by less than 0.1 deg.
+    at_rest : displacement below which the curve has converged: below the deviation.
+    max_passes : searches for edges across the moved curve. Measured likewise: 1.2 and 1.1
         deg with 3 and 10.
     """
 
@@ -75,21 +75,21 @@ def smoothly_beside(inside: Mask) -> Array:
 
 
 def drawn_border(inside: Mask, across: Across, tolerances: BorderTolerances | None = None) -> Array:
-    """Signed distance (H, W) in cells to the border of a region, drawn to steps, negative inside.
+    """Signed distance (H, W) in cells to the border of a region, fitted to edges, negative inside.
 
     Parameters
     ----------
-    inside : (H, W) bool, the region as labels of cells have it.
-    across : for points ``(P, 2)``, rows and columns, of a curve and its unit normals ``(P, 2)``
-        outwards: by how many cells ``(P,)`` the step lies outside, and its weight ``(P,)`` in
-        [0, 1]; NaN where the border is none of those that are to move. Points may lie beyond the
+    inside : (H, W) bool, the region by labels of cells.
+    across : takes points ``(P, 2)``, rows and columns, of a curve and its outward unit normals
+        ``(P, 2)``; gives the distance ``(P,)`` of the edge outside of the curve, in cells, and its
+        weight ``(P,)`` in [0, 1]; NaN where the border may not move. Points may lie beyond the
         grid.
     tolerances : of the curves.
     """
     tol = tolerances or BorderTolerances()
     if inside.all() or not inside.any():
         return smoothly_beside(inside)
-    # Regions go on beyond the grid, and close there: its edge is no border of them.
+    # Regions continue beyond the grid and close there: the grid's edge is not their border.
     inside = np.pad(np.pad(inside, BEYOND - 1, mode="edge"), 1)
     on_grid = (slice(BEYOND, -BEYOND),) * 2
     distance = smoothly_beside(inside)
@@ -131,7 +131,7 @@ def _evenly(curve: Array) -> Array:
 
 
 def _drawn(curve: Array, slope: Array, across: Across, tol: BorderTolerances) -> Array:
-    """A closed curve, moved along its normals until it is at rest."""
+    """A closed curve, moved along its normals until it has converged."""
     for _ in range(tol.max_passes):
         normals = _normals(curve, slope)
         step, weight = across(curve, normals)

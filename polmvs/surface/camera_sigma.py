@@ -1,4 +1,4 @@
-"""What estimated cameras and poses add to the stated deviations of a surface."""
+"""Contribution of estimated cameras and poses to the position uncertainty of a surface."""
 
 from __future__ import annotations
 
@@ -19,18 +19,17 @@ from polmvs.surface.fusion import FusedCloud
 Array = NDArray[np.float64]
 
 NUM_NEAREST = (
-    8  # sparse points that a place's modes are the mean of: they vary over the whole scene
+    8  # sparse points over which the modes at a point are averaged: modes vary over the whole scene
 )
 
 
 class CameraModes:
-    """The modes of :mod:`polmvs.colmap.camera_uncertainty` at any place.
+    """The modes of :mod:`polmvs.colmap.camera_uncertainty` at any point.
 
     Parameters
     ----------
     points : (T, 3), sparse points, world.
-    modes : (K, T, 3), what each mode moves them by, world units; K is 0 for a camera that was
-        given.
+    modes : (K, T, 3), their displacement by each mode, world units; K is 0 for a given camera.
     """
 
     def __init__(self, points: Array, modes: Array) -> None:
@@ -38,7 +37,7 @@ class CameraModes:
         self._tree = cKDTree(points) if modes.size else None
 
     def sigma_along(self, points: Array, directions: Array) -> Array:
-        """Deviation (N,) of places (N, 3) along unit directions (N, 3), world units."""
+        """Deviation (N,) of points (N, 3) along unit directions (N, 3), world units."""
         if self._tree is None or len(points) == 0:
             return np.zeros(len(points))
         num = min(NUM_NEAREST, self._tree.n)
@@ -48,27 +47,28 @@ class CameraModes:
         return np.asarray(np.sqrt(np.square(along).sum(axis=0)), np.float64)
 
     def widened(self, cloud: FusedCloud) -> FusedCloud:
-        """A cloud whose deviations hold the camera's."""
+        """A cloud whose deviations include the camera's."""
         if self._tree is None:
             return cloud
         own = self.sigma_along(cloud.points, cloud.normals)
         return replace(cloud, sigma=np.hypot(cloud.sigma, own).astype(np.float32))
 
     def widen_stored(self, views: Sequence[View], folder: Path) -> None:
-        """Have the deviations of stored dense views hold the camera's."""
+        """Add the camera's deviations to those of stored dense views."""
         for view in views if self._tree is not None else ():
             _widen(view, folder, lambda points, rays, normals: self.sigma_along(points, rays))
 
 
 def widen_by_poses(views: Sequence[View], covariances: Array, folder: Path) -> None:
-    """Have the deviations of stored dense views hold those of the views' own poses.
+    """Add the deviations by the views' own poses to those of stored dense views.
 
-    The surface is where all views have it; how far it is from one of them hangs on its own pose.
+    All views determine the position of the surface; its distance from one view depends on the pose
+    of that view.
 
     Parameters
     ----------
     views, covariances : (V, 6, 6), as of :func:`polmvs.colmap.camera_uncertainty.pose_uncertainty`;
-        none where nothing is known of them.
+        empty if unknown.
     folder : of the stored views.
     """
     if not len(covariances):

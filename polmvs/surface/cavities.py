@@ -1,13 +1,13 @@
-"""Cavities that see only themselves: the inside of a mug.
+"""Cavities that reflect only themselves, such as the inside of a mug.
 
-A vessel's mouth is dark: light that comes out of it has been reflected several times, and its
-phase says nothing of a normal. Silhouettes close the mouth with a flat cap, which no view's phase
-supports, in the middle of a ring in the same plane that the phases do support: the rim. It lies at
-the offset at which its lines in the views meet, and its inner line is the mouth's border. How
-thick the wall is shows at the rim; where it is of one thickness all around, a wall of that
-thickness is inferred to go on below, and the inside follows the outside. That is an inference,
-not a measurement: each cavity carries its thickness and how much it varies, and points on its
-walls should be labelled accordingly. Where the rim's width varies nothing is inferred.
+The opening of a vessel is dark: light from inside has been reflected several times, and its phase
+gives no normal. Silhouettes close the opening with a flat cap, which no phase supports. Around it,
+in the same plane, is a ring that the phases do support: the top of the wall, the vessel's rim. Its
+lines in the views coincide at the right offset of its plane; its inner line is the border of the
+opening. The width of the rim is the thickness of the wall. If it is the same all around, a wall of
+that thickness is inferred to continue below, so that the inside follows the outside. This is an
+inference, not a measurement: each cavity has its thickness and the thickness's variation, and
+points on its walls should be labelled as inferred. If the rim's width varies, nothing is inferred.
 """
 
 from __future__ import annotations
@@ -50,28 +50,29 @@ Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-SAME_PLANE_PX = HullTolerances.step_px  # GSDs within which a rim is known: a cell of the hull
+SAME_PLANE_PX = HullTolerances.step_px  # GSDs, uncertainty of a rim's plane: a cell of the hull
 
 
 @dataclass(frozen=True, kw_only=True)
 class CavityTolerances:
-    """Numbers of the search for cavities; lengths in GSD (length of a pixel at the surface).
+    """Tolerances of the search for cavities; lengths in GSD.
 
     Attributes
     ----------
-    max_planes : of the surface that are looked at, largest first: a box has six. 4 and 16 alike.
-    min_part : share of a plane's faces that is rim, and that is mouth, at least. Guess.
-    min_sectors : of eight about what has no phase, in which there must be some that has. Guess:
-        one may be hidden.
-    max_gap : of the rim, half its length (a mark, a reflection). Guess. The cells that the closed
-        rim encloses may be off the mouth's border by as much. 2 and 8 alike.
-    max_brightness : of the mouth over the rim, median over the views. A second reflection on
+    max_planes : number of planes of the surface to check, largest first: a box has six. 4 and 16
+        give the same.
+    min_part : least share of rim, and of opening, in the faces of a plane. Guess.
+    min_sectors : number of the eight sectors around faces without a phase that must have faces with
+        one. Guess: one sector may be hidden.
+    max_gap : half the length of a gap of the rim (a mark, a reflection). Guess. The cells that the
+        closed rim encloses may be off the opening's border by as much. 2 and 8 give the same.
+    max_brightness : of the opening over the rim, median over the views. A second reflection on
         glass of ior 1.5 leaves a tenth to a half of the light of the first at 45 to 75 deg. Guess.
-    rounding : of the surface beside the rim; below it the wall's thickness is measured, over half
-        of it the rim's brightness is taken, and what is no wider is no mouth. Three of the
-        surface's cells; 3 and 12 alike.
+    rounding : width of the rounded surface beside the rim. The wall's thickness is measured below
+        it, the rim's brightness over half of it, and an opening must be wider. Three of the
+        surface's cells; 3 and 12 give the same.
     thickness_spread : robust deviation of the wall's thickness around the rim, as a share of it;
-        one gsd is always allowed. Guess.
+        one GSD is always allowed. Guess.
     growth : of a cavity's half width per depth. A bottle's shoulders are not inferred. Guess.
     """
 
@@ -87,15 +88,15 @@ class CavityTolerances:
 
 @dataclass(frozen=True)
 class Cavity:
-    """Free space inside of a vessel.
+    """Free space inside a vessel.
 
     Attributes
     ----------
-    rim : plane of the mouth; its members are faces of the surface on the rim.
-    grid : across the mouth.
+    rim : plane of the opening; its members are faces of the surface on the rim.
+    grid : across the opening.
     thickness : of the wall, world units.
     thickness_sigma : its robust deviation around the rim, world units.
-    field : (D, H, W) float32, signed distance to the cavity's walls in layers across the mouth,
+    field : (D, H, W) float32, signed distance to the cavity's walls in layers across the opening,
         positive in the cavity.
     layer_step : distance of the layers, world units.
     first_layer : depth of the first layer below the rim, in layers (negative: above).
@@ -128,9 +129,9 @@ class SurfaceFaces:
     ----------
     centers, normals : (F, 3), world; unit normals outwards.
     areas : (F,).
-    inside_along : which places ``(D, N)`` lie inside, on rays from origins ``(N, 3)`` along one
+    inside_along : which points ``(D, N)`` lie inside, on rays from origins ``(N, 3)`` along one
         direction ``(3,)``, at ascending distances ``(D,)``.
-    gsd : length that a pixel covers at the surface, world units.
+    gsd : ground sampling distance at the surface, world units.
     """
 
     centers: Array
@@ -148,15 +149,15 @@ def find_cavities(
     offset_tolerances: OffsetTolerances | None = None,
     before: Sequence[Cavity] = (),
 ) -> tuple[Cavity, ...]:
-    """Mouths that a surface closes with a cap, and the cavities inferred behind them.
+    """Openings that a surface closes with a cap, and the cavities inferred behind them.
 
     Parameters
     ----------
-    surface : the visual hull or better; its outside decides where the cavity's walls are.
+    surface : the visual hull or better; its outside determines the cavity's walls.
     scene : the views.
-    tolerances, offset_tolerances : numbers of the search, and of the borders.
-    before : cavities of an earlier state of the surface, whose mouths are looked for first: a cap
-        that phases have bent lies in no plane by itself.
+    tolerances, offset_tolerances : of the search, and of the borders.
+    before : cavities of an earlier state of the surface, whose openings are tried first: a cap that
+        phases have bent is not planar.
     """
     tol, face_tol = tolerances or CavityTolerances(), offset_tolerances or OffsetTolerances()
     if not len(surface.centers) or len(scene.maps) < MIN_VIEWS:
@@ -216,10 +217,9 @@ def _rim(
     tol: CavityTolerances,
     face_tol: OffsetTolerances,
 ) -> Face | None:
-    """The plane turned to the normal that the phases of its faces have; None for no mouth.
+    """The plane turned to the normal that the phases of its faces have; None without an opening.
 
-    A mouth in its rim: a part of the faces has phases, and a part has not, or ones that
-    contradict.
+    At an opening in a rim, some faces have phases, and others have none or contradicting ones.
     """
     rows = scene.rows(surface.centers[flat.members])
     facing = -np.einsum("ikn,i->kn", rows.rays, flat.normal) > Looking.min_cosine
@@ -253,7 +253,7 @@ def _rim(
 
 
 def _is_same(rim: Face, other: Face, surface: SurfaceFaces) -> bool:
-    """Whether two rims are of the same mouth."""
+    """Whether two rims are of the same opening."""
     near = np.abs(other.height(surface.centers[rim.members])) < SAME_PLANE_PX * surface.gsd
     return bool(near.mean() > 0.5)
 
@@ -266,7 +266,7 @@ def _grid_about(surface: SurfaceFaces, rim: Face, tol: CavityTolerances) -> Face
     center = 0.5 * (members.min(axis=0) + members.max(axis=0))
     center = center - rim.height(center) * rim.normal
     radius = float(np.linalg.norm(members - center, axis=1).max())
-    # Below its mouth a vessel may be wider: half as wide again at most.
+    # Below its opening a vessel may be wider, at most by half.
     half = int(np.ceil(1.5 * radius / surface.gsd))
     step = surface.gsd
     origin = center - half * step * (first + second)
@@ -281,7 +281,7 @@ def _in_focus(
     tol: CavityTolerances,
     face_tol: OffsetTolerances,
 ) -> Face:
-    """The rim at the offset at which its lines in the views meet (a sweep)."""
+    """The rim at the offset at which its lines in the views coincide (a plane sweep)."""
 
     def strength(shift: float) -> float:
         face = replace(rim, offset=rim.offset + shift * gsd)
@@ -306,16 +306,16 @@ def _mouth(
     tol: CavityTolerances,
     face_tol: OffsetTolerances,
 ) -> Mask:
-    """Cells (H, W) that the bright cells of the rim enclose, up to the rim's inner line.
+    """Cells (H, W) of the opening: those inside the bright cells of the rim, up to its inner line.
 
     ``on_rim`` are centres (N, 3) of the surface's faces on the rim. Phases of the inside may
-    agree with the rim's normal by chance; darkness tells the inside from the rim.
+    agree with the rim's normal by chance; darkness separates the inside from the rim.
     """
     nothing_near = np.zeros(grid.shape, np.bool_)
     places = grid.points(rim)
     evidence = face_evidence(places, rim, scene, nothing_near, None, face_tol)
     brightness = _brightness(places.reshape(-1, 3), on_rim, scene.maps).reshape(grid.shape)
-    # Outlines may have cut off a part of the rim, so `evidence.possible` is not asked for.
+    # Outlines may have cut off a part of the rim, so `evidence.possible` is not used.
     supported = (brightness > tol.max_brightness) & (evidence.cost < MAX_COST)
     closed = ndimage.binary_closing(supported, iterations=round(tol.max_gap))
     enclosed = np.asarray(ndimage.binary_fill_holes(closed), np.bool_) & ~closed
@@ -341,7 +341,7 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: CavityTol
 def _brightness(points: Array, ring: Array, maps: Sequence[PhaseMap]) -> Array:
     """Intensity ``(N,)`` of points over the median of a ring's, median over the views.
 
-    Views that show less than half of the ring do not count. NaN where fewer than ``MIN_VIEWS``
+    Views that show less than half of the ring are ignored. NaN where fewer than ``MIN_VIEWS``
     views show a point.
     """
     ratios = np.full((len(maps), len(points)), np.nan)
@@ -365,7 +365,7 @@ def _intensities(points: Array, phase_map: PhaseMap) -> Array:
 
 
 def _ring_about(mouth: Mask, tol: CavityTolerances) -> Mask:
-    """Cells (H, W) of the rim about a mouth, off the line between them."""
+    """Cells (H, W) of the rim about an opening, away from the line between them."""
     line = ndimage.binary_dilation(mouth, iterations=2)
     ring = ndimage.binary_dilation(line, iterations=max(round(0.5 * tol.rounding), 1))
     return np.asarray(ring & ~line, np.bool_)
@@ -379,9 +379,9 @@ def _cavity(
     beside: Floats,
     tol: CavityTolerances,
 ) -> Cavity | None:
-    """The cavity under a mouth, its wall as thick as at the rim; None where that varies.
+    """The cavity under an opening, its wall as thick as at the rim; None if that varies.
 
-    The mouth's border lies ``beside`` (H, W) cells off the cells, negative inside.
+    ``beside`` (H, W) is the signed distance of the cells to the opening's border, negative inside.
     """
     border = mouth & ~ndimage.binary_erosion(mouth)
     spacing, most = 0.5 * tol.rounding, MAX_CELLS // mouth.size
@@ -394,7 +394,7 @@ def _cavity(
 
     def outside_of(inside: Mask) -> Array:
         """Distance (H, W) in cells to the outer wall, negative inside."""
-        # What the silhouettes left open inside of the wall is no wall.
+        # Space that the silhouettes left open inside the wall is not wall.
         return cells_beside(np.asarray(ndimage.binary_fill_holes(inside), np.bool_))
 
     wall = (beside - outside_of(insides[0]))[border]
@@ -407,7 +407,7 @@ def _cavity(
     for depth, inside in zip(depths[1:], insides[1:], strict=True):
         if not inside.any():
             break
-        # At the rim its line is known; below it the wall's thickness takes over.
+        # At the rim its line is known; below it the wall's thickness is used.
         known = min(depth / tol.rounding, 1.0)
         inferred = known * (-outside_of(inside) - thickness) + (1 - known) * layers[0]
         free = np.minimum(inferred, layers[-1] + tol.growth * spacing)
@@ -418,11 +418,11 @@ def _cavity(
             break
         layers.append(free)
     depths = spacing * np.arange(len(layers), dtype=np.float64)
-    # The bottom is as thick as the wall, at least.
+    # The bottom is at least as thick as the wall.
     floor = spacing * len(layers) - thickness - depths
     if floor[0] <= tol.rounding:
         return None
-    # A cap bulges over the rim by no more than it is rounded.
+    # A cap bulges above the rim by no more than its rounding.
     above = int(np.ceil(2 * tol.rounding / spacing))
     field = np.minimum(np.stack(layers), floor[:, None, None])
     field = np.concatenate([np.repeat(field[:1], above, axis=0), field])

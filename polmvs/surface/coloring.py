@@ -1,7 +1,8 @@
-"""Colours of a surface from the views that see a place best, without their highlights.
+"""Colours of a surface from the views that see each point best, without highlights.
 
-Of each view the unpolarized part of the light is taken, which lacks most of what is reflected, and
-of the views that see a place best their weighted median, in which a highlight that some see loses.
+Each view gives the unpolarized part of its light, which lacks most of the specular reflection. The
+colour is the weighted median of the views that see the point best, which removes highlights that
+only some of them see.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ DISPLAY_GAMMA = 2.2
 
 @dataclass(frozen=True, kw_only=True)
 class ColoringTolerances:
-    """How places take their colour.
+    """Tolerances of colours and textures.
 
     Attributes
     ----------
-    num_views : that a place takes its colour from, at most: those that see it best. Guess.
-    min_cosine : between normal and ray; flatter views blur. Guess: 75 degrees.
-    depth_share : of the distance, within which a hit of the ray is the place itself. Guess.
-    gutter_px : of the texture's background about its charts that is painted, for filters.
-    fill : share of a texture that its charts cover; what packing leaves. Measured: xatlas on the
-        meshes of the shared captures, 0.5 to 0.7.
+    num_views : largest number of views for a point's colour: those that see it best. Guess.
+    min_cosine : between normal and ray; more oblique views blur. Guess: 75 degrees.
+    depth_share : share of the distance within which a ray's hit is the point itself. Guess.
+    gutter_px : width of the background about the charts of a texture that is painted, for filters.
+    fill : share of a texture that its charts cover after packing. Measured: xatlas on the meshes of
+        the shared captures, 0.5 to 0.7.
     max_size_px : of a texture.
     """
 
@@ -59,20 +60,20 @@ def surface_colors(
     white: float,
     tolerances: ColoringTolerances = ColoringTolerances(),
 ) -> NDArray[np.uint8]:
-    """Colours of places on a surface as a screen shows them.
+    """Colours of points on a surface, encoded for display.
 
     Parameters
     ----------
     points, normals : (N, 3) world, unit normals outwards.
-    views : that may see them.
-    load : gives a view's linear intensities (H, W) or (H, W, 3), NaN where they are none.
-    scene : the surface, which hides places from views.
-    white : intensity that is shown white.
+    views : views that may see them.
+    load : gives a view's linear intensities (H, W) or (H, W, 3), NaN where unknown.
+    scene : the surface, for occlusion.
+    white : intensity of white.
 
     Returns
     -------
-    (N, 3) red, green, blue. A place that no view sees has the colour of the nearest that one does;
-    mid grey where none does.
+    (N, 3) red, green, blue. A point that no view sees gets the colour of the nearest seen one, or
+    mid grey if there is none.
     """
     num = len(points)
     weights = np.zeros((num, tolerances.num_views), np.float32)
@@ -101,7 +102,7 @@ def _seen_by(
     scene: RayScene,
     tolerances: ColoringTolerances,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """How well a view sees places (N,), 0 where it does not, and what it sees there (N, 3)."""
+    """How well a view sees points (N,), 0 if not at all, and their colours in it (N, 3)."""
     weight = np.zeros(len(points), np.float32)
     value = np.zeros((len(points), 3), np.float32)
     towards = points - view.center_in_world
@@ -153,16 +154,16 @@ def paint_texture(
     *,
     tolerances: ColoringTolerances = ColoringTolerances(),
 ) -> Texture:
-    """A square texture of a mesh whose vertices have places in it.
+    """A square texture of a mesh whose vertices have texture coordinates.
 
     Parameters
     ----------
     mesh : with a vertex for each side of a seam.
-    uv : (V, 2), shares of width and height, from the lower left.
+    uv : (V, 2), texture coordinates, shares of width and height from the lower left.
     colors_of : gives (N, 3) colours of points and normals (N, 3).
-    size_px : its sides.
+    size_px : side of the texture.
     """
-    # In the plane of the texture the mesh is looked at from above: a texel's face, and where in it.
+    # Rays on the mesh in texture coordinates give the face of each texel, and the point in it.
     flat = TriangleMesh(np.column_stack([uv, np.zeros(len(uv))]), mesh.faces)
     axis = (np.arange(size_px) + 0.5) / size_px
     u, v = np.meshgrid(axis, axis[::-1])

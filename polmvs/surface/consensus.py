@@ -1,4 +1,4 @@
-"""What one view's dense result shows of points of another: places, normals, who hides whom."""
+"""Comparison of dense views: positions, normals and occlusion of one view's points in another."""
 
 from __future__ import annotations
 
@@ -25,24 +25,22 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-MAX_DEVIATIONS = 3.0  # of what views say of one place, apart: 0.3 % of right ones are farther
+MAX_DEVIATIONS = 3.0  # between views at one point: 0.3 % of correct ones differ by more
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """What another view sees where N points of a view lie.
+    """Surface of another view at N points of a view.
 
     Attributes
     ----------
-    place : (N,) distance along the first view's rays at which the other's surface is met; NaN:
-        none.
+    place : (N,) distance along the first view's rays to the other's surface; NaN: none.
     sigma : (N,) its standard deviation.
-    normals : (N, 3) its normal there, zero where it has none.
+    normals : (N, 3) its normal there, zero if it has none.
     cosine : (N,) between that normal and the point's own.
-    excess : (N,) how much farther than the point its surface lies, along its own ray; NaN: it has
-        none there.
+    excess : (N,) distance of its surface behind the point, along its own ray; NaN: none.
     facing : (N,) cosine between the point's normal and the direction to the other camera.
-    outside : (N,) it shows the point's place and no polarized surface there.
+    outside : (N,) its image contains the point but shows no polarized surface there.
     """
 
     place: Array
@@ -62,7 +60,7 @@ def sight(
     distance: Floats,
     normals: Floats,
 ) -> Sighting:
-    """Look a view's points up in another dense view.
+    """Look up a view's points in another dense view.
 
     Parameters
     ----------
@@ -106,16 +104,16 @@ def surface_of_others(
     dense: Sequence[DenseView | None],
     xy: Floats,
 ) -> SurfaceSamples | None:
-    """A first guess of the surface at pixels of the first view: what the other views show there.
+    """A first estimate of the surface at pixels of the first view, from the other views.
 
     Parameters
     ----------
-    maps, dense : of the views, the first one's own first.
-    xy : (N, 2), where the surface is wanted.
+    maps, dense : of the views, the first view first.
+    xy : (N, 2), image coordinates of the wanted surface.
 
     Returns
     -------
-    None where they show nothing in the view's region.
+    None if they show nothing in the view's region.
     """
     view, center = maps[0].view, maps[0].view.center_in_world
     known = [(m.view, d) for m, d in zip(maps[1:], dense[1:], strict=True) if d is not None]
@@ -153,7 +151,7 @@ def surface_of_others(
 def hidden_by(dense: DenseView, view: View, points: Floats, normals: Floats) -> Mask:
     """Which lattice points (h, w) of a view lie behind a surface that faces it.
 
-    Views may agree on a surface that this one cannot see, and its phase need not deny it.
+    Views may agree on a surface that this view cannot see and that its phase does not contradict.
 
     Parameters
     ----------
@@ -169,5 +167,5 @@ def hidden_by(dense: DenseView, view: View, points: Floats, normals: Floats) -> 
 
 
 def _shows_background(phase_map: PhaseMap, xy: Floats) -> Mask:
-    """Which places lie in the image but outside its region."""
+    """Which points lie in the image but outside its region."""
     return np.asarray(in_image(phase_map.view.camera, xy) & ~phase_map.shows_surface(xy))

@@ -1,14 +1,14 @@
-"""Contours of phase: ranges carried along them over a polarized region, as in the paper.
+"""Contours of phase, which carry ranges over a polarized region, as in the paper.
 
 A row ``m`` is a tangent of the surface. Under PPA it is perpendicular to the ray, so a point moved
 along it keeps its distance to the camera centre: the contour is an iso-range curve. Under OPA it
 has no z component and the contour is an iso-depth curve (Cui et al. 2017). Both need one view
-and no normal. The curves are traced in the image; what stays constant along them is applied
-afterwards, so nothing drifts.
+and no normal. The curves are traced in the image; the constant quantity is applied afterwards, so
+it does not drift.
 
 Contours traced through a view's phase carry a seed's range across the region; normals solved from
 the phases of all views carry it sideways, from contour to contour. One robust least-squares
-problem per view joins both, so that every node draws on all seeds.
+problem per view combines both, so every node uses all seeds.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class ContourTolerances:
-    """Where contours may run, and what they are joined to.
+    """Tolerances of the tracing of contours, and of their connections.
 
     Attributes
     ----------
-    num_neighbors : that a node is joined to. Guess.
-    min_dolp : smoothed; contours stop under it. Guess; without it F at 1 mm of OPA on the bundled
+    num_neighbors : number of neighbours to which a node is connected. Guess.
+    min_dolp : smoothed; contours stop below it. Guess; without it F at 1 mm of OPA on the bundled
         capture is 33.0 and not 35.4 %.
     min_coherence : of neighbouring directions: a contour stops in an incoherent field.
         Derived: cosine of half a right angle.
-    meeting_px : the two halves of a closed curve end this close to each other. Guess.
+    meeting_px : distance at which the two halves of a closed curve end. Guess.
     """
 
     num_neighbors: int = 6
@@ -87,18 +87,18 @@ def propagate(
 
     Parameters
     ----------
-    angle_model : OPA or PPA; it decides the rows of the normals and what is constant on a contour.
+    angle_model : OPA or PPA; it sets the rows of the normals and the constant of a contour.
     maps : phase maps of the posed views.
     seeds : points on the surface.
     folder : for the dense views, which stay on disk; existing files are replaced.
     tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
-    workers : processes to share the views among; None: this one.
+    workers : processes for the views; None: this process.
     on_progress : called with the number of views done, ``(num_rounds + 1)`` times per view.
     tolerances : of this step.
 
     Returns
     -------
-    Per view its dense result, or None where no seed reaches the view's region.
+    Dense result of each view, or None if no seed reaches its region.
     """
     workers = workers or Workers(1)
     nodes: list[Nodes | None] = []
@@ -222,7 +222,7 @@ def direction_field(angle_model: AngleModel, samples: Image, rays: Image, passab
     angle_model : OPA or PPA.
     samples : (H, W, 3), phase map samples.
     rays : (H, W, 3), unit rays of the pixels; their derivatives carry any camera model.
-    passable : (H, W) bool, pixels that a contour may cross.
+    passable : (H, W) bool, pixels on which a contour may run.
 
     Returns
     -------
@@ -256,18 +256,18 @@ def trace_contours(
 ) -> Contours:
     """Trace contours both ways from all seeds in lock step (midpoint rule).
 
-    A contour ends where the field ends (region edge, crease, weak polarization, clipped pixels:
-    whatever was not passable), where neighbouring directions disagree, or where it closes. One that
-    winds about without an end is cut where each half is as long as the image's border.
+    A contour ends where the field ends (region edge, crease, weak polarization, clipped pixels),
+    where neighbouring directions disagree, or where it closes. A contour without an end is cut
+    where each half is as long as the image's border.
 
     Parameters
     ----------
     field : (H, W, 2), from :func:`direction_field`.
     seeds_xy : (S, 2), image coordinates.
     step_px : step length, px.
-    keep_every : nodes kept, in steps.
+    keep_every : number of steps between kept nodes.
     claims : cells of the image, each owned by the first curve that entered it (-1: free), over
-        the same extent as the field; a curve ends in a cell of another. Updated in place.
+        the extent of the field; a curve ends in a cell of another. Updated in place.
     first_curve : index of the first seed's curve.
     tolerances : of this step.
     """
@@ -357,10 +357,10 @@ def cover_with_contours(
     step_px: float,
     tolerances: ContourTolerances = ContourTolerances(),
 ) -> Contours:
-    """Contours from the seeds, then sideways of them until the region is covered.
+    """Contours from the seeds, then between them until the region is covered.
 
-    First the seeds' own contours, then in rounds from free places ever closer together; a new
-    curve ends where it meets an earlier one. Places of the region that no contour can reach
+    The seeds' contours come first, then rounds from free pixels with decreasing spacing. A new
+    curve ends where it meets an earlier one. Pixels of the region that no contour can reach
     (frontal spots, marks) become curves of a single node.
 
     Parameters

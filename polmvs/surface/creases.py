@@ -1,9 +1,9 @@
 """Sharp edges of a mesh from the normals of its faces.
 
-A mesh whose triangles do not follow an edge of the object rounds it over a triangle's width. The
-normals that the phases give are those of one side or of the other up to a few pixels from the edge:
-smoothed over faces of like normal alone, they part the sides, and vertices that are moved until
-all faces about them lie in planes of these normals come to lie on the edge itself.
+A mesh whose triangles do not follow an edge of the object rounds it over the width of a triangle.
+The normals of the phases belong to one side or the other up to a few pixels from the edge. Smoothed
+only over faces with similar normals, they separate the sides. Vertices then move until all faces
+about them have these normals, which puts them on the edge.
 
 Sun et al., Fast and effective feature-preserving mesh denoising, TVCG 2007.
 """
@@ -24,32 +24,31 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-GRADIENT_STEP = 0.1  # of a mesh's edge: small against what it can show
+GRADIENT_STEP = 0.1  # of the mean edge length: small against the resolution of the mesh
 
 
 @dataclass(frozen=True, kw_only=True)
 class CreaseTolerances:
-    """When faces belong to one side of an edge.
+    """Tolerances for faces that belong to one side of an edge.
 
     Attributes
     ----------
     like_sine : deviation of the difference of normals that are averaged. Above the noise of fitted
         normals (1 to 3 deg) and the curvature of a face, below the edges of parts. Measured on five
-        captures: with 0.4 for 0.2 the F-score at 1 mm falls by 0.2 to 1.4 points. Half of it is
-        the deviation of a face's own normal from the given one at which its vertices are free to
-        move.
-    crease_deg : between normals of different sides, of a mesh, of its phases and of faces that
-        points show: a face that a mesh rounds across a right-angled edge is turned by 45 deg, most
-        by less. Measured: 60 for the corners costs an analytic bracket 0.24 deg, 50 for the phases'
-        normals 0.4 points of F at 1 mm; half of it is as good.
-    unfitted_weight : of a normal that is the mesh's own. Measured, 1 for 0.2: normals of `step` err
-        by 2.10 deg and not 1.81, of `mug` by 1.78 and not 1.96.
-    normal_rounds : of the average. Measured, 6, 12, 20: normals of `step` err by 2.61, 2.47, 2.40
-        deg, of `mug` by 1.84, 1.97, 2.12.
-    vertex_rounds : of the vertices' move. Measured on `step`: the faces along the edge of the box
-        lie too low by 0.16, 0.11, 0.12, 0.12 mm after 20, 30, 40 and 240. Where normals contradict
-        one another (OPA's) what lies far from edges moves as well: F at 1 mm of OPA on `mug` is
-        84, 84, 53 % after 12, 20 and 40.
+        captures: with 0.4 for 0.2 the F-score at 1 mm falls by 0.2 to 1.4 points. A face's vertices
+        are free to move if its own normal differs from the given one by half of this.
+    crease_deg : between normals of different sides, of a mesh, of its phases and of planar patches:
+        a face across a right-angled edge is turned by at most 45 deg. Measured: 60 for the corners
+        costs an analytic bracket 0.24 deg, 50 for the phases' normals 0.4 points of F at 1 mm; half
+        of it is as good.
+    unfitted_weight : of a normal of the mesh. Measured, 1 for 0.2: the error of normals of `step`
+        is 2.10 deg and not 1.81, of `mug` 1.78 and not 1.96.
+    normal_rounds : of the average. Measured, 6, 12, 20: the error of normals of `step` is 2.61,
+        2.47, 2.40 deg, of `mug` 1.84, 1.97, 2.12.
+    vertex_rounds : of the vertices' moves. Measured on `step`: the faces along the edge of the box
+        are too low by 0.16, 0.11, 0.12, 0.12 mm after 20, 30, 40 and 240. With contradictory
+        normals (OPA's) vertices far from edges move as well: F at 1 mm of OPA on `mug` is 84, 84,
+        53 % after 12, 20 and 40.
     """
 
     like_sine: float = 0.2
@@ -71,7 +70,7 @@ def sided_normals(
     ----------
     mesh : with F faces.
     normals : (F, 3) unit.
-    is_fitted : (F,) bool, those that the phases gave.
+    is_fitted : (F,) bool, normals from the phases.
 
     Returns
     -------
@@ -98,10 +97,10 @@ def _taken_from_sides(
     other: NDArray[np.integer],
     tol: CreaseTolerances,
 ) -> Array:
-    """Normals ``(F, 3)``, of unknown faces turned from known ones beside them that of the nearest.
+    """Normals ``(F, 3)``; an unknown face on an edge gets that of the nearest known side.
 
-    A face that a mesh rounds across an edge is of one of its sides, and resembles neither enough
-    for an average of like ones to tell which.
+    A rounded face across an edge belongs to one of its sides, but resembles neither enough for the
+    average of similar normals.
 
     Parameters
     ----------
@@ -125,13 +124,13 @@ def _taken_from_sides(
 def sides_known(
     mesh: TriangleMesh, normals: Array, is_known: Mask, tolerances: CreaseTolerances | None = None
 ) -> Mask:
-    """Which faces ``(F,)`` belong to a side of which some face near them is known.
+    """Which faces ``(F,)`` belong to a side with a known face nearby.
 
     Parameters
     ----------
     mesh : with F faces.
     normals : (F, 3) unit, as of :func:`sided_normals`.
-    is_known : (F,) bool, faces whose normals something shows.
+    is_known : (F,) bool, faces with a measured normal.
     """
     tol = tolerances or CreaseTolerances()
     one, other = mesh.face_pairs.tocoo().coords
@@ -147,7 +146,7 @@ def sides_known(
 def crease_vertices(
     mesh: TriangleMesh, is_shown: Mask, tolerances: CreaseTolerances | None = None
 ) -> Mask:
-    """Which vertices ``(V,)`` of a sharpened mesh lie on an edge between sides that are known.
+    """Which vertices ``(V,)`` of a sharpened mesh lie on an edge between known sides.
 
     Parameters
     ----------
@@ -157,7 +156,7 @@ def crease_vertices(
     tol = tolerances or CreaseTolerances()
     corner = mesh.faces.ravel()
     apart = dots(mesh.vertex_normals[corner], np.repeat(mesh.face_normals, 3, axis=0))
-    # Two sides are turned from their mean by half of what they are from each other.
+    # The angle of each side to their mean is half of the angle between them.
     turned = apart < np.cos(np.radians(0.5 * tol.crease_deg))
     found = np.zeros(len(mesh.vertices), np.bool_)
     found[corner[turned]] = True
@@ -173,17 +172,17 @@ def wall_normals(
     to_uncarved: Floats,
     tolerances: CreaseTolerances | None = None,
 ) -> tuple[Array, Mask]:
-    """Normals ``(F, 3)``, those of carved walls as they were carved, and which faces ``(F,)`` are.
+    """Normals ``(F, 3)`` with those of carved walls as carved, and which faces ``(F,)`` are walls.
 
-    Walls of steps and of cavities see what stands beside them, and their phases are those of its
-    mirror image.
+    Walls of height steps and cavities reflect what is next to them, and their phases are those of
+    its mirror image.
 
     Parameters
     ----------
     mesh : carved, with F faces.
     normals, is_fitted : as of :func:`sided_normals`.
-    carvings : signed distances of points ``(N, 3)``, positive in the space that is carved away.
-    to_uncarved : (F,), distances of the faces to the surface before.
+    carvings : signed distances of points ``(N, 3)``, positive in the carved space.
+    to_uncarved : (F,), distances of the faces to the surface before carving.
     """
     tol = tolerances or CreaseTolerances()
     carved, is_carved = normals.copy(), np.zeros(len(normals), np.bool_)
@@ -212,13 +211,13 @@ def _gradients(values: Callable[[Array], Floats], points: Array, step: float) ->
 def sharpened(
     mesh: TriangleMesh, normals: Array, tolerances: CreaseTolerances | None = None
 ) -> TriangleMesh:
-    """The mesh, its vertices moved until its faces have given normals ``(F, 3)``."""
+    """The mesh with its vertices moved until its faces have given normals ``(F, 3)``."""
     tol = tolerances or CreaseTolerances()
     if not len(mesh.faces):
         return mesh
     num, area = len(mesh.vertices), mesh.face_areas
     total = np.maximum(mesh.incidence.T @ area, 1e-300)[:, None]
-    # Places that fit stay: what a rounded edge lacks is not to be taken from the face beside it.
+    # Vertices that fit stay: an edge must not be sharpened at the expense of the patch beside it.
     off = ((mesh.face_normals - normals) ** 2).sum(axis=1)
     off = (mesh.incidence.T @ (area * off))[:, None] / total
     mobility = 1 - np.exp(-0.5 * off / (0.5 * tol.like_sine) ** 2)
@@ -235,14 +234,14 @@ def sharpened(
     start = mesh.vertices - mesh.vertices.mean(axis=0)
     moved = before = np.zeros_like(start)
     for k in range(tol.vertex_rounds):
-        # With the last move once more (Nesterov): what takes edges together is slow without.
+        # With momentum (Nesterov): long-range moves of edges are slow without it.
         ahead = moved + k / (k + 3) * (moved - before)
         vertices, before = start + ahead, moved
         height = along @ vertices.ravel() / 3
         step = (spread @ height).reshape(-1, 3) - (own @ vertices[:, :, None])[..., 0]
         moved = ahead + mobility * step / total
         length = np.linalg.norm(moved, axis=1, keepdims=True)
-        # What rounding takes is less than an edge; half of one as a limit gives the same.
+        # Rounding removes less than an edge length; half of it as a limit gives the same.
         moved = moved * np.minimum(1.0, mesh.mean_edge / np.maximum(length, 1e-300))
     return mesh.moved(moved)
 

@@ -19,8 +19,8 @@ Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-NUM_NEAREST = 4  # known points that a point of the surface between them is made of
-REACH = 2.0  # their spacings, from them to what they tell of: a cell's diagonal, with a margin
+NUM_NEAREST = 4  # known points from which a point between them is interpolated
+REACH = 2.0  # reach of known points, in their spacings: a cell's diagonal, with a margin
 MEMBERS = ("range", "normals", "sigma_deg", "sigma", "confidence")  # of a stored view
 
 
@@ -96,7 +96,7 @@ def lattice_points(wanted: NDArray[np.bool_], stride_px: int) -> Array:
 
 @dataclass(frozen=True)
 class SurfaceSamples:
-    """Some points of the surface that a view sees.
+    """Points of the surface that a view sees.
 
     Attributes
     ----------
@@ -144,8 +144,8 @@ def extend_planes(
     Parameters
     ----------
     samples : at least one, all finite.
-    xy, rays_in_world : (N, 2) and (N, 3), where the surface is wanted.
-    max_gap_px : from farther samples nothing is taken.
+    xy, rays_in_world : (N, 2) and (N, 3), of the wanted surface.
+    max_gap_px : samples farther away are ignored.
 
     Returns
     -------
@@ -203,7 +203,7 @@ def dense_view(samples: SurfaceSamples, wanted: NDArray[np.bool_], stride_px: in
 
 
 def store_dense_view(dense: DenseView, path: Path) -> DenseView:
-    """Write a dense view to ``path.range.npy`` and its fellows; returns the stored one."""
+    """Write a dense view to ``path.range.npy`` and other files; return the stored view."""
     for name, array in zip(MEMBERS, dense._arrays(), strict=True):
         save_array(_member(path, name), array)
     save_array(_member(path, "stride"), np.array(dense.stride_px))
@@ -216,7 +216,7 @@ def open_dense_view(stride_px: int, path: Path) -> DenseView:
     Raises
     ------
     DataError
-        A file is missing, damaged, or of another size than the others.
+        A file is missing, damaged, or has another size than the others.
     """
     range_map, normals, sigma_deg, sigma, confidence = (
         map_array(_member(path, name), np.floating) for name in MEMBERS
@@ -229,7 +229,7 @@ def open_dense_view(stride_px: int, path: Path) -> DenseView:
 
 
 def find_dense_view(path: Path) -> DenseView | None:
-    """Map a stored dense view into memory that says itself what its stride is; None: no such."""
+    """Map a stored dense view, with its own stride, into memory; None if there is none."""
     if not _member(path, "stride").is_file():
         return None
     stride = map_array(_member(path, "stride"), np.integer)

@@ -1,4 +1,4 @@
-"""Fusion: the points on which views agree, each placed by all views that see it."""
+"""Fusion: the points on which views agree, each at the mean position of these views."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class FusionTolerances:
-    """When views agree on a point, beside what the options say.
+    """Tolerances of the agreement of views, in addition to the options.
 
     Attributes
     ----------
-    min_tolerance : share of the tolerance that is left to views however certain they are.
-        Guess.
-    min_sigma_px : of a range, in GSDs: no view is trusted more than that. Guess.
+    min_tolerance : least share of the tolerance, for views of any certainty. Guess.
+    min_sigma_px : least deviation of a range, GSD. Guess.
     """
 
     min_tolerance: float = 0.5
@@ -49,8 +48,8 @@ class FusedCloud:
     intensity : (N,) float32, s0 in units of full scale.
     num_views : (N,) int32, views that agree on the point.
     sigma_deg : (N,) float32, standard deviation of the normal.
-    sigma : (N,) float32, standard deviation of the place along the normal, world units. Views
-        err alike, so that their number does not narrow it.
+    sigma : (N,) float32, standard deviation of the position along the normal, world units. The
+        errors of views are correlated, so their number does not reduce it.
     """
 
     points: Array
@@ -81,20 +80,19 @@ def fuse(
 ) -> FusedCloud:
     """Fuse the dense views into one cloud.
 
-    A point stays if enough views agree with it in distance and normal and if not most of the
-    views that should see it see through it or show no polarized surface there. Distances may
-    differ by what their deviations explain, at most by as many GSDs as the options say and
-    never by less than half of it. The point moves along its ray to the mean of the places that the
-    agreeing views give it, weighted by their deviations. Points closer than the merging voxel
-    become one; lone points go.
+    A point is kept if enough views agree with it in distance and normal, and unless most of the
+    views that should see it see through it or show no polarized surface there. Distances may differ
+    within their deviations, at most by the GSDs of the options and at least by half of that. The
+    point moves along its ray to the mean position of the agreeing views, weighted by their inverse
+    variances. Points within one merging voxel become one; isolated points are removed.
 
     Parameters
     ----------
     maps : phase maps of the views.
     dense : per view its dense result.
-    options : thresholds, in GSD (length of a pixel at the surface).
-    max_neighbors : other views that are asked about a view's points, nearest first.
-    workers : processes to share the views among; None: this one.
+    options : thresholds, in GSD.
+    max_neighbors : number of other views with which a view's points are compared, nearest first.
+    workers : processes for the views; None: this process.
     on_progress : called with the number of views done.
     on_confirmed : called with the index of each view that has a result and with the points
         (h, w) of its lattice on which the others agree.

@@ -1,15 +1,15 @@
 """Focal length from one view of a plane.
 
-Under PPA a change of the focal length is a change of the plane's normal (the row of a pixel is
-``n_x sin + n_y cos - (x sin + y cos) n_z / f``), so that every focal length fits alike. The
-correction of the tilted model depends on the true obliqueness of the rays: of all focal lengths
-one leaves the least phase residual.
+Under PPA, a change of the focal length is equivalent to a change of the plane's normal (the row of
+a pixel is ``n_x sin + n_y cos - (x sin + y cos) n_z / f``), so every focal length fits equally. The
+correction of the tilted model depends on the true angles of the rays, so one focal length has the
+least phase residual.
 
-Light that no single normal explains (mixed with that from under the surface, or from a second
-reflection) shifts the minimum by more than its deviation: on a real pond of nominally 870 px it
-was 837 +- 22, 880 +- 22 and 908 +- 25 px from the pixels with a DoLP over 0.35, 0.45 and 0.55. The
-correction is not linear in noise: blur images of weak polarization (noise over a tenth of the
-polarized intensity) first.
+Light that no single normal explains (mixed with light from below the surface, or from a second
+reflection) shifts the minimum by more than its deviation. On a real pond of nominally 870 px the
+result is 837 +- 22, 880 +- 22 and 908 +- 25 px from the pixels with a DoLP over 0.35, 0.45 and
+0.55. The correction is not linear in noise: blur images of weak polarization (noise over a tenth of
+the polarized intensity) first.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ Array: TypeAlias = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class FocalTolerances:
-    """How a focal length is searched for, and when it is observable.
+    """Tolerances of the search for a focal length, and of its observability.
 
     Attributes
     ----------
     num_focals : of the scan. Guess.
-    log_step : of the numerical derivative on the logarithm of the focal length.
-    max_log_sigma : relative deviation from which a focal length counts as not observable.
+    log_step : step of the numerical derivative by the logarithm of the focal length.
+    max_log_sigma : relative deviation above which a focal length is not observable.
         Guess.
     """
 
@@ -64,13 +64,13 @@ class FocalEstimate:
     Attributes
     ----------
     focal_px : of the least residual, px.
-    sigma_px : its standard deviation, from the scatter of runs of pixels; infinite where nothing
-        depends on the focal length. Errors of the principal point and distortion are not in it.
+    sigma_px : its standard deviation, from the scatter of runs of pixels; infinite if the residual
+        does not depend on it. Errors of the principal point and distortion are not included.
     observable : the residual has a minimum within the range, and ``sigma_px`` is below a fifth of
-        it. Where it is not, ``focal_px`` means nothing.
+        it. Otherwise ``focal_px`` is meaningless.
     plane : the plane's normal at ``focal_px``.
-    scan_focal_px, scan_rmse_deg, scan_median_deg : (S,), residual of the best normal per focal
-        length tried.
+    scan_focal_px, scan_rmse_deg, scan_median_deg : (S,), residual of the best normal for each tried
+        focal length.
     """
 
     focal_px: float
@@ -128,16 +128,15 @@ def estimate_focal(
     focal_range_px: tuple[float, float],
     tolerances: FocalTolerances = FocalTolerances(),
 ) -> FocalEstimate:
-    """Focal length at which one normal explains the phase angles of a plane best.
+    """Focal length at which one normal best explains the phase angles of a plane.
 
     Parameters
     ----------
-    angle_model : tilted; under the others the focal length is not observable, which the result
-        says.
+    angle_model : tilted; under the others the result is not observable.
     parameters : (3, N), Stokes parameters s0, s1, s2 as measured, not corrected.
     offsets_px : (2, N), image coordinates relative to the principal point, px; square pixels.
     sigma : (N,), standard deviation of the phase, rad.
-    light : which reflection dominates.
+    light : dominant kind of light.
     focal_range_px : shortest and longest focal length to try, px.
     tolerances : of this step.
     """

@@ -1,6 +1,6 @@
-"""All that one raw image tells about planes: their normals, the focal length, the model that fits.
+"""Measurements of planes in one raw image: normals, focal length, and the model that fits.
 
-The library's side of ``polmvs plane``.
+The implementation of ``polmvs plane``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class IntrinsicsSource(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneFigures:
-    """A plane's normal, as in :class:`.plane.PlaneEstimate`, in numbers that JSON holds.
+    """A plane's normal, as in :class:`.plane.PlaneEstimate`, in JSON types.
 
     Attributes
     ----------
@@ -84,19 +84,19 @@ class FocalFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneMeasurement:
-    """What one image tells about planes.
+    """Measurements of planes in one image.
 
     Attributes
     ----------
     image : the raw mosaic.
     width, height : of the polarization image, px.
     intrinsics : fx, fy, cx, cy that were used, px, COLMAP's convention.
-    intrinsics_from : where they come from.
-    angle_model, light, estimator, min_dolp : options that ``plane`` depends on.
-    plane : the best single normal of all pixels that count, under ``angle_model``.
+    intrinsics_from : their source.
+    angle_model, light, estimator, min_dolp : options on which ``plane`` depends.
+    plane : the best single normal of all usable pixels, under ``angle_model``.
     residuals : of the best single normal under each model.
-    focal : the focal length, if it was asked for.
-    planes : all planes in view, if they were asked for.
+    focal : the focal length, if requested.
+    planes : all planes in view, if requested.
     """
 
     image: Path
@@ -114,7 +114,7 @@ class PlaneMeasurement:
     planes: tuple[PlaneFigures, ...] | None = None
 
     def content(self) -> dict[str, Any]:
-        """In terms of JSON, without what was not asked for."""
+        """The measurement as JSON, without what was not requested."""
         plain: dict[str, Any] = to_plain(self)
         return {key: value for key, value in plain.items() if value is not None}
 
@@ -127,15 +127,15 @@ def measure_planes(
     Parameters
     ----------
     image : the file.
-    options : which pixels count, and how their normal is solved.
-    capture : how the mosaic is read.
+    options : which pixels to use, and how to solve their normal.
+    capture : how to read the mosaic.
 
     Raises
     ------
     OptionError
         The intrinsics do not fit the image.
     DataError
-        A file is unusable, or no pixel counts.
+        A file is unusable, or no pixel is usable.
     """
     options = options or PlaneOptions()
     stokes = load_stokes(image, capture or CaptureOptions())
@@ -178,19 +178,19 @@ def measure_planes(
 def select_pixels(
     stokes: Stokes, options: PlaneOptions, source: str | Path, inside: Mask | None = None
 ) -> Mask:
-    """Pixels (H, W) that count.
+    """Usable pixels (H, W).
 
     Parameters
     ----------
     stokes : images of the mosaic.
-    options : say which.
+    options : conditions on the pixels.
     source : the image, for messages.
-    inside : (H, W) bool, the only pixels that may count, instead of the options' mask or polygon.
+    inside : (H, W) bool, pixels to choose from, instead of the options' mask or polygon.
 
     Raises
     ------
     DataError
-        Fewer than ``MIN_PIXELS`` do, or the mask is unusable.
+        Fewer than ``MIN_PIXELS`` are usable, or the mask is unusable.
     """
     if inside is not None:
         if inside.shape != stokes.shape:

@@ -1,4 +1,4 @@
-"""The pixels of one image that show a plane: what ``polmvs plane`` measures on."""
+"""The pixels of one image that show a plane, for ``polmvs plane``."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from polmvs.polarization.stokes import Stokes
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-FOCAL_RANGE = (0.25, 6.0)  # focal lengths that are tried, image widths
+FOCAL_RANGE = (0.25, 6.0)  # tried focal lengths, image widths
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlaneView:
-    """One image and the pixels of it that are used.
+    """One image and its used pixels.
 
     Attributes
     ----------
     stokes : (H, W) images as measured.
-    mask : (H, W) bool, pixels that count.
-    light : which reflection dominates.
+    mask : (H, W) bool, pixels to use.
+    light : dominant kind of light.
     """
 
     stokes: Stokes
@@ -42,7 +42,7 @@ class PlaneView:
     light: Light
 
     def phase_map(self, model: AngleModel, camera: Camera) -> tuple[Image, Image, Image]:
-        """Phase as the estimators take it.
+        """Phase in the form of the estimators.
 
         Returns
         -------

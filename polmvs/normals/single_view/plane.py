@@ -1,19 +1,19 @@
 """Normal of a plane from the phase angles of one view (paper, M1, eq. coeff).
 
-The paper's estimator is the eigenvector of ``M^T M`` over all pixels. The robust one is the
-maximum likelihood of the phase angles themselves: Gauss-Newton steps on the sphere minimise a
-Cauchy loss of phase error over sigma. It is as fast, and free of the bias of an eigenvector, whose
-rows carry their noise into ``M^T M`` (at 5 degrees of noise and a fifth of outliers 0.004 instead
-of 0.1 degrees for the same weights).
+The paper's estimator is the eigenvector of ``M^T M`` over all pixels. The robust estimator is the
+maximum likelihood of the phase angles: Gauss-Newton steps on the sphere minimize a Cauchy loss of
+phase error over sigma. It is as fast, and it has no bias. The eigenvector is biased, because the
+noise of the rows enters ``M^T M`` (at 5 degrees of noise and a fifth of outliers 0.1 instead of
+0.004 degrees for the same weights).
 
-With ``x, y`` the ray over its z component and ``p = (x n_z - n_x, y n_z - n_y)`` the phase of a
-normal n is ``-atan2(p_y, p_x)`` (paper, eq. phi_persp), and its gradient on n is minus the
-predicted row ``(p_y, -p_x, p_x y - p_y x)`` over ``|p|^2``. All of it works on doubled angles, so
-that neither the axial ambiguity nor trigonometry comes in. Under OPA ``x = y = 0``.
+Let ``x, y`` be the ray over its z component and ``p = (x n_z - n_x, y n_z - n_y)``. The phase of a
+normal n is ``-atan2(p_y, p_x)`` (paper, eq. phi_persp). Its gradient with respect to n is minus the
+predicted row ``(p_y, -p_x, p_x y - p_y x)`` over ``|p|^2``. All computations use doubled angles,
+which avoids the axial ambiguity and trigonometric functions. Under OPA ``x = y = 0``.
 
-Arrays are component first, ``(3, N)``, the pixels in raster order: the covariance is taken from
-the scatter of runs of neighbouring pixels, whose errors may have a common cause. Samples of pixels
-are one array (5, N): cosine and sine of the doubled phase, x, y, and the precision
+Arrays are component first, ``(3, N)``, the pixels in raster order: the covariance comes from the
+scatter of runs of neighbouring pixels, whose errors may have a common cause. Samples of pixels are
+one array (5, N): cosine and sine of the doubled phase, x, y, and the precision
 ``1 / sigma^2`` of the phase.
 """
 
@@ -34,23 +34,23 @@ Floats: TypeAlias = NDArray[np.floating[Any]]
 Array: TypeAlias = NDArray[np.float64]
 
 
-CHUNK = 8192  # pixels worked on at a time: the temporaries stay in the cache
+CHUNK = 8192  # pixels processed at a time: the temporaries stay in the cache
 TINY = 1e-12
 EXACT = float(np.finfo(np.float32).eps)  # of angles: what their rounding leaves
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneTolerances:
-    """How the normal of a plane is searched for and judged.
+    """Tolerances of the normal of a plane.
 
     Attributes
     ----------
-    some_pixels : evenly spread, that the first rounds, medians and the search for a focal length
-        take, at least; time only.
-    coarse_rounds : on these. Derived: those of normals from many views.
+    some_pixels : least number of evenly spread pixels for the first rounds, medians and the search
+        for a focal length; time only.
+    coarse_rounds : rounds on these. Derived: those of normals from many views.
     fine_rounds : over all pixels. Guess.
-    num_runs : of pixels from whose scatter a covariance is taken, at least. Guess.
-    min_conditioning : ratio of singular values under which rows have rank 1. Derived: that of
+    num_runs : least number of runs of pixels for a covariance. Guess.
+    min_conditioning : ratio of singular values below which rows have rank 1. Derived: that of
         normals from many views.
     max_step : rad, of a Gauss-Newton step. Guess.
     """
@@ -69,21 +69,21 @@ class PlaneEstimate:
 
     Attributes
     ----------
-    normal : (3,) float64, unit, camera frame, facing the camera. Where not ``valid`` it still is
-        one that leaves the least residual, but not the only one: under OPA, whose rows have rank
-        1, it is the direction in the image plane. NaN where there are fewer than two pixels.
+    normal : (3,) float64, unit, camera frame, facing the camera. If not ``valid``, it has the least
+        residual but is not unique: under OPA, whose rows have rank 1, it is the direction in the
+        image plane. NaN for fewer than two pixels.
     valid : the rows determine a single normal.
     conditioning : ratio of the middle to the largest singular value of the weighted predicted
         rows; 0 for rows of rank 1, at most 1.
     covariance : (3, 3) float64, of the normal, rad^2, camera frame; across the normal, of rank 2.
-        What the pixels' sigma explains or, where it is larger, the scatter of runs of pixels. NaN
-        where not valid. An error that is common to the whole view is not in it.
+        It is that of the pixels' sigma or, if larger, the scatter of runs of pixels. NaN if not
+        valid. It does not include an error that is common to the whole view.
     sigma_deg : standard deviation along the larger axis of the covariance, degrees; infinite
         where not valid.
     rmse_deg, median_deg : root mean square, and median of the absolute, phase residual (measured
         minus predicted by ``normal``), degrees.
     num_pixels : pixels used, outliers included.
-    outlier_share : share of the pixels with a residual beyond what chance makes.
+    outlier_share : share of the pixels with a residual larger than chance explains.
     """
 
     normal: Array
@@ -107,7 +107,7 @@ def plane_normal(
     initial_normal: Floats | None = None,
     tolerances: PlaneTolerances = PlaneTolerances(),
 ) -> PlaneEstimate:
-    """Normal that the pixels of one view share (paper, "Single-view Normal Estimation").
+    """Common normal of pixels of one view (paper, "Single-view Normal Estimation").
 
     Parameters
     ----------
@@ -116,15 +116,15 @@ def plane_normal(
     axial : (2, N), ``(cos 2 phase, sin 2 phase)`` times any positive number.
     rays : (3, N), camera frame, of any length.
     sigma : (N,), standard deviation of the phase, rad.
-    robust : maximum likelihood with a Cauchy loss whose scale is the residuals' own, or the
-        paper's eigenvector, which weighs all pixels alike.
-    initial_normal : (3,), start of the robust estimator; the paper's eigenvector where None.
+    robust : maximum likelihood with a Cauchy loss, whose scale comes from the residuals; else the
+        paper's eigenvector with equal weights.
+    initial_normal : (3,), start of the robust estimator; None: the paper's eigenvector.
     tolerances : of this step.
 
     Returns
     -------
-    Not valid for fewer than two pixels, or where their rows have rank 1. Pixels that are not
-    finite or have no polarization are left out.
+    Not valid for fewer than two pixels, or if their rows have rank 1. Pixels that are not finite or
+    have no polarization are ignored.
     """
     samples = stack_samples(angle_model, axial, rays, sigma)
     num = samples.shape[1]
@@ -162,7 +162,7 @@ def phase_residuals(angle_model: AngleModel, normal: Floats, axial: Floats, rays
 
     Returns
     -------
-    (N,), NaN where nothing is measured.
+    (N,), NaN where nothing was measured.
     """
     measured = (np.abs(axial[0]) + np.abs(axial[1]) > 0) & np.isfinite(rays).all(axis=0)
     residuals = np.full(measured.shape, np.nan, np.result_type(axial, rays))
@@ -184,7 +184,7 @@ def _eigenvector(angle_model: AngleModel, samples: Floats) -> Array:
 
 
 def residual_scale(normalized_errors: Floats) -> float:
-    """Deviation of errors, from the median of their size; that of exact data is its rounding."""
+    """Deviation of errors, from their median absolute value; for exact data, that of rounding."""
     return max(robust_deviation(normalized_errors), EXACT)
 
 
@@ -276,7 +276,7 @@ class NormalEquations(NamedTuple):
     Attributes
     ----------
     matrix : (3, 3), sum of ``w r r^T``.
-    noise : (3, 3), covariance of the sum of ``w r error`` that the pixels' sigma explains.
+    noise : (3, 3), covariance of the sum of ``w r error`` by the pixels' sigma.
     scores : (R, 3), sum of ``w r error`` over each run of pixels.
     errors : (N,), measured minus predicted phase, rad.
     """
@@ -288,7 +288,7 @@ class NormalEquations(NamedTuple):
 
 
 def stack_samples(angle_model: AngleModel, axial: Floats, rays: Floats, sigma: Floats) -> Floats:
-    """Samples (5, N) of the pixels that count: polarized, finite, with a sigma.
+    """Samples (5, N) of the usable pixels: polarized, finite, with a sigma.
 
     Parameters
     ----------
@@ -325,8 +325,8 @@ def normal_equations(
     ----------
     normal : (3,), camera frame.
     samples : (5, N).
-    scale : of the Cauchy loss, in units of sigma; None: the paper's weights, all unit rows alike.
-    run_length : pixels that share a score.
+    scale : of the Cauchy loss, in units of sigma; None: the paper's weights, equal for unit rows.
+    run_length : number of pixels that share a score.
     """
     matrix, noise = np.zeros((3, 3)), np.zeros((3, 3))
     scores, errors = [], []
@@ -347,7 +347,7 @@ def normal_equations(
 
 
 def error_gradients(normal: Floats, samples: Floats) -> Floats:
-    """Gradient (3, N) of the phase errors of samples (5, N) on the normal, rad."""
+    """Gradient (3, N) of the phase errors of samples (5, N) with respect to the normal, rad."""
     return np.stack(_rows(_compare(normal, samples)[2], samples)[0])
 
 

@@ -1,8 +1,8 @@
 """Several planes in one phase map: RANSAC on pairs of rows, then the robust estimator.
 
-The search runs on the map averaged over blocks of pixels, whose noise is low enough for a normal
-from two rows to be useful. What remains, once a plane is found, is searched again. In the end every
-block goes to the plane that explains it and its neighbours best.
+The search runs on averages over blocks of pixels: their noise is low enough for a normal from two
+rows. After a plane is found, the remaining blocks are searched again. Finally each block is
+assigned to the plane that best explains it and its neighbours.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ BLOCK_PX = 4
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneSearchTolerances:
-    """How planes are searched for.
+    """Tolerances of the search for planes.
 
     Attributes
     ----------
     num_hypotheses : pairs of rows per plane. Guess.
-    num_scored : blocks on which they are scored. Guess; time only.
-    num_refined : of the best hypotheses that are refined. Guess.
-    coherence_blocks : side of the window in which most blocks have to agree. Guess.
+    num_scored : blocks for their scores. Guess; time only.
+    num_refined : best hypotheses that are refined. Guess.
+    coherence_blocks : side of the window in which most blocks must agree. Guess.
     coherent_share : of that window. Derived: the majority, with a margin.
     model_sigma : rad; error of a block's phase that does not average out. Guess.
     min_share : least support of a plane, share of the mask. Guess.
-    max_planes : the search ends there at the latest. Guess; time only.
-    max_residual_deg : of a block that supports a plane, beside three times its noise. Guess.
-    min_angle_deg : between the normals of two planes; what differs by less is the same plane under
-        light that the model does not explain. Guess.
+    max_planes : largest number of planes. Guess; time only.
+    max_residual_deg : of a block that supports a plane, beyond three times its noise. Guess.
+    min_angle_deg : between the normals of two planes; with less they are the same plane under light
+        that the model does not explain. Guess.
     """
 
     num_hypotheses: int = 400
@@ -72,7 +72,7 @@ class FoundPlane:
     Attributes
     ----------
     estimate : normal and quality, from the pixels of ``mask``.
-    mask : (H, W) bool, its pixels; several areas where parallel planes are seen.
+    mask : (H, W) bool, its pixels; several areas if there are parallel planes.
     """
 
     estimate: PlaneEstimate
@@ -139,7 +139,7 @@ def find_planes(
 
     Parameters
     ----------
-    angle_model : PPA or tilted; under OPA a plane is known by its azimuth only.
+    angle_model : PPA or tilted; OPA gives only the azimuth of a plane.
     axial : (2, H, W), ``(cos 2 phase, sin 2 phase)`` times any positive number.
     rays : (3, H, W), unit, camera frame.
     sigma : (H, W), standard deviation of the phase, rad.
@@ -149,7 +149,7 @@ def find_planes(
 
     Returns
     -------
-    Planes with disjoint masks; none where nothing is explained by a plane.
+    Planes with disjoint masks; none if no plane explains anything.
     """
     if axial.shape != (2, *mask.shape) or rays.shape != (3, *mask.shape):
         raise ValueError(f"{axial.shape=}, {rays.shape=}, {mask.shape=}.")

@@ -1,6 +1,6 @@
 """Stage ``box``: check that the crop box holds part of the scene.
 
-It is asked as soon as there are poses, before the surface is made.
+It runs as soon as the poses are known, before the surface is made.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class BoxResult:
 
 
 def check_box(folder: RunFolder, crop: CropOptions, aruco: str | None) -> BoxResult:
-    """Hold a box against the sparse points.
+    """Check a box against the sparse points.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def check_box(folder: RunFolder, crop: CropOptions, aruco: str | None) -> BoxRes
     Raises
     ------
     OptionError
-        The box lies beside all that the cameras see, or its marker is not found.
+        No camera sees the box, or its marker is not found.
     """
     model = read_model(folder.sparse)
     box = crop_box(crop, aruco, model.views, lambda name: read_gray(folder.images / name))

@@ -27,8 +27,8 @@ class DenseWorkspaceResult:
 
     Attributes
     ----------
-    folder : of the workspace; None where there are no points to write one of.
-    backup : folder of the maps that were there before, where a given workspace was filled itself.
+    folder : of the workspace; None if there are no points.
+    backup : folder of the former maps, if a given workspace was filled in place.
     """
 
     folder: Path | None
@@ -39,18 +39,18 @@ class DenseWorkspaceResult:
 
 
 def write_workspace(model: AngleModel, folder: RunFolder) -> DenseWorkspaceResult:
-    """A COLMAP workspace of the run's own undistorted images and maps.
+    """Write a COLMAP workspace of the run's undistorted images and maps.
 
     Parameters
     ----------
     model : angle model.
-    folder : of a run with images, sparse model and dense views; the workspace is written whole or
+    folder : of a run with images, sparse model and dense views. The workspace is written whole or
         not at all.
 
     Raises
     ------
     DataError
-        There are no dense views, or the workspace's place holds files that no run wrote.
+        There are no dense views, or the target folder holds files that no run wrote.
     """
     sparse, target = read_model(folder.sparse), folder.dense(model)
     dense = _by_name(sparse, model, folder)
@@ -64,13 +64,13 @@ def write_workspace(model: AngleModel, folder: RunFolder) -> DenseWorkspaceResul
 def fill_given(
     model: AngleModel, folder: RunFolder, given: Path, *, in_place: bool
 ) -> DenseWorkspaceResult:
-    """A copy of the user's workspace, or that one itself, with the holes of its maps filled.
+    """Fill the holes of the maps of the user's workspace, in a copy or in place.
 
     Parameters
     ----------
     model, folder : as in :func:`write_workspace`.
     given : the user's workspace.
-    in_place : fill that one, after a backup of its maps, and write no other.
+    in_place : fill the given one after a backup of its maps, and write no copy.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def fill_given(
 
 @contextmanager
 def _new_workspace(target: Path) -> Iterator[Path]:
-    """Where to write a COLMAP workspace, which then takes the place of the last one."""
+    """Folder to write a COLMAP workspace to, which then replaces the former one."""
     with scratch(target) as folder:
         workspace = folder / "dense"
         yield workspace

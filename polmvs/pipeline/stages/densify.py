@@ -1,6 +1,6 @@
 """Stage ``densify_MODEL``: the dense cloud of a scene, and the dense depth of its views.
 
-The cloud holds the polarized surfaces and their surroundings, told apart by the kind of a point.
+The cloud holds the polarized surfaces and their surroundings; ``kind`` distinguishes them.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T", bound=np.generic)
 
-# Options that a method makes no use of.
+# Options that a method ignores.
 _OF_CONTOURS = ("propagation.contour", "propagation.step_px", "propagation.spacing_px")
 UNUSED: Mapping[Method, tuple[str, ...]] = {
     Method.SURFACE: (
@@ -94,12 +94,12 @@ class DensifyResult:
 
     Attributes
     ----------
-    num_points : of the cloud, on polarized surfaces.
-    num_surroundings : of the cloud, beside them.
-    method : by which the points were made: the views one by one where there is no surface from all.
-    tilt_share : of the turn by tilted polarizers that the surface of all views took back; None by
-        the other methods.
-    left_out : names of views that contradict the surface of all others, which is made without them.
+    num_points : points of the cloud on polarized surfaces.
+    num_surroundings : points of the cloud in the surroundings.
+    method : method of the points: view by view if there is no surface of all views.
+    tilt_share : share of the rotation by tilted polarizers that the surface of all views corrects;
+        None with the other methods.
+    left_out : names of inconsistent views, which the surface does not use.
     """
 
     num_points: int
@@ -153,15 +153,15 @@ def densify(
 ) -> DensifyResult:
     """One dense cloud, and the depth and normals of every view.
 
-    By the method ``surface`` both come from one mesh that all views agree on, where their
-    silhouettes bound the objects. Else the seeds are spread over the region of every view and the
-    views fused; without a region or seeds the surface then has no points.
+    With the method ``surface``, both come from one mesh of all views if silhouettes bound the
+    objects. Otherwise, the surface spreads from the seeds over the region of every view, and the
+    views are fused; without a region or seeds it has no points.
 
     Parameters
     ----------
-    model : angle model; a textbook model is never aware of the polarizers' tilt.
+    model : angle model; a textbook model ignores the polarizers' tilt.
     folder : of a run with images, model, phase maps, normals of the tracks, and seeds; the cloud
-        and the views of ``model`` are written.
+        and the dense views of ``model`` are written there.
     options : of the run.
 
     Raises
@@ -229,10 +229,10 @@ def densify(
 
 
 def crop_views(folder: Path, views: Sequence[View], box: CropBox) -> None:
-    """Leave of stored views, and of the mesh beside them, what lies in a box.
+    """Crop stored views, and the mesh beside them, to a box.
 
-    ``OUTSIDE`` are then the pixels (H, W) that show what lies beside the box: their rays miss it,
-    or the surface there lies outside; all of a view that has no surface.
+    ``OUTSIDE`` then has the pixels (H, W) that show what is outside the box: their rays miss it, or
+    their surface is outside. In a view without a surface these are all pixels.
     """
     for view in views:
         dense = find_dense_view(folder / view.name)
@@ -259,7 +259,7 @@ def crop_views(folder: Path, views: Sequence[View], box: CropBox) -> None:
 def unused_options(
     method: Method, propagation: PropagationOptions, fusion: FusionOptions
 ) -> list[str]:
-    """Sentences on options that are not the defaults and that a method makes no use of."""
+    """Sentences about options that are not the defaults and that a method ignores."""
     groups = {"propagation": propagation, "fusion": fusion}
 
     def is_given(path: str) -> bool:
@@ -376,7 +376,7 @@ def _dense_surface(given: _Inputs, folder: Path, views: Path) -> _Surface:
 
 
 def num_densify_steps(num_views: int, options: PropagationOptions) -> int:
-    """How many steps :func:`densify` reports."""
+    """Number of steps that :func:`densify` reports."""
     if options.method is Method.SURFACE:
         return num_surface_steps(num_views)
     if options.method is Method.INTEGRATE:
@@ -385,24 +385,24 @@ def num_densify_steps(num_views: int, options: PropagationOptions) -> int:
 
 
 def open_dense_views(folder: RunFolder, model: AngleModel) -> list[DenseView | None]:
-    """Dense results of all posed views of a run, None where a view has none."""
+    """Dense results of all posed views of a run; None for a view without one."""
     return [find_dense_view(folder.views(model) / view.name) for view in posed_views(folder)]
 
 
 def open_outside(folder: RunFolder, model: AngleModel) -> dict[str, NDArray[np.bool_]]:
-    """Pixels (H, W) of views, by name, that show what lies outside a box; none without a box."""
+    """Pixels (H, W) of views, by name, that show what is outside a box; none without a box."""
     names = [view.name for view in posed_views(folder)]
     paths = {name: folder.views(model) / OUTSIDE.format(name=name) for name in names}
     return {n: map_array(path, np.bool_) for n, path in paths.items() if path.is_file()}
 
 
 def open_checked(workspace: Path, folder: RunFolder) -> DenseWorkspace:
-    """A user's COLMAP workspace, found to be of the run's images and model.
+    """A user's COLMAP workspace, after a check that it has the run's images and model.
 
     Raises
     ------
     DataError
-        It is unusable, or not of these.
+        It is unusable, or of other images or another model.
     """
     given, model = open_dense_workspace(workspace), read_model(folder.sparse)
     require_same_frame(given, model)
@@ -426,7 +426,7 @@ def _open_given(options: FusionOptions, folder: RunFolder) -> DenseWorkspace | N
 
 
 def surface_cloud(cloud: FusedCloud, kind: PointKind = PointKind.SURFACE) -> Cloud:
-    """A fused cloud as it is written, with grey colours as in COLMAP's images.
+    """A fused cloud for writing, with grey colours as in COLMAP's images.
 
     The brightest 1 % are white.
     """
@@ -453,14 +453,14 @@ def surroundings_cloud(
     workspace: DenseWorkspace | None,
     folder: Path,
 ) -> Cloud:
-    """Points of the scene beside its polarized parts, of the kind that the options ask for.
+    """Points of the surroundings, of the kind that the options select.
 
     Parameters
     ----------
     tracks : of the COLMAP model.
-    surface : of the polarized parts; what COLMAP saw there is left out.
-    workspace : the user's of COLMAP, if there is one; its points are the surroundings.
-    folder : for what is kept on disk meanwhile.
+    surface : of the polarized parts; COLMAP's points on it are left out.
+    workspace : the user's COLMAP workspace, if there is one; its points are the surroundings.
+    folder : for temporary files.
     """
     if workspace is not None:
         return surface_cloud(kept_cloud(workspace, surface.points), PointKind.COLMAP)
@@ -479,7 +479,7 @@ def surroundings_cloud(
 
 
 def sparse_part(sparse: SparseSurroundings) -> Cloud:
-    """Sparse points as they are written; they have no normals, which is zero in a PLY file."""
+    """Sparse points for writing; their normals are zero, as they have none."""
     num = len(sparse.points)
     unknown = np.full(num, np.nan)
     return Cloud(

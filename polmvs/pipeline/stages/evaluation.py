@@ -1,4 +1,4 @@
-"""Stage ``evaluation``: figures of several models on the same poses and seeds."""
+"""Stage ``evaluation``: metrics of several models on the same poses and seeds."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from polmvs.polarization.kinds import AngleModel
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationResult:
-    """What the stage found; the figures themselves are in ``metrics.json``.
+    """Result of the stage; the metrics are in ``metrics.json``.
 
     Attributes
     ----------
-    models : that were compared.
-    best_fit : the model that the phases fit best; None where nothing tells.
+    models : compared models.
+    best_fit : the model that fits the phases best; None if unknown.
     """
 
     models: tuple[AngleModel, ...]
@@ -39,7 +39,7 @@ class EvaluationResult:
 
 
 def load_estimate(run_folder: RunFolder, model: AngleModel) -> ModelEstimate:
-    """What a model came to, from the files of a run.
+    """Results of a model from the files of a run.
 
     Raises
     ------
@@ -64,12 +64,12 @@ def evaluate_models(
     *,
     workers: Workers | None = None,
 ) -> Comparison:
-    """Measure the clouds of a run.
+    """Evaluate the clouds of a run.
 
     Parameters
     ----------
     capture : raw mosaics.
-    sparse : what all models started from.
+    sparse : numbers of the input that all models share.
     run_folder : with the results of the models.
     models : to compare.
     gt : folder of the ground truth, if there is one.
@@ -83,7 +83,7 @@ def evaluate_models(
 
 
 def write_comparison(comparison: Comparison, metrics: Path, summary: Path) -> EvaluationResult:
-    """Write the figures, as JSON and as a page."""
+    """Write the metrics as JSON and Markdown."""
     write_json(metrics, comparison)
     write_bytes(summary, comparison.summary().encode())
     return EvaluationResult(models=tuple(comparison.models), best_fit=comparison.best_fit)

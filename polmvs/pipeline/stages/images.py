@@ -1,4 +1,4 @@
-"""Stage ``images``: the 8-bit intensity images that COLMAP sees."""
+"""Stage ``images``: the 8-bit intensity images for COLMAP."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class ImagesResult:
 
     Attributes
     ----------
-    num_images : written.
+    num_images : number of written images.
     """
 
     num_images: int
@@ -39,12 +39,12 @@ def write_images(
 
     Parameters
     ----------
-    target : folder, whole or not at all.
+    target : folder, written whole or not at all.
 
     Raises
     ------
     DataError
-        A mosaic is unusable, or two are of one name.
+        A mosaic is unusable, or two have the same name.
     """
     names = image_names(capture)
     white = capture.exposure()
@@ -62,7 +62,7 @@ def image_names(capture: Capture) -> dict[str, str]:
     Raises
     ------
     DataError
-        Two mosaics differ in their suffix only.
+        Two mosaics differ only in their suffix.
     """
     names: dict[str, str] = {}
     for name in capture.names:

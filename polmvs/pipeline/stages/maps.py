@@ -1,7 +1,7 @@
 """Stages ``maps`` and ``maps_tilted``: where each view shows a polarized surface, and its phase.
 
-The maps of OPA and PPA are the same; those of the tilted model are corrected for the tilt of the
-sensor's polarizers and lie in a folder of their own.
+OPA and PPA have the same maps. Those of the tilted model are corrected for the tilt of the sensor's
+polarizers and have their own folder.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
-POLARIZED_SHARE = 0.99  # of an object within its outline: its polarized region is whole then
+POLARIZED_SHARE = 0.99  # of an object within its outline: its polarized region is then complete
 MIN_DOLP_SIGMAS = 3.0  # of the median pixel of an object; white plastic in a studio has 12
 DOLP_WINDOW_PX = 3.0
 MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are held together
@@ -55,14 +55,14 @@ MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are he
 
 @dataclass(frozen=True, kw_only=True)
 class MapsResult:
-    """What the stage ``maps`` found.
+    """Result of the stage ``maps``.
 
     Attributes
     ----------
     num_region_px : pixels of all views that show a polarized surface.
-    num_diffuse_px : those of them whose light is diffuse.
-    complaints : settings that the phases contradict, a clause each.
-    cut_share : of the bands outside of the user's masks, how much is polarized as a surface is,
+    num_diffuse_px : those with diffuse light.
+    complaints : settings that the phases contradict, one clause each.
+    cut_share : share of the bands outside of the user's masks that is as polarized as a surface,
         mean over the views; None without masks.
     """
 
@@ -77,11 +77,11 @@ class MapsResult:
 
 @dataclass(frozen=True, kw_only=True)
 class TiltedMapsResult:
-    """What the stage ``maps_tilted`` did.
+    """Result of the stage ``maps_tilted``.
 
     Attributes
     ----------
-    num_maps : corrected for the tilt.
+    num_maps : maps corrected for the tilt.
     """
 
     num_maps: int
@@ -105,8 +105,8 @@ def build_maps(
     ----------
     capture : raw mosaics.
     run_folder : with the sparse model; the maps are written whole or not at all.
-    options : defaults where None.
-    max_rows : of points and views together, that normals are solved from at a time.
+    options : defaults if None.
+    max_rows : rows of points and views from which normals are solved at a time.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def build_maps(
         num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
         wrong = None
         if len(tracks.point3D_ids):
-            # Both ask all views, so that they are tasks of their own.
+            # Both need all views, so they are separate tasks.
             questions: list[Callable[[], Any]] = [
                 partial(_wrong_setting, capture, options.light, tracks, maps)
             ]
@@ -205,7 +205,7 @@ def posed_views(folder: RunFolder) -> tuple[View, ...]:
     Raises
     ------
     DataError
-        There are too few for normals.
+        There are too few views for normals.
     """
     return _enough(read_views(folder.sparse), folder.sparse)
 
@@ -256,7 +256,7 @@ def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] 
     logger.info("%.1f %% of what hides its support is polarized.", 100 * share)
     if share >= POLARIZED_SHARE:
         return None
-    # Without any phase its outline alone would be taken for a surface.
+    # Without any phase, its outline alone would pass for a surface.
     strengths = [
         _dolp_in_sigmas(one, hiding.inner) for one, hiding in zip(maps, found, strict=True)
     ]

@@ -1,4 +1,4 @@
-"""Stage ``mesh_MODEL``: a mesh of the polarized surfaces, that of all views or Poisson's."""
+"""Stage ``mesh_MODEL``: the mesh of all views, or the Poisson mesh of the polarized surfaces."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class MeshResult:
 
     Attributes
     ----------
-    num_triangles : 0 where the cloud has too few points for a mesh, which is then not written.
+    num_triangles : 0 if the cloud has too few points; no mesh is then written.
     """
 
     num_triangles: int
@@ -27,13 +27,13 @@ class MeshResult:
 
 
 def make_mesh(model: AngleModel, folder: RunFolder) -> MeshResult:
-    """Mesh of the polarized surfaces: what cloud and views were made from, or Poisson's of a cloud.
+    """Mesh of the polarized surfaces: the surface of all views, or the Poisson mesh of the cloud.
 
     Parameters
     ----------
     model : angle model.
-    folder : of a run with a dense cloud of it; its views hold a mesh where one surface came from
-        all of them. The mesh is not written where a cloud has too few points.
+    folder : of a run with a dense cloud of the model. The folder of the dense views has a mesh if
+        one surface came from all views. No mesh is written if the cloud has too few points.
     """
     found, target = folder.views(model) / SURFACE_MESH, folder.mesh(model)
     if found.is_file():

@@ -16,7 +16,7 @@ from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.polarization.kinds import AngleModel, Light
 
-# Columns of the stored normals, a row for each track; see MixtureEstimate.
+# Columns of the stored normals, one row for each track; see MixtureEstimate.
 NORMALS_TYPE = np.dtype(
     [
         ("normal", np.float64, 3),
@@ -62,11 +62,11 @@ def solve_track_normals(
     Parameters
     ----------
     model : angle model.
-    folder : of a run with model and phase maps; a row of ``NORMALS_TYPE`` for each track is
-        written.
-    options : defaults where None.
-    light : of everything, where it is known.
-    max_rows : of points and views together, that are solved at a time.
+    folder : of a run with model and phase maps; one row of ``NORMALS_TYPE`` is written for each
+        track.
+    options : defaults if None.
+    light : kind of light of all observations, if known.
+    max_rows : rows of points and views that are solved at a time.
     """
     tracks, target = read_model(folder.sparse).tracks, folder.track_normals(model)
     phase_maps = open_maps(folder, model)
@@ -86,7 +86,7 @@ def solve_track_normals(
 
 
 def load_track_normals(folder: RunFolder, model: AngleModel) -> MixtureEstimate:
-    """The normals that :func:`solve_track_normals` stored; nothing of single rows is kept.
+    """The normals that :func:`solve_track_normals` stored; they have no data of single rows.
 
     Raises
     ------

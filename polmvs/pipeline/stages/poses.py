@@ -1,4 +1,4 @@
-"""Stage ``poses``: the COLMAP model of the run, in the metric frame that is asked for."""
+"""Stage ``poses``: the COLMAP model of the run, in the metric frame of the options."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from polmvs.scene import match_names, without_views
 
 @dataclass(frozen=True, kw_only=True)
 class MetricFrameResult:
-    """The metric frame that the model was brought into.
+    """The metric frame of the model.
 
     Attributes
     ----------
     source : ``reference``, ``aruco`` or ``scale``.
-    scale : metres per unit of the model before.
-    relative_sigma : standard deviation of the scale as a share of it; None where unknown.
-    rms_residual : of what the frame was found by; see :class:`polmvs.poses.metric_frame.Frame`.
-    num_used : cameras, views or ends that it was found by.
+    scale : metres per unit of the model from SfM.
+    relative_sigma : relative standard deviation of the scale; None if unknown.
+    rms_residual : residual of the source; see :class:`polmvs.poses.metric_frame.Frame`.
+    num_used : number of cameras, views or end points used.
     dropped : names of those that were left out.
-    checked_by : scales of the other sources that agree, by source.
-    rotation, translation : of the similarity from the model before, row by row, m.
+    checked_by : scales of the other sources, which agree, by source.
+    rotation, translation : of the similarity from the model of SfM, row by row, m.
     """
 
     source: str
@@ -55,14 +55,14 @@ class MetricFrameResult:
 
 @dataclass(frozen=True, kw_only=True)
 class PosesResult:
-    """What the stage found.
+    """Result of the stage.
 
     Attributes
     ----------
     num_views : images with a pose.
-    unregistered : names of those without.
+    unregistered : names of images without a pose.
     num_tracks : sparse points.
-    frame : the metric frame; None where the model stays in its own.
+    frame : the metric frame; None if the model keeps its own frame.
     """
 
     num_views: int
@@ -72,7 +72,7 @@ class PosesResult:
 
     @property
     def is_metric(self) -> bool:
-        """Whether the unit is the metre by a source that was given."""
+        """Whether the unit is the metre, by a given source."""
         return self.frame is not None
 
     def __str__(self) -> str:
@@ -86,20 +86,20 @@ def place_model(
     reference: ReferenceOptions | None = None,
     without: Sequence[str] = (),
 ) -> PosesResult:
-    """Bring the model of SfM, or a given one, into the metric frame that is asked for.
+    """Transform the model of SfM, or a given one, to the metric frame of the options.
 
     Parameters
     ----------
-    run_folder : with the images, in which markers are looked for, and the model of SfM in its own
-        frame; the model, the camera's modes and the poses' covariances are written.
-    names : of the images.
-    reference : defaults where None.
-    without : names of images to take out of the model, with or without suffix.
+    run_folder : with the images, in which markers are searched, and the model of SfM in its own
+        frame; the model, the camera's modes and the poses' covariances are written there.
+    names : names of the images.
+    reference : defaults if None.
+    without : names of images to remove from the model, with or without suffix.
 
     Raises
     ------
     DataError, OptionError
-        A source of the frame, or a name, is unusable; the model of SfM stays.
+        A source of the frame, or a name, is unusable; the model of SfM is kept.
     """
     source, names = run_folder.sfm, tuple(names)
     model = read_model(source)

@@ -1,7 +1,6 @@
-"""Stage ``seeds``: the points of known place from which surfaces grow, one set for all models.
+"""Stage ``seeds``: the sparse points on a polarized surface, which give its distance.
 
-They are the sparse points that lie on a polarized surface. PPA chooses them, so that a comparison
-of models starts from the same.
+All models use one set, which PPA chooses, so that they are compared from the same seeds.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ def find_seeds(folder: RunFolder) -> SeedsResult:
 
 
 def load_seeds(folder: RunFolder, model: AngleModel) -> Seeds:
-    """Seeds with the normals of a model; which points they are is the same for all models.
+    """Seeds with the normals of a model; all models have the same points.
 
     Raises
     ------

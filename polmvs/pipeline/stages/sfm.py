@@ -32,7 +32,7 @@ from polmvs.separate import CrashError, run_separately
 
 logger = logging.getLogger(__name__)
 
-# Of SQLite and of the system, in the last words of a process of COLMAP's.
+# Messages of SQLite and of the system in the last output of COLMAP's process.
 FULL_DISK = re.compile("disk I/O error|database or disk is full|No space left|readonly database")
 CANNOT_WRITE = "cannot be written: is the disk full?"
 NUM_SFM_STEPS = 4  # that run_sfm reports
@@ -50,12 +50,12 @@ class SfmResult:
     Attributes
     ----------
     num_views : images with a pose.
-    num_points : sparse ones.
-    focal_sigma : standard deviation of the estimated focal length as a share of it; None where the
-        camera was given, or that is not known.
-    bending : median deviation of the sparse points by what the estimated camera leaves open, as a
-        share of their distance; likewise.
-    complaints : what the matches say against given cameras.
+    num_points : sparse points.
+    focal_sigma : relative standard deviation of the estimated focal length; None if the camera was
+        given or the deviation is unknown.
+    bending : median shift of the sparse points by the uncertainty of the estimated camera,
+        relative to their distance; None likewise.
+    complaints : contradictions between given cameras and the matches.
     """
 
     num_views: int
@@ -84,15 +84,15 @@ def find_model(
     Parameters
     ----------
     images : folder of 8-bit intensity images.
-    names : of the images in it.
-    target : folder of the COLMAP model, whole or not at all; with it go ``CAMERA_MODES`` and
-        ``POSE_COVARIANCES``, which :mod:`polmvs.colmap.camera_uncertainty` explains.
-    options : defaults where None.
+    names : names of the images in it.
+    target : folder of the COLMAP model, written whole or not at all, with ``CAMERA_MODES`` and
+        ``POSE_COVARIANCES`` (see :mod:`polmvs.colmap.camera_uncertainty`).
+    options : defaults if None.
 
     Raises
     ------
     DataError, OptionError
-        No model comes out, or the options do not fit the images.
+        SfM finds no model, or the options do not fit the images.
     """
     options = options or SfmOptions()
     if options.camera_model != SfmOptions.camera_model and (options.intrinsics or options.camera):
@@ -114,7 +114,7 @@ def find_model(
     with scratch(target) as folder:
         work, new = folder / "work", folder / "sparse"
         try:
-            # Where its database cannot be written COLMAP ends the process.
+            # COLMAP ends the process if it cannot write its database.
             model = run_separately(
                 _run_sfm, images, names, work, new, options, masks, on_message=on_step
             )
@@ -181,7 +181,7 @@ def fit_model(capture: Capture, source: Path) -> SparseModel:
     Raises
     ------
     DataError
-        It is missing, damaged or of other images.
+        The model is missing, damaged or of other images.
     """
     names = list(image_names(capture))
     return match_model_to_capture(
@@ -190,13 +190,13 @@ def fit_model(capture: Capture, source: Path) -> SparseModel:
 
 
 def take_model(model: SparseModel, source: Path, target: Path) -> SfmResult:
-    """Write an existing model that was fitted to the capture; the original is not touched.
+    """Write an existing model that was fitted to the capture; the original stays unchanged.
 
     Parameters
     ----------
     model : from :func:`fit_model`.
-    source : where it was read, for messages.
-    target : folder of the COLMAP model, whole or not at all.
+    source : folder it was read from, for messages.
+    target : folder of the COLMAP model, written whole or not at all.
     """
     with scratch(target) as folder:
         write_model(model, folder / "sparse")

@@ -1,4 +1,4 @@
-"""Stage ``trust_MODEL``: whether a reconstruction is to be trusted, and what is not normal."""
+"""Stage ``trust_MODEL``: the quality checks of a reconstruction, and its verdict."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
-# Views that are held against the surface, of more spread evenly: so that the time is bounded.
+# Number of views compared with the surface, spread evenly among more: it bounds the time.
 MAX_TRIED_VIEWS = 24
 
 
 def find_trust(model: AngleModel, folder: RunFolder, record: Record, options: Options) -> Trust:
-    """Measure a dense cloud against its capture, and warn if it is not to be trusted.
+    """Compare a dense cloud with its capture, and warn if it is not to be trusted.
 
     Parameters
     ----------
