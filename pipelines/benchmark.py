@@ -64,7 +64,14 @@ from polmvs.pipeline.stages.maps import build_maps
 from polmvs.polarization.angle_models import phase_from_normal, rows_from_phase
 from polmvs.polarization.capture import Capture, open_capture
 from polmvs.polarization.kinds import AngleModel
-from polmvs.synthetic.printed_capture import Part, printed_model, scene_of, write_printed_capture
+from polmvs.synthetic.printed import orbit_views
+from polmvs.synthetic.printed_capture import (
+    Part,
+    camera_of,
+    printed_model,
+    scene_of,
+    write_printed_capture,
+)
 
 NUM_PIXELS = 250_000
 NUM_TRACKS, NUM_VIEWS = 10_000, 10
@@ -446,10 +453,12 @@ def _capture(given: Arguments, num_views: int) -> tuple[Path, Path]:
     folder = given.growth / f"capture-{num_views}-{given.width}"
     model = given.growth / f"model-{num_views}-{given.width}"
     if not folder.exists():
+        views = orbit_views(num_views, camera_of(given.width))
+        scene = scene_of(Part.BOARD)
         with Workers(default_num_workers()) as workers:
-            views = write_printed_capture(folder, num_views, width=given.width, workers=workers)
+            write_printed_capture(folder, views, scene, workers=workers)
         shutil.rmtree(model, ignore_errors=True)
-        write_model(printed_model(scene_of(Part.BOARD), views), model)
+        write_model(printed_model(scene, views), model)
     return folder, model
 
 

@@ -18,7 +18,8 @@ from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.config import OptionGroup, default_num_workers, option
 from polmvs.parallel import Workers
-from polmvs.synthetic.printed_capture import Part, camera_of, write_printed_capture
+from polmvs.synthetic.printed import orbit_views
+from polmvs.synthetic.printed_capture import Part, camera_of, scene_of, write_printed_capture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,19 +38,16 @@ class Arguments(OptionGroup, group="arguments", in_files=False):
 
 def _make(call: Call, terminal: Terminal) -> int:
     given = call.get(Arguments)
+    camera = camera_of(given.width)
     with Workers(given.workers) as workers, terminal.stage("views", given.views) as progress:
         write_printed_capture(
             given.capture,
-            given.views,
-            part=given.part,
-            width=given.width,
-            ordered=given.ordered,
+            orbit_views(given.views, camera, seed=given.seed, ordered=given.ordered),
+            scene_of(given.part, given.seed),
             maps=given.maps,
-            seed=given.seed,
             workers=workers,
             on_progress=progress,
         )
-    camera = camera_of(given.width)
     intrinsics = f"{camera.fx:.10g},{camera.fy:.10g},{camera.cx:.10g},{camera.cy:.10g}"
     terminal.show(
         f"{given.capture}: {given.views} views; --intrinsics {intrinsics}",

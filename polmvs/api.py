@@ -51,7 +51,7 @@ if TYPE_CHECKING:  # heavy
     from polmvs.normals.single_view.plane import PlaneEstimate
     from polmvs.pipeline.record import Record
     from polmvs.pipeline.run_folder import RunFolder
-    from polmvs.pipeline.runner import Monitor
+    from polmvs.pipeline.runner import Job, Monitor
     from polmvs.polarization.stokes import Stokes
     from polmvs.scene import SparseModel, View
     from polmvs.simulation.capture import SimulatedCapture
@@ -549,7 +549,8 @@ def reconstruct(
     from polmvs.pipeline import jobs
 
     angle_model = _angle_model(model, "model")
-    job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
+    run = _run_options(workers, overwrite=overwrite, resume=resume, scheduler=scheduler)
+    job = _job(capture, out, options, changes, run, monitor)
     with _lost_workers_told(job.run_options.workers):
         outcome = jobs.reconstruct(job, angle_model)
     _warn_if_empty(outcome.empty)
@@ -588,7 +589,8 @@ def compare(
     chosen = tuple(dict.fromkeys(_angle_model(model, "models") for model in given))
     if not chosen:
         raise OptionError("needs one angle model or more.", field="models")
-    job = _job(capture, out, options, changes, overwrite, resume, workers, scheduler, monitor)
+    run = _run_options(workers, overwrite=overwrite, resume=resume, scheduler=scheduler)
+    job = _job(capture, out, options, changes, run, monitor)
     with _lost_workers_told(job.run_options.workers):
         outcome = jobs.compare(job, chosen)
     _warn_if_empty(outcome.empty)
@@ -673,35 +675,25 @@ def _job(
     out: PathArg,
     options: Options | None,
     changes: Mapping[str, Any],
-    overwrite: bool,
-    resume: bool,
-    workers: int | None,
-    scheduler: str | None,
+    run: RunOptions,
     monitor: Monitor | None,
-) -> Any:
+) -> Job:
     from polmvs.pipeline.data_set_import import as_capture
     from polmvs.pipeline.record import read_options
     from polmvs.pipeline.run_folder import RunFolder
     from polmvs.pipeline.runner import Job
 
     for name, path in (("capture", capture), ("out", out)):
-        if isinstance(path, str | PathLike) and not fspath(
-            path
-        ):  # which would be the current directory
+        # An empty one would be the current directory.
+        if isinstance(path, str | PathLike) and not fspath(path):
             raise ValueError(f"{name}={path!r} is no path.")
-    if resume and options is None:  # the options of the run, as on the command line
+    if run.resume and options is None:  # the options of the run, as on the command line
         options = options_from_plain(read_options(RunFolder(Path(out))), str(out))
     chosen = change_options(options, changes)
     if not isinstance(capture, str | PathLike):
-        capture, chosen = _kept_frames(capture, Path(out), chosen, overwrite=overwrite)
+        capture, chosen = _kept_frames(capture, Path(out), chosen, overwrite=run.overwrite)
     place, chosen = as_capture(Path(capture), Path(out), chosen)
-    return Job(
-        capture=place,
-        out=Path(out),
-        options=chosen,
-        run_options=_run_options(workers, overwrite=overwrite, resume=resume, scheduler=scheduler),
-        monitor=monitor,
-    )
+    return Job(capture=place, out=Path(out), options=chosen, run_options=run, monitor=monitor)
 
 
 def _kept_frames(

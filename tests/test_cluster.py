@@ -20,7 +20,14 @@ from polmvs.errors import DataError, OptionError
 from polmvs.parallel import Workers
 from polmvs.pipeline.stages.images import write_images
 from polmvs.polarization.capture import open_capture
-from polmvs.synthetic.printed_capture import Part, printed_model, scene_of, write_printed_capture
+from polmvs.synthetic.printed import orbit_views
+from polmvs.synthetic.printed_capture import (
+    Part,
+    camera_of,
+    printed_model,
+    scene_of,
+    write_printed_capture,
+)
 
 distributed = pytest.importorskip("distributed")
 
@@ -168,8 +175,9 @@ def test_without_dask(monkeypatch) -> None:
 
 
 def test_commands_on_a_cluster(cli, address, tmp_path) -> None:
-    views = write_printed_capture(tmp_path / "capture", 4, width=96)
-    write_model(printed_model(scene_of(Part.BOARD), views, num_points=400), tmp_path / "model")
+    views, scene = orbit_views(4, camera_of(96)), scene_of(Part.BOARD)
+    write_printed_capture(tmp_path / "capture", views, scene)
+    write_model(printed_model(scene, views, num_points=400), tmp_path / "model")
     content = []
     for name, where in (("here", ()), ("there", ("--scheduler", address))):
         out = tmp_path / name

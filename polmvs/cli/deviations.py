@@ -14,7 +14,7 @@ from polmvs.cli.flags import in_flags
 from polmvs.cli.pages import make_report
 from polmvs.cli.terminal import Terminal
 from polmvs.errors import DataError, OptionError
-from polmvs.evaluation.deviation import Deviation, measure_deviation
+from polmvs.evaluation.deviation import Deviation, MeasuredPart, measure_deviation
 from polmvs.evaluation.registration import CloudReference, MeshReference, Reference
 from polmvs.io.clouds import Cloud, Mesh, has_triangles, read_any_mesh, read_cloud, read_mesh
 from polmvs.io.folders import new_folder
@@ -45,11 +45,13 @@ def deviation(call: Call, terminal: Terminal) -> int:
     reference, unit, other_run = _reference(given.reference, given.model)
     with terminal.stage("registration", None):
         found = measure_deviation(
-            cloud.points,
-            _usable(cloud.normals),
-            cloud.scalars.get("sigma"),
+            MeasuredPart(
+                points=cloud.points,
+                normals=_usable(cloud.normals),
+                sigma=cloud.scalars.get("sigma"),
+                is_metric=is_metric or given.metric,
+            ),
             reference,
-            is_metric=is_metric or given.metric,
             unit=given.unit or unit,
             aligned=given.aligned,
             tolerance_mm=given.tolerance,

@@ -6,7 +6,7 @@ from polmvs.cli.call import Call
 from polmvs.cli.commands import ExportArguments
 from polmvs.cli.terminal import Terminal
 from polmvs.config import CropOptions
-from polmvs.pipeline.export import export_format, export_run
+from polmvs.pipeline.export import ExportRequest, export_format, export_run
 from polmvs.pipeline.run_folder import RunFolder
 
 
@@ -16,15 +16,17 @@ def export(call: Call, terminal: Terminal) -> int:
     form = export_format(given.target, given.format)
     written = export_run(
         RunFolder(given.run),
-        given.target,
-        form,
-        model=given.model,
-        texture=given.texture,
-        texture_px=given.texture_px,
-        colors=given.colors,
-        part=given.part,
-        crop=call.get(CropOptions),
-        overwrite=given.overwrite,
+        ExportRequest(
+            target=given.target,
+            form=form,
+            model=given.model,
+            texture=given.texture,
+            texture_px=given.texture_px,
+            colors=given.colors,
+            part=given.part,
+            crop=call.get(CropOptions),
+            overwrite=given.overwrite,
+        ),
     )
     what = [
         f"{number:,} {noun}"

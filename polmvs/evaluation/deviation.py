@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.arrays import Array
 from polmvs.errors import OptionError
-from polmvs.evaluation.registration import IDENTITY, Reference, register
+from polmvs.evaluation.registration import ALIGNED, Reference, register
 from polmvs.geometry import SimilarityTransform, dots, lengths
 
 UNITS_M: Mapping[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254, "um": 1e-6}
@@ -23,6 +23,25 @@ SIZE_RATIO = 1.5
 AMBIGUOUS = 1.3  # of the second-best place's mean distance to the best one's, under which both fit
 # Beyond it a point is no point of the part, but of something beside it. Share of the size. Guess.
 FAR_SHARE = 0.1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeasuredPart:
+    """A result of which the deviation is measured.
+
+    Attributes
+    ----------
+    points : (N, 3), metres where ``is_metric``.
+    normals : (N, 3) unit, outwards; None where points have none.
+    sigma : (N,) standard deviations of the points along their normals, in their unit; None where
+        the result states none.
+    is_metric : else the scale is estimated, and sizes are not tested.
+    """
+
+    points: Array
+    normals: Array | None = None
+    sigma: Array | None = None
+    is_metric: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,12 +134,9 @@ def infer_unit(result_m: Array, reference: Array) -> str:
 
 
 def measure_deviation(
-    points: Array,
-    normals: Array | None,
-    sigma: Array | None,
+    part: MeasuredPart,
     reference: Reference,
     *,
-    is_metric: bool,
     unit: str | None,
     aligned: bool = False,
     tolerance_mm: float | None = None,
@@ -131,9 +147,7 @@ def measure_deviation(
 
     Parameters
     ----------
-    points, normals, sigma : (N, 3), (N, 3) and (N,) of the result, metres where ``is_metric``.
     reference : in its ``unit``, one of ``UNITS_M``; None: inferred, of a metric result.
-    is_metric : else the scale is estimated, and sizes are not tested.
     aligned : the result lies in the frame of the reference.
     tolerance_mm : distance that is allowed either way, and the ``least_share`` of the points that
         must keep to it.
@@ -147,59 +161,52 @@ def measure_deviation(
     """
     inferred = unit is None
     if unit is None:
-        if not is_metric:
+        if not part.is_metric:
             raise OptionError(
                 "is needed: the result has no metric scale to tell it by.", field="arguments.unit"
             )
-        unit = infer_unit(points, reference.points)
-    metres = UNITS_M[unit]
-    to_unit = SimilarityTransform(
-        scale=1 / metres if is_metric else 1.0, rotation=np.eye(3), translation=np.zeros(3)
-    )
-    scaled = np.asarray(to_unit * points)
-    if aligned:
-        found = None
-        moved = scaled
-    else:
-        found = register(scaled, normals, reference, with_scale=not is_metric)
-        moved = np.asarray(found.reference_from_result * scaled)
-    place = IDENTITY if found is None else found.reference_from_result
+        unit = infer_unit(part.points, reference.points)
+    to_unit = 1 / UNITS_M[unit] if part.is_metric else 1.0
+    to_mm = 1e3 * UNITS_M[unit]
+    scaled = to_unit * part.points
+    found = ALIGNED
+    if not aligned:
+        found = register(scaled, part.normals, reference, with_scale=not part.is_metric)
+    place = found.reference_from_result
+    moved = place * scaled
     closest, facing = reference.closest(moved)
-    distance = dots(moved - closest, facing)
-    size = float(np.linalg.norm(np.ptp(reference.points, axis=0)))
-    near = lengths(moved - closest) < FAR_SHARE * size
-    if normals is not None:
-        near &= dots(normals @ np.asarray(place.rotation).T, facing) > 0
-    to_mm = 1e3 * metres
-    own = np.full(len(points), np.nan) if sigma is None else sigma * to_unit.scale * place.scale
-    fitted = 0.0 if found is None else found.distance_sigmas(moved, facing)
-    others: Array | float = 0.0
-    if other_run is not None:
-        _, nearest = cKDTree(other_run[0]).query(closest)
-        others = other_run[1][nearest]
-    total = to_mm * np.sqrt(np.square(own) + np.square(fitted) + np.square(others))
-    laid = SimilarityTransform(
-        scale=place.scale * to_unit.scale,
-        rotation=place.rotation,
-        translation=place.translation,
+    near = lengths(moved - closest) < FAR_SHARE * float(
+        np.linalg.norm(np.ptp(reference.points, axis=0))
     )
+    if part.normals is not None:
+        near &= dots(part.normals @ place.rotation.T, facing) > 0
+    distance = to_mm * dots(moved - closest, facing)[near]
+    variance = np.square(found.distance_sigmas(moved, facing))
+    if part.sigma is None:
+        variance[:] = np.nan
+    else:
+        variance += np.square(part.sigma * to_unit * place.scale)
+    if other_run is not None:
+        points, sigma = other_run
+        variance += np.square(sigma[cKDTree(points).query(closest)[1]])
+    stated = to_mm * np.sqrt(variance[near])
+    laid = SimilarityTransform(place.scale * to_unit, place.rotation, place.translation)
     matrix = np.column_stack([laid.scale * laid.rotation, laid.translation])
-    spread = (to_mm * distance[near]).std()
     return Deviation(
         index=np.flatnonzero(near),
         points=moved[near],
         normals=facing[near],
-        distance=to_mm * distance[near],
-        sigma=total[near],
+        distance=distance,
+        sigma=stated,
         figures=DeviationFigures(
-            **_statistics(to_mm * distance[near], total[near], tolerance_mm, least_share),
+            **_statistics(distance, stated, tolerance_mm, least_share),
             num_far=int((~near).sum()),
-            scale=place.scale if not is_metric else 1.0,
+            scale=place.scale if not part.is_metric else 1.0,
             unit=unit,
             unit_inferred=inferred,
-            ambiguous=found is not None and found.runner_up < AMBIGUOUS,
+            ambiguous=found.runner_up < AMBIGUOUS,
             reference_from_result=(*map(tuple, matrix.tolist()), (0.0, 0.0, 0.0, 1.0)),
-            repeatability=None if other_run is None else float(spread / np.sqrt(2)),
+            repeatability=None if other_run is None else float(distance.std() / np.sqrt(2)),
         ),
         reference_from_result=laid,
     )

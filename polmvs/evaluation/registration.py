@@ -21,8 +21,6 @@ from polmvs.fitting import geman_mcclure_weights, robust_deviation
 from polmvs.geometry import SimilarityTransform, dots, lengths
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
-IDENTITY = SimilarityTransform(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
-
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationTolerances:
@@ -121,6 +119,18 @@ class Registration:
         return np.asarray(
             np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", rows, self.covariance, rows), 0))
         )
+
+
+# Of a result that lies in the reference's frame as it is.
+ALIGNED = Registration(
+    reference_from_result=SimilarityTransform(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3)
+    ),
+    covariance=np.zeros((7, 7)),
+    center=np.zeros(3),
+    rms=float("nan"),
+    runner_up=float("inf"),
+)
 
 
 def register(

@@ -11,7 +11,7 @@ the pixels' centres.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from polmvs.io.image_size import PNG_SIGNATURE
 from polmvs.io.images import decode_image, read_bytes, write_png
 from polmvs.io.plain_files import read_text
 from polmvs.io.raw_formats import read_npy
-from polmvs.io.typed_json import parse_json
+from polmvs.io.typed_json import parse_json, write_json
 from polmvs.neighbors import in_cells_beside, voxel_representatives
 from polmvs.scene import View, find_name, stem_of
 
@@ -225,6 +225,26 @@ def read_views(path: Path) -> dict[str, View]:
     if not images or min(width, height) <= 0 or max(width, height) > MAX_SIDE:
         raise DataError(path, f"lists no image or no size; {_REMEDY}.")
     return {name: _parse_view(path, name, entry, width, height) for name, entry in images.items()}
+
+
+def write_views(path: Path, views: Sequence[View]) -> None:
+    """Write a ``cameras.json`` of views of pinhole cameras of one size.
+
+    Raises
+    ------
+    DataError
+        The system refuses.
+    """
+    images = {}
+    for view in views:
+        assert isinstance(view.camera, PinholeCamera)
+        pose = view.cam_from_world
+        images[view.name] = {
+            "K": view.camera.K.tolist(),
+            "cam_from_world": np.column_stack([pose.rotation, pose.translation]).tolist(),
+        }
+    size = {"width": views[0].camera.width, "height": views[0].camera.height}
+    write_json(path, {**size, "images": images})
 
 
 def _parse_view(path: Path, name: str, entry: Any, width: int, height: int) -> View:

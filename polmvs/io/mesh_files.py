@@ -163,29 +163,34 @@ def _require_plain_name(path: Path) -> None:
         raise OptionError(f"{path}: an OBJ with a texture needs a name without blanks.")
 
 
+class _Buffer:
+    """Binary data of a glTF, with the views and accessors that say what lies where in it."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def view(self, content: bytes, **more: Any) -> int:
+        """Add bytes; the number of their view."""
+        place = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)}
+        self.views.append({**place, **more})
+        self.data += content + b"\0" * (-len(content) % 4)
+        return len(self.views) - 1
+
+    def accessor(self, array: NDArray[Any], target: int = ARRAY_BUFFER, **more: Any) -> int:
+        """Add float32 or uint32 numbers (N,) or vectors (N, K); the number of their accessor."""
+        view = self.view(np.ascontiguousarray(array).tobytes(), target=target)
+        kind = UNSIGNED_INT if array.dtype == np.uint32 else FLOAT
+        shape = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
+        found = {"bufferView": view, "componentType": kind, "count": len(array), "type": shape}
+        self.accessors.append({**found, **more})
+        return len(self.accessors) - 1
+
+
 def _write_glb(path: Path, mesh: Mesh, texture: Texture | None) -> tuple[Path, ...]:
     """Binary glTF 2.0; colours of vertices are linear there, those of a texture are not."""
-    chunks: list[bytes] = []
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-
-    def view(data: bytes, target: int | None) -> int:
-        start = sum(map(len, chunks))
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(data)})
-        if target is not None:
-            views[-1]["target"] = target
-        chunks.append(data + b"\0" * (-len(data) % 4))
-        return len(views) - 1
-
-    def accessor(array: NDArray[Any], shape: str, target: int, **more: Any) -> int:
-        kind = UNSIGNED_INT if array.dtype == np.uint32 else FLOAT
-        number = view(np.ascontiguousarray(array).tobytes(), target)
-        count = array.size if shape == "SCALAR" else len(array)
-        accessors.append(
-            {"bufferView": number, "componentType": kind, "count": count, "type": shape, **more}
-        )
-        return len(accessors) - 1
-
+    buffer = _Buffer()
     places = mesh.vertices.astype(np.float32)
     span: Mapping[str, Any] = {}
     if len(places):
@@ -193,29 +198,27 @@ def _write_glb(path: Path, mesh: Mesh, texture: Texture | None) -> tuple[Path, .
     length = np.linalg.norm(mesh.normals, axis=1, keepdims=True)
     upright = np.where(length > 0, mesh.normals / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
     attributes = {
-        "POSITION": accessor(places, "VEC3", ARRAY_BUFFER, **span),
-        "NORMAL": accessor(upright.astype(np.float32), "VEC3", ARRAY_BUFFER),
+        "POSITION": buffer.accessor(places, **span),
+        "NORMAL": buffer.accessor(upright.astype(np.float32)),
     }
     surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": ROUGHNESS}
     content: dict[str, Any] = {}
     if texture is not None:
         below = np.column_stack([texture.uv[:, 0], 1 - texture.uv[:, 1]]).astype(np.float32)
-        attributes["TEXCOORD_0"] = accessor(below, "VEC2", ARRAY_BUFFER)
+        attributes["TEXCOORD_0"] = buffer.accessor(below)
         surface["baseColorTexture"] = {"index": 0}
-        image = {"bufferView": view(encode_png(texture.image[..., ::-1]), None)}
+        image = buffer.view(encode_png(texture.image[..., ::-1]))
         content = {
-            "images": [{**image, "mimeType": "image/png"}],
+            "images": [{"bufferView": image, "mimeType": "image/png"}],
             "samplers": [
                 {"magFilter": LINEAR, "minFilter": MIPMAPPED, "wrapS": CLAMPED, "wrapT": CLAMPED}
             ],
             "textures": [{"source": 0, "sampler": 0}],
         }
     elif mesh.colors is not None:
-        attributes["COLOR_0"] = accessor(linear_of_display(mesh.colors), "VEC3", ARRAY_BUFFER)
-    corners = mesh.triangles.astype(np.uint32).ravel()
-    indices = accessor(corners, "SCALAR", ELEMENT_ARRAY_BUFFER)
-    primitive = {"attributes": attributes, "indices": indices, "material": 0}
-    data = b"".join(chunks)
+        attributes["COLOR_0"] = buffer.accessor(linear_of_display(mesh.colors))
+    corners = buffer.accessor(mesh.triangles.astype(np.uint32).ravel(), ELEMENT_ARRAY_BUFFER)
+    primitive = {"attributes": attributes, "indices": corners, "material": 0}
     content |= {
         "asset": {"version": "2.0", "generator": f"polmvs {__version__}"},
         "scene": 0,
@@ -223,23 +226,18 @@ def _write_glb(path: Path, mesh: Mesh, texture: Texture | None) -> tuple[Path, .
         "nodes": [{"mesh": 0, "name": path.stem}],
         "meshes": [{"primitives": [primitive], "name": path.stem}],
         "materials": [{"name": "surface", "pbrMetallicRoughness": surface, "doubleSided": True}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(data)}],
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": len(buffer.data)}],
     }
     words = json.dumps(content, separators=(",", ":")).encode()
     words += b" " * (-len(words) % 4)
-    total = 12 + 8 + len(words) + 8 + len(data)
+    total = 12 + 8 + len(words) + 8 + len(buffer.data)
     if total >= 1 << 32:
         raise DataError(path, "would exceed the 4 GB that GLB holds. Write PLY.")
-    write_bytes(
-        path,
-        struct.pack("<III", GLB_MAGIC, GLB_VERSION, total)
-        + struct.pack("<II", len(words), GLB_JSON)
-        + words
-        + struct.pack("<II", len(data), GLB_BIN)
-        + data,
-    )
+    header = struct.pack("<5I", GLB_MAGIC, GLB_VERSION, total, len(words), GLB_JSON)
+    binary = struct.pack("<II", len(buffer.data), GLB_BIN)
+    write_bytes(path, header + words + binary + buffer.data)
     return (path,)
 
 

@@ -14,12 +14,7 @@ from polmvs.camera import pixel_centers
 from polmvs.colmap.camera_exports import CAMERA_FORMATS, CameraExport
 from polmvs.colmap.dense_workspace import open_dense_workspace
 from polmvs.colmap.models import read_model
-from polmvs.config import (
-    Channel,
-    CropOptions,
-    ExportFormat,
-    options_from_plain,
-)
+from polmvs.config import Channel, CropOptions, ExportFormat, options_from_plain
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.io.cloud_files import write_cloud_file
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
@@ -48,6 +43,47 @@ CLOUDS = {
     ExportFormat.LAZ: "laz",
 }
 MESHES = (ExportFormat.PLY, ExportFormat.OBJ, ExportFormat.STL, ExportFormat.GLB)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportRequest:
+    """What is to be written of a run.
+
+    Attributes
+    ----------
+    target : file, or folder for posed images.
+    form : of it, see :func:`export_format`.
+    model : whose surface; None: PPA's, else that of the only cloud.
+    texture : of a mesh: a texture instead of a colour for each vertex.
+    texture_px : sides of the texture; None: a texel has the size of a pixel on the part.
+    colors : of a mesh: without, it has none.
+    part : of a cloud: the polarized surface alone, without its surroundings.
+    crop : of a mesh or cloud: what lies within its box.
+    overwrite : replace what is there.
+    """
+
+    target: Path
+    form: ExportFormat
+    model: AngleModel | None = None
+    texture: bool = False
+    texture_px: int | None = None
+    colors: bool = True
+    part: bool = False
+    crop: CropOptions = CropOptions()
+    overwrite: bool = False
+
+    def check(self) -> None:
+        """OptionError where the format cannot hold what is asked for, or the target exists."""
+        if self.crop.box is not None and self.form not in (*MESHES, *CLOUDS):
+            raise OptionError("is of a mesh or a cloud.", field="crop.box")
+        if self.texture and self.form not in MESHES:
+            raise OptionError("is of a mesh.", field="arguments.texture")
+        if self.texture and not MESH_FORMATS[f".{self.form}"].texture:
+            raise OptionError(
+                f"cannot be held by {self.form}; name an .obj or .glb.", field="arguments.texture"
+            )
+        if self.target.exists() and not self.overwrite:
+            raise OptionError(f"{self.target}: exists. Give `arguments.overwrite` to replace it.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,31 +130,8 @@ def export_format(target: Path, given: ExportFormat | None) -> ExportFormat:
     return given
 
 
-def export_run(
-    run_folder: RunFolder,
-    target: Path,
-    form: ExportFormat,
-    *,
-    model: AngleModel | None = None,
-    texture: bool = False,
-    texture_px: int | None = None,
-    colors: bool = True,
-    part: bool = False,
-    crop: CropOptions | None = None,
-    overwrite: bool = False,
-) -> Exported:
+def export_run(run_folder: RunFolder, wanted: ExportRequest) -> Exported:
     """Write a mesh, a cloud or posed images of a finished run.
-
-    Parameters
-    ----------
-    target : file, or folder for posed images.
-    model : whose surface; by default PPA's, else that of the only cloud.
-    texture : of a mesh: a texture instead of a colour for each vertex.
-    texture_px : sides of the texture; by default a texel has the size of a pixel on the part.
-    colors : of a mesh: without, it has none.
-    part : of a cloud: the polarized surface alone, without its surroundings.
-    crop : of a mesh or cloud: what lies within its box.
-    overwrite : replace what is there.
 
     Raises
     ------
@@ -126,51 +139,50 @@ def export_run(
         The run lacks what is asked for, the target exists, or a library is missing.
     """
     record = load_record(run_folder)
-    is_metric = record.result(PosesResult).is_metric
-    model = surface_of(run_folder, dense_models(record), model)
-    crop = crop or CropOptions()
-    if crop.box is not None and form not in (*MESHES, *CLOUDS):
-        raise OptionError("is of a mesh or a cloud.", field="crop.box")
-    if texture and form not in MESHES:
-        raise OptionError("is of a mesh.", field="arguments.texture")
-    if texture and not MESH_FORMATS[f".{form}"].texture:
-        raise OptionError(
-            f"cannot be held by {form}; name an .obj or .glb.", field="arguments.texture"
-        )
-    if target.exists() and not overwrite:
-        raise OptionError(f"{target}: exists. Give `arguments.overwrite` to replace it.")
-    if form in CLOUDS:
-        cloud = read_cloud(run_folder.cloud(model))
-        cloud = part_of(cloud) if part else cloud
-        if (box := _box_of_run(run_folder, record, crop)) is not None:
-            cloud = cloud.only(box.require_some(cloud.points))
-        write_cloud_file(target, cloud, CLOUDS[form])
-        return Exported(files=(target,), num_points=len(cloud.points), is_metric=is_metric)
-    if form not in MESHES:
-        posed = _export_cameras(run_folder, model, target, form, overwrite=overwrite)
-        return replace(posed, is_metric=is_metric)
-    mesh_format_of(target)
+    model = surface_of(run_folder, dense_models(record), wanted.model)
+    wanted.check()
+    if wanted.form in CLOUDS:
+        exported = _export_cloud(run_folder, model, record, wanted)
+    elif wanted.form in MESHES:
+        exported = _export_mesh(run_folder, model, record, wanted)
+    else:
+        exported = _export_cameras(run_folder, model, wanted)
+    return replace(exported, is_metric=record.result(PosesResult).is_metric)
+
+
+def _export_cloud(
+    run_folder: RunFolder, model: AngleModel, record: Record, wanted: ExportRequest
+) -> Exported:
+    cloud = read_cloud(run_folder.cloud(model))
+    cloud = part_of(cloud) if wanted.part else cloud
+    if (box := _box_of_run(run_folder, record, wanted.crop)) is not None:
+        cloud = cloud.only(box.require_some(cloud.points))
+    write_cloud_file(wanted.target, cloud, CLOUDS[wanted.form])
+    return Exported(files=(wanted.target,), num_points=len(cloud.points))
+
+
+def _export_mesh(
+    run_folder: RunFolder, model: AngleModel, record: Record, wanted: ExportRequest
+) -> Exported:
+    mesh_format_of(wanted.target)
     mesh = read_mesh(_existing(run_folder.mesh(model), "mesh"))
-    if (box := _box_of_run(run_folder, record, crop)) is not None:
+    if (box := _box_of_run(run_folder, record, wanted.crop)) is not None:
         mesh = mesh.only(box.require_some(mesh.vertices))
         if not len(mesh.triangles):
             raise OptionError("holds no whole triangle of the mesh.", field="crop.box")
-    painted: Texture | None = None
-    if MESH_FORMATS[f".{form}"].colors and colors:
-        painter = _Painter(run_folder, mesh)
-        if texture:
-            mesh, painted = painter.textured(texture_px)
-        else:
-            mesh = replace(mesh, colors=painter.colors_of(mesh.vertices, mesh.normals))
-    else:
+    texture: Texture | None = None
+    if not (MESH_FORMATS[f".{wanted.form}"].colors and wanted.colors):
         mesh = replace(mesh, colors=None)
-    files = write_mesh_file(target, mesh, painted)
+    elif wanted.texture:
+        mesh, texture = _Painter(run_folder, mesh).textured(wanted.texture_px)
+    else:
+        colors = _Painter(run_folder, mesh).colors_of(mesh.vertices, mesh.normals)
+        mesh = replace(mesh, colors=colors)
     return Exported(
-        files=files,
+        files=write_mesh_file(wanted.target, mesh, texture),
         num_points=len(mesh.vertices),
         num_triangles=len(mesh.triangles),
-        texture_px=0 if painted is None else painted.image.shape[0],
-        is_metric=is_metric,
+        texture_px=0 if texture is None else texture.image.shape[0],
     )
 
 
@@ -219,9 +231,7 @@ def part_of(cloud: Cloud) -> Cloud:
     return cloud.only(cloud.are(PointKind.SURFACE, PointKind.INFERRED))
 
 
-def _export_cameras(
-    run_folder: RunFolder, model: AngleModel, target: Path, form: ExportFormat, *, overwrite: bool
-) -> Exported:
+def _export_cameras(run_folder: RunFolder, model: AngleModel, wanted: ExportRequest) -> Exported:
     workspace = open_dense_workspace(_existing(run_folder.dense(model), "COLMAP workspace"))
     mesh = read_mesh(_existing(run_folder.mesh(model), "mesh"))
     scene = RayScene(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64)))
@@ -238,9 +248,9 @@ def _export_cameras(
         mask=mask,
         part=mesh.vertices,
     )
-    with new_folder(target, overwrite=overwrite) as folder:
-        CAMERA_FORMATS[form](export, folder)
-    return Exported(files=(target,), num_views=len(workspace.views))
+    with new_folder(wanted.target, overwrite=wanted.overwrite) as folder:
+        CAMERA_FORMATS[wanted.form](export, folder)
+    return Exported(files=(wanted.target,), num_views=len(workspace.views))
 
 
 class _Painter:

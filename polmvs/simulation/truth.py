@@ -9,17 +9,16 @@ plane of each pixel's ray (see :mod:`polmvs.simulation.transport`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.io.arrays import save_array
-from polmvs.io.ground_truth import write_true_maps
+from polmvs.io.ground_truth import write_true_maps, write_views
 from polmvs.io.images import write_png
-from polmvs.io.typed_json import write_json
 from polmvs.scene import View, stem_of
 from polmvs.simulation.camera_model import pinhole_of
 from polmvs.simulation.picture import Picture
@@ -109,21 +108,12 @@ def write_cameras(folder: Path, views: Sequence[View]) -> None:
     DataError
         The system refuses.
     """
-    images: dict[str, Any] = {}
-    for view in views:
-        pose = view.cam_from_world
-        images[view.name] = {
-            "K": pinhole_of(view.camera).K.tolist(),
-            "cam_from_world": np.column_stack([pose.rotation, pose.translation]).tolist(),
-        }
     camera = views[0].camera
     if not isinstance(camera, PinholeCamera):
         rays = camera.rays(pixel_centers(camera.width, camera.height))
         save_array(folder / "plane_xy.npy", np.asarray(rays[..., :2] / rays[..., 2:], np.float32))
-    write_json(
-        folder / CAMERAS_FILE,
-        {"width": camera.width, "height": camera.height, "images": images},
-    )
+    plain = [replace(view, camera=pinhole_of(view.camera)) for view in views]
+    write_views(folder / CAMERAS_FILE, plain)
 
 
 def _at_pixels(image: Array, shape: tuple[int, ...]) -> Array:

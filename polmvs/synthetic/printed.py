@@ -33,6 +33,8 @@ from polmvs.synthetic.captures import (
 from polmvs.synthetic.surfaces import Group, Surface
 
 DARKEST, BRIGHTEST = 0.15, 0.85  # of a print, s0 in full scales
+DISTANCE = 0.6  # of an orbit's cameras from the origin, metres
+ELEVATIONS_DEG = (30.0, 65.0)  # of these over the x-y plane
 STRIP = 32  # rows of a mosaic that are rendered at a time
 
 
@@ -98,21 +100,17 @@ def orbit_views(
     num_views: int,
     camera: Camera,
     *,
-    target: ArrayLike = (0.0, 0.0, 0.0),
-    distance: float = 0.6,
-    elevations_deg: tuple[float, float] = (30.0, 65.0),
     seed: int = 0,
     ordered: bool = False,
 ) -> list[View]:
     """Views from all around, as a hand would take them; their names' order tells nothing.
 
-    Azimuths advance by the golden angle, so that any number of views surrounds the target; places,
+    Azimuths advance by the golden angle, so that any number of views surrounds the origin; places,
     directions and rolls vary by a few percent and degrees.
 
     Parameters
     ----------
-    num_views, camera, target, distance : of how many, with which, at what, how far off.
-    elevations_deg : range of the elevations over the x-y plane.
+    num_views, camera : of how many, with which.
     seed : of the variations and of the order of the names.
     ordered : name the views by their azimuth instead.
 
@@ -121,16 +119,14 @@ def orbit_views(
     Views named ``000.png`` on, sorted by name.
     """
     rng = np.random.default_rng(seed)
-    low, high = np.radians(elevations_deg)
+    low, high = np.radians(ELEVATIONS_DEG)
     azimuths = np.mod(np.arange(num_views) * np.pi * (3 - np.sqrt(5)), 2 * np.pi)
     ranks = np.argsort(np.argsort(azimuths)) if ordered else rng.permutation(num_views)
     views = []
     for rank, azimuth in zip(ranks, azimuths, strict=True):
         elevation = rng.uniform(low, high)
-        center = np.asarray(target) + (
-            distance * rng.uniform(0.9, 1.1) * direction(azimuth, elevation)
-        )
-        pose = look_at(center, np.asarray(target) + distance * rng.normal(scale=0.02, size=3))
+        center = DISTANCE * rng.uniform(0.9, 1.1) * direction(azimuth, elevation)
+        pose = look_at(center, DISTANCE * rng.normal(scale=0.02, size=3))
         pose = rolled(pose, rng.normal(scale=0.2))
         name = f"{rank:0{max(3, len(str(num_views - 1)))}d}.png"
         views.append(View(name=name, camera=camera, cam_from_world=pose))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from enum import StrEnum
 from functools import partial
@@ -12,17 +11,12 @@ import numpy as np
 
 from polmvs.camera import PinholeCamera, in_image
 from polmvs.io.folders import new_folder
-from polmvs.io.ground_truth import write_true_maps
-from polmvs.io.images import write_bytes, write_png
+from polmvs.io.ground_truth import write_true_maps, write_views
+from polmvs.io.images import write_png
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.scene import SparseModel, Tracks, View
 from polmvs.synthetic.captures import add_noise, quantize
-from polmvs.synthetic.printed import (
-    PrintedScene,
-    orbit_views,
-    render_printed_mosaic,
-    render_printed_truth,
-)
+from polmvs.synthetic.printed import PrintedScene, render_printed_mosaic, render_printed_truth
 from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
 SAME_PLACE = 1e-4  # relative: of a point and of what its view sees there
@@ -73,47 +67,35 @@ def camera_of(width: int) -> PinholeCamera:
 
 def write_printed_capture(
     target: Path,
-    num_views: int,
+    views: Sequence[View],
+    scene: PrintedScene,
     *,
-    part: Part = Part.BOARD,
-    width: int = 612,
-    ordered: bool = False,
     maps: bool = False,
-    seed: int = 0,
     workers: Workers | None = None,
     on_progress: OnProgress = no_progress,
-) -> list[View]:
+) -> None:
     """Write raw mosaics of 8 bits with photon noise, and ``gt/`` as :mod:`polmvs.io.ground_truth`.
 
     Parameters
     ----------
     target : folder, whole or not at all.
-    num_views : on an orbit, see :func:`polmvs.synthetic.printed.orbit_views`.
-    part : shape of the part.
-    width : of the half-size images, px; their height is 5/6 of it.
-    ordered : names follow the orbit.
+    views : of one camera, by name, metres; see :func:`polmvs.synthetic.printed.orbit_views`.
+    scene : its seed is that of the noise as well.
     maps : write depth, normals and masks as well.
-    seed : of print, places, names and noise.
-
-    Returns
-    -------
-    The true views, by name, metres.
 
     Raises
     ------
     DataError
         The folder exists and is not empty, or the system refuses.
     """
-    camera = camera_of(width)
-    views = orbit_views(num_views, camera, seed=seed, ordered=ordered)
     with new_folder(target) as folder:
         (folder / "raw").mkdir()
         (folder / "gt").mkdir()
-        write_bytes(folder / "gt" / "cameras.json", _cameras(camera, views).encode())
-        work = partial(_write_view, folder, scene_of(part, seed), maps)
-        for _ in (workers or Workers()).map(work, views, range(seed, seed + num_views)):
+        write_views(folder / "gt" / "cameras.json", views)
+        work = partial(_write_view, folder, scene, maps)
+        seeds = range(scene.seed, scene.seed + len(views))
+        for _ in (workers or Workers()).map(work, views, seeds):
             on_progress(1)
-    return views
 
 
 def printed_model(
@@ -155,21 +137,6 @@ def printed_model(
         obs_xy=np.concatenate(obs_xy),
     )
     return SparseModel(views=tuple(views), tracks=tracks, unregistered=())
-
-
-def _cameras(camera: PinholeCamera, views: Sequence[View]) -> str:
-    """The content of ``cameras.json``."""
-    matrix = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
-    images = {
-        view.name: {
-            "K": matrix,
-            "cam_from_world": np.column_stack(
-                [view.cam_from_world.rotation, view.cam_from_world.translation]
-            ).tolist(),
-        }
-        for view in views
-    }
-    return json.dumps({"width": camera.width, "height": camera.height, "images": images}, indent=1)
 
 
 def _write_view(folder: Path, scene: PrintedScene, maps: bool, view: View, seed: int) -> None:

@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from polmvs.errors import OptionError
-from polmvs.evaluation.deviation import infer_unit, measure_deviation
+from polmvs.evaluation.deviation import MeasuredPart, infer_unit, measure_deviation
 from polmvs.evaluation.registration import CloudReference, MeshReference, register
 from polmvs.surface.mesh_geometry import TriangleMesh
 
@@ -48,9 +48,16 @@ def _inside(points: np.ndarray) -> np.ndarray:
     return rib | knob
 
 
-def moved(points: np.ndarray, normals: np.ndarray, scale: float = 1.0):
+def moved(
+    points: np.ndarray, normals: np.ndarray, scale: float = 1.0, sigma: np.ndarray | None = None
+) -> MeasuredPart:
     turn = Rotation.from_euler("xyz", [100, -35, 200], degrees=True).as_matrix()
-    return scale * (points @ turn.T) + [0.4, -1.2, 3.0], normals @ turn.T
+    return MeasuredPart(
+        points=scale * (points @ turn.T) + [0.4, -1.2, 3.0],
+        normals=normals @ turn.T,
+        sigma=sigma,
+        is_metric=scale == 1,
+    )
 
 
 def reference(scale: float = 1e3) -> MeshReference:
@@ -65,9 +72,12 @@ def test_a_dent_is_found_within_its_stated_deviation() -> None:
     points, normals, in_dent = scanned(DENT_M)
     sigma = np.full(len(points), NOISE_M)
     found = measure_deviation(
-        *moved(points, normals), sigma, reference(), is_metric=True, unit=None, tolerance_mm=0.25,
+        moved(points, normals, sigma=sigma),
+        reference(),
+        unit=None,
+        tolerance_mm=0.25,
         least_share=0.99,
-    )  # fmt: skip
+    )
     figures = found.figures
     assert (figures.unit, figures.unit_inferred, figures.scale) == ("mm", True, 1)
     assert not figures.ambiguous
@@ -85,30 +95,30 @@ def test_a_dent_is_found_within_its_stated_deviation() -> None:
     assert figures.share_within == pytest.approx(1 - share, abs=0.005)
     assert figures.passed is (figures.share_within >= 0.99)
     assert figures.significant_share == pytest.approx(share, abs=0.006)
+    points, normals, _ = scanned(0.0)
     sound = measure_deviation(
-        *scanned(0.0)[:2], None, reference(), is_metric=True, unit="mm", tolerance_mm=0.25,
+        MeasuredPart(points=points, normals=normals),
+        reference(),
+        unit="mm",
+        tolerance_mm=0.25,
         least_share=0.999,
-    )  # fmt: skip
+    )
     assert sound.figures.passed is True
     assert np.isnan(sound.figures.median_sigma)
 
 
 def test_a_result_of_any_scale() -> None:
     points, normals, in_dent = scanned(DENT_M)
-    found = measure_deviation(
-        *moved(points, normals, scale=7.3), None, reference(), is_metric=False, unit="mm"
-    )
+    found = measure_deviation(moved(points, normals, scale=7.3), reference(), unit="mm")
     assert found.figures.scale == pytest.approx(1e3 / 7.3, rel=5e-4)
     assert found.distance[in_dent[found.index]].mean() == pytest.approx(-1e3 * DENT_M, abs=0.03)
     with pytest.raises(OptionError, match="has no metric scale"):
-        measure_deviation(points, normals, None, reference(), is_metric=False, unit=None)
+        measure_deviation(moved(points, normals, scale=7.3), reference(), unit=None)
 
 
 def test_a_wrong_size_is_told_and_not_fitted_away() -> None:
     points, normals, _ = scanned(0.0)
-    found = measure_deviation(
-        *moved(1.02 * points, normals), None, reference(), is_metric=True, unit=None
-    )
+    found = measure_deviation(moved(1.02 * points, normals), reference(), unit=None)
     assert found.figures.scale == 1
     assert found.figures.percentiles["99"] > 0.5  # 2 % of half of 120 mm is 1.2 mm
 
@@ -116,11 +126,8 @@ def test_a_wrong_size_is_told_and_not_fitted_away() -> None:
 def test_an_aligned_result_stays_where_it_is() -> None:
     points, normals, _ = scanned(0.0)
     found = measure_deviation(
-        points + np.array([0, 0, 1e-3]),
-        normals,
-        None,
+        MeasuredPart(points=points + np.array([0, 0, 1e-3]), normals=normals),
         reference(),
-        is_metric=True,
         unit="mm",
         aligned=True,
     )
@@ -131,7 +138,7 @@ def test_an_aligned_result_stays_where_it_is() -> None:
 def test_two_scans_of_one_part() -> None:
     points, normals, _ = scanned(0.0)
     other = CloudReference(*scanned(0.0, seed=1)[:2])
-    found = measure_deviation(*moved(points, normals), None, other, is_metric=True, unit="m")
+    found = measure_deviation(moved(points, normals), other, unit="m")
     # Noise of both; points at edges have no tangent plane.
     assert np.median(np.abs(found.distance)) < 2 * 1e3 * NOISE_M
 

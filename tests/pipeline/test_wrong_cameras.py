@@ -7,14 +7,22 @@ import pytest
 
 from polmvs.colmap.models import write_model
 from polmvs.scene import SparseModel
-from polmvs.synthetic.printed_capture import Part, printed_model, scene_of, write_printed_capture
+from polmvs.synthetic.printed import orbit_views
+from polmvs.synthetic.printed_capture import (
+    Part,
+    camera_of,
+    printed_model,
+    scene_of,
+    write_printed_capture,
+)
 
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SparseModel]:
     folder = tmp_path_factory.mktemp("wrong") / "capture"
-    views = write_printed_capture(folder, 6, width=128)
-    return folder, printed_model(scene_of(Part.BOARD), views, num_points=400)
+    views, scene = orbit_views(6, camera_of(128)), scene_of(Part.BOARD)
+    write_printed_capture(folder, views, scene)
+    return folder, printed_model(scene, views, num_points=400)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.1])

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from polmvs.colmap.models import read_model, write_model
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform
+from polmvs.io.ground_truth import write_views
 from polmvs.poses.known_poses import retriangulate, with_known_poses, write_known_poses
 from polmvs.scene import SparseModel, Tracks, View
 from polmvs.synthetic.captures import ring_of_views
@@ -173,12 +173,7 @@ def test_inverted_poses_are_told() -> None:
 def files(tmp_path: Path) -> tuple[Path, Path]:
     """A COLMAP model and a ``cameras.json``."""
     write_model(model_of(tracks_at(Scene, some_points(20))), tmp_path / "sparse")
-    images = {}
-    for view in VIEWS:
-        pose = np.column_stack([view.cam_from_world.rotation, view.cam_from_world.translation])
-        images[view.name] = {"K": CAMERA.K.tolist(), "cam_from_world": pose.tolist()}
-    content = {"width": CAMERA.width, "height": CAMERA.height, "images": images}
-    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    write_views(tmp_path / "cameras.json", VIEWS)
     return tmp_path / "sparse", tmp_path / "cameras.json"
 
 

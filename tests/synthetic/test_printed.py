@@ -77,7 +77,8 @@ def test_orders_of_names(views) -> None:
 
 
 def test_written_capture(tmp_path) -> None:
-    views = write_printed_capture(tmp_path / "a", 2, width=60, maps=True, part=Part.DOME)
+    views = orbit_views(2, camera_of(60))
+    write_printed_capture(tmp_path / "a", views, scene_of(Part.DOME), maps=True)
     truth = open_ground_truth(tmp_path / "a")
     assert list(truth.views) == ["000.png", "001.png"]
     for view in views:
@@ -92,4 +93,4 @@ def test_written_capture(tmp_path) -> None:
         points = rays * (truth.depth(view.name)[mask] / rays[:, 2])[:, None]
         np.testing.assert_allclose((points - center) / 0.12, normals[mask], atol=2e-3)
     with pytest.raises(DataError, match="exists already"):
-        write_printed_capture(tmp_path / "a", 2, width=60)
+        write_printed_capture(tmp_path / "a", views, SCENE)
