@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from polmvs.arrays import Floats, Image, Mask
+from polmvs.arrays import Array, Floats, Image, Mask
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,20 +207,22 @@ def _substantial(
 
 
 def _fill_holes(mask: Mask, texture: Image, *, tolerances: RegionTolerances) -> Mask:
-    """Fill holes that are small or show no texture, also those that a narrow gap opens."""
-    filled = mask | _holes(mask, texture, tolerances=tolerances)
+    """Fill holes that are small or show no texture, and small ones that a narrow gap opens."""
+    labels, area = _holes(mask)
+    flat = np.bincount(labels.ravel(), (texture < tolerances.low_texture).ravel(), len(area))
+    filled = mask | ((area <= tolerances.mark_area_px) | (flat > 0.7 * area))[labels]
     size = np.ones((tolerances.gap_px + 1, tolerances.gap_px + 1), np.uint8)
     without_gaps = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_CLOSE, size) > 0
-    opened = _holes(without_gaps, texture, tolerances=tolerances)
+    labels, area = _holes(without_gaps)
+    opened = ~without_gaps & (area <= tolerances.mark_area_px)[labels]
     # Closing gaps has taken the margin of such a hole as well.
-    return filled | opened | (without_gaps & grow_mask(opened, tolerances.gap_px // 2))
+    margin = without_gaps & grow_mask(opened, tolerances.gap_px // 2)
+    return np.asarray(filled | opened | margin)
 
 
-def _holes(mask: Mask, texture: Image, *, tolerances: RegionTolerances) -> Mask:
-    """Holes of a mask that are small or show no texture."""
-    num, labels, stats, _ = cv2.connectedComponentsWithStats(
-        (~mask).astype(np.uint8), connectivity=4
-    )
+def _holes(mask: Mask) -> tuple[NDArray[np.int32], Array]:
+    """Labels (H, W) of the parts beside a mask, and their areas; inf where it encloses none."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
     height, width = mask.shape
     left, top = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
     closed = (
@@ -228,11 +231,8 @@ def _holes(mask: Mask, texture: Image, *, tolerances: RegionTolerances) -> Mask:
         & (left + stats[:, cv2.CC_STAT_WIDTH] < width)
         & (top + stats[:, cv2.CC_STAT_HEIGHT] < height)
     )
-    area = np.maximum(stats[:, cv2.CC_STAT_AREA], 1)
-    flat = np.bincount(labels.ravel(), (texture < tolerances.low_texture).ravel(), minlength=num)
-    fill = closed & ((area <= tolerances.mark_area_px) | (flat > 0.7 * area))
-    fill[0] = False
-    return np.asarray(fill[labels])
+    closed[0] = False
+    return labels, np.where(closed, np.maximum(stats[:, cv2.CC_STAT_AREA], 1.0), np.inf)
 
 
 def _marks(s0: Image, polarized: Mask, reach_px: float) -> Mask:
