@@ -232,7 +232,8 @@ def _holes(mask: Mask) -> tuple[NDArray[np.int32], Array]:
         & (top + stats[:, cv2.CC_STAT_HEIGHT] < height)
     )
     closed[0] = False
-    return labels, np.where(closed, np.maximum(stats[:, cv2.CC_STAT_AREA], 1.0), np.inf)
+    area = np.where(closed, np.maximum(stats[:, cv2.CC_STAT_AREA], 1.0), np.inf)
+    return np.asarray(labels, np.int32), area
 
 
 def _marks(s0: Image, polarized: Mask, reach_px: float) -> Mask:
