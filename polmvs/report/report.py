@@ -14,11 +14,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.arrays import Floats
 from polmvs.colmap.models import read_model
-from polmvs.config import (
-    Options,
-    options_from_plain,
-    to_plain,
-)
+from polmvs.config import Options, options_from_plain, to_plain
 from polmvs.errors import DataError, PolmvsError
 from polmvs.evaluation.comparison import (
     Comparison,
@@ -166,7 +162,7 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
     text = page_text(
         Page(
             title=_title(given),
-            sentence=" ".join([*_verdict(given), _sentence(given)]),
+            sentence=" ".join([*_verdict(given), *_size_words(given), *_quality_words(given)]),
             facts=_facts(given),
             warnings=warnings_of(given),
             tables=_tables(given),
@@ -293,6 +289,27 @@ def _mesh_of(given: ReportInput, model: AngleModel) -> Mesh | None:
 
 def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColoring]]:
     """Clouds and meshes of all models, and what they can be coloured by."""
+    layers = [
+        _cloud_layer(given, model, cloud, given.length.factor)
+        for model, cloud in given.clouds.items()
+        if len(cloud.points)
+    ]
+    for model in given.models:
+        if (mesh := _mesh_of(given, model)) is not None:
+            layers.append(_mesh_layer(model, mesh, layers))
+    channels = _point_colorings(given)
+    if given.deviation is not None and not given.deviation.is_stale:
+        layer, channels["deviation"] = deviation_layer(given.deviation)
+        layers.append(thinned(layer, MAX_POINTS))
+    for name, limit in ADAPTED.items():
+        if name in channels:
+            channels[name] = replace(channels[name], high=_top(layers, name, limit))
+    used = {name for layer in layers for name in layer.values}
+    return layers, {name: one for name, one in channels.items() if name in used}
+
+
+def _point_colorings(given: ReportInput) -> dict[str, PointColoring]:
+    """What a run's points can be coloured by."""
     sigmas = [
         np.asarray(cloud.scalars["sigma"])[cloud.are(PointKind.SURFACE)]
         for cloud in given.clouds.values()
@@ -300,8 +317,7 @@ def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColori
     ]
     finite = np.concatenate([np.zeros(0), *sigmas])
     finite = finite[np.isfinite(finite)]
-    factor, unit = given.length.factor, given.length.name
-    top = float(np.percentile(finite, 95)) * factor if len(finite) else 1.0
+    top = float(np.percentile(finite, 95)) * given.length.factor if len(finite) else 1.0
     channels = {
         "intensity": PointColoring(label="intensity", note="Brightness in the photographs."),
         "kind": KIND,
@@ -315,7 +331,7 @@ def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColori
         ),
         "sigma": PointColoring(
             label="position uncertainty (1 sigma)",
-            unit=unit,
+            unit=given.length.name,
             high=top,
             colors=pictures.SEQUENTIAL,
             note="Standard deviation of a place along its normal, by its own statement.",
@@ -349,22 +365,7 @@ def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColori
             note="Between the surface's direction and the true one.",
             may_lack=True,
         )
-    layers = [
-        _cloud_layer(given, model, cloud, factor)
-        for model, cloud in given.clouds.items()
-        if len(cloud.points)
-    ]
-    for model in given.models:
-        if (mesh := _mesh_of(given, model)) is not None:
-            layers.append(_mesh_layer(model, mesh, layers))
-    if given.deviation is not None and not given.deviation.is_stale:
-        layer, channels["deviation"] = deviation_layer(given.deviation)
-        layers.append(thinned(layer, MAX_POINTS))
-    for name, limit in ADAPTED.items():
-        if name in channels:
-            channels[name] = replace(channels[name], high=_top(layers, name, limit))
-    used = {name for layer in layers for name in layer.values}
-    return layers, {name: one for name, one in channels.items() if name in used}
+    return channels
 
 
 def _mesh_layer(model: AngleModel, mesh: Mesh, layers: Sequence[Layer]) -> Layer:
@@ -513,17 +514,9 @@ def _title(given: ReportInput) -> str:
     return f"{name}: {num_views} views became a surface of {points:,} points"
 
 
-def _sentence(given: ReportInput) -> str:
-    """What a reader in a hurry takes along, in plain words."""
-    words = [*_size_words(given), *_quality_words(given)]
-    return " ".join(words)
-
-
 def _size_words(given: ReportInput) -> list[str]:
     size = _size(given)
-    if size is None:
-        return []
-    return [f"The part is about {size} in size."]
+    return [] if size is None else [f"The part is about {size} in size."]
 
 
 def _size(given: ReportInput) -> str | None:
@@ -576,14 +569,14 @@ def _quality_words(given: ReportInput) -> list[str]:
             )
         return words
     residual = figures[main].consistency.phase_residual.median_deg
-    words = [
+    sentence = (
         f"The polarization angles that the surface predicts differ from the measured ones by "
         f"{number(residual)} deg in the median ({name})"
-    ]
+    )
     if other is not None:
         before = other.consistency.phase_residual.median_deg
-        words[0] += f", under {older} by {number(before)} deg"
-    return [words[0] + "."]
+        sentence += f", under {older} by {number(before)} deg"
+    return [sentence + "."]
 
 
 def _uncertainty_words(given: ReportInput) -> list[str]:
@@ -648,7 +641,7 @@ def _tables(given: ReportInput) -> tuple[Table, ...]:
 
 def _verdict(given: ReportInput) -> list[str]:
     """Whether the main result is to be trusted, in one sentence."""
-    main = next(m for m in MAIN if m in given.models)
+    main = given.main
     found = given.record.find(Trust, main)
     if found is None or not found.verdict:
         return []
@@ -657,7 +650,7 @@ def _verdict(given: ReportInput) -> list[str]:
 
 def trust_table(given: ReportInput) -> Table | None:
     """What the main result says about itself, with what is normal."""
-    main = next(m for m in MAIN if m in given.models)
+    main = given.main
     found = given.record.find(Trust, main)
     if found is None:
         return None
