@@ -394,15 +394,8 @@ def run_sfm(
                 inside = {name: read_mask(masks[name], (height, width)) for name in names}
                 num_inside = keep_inside(work.database, inside)
                 logger.info("SfM: %d features inside the masks.", num_inside)
-            static = take_out_static(work.database) if options.static_background else None
-            if static is not None:
-                logger.warning(
-                    "a background stands still while the part turns: its features, %.0f %% of all, "
-                    "are left out. The poses are those of a camera that moves about the part; with "
-                    "`sfm.static_background` off all features are used, with "
-                    "`sfm.feature_masks` those inside masks.",
-                    100 * static,
-                )
+            if options.static_background:
+                _leave_out_static(work.database)
         else:
             _take_database(given, work, width, height)
         on_step("matching")
@@ -418,10 +411,7 @@ def run_sfm(
             free_intrinsics=options.known_camera is None,
             single_camera=single,
         )
-    write_reconstruction(reconstruction, sparse_folder)
-    sparse_model = model_from_reconstruction(reconstruction, names)
-    _log_result(sparse_model, reconstruction.compute_mean_reprojection_error())
-    return sparse_model
+    return _written(reconstruction, names, sparse_folder)
 
 
 def triangulate_views(
@@ -468,10 +458,7 @@ def triangulate_views(
         work.match()
         # Images were imported in the order of names, so their ids are those of the views here.
         found = work.triangulate(reconstruction_of_views(ordered, single_camera=single))
-    write_reconstruction(found, sparse_folder)
-    model = model_from_reconstruction(found, names)
-    _log_result(model, found.compute_mean_reprojection_error())
-    return model
+    return _written(found, names, sparse_folder)
 
 
 def _place_of_database(work_folder: Path) -> Path:
@@ -585,6 +572,19 @@ def _take_database(given: GivenDatabase, work: SfmWork, width: int, height: int)
         replace_cameras(work.database, camera)
 
 
+def _leave_out_static(database: Path) -> None:
+    """Take out the features of a background that stands still while the part turns."""
+    static = take_out_static(database)
+    if static is not None:
+        logger.warning(
+            "a background stands still while the part turns: its features, %.0f %% of all, "
+            "are left out. The poses are those of a camera that moves about the part; with "
+            "`sfm.static_background` off all features are used, with "
+            "`sfm.feature_masks` those inside masks.",
+            100 * static,
+        )
+
+
 def _refine(
     reconstruction: pycolmap.Reconstruction,
     tolerances: SfmTolerances,
@@ -670,18 +670,22 @@ def _principal_points_plausible(
     )
 
 
-def _log_result(sparse_model: SparseModel, error_px: float) -> None:
-    """Headline numbers, and the views that are missing."""
-    num_points = len(sparse_model.tracks.point3D_ids)
+def _written(
+    reconstruction: pycolmap.Reconstruction, names: Sequence[str], folder: Path
+) -> SparseModel:
+    """The model, written; headline numbers and the views that are missing go to the log."""
+    write_reconstruction(reconstruction, folder)
+    model = model_from_reconstruction(reconstruction, names)
     logger.info(
         "SfM: %d views, %d points, reprojection error %.2f px.",
-        len(sparse_model.views),
-        num_points,
-        error_px,
+        len(model.views),
+        len(model.tracks.point3D_ids),
+        reconstruction.compute_mean_reprojection_error(),
     )
-    if sparse_model.unregistered:
+    if model.unregistered:
         logger.warning(
             "SfM: %d views have no pose and are left out: %s.",
-            len(sparse_model.unregistered),
-            short_list(sparse_model.unregistered),
+            len(model.unregistered),
+            short_list(model.unregistered),
         )
+    return model

@@ -95,55 +95,22 @@ def find_model(
         No model comes out, or the options do not fit the images.
     """
     options = options or SfmOptions()
-    if options.camera_model != SfmOptions.camera_model and (options.intrinsics or options.camera):
+    known = options.known_camera
+    if options.camera_model != SfmOptions.camera_model and known is not None:
         logger.warning("`sfm.camera_model` is not used where the camera is given.")
-    loading: list[Thread] = []
-
-    folder_of_masks = options.feature_masks
-    masks = (
-        None
-        if folder_of_masks is None
-        else {name: find_mask(folder_of_masks, name) for name in names}
-    )
-
-    def on_step(name: str) -> None:
-        if name == "mapping":  # on one core: the other can load what the next stages need
-            loading.append(preload())
-        on_progress(1)
-
     with scratch(target) as folder:
-        work, new = folder / "work", folder / "sparse"
-        try:
-            # Where its database cannot be written COLMAP ends the process.
-            model = run_separately(
-                _run_sfm, images, names, work, new, options, masks, on_message=on_step
-            )
-            for thread in loading:
-                thread.join()
-        except NoRoomError as error:
-            raise DataError(target.parent, CANNOT_WRITE) from error
-        except CrashError as error:
-            if FULL_DISK.search(error.said):
-                raise DataError(target.parent, CANNOT_WRITE) from error
-            if options.database is not None:
-                raise DataError(options.database, f"is not usable: {error}") from error
-            raise
-        except NoModelError as error:
-            reason = why_no_model(work / "database.db", options)
-            raise DataError(images, f"SfM finds no model: {reason}") from error
-        found = None
-        if options.known_camera is None:
-            found = camera_uncertainty(new)
+        new = folder / "sparse"
+        model = _find_apart(images, names, folder / "work", new, options, on_progress)
+        found = camera_uncertainty(new) if known is None else None
         _store_uncertainty(new, model, found, pose_uncertainty(new))
         replace_folder(new, target)
     _warn_of_missing(model, images)
     _warn_of_few(len(model.views))
-    complaints: tuple[Complaint, ...] = ()
-    if options.known_camera is not None:
-        given = f"`{options.known_camera}`"
-        complaints = _warn_of_cameras(target, given, "Leave it out, or give a camera that fits.")
+    if known is not None:
+        remedy = "Leave it out, or give a camera that fits."
+        return replace(_result(model), complaints=_warn_of_cameras(target, f"`{known}`", remedy))
     if found is None:
-        return replace(_result(model), complaints=complaints)
+        return _result(model)
     bending = _bending(model, found.modes)
     if not bending < LARGE_BENDING:
         logger.warning(
@@ -156,6 +123,45 @@ def find_model(
             100 * bending,
         )
     return _result(model, focal_sigma=found.focal, bending=bending)
+
+
+def _find_apart(
+    images: Path,
+    names: Sequence[str],
+    work: Path,
+    new: Path,
+    options: SfmOptions,
+    on_progress: OnProgress,
+) -> SparseModel:
+    """SfM in a process of its own, which COLMAP ends where it cannot write its database."""
+    masks = None
+    if (given := options.feature_masks) is not None:
+        masks = {name: find_mask(given, name) for name in names}
+    loading: list[Thread] = []
+
+    def on_step(name: str) -> None:
+        if name == "mapping":  # on one core: the other can load what the next stages need
+            loading.append(preload())
+        on_progress(1)
+
+    try:
+        model = run_separately(
+            _run_sfm, images, names, work, new, options, masks, on_message=on_step
+        )
+    except NoRoomError as error:
+        raise DataError(new.parent.parent, CANNOT_WRITE) from error
+    except CrashError as error:
+        if FULL_DISK.search(error.said):
+            raise DataError(new.parent.parent, CANNOT_WRITE) from error
+        if options.database is not None:
+            raise DataError(options.database, f"is not usable: {error}") from error
+        raise
+    except NoModelError as error:
+        reason = why_no_model(work / "database.db", options)
+        raise DataError(images, f"SfM finds no model: {reason}") from error
+    for thread in loading:
+        thread.join()
+    return model
 
 
 def _run_sfm(
