@@ -43,6 +43,7 @@ from polmvs.pipeline.checks import (
     require_same_capture,
 )
 from polmvs.pipeline.record import (
+    CaptureIdentity,
     Record,
     StageRecord,
     read_image_names,
@@ -132,6 +133,15 @@ class Job:
     run_options: RunOptions = RunOptions()
     monitor: Monitor | None = None
     command_line: Sequence[str] = ()
+
+    def absolute(self) -> Job:
+        """The same with paths that any working folder can read."""
+        return replace(
+            self,
+            capture=self.capture.absolute(),
+            out=self.out.absolute(),
+            options=with_absolute_paths(self.options),
+        )
 
 
 @dataclass(kw_only=True)
@@ -378,6 +388,13 @@ class Run(StageInput):
                         field=path,
                     )
 
+    def record_origin(self, identity: CaptureIdentity, command_line: Sequence[str]) -> None:
+        """Record what the run is made of, with what options and versions."""
+        record, capture = self.record, self.capture
+        record.capture, record.images = identity, tuple(image_names(capture))
+        record.notes, record.options = capture.notes, to_plain(self.options)
+        record.command_line, record.versions = tuple(command_line), versions()
+
     def save(self, *, finished: bool = False) -> None:
         """Write ``run.json``."""
         now = time.perf_counter()
@@ -473,12 +490,7 @@ def open_run(
     monitor = job.monitor if job.monitor is not None else NoMonitor()
     run_options = job.run_options
     if run_options.scheduler is not None:  # whose workers have other working folders
-        job = replace(
-            job,
-            capture=job.capture.absolute(),
-            out=job.out.absolute(),
-            options=with_absolute_paths(job.options),
-        )
+        job = job.absolute()
     run_folder, others = RunFolder(job.out), list(inputs_of(job.options).values())
     for path in (job.capture, job.out, *others):
         require_unicode(path)
@@ -516,10 +528,7 @@ def open_run(
             budget_gb=run_options.memory,
         )
         run.require_same_options(taken_over)
-        record.capture, record.images = identity, tuple(image_names(capture))
-        record.notes = capture.notes
-        record.command_line, record.versions = tuple(job.command_line), versions()
-        record.options = to_plain(job.options)
+        run.record_origin(identity, job.command_line)
         run.save()
         monitor.opened(run_folder)
         try:

@@ -83,9 +83,8 @@ UNUSED: Mapping[Method, tuple[str, ...]] = {
 }
 
 OUTSIDE = "{name}.outside.npy"  # among dense views: pixels that show nothing within the box
-FINEST_SPACING_PX = (
-    0.25  # of points that are not to be merged, in GSD (length of a pixel at the surface)
-)
+# Of points that are not to be merged, in GSD (length of a pixel at the surface).
+FINEST_SPACING_PX = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,14 +204,7 @@ def densify(
             surface = replace(surface, scalars={**surface.scalars, **found.points.scalars()})
         around = surroundings_cloud(sparse.tracks, found.cloud, given, workspace, kept / "around")
         if box is not None:
-            inside = box.require_some(surface.points)
-            if not inside.all():
-                logger.warning(
-                    "`crop.box` leaves out %.0f %% of the surface; figures against a ground truth "
-                    "count that as missing.",
-                    100 * (1 - inside.mean()),
-                )
-            surface = surface.only(inside)
+            surface = _crop_surface(surface, box)
             around = around.only(box.contains(around.points))
             crop_views(new_views, given.views, box)
         replace_folder(new_views, folder.views(model))
@@ -226,6 +218,17 @@ def densify(
         tilt_share=found.tilt_share,
         left_out=found.left_out,
     )
+
+
+def _crop_surface(surface: Cloud, box: CropBox) -> Cloud:
+    inside = box.require_some(surface.points)
+    if not inside.all():
+        logger.warning(
+            "`crop.box` leaves out %.0f %% of the surface; figures against a ground truth "
+            "count that as missing.",
+            100 * (1 - inside.mean()),
+        )
+    return surface.only(inside)
 
 
 def crop_views(folder: Path, views: Sequence[View], box: CropBox) -> None:
