@@ -152,6 +152,17 @@ class Tracks:
         starts = np.searchsorted(self.obs_view[order], np.arange(num_views + 1))
         return [order[a:b] for a, b in pairwise(starts)]
 
+    def in_views(self, kept: Mask) -> Tracks:
+        """All tracks with the observations of the chosen ``(V,)`` views, which count anew."""
+        index = np.cumsum(kept) - 1
+        seen = kept[self.obs_view]
+        return replace(
+            self,
+            obs_track=self.obs_track[seen],
+            obs_view=index[self.obs_view[seen]],
+            obs_xy=self.obs_xy[seen],
+        )
+
 
 def some_tracks(tracks: Tracks, chosen: Mask) -> Tracks:
     """The chosen ``(T,)`` tracks with their observations."""
@@ -228,16 +239,8 @@ def without_views(model: SparseModel, names: Collection[str]) -> tuple[SparseMod
     The model; which views (V,) and which tracks (T,) it has of the former one.
     """
     kept = np.array([view.name not in names for view in model.views], np.bool_)
-    tracks = model.tracks
-    seen = kept[tracks.obs_view]
-    index = np.cumsum(kept) - 1
-    fewer = replace(
-        tracks,
-        obs_track=tracks.obs_track[seen],
-        obs_view=index[tracks.obs_view[seen]],
-        obs_xy=tracks.obs_xy[seen],
-    )
-    enough = np.bincount(fewer.obs_track, minlength=len(tracks.point3D_ids)) >= 2
+    fewer = model.tracks.in_views(kept)
+    enough = np.bincount(fewer.obs_track, minlength=len(fewer.point3D_ids)) >= 2
     out = [view.name for view in model.views if view.name in names]
     changed = SparseModel(
         views=tuple(compress(model.views, kept)),

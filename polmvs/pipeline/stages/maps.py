@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -321,16 +321,8 @@ def _wrong_setting(
 def _some_views(tracks: Tracks, maps: Sequence[PhaseMap]) -> tuple[Tracks, list[PhaseMap]]:
     """Evenly spread views, so many as a check may hold at a time, and what these observe."""
     chosen = np.linspace(0, len(maps) - 1, min(len(maps), MAX_CHECKED_VIEWS)).round().astype(int)
-    index = np.full(len(maps), -1)
-    index[chosen] = np.arange(len(chosen))
-    kept = index[tracks.obs_view] >= 0
-    observed = replace(
-        tracks,
-        obs_track=tracks.obs_track[kept],
-        obs_view=index[tracks.obs_view[kept]],
-        obs_xy=tracks.obs_xy[kept],
-    )
-    return observed, [maps[k] for k in chosen]
+    kept = np.isin(np.arange(len(maps)), chosen)
+    return tracks.in_views(kept), [maps[k] for k in chosen]
 
 
 def _turn_parts(folder: Path, phase_map: PhaseMap, parts: NDArray[np.bool_]) -> int:
