@@ -10,8 +10,12 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Iterator
 from io import BufferedReader
 from os import PathLike
+from pathlib import Path
+
+from polmvs.errors import as_data_error
 
 MAX_TEXT_BYTES = 1 << 28  # of a text that is read whole; lists of a million pairs have 2^26
 
@@ -61,6 +65,22 @@ def read_text(path: str | PathLike[str], encoding: str = "utf-8") -> str:
     if len(data) > MAX_TEXT_BYTES:
         raise OSError(errno.EFBIG, "it is too large for a text", os.fspath(path))
     return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Words of a plain text file's lines, with their numbers; no empty lines, no ``#`` comments.
+
+    Raises
+    ------
+    DataError
+        It cannot be read.
+    """
+    with as_data_error(path, "read"), open_plain(path) as file:
+        text = file.read().decode("utf-8", "replace")
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            yield number, words
 
 
 def _require_regular(found: os.stat_result, path: str | PathLike[str]) -> None:

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from polmvs.camera import Camera
 from polmvs.colmap.models import read_views as read_model_views
-from polmvs.errors import DataError, as_data_error
+from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
+from polmvs.io.plain_files import read_rows
 from polmvs.scene import View, stem_of
 from polmvs.simulation.options import PathName, PathOptions
 from polmvs.synthetic.captures import direction, look_at, rolled
@@ -102,13 +103,8 @@ def given_views(path: Path, camera: Camera) -> list[View]:
 
 
 def _read_trajectory(path: Path) -> dict[str, RigidTransform]:
-    with as_data_error(path, "read"):
-        data = path.read_bytes()
     poses: dict[str, RigidTransform] = {}
-    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
+    for number, words in read_rows(path):
         try:
             w, x, y, z, *translation = map(float, words[1:])
         except ValueError:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
-from polmvs.errors import DataError, as_data_error
+from polmvs.errors import DataError
 from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
+from polmvs.io.plain_files import read_rows
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
 Array = NDArray[np.float64]
@@ -106,13 +107,8 @@ def marks_at(mesh: Mesh, file: Path, diameter: float, seed: int) -> Marks:
 
 
 def _read_places(file: Path) -> Array:
-    with as_data_error(file, "read"):
-        data = file.read_bytes()
     places = []
-    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
+    for number, words in read_rows(file):
         try:
             place = [float(word) for word in words]
         except ValueError:

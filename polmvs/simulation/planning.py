@@ -10,13 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from polmvs.errors import OptionError
-from polmvs.evaluation.tables import format_table
 from polmvs.io.images import write_bytes
 from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import from_json, json_bytes, parse_json, write_json
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.simulation.options import LightName, PlanOptions, Simulation
-from polmvs.simulation.trial import HEADER, TrialResult, run_trial
+from polmvs.simulation.trial import TrialResult, run_trial, trial_table
 
 ENOUGH_OF_BEST = 0.02  # F-score given up for fewer views; defines the recommendation
 USELESS = 0.5  # F-score at 2 mm under which nothing is recommended; defines it as well
@@ -48,8 +47,8 @@ class Plan:
 
     def table(self) -> str:
         """A row for each trial, in Markdown."""
-        rows = [(one.light.value, *one.trial.cells[1:]) for one in self.trials]
-        return format_table(("light", *HEADER[1:]), rows)
+        named = [replace(one.trial, name=one.light.value) for one in self.trials]
+        return trial_table(named, first="light")
 
 
 def make_plan(

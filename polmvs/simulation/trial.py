@@ -7,13 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from polmvs.config import (
-    CaptureOptions,
-    EvaluationOptions,
-    Options,
-    RunOptions,
-    SfmOptions,
-)
+from polmvs.config import CaptureOptions, EvaluationOptions, Options, RunOptions, SfmOptions
 from polmvs.errors import PolmvsError
 from polmvs.evaluation.comparison import ModelFigures
 from polmvs.evaluation.tables import format_table
@@ -26,8 +20,7 @@ from polmvs.simulation.options import SensorOptions, Simulation, SimulationRun
 
 MODEL = AngleModel.PPA
 CAPTURE, RUN = "capture", "run"  # folders of a trial
-HEADER = (
-    "",
+HEADER = (  # but for the name
     "views",
     "posed",
     "points",
@@ -87,8 +80,6 @@ def run_trial(
     mesh: str | Path | Mesh,
     folder: Path,
     simulation: Simulation,
-    *,
-    workers: int = 1,
 ) -> TrialResult:
     """Render a capture into a folder, reconstruct it and measure it; a failure is a result.
 
@@ -99,7 +90,7 @@ def run_trial(
     capture, run = folder / CAPTURE, folder / RUN
     made = simulate_capture(mesh, capture, simulation, SimulationRun(resume=True))
     options = options_of(capture, simulation.sensor)
-    (trial,) = measure(name, capture, run, options, views=made.num_views, workers=workers)
+    (trial,) = measure(name, capture, run, options, views=made.num_views)
     return trial
 
 
@@ -170,6 +161,6 @@ def _with_figures(trial: TrialResult, figures: ModelFigures) -> TrialResult:
     )
 
 
-def trial_table(trials: Sequence[TrialResult], first: str = "capture") -> str:
-    """A row for each trial, in Markdown."""
-    return format_table((first, *HEADER[1:]), [trial.cells for trial in trials])
+def trial_table(trials: Sequence[TrialResult], *, first: str = "capture") -> str:
+    """A row for each trial, in Markdown; ``first`` says what their names are."""
+    return format_table((first, *HEADER), [trial.cells for trial in trials])
