@@ -11,7 +11,7 @@ from polmvs.scene import View
 from polmvs.simulation.irradiance import bake
 from polmvs.simulation.lights import environment
 from polmvs.simulation.marks import marks_on
-from polmvs.simulation.materials import Material
+from polmvs.simulation.materials import Material, fresnel
 from polmvs.simulation.options import LightingOptions, LightName
 from polmvs.simulation.renderer_import import Renderer
 from polmvs.simulation.scene import MitsubaScene, SceneDescription, build_scene
@@ -23,6 +23,19 @@ SIDE = 64  # px
 CAMERA = PinholeCamera(width=SIDE, height=SIDE, fx=56.0, fy=56.0, cx=30.0, cy=33.0)
 SMOOTH = 0.004  # roughness; slopes of 0.2 degrees
 GLOSS = Material(roughness=SMOOTH, ior=1.5)
+
+
+def specular_dolp(cos_incidence: np.ndarray, index: complex) -> np.ndarray:
+    """Degree of polarization of unpolarized light that a surface reflects."""
+    across, along = fresnel(cos_incidence, index)
+    return np.asarray((across - along) / (across + along))
+
+
+def diffuse_dolp(cos_emergence: np.ndarray, index: complex) -> np.ndarray:
+    """Degree of polarization of unpolarized light that leaves a dielectric."""
+    across, along = fresnel(cos_emergence, index)
+    with np.errstate(invalid="ignore"):  # nothing leaves at grazing emergence
+        return np.asarray((across - along) / (2 - across - along))
 
 
 def view_of(distance: float = 0.22, elevation_deg: float = 35.0) -> View:

@@ -125,19 +125,6 @@ def transmittance(cos_incidence: Array, index: complex) -> Array:
     return np.asarray(1 - 0.5 * (across + along))
 
 
-def specular_dolp(cos_incidence: Array, index: complex) -> Array:
-    """Degree of polarization of unpolarized light that a surface reflects."""
-    across, along = fresnel(cos_incidence, index)
-    return np.asarray((across - along) / (across + along))
-
-
-def diffuse_dolp(cos_emergence: Array, index: complex) -> Array:
-    """Degree of polarization of unpolarized light that leaves a dielectric."""
-    across, along = fresnel(cos_emergence, index)
-    with np.errstate(invalid="ignore"):  # nothing leaves at grazing emergence
-        return np.asarray((across - along) / (2 - across - along))
-
-
 def bsdf_of(material: Material, *, colour: bool) -> dict[str, Any]:
     """The material as Mitsuba has it; its diffuse base of its own albedo."""
     if material.metal is not None:

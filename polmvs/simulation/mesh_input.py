@@ -44,13 +44,11 @@ class ObjectMesh:
     source : its file or name.
     mesh : metres, on the plane z = 0 over the origin; its normals are those that light follows.
     vertex_albedo : (V, 3) float32, linear, of a file with colours; else None.
-    sag : largest distance between facets and the surface that their normals belong to, metres.
     """
 
     source: str
     mesh: Mesh
     vertex_albedo: NDArray[np.float32] | None = None
-    sag: float = 0.0
 
 
 def object_mesh(source: str | Path | Mesh, options: ObjectOptions) -> ObjectMesh:
@@ -71,7 +69,7 @@ def object_mesh(source: str | Path | Mesh, options: ObjectOptions) -> ObjectMesh
         shape = named_shape(str(source))
         size = options.size or DEFAULT_SIZE
         mesh = Mesh(shape.vertices * size, shape.normals, shape.triangles)
-        return ObjectMesh(source=str(source), mesh=mesh, sag=surface_sag(mesh))
+        return ObjectMesh(source=str(source), mesh=mesh)
     path = Path(source)
     if not path.is_file():
         shapes = ", ".join(shape_names())
@@ -248,15 +246,14 @@ def _placed(
     scale = unit_m if options.size is None else options.size / extent
     origin = np.array([*(0.5 * (low + high))[:2], low[2]])
     placed = Mesh((mesh.vertices - origin) * scale, mesh.normals, mesh.triangles)
-    sag = surface_sag(placed)
     logger.info(
         "%s: %s triangles, %.4g m; facets and normals differ by %.3g mm at most",
         source,
         f"{len(mesh.triangles):,}",
         extent * scale,
-        1e3 * sag,
+        1e3 * surface_sag(placed),
     )
-    return ObjectMesh(source=source, mesh=placed, vertex_albedo=colours, sag=sag)
+    return ObjectMesh(source=source, mesh=placed, vertex_albedo=colours)
 
 
 def _import_trimesh() -> Any:

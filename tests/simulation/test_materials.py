@@ -2,17 +2,10 @@
 
 import numpy as np
 import pytest
+from traced_scenes import diffuse_dolp, specular_dolp
 
 from polmvs.errors import OptionError
-from polmvs.simulation.materials import (
-    PRESETS,
-    bsdf_of,
-    diffuse_dolp,
-    fresnel,
-    material_of,
-    specular_dolp,
-    transmittance,
-)
+from polmvs.simulation.materials import PRESETS, bsdf_of, fresnel, material_of, transmittance
 from polmvs.simulation.options import MaterialName, Metal, ObjectOptions
 
 COSINES = np.cos(np.radians([5, 20, 40, 55, 70, 80]))

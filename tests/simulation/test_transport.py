@@ -11,8 +11,10 @@ from traced_scenes import (
     SIDE,
     SMOOTH,
     cosines,
+    diffuse_dolp,
     lit_scene,
     scaled,
+    specular_dolp,
     stokes_of,
     view_of,
 )
@@ -25,13 +27,7 @@ from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.scene import View
 from polmvs.simulation.lights import environment
 from polmvs.simulation.marks import marks_on
-from polmvs.simulation.materials import (
-    Material,
-    diffuse_dolp,
-    fresnel,
-    specular_dolp,
-    transmittance,
-)
+from polmvs.simulation.materials import Material, fresnel, transmittance
 from polmvs.simulation.options import LightingOptions, LightName, Metal, Optics
 from polmvs.simulation.scene import MitsubaScene, SceneDescription, build_scene
 from polmvs.simulation.sensor import polarizer_images
