@@ -40,21 +40,18 @@ def geman_mcclure_weights(residuals: Array, square: float | Array) -> Array:
     return np.asarray((square / (square + residuals**2)) ** 2)
 
 
-def annealed_scales(
-    num_rounds: int, *, num_final: int = 3, last: float = CAUCHY_SCALE
-) -> Iterator[float]:
-    """Scales of a Cauchy loss for the rounds of a fit: wide first, halved down to the final one.
+def annealed_scales(num_rounds: int, *, num_final: int = 3) -> Iterator[float]:
+    """Scales of a Cauchy loss for the rounds of a fit: wide first, halved to ``CAUCHY_SCALE``.
 
     A wide loss is nearly convex and lets the fit find the place that most data agree on.
 
     Parameters
     ----------
     num_rounds : scales to give.
-    num_final : how many of them, the last ones, are ``last``.
-    last : deviations.
+    num_final : how many of them, the last ones, are the final one.
     """
     for index in range(num_rounds):
-        yield last * 2.0 ** max(num_rounds - num_final - index, 0)
+        yield CAUCHY_SCALE * 2.0 ** max(num_rounds - num_final - index, 0)
 
 
 def robust_deviation(residuals: Floats) -> float:

@@ -135,10 +135,7 @@ class CameraTrial:
 
 
 def try_cameras(
-    model: Path,
-    *,
-    tolerances: TrialTolerances = TrialTolerances(),
-    adjustment: CameraTolerances = ADJUSTMENT,
+    model: Path, *, tolerances: TrialTolerances = TrialTolerances()
 ) -> CameraTrial | None:
     """Adjust a model's matches with its cameras free, and compare; points seen once are left out.
 
@@ -156,19 +153,17 @@ def try_cameras(
         if point.track.length() < 2:
             given.delete_point3D(number)
     try:
-        return _compared(given, tolerances, adjustment)
+        return _compared(given, tolerances)
     except (ValueError, RuntimeError) as error:  # what COLMAP says of a model that it cannot adjust
         logger.info("the cameras of %s cannot be tried: %s", model, error)
         return None
 
 
-def _compared(
-    given: pycolmap.Reconstruction, t: TrialTolerances, adjustment: CameraTolerances
-) -> CameraTrial | None:
+def _compared(given: pycolmap.Reconstruction, t: TrialTolerances) -> CameraTrial | None:
     """The comparison; see :func:`try_cameras`."""
     if (
         len(given.cameras) != 1
-        or not t.min_images <= given.num_reg_images() <= adjustment.max_views
+        or not t.min_images <= given.num_reg_images() <= ADJUSTMENT.max_views
         or given.num_points3D() < t.min_points
     ):
         return None
@@ -179,18 +174,18 @@ def _compared(
     widest = 2 * max(finite, default=0.0)
     bundle, config = bundle_of(
         fitting,
-        max(widest, adjustment.loss_scale_px),
+        max(widest, ADJUSTMENT.loss_scale_px),
         free_intrinsics=False,
         free_principal_point=False,
     )
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
     with quiet_colmap():
         pycolmap.create_default_bundle_adjuster(bundle, config, fitting).solve()
-        adjuster_of(fitting, adjustment, free=True, free_point=True).solve()
+        adjuster_of(fitting, ADJUSTMENT, free=True, free_point=True).solve()
         fitting.update_point_3d_errors()
         camera = next(iter(fitting.cameras.values()))
         estimated = list(range(len(camera.params)))
-        covariance = parameter_covariance(fitting, camera, estimated, True, adjustment)
+        covariance = parameter_covariance(fitting, camera, estimated, True, ADJUSTMENT)
     if covariance is None or not np.isfinite(camera.params).all():
         return None
     before = next(iter(given.cameras.values()))
@@ -202,7 +197,7 @@ def _compared(
     fitting_errors = _errors_of_images(fitting)
     usual, usual_fitting = (float(np.median([*e.values()])) for e in (errors, fitting_errors))
     # Most views do not see the points where they are said to be: the camera was changed since.
-    stale = usual > max(t.pose_ratio * usual_fitting, adjustment.min_residual_px)
+    stale = usual > max(t.pose_ratio * usual_fitting, ADJUSTMENT.min_residual_px)
     certain = stale | (np.abs(change) > t.max_sigmas * sigma)
     wrong = (certain[focal_at] & (focal_change > t.min_focal_change)).any() or (
         certain[point_at] & (point_change > t.min_point_change)

@@ -164,9 +164,9 @@ def draw_plane(result: PlaneResult) -> bytes:
     return _png(figure)
 
 
-def draw_track_distribution(result: TrackResult, k: int = 3) -> bytes:
-    """Histogram and cumulative distribution of the errors with K views, as in the paper."""
-    index = int(np.argmin(np.abs(np.array(result.k) - k)))
+def draw_track_distribution(result: TrackResult) -> bytes:
+    """Histogram and cumulative distribution of the errors with three views, as in the paper."""
+    index = int(np.argmin(np.abs(np.array(result.k) - 3)))
     figure = _figure(9.5, 3.6)
     left, right = figure.subplots(1, 2)
     bins = np.linspace(0, 40, 81)

@@ -395,9 +395,9 @@ def _track_json(errors: TrackErrors) -> dict[str, list[float]]:
     }
 
 
-def tracks_table(result: TrackResult, wanted: Sequence[int] = (2, 3, 5, 10, 15, 20)) -> str:
+def tracks_table(result: TrackResult) -> str:
     """Errors of the normals from tracks, for some numbers of views."""
-    shown = [i for i, k in enumerate(result.k) if k in wanted] or [0]
+    shown = [i for i, k in enumerate(result.k) if k in (2, 3, 5, 10, 15, 20)] or [0]
     head = ["estimator", "statistic", *(f"K = {result.k[i]}" for i in shown)]
     rows = []
     for name in ESTIMATORS:

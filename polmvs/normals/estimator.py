@@ -180,7 +180,7 @@ def solve_normals(
     moments = _moments(rows, weights)
     if robust:
         moments -= problem.gained(normals, CAUCHY_SCALE)
-    estimate = _describe(rows, rays, weights, outlier_weights, moments, tolerances)
+    estimate = _describe(rays, weights, outlier_weights, moments, tolerances)
     kept = precision * (outlier_weights > tolerances.counted_weight)
     determined = _spread(rows, kept, alike=not robust) > tolerances.min_spread
     determined &= (estimate.num_rows > 2) | (facing.sum(axis=0) <= 2)
@@ -319,7 +319,6 @@ def _moments(rows: Floats, weights: Floats) -> Array:
 
 
 def _describe(
-    rows: Floats,
     rays: Floats,
     weights: Floats,
     outlier_weights: Floats,

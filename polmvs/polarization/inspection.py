@@ -175,7 +175,7 @@ def inspect_capture(
         white=white,
         views=tuple(figures),
         warnings=tuple(_warnings(capture, white, figures, colour, limits)),
-        obstacles=tuple(_obstacles(capture, white, figures, limits)),
+        obstacles=tuple(_obstacles(capture, figures, limits)),
     )
 
 
@@ -351,7 +351,7 @@ def _block_differences(capture: Capture, stokes: Stokes) -> float:
 
 
 def _obstacles(
-    capture: Capture, white: float, views: Sequence[ViewFigures], limits: InspectionLimits
+    capture: Capture, views: Sequence[ViewFigures], limits: InspectionLimits
 ) -> list[str]:
     """Why nothing is to be had from a capture, as clauses after "because"."""
     lines = []

@@ -99,26 +99,23 @@ def with_known_poses(
     return replace(fitted, views=views, tracks=tracks)
 
 
-def retriangulate(
-    views: Sequence[View], tracks: Tracks, *, max_error_px: float = MAX_ERROR_PX
-) -> Tracks:
+def retriangulate(views: Sequence[View], tracks: Tracks) -> Tracks:
     """Triangulate tracks from their observations, all tracks at once.
 
     Parameters
     ----------
     views : that ``tracks.obs_view`` counts in.
     tracks : whose points and errors do not matter.
-    max_error_px : mean reprojection error above which a track is dropped.
 
     Returns
     -------
     Tracks
         With new points and errors. Those seen once, from one place or under parallel rays, with
-        too large an error or behind a camera that observes them are dropped.
+        a mean error above ``MAX_ERROR_PX`` or behind a camera that observes them are dropped.
     """
     points = _intersect(views, tracks)
     errors = _mean_errors(views, points, tracks)
-    good = errors <= max_error_px  # not where NaN
+    good = errors <= MAX_ERROR_PX  # not where NaN
     return some_tracks(replace(tracks, points_in_world=points, errors=errors), good)
 
 

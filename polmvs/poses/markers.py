@@ -439,7 +439,6 @@ class MarkerMeasure:
     side : world units.
     relative_sigma : its standard deviation as a share of it.
     rms_residual_px : of the corners, px.
-    marker_ids : measured markers.
     num_views : that show at least one of them.
     dropped : what is left out, as ``marker ID in NAME``.
     """
@@ -447,7 +446,6 @@ class MarkerMeasure:
     side: float
     relative_sigma: float
     rms_residual_px: float
-    marker_ids: tuple[int, ...]
     num_views: int
     dropped: tuple[str, ...]
 
@@ -601,7 +599,6 @@ def _combine(views: Sequence[View], squares: Sequence[_Square], source: str) -> 
         side=side,
         relative_sigma=float(weights.sum() ** -0.5) / side,
         rms_residual_px=float(np.sqrt((num_views * squared).sum() / num_views.sum())),
-        marker_ids=tuple(square.marker_id for square in squares),
         num_views=len({k for square in squares for k in square.views}),
         dropped=dropped,
     )

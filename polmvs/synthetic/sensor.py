@@ -39,7 +39,6 @@ def faulty_sensor(
     shape: tuple[int, int],
     rng: np.random.Generator,
     *,
-    pattern: tuple[int, int, int, int] = CaptureOptions.pattern,
     gain_sigma: float = 0.02,
     angle_sigma_deg: float = 1.0,
     extinction_ratio: float = 50.0,
@@ -57,7 +56,7 @@ def faulty_sensor(
     dark : level without light, full scales.
     """
     gain, angle, strength = (np.empty(shape) for _ in range(3))
-    for cell, nominal in enumerate(pattern):
+    for cell, nominal in enumerate(CaptureOptions.pattern):
         site = np.s_[cell // 2 :: 2, cell % 2 :: 2]
         ratio = extinction_ratio * (1 + 0.25 * rng.uniform(-1, 1))
         gain[site] = 1 + gain_sigma * rng.normal()

@@ -118,7 +118,7 @@ def _mug() -> Mesh:
     )
     tangents = unit(np.stack([-0.2 * np.sin(along), 0 * along, 0.24 * np.cos(along)], axis=1))
     sides = np.broadcast_to([0.0, 1.0, 0.0], path.shape)
-    handle = _tube(path, tangents, sides, 0.045, closed=False)
+    handle = _tube(path, tangents, sides, 0.045)
     return _joined([body, handle])
 
 
@@ -134,7 +134,7 @@ def _knot() -> Mesh:
             axis=1,
         )
     )
-    return _tube(path, tangents, _carried(tangents), 0.62, closed=True)
+    return _tube(path, tangents, _carried(tangents), 0.62)
 
 
 def _vase() -> Mesh:
@@ -231,7 +231,7 @@ def _disc(border: Array) -> Mesh:
     return Mesh(points, normals, triangles)
 
 
-def _tube(path: Array, tangents: Array, sides: Array, radius: float, *, closed: bool) -> Mesh:
+def _tube(path: Array, tangents: Array, sides: Array, radius: float) -> Mesh:
     """A round tube about a path (N, 3); ``sides`` are unit and across the tangents."""
     num = 96
     angle = np.linspace(0.0, 2 * np.pi, num + 1)[:, None]

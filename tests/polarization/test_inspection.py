@@ -136,7 +136,7 @@ def test_each_limit_of_a_capture(small) -> None:
 
 def test_obstacles(small) -> None:
     def kept(*views: ViewFigures) -> str:
-        return " | ".join(_obstacles(small, 0.5, views, InspectionLimits()))
+        return " | ".join(_obstacles(small, views, InspectionLimits()))
 
     assert kept(GOOD, GOOD, GOOD) == ""
     assert kept(GOOD, GOOD) == "it has 2 views: a surface takes three or more"

@@ -88,7 +88,6 @@ def test_exact_corners_give_the_exact_side() -> None:
         measure = measure_markers(views, exact(views, ONE), source="test")
         assert measure.side == pytest.approx(SIDE, rel=1e-9)
         assert measure.rms_residual_px < 1e-6
-        assert measure.marker_ids == (7,)
 
 
 def test_standard_deviation_is_that_of_repeated_noise() -> None:
@@ -131,7 +130,7 @@ def test_views_that_contradict_each_other() -> None:
         measure_markers(views, detections, source="test")
 
 
-def test_marker_in_a_single_view() -> None:
+def test_marker_in_a_single_view(caplog: pytest.LogCaptureFixture) -> None:
     views = views_of(PINHOLE)
     shown = loader(views[:1], ONE)(views[0].name)
     blank = np.full_like(shown, 140)
@@ -140,8 +139,8 @@ def test_marker_in_a_single_view() -> None:
         metric_frame(model_of(views), ReferenceOptions(aruco=OPTION), load)
     # Beside a good marker it is left out.
     pair = (*ONE, (9, (0.0, 0.03), SIDE, 0.0))
-    measure = measure_markers(views, [*exact(views, ONE), exact(views, pair)[1]], source="test")
-    assert measure.marker_ids == (7,)
+    measure_markers(views, [*exact(views, ONE), exact(views, pair)[1]], source="test")
+    assert "marker 9 is seen in one view only" in caplog.text
 
 
 def test_no_marker() -> None:
