@@ -67,6 +67,12 @@ def read_text(path: str | PathLike[str], encoding: str = "utf-8") -> str:
     return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
 
 
+def read_head(path: str | PathLike[str], most: int) -> tuple[bytes, int]:
+    """The first bytes of a plain file, and how many it has; OSError as of :func:`open_plain`."""
+    with open_plain(path) as file:
+        return file.read(most), file.seek(0, os.SEEK_END)
+
+
 def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Words of a plain text file's lines, with their numbers; no empty lines, no ``#`` comments.
 
