@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polmvs._version import __version__
+from polmvs.arrays import Array
 from polmvs.camera import pixel_centers
 from polmvs.config import to_plain
 from polmvs.errors import DataError, OptionError, as_data_error
@@ -61,7 +61,6 @@ from polmvs.simulation.truth import CAMERAS_FILE, true_maps, write_cameras, writ
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 RECORD = "simulation.json"
 FILLED = 0.8  # of the image's smaller side by the object's circumscribed sphere

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.arrays import Array
 from polmvs.simulation.materials import transmittance
 from polmvs.simulation.scene import SPREAD_NM, MitsubaScene
-
-Array = NDArray[np.float64]
 
 CHUNK = 1 << 21  # paths at a time: about 100 MB
 NORMAL_WEIGHT = 3.0  # a right angle between normals counts as 4.2 spacings: edges stay sharp
