@@ -101,8 +101,12 @@ class OptionError(PolmvsError):
 
 
 @contextmanager
-def as_data_error(path: str | PathLike[str], done: str) -> Iterator[None]:
+def as_data_error(path: str | PathLike[str], done: str, missing: str = "") -> Iterator[None]:
     """Turn an ``OSError`` into a DataError that names the file or folder and the failed action.
+
+    Parameters
+    ----------
+    missing : what is said of one that there is not; where it is empty, what the system says.
 
     Raises
     ------
@@ -112,6 +116,8 @@ def as_data_error(path: str | PathLike[str], done: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if missing and isinstance(error, FileNotFoundError):
+            raise DataError(path, missing) from error
         raise DataError(path, f"cannot be {done}: {error.strerror or error}.") from error
 
 

@@ -24,7 +24,7 @@ from polmvs.camera import PinholeCamera
 from polmvs.colmap.dense_workspace import DenseWorkspace, WorkspaceView
 from polmvs.io.arrays import save_array
 from polmvs.io.clouds import Cloud, write_cloud
-from polmvs.io.images import write_bytes, write_png
+from polmvs.io.images import write_bytes, write_mask, write_png
 from polmvs.io.typed_json import write_json
 from polmvs.scene import View, stem_of
 
@@ -67,7 +67,7 @@ def write_nerfstudio(export: CameraExport, folder: Path) -> None:
     for number, item in enumerate(export.workspace.views):
         name = f"{number:05d}_{_flat(item.view.name)}"
         shutil.copyfile(item.image, folder / "images" / f"{name}{item.image.suffix}")
-        write_png(folder / "masks" / f"{name}.png", _as_image(export.mask(item.view)))
+        write_mask(folder / "masks" / f"{name}.png", export.mask(item.view))
         frame: dict[str, Any] = {
             "file_path": f"images/{name}{item.image.suffix}",
             "mask_path": f"masks/{name}.png",
@@ -113,7 +113,7 @@ def write_neus(export: CameraExport, folder: Path) -> None:
     content: dict[str, Array] = {}
     for number, item in enumerate(export.workspace.views):
         shutil.copyfile(item.image, folder / "image" / f"{number:03d}{item.image.suffix}")
-        write_png(folder / "mask" / f"{number:03d}.png", _as_image(export.mask(item.view)))
+        write_mask(folder / "mask" / f"{number:03d}.png", export.mask(item.view))
         matrix = np.eye(4)
         matrix[:3, :3] = item.camera.K
         matrix[:2, 2] -= 0.5
@@ -256,10 +256,6 @@ def _world_from_cam(view: View) -> Array:
     matrix[:3, :3] = np.asarray(view.cam_from_world.rotation).T
     matrix[:3, 3] = view.center_in_world
     return matrix
-
-
-def _as_image(mask: Mask) -> NDArray[np.uint8]:
-    return np.where(mask, 255, 0).astype(np.uint8)
 
 
 def _row(values: NDArray[np.floating]) -> str:

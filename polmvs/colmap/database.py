@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise, repeat
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -159,16 +159,8 @@ def match_pairs(
                 _copy(database, copy)
         shares = ["".join(lines[begin:end]) for begin, end in pairwise(ends)]
         with ThreadPoolExecutor(num_shares) as pool:  # each waits for its process
-            list(
-                pool.map(
-                    partial(run_separately, _match_share),
-                    copies,
-                    shares,
-                    repeat(seed),
-                    repeat(guided),
-                    repeat(learned),
-                )
-            )
+            match = partial(run_separately, _match_share)
+            list(pool.map(lambda *own: match(*own, seed, guided, learned), copies, shares))
         with _room():
             for copy in copies:
                 _take_matches(database, copy)

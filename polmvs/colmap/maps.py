@@ -25,7 +25,7 @@ from polmvs.camera import PinholeCamera
 from polmvs.errors import DataError, as_data_error
 from polmvs.geometry import dots, lengths
 from polmvs.io.images import write_bytes
-from polmvs.io.plain_files import open_plain
+from polmvs.io.plain_files import read_head
 
 PathArg = str | PathLike[str]
 
@@ -190,14 +190,8 @@ def _check(path: PathArg, camera: PinholeCamera, kind: str) -> None:
 
 def _read_header(path: PathArg) -> tuple[tuple[int, int, int], int, int]:
     """Width, height and channels; where the samples start; length of the file in bytes."""
-    try:
-        with open_plain(path) as file:
-            head = file.read(HEADER_BYTES)
-            num_bytes = file.seek(0, 2)
-    except FileNotFoundError as error:
-        raise DataError(path, f"no such file. {AGAIN}") from error
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+    with as_data_error(path, "read", missing=f"no such file. {AGAIN}"):
+        head, num_bytes = read_head(path, HEADER_BYTES)
     match = HEADER.match(head)
     if match is None:
         raise DataError(path, f"is no map of COLMAP's: W&H&C& is expected at its start. {AGAIN}")

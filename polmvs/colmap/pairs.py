@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from polmvs.config import PairChoice
 from polmvs.errors import DataError
-from polmvs.io.plain_files import read_text
+from polmvs.io.plain_files import read_list
 from polmvs.scene import find_name, short_list
 
 logger = logging.getLogger(__name__)
@@ -117,11 +117,7 @@ def read_pairs(path: Path, names: Sequence[str]) -> Pairs:
         It cannot be read, has a line that is no pair, names images that there are not, or leaves
         nothing to match.
     """
-    try:
-        lines = read_text(path).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not UTF-8"
-        raise DataError(path, f"is no readable list of pairs ({reason}).") from error
+    lines = read_list(path, "pairs").splitlines()
     known = {name: name for name in names}
     pairs, unknown = set(), []
     for number, line in enumerate(lines, start=1):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.colmap.models import read_model
-from polmvs.errors import DataError
+from polmvs.errors import DataError, as_data_error
 from polmvs.evaluation.consistency import Consistency, best_fitting_model, measure_consistency
 from polmvs.evaluation.map_errors import MapErrors, map_errors
 from polmvs.evaluation.metrics import AngleStats, CloudMetrics
@@ -273,7 +273,8 @@ def read_comparison(path: Path) -> Comparison:
         It is missing, no such file, or of another version.
     """
     try:
-        content = parse_json(read_text(path))
+        with as_data_error(path, "read"):
+            content = parse_json(read_text(path))
         found = content.get("schema_version", 1)
         if found != SCHEMA_VERSION:
             raise DataError(
@@ -281,8 +282,6 @@ def read_comparison(path: Path) -> Comparison:
                 f"has schema version {found}; this polmvs reads {SCHEMA_VERSION}. Compare again.",
             )
         return from_json(Comparison, content)
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
     except (ValueError, AttributeError) as error:
         raise DataError(path, f"holds no figures of a comparison ({error}).") from error
 

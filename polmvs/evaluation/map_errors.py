@@ -150,28 +150,24 @@ def lattice_errors(
     camera = view.camera
     if dense is None:
         xy = lattice_xy(camera.height // stride_px, camera.width // stride_px, stride_px)
-        known, nothing = np.zeros(xy.shape[:2], np.bool_), np.full(xy.shape[:2], np.nan)
-        true = _truth_at(xy, view, truth)
-        return LatticeErrors(
-            on_part=true.on_part,
-            off_part=true.off_part,
-            known=known,
-            depth_m=nothing,
-            sigma_m=nothing,
-            normal_deg=nothing,
-        )
-    xy = dense.lattice_xy()
-    true, known = _truth_at(xy, view, truth), dense.range_map > 0
-    compared = known & true.on_part
-    z_per_range = truth_from_world.scale * camera.rays(xy)[..., 2]
-    in_cam = dense.normals_in_world @ view.cam_from_world.rotation.T
+        true, known = _truth_at(xy, view, truth), np.zeros(xy.shape[:2], np.bool_)
+        depth_m = sigma_m = normal_deg = np.full(xy.shape[:2], np.nan)
+    else:
+        xy = dense.lattice_xy()
+        true, known = _truth_at(xy, view, truth), dense.range_map > 0
+        compared = known & true.on_part
+        z_per_range = truth_from_world.scale * camera.rays(xy)[..., 2]
+        in_cam = dense.normals_in_world @ view.cam_from_world.rotation.T
+        depth_m = np.where(compared, z_per_range * dense.range_map - true.depth, np.nan)
+        sigma_m = np.where(compared, z_per_range * dense.sigma, np.nan)
+        normal_deg = np.where(compared, angular_errors_deg(in_cam, true.normals), np.nan)
     return LatticeErrors(
         on_part=true.on_part,
         off_part=true.off_part,
         known=known,
-        depth_m=np.where(compared, z_per_range * dense.range_map - true.depth, np.nan),
-        sigma_m=np.where(compared, z_per_range * dense.sigma, np.nan),
-        normal_deg=np.where(compared, angular_errors_deg(in_cam, true.normals), np.nan),
+        depth_m=depth_m,
+        sigma_m=sigma_m,
+        normal_deg=normal_deg,
     )
 
 

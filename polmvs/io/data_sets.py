@@ -48,7 +48,7 @@ from polmvs.config import (
     Resolution,
     describe_fields,
 )
-from polmvs.errors import DataError
+from polmvs.errors import DataError, as_data_error
 from polmvs.geometry import RigidTransform, nearest_rotation
 from polmvs.io.capture_files import find_capture
 from polmvs.io.images import decode_image, read_bytes
@@ -447,7 +447,11 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         The file is missing, damaged or too large.
     """
     try:
-        with open_plain(path) as file, zipfile.ZipFile(file) as content:
+        with (
+            as_data_error(path, "read"),
+            open_plain(path) as file,
+            zipfile.ZipFile(file) as content,
+        ):
             members = content.infolist()
             # What a member says of its size is all that is read of it.
             if sum(member.file_size for member in members) > MAX_NPZ_BYTES:
@@ -458,8 +462,6 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
             }
     except DataError:
         raise
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
     except Exception as error:  # zipfile and NumPy's header parser raise many kinds
         raise DataError(path, "is no readable .npz of cameras; copy the set again.") from error
 

@@ -24,7 +24,7 @@ from polmvs.camera import MAX_SIDE, PinholeCamera, pixel_centers
 from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform, nearest_rotation, unit
 from polmvs.io.image_size import PNG_SIGNATURE
-from polmvs.io.images import decode_image, read_bytes, write_png
+from polmvs.io.images import decode_image, read_bytes, write_mask, write_png
 from polmvs.io.plain_files import read_text
 from polmvs.io.raw_formats import read_npy
 from polmvs.io.typed_json import parse_json, write_json
@@ -345,6 +345,6 @@ def write_true_maps(stem: Path, depth: Array, normals_in_cam: Array, mask: Mask)
     encoded = np.rint(depth / DEPTH_UNIT_M)
     encoded = np.where(encoded <= np.iinfo(np.uint16).max, encoded, 0)
     write_png(f"{stem}_depth.png", encoded.astype(np.uint16))
-    write_png(f"{stem}_mask.png", np.where(mask, 255, 0).astype(np.uint8))
+    write_mask(f"{stem}_mask.png", mask)
     coded = np.rint((np.where(mask[..., None], normals_in_cam, 0) + 1) * 32767.5)
     write_png(f"{stem}_normal.png", np.ascontiguousarray(coded.astype(np.uint16)[..., ::-1]))

@@ -93,6 +93,11 @@ def write_png(path: PathArg, image: NDArray[Any]) -> None:
     write_bytes(path, encode_png(image))
 
 
+def write_mask(path: PathArg, mask: NDArray[np.bool_]) -> None:
+    """Write a mask (H, W) as :func:`read_mask` reads it, 255 inside."""
+    write_png(path, np.where(mask, 255, 0).astype(np.uint8))
+
+
 def encode_png(image: NDArray[Any]) -> bytes:
     """An image as :func:`write_png` takes it, as the bytes of a PNG."""
     if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or image.size == 0:
@@ -131,18 +136,13 @@ def read_bytes(path: PathArg, most: int | None = None) -> bytes:
     ----------
     most : bytes that it may have.
     """
-    try:
-        with open_plain(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            if most is not None and size > most:
-                raise DataError(
-                    path, f"has {size / 1e9:.1f} GB; the limit is {most / 1e9:.1f} GB. {SCALE_DOWN}"
-                )
-            data = file.read()
-    except FileNotFoundError as error:
-        raise DataError(path, "no such file.") from error
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+    with as_data_error(path, "read", missing="no such file."), open_plain(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if most is not None and size > most:
+            raise DataError(
+                path, f"has {size / 1e9:.1f} GB; the limit is {most / 1e9:.1f} GB. {SCALE_DOWN}"
+            )
+        data = file.read()
     if not data:
         raise DataError(path, f"is empty. {BROKEN}")
     return data

@@ -15,7 +15,7 @@ from io import BufferedReader
 from os import PathLike
 from pathlib import Path
 
-from polmvs.errors import as_data_error
+from polmvs.errors import DataError, as_data_error
 
 MAX_TEXT_BYTES = 1 << 28  # of a text that is read whole; lists of a million pairs have 2^26
 
@@ -65,6 +65,21 @@ def read_text(path: str | PathLike[str], encoding: str = "utf-8") -> str:
     if len(data) > MAX_TEXT_BYTES:
         raise OSError(errno.EFBIG, "it is too large for a text", os.fspath(path))
     return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_list(path: Path, what: str, encoding: str = "utf-8") -> str:
+    """The text of a list that a user gives; DataError where it is no readable list of that."""
+    try:
+        return read_text(path, encoding)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8"
+        raise DataError(path, f"is no readable list of {what} ({reason}).") from error
+
+
+def read_head(path: str | PathLike[str], most: int) -> tuple[bytes, int]:
+    """The first bytes of a plain file, and how many it has; OSError as of :func:`open_plain`."""
+    with open_plain(path) as file:
+        return file.read(most), file.seek(0, os.SEEK_END)
 
 
 def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from polmvs.errors import MAX_QUOTED, DataError, as_data_error
 from polmvs.io.images import read_bytes, write_bytes
-from polmvs.io.plain_files import open_plain
+from polmvs.io.plain_files import read_head
 
 MAX_HEADER_BYTES = 1 << 16
 TYPES = {
@@ -118,14 +118,8 @@ def read_ply_header(path: Path) -> PlyHeader:
     DataError
         The file is missing, no PLY, or too short for what it promises.
     """
-    try:
-        with open_plain(path) as file:
-            head = file.read(MAX_HEADER_BYTES)
-            size = file.seek(0, 2)
-    except FileNotFoundError as error:
-        raise DataError(path, "no such file; give a PLY point cloud.") from error
-    except OSError as error:
-        raise DataError(path, f"cannot be read: {error.strerror or error}.") from error
+    with as_data_error(path, "read", missing="no such file; give a PLY point cloud."):
+        head, size = read_head(path, MAX_HEADER_BYTES)
     found = re.match(rb"ply\s.*?^end_header[^\S\n]*\r?\n", head, re.DOTALL | re.MULTILINE)
     if found is None:
         raise DataError(path, "is no PLY file; give a PLY point cloud.")

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.config import (
     CaptureKind,
     CaptureOptions,
@@ -27,8 +27,6 @@ from polmvs.normals.tracks import evenly_chosen, matched_views, tracks_on_parts
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Tracks, some_tracks
-
-Array = NDArray[np.float64]
 
 MIRRORED: Reading = ((1, 0), (0, -1))
 TURNED: Reading = ((0, 1), (-1, 0))  # by 45 degrees

@@ -12,11 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats
 from polmvs.fitting import CAUCHY_SCALE, annealed_scales, cauchy_weights
 from polmvs.scene import MIN_FACING_COSINE
-
-Floats = NDArray[np.floating]
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

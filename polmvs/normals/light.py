@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Mask
 from polmvs.camera import in_image, sample_image
 from polmvs.config import NormalOptions
 from polmvs.geometry import lengths, points_on_rays
@@ -28,10 +29,6 @@ from polmvs.normals.tracks import MAX_ROWS, in_tiles, observe, tracks_on_parts
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS, Tracks
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating]
-Mask = NDArray[np.bool_]
 
 LIGHTS = (AS_MEASURED, OTHER_LIGHT)  # that of the maps, and the other
 

@@ -18,6 +18,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Mask
 from polmvs.fitting import MEDIAN_OF_NORMAL
 from polmvs.normals.estimator import NormalEstimate, smallest_eigenvectors
 from polmvs.normals.observations import Observations
@@ -29,10 +30,6 @@ from polmvs.polarization.light_mixture import (
     row_precisions,
 )
 from polmvs.scene import MIN_FACING_COSINE
-
-Floats = NDArray[np.floating]
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 TRIED_AT_A_TIME = 2_000_000  # observations times directions: 100 MB
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))

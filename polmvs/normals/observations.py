@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Image
 from polmvs.camera import in_image, sample_image
 from polmvs.normals.rows import AS_MEASURED, Reading
 from polmvs.polarization.angle_models import (
@@ -26,10 +27,6 @@ from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.light_mixture import phase_variance
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_DISTANCE
-
-Floats = NDArray[np.floating]
-Image = NDArray[np.float32]
-Array = NDArray[np.float64]
 
 LIGHTS = (Light.SPECULAR, Light.DIFFUSE)  # order of the first axis
 LOCAL_SHARE = 6  # a pixel's phase is judged in a neighbourhood of this part of the window. Guess.

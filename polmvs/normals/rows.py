@@ -9,14 +9,12 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Floats, Image
 from polmvs.camera import sample_image
 from polmvs.polarization.angle_models import rows_from_axial, tilt_turn
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_DISTANCE, View
-
-Floats = NDArray[np.floating]
-Image = NDArray[np.float32]
 
 # Relative distance behind the surface of a view beyond which a point is occluded. A guess: several
 # times the error of a first range map, less than the depth of occluding objects.

@@ -13,8 +13,8 @@ from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Mask
 from polmvs.camera import in_image, sample_image
 from polmvs.config import Estimator, NormalOptions
 from polmvs.memory import MemoryNeeds
@@ -27,8 +27,6 @@ from polmvs.scene import MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MAX_SCALE_POINTS = 600  # points for the scales of the rows. Guess: more cost time only
 MAX_ROWS = MemoryNeeds.max_rows  # rows of points and views at a time, without a budget

@@ -36,7 +36,7 @@ from polmvs.config import (
 from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.images import write_bytes
-from polmvs.io.plain_files import read_text
+from polmvs.io.plain_files import read_list
 from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import JobOutcome, reconstruct
@@ -130,11 +130,7 @@ def read_batch(
     OptionError
         A key or value is unusable, or a name is there twice.
     """
-    try:
-        text = read_text(path, "utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not UTF-8"
-        raise DataError(path, f"is no readable list of captures ({reason}).") from error
+    text = read_list(path, "captures", "utf-8-sig")
     suffix = path.suffix.lower()
     if suffix not in (".toml", ".csv"):
         raise DataError(path, "is no list of captures: its name must end in .toml or .csv.")

@@ -31,7 +31,7 @@ from polmvs.io.data_sets import (
     read_set_mask,
     recognise_data_set,
 )
-from polmvs.io.images import write_bytes, write_png
+from polmvs.io.images import write_bytes, write_mask
 from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.pipeline.stages.images import image_names, write_images
 from polmvs.polarization.capture import Capture, open_capture
@@ -253,7 +253,7 @@ def _write_mask(data_set: DataSet, stem: str, folder: Path, capture: Capture) ->
     step = int(step_x)
     # On the part where all of the finer mask's pixels are.
     blocks = mask.reshape(capture.height, step, capture.width, step)
-    write_png(folder / f"{stem}.png", np.where(blocks.all(axis=(1, 3)), 255, 0).astype(np.uint8))
+    write_mask(folder / f"{stem}.png", np.asarray(blocks.all(axis=(1, 3))))
 
 
 def _toml(options: CaptureOptions) -> str:

@@ -19,6 +19,7 @@ from polmvs.arrays import Floats, Mask
 Rgb = NDArray[np.uint8]
 
 CYCLIC, SEQUENTIAL, ERROR = "twilight", "viridis", "plasma"
+OUTLINE = (230, 159, 0)
 NOTHING = 236  # grey of pixels without a value; reads on light and dark pages
 QUALITY = 82  # of 100, of what compresses; 100 px of a thumbnail hardly show a difference above
 
@@ -91,9 +92,7 @@ def outline_picture(intensity: Floats, white: float, inside: Mask) -> Rgb:
     """The intensity with what lies outside a mask dimmed and the mask's outline drawn."""
     picture = gray_picture(intensity, white)
     picture[~inside] = (0.35 * picture[~inside]).astype(np.uint8)
-    flags = inside.astype(np.uint8)
-    edge = cv2.dilate(flags, np.ones((3, 3), np.uint8)) > flags
-    picture[edge] = (230, 159, 0)
+    picture[_border(inside)] = OUTLINE
     return picture
 
 
@@ -105,13 +104,18 @@ def mesh_picture(intensity: Floats, white: float, normals_in_cam: Floats) -> Rgb
     normals_in_cam : (H, W, 3), camera frame, NaN where the mesh is not.
     """
     picture = gray_picture(intensity, white).astype(np.float64)
-    shown = np.isfinite(normals_in_cam).all(axis=-1)
+    shown = np.asarray(np.isfinite(normals_in_cam).all(axis=-1))
     facing = np.clip(-np.where(shown, normals_in_cam[..., 2], -1.0), 0, 1)
     tint = (0.25 + 0.75 * facing)[..., None] * np.array([86.0, 180.0, 233.0])
     picture[shown] = 0.45 * picture[shown] + 0.55 * tint[shown]
-    flags = np.asarray(shown, np.uint8)
-    picture[cv2.dilate(flags, np.ones((3, 3), np.uint8)) > flags] = (230, 159, 0)
+    picture[_border(shown)] = OUTLINE
     return np.asarray(picture, np.uint8)
+
+
+def _border(mask: Mask) -> Mask:
+    """Pixels beside those of a mask."""
+    flags = mask.astype(np.uint8)
+    return np.asarray(cv2.dilate(flags, np.ones((3, 3), np.uint8)) > flags)
 
 
 def _colored(share: Floats, colors: Rgb) -> Rgb:

@@ -159,6 +159,7 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
         on_progress(1)
     layers, channels = scene_layers(given)
     scene = _scene(given, layers, channels)
+    is_thinned = any(len(cloud.points) > MAX_POINTS for cloud in given.clouds.values())
     text = page_text(
         Page(
             title=_title(given),
@@ -171,7 +172,7 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
             plots=_plots(given, samples),
             deviation=deviation_section(given.deviation),
             scene=scene,
-            thinned=MAX_POINTS if _is_thinned(given) else 0,
+            thinned=MAX_POINTS if is_thinned else 0,
             stages=[
                 (stage.name, number(stage.seconds, 1, 1), number(stage.peak_rss_mb, 1, 0))
                 for stage in given.record.stages
@@ -496,10 +497,6 @@ def _box_frames(given: ReportInput) -> list[BoxFrame]:
         BoxFrame(f"marker {marker}", f"--box-marker={marker}", frame)
         for marker, frame in frames.items()
     ]
-
-
-def _is_thinned(given: ReportInput) -> bool:
-    return any(len(cloud.points) > MAX_POINTS for cloud in given.clouds.values())
 
 
 # Words and figures

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import Camera, PinholeCamera
 from polmvs.colmap.cameras import ColmapCamera
 from polmvs.errors import OptionError
@@ -12,8 +12,6 @@ from polmvs.io.intrinsics import Intrinsics, read_intrinsics
 from polmvs.scene import View
 from polmvs.simulation.options import SensorKind, SensorOptions
 from polmvs.simulation.transport import Lens
-
-Array = NDArray[np.float64]
 
 FOCAL_LENGTH_M = 0.008  # of the lens that has an f-number
 

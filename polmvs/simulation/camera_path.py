@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from polmvs.arrays import Array
 from polmvs.camera import Camera
 from polmvs.colmap.models import read_views as read_model_views
 from polmvs.errors import DataError
@@ -16,8 +16,6 @@ from polmvs.io.plain_files import read_rows
 from polmvs.scene import View, stem_of
 from polmvs.simulation.options import PathName, PathOptions
 from polmvs.synthetic.captures import direction, look_at, rolled
-
-Array = NDArray[np.float64]
 
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 

@@ -16,15 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polmvs._version import __version__
-from polmvs.camera import Camera, pixel_centers
+from polmvs.arrays import Array
+from polmvs.camera import pixel_centers
 from polmvs.config import to_plain
 from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.geometry import RigidTransform
 from polmvs.io.clouds import Mesh, write_mesh
-from polmvs.io.images import write_bytes, write_png
+from polmvs.io.images import write_bytes, write_mask, write_png
 from polmvs.io.intrinsics import write_intrinsics
 from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import parse_json, write_json
@@ -61,7 +61,6 @@ from polmvs.simulation.truth import CAMERAS_FILE, true_maps, write_cameras, writ
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 RECORD = "simulation.json"
 FILLED = 0.8  # of the image's smaller side by the object's circumscribed sphere
@@ -319,7 +318,8 @@ class _Studio:
             )
             checked = replace(view, camera=small)
             _, normals, mask = true_maps(scene, checked)
-            away = (normals * _rays(small)).sum(axis=-1) > 0
+            rays = small.rays(pixel_centers(small.width, small.height))
+            away = (normals * rays).sum(axis=-1) > 0
             if mask.sum() < MIN_SEEN:
                 blind.append(view.name)
             elif (away & mask).sum() > 0.5 * mask.sum():
@@ -355,22 +355,12 @@ class _Studio:
         """One view, or each such sample of it."""
         plan = self.plan
         view = plan.views[index]
-        lens = self._lens(view, index)
-        seed = self._seed(index)
+        seed = plan.options.rendering.seed * 100_003 + index
+        distance = object_distance(view, plan.target)
+        lens = lens_of(plan.options.sensor, view.camera, distance, seed)
         return render_picture(
             scene, view, lens, plan.options, plan.channels, exposure, seed=seed, step=step
         )
-
-    def _lens(self, view: View, index: int) -> Any:
-        distance = object_distance(view, self.plan.target)
-        return lens_of(self.plan.options.sensor, view.camera, distance, self._seed(index))
-
-    def _seed(self, index: int) -> int:
-        return self.plan.options.rendering.seed * 100_003 + index
-
-
-def _rays(camera: Camera) -> Array:
-    return np.asarray(camera.rays(pixel_centers(camera.width, camera.height)))
 
 
 def _require_compatible(options: Simulation) -> None:
@@ -483,7 +473,7 @@ def _write_view(out: Path, studio: _Studio, index: int, exposure: float) -> Simu
     maps = true_maps(scene, view)
     write_truth(out / "gt", view, maps, picture)
     if options.rendering.masks:
-        write_png(out / "masks" / view.name, np.where(maps[2], 255, 0).astype(np.uint8))
+        write_mask(out / "masks" / view.name, maps[2])
     rng = np.random.default_rng([options.rendering.seed, 3, index])
     files = expose_picture(picture, view, options.sensor, plan.channels, exposure, rng)
     names = [view.name]

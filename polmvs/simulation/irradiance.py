@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.arrays import Array
 from polmvs.simulation.materials import transmittance
 from polmvs.simulation.scene import SPREAD_NM, MitsubaScene
-
-Array = NDArray[np.float64]
 
 CHUNK = 1 << 21  # paths at a time: about 100 MB
 NORMAL_WEIGHT = 3.0  # a right angle between normals counts as 4.2 spacings: edges stay sharp
@@ -108,6 +107,47 @@ class _Gathering:
         ]
         return np.concatenate(parts) if parts else np.zeros(0)
 
+    def by_hemisphere(self, place: Any, points: Any, sampler: Any) -> Any:
+        """By samples of the hemisphere: light from surfaces, and that of the sky with its share."""
+        scene = self.scene
+        mi, dr = scene.renderer.mi, scene.renderer.dr
+        local = mi.warp.square_to_cosine_hemisphere(points)
+        cosine = local.z
+        ray = mi.Ray3f(place.p, mi.Frame3f(place.n).to_world(local))
+        ray.wavelengths = place.wavelengths
+        hit = scene.scene.ray_intersect(ray)
+        density = cosine / dr.pi
+        emitter = hit.emitter(scene.scene)
+        has_emitter = dr.neq(emitter, None) if hasattr(dr, "neq") else emitter != None  # noqa: E711
+        emitted = self.brightness(emitter.eval(hit, has_emitter))
+        record = mi.DirectionSample3f(scene.scene, hit, place)
+        of_emitter = scene.scene.pdf_emitter_direction(place, record, has_emitter)
+        emitted *= density / (density + of_emitter)
+        indirect = mi.Float(0.0)
+        if self.bounces > 1:
+            path = mi.load_dict(
+                {"type": "path", "max_depth": self.bounces, "rr_depth": 64, "hide_emitters": True}
+            )
+            found, _, _ = path.sample(
+                scene.scene, sampler, mi.RayDifferential3f(ray), None, hit.is_valid() & ~has_emitter
+            )
+            indirect = dr.select(hit.is_valid() & ~has_emitter, self.brightness(found), 0.0)
+        return dr.pi * self.entering(cosine) * (dr.select(has_emitter, emitted, 0.0) + indirect)
+
+    def by_emitters(self, place: Any, points: Any) -> Any:
+        """By samples of the emitters, with theirs."""
+        dr = self.scene.renderer.dr
+        towards, weight = self.scene.scene.sample_emitter_direction(place, points, True)
+        cosine = dr.dot(towards.d, place.n)
+        lit = (cosine > 0) & (towards.pdf > 0)
+        share = towards.pdf / (towards.pdf + cosine / dr.pi)
+        entering = self.entering(dr.maximum(cosine, 1e-6))
+        return dr.select(lit, self.brightness(weight) * cosine * entering * share, 0.0)
+
+    def brightness(self, value: Any) -> Any:
+        """Of unpolarized light: the first element of Mueller's matrix, mean over wavelengths."""
+        return self.scene.renderer.dr.mean(value[0, 0])
+
     def entering(self, cosine: Any) -> Any:
         """Transmittance of unpolarized light, over that at normal incidence."""
         mi, dr, ior = self.scene.renderer.mi, self.scene.renderer.dr, self.ior
@@ -121,6 +161,7 @@ class _Gathering:
 
 
 def _gather(light: _Gathering, points: Array, normals: Array, seed: int) -> Array:
+    """Irradiance (N,) at so many points as are looked at together."""
     scene, samples = light.scene, light.samples
     mi, dr = scene.renderer.mi, scene.renderer.dr
     num = len(points) * samples
@@ -134,10 +175,7 @@ def _gather(light: _Gathering, points: Array, normals: Array, seed: int) -> Arra
         columns = [mi.Float(np.ascontiguousarray(values[:, k], np.float32)) for k in range(3)]
         return mi.Vector3f(*(dr.gather(mi.Float, column, site) for column in columns))
 
-    normal = at_site(normals)
-    origin = mi.Point3f(at_site(points + offset * normals))
     shifts = np.random.default_rng(seed).uniform(size=(len(points), 4)).astype(np.float32)
-    frame = mi.Frame3f(normal)
 
     def stratified(first: int) -> Any:
         # Roberts' sequence: additive, of the plastic number.
@@ -148,42 +186,12 @@ def _gather(light: _Gathering, points: Array, normals: Array, seed: int) -> Arra
             values.append(value - dr.floor(value))
         return mi.Point2f(*values)
 
-    def brightness(value: Any) -> Any:
-        # Of unpolarized light: the first element of Mueller's matrix, its mean over wavelengths.
-        return dr.mean(value[0, 0])
-
-    # Samples of the hemisphere: light from surfaces, and that of the sky with its share.
-    local = mi.warp.square_to_cosine_hemisphere(stratified(0))
-    cosine = local.z
-    ray = mi.Ray3f(origin, frame.to_world(local))
+    place = dr.zeros(mi.Interaction3f, num)
+    place.n = at_site(normals)
+    place.p = mi.Point3f(at_site(points + offset * normals))
     if scene.description.colour:
-        ray.wavelengths = type(ray.wavelengths)(*SPREAD_NM)
-    hit = scene.scene.ray_intersect(ray)
-    density = cosine / dr.pi
-    emitter = hit.emitter(scene.scene)
-    has_emitter = dr.neq(emitter, None) if hasattr(dr, "neq") else emitter != None  # noqa: E711
-    start = dr.zeros(mi.Interaction3f, num)
-    start.p, start.n, start.wavelengths = origin, normal, ray.wavelengths
-    emitted = brightness(emitter.eval(hit, has_emitter))
-    record = mi.DirectionSample3f(scene.scene, hit, start)
-    of_emitter = scene.scene.pdf_emitter_direction(start, record, has_emitter)
-    emitted *= density / (density + of_emitter)
-    indirect = mi.Float(0.0)
-    if light.bounces > 1:
-        path = mi.load_dict(
-            {"type": "path", "max_depth": light.bounces, "rr_depth": 64, "hide_emitters": True}
-        )
-        found, _, _ = path.sample(
-            scene.scene, sampler, mi.RayDifferential3f(ray), None, hit.is_valid() & ~has_emitter
-        )
-        indirect = dr.select(hit.is_valid() & ~has_emitter, brightness(found), 0.0)
-    total = dr.pi * light.entering(cosine) * (dr.select(has_emitter, emitted, 0.0) + indirect)
-    # Samples of the emitters, with theirs.
-    towards, weight = scene.scene.sample_emitter_direction(start, stratified(2), True)
-    cosine = dr.dot(towards.d, normal)
-    lit = (cosine > 0) & (towards.pdf > 0)
-    share = towards.pdf / (towards.pdf + cosine / dr.pi)
-    direct = brightness(weight) * cosine * light.entering(dr.maximum(cosine, 1e-6)) * share
-    total += dr.select(lit, direct, 0.0)
+        place.wavelengths = type(place.wavelengths)(*SPREAD_NM)
+    total = light.by_hemisphere(place, stratified(0), sampler)
+    total += light.by_emitters(place, stratified(2))
     summed = dr.block_reduce(dr.ReduceOp.Add, total, samples)
     return np.asarray(summed, np.float64) / samples

@@ -9,13 +9,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Image
 from polmvs.errors import DataError, OptionError
 from polmvs.io.raw_formats import read_radiance
 from polmvs.simulation.options import LightingOptions, LightName
-
-Array = NDArray[np.float32]
 
 HEIGHT = 256  # rows of a preset's image, 0.7 degrees each
 RING_DIM = 0.05  # radiance of the room about a ring light
@@ -23,7 +21,7 @@ RING_DIM = 0.05  # radiance of the room about a ring light
 RING_RADII = (0.12, 0.2)
 
 
-def environment(options: LightingOptions) -> Array:
+def environment(options: LightingOptions) -> Image:
     """The light from infinity, (H, 2 H, 3) float32, radiance red, green, blue.
 
     Row r is at the elevation ``90 - 180 (r + 0.5) / H`` degrees, column c at the azimuth
@@ -52,7 +50,7 @@ def environment(options: LightingOptions) -> Array:
     return np.asarray(image if image.ndim == 3 else np.repeat(image[..., None], 3, -1), np.float32)
 
 
-def _directions() -> tuple[Array, Array]:
+def _directions() -> tuple[Image, Image]:
     """Elevation and azimuth, degrees, of a preset's pixels (H, 2 H)."""
     elevation = 90 - 180 * (np.arange(HEIGHT) + 0.5) / HEIGHT
     azimuth = 360 * (np.arange(2 * HEIGHT) + 0.5) / (2 * HEIGHT)
@@ -60,17 +58,17 @@ def _directions() -> tuple[Array, Array]:
     return np.asarray(grid[0], np.float32), np.asarray(grid[1], np.float32)
 
 
-def _even(elevation: Array, azimuth: Array) -> Array:
+def _even(elevation: Image, azimuth: Image) -> Image:
     return np.ones_like(elevation)
 
 
-def _overcast(elevation: Array, azimuth: Array) -> Array:
+def _overcast(elevation: Image, azimuth: Image) -> Image:
     """Moon and Spencer's sky: three times as bright above as at the horizon; a dim ground."""
     sky = (1 + 2 * np.sin(np.radians(elevation))) / 3
     return np.asarray(np.where(elevation > 0, sky, 0.15), np.float32)
 
 
-def _studio(elevation: Array, azimuth: Array) -> Array:
+def _studio(elevation: Image, azimuth: Image) -> Image:
     """A dim room with a bright ceiling, three lamps and two windows."""
     light = 0.12 + 0.25 * np.clip(elevation / 90, 0, 1)
     for center, up, across, along, radiance in (
@@ -84,20 +82,20 @@ def _studio(elevation: Array, azimuth: Array) -> Array:
     return np.asarray(np.where(elevation < 0, 0.08, light), np.float32)
 
 
-def _softbox(elevation: Array, azimuth: Array) -> Array:
+def _softbox(elevation: Image, azimuth: Image) -> Image:
     """One large softbox high at one side of a dark room."""
     box = _panel(elevation, azimuth, 60, 52, 60, 40)
     return np.asarray(np.maximum(0.06, 4.0 * box), np.float32)
 
 
-def _ring(elevation: Array, azimuth: Array) -> Array:
+def _ring(elevation: Image, azimuth: Image) -> Image:
     """The dim room about a ring light."""
     return np.full_like(elevation, RING_DIM)
 
 
 def _panel(
-    elevation: Array, azimuth: Array, center: float, up: float, across: float, along: float
-) -> Array:
+    elevation: Image, azimuth: Image, center: float, up: float, across: float, along: float
+) -> Image:
     """1 in a panel of these angular sides, degrees, 0 beside it, over a soft edge of 2 degrees."""
     turned = (azimuth - center + 180) % 360 - 180
     sideways = np.abs(turned) * np.cos(np.radians(elevation))
@@ -114,7 +112,7 @@ _PRESETS = {
 }
 
 
-def _with_contrast(image: Array, contrast: float) -> Array:
+def _with_contrast(image: Image, contrast: float) -> Image:
     """Radiances between the same brightest one and another darkest one, evenly in logarithms."""
     brightness = image if image.ndim == 2 else image.mean(axis=-1)
     floor = float(brightness.max()) * 1e-6
@@ -127,7 +125,7 @@ def _with_contrast(image: Array, contrast: float) -> Array:
     return np.asarray(image * (scale if image.ndim == 2 else scale[..., None]), np.float32)
 
 
-def _read(path: Path) -> Array:
+def _read(path: Path) -> Image:
     """An equirectangular image of a file, its first column along the world's x."""
     image = read_radiance(path)
     if image.shape[1] != 2 * image.shape[0] or image.shape[0] < 2:

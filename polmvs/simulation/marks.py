@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 
+from polmvs.arrays import Array
 from polmvs.errors import DataError
 from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
 from polmvs.io.plain_files import read_rows
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
-
-Array = NDArray[np.float64]
 
 PRINT_CELLS = 8  # along a mark's side
 CELL_TEXELS = 8

@@ -11,12 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.errors import OptionError
 from polmvs.simulation.options import MaterialName, Metal, ObjectOptions
-
-Array = NDArray[np.float64]
 
 # n and k at 550 nm, and the name that Mitsuba's table of spectra has of them.
 METALS = {

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
@@ -24,7 +25,6 @@ from polmvs.synthetic.shapes import named_shape, shape_names
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 DEFAULT_SIZE = 0.2  # metres
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.config import BayerOrder
 from polmvs.scene import View
 from polmvs.simulation.options import SensorKind, SensorOptions, Simulation
@@ -22,8 +23,6 @@ from polmvs.simulation.sensor import (
     vignette,
 )
 from polmvs.simulation.transport import RAYS, Lens, Samples, trace
-
-Array = NDArray[np.float64]
 
 BAND_ROWS = 128  # of samples at a time, where they need much memory
 # Gaussian responses of a colour sensor's filters: centre and standard deviation, nm. A guess at

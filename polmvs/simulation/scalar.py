@@ -11,8 +11,8 @@ import logging
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import sample_image
 from polmvs.errors import OptionError
 from polmvs.geometry import unit
@@ -23,7 +23,6 @@ from polmvs.simulation.transport import Lens
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 MAX_FILM = 8192  # px along a side
 

@@ -22,8 +22,6 @@ from polmvs.simulation.renderer_import import Renderer
 from polmvs.simulation.surroundings import Surrounding
 from polmvs.simulation.vertex_albedo import ATTRIBUTE, vertex_albedo
 
-Array = NDArray[np.float64]
-
 # Of the baked irradiance of a colour sensor, which is their mean: its own spectrum is the sky's.
 SPREAD_NM = (450.0, 520.0, 580.0, 640.0)
 RING_IRRADIANCE = 2.0  # at the camera's distance, facing it

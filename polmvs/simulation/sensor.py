@@ -14,13 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import Camera, pixel_centers
 from polmvs.geometry import unit
 from polmvs.polarization.mosaic import ANGLES_DEG
 from polmvs.simulation.options import Optics, SensorKind, SensorOptions
 from polmvs.synthetic.captures import add_noise, quantize
-
-Array = NDArray[np.float64]
 
 MOST_WELLS = 1e3  # of light on a sample: far over what it holds
 

@@ -14,14 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Image
 from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
 from polmvs.simulation.options import Scenery, SceneryOptions
 from polmvs.synthetic.printed import random_print
 from polmvs.synthetic.shapes import grid_triangles
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 # All lengths in sizes of the object.
 TABLE_SIDE = 5.0

@@ -16,11 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.geometry import RigidTransform
 from polmvs.simulation.scene import SPREAD_NM, MitsubaScene
-
-Array = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 STRATA = 4  # of a sample's area along each side; third differences need four
 MIN_CHUNK_RAYS = 1 << 15

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Mask
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.io.arrays import save_array
 from polmvs.io.ground_truth import write_true_maps, write_views
@@ -24,10 +25,7 @@ from polmvs.simulation.camera_model import pinhole_of
 from polmvs.simulation.picture import Picture
 from polmvs.simulation.scene import MitsubaScene
 
-Array = NDArray[np.float64]
-
 CAMERAS_FILE = "cameras.json"
-Mask = NDArray[np.bool_]
 
 SPECULAR, DIFFUSE = 255, 128
 

@@ -42,7 +42,7 @@ def test_trust_names_what_to_check(monkeypatch) -> None:
         sigma_share=1e-4,
     )
     monkeypatch.setattr(Record, "find", lambda self, kind, model: found)
-    given = type("Given", (), {"models": report.MAIN, "record": Record()})
+    given = type("Given", (), {"main": report.MAIN[0], "record": Record()})
     table = report.trust_table(given)
     odd = [row for row in table.rows if row[3]]
     assert [row[0] for row in odd] == ["views that agree with a point they see, %"]

@@ -15,12 +15,11 @@ the polarized intensity) first.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from polmvs.arrays import Array, Floats
 from polmvs.fitting import CAUCHY_SCALE, cauchy_weights
 from polmvs.normals.single_view.plane import (
     EXACT,
@@ -35,9 +34,6 @@ from polmvs.normals.single_view.plane import (
 )
 from polmvs.polarization.angle_models import correct_parameters, phase_sign, sigma_scale
 from polmvs.polarization.kinds import AngleModel, Light
-
-Floats: TypeAlias = NDArray[np.floating[Any]]
-Array: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

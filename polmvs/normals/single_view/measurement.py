@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Mask
 from polmvs.camera import PinholeCamera
 from polmvs.config import (
     CaptureOptions,
@@ -27,8 +27,6 @@ from polmvs.normals.single_view.pixels import PlaneView, load_stokes, polygon_ma
 from polmvs.normals.single_view.plane import PlaneEstimate
 from polmvs.polarization.kinds import FORMULAS, AngleModel, Light
 from polmvs.polarization.stokes import Stokes
-
-Mask = NDArray[np.bool_]
 
 MIN_PIXELS = 50
 

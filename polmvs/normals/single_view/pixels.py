@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Image, Mask
 from polmvs.camera import Camera, PinholeCamera, pixel_centers
 from polmvs.config import CaptureOptions
 from polmvs.normals.single_view.focal import FocalEstimate, estimate_focal
@@ -19,9 +19,6 @@ from polmvs.polarization.capture import open_image
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseTolerances
 from polmvs.polarization.stokes import Stokes
-
-Image = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 FOCAL_RANGE = (0.25, 6.0)  # tried focal lengths, image widths
 

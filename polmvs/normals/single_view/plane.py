@@ -21,18 +21,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats
 from polmvs.fitting import BEYOND_CHANCE, CAUCHY_SCALE, annealed_scales, robust_deviation
 from polmvs.normals.estimator import EstimatorTolerances, smallest_eigenvectors
 from polmvs.polarization.kinds import AngleModel
-
-Floats: TypeAlias = NDArray[np.floating[Any]]
-Array: TypeAlias = NDArray[np.float64]
-
 
 CHUNK = 8192  # pixels processed at a time: the temporaries stay in the cache
 TINY = 1e-12
@@ -176,9 +172,8 @@ def phase_residuals(angle_model: AngleModel, normal: Floats, axial: Floats, rays
 def _eigenvector(angle_model: AngleModel, samples: Floats) -> Array:
     """Eigenvector of the smallest eigenvalue of ``M^T M`` (paper, eq. coeff), ``(3,)``."""
     entries = row_products(samples)
-    if (
-        angle_model is AngleModel.OPA
-    ):  # no row has a z component: only the direction in the image counts
+    # Under OPA no row has a z component: only the direction in the image counts.
+    if angle_model is AngleModel.OPA:
         entries[2] = entries[:2].sum()
     return smallest_eigenvectors(entries[:, None])[1][:, 0]
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array, Floats, Mask
 from polmvs.normals.single_view.plane import (
     PlaneEstimate,
     PlaneTolerances,
@@ -26,10 +27,6 @@ from polmvs.normals.single_view.plane import (
 )
 from polmvs.polarization.angle_models import rows_from_axial
 from polmvs.polarization.kinds import AngleModel
-
-Floats: TypeAlias = NDArray[np.floating[Any]]
-Array: TypeAlias = NDArray[np.float64]
-Mask: TypeAlias = NDArray[np.bool_]
 
 BLOCK_PX = 4
 
