@@ -163,9 +163,9 @@ def find_cavities(
     if not len(surface.centers) or len(scene.maps) < MIN_VIEWS:
         return ()
     found: list[Cavity] = []
-    known = [_on_surface(cavity.rim, surface) for cavity in before]
-    for flat in [*known, *_flat_pieces(surface, tol, face_tol)]:
-        rim = _rim(surface, flat, scene, tol, face_tol)
+    planes = [*(cavity.rim for cavity in before), *_flat_pieces(surface, tol, face_tol)]
+    for plane in planes:
+        rim = _rim(surface, _on_surface(plane, surface), scene, tol, face_tol)
         if rim is None or any(_is_same(rim, other.rim, surface) for other in found):
             continue
         grid = _grid_about(surface, rim, tol)
@@ -219,7 +219,8 @@ def _rim(
 ) -> Face | None:
     """The plane turned to the normal that the phases of its faces have; None without an opening.
 
-    At an opening in a rim, some faces have phases, and others have none or contradicting ones.
+    At an opening in a rim, some faces are bright and have phases, and others are dark and have none
+    or contradicting ones. Beside the rim, dark ones may agree with its normal.
     """
     rows = scene.rows(surface.centers[flat.members])
     facing = -np.einsum("ikn,i->kn", rows.rays, flat.normal) > Looking.min_cosine
@@ -236,11 +237,12 @@ def _rim(
     losses = row_losses(rows, normal[:, None], face_tol)[0]
     losses = np.where(facing, losses, np.nan)
     has_phase = np.isfinite(losses).sum(axis=0) >= 0.5 * facing.sum(axis=0)
-    supported = has_phase & (median_loss(losses[:, None])[0] < MAX_COST)
+    places = surface.centers[flat.members]
+    bright = _is_bright(places, scene.maps, tol)
+    supported = bright & has_phase & (median_loss(losses[:, None])[0] < MAX_COST)
     share = float(supported.mean())
     if not tol.min_part <= share <= 1 - tol.min_part:
         return None
-    places = surface.centers[flat.members]
     tangents = np.linalg.svd(normal[None])[2][1:]
     x, y = tangents @ (places[supported] - np.median(places[~supported], axis=0)).T
     sectors = np.unique(np.floor((np.arctan2(y, x) / np.pi + 1) * 4).astype(np.int64) % 8)
@@ -336,6 +338,16 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: CavityTol
     """Whether half of points ``(N, 3)`` are much darker than a ring ``(R, 3)``."""
     dark = _brightness(inner, ring, maps) < tol.max_brightness
     return bool(len(dark) and dark.mean() > 0.5)
+
+
+def _is_bright(places: Array, maps: Sequence[PhaseMap], tol: CavityTolerances) -> Mask:
+    """Which faces ``(N, 3)`` of a plane are not much darker than its brightest ones.
+
+    As many are the brightest as a rim has at least.
+    """
+    among_all = np.nan_to_num(_brightness(places, places, maps))
+    brightest = among_all >= np.quantile(among_all, 1 - tol.min_part)
+    return np.asarray(_brightness(places, places[brightest], maps) > tol.max_brightness)
 
 
 def _brightness(points: Array, ring: Array, maps: Sequence[PhaseMap]) -> Array:
