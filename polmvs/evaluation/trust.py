@@ -214,12 +214,12 @@ class Trust:
             yield _figure(name, self.fitted.unexplained, ranges.unexplained, LIGHT_OPTIONS)
         if self.soundness is not None:
             views = "views that contradict each other: poses, `region.mask`"
-            name = "lines of sight through two sheets of surface upon each other, %"
+            name = "lines of sight through a double layer of the surface, %"
             yield _figure(name, self.soundness.layered, ranges.layered, views)
             name = "lines of sight through a surface that intersects itself, %"
             yield _figure(name, self.soundness.overlapping, ranges.overlapping, views)
         if self.num_views:
-            name = "views without a pose or that contradict the others, %"
+            name = "views without a pose or inconsistent, %"
             remedy = "the images of these views, `sfm.intrinsics`, `region.mask`"
             yield _figure(name, self.left_out / self.num_views, ranges.left_out, remedy)
         if self.cut_share is not None:
@@ -241,7 +241,7 @@ class Trust:
         yield _figure(name, self.agreement, ranges.agreement, remedy)
         name = "points within the silhouettes of the views, %"
         yield _figure(name, self.inside, ranges.inside, "`region.mask`, poses")
-        name = "part of the polarized regions determined, %"
+        name = "coverage of the polarized regions, %"
         remedy = "marks on the part; more views"
         yield _figure(name, self.determined, ranges.determined, remedy, decides=False)
         name = "position uncertainty (1 sigma), median, % of the distance"

@@ -1,8 +1,8 @@
-"""What the page's figures mean, one line each, for readers to whom the field's words are new."""
+"""Meaning of the page's numbers, one line each, for readers who are new to the field."""
 
 from __future__ import annotations
 
-# By the beginning of a figure's name; the longest that fits counts.
+# By the beginning of a number's name; the longest match is used.
 _MEANINGS = {
     # models
     "OPA": "Orthographic phase angle: the older model, which takes all rays of the camera as "
@@ -55,11 +55,11 @@ _MEANINGS = {
     "stated with.",
     "views that agree": "Of all views that see a point, the share that agree with its place and "
     "normal.",
-    "points within the silhouettes": "Share of the points that fall inside the outline of the part "
+    "points within the silhouettes": "Share of the points that are inside the outline of the part "
     "in the views that see them.",
-    "part of the polarized regions": "Share of the polarized pixels that the surface explains.",
-    "position uncertainty (1 sigma)": "How uncertain places are by their own statement, as a share "
-    "of their distance.",
+    "coverage of the polarized regions": "Share of the polarized pixels that the surface explains.",
+    "position uncertainty (1 sigma)": "Stated standard deviation of a point along its normal, as a "
+    "share of its distance.",
     # deviation
     "compared points": "Points of the part that were compared with the reference.",
     "mean": "Of the signed distances: positive is outside the reference.",
@@ -83,6 +83,6 @@ _MEANINGS = {
 
 
 def meaning(name: str) -> str:
-    """A line on what a figure means; "" where none is written."""
+    """The meaning of a number, one line; "" if unknown."""
     fitting = [known for known in _MEANINGS if name.startswith(known)]
     return _MEANINGS[max(fitting, key=len)] if fitting else ""

@@ -73,7 +73,7 @@ logger = logging.getLogger(__name__)
 
 MAX_POINTS = 150_000  # of each cloud on the page: two clouds turn smoothly, and 2 MB each
 ANGLE_BINS_DEG = np.arange(0.0, 91.0, 5.0)
-# Rows of the comparison that tell the models apart at a glance.
+# Rows of the comparison that best show the difference of the models.
 HEADLINE = (
     "coverage, %",
     "phase residual over all views, RMSE / median, deg",
@@ -85,9 +85,9 @@ HEADLINE = (
 # Colour scales that end where 95 % of the worst layer's values do, and at most here.
 ADAPTED = {"residual": MAX_ERROR_DEG, "normal_error": MAX_ERROR_DEG, "error": 1e3 * MAX_ERROR_M}
 SIZE_PERCENTILES = (0.5, 99.5)
-MIN_SIZED = 100  # points for a size to be told
-SIZED = 5000  # points that a size is told from: its ends err by some of their spacings
-# Who stands for the run, and for OPA, in order: people know OPA as the paper has it.
+MIN_SIZED = 100  # least number of points for a size
+SIZED = 5000  # points for a size: its ends are exact to some of their spacings
+# Models that represent the run, and OPA, in order of preference: OPA is best known as published.
 MAIN = (
     AngleModel.PPA,
     AngleModel.TILTED,
@@ -104,8 +104,8 @@ class ReportInput:
 
     Attributes
     ----------
-    models : those that have a cloud with points, OPA first.
-    capture : None where it is gone or has changed.
+    models : those with points, OPA first.
+    capture : None if it is missing or has changed.
     truth : with ``truth_from_world``; None without ground truth.
     """
 
@@ -122,7 +122,7 @@ class ReportInput:
 
     @property
     def main(self) -> AngleModel:
-        """Who stands for the run."""
+        """The model that represents the run."""
         return next(model for model in MAIN if model in self.models)
 
     @property
@@ -132,14 +132,14 @@ class ReportInput:
 
     @property
     def length(self) -> DisplayUnit:
-        """In which lengths are shown; the truth is metric, and so is the scale that it gives."""
+        """Unit of the shown lengths; with ground truth the scale is metric."""
         if self.truth is not None:
             return DisplayUnit("mm", 1e3 * self.truth[1].scale)
         return DisplayUnit("mm", 1e3) if self.is_metric else DisplayUnit("model units")
 
 
 def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress) -> Path:
-    """Make the report of a run, again if there is one.
+    """Write the report of a run; an existing one is replaced.
 
     Parameters
     ----------
@@ -292,7 +292,7 @@ def _mesh_of(given: ReportInput, model: AngleModel) -> Mesh | None:
 
 
 def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColoring]]:
-    """Clouds and meshes of all models, and what they can be coloured by."""
+    """Clouds and meshes of all models, and the quantities for their colours."""
     sigmas = [
         np.asarray(cloud.scalars["sigma"])[cloud.are(PointKind.SURFACE)]
         for cloud in given.clouds.values()
@@ -602,7 +602,7 @@ def _uncertainty_words(given: ReportInput) -> list[str]:
 
 
 def warnings_of(given: ReportInput) -> tuple[str, ...]:
-    """Those of the run, and of what stands beside it."""
+    """Warnings of the run, and of its comparison with a reference."""
     warnings = [w for stage in given.record.stages for w in stage.warnings]
     if given.deviation is not None and given.deviation.is_stale:
         warnings.append(
@@ -656,7 +656,7 @@ def _verdict(given: ReportInput) -> list[str]:
 
 
 def trust_table(given: ReportInput) -> Table | None:
-    """What the main result says about itself, with what is normal."""
+    """Quality checks of the main result, with their ranges."""
     main = next(m for m in MAIN if m in given.models)
     found = given.record.find(Trust, main)
     if found is None:
