@@ -90,7 +90,7 @@ FINEST_SPACING_PX = (
 
 @dataclass(frozen=True, kw_only=True)
 class DensifyResult:
-    """What the stage found.
+    """Result of the stage.
 
     Attributes
     ----------
