@@ -684,7 +684,7 @@ def _plots(given: ReportInput, samples: Mapping[AngleModel, ErrorSamples]) -> li
         Plot(
             svg=plots.error_curves(residual, "deg", "residual phase"),
             caption="Angle between the measured phase and that of the surface found, at pixels of "
-            "all views. No truth is needed for it.",
+            "all views. It needs no ground truth.",
             wide=True,
         ),
         Plot(
