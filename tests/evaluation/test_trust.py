@@ -164,7 +164,7 @@ def test_a_right_result_says_why_it_is_to_be_trusted():
         ({"predicted": replace(PREDICTED, num_phases=20)}, "median error.* unknown"),
         ({"predicted": replace(PREDICTED, overlap=0.7)}, "silhouettes of views left out.* 70 "),
         ({"fitted": replace(PREDICTED, unexplained=0.5)}, "neither kind of light explains.* 50 "),
-        ({"soundness": Soundness(layered=0.2, overlapping=0.0)}, "two sheets.* 20 "),
+        ({"soundness": Soundness(layered=0.2, overlapping=0.0)}, "double layer.* 20 "),
         ({"soundness": Soundness(layered=0.0, overlapping=0.1)}, "intersects itself.* 10 "),
         ({"left_out": 5}, "a pose or inconsistent, %: 41.7 "),
         ({"num_views": 3}, "3 views leave none to check"),
