@@ -1,7 +1,7 @@
 """COLMAP's models, maps and workspaces: the only importer of pycolmap.
 
-When pycolmap is imported, COLMAP's log takes SIGTERM, and prints a native stack trace where a
-process is told to end. Here it is imported first and the signal given back, in every process.
+When pycolmap is imported, COLMAP's log installs a handler of SIGTERM that prints a native stack
+trace. Here pycolmap is imported first and the former handler is restored, in every process.
 """
 
 import signal
@@ -11,6 +11,6 @@ _before = signal.getsignal(signal.SIGTERM)
 
 import pycolmap  # noqa: E402, F401
 
-# The handler is None where something that is not Python's had the signal before.
+# The handler is None if it was not installed from Python.
 if _before is not None and threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGTERM, _before)

@@ -1,8 +1,8 @@
 """Posed images for other programs: nerfstudio, gsplat, NeuS, IDR, Metashape, RealityScan, Bundler.
 
-All are of the undistorted images of a dense workspace, so that every camera is a pinhole without
-distortion. Each function fills an empty folder. Pixels count from the corner of the first (COLMAP,
-nerfstudio, Metashape) or from its centre (NeuS), axes are x right, y down, z forward but where a
+All formats use the undistorted images of a dense workspace, so every camera is a pinhole without
+distortion. Each function fills an empty folder. The pixel origin is the corner of the first pixel
+(COLMAP, nerfstudio, Metashape) or its centre (NeuS). Axes are x right, y down, z forward unless a
 format has others.
 """
 
@@ -29,23 +29,23 @@ from polmvs.io.typed_json import write_json
 from polmvs.scene import View, stem_of
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes x right, y up, z backwards
-# nerfstudio multiplies depths by 0.001 where nothing else is set, so that they are written in
-# thousandths of the model's unit.
+# nerfstudio multiplies depths by 0.001 by default, so they are written in thousandths of the
+# model's unit.
 DEPTH_FACTOR = 1000.0
-FULL_FRAME_MM = 36.0  # width of the film that RealityScan's focal lengths are of
-SPHERE_MARGIN = 1.1  # of the sphere that NeuS trains in, over the part's radius
+FULL_FRAME_MM = 36.0  # film width of RealityScan's focal lengths
+SPHERE_MARGIN = 1.1  # radius of the sphere of NeuS over the part's radius
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraExport:
-    """What is exported.
+    """Data for an export of posed images.
 
     Attributes
     ----------
     workspace : images, cameras, depth and normals, sparse points.
-    cloud : dense, the start of a splatting.
-    mask : gives where the part is in a view, (H, W).
-    part : (N, 3) points of the part alone, for its place and size.
+    cloud : dense cloud, the start of splatting.
+    mask : gives the mask (H, W) of the part in a view.
+    part : (N, 3) points of the part, for its position and size.
     """
 
     workspace: DenseWorkspace
@@ -102,7 +102,7 @@ def _nerfstudio_camera(camera: PinholeCamera) -> dict[str, Any]:
 def write_neus(export: CameraExport, folder: Path) -> None:
     """``image/ mask/`` and ``cameras_sphere.npz``, also as ``cameras.npz``, of NeuS and IDR.
 
-    ``scale_mat`` brings the unit sphere about the part to the model's world.
+    ``scale_mat`` transforms the unit sphere about the part to the model's world.
     """
     (folder / "image").mkdir()
     (folder / "mask").mkdir()

@@ -1,10 +1,11 @@
 """Uncertainty of estimated cameras and poses.
 
-Few views fix a camera badly, and an error of its focal length or principal point bends the whole
-model while every image fits. Bundle adjustment's covariance says how well each combination of the
-camera's parameters is known. The model is adjusted anew with the camera moved by one standard
-deviation along each of them: how its points move then is a *mode*, and the modes' squares add up to
-the variance of any place. That of the poses is what is left once the cameras' centres are aligned.
+Few views determine a camera badly, and an error of its focal length or principal point bends the
+whole model although every image fits. The covariance of bundle adjustment gives the deviation of
+independent combinations of the camera's parameters. The model is adjusted again with the camera
+changed by one standard deviation along each of them. The displacement of its points is a *mode*,
+and the squares of the modes add up to the variance at any point. The covariance of the poses is
+taken after an alignment of the camera centres.
 """
 
 from __future__ import annotations
@@ -29,19 +30,19 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class CameraTolerances:
-    """What the camera's uncertainty is made of.
+    """Tolerances of the camera's uncertainty.
 
     Attributes
     ----------
-    principal_point_sigma : of a lens, from the image's centre, share of the image's width: what is
-        known of it where it is not estimated. Guess; sensors are mounted to about 1 %.
-    min_residual_px : of a keypoint's coordinate, where the residual is less: that which the points'
-        own deviations are made of. Features near each other err alike, which residuals hide.
-        Measured: cameras of five captures err by 1.8 times what residuals of 0.17 px say (RMS of 12
-        parameters, from five views each), of ``demo`` with ten views by 4 times.
+    principal_point_sigma : of a lens, from the image's centre, share of the image's width, if it is
+        not estimated. Guess; sensors are mounted to about 1 %.
+    min_residual_px : least deviation of a keypoint's coordinate, as for the points' own deviations.
+        Errors of nearby features are correlated, which residuals do not show. Measured: errors of
+        the cameras of five captures are 1.8 times those from residuals of 0.17 px (RMS of 12
+        parameters, from five views each), of ``demo`` with ten views 4 times.
     loss_scale_px : of the adjustment's Cauchy loss. Derived: that of SfM's last one.
-    max_views : of a model that is looked at: each mode costs an adjustment, and the camera of so
-        many views is known. Guess.
+    max_views : of a model: each mode costs an adjustment, and the camera of so many views is well
+        known. Guess.
     """
 
     principal_point_sigma: float = 0.01
@@ -52,13 +53,13 @@ class CameraTolerances:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraUncertainty:
-    """How an estimated camera may err.
+    """Uncertainty of an estimated camera.
 
     Attributes
     ----------
-    focal : standard deviation of the focal length as a share of it.
-    modes : (K, T, 3) float64, what each uncertain combination of the parameters moves the sparse
-        points by, in the order of their ids, world; the cameras' centres stay.
+    focal : relative standard deviation of the focal length.
+    modes : (K, T, 3) float64, displacement of the sparse points by each uncertain combination of
+        the parameters, in the order of their ids, world; the cameras' centres stay.
     """
 
     focal: float
@@ -76,8 +77,8 @@ def camera_uncertainty(
 
     Returns
     -------
-    None where there are several cameras, too many views, or the covariance cannot be had: a model
-    of three or more views whose camera is not fixed at all has none.
+    None if there are several cameras, too many views, or no covariance, such as for a model of
+    three or more views that do not determine the camera.
     """
     reconstruction = read_reconstruction(model)
     if len(reconstruction.cameras) != 1 or reconstruction.num_reg_images() > tolerances.max_views:
@@ -111,7 +112,7 @@ def camera_uncertainty(
 def pose_uncertainty(
     model: Path, *, tolerances: CameraTolerances = CameraTolerances()
 ) -> Array | None:
-    """Covariances of the poses that bundle adjustment estimated, with the camera as it is.
+    """Covariances of the poses that bundle adjustment estimated, with a fixed camera.
 
     Parameters
     ----------
@@ -119,9 +120,9 @@ def pose_uncertainty(
 
     Returns
     -------
-    (V, 6, 6) of the views sorted by name: of a small turn of the camera about the world's axes,
-    radians, and of its centre, world units, where the centres of all are aligned by a similarity.
-    None where there are too many views, or no covariance can be had.
+    (V, 6, 6) of the views sorted by name: of a small rotation of the camera about the world's axes,
+    radians, and of its centre, world units, after all centres are aligned by a similarity. None if
+    there are too many views, or no covariance.
     """
     reconstruction = read_reconstruction(model)
     if reconstruction.num_reg_images() > tolerances.max_views:

@@ -1,6 +1,6 @@
-"""COLMAP's cameras as this package's, and its log.
+"""Conversion of COLMAP's cameras, and its log level.
 
-The rest of the package sees :class:`polmvs.camera.Camera` and no type of pycolmap.
+The rest of the package uses :class:`polmvs.camera.Camera` and no type of pycolmap.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from polmvs.arrays import Array
 from polmvs.camera import Camera, PinholeCamera
 
-# Models that are a pinhole camera where all their distortion is zero. Fisheye models are not.
+# Models that are pinhole cameras if all their distortion is zero. Fisheye models are not.
 PERSPECTIVE_MODELS = frozenset(
     {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 )
@@ -29,7 +29,7 @@ BORDER_SAMPLES = 64  # along each side of the image
 
 @contextmanager
 def quiet_colmap() -> Iterator[None]:
-    """Keep COLMAP's own log to fatal errors meanwhile: it prints every step by default."""
+    """Limit COLMAP's log to fatal errors in this block: it prints every step by default."""
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     try:
@@ -62,7 +62,7 @@ class ColmapCamera:
     def rays(self, xy: NDArray[np.floating]) -> Array:
         """Unit rays ``(..., 3)`` in the camera frame of image coordinates ``(..., 2)``.
 
-        NaN where the distortion has no inverse and for pixels that look sideways or backwards.
+        NaN where the distortion has no inverse and for rays that point sideways or backwards.
         """
         xy = np.asarray(xy, np.float64)
         camera = _pycolmap_camera(self)
@@ -79,7 +79,7 @@ class ColmapCamera:
     def project(self, points_in_cam: NDArray[np.floating]) -> NDArray[np.floating]:
         """Image coordinates ``(..., 2)`` of camera-frame points.
 
-        NaN behind the camera and more than 5 % further from the axis than the widest ray.
+        NaN behind the camera and more than 5 % farther from the axis than the widest ray.
         """
         points = np.asarray(points_in_cam, np.float64)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
@@ -125,7 +125,7 @@ def _widest_angle(camera: ColmapCamera) -> float:
 
 
 def camera_from_colmap(camera: pycolmap.Camera) -> Camera:
-    """A ``pycolmap.Camera`` as this package's; the fast pinhole where it is one."""
+    """A ``pycolmap.Camera`` as a camera of this package; the fast pinhole if it is one."""
     model = str(camera.model_name)
     if model in PERSPECTIVE_MODELS and camera.is_undistorted():
         return PinholeCamera(

@@ -1,9 +1,9 @@
-"""Pairs of images whose matches a known camera rules out.
+"""Pairs of images whose matches contradict a known camera.
 
-COLMAP verifies the matches of a pair by the epipolar geometry of its calibrated cameras, of any
-cameras, and of a plane. Matches that fit any cameras clearly better than the given ones are mostly
-those of two things that look alike: of a textured table after a turn, say. The mapper takes them as
-they are, and places a view wrongly by them.
+COLMAP verifies the matches of a pair by the epipolar geometry of calibrated cameras, of
+uncalibrated cameras, and of a plane. Matches that fit uncalibrated cameras clearly better than the
+given ones are mostly between two things that look alike, such as parts of a textured table. The
+mapper would use them and give a view a wrong pose.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import pycolmap
 
 from polmvs.colmap.database import opened
 
-# Of the verified pairs. If more contradict the camera, it is the camera that is wrong: then the
-# pairs stay, and the trial adjustment names the camera.
+# Of the verified pairs. If more contradict the camera, the camera is wrong: then the pairs are
+# kept, and the trial adjustment names the camera.
 MAX_SHARE = 0.5
 # Of images that this is done for. A guess: where each has many pairs, the others outvote a wrong
 # one, and contradicting pairs hold good matches too. Measured: of six images of a mug two choices
@@ -25,12 +25,12 @@ MAX_IMAGES = 8
 
 
 def drop_contradicting(database: Path) -> int:
-    """Take pairs that fit no geometry of their known cameras out of a database.
+    """Remove pairs that fit no geometry of their known cameras from a database.
 
     Returns
     -------
-    Their number; 0 where so many contradict the cameras that these are wrong, and where images
-    are many.
+    Their number; 0 if so many contradict the cameras that the cameras are wrong, and if there are
+    many images.
     """
     with opened(database) as content:
         numbers = sorted(image.image_id for image in content.read_all_images())

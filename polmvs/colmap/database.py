@@ -1,6 +1,6 @@
-"""COLMAP databases: a user's is checked and copied, never opened for writing.
+"""COLMAP databases: a user's database is checked and copied, never opened for writing.
 
-A faulty database makes COLMAP stop the process, so that it is read with SQLite itself first.
+A faulty database makes COLMAP end the process, so it is read with SQLite first.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ REMEDY = "Make it again with COLMAP, or leave `sfm.database` out."
 
 @dataclass(frozen=True, kw_only=True)
 class GivenDatabase:
-    """What a user's database holds of a capture.
+    """Content of a user's database for a capture.
 
     Attributes
     ----------
     path : of the database.
-    ids : its number of each image that it has, by the capture's name.
-    num_cameras : that these images have.
+    ids : its ids of the images that it has, by the capture's name.
+    num_cameras : number of cameras of these images.
     has_matches : whether any two images are matched and verified.
     """
 
@@ -51,7 +51,7 @@ class GivenDatabase:
 
 
 class NoRoomError(PolmvsError):
-    """A database cannot be written where there should be room for it."""
+    """A database cannot be written, such as on a full disk."""
 
 
 def check_database(path: Path, names: Sequence[str], width: int, height: int) -> GivenDatabase:
@@ -66,7 +66,7 @@ def check_database(path: Path, names: Sequence[str], width: int, height: int) ->
     Raises
     ------
     DataError
-        It is missing, damaged, no database of COLMAP, of other images or of another size.
+        It is missing, damaged, not a COLMAP database, of other images or of another size.
     """
     if not path.is_file():
         raise DataError(path, "no such file. `sfm.database` takes a COLMAP database.")
@@ -76,7 +76,7 @@ def check_database(path: Path, names: Sequence[str], width: int, height: int) ->
 
 @contextmanager
 def sound(path: Path) -> Iterator[None]:
-    """Faults that SQLite and COLMAP find in a database meanwhile are errors that name it."""
+    """Turn errors of SQLite and COLMAP in this block into errors that name the database."""
     try:
         yield
     except (sqlite3.Error, ValueError, RuntimeError) as error:
@@ -96,9 +96,9 @@ def _room() -> Iterator[None]:
 
 
 def copy_database(given: GivenDatabase, target: Path) -> None:
-    """A copy in a new file, whose images carry the capture's names.
+    """A copy in a new file, with the capture's names of the images.
 
-    Images that are none of the capture's stay in it, named by their numbers.
+    Images that are not of the capture stay in it, named by their ids.
 
     Raises
     ------
@@ -123,26 +123,26 @@ def match_pairs(
     guided: bool = False,
     learned: LearnedFeatures | None = None,
 ) -> None:
-    """Match pairs of images and verify them; those that the database has matched already stay.
+    """Match pairs of images and verify them; existing matches of the database are kept.
 
-    Cores are used by processes, with a copy of the database each. Two threads that search COLMAP's
-    indices of descriptors disturb each other: about once in 600 times ten images matched in pairs
-    had other matches, whatever the number of threads of OpenMP and OpenBLAS; with one thread never
-    in 3,000.
+    Each core has a process with a copy of the database. Two threads that search COLMAP's indices of
+    descriptors disturb each other. Measured: about once in 600 times, ten images matched in pairs
+    have other matches, for any number of threads of OpenMP and OpenBLAS; with one thread never in
+    3,000.
 
     Parameters
     ----------
     pairs : of names of images.
     seed : of the verification.
-    guided : look for more matches along the geometry that the first ones give.
-    learned : by which the features were extracted; None: SIFT.
+    guided : find more matches along the geometry of the first ones.
+    learned : extractor of the features; None: SIFT.
 
     Raises
     ------
     NoRoomError
         A copy cannot be written.
     CrashError
-        COLMAP ends a process, as where its database cannot be written.
+        COLMAP ends a process, such as when its database cannot be written.
     """
     # COLMAP's lists of pairs are split at blanks, which names may have.
     numbers = image_numbers(database)

@@ -2,8 +2,8 @@
 
 ``images/``, ``sparse/`` (pinhole cameras), ``stereo/depth_maps/``, ``stereo/normal_maps/`` with
 ``<image>.geometric.bin`` or ``<image>.photometric.bin``, ``stereo/fusion.cfg`` and
-``stereo/patch-match.cfg``. COLMAP's fusion and its GUI read it, and OpenMVS. A workspace that a
-user gives must belong to the capture: the same frame, the same images.
+``stereo/patch-match.cfg``. COLMAP's fusion, its GUI and OpenMVS read it. A workspace from a user
+must belong to the capture: it must have the same frame and images.
 """
 
 from __future__ import annotations
@@ -56,22 +56,21 @@ NUM_SOURCES = 20  # as many as COLMAP's own undistorter asks for
 
 @dataclass(frozen=True, kw_only=True)
 class MatchTolerances:
-    """When a workspace is of the same frame and images as a capture.
+    """Tolerances of the frame and the images of a workspace.
 
     Attributes
     ----------
-    max_pose_error_px : by which a pose may move a point of the scene; derived: depth cannot tell
-        poses apart by less than a keypoint errs, and models that went through text files differ by
-        their rounding.
-    min_correlation : of the local contrast of two images; derived: from here each explains half
-        of the other one's variance. Images of other things explain nothing, the same image nearly
-        all, whatever its exposure.
+    max_pose_error_px : displacement of a point of the scene by a pose difference; derived: the
+        error of a keypoint, and the rounding of models in text files.
+    min_correlation : of the local contrast of two images; derived: each then explains half of the
+        variance of the other. Images of different scenes explain nothing, the same image nearly
+        all, at any exposure.
     max_compared_px : longest side of the compared images; a guess, bounds the time.
     max_compared_views : spread over the workspace; a guess, bounds the time.
-    fine_sigma_px, coarse_sigma_px : band of the contrast, compared pixels; a guess, from what the
-        shrinking leaves to a thirtieth of the image.
-    dark_level : grey levels added before the logarithm; a guess: under it lies noise, and what
-        gamma curves treat differently.
+    fine_sigma_px, coarse_sigma_px : band of the contrast, compared pixels; a guess: from the
+        resolution of the reduced image to a thirtieth of the image.
+    dark_level : grey levels added before the logarithm; a guess: below it are noise and differences
+        of gamma curves.
     min_common_share : of the compared image that both must show; a guess.
     """
 
@@ -93,8 +92,7 @@ class WorkspaceView:
     ----------
     view : name, undistorted camera and pose.
     image : undistorted image.
-    depth, normals : map files of one kind, geometric if there are such; None where either map
-        is missing.
+    depth, normals : map files of one kind, geometric if available; None if either map is missing.
     """
 
     view: View
@@ -109,7 +107,7 @@ class WorkspaceView:
         return self.view.camera
 
     def load_maps(self) -> DepthNormals | None:
-        """Depth and normals in the camera frame, None where the view has none.
+        """Depth and normals in the camera frame; None if the view has none.
 
         Raises
         ------
@@ -127,7 +125,7 @@ class WorkspaceView:
         Raises
         ------
         DataError
-            It is no image or of another size than the camera.
+            The file is not an image or has another size than the camera.
         """
         gray = read_gray(self.image)
         if gray.shape != (self.camera.height, self.camera.width):
@@ -161,9 +159,9 @@ class DenseWorkspace:
 
 
 def open_dense_workspace(folder: PathArg) -> DenseWorkspace:
-    """Open a dense workspace of COLMAP's or ours, and check what can be checked without loading.
+    """Open a dense workspace and check it without loading the maps.
 
-    Views without maps are fine.
+    Views without maps are allowed.
 
     Raises
     ------
@@ -255,7 +253,7 @@ def write_dense_workspace(
 
 
 def source_order(sparse_model: SparseModel) -> list[list[int]]:
-    """For each view the other views, by shared sparse points and then by nearness."""
+    """For each view the other views, by common sparse points and then by distance."""
     tracks, num_views = sparse_model.tracks, len(sparse_model.views)
     seen = sparse.csr_matrix(
         (np.ones(len(tracks.obs_view)), (tracks.obs_view, tracks.obs_track)),
@@ -285,9 +283,9 @@ def _patch_match_lines(sparse_model: SparseModel) -> list[str]:
 
 
 def member(folder: Path, name: str) -> Path:
-    """A file in a folder by an image's name, which may have sub-folders.
+    """Path of an image's file in a folder; the name may have sub-folders.
 
-    Names come with a model that may be a stranger's: they must not lead out of the folder.
+    Names come with a model from any source, so they must not lead out of the folder.
     """
     relative = PurePosixPath(name)
     if relative.is_absolute() or ".." in relative.parts or not relative.parts:
@@ -316,7 +314,7 @@ def write_lines(path: Path, lines: Sequence[str]) -> None:
 
 
 class CommonView(NamedTuple):
-    """A view of the workspace and the same of the capture's model."""
+    """A view of the workspace and the same view of the capture's model."""
 
     item: WorkspaceView
     view: View
@@ -346,16 +344,16 @@ def require_same_frame(
     *,
     tolerances: MatchTolerances = MatchTolerances(),
 ) -> None:
-    """Refuse a workspace whose poses are not those of the capture's model.
+    """Refuse a workspace whose poses differ from those of the capture's model.
 
-    Views of the same name must agree in centre and rotation so well that a point at the scene's
-    distance moves by less than ``max_pose_error_px`` in the workspace's image.
+    Views of the same name must agree in centre and rotation: a point at the scene's distance must
+    move by less than ``max_pose_error_px`` in the workspace's image.
 
     Raises
     ------
     DataError
-        They differ, or no view is common. The message names the worst view, and says whether the
-        two agree after a similarity.
+        They differ, or there is no common view. The message names the worst view, and says whether
+        the two agree after a similarity.
     """
     pairs = common_views(workspace, sparse_model)
     distances = _scene_distances(pairs, workspace)
@@ -432,10 +430,10 @@ def require_matching_images(
     *,
     tolerances: MatchTolerances = MatchTolerances(),
 ) -> float:
-    """Refuse a workspace whose undistorted images do not show what the capture shows.
+    """Refuse a workspace whose undistorted images differ from those of the capture.
 
-    The capture's intensity images are warped to the workspace's cameras, whatever their size, and
-    the local contrast of both is compared, over a few views.
+    The capture's intensity images are warped to the workspace's cameras, of any size, and the local
+    contrast of both is compared in a few views.
 
     Parameters
     ----------
@@ -449,7 +447,7 @@ def require_matching_images(
     Raises
     ------
     DataError
-        An image does not match, or no view is common.
+        An image does not match, or there is no common view.
     """
     pairs = common_views(workspace, sparse_model)
     step = -(-len(pairs) // tolerances.max_compared_views)
@@ -480,8 +478,8 @@ def image_correlation(
 ) -> float:
     """Correlation of the local contrast of an undistorted image and one of the sensor.
 
-    In the logarithm of the image a gamma is a factor and an exposure an offset; a band of it is
-    blind to both.
+    In the logarithm of the image, a gamma is a factor and an exposure an offset; a band-passed
+    image is independent of both.
 
     Parameters
     ----------

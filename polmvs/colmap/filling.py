@@ -1,8 +1,8 @@
-"""Fill the holes of a dense workspace that COLMAP made, in a new folder or in place.
+"""Fill the holes of a dense workspace from COLMAP, in a new folder or in place.
 
-COLMAP's own depth is kept as it is. It was found with images whose pixels lie half a pixel from
-where its stereo takes them to be (see :mod:`polmvs.colmap.maps`), so that its part of a fused
-cloud lies about half a pixel beside the sparse points; what fills the holes does not.
+COLMAP's own depth is kept. Its stereo uses another pixel origin than its cameras (see
+:mod:`polmvs.colmap.maps`), so its part of a fused cloud is shifted by about half a pixel against
+the sparse points. The fill is not.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ BACKUP = "stereo.polmvs-backup"
 
 
 def fill_maps(own: DepthNormals | None, fill: DepthNormals) -> DepthNormals:
-    """Maps with the holes of one's own filled: where its depth is positive it is kept.
+    """Maps with their holes filled; positive depth is kept.
 
     Parameters
     ----------
@@ -64,30 +64,30 @@ def fill_workspace(
     *,
     in_place: bool = False,
 ) -> Path | None:
-    """Put depth and normals into a workspace where it has none.
+    """Add depth and normals to a workspace where it has none.
 
-    The result has geometric maps of every view that had maps of either kind or has a fill, and
-    all of them are in its ``fusion.cfg``, so that one fusion uses both. Clouds and meshes made of
-    the old maps are not copied.
+    The result has geometric maps of every view that had maps of either kind or has a fill. All of
+    them are in its ``fusion.cfg``, so one fusion uses both. Clouds and meshes from the old maps are
+    not copied.
 
     Parameters
     ----------
     source : the workspace; not modified unless ``in_place``.
     target : folder of the new workspace, which may exist if it is empty; None with ``in_place``.
     load_fill : gives a view's depth and normals by name.
-    in_place : change the source itself. Every file that is replaced goes into
-        ``stereo.polmvs-backup-<n>/`` first; after a failure all is as it was.
+    in_place : change the source itself. Every replaced file is first moved to
+        ``stereo.polmvs-backup-<n>/``; after a failure the former state is restored.
 
     Returns
     -------
-    The folder of the backup, None where a new workspace was written.
+    The folder of the backup; None if a new workspace was written.
 
     Raises
     ------
     DataError
         A map is damaged, or the system refuses.
     OptionError
-        Both or neither of ``target`` and ``in_place``, or the target lies in the source.
+        Both or neither of ``target`` and ``in_place``, or the target is inside the source.
     """
     if in_place != (target is None):
         raise OptionError("Filling a workspace needs a new folder or in_place, and not both.")

@@ -1,6 +1,6 @@
 """Learned features, ALIKED matched by LightGlue, where pycolmap was built with ONNX.
 
-The weights are files that the user gives; nothing is fetched from anywhere.
+The user gives the files of the weights; nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ class LearnedFeatures:
     lightglue: Path
 
     def extraction(self) -> pycolmap.FeatureExtractionOptions:
-        """What COLMAP is told to extract."""
+        """COLMAP's options of the extraction."""
         options = pycolmap.FeatureExtractionOptions()
         options.type = pycolmap.FeatureExtractorType.ALIKED_N16ROT
         options.aliked.n16rot_model_path = str(self.aliked)  # type: ignore[attr-defined]
         return options
 
     def matching(self) -> pycolmap.FeatureMatchingOptions:
-        """How COLMAP is told to match."""
+        """COLMAP's options of the matching."""
         options = pycolmap.FeatureMatchingOptions()
         options.type = pycolmap.FeatureMatcherType.ALIKED_LIGHTGLUE
         options.aliked.lightglue.model_path = str(self.lightglue)  # type: ignore[attr-defined]
@@ -43,12 +43,12 @@ class LearnedFeatures:
 
 
 def learned_features(options: SfmOptions) -> LearnedFeatures | None:
-    """The learned features that the options ask for; None: SIFT.
+    """The learned features of the options; None: SIFT.
 
     Raises
     ------
     OptionError
-        This pycolmap cannot take them.
+        This pycolmap does not support them.
     DataError
         A file of weights is missing.
     """

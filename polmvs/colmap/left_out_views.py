@@ -1,7 +1,7 @@
-"""Harder matching, in steps, of the views that SfM leaves without a pose.
+"""Harder matching, in steps, for views that SfM does not register.
 
-Steps keep the keypoints and all matches between views that have a pose. Each is slower than the
-one before, and they end when no view is left out.
+Steps keep the keypoints and all matches between registered views. Each step is slower than the
+previous one, and they end when every view is registered.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Map = Callable[[], pycolmap.Reconstruction | None]
 
 
 class Step(StrEnum):
-    """What is tried, the quickest first."""
+    """The steps, the quickest first."""
 
     GUIDED = "guided matching"
     POOLED = "domain-size pooling and guided matching"
@@ -38,14 +38,14 @@ class Step(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """How matches are made anew and mapped.
+    """Functions for new matches and models.
 
     Attributes
     ----------
     database : of the features and matches; changed.
-    pairs : of names of images that are matched.
+    pairs : names of the matched pairs of images.
     describe : makes a database with pooled descriptors of the same images.
-    map : what the mapper makes of the database; None: nothing.
+    map : gives the mapper's model of the database, or None.
     seed : of the verification.
     """
 
@@ -59,17 +59,17 @@ class Trial:
 def try_harder(
     found: pycolmap.Reconstruction | None, names: Sequence[str], trial: Trial
 ) -> pycolmap.Reconstruction | None:
-    """The model with the most views after as many steps as it takes.
+    """The model with the most views after the necessary steps.
 
     Parameters
     ----------
-    found : what there is so far.
+    found : the current model.
     names : of all images.
-    trial : how.
+    trial : functions of the steps.
 
     Returns
     -------
-    ``found`` where no step registers more views.
+    ``found`` if no step registers more views.
     """
     best = found
     for step in Step:
@@ -104,7 +104,7 @@ def _missing(model: pycolmap.Reconstruction | None, names: Sequence[str]) -> set
 
 
 def forget_matches(database: Path, pairs: Pairs) -> None:
-    """Take the matches of pairs out of a database."""
+    """Remove the matches of pairs from a database."""
     numbers = image_numbers(database)
     with opened(database) as content:
         for first, second in pairs:

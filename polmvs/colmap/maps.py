@@ -1,14 +1,14 @@
-"""COLMAP's depth and normal maps: the files of a dense workspace, and what their pixels stand for.
+"""COLMAP's depth and normal maps: files of a dense workspace, and the coordinates of their pixels.
 
 A file is ``W&H&C&`` in ASCII and then little-endian float32, channel after channel: all x of the
-normals, then all y, then all z. ``pycolmap.NormalMap.from_array`` and ``to_array`` take the
-channels of each pixel together instead, and are not used.
+normals, then all y, then all z. ``pycolmap.NormalMap.from_array`` and ``to_array`` interleave the
+channels of each pixel instead, so they are not used.
 
 Half a pixel
 ------------
-COLMAP's intrinsics put the centre of the first pixel at ``(0.5, 0.5)``, yet its PatchMatch and
-its fusion take pixel ``(row, col)`` of a map through the same intrinsics as ``xy = (col, row)``.
-A map therefore holds the depth along that ray: :func:`map_pixel_xy`, here and nowhere else.
+COLMAP's intrinsics put the centre of the first pixel at ``(0.5, 0.5)``. But its PatchMatch and its
+fusion use pixel ``(row, col)`` of a map with the same intrinsics as ``xy = (col, row)``. A map
+therefore holds the depth along that ray: only :func:`map_pixel_xy` has this convention.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ class DepthNormals(NamedTuple):
 
 
 def map_pixel_xy(width: int, height: int) -> NDArray[np.float64]:
-    """Image coordinates ``(height, width, 2)`` that the pixels of a map stand for: (col, row).
+    """Image coordinates ``(height, width, 2)`` of the pixels of a map: (col, row).
 
-    They lie half a pixel up and left of the pixels' centres, see the head of this module.
+    They are half a pixel up and left of the pixels' centres; see the module's docstring.
     """
     grid = np.meshgrid(np.arange(width), np.arange(height))
     return np.stack(grid, axis=-1).astype(np.float64)
@@ -68,7 +68,7 @@ def write_depth_map(path: PathArg, depth: Image) -> None:
     Parameters
     ----------
     path : file to write or replace; its folder must exist.
-    depth : (H, W), z in the camera frame; what is not positive (or NaN) is written as 0.
+    depth : (H, W), z in the camera frame; values that are not positive (or NaN) are written as 0.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def read_depth_map(path: PathArg, camera: PinholeCamera) -> Image:
     Raises
     ------
     DataError
-        The file is missing, truncated, no depth map, of another size or not finite.
+        The file is missing, truncated, not a depth map, of another size or not finite.
     """
     check_depth_map(path, camera)
     depth = _read(path)[0]
@@ -122,8 +122,8 @@ def read_normal_map(path: PathArg, camera: PinholeCamera) -> Image:
     Raises
     ------
     DataError
-        The file is missing, truncated, no normal map, of another size or not finite, or its
-        numbers are no unit normals that face the camera.
+        The file is missing, truncated, not a normal map, of another size or not finite, or its
+        values are not unit normals that face the camera.
     """
     check_normal_map(path, camera)
     normals = np.ascontiguousarray(np.moveaxis(_read(path), 0, -1))
@@ -146,7 +146,7 @@ def check_depth_map(path: PathArg, camera: PinholeCamera) -> None:
     Raises
     ------
     DataError
-        The file is missing, truncated, no depth map or of another size.
+        The file is missing, truncated, not a depth map or of another size.
     """
     _check(path, camera, "depth")
 

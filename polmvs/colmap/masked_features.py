@@ -13,7 +13,7 @@ from polmvs.colmap.static_features import keep_features
 
 
 def keep_inside(database: Path, masks: Mapping[str, Mask]) -> int:
-    """Take features outside of masks out of a database that has no matches yet.
+    """Remove features outside of masks from a database that has no matches yet.
 
     Parameters
     ----------
@@ -21,7 +21,7 @@ def keep_inside(database: Path, masks: Mapping[str, Mask]) -> int:
 
     Returns
     -------
-    How many features stay.
+    The number of remaining features.
     """
     numbers = image_numbers(database)
     kept: dict[int, Mask] = {}

@@ -1,12 +1,12 @@
-"""COLMAP's sparse models: read, fitted to a capture, and written.
+"""Reading and writing of COLMAP's sparse models, and their fit to a capture.
 
-A user's model is never modified; what is written is the model as it is used. The rest of the
-package sees :class:`polmvs.scene.SparseModel` and no type of pycolmap.
+A user's model is never modified; the written model is the used one. The rest of the package uses
+:class:`polmvs.scene.SparseModel` and no type of pycolmap.
 
-Binary files say nowhere that they are complete, and pycolmap 4.2 reads one that ends early without
-a word: it repeats the last record, or runs forever where that one is a point. So their records are
-walked through first: they must follow each other to the file's last byte. That is a cheap and
-sharp test, half a second for a million points.
+Binary files have no end marker, and pycolmap 4.2 reads a truncated file without an error: it
+repeats the last record, or runs forever if that is a point. So the records are checked first: they
+must fill the file to its last byte. This test is cheap and reliable, half a second for a million
+points.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def read_views(path: PathArg) -> tuple[View, ...]:
 
 
 def _require_sound(folder: Path, views: Sequence[View], tracks: Tracks | None = None) -> None:
-    """Refuse a model without views, or whose numbers are absurd."""
+    """Refuse a model without views or with implausible numbers."""
     if not views:
         raise DataError(
             folder, "has no registered image. Run COLMAP again or leave out `sfm.sparse`."
@@ -122,7 +122,7 @@ def _unsound_tracks(tracks: Tracks) -> str | None:
 
 
 def read_reconstruction(path: PathArg) -> pycolmap.Reconstruction:
-    """Read a COLMAP model as pycolmap's own type, for users of pycolmap.
+    """Read a COLMAP model as pycolmap's type, for users of pycolmap.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def find_model(path: PathArg) -> Path:
     Raises
     ------
     DataError
-        No such folder, or no complete model in it.
+        There is no such folder, or no complete model in it.
     """
     root = Path(path)
     require_unicode(root)
@@ -183,7 +183,7 @@ def find_model(path: PathArg) -> Path:
 
 
 def _model_suffix(folder: Path) -> str | None:
-    """``.bin`` or ``.txt``, whichever of COLMAP's forms the folder holds whole."""
+    """``.bin`` or ``.txt``, the format that is complete in the folder."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{name}{suffix}").is_file() for name in MODEL_FILES):
             return suffix
@@ -201,8 +201,8 @@ def model_from_reconstruction(
     Parameters
     ----------
     reconstruction : with any rigs and camera models.
-    names : of all images that were to be registered, in addition to the reconstruction's own.
-    stored : keypoints with a point by image id, where its binary file was read as a whole already.
+    names : of all images of the capture, in addition to the reconstruction's own.
+    stored : keypoints with a point by image id, if its binary file was already read.
     """
     images = registered(reconstruction)
     views = _views(reconstruction, images)
@@ -300,17 +300,17 @@ def match_model_to_capture(
 ) -> SparseModel:
     """Fit a model to a capture: its names, and the size of its polarization images.
 
-    Images are matched by name, else by name without folder and suffix where that is unambiguous.
-    Views that the capture lacks are dropped, and tracks that no view is left of. Cameras of
-    another size with the same aspect ratio are rescaled together with their observations; those
-    of the raw mosaic, which has exactly twice the size, thus get ``K / 2``.
+    Images are matched by name, else by name without folder and suffix if that is unambiguous.
+    Views that the capture lacks are dropped, and tracks without a remaining view. Cameras of
+    another size with the same aspect ratio are rescaled together with their observations; those of
+    the raw mosaic, which has exactly twice the size, get ``K / 2``.
 
     Parameters
     ----------
     sparse_model : as read.
     names : of the capture's images.
     width, height : of the polarization images, px.
-    source : where the model came from, for messages.
+    source : origin of the model, for messages.
 
     Returns
     -------
@@ -358,7 +358,7 @@ def require_matches(
     Raises
     ------
     DataError
-        None has one.
+        No image has one.
     """
     matched = match_names(model_names, names)
     if not matched:
@@ -406,7 +406,7 @@ def _select_tracks(tracks: Tracks, kept: Sequence[int], scales: NDArray[np.float
 
 
 def write_model(sparse_model: SparseModel, folder: str | PathLike[str]) -> None:
-    """Write a model as COLMAP binary, whole or not at all; a folder of that name is replaced.
+    """Write a model as COLMAP binary, whole or not at all; an existing folder is replaced.
 
     Keypoints without a track and images without a pose are not part of a :class:`SparseModel`
     and are not written. Each view becomes an image with its own frame.
@@ -427,7 +427,7 @@ def reconstruction_of_views(
 
     Parameters
     ----------
-    single_camera : all share that of the first; else each has its own.
+    single_camera : all views share the camera of the first; else each has its own.
     """
     reconstruction = pycolmap.Reconstruction()
     for index, view in enumerate(views):
@@ -519,12 +519,12 @@ Reader = Callable[[mmap.mmap, int], int]
 def check_binary_model(folder: Path) -> None:
     """Refuse a binary model of which a file is truncated or has another format.
 
-    Files that the folder lacks are passed over.
+    Missing files are ignored.
 
     Raises
     ------
     DataError
-        Names the file at fault.
+        A file is damaged; the message names it.
     """
     readers: dict[str, Reader] = {
         "cameras": _camera_end,

@@ -1,9 +1,9 @@
-"""Which images are matched with which: all, the most similar ones, neighbours by name, or a list.
+"""Pairs of images to match: all, the most similar ones, neighbours by name, or a list.
 
-All pairs of 100 images are 4,950, of 1,000 half a million, and most of them show different things
-or the same from too far aside. Retrieval compares whole images first, by VLAD (Jegou et al.,
-Aggregating local descriptors into a compact image representation, CVPR 2010) of the very features
-that are to be matched, with the normalisation within words of Arandjelovic and Zisserman (All about
+100 images have 4,950 pairs, 1,000 have half a million, and most pairs have no overlap or too
+different directions. Retrieval first compares whole images, by VLAD (Jegou et al., Aggregating
+local descriptors into a compact image representation, CVPR 2010) of the features for matching, with
+the normalization within words of Arandjelovic and Zisserman (All about
 VLAD, CVPR 2013).
 """
 
@@ -35,20 +35,21 @@ Descriptors: TypeAlias = Callable[[str], NDArray[np.generic]]
 
 @dataclass(frozen=True, kw_only=True)
 class PairTolerances:
-    """How many pairs are enough.
+    """Tolerances of the number of pairs.
 
     Measured: with ``pipelines/synthetic.py``, 100 views of an orbit in random order.
 
     Attributes
     ----------
-    max_exhaustive_images : that are matched in all pairs; a guess: 780 pairs take seconds.
-    num_similar : most similar images that each one is matched with; measured: see
+    max_exhaustive_images : number of images up to which all pairs are matched; a guess: 780 pairs
+        take seconds.
+    num_similar : most similar images with which each one is matched; measured: see
         ``docs/records/scale.md``.
-    num_in_time : images before and after that each one is matched with, where names count up; a
+    num_in_time : images before and after with which each one is matched if names are numbered; a
         guess.
-    num_words : of the vocabulary; a guess, published figures hardly change from 64 to 256.
-    num_training : descriptors that the vocabulary is made of; a guess, 300 for each word.
-    min_change : of the mean distance to the words at which the vocabulary is done; a guess.
+    num_words : of the vocabulary; a guess: published results hardly change from 64 to 256.
+    num_training : descriptors for the vocabulary; a guess, 300 for each word.
+    min_change : of the mean distance to the words at which the vocabulary has converged; a guess.
     """
 
     max_exhaustive_images: int = 40
@@ -74,9 +75,9 @@ def choose_pairs(
     names : of the images, sorted.
     choice : ``exhaustive``, ``retrieval``, ``sequential``, or the path of a list of pairs; None:
         all pairs of few images, retrieval for more.
-    descriptors : gives the (N, D) descriptors of an image by its name; asked by retrieval only.
+    descriptors : gives the (N, D) descriptors of an image by its name; only for retrieval.
     seed : of the vocabulary.
-    tolerances : see there.
+    tolerances : of this step.
 
     Raises
     ------
@@ -104,7 +105,7 @@ def choose_pairs(
 
 
 def read_pairs(path: Path, names: Sequence[str]) -> Pairs:
-    """Pairs of a text file: two names of images on each line, ``#`` begins a comment.
+    """Pairs from a text file: two names of images on each line; ``#`` begins a comment.
 
     Parameters
     ----------
@@ -114,8 +115,8 @@ def read_pairs(path: Path, names: Sequence[str]) -> Pairs:
     Raises
     ------
     DataError
-        It cannot be read, has a line that is no pair, names images that there are not, or leaves
-        nothing to match.
+        It cannot be read, has a line that is not a pair, names unknown images, or has no pair to
+        match.
     """
     lines = read_list(path, "pairs").splitlines()
     known = {name: name for name in names}
@@ -174,7 +175,7 @@ def image_similarity(
 
 
 def vlad(descriptors: Floats, words: Floats) -> Floats:
-    """One unit vector ``(W * D,)`` of an image's descriptors ``(N, D)``; 0 where it has none."""
+    """Unit vector ``(W * D,)`` of an image's descriptors ``(N, D)``; 0 if it has none."""
     total = np.zeros_like(words)
     if len(descriptors):
         nearest, _ = vq(descriptors, words)
@@ -186,13 +187,13 @@ def vlad(descriptors: Floats, words: Floats) -> Floats:
 def similar_pairs(
     names: Sequence[str], similarity: NDArray[np.floating], num_similar: int
 ) -> set[tuple[str, str]]:
-    """Each image with those most similar to it, and what keeps all images in one graph.
+    """Each image with the most similar ones, and the pairs that connect all images in one graph.
 
     Parameters
     ----------
     names : K images, sorted.
     similarity : (K, K), symmetric.
-    num_similar : images that each is paired with at least.
+    num_similar : least number of partners of each image.
     """
     others = similarity - 4 * np.eye(len(names))  # never itself
     nearest = np.argsort(-others, axis=1, kind="stable")[:, : min(num_similar, len(names) - 1)]

@@ -1,11 +1,12 @@
 """Structure from motion with COLMAP on the intensity images of a capture.
 
-What differs from COLMAP's defaults was chosen on the captures board, dome and demo, by the median
-error of the cameras' centres: affine-adapted features, a threshold of 2 px instead of 4 on the
-reprojection error, and a last bundle adjustment with a robust loss; together 0.31 to 0.18 mm,
-0.31 to 0.11 mm and 0.57 to 0.19 mm. Without intrinsics the last adjustment also frees the
-principal point, which COLMAP leaves at the image's centre: 6 px off, there, turned every camera by
-0.8 degrees (1.5 to 0.19 mm, 1.7 to 0.13 mm and 1.8 to 0.22 mm).
+Three settings differ from COLMAP's defaults: affine-adapted features, a threshold of 2 px instead
+of 4 on the reprojection error, and a final bundle adjustment with a robust loss. Measured: median
+error of the camera centres of board, dome and demo, 0.18 instead of 0.31 mm, 0.11 instead of 0.31
+mm and 0.19 instead of 0.57 mm. Without intrinsics the final adjustment also frees the principal
+point, which COLMAP leaves at the image's centre. A principal point 6 px off turns every camera by
+0.8 degrees (with it free 0.19 instead of 1.5 mm, 0.13 instead of 1.7 mm and 0.22 instead of 1.8
+mm).
 """
 
 from __future__ import annotations
@@ -64,43 +65,42 @@ COLMAP_DEFAULTS = pycolmap.IncrementalMapperOptions()
 
 
 class NoModelError(DataError):
-    """SfM finds no model; the database in its work folder tells why."""
+    """SfM finds no model; the database in its work folder shows the reason."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SfmTolerances:
-    """What is asked of features, tracks and the camera beside COLMAP's own defaults.
+    """Tolerances of features, tracks and the camera, in addition to COLMAP's defaults.
 
-    Measured: by the median error of the cameras' centres on the captures board, dome and demo, as
-    the head of this module says. Errors in px are those of keypoints, which do not scale with the
-    focal length.
+    Measured: by the median error of the camera centres of board, dome and demo, as in the module's
+    docstring. Errors in px are those of keypoints, which do not scale with the focal length.
 
     Attributes
     ----------
-    max_reproj_error_px : of an observation that is kept; measured, of 1, 2 and 4.
+    max_reproj_error_px : of a kept observation; measured, of 1, 2 and 4.
     loss_scale_px : of the last adjustment's Cauchy loss. Derived: the deviation of a keypoint,
         about twice the error of a good one; measured.
-    max_cost_change : relative, of the cost in an adjustment's step, at which it ends. Measured: of
-        40 views a hundredth of this takes three times the steps, for 0.5 % of the cameras' errors;
-        COLMAP's own 0 goes on to its last allowed step.
-    max_refinements : adjustments in a row, of the model or about a new view, on the mapper's way.
-        Measured: COLMAP's own 5 and 2 take twice the mapper's time, and the last adjustment, which
-        is the same, leaves no trace of them.
-    model_growth : factor in images or points at which the incremental mapper adjusts all anew;
-        measured: at COLMAP's own 1.1 it takes most of the mapper's time.
-    min_views_principal_point : from which the principal point is freed; measured: of three views
-        two captures of three got worse, of four none.
-    max_principal_point_shift : from where a principal point belongs, in sides of the image; a
-        guess. Farther from the centre an estimate has gone astray; as near to the lower right
-        corner given intrinsics are those of the full mosaic, which have it there.
-    min_pair_matches : that each pair keeps where the mapper is given fewer. Derived: what COLMAP
-        asks of the pair that it begins with. Measured: docs/records/scale.md.
-    max_images_dense : up to which the last adjustment's equations are solved as a dense matrix.
-        Measured: of 100 and 282 images faster than sparse, 8.2 of 9.6 and 19 of 32 s; a guess
-        where that ends, as the cube of the images does.
-    max_images_two_view_tracks : up to which tracks of two views count; a guess: with few images
-        most tracks have two views only, with more those are mostly mismatches.
-    focal_range : focal lengths that are believed, in widths of the image: 136 to 6 degrees.
+    max_cost_change : relative change of the cost at which an adjustment ends. Measured: with 40
+        views a hundredth of this takes three times the steps, for 0.5 % of the cameras' errors;
+        COLMAP's default 0 continues to the last allowed step.
+    max_refinements : consecutive adjustments, of the model or about a new view, in the mapper.
+        Measured: COLMAP's defaults 5 and 2 take twice the mapper's time, and have no effect after
+        the final adjustment.
+    model_growth : factor in images or points at which the incremental mapper adjusts all again;
+        measured: at COLMAP's default 1.1 this takes most of the mapper's time.
+    min_views_principal_point : number of views from which the principal point is free; measured:
+        with three views two captures of three are worse, with four none.
+    max_principal_point_shift : of a principal point, in sides of the image; a guess. An estimate
+        farther from the centre is wrong. Given intrinsics as near to the lower right corner are
+        those of the full mosaic.
+    min_pair_matches : matches that each pair keeps if the mapper gets fewer. Derived: what COLMAP
+        requires of the initial pair. Measured: docs/records/scale.md.
+    max_images_dense : number of images up to which the final adjustment is solved as a dense
+        matrix. Measured: with 100 and 282 images faster than sparse, 8.2 of 9.6 and 19 of 32 s; the
+        limit is a guess, as the time grows with the cube of the images.
+    max_images_two_view_tracks : number of images up to which tracks of two views are used; a guess:
+        with few images most tracks have only two views, with more those are mostly mismatches.
+    focal_range : plausible focal lengths, in widths of the image: 136 to 6 degrees.
     """
 
     max_reproj_error_px: float = 2.0
@@ -118,14 +118,14 @@ class SfmTolerances:
 
 @dataclass(frozen=True, kw_only=True)
 class SfmWork:
-    """Images whose poses are to be found, by what options, in what database.
+    """Input of SfM: images, options and database.
 
     Attributes
     ----------
     images : folder of 8-bit intensity images.
-    names : of the images that count, in order; a given database may have more.
-    database : COLMAP's. The mapper's own files lie beside it while it works.
-    reader : the camera that COLMAP starts from.
+    names : names of the images to use, in order; a given database may have more.
+    database : COLMAP's. The mapper's files are beside it while it runs.
+    reader : COLMAP's initial camera.
     """
 
     images: Path
@@ -136,10 +136,10 @@ class SfmWork:
     tolerances: SfmTolerances = SfmTolerances()
 
     def describe(self, database: Path, *, pooled: bool = False) -> None:
-        """Affine-adapted SIFT of all images into a new database, or the features asked for.
+        """Extract affine-adapted SIFT, or the features of the options, into a new database.
 
-        ``pooled``: descriptors are means over sizes of the domain (DSP-SIFT), which takes three
-        times as long.
+        ``pooled``: descriptors are means over domain sizes (DSP-SIFT), which takes three times as
+        long.
         """
         single, each = pycolmap.CameraMode.SINGLE, pycolmap.CameraMode.PER_IMAGE
         mode = single if self.options.single_camera else each
@@ -160,7 +160,7 @@ class SfmWork:
         )
 
     def pairs(self) -> Pairs:
-        """The pairs of images that are asked for, or that are likely to show the same."""
+        """The pairs of images of the options, or those that probably overlap."""
         numbers = image_numbers(self.database)
         with opened(self.database) as content:
             return choose_pairs(
@@ -176,7 +176,7 @@ class SfmWork:
         match_pairs(self.database, self.pairs(), seed=self.options.seed, learned=learned)
 
     def map_all(self) -> pycolmap.Reconstruction:
-        """The largest model of the images, after harder matching where it leaves some out."""
+        """The largest model of the images, after harder matching if some have no pose."""
         unable: list[NoModelError] = []
 
         def map_once() -> pycolmap.Reconstruction | None:
@@ -205,9 +205,10 @@ class SfmWork:
         return found
 
     def map(self) -> pycolmap.Reconstruction:
-        """The largest model of the images that the mapper makes.
+        """The largest model of the mapper.
 
-        Where matches abound it finds the poses from a part of them, if that registers every image.
+        With very many matches it finds the poses from a part of them, if that registers every
+        image.
         """
         thinned = self.database.with_name("mapping.db")
         thinned.unlink(missing_ok=True)
@@ -235,14 +236,14 @@ class SfmWork:
         return largest
 
     def triangulate(self, known: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """A model of known poses with the points of all matches."""
+        """A model with known poses and the points of all matches."""
         with self._place_for_models() as models:
             return pycolmap.triangulate_points(
                 known, self.database, self.images, models, options=self._incremental()
             )
 
     def _models(self, database: Path) -> list[pycolmap.Reconstruction]:
-        """What the mapper makes of a database, the largest model first."""
+        """The mapper's models of a database, the largest first."""
         with self._place_for_models() as models:
             if self.options.mapper is Mapper.GLOBAL:
                 found = pycolmap.global_mapping(database, self.images, models, self._global())
@@ -290,7 +291,7 @@ class SfmWork:
             pipeline.ba_refine_extra_params = False
             pipeline.mapper.abs_pose_refine_focal_length = False
             pipeline.mapper.abs_pose_refine_extra_params = False
-            # With a camera still to be found the errors are larger at first: COLMAP's 4 px stay.
+            # With an unknown camera the errors are larger at first, so COLMAP's 4 px are kept.
             error_px = self.tolerances.max_reproj_error_px
             pipeline.mapper.filter_max_reproj_error = error_px
             pipeline.triangulation.complete_max_reproj_error = error_px
@@ -354,19 +355,19 @@ def run_sfm(
     ----------
     image_folder : 8-bit intensity images, one size.
     image_names : names of the images in it.
-    work_folder : gets COLMAP's database, if one is given its copy; what an earlier run left there
-        is replaced.
-    sparse_folder : gets the model as COLMAP binary, whole or not at all.
+    work_folder : for COLMAP's database, or the copy of a given one; files of an earlier run are
+        replaced.
+    sparse_folder : for the model as COLMAP binary, written whole or not at all.
     options : see :class:`polmvs.config.SfmOptions`; ``sparse`` is not used here.
-    on_step : called with the name of each stage when it starts.
-    masks : file of each image by its name, not 0 where features count; None: everywhere.
+    on_step : called with the name of each step when it starts.
+    masks : file of each image by its name, not 0 where features are used; None: everywhere.
 
     Raises
     ------
     OptionError
         The intrinsics do not fit the images, or the camera model or the mapper is unknown.
     DataError
-        An image is missing, the list of pairs or the database is unusable, or no model comes out.
+        An image is missing, the list of pairs or the database is unusable, or there is no model.
     """
     names = sorted(image_names)
     width, height = _image_size(image_folder, names)
@@ -420,7 +421,7 @@ def triangulate_views(
     work_folder: Path,
     sparse_folder: Path,
 ) -> SparseModel:
-    """A model of known cameras: features are matched and triangulated, no pose is changed.
+    """A model with known cameras: features are matched and triangulated, poses do not change.
 
     Parameters
     ----------
@@ -476,7 +477,7 @@ def check_intrinsics(
     *,
     tolerances: SfmTolerances = SfmTolerances(),
 ) -> PinholeCamera:
-    """The camera of ``fx, fy, cx, cy``, px, if it can be that of images of this size.
+    """The camera of ``fx, fy, cx, cy``, px, if it is plausible for images of this size.
 
     Raises
     ------
@@ -515,7 +516,7 @@ def check_camera(path: Path, width: int, height: int) -> Intrinsics:
     Raises
     ------
     DataError
-        The file cannot be read, or is of images of another shape.
+        The file cannot be read, or is for images of another aspect ratio.
     """
     try:
         return read_intrinsics(path).scaled_to(width, height)
@@ -592,14 +593,14 @@ def _refine(
     free_intrinsics: bool,
     single_camera: bool,
 ) -> pycolmap.Reconstruction:
-    """The last bundle adjustment, more careful than those on its way; then filter the points.
+    """The final bundle adjustment, more careful than those of the mapper; then filter the points.
 
     Parameters
     ----------
-    reconstruction : from the mapper; adjusted in place, or left aside for the result.
-    free_intrinsics : estimate the cameras too.
-    single_camera : all images share one; its principal point is then freed as well where there
-        are views enough, and kept at the centre where the estimate goes astray.
+    reconstruction : from the mapper; adjusted in place, or replaced by the result.
+    free_intrinsics : also estimate the cameras.
+    single_camera : all images share one; its principal point is then also free if there are enough
+        views, and is kept at the centre if the estimate is implausible.
     """
     num_views = reconstruction.num_reg_images()
     if free_intrinsics and single_camera and num_views >= tolerances.min_views_principal_point:
@@ -644,7 +645,7 @@ def bundle_of(
     free_intrinsics: bool,
     free_principal_point: bool,
 ) -> tuple[pycolmap.BundleAdjustmentOptions, pycolmap.BundleAdjustmentConfig]:
-    """How a bundle of all registered images is adjusted on one thread, its frame held by two."""
+    """An adjustment of all registered images on one thread; two images fix the frame."""
     bundle = pycolmap.BundleAdjustmentOptions()
     bundle.refine_focal_length = bundle.refine_extra_params = free_intrinsics
     bundle.refine_principal_point = free_principal_point

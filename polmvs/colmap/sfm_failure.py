@@ -13,7 +13,7 @@ from polmvs.scene import short_list
 
 
 def why_no_model(database: Path, options: SfmOptions) -> str:
-    """One or two sentences: what is missing, and which setting or change of the capture helps.
+    """One or two sentences with the cause of the failure and the remedy.
 
     Parameters
     ----------
@@ -22,9 +22,9 @@ def why_no_model(database: Path, options: SfmOptions) -> str:
 
     Notes
     -----
-    A pair that begins a model, and an image that is added to one, need as many matches as COLMAP's
-    mapper asks of them; an image with fewer features than such a pair shares is poor. Those that
-    make a model have thousands.
+    The initial pair of a model, and an image that is added, need a number of matches that COLMAP's
+    mapper requires. An image with fewer features than that has too little texture; usual images
+    have thousands.
     """
     asked = pycolmap.IncrementalMapperOptions()
     to_begin, to_add = asked.init_min_num_inliers, asked.abs_pose_min_num_inliers

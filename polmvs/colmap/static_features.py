@@ -1,8 +1,8 @@
-"""Features that stand still while the part turns: a background that the camera always sees alike.
+"""Features of a static background behind a part on a turntable.
 
-On a turntable part and table turn before a camera that does not move. To SfM this is a camera that
-moves about the part, but for the background, whose matches say that it stands still and are the
-more. They are told from the others by their place: the same pixel shows the same in most images.
+On a turntable, part and table turn before a static camera. For SfM the camera moves about the part,
+but the more numerous matches of the background say that it does not move. Background features are
+recognized by their position: the same pixel shows the same in most images.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from polmvs.colmap.database import opened
 
 @dataclass(frozen=True, kw_only=True)
 class StaticTolerances:
-    """What stands still.
+    """Tolerances of static features.
 
     Attributes
     ----------
-    num_others : images that each is compared with, evenly spread over the others. Costs time only.
-    reach_px : within which a keypoint is at the same place. Derived: three deviations of a keypoint
-        along each axis.
-    min_likeness : cosine of two descriptors of one thing. Guess.
-    min_images : share of the images compared in which a keypoint stands still, and in which a
+    num_others : images with which each is compared, evenly spread over the others. Costs time only.
+    reach_px : distance within which a keypoint has the same position. Derived: three deviations of
+        a keypoint along each axis.
+    min_likeness : cosine of two descriptors of one feature. Guess.
+    min_images : share of the compared images in which a keypoint is static, and in which a
         background must have such keypoints. Guess.
-    min_share : of an image's keypoints, of a background. Guess: by chance it is under 1 %, and a
+    min_share : of a background, in an image's keypoints. Guess: by chance it is below 1 %, and a
         mark on the lens or a dead pixel makes a few keypoints.
     min_count : of keypoints of a background in an image. Guess.
     """
@@ -49,11 +49,11 @@ class StaticTolerances:
 def take_out_static(
     database: Path, *, tolerances: StaticTolerances = StaticTolerances()
 ) -> float | None:
-    """Take features of a static background out of a database that has no matches yet.
+    """Remove features of a static background from a database that has no matches yet.
 
     Returns
     -------
-    The share of the features that went, if there is such a background; None: nothing was changed.
+    The share of removed features, if there is such a background; None: nothing was changed.
     """
     with opened(database) as content:
         ids = [image.image_id for image in content.read_all_images()]
@@ -68,7 +68,7 @@ def take_out_static(
 
 
 def keep_features(content: pycolmap.Database, kept: Mapping[int, Mask]) -> None:
-    """Keep the features (N,) alone of each image, by its number, of a database without matches."""
+    """Keep only the given features (N,) of each image, by its id, in a database without matches."""
     found = {n: (content.read_keypoints(n), content.read_descriptors(n)) for n in kept}
     content.clear_keypoints()
     content.clear_descriptors()
@@ -84,7 +84,7 @@ def find_static(
     *,
     tolerances: StaticTolerances = StaticTolerances(),
 ) -> list[Mask] | None:
-    """Which keypoints of each image stand still; None where there is no static background.
+    """Which keypoints of each image are static; None if there is no static background.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""Fewer matches for the mapper, whose time grows with them while the views' poses hardly gain.
+"""Fewer matches for the mapper: its time grows with them, and the poses hardly improve.
 
-Poses are found from a sample of the tracks, points then of all, and the last adjustment sees all.
+Poses come from a sample of the tracks; points and the final adjustment use all of them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PAIR_BYTES = 8  # of a match: two uint32
 
 
 def thin_database(database: Path, target: Path, num_kept: int, *, seed: int = 0) -> bool:
-    """Write a database with fewer matches, if it is worth it: if more than half of them go.
+    """Write a database with fewer matches, if more than half of them can be removed.
 
     Parameters
     ----------
@@ -67,17 +67,17 @@ def sample_tracks(
     *,
     seed: int = 0,
 ) -> list[Flags]:
-    """Which matches of each pair stay, whole tracks at a time.
+    """Matches of each pair to keep, whole tracks at a time.
 
-    Tracks have one random order; a pair keeps the first that it has of it, and with them the other
-    pairs that see the same. So tracks stay whole, a pair with few matches keeps all, and what is
-    kept lies as the matches did.
+    All tracks have one random order. A pair keeps its first tracks in this order, and all other
+    pairs keep these as well. So tracks stay whole, a pair with few matches keeps all, and the kept
+    matches have the distribution of all.
 
     Parameters
     ----------
     pairs : numbers of the two images of each.
     matches : (M, 2) of each pair, indices of keypoints in the two images.
-    num_kept : matches that a pair keeps at least, where it has as many.
+    num_kept : least number of matches that a pair keeps, if it has as many.
     seed : of the order.
     """
     if not matches:

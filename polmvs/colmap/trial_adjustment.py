@@ -1,9 +1,9 @@
-"""Trial adjustments: whether other cameras fit a model's matches better than the given ones.
+"""Trial adjustments: a test whether other cameras fit a model's matches better than the given ones.
 
-A focal length or a principal point that is wrong bends the whole model while every image fits, and
-normals with it; a pose that is wrong has all rows of its view wrong. The matches know both. They
-are adjusted once more, with focal length, principal point, poses and points free; what comes out is
-compared with what was given, in deviations of the adjustment.
+A wrong focal length or principal point bends the whole model and its normals although every image
+fits; a wrong pose makes all rows of its view wrong. The matches show both. The model is adjusted
+again with focal length, principal point, poses and points free, and the result is compared with the
+given cameras, in deviations of the adjustment.
 """
 
 from __future__ import annotations
@@ -29,22 +29,23 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class TrialTolerances:
-    """When given cameras are said not to fit.
+    """Tolerances of given cameras.
 
     Attributes
     ----------
-    min_images, min_points : of a model that can tell. Guess.
-    max_sigmas : by which a parameter may differ from what fits. Derived: cameras err by up to 4
-        times what residuals say (see ``CameraTolerances.min_residual_px``).
-    min_focal_change : share of the focal length. Guess: a tenth of what turns normals by 3 degrees.
-    min_point_change : share of the image's width, of the principal point. Measured: 1.3 % turn
+    min_images, min_points : least size of a model for the test. Guess.
+    max_sigmas : largest difference of a parameter from the fitting one. Derived: errors of cameras
+        are up to 4 times those from residuals (see ``CameraTolerances.min_residual_px``).
+    min_focal_change : share of the focal length. Guess: a tenth of the change that turns normals by
+        3 degrees.
+    min_point_change : of the principal point, share of the image's width. Measured: 1.3 % turn
         normals by 2.2 degrees; a guess of a third of it.
-    min_turn_deg : of a pose. Guess: half of what turns normals by about one degree.
-    min_shift : of a camera, share of its distance from the points: as far as ``min_turn_deg`` moves
-        what it sees. Derived.
-    pose_ratio : by which the keypoints of a view must lie farther from where the given cameras put
-        its points than those of the other views do; or those of most, than where fitting cameras
-        put them, for a camera that is wrong beyond doubt. Guess.
+    min_turn_deg : of a pose. Guess: half of the rotation that turns normals by about one degree.
+    min_shift : of a camera, share of its distance from the points: it moves the image as far as
+        ``min_turn_deg``. Derived.
+    pose_ratio : factor by which reprojection errors of a view under the given cameras must exceed
+        those of the other views; or those of most views must exceed the errors under fitting
+        cameras, for a camera that is certainly wrong. Guess.
     """
 
     min_images: int = 3
@@ -59,7 +60,7 @@ class TrialTolerances:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseChange:
-    """How a pose differs from one that fits.
+    """Difference of a pose from the fitting one.
 
     Attributes
     ----------
@@ -75,12 +76,12 @@ class PoseChange:
 
 @dataclass(frozen=True, kw_only=True)
 class Complaint:
-    """What does not fit, and what would.
+    """A camera or pose that does not fit, with the fitting one.
 
     Attributes
     ----------
     text : a clause.
-    view : name of the view whose pose it is of; None: of all.
+    view : name of the view of a pose; None: all views.
     """
 
     text: str
@@ -89,16 +90,16 @@ class Complaint:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraTrial:
-    """What the matches say of given cameras.
+    """Result of the test of given cameras.
 
     Attributes
     ----------
-    focal, fitting_focal : mean focal length that was given, and that which fits, px.
+    focal, fitting_focal : given and fitting mean focal length, px.
     point, fitting_point : the principal points, px.
-    focal_sigma, point_sigma : deviations of those that fit, px.
+    focal_sigma, point_sigma : deviations of the fitting ones, px.
     camera_fits : whether both agree.
-    wrong_poses : of views whose pose does not fit while those of others do.
-    error_px, fitting_error_px : mean distances of keypoints from where points are seen.
+    wrong_poses : of views whose pose does not fit although the others do.
+    error_px, fitting_error_px : mean reprojection errors.
     """
 
     focal: float
@@ -114,7 +115,7 @@ class CameraTrial:
 
     @property
     def complaints(self) -> tuple[Complaint, ...]:
-        """What does not fit and what would."""
+        """Cameras and poses that do not fit, with the fitting ones."""
         found = []
         if not self.camera_fits:
             x, y = self.point
@@ -145,8 +146,8 @@ def try_cameras(
 
     Returns
     -------
-    None where the model cannot tell: several cameras, too few or too many views, too few points, or
-    an adjustment that leaves the camera open.
+    None if the test is impossible: several cameras, too few or too many views, too few points, or
+    an adjustment that does not determine the camera.
     """
     given = read_reconstruction(model)
     for number, point in list(given.points3D.items()):

@@ -1,9 +1,9 @@
-"""From the sensor's pixels to an undistorted pinhole camera: models and images.
+"""Undistortion of models and images to a pinhole camera.
 
-Both cameras share centre and axes, so a warp needs rays only. Polarization is warped as Stokes
-images or as the four intensities, never as angles: an angle is axial and does not interpolate.
-The values are the same after the warp: the polarizers are fixed to the sensor and an angle is
-counted from its x axis, so moving pixels does not turn it.
+Both cameras share centre and axes, so a warp needs only rays. Polarization is warped as Stokes
+images or as the four intensities, never as angles: an angle is axial and cannot be interpolated.
+The warp does not change the values: the polarizers are fixed to the sensor and angles are relative
+to its x axis, so moving pixels does not turn them.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from polmvs.scene import SparseModel, some_tracks
 def undistorted_camera(
     camera: Camera, *, blank_pixels: float = 0.0, max_image_size: int | None = None
 ) -> PinholeCamera:
-    """The pinhole camera that COLMAP's image undistorter makes of a camera.
+    """The pinhole camera of COLMAP's image undistorter for a camera.
 
     Parameters
     ----------
-    camera : of any model of COLMAP's; one without distortion comes back unchanged.
-    blank_pixels : 0 leaves no pixel blank, 1 loses no pixel of the sensor.
+    camera : of any COLMAP model; one without distortion is returned unchanged.
+    blank_pixels : 0: no pixel is blank; 1: no pixel of the sensor is lost.
     max_image_size : longest side, px; None for no limit.
     """
     options = pycolmap.UndistortCameraOptions()
@@ -41,9 +41,9 @@ def undistorted_camera(
 
 
 def undistort_xy(xy: NDArray[np.floating], source: Camera, target: PinholeCamera) -> Array:
-    """Image coordinates ``(..., 2)`` in the target of those in the source, COLMAP's convention.
+    """Image coordinates ``(..., 2)`` of the source converted to the target, COLMAP's convention.
 
-    NaN where the distortion has no inverse; they may lie outside the target's image.
+    NaN where the distortion has no inverse; they may be outside the target's image.
     """
     return np.asarray(target.project(source.rays(xy)), np.float64)
 
@@ -87,7 +87,7 @@ def warp_image(
     Returns
     -------
     warped : (h, w) or (h, w, C) float32; 0 where the mask is False.
-    mask : (h, w) bool, whether the ray of the pixel's centre meets the sensor.
+    mask : (h, w) bool, whether the ray of the pixel's centre hits the sensor.
     """
     if image.shape[:2] != (source.height, source.width):
         raise ValueError(f"{image.shape=} but expected {source.height}x{source.width} pixels.")

@@ -1,1 +1,1 @@
-"""Results against the truth, or against their own data."""
+"""Evaluation of results against ground truth and against their own data."""

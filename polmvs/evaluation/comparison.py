@@ -1,4 +1,4 @@
-"""Compare the clouds of several models, against the truth or against the phases themselves."""
+"""Compare the clouds of several models, against ground truth or against the phases."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ SCHEMA_VERSION = 3  # of ``metrics.json``; 1: the first releases, which did not 
 
 @dataclass(frozen=True, kw_only=True)
 class TruthFigures:
-    """What a model came to, against ground truth.
+    """Metrics of a model against ground truth.
 
     Attributes
     ----------
     cloud : of the dense cloud.
-    alignment : how the estimated cameras were brought onto the true ones.
-    tracks : of the normals of the sparse points; None where they were not measured.
-    maps : of the dense depth and normal maps; None where they were not measured.
+    alignment : of the estimated cameras to the true ones.
+    tracks : of the normals of the sparse points; None if not measured.
+    maps : of the dense depth and normal maps; None if not measured.
     """
 
     cloud: CloudMetrics
@@ -71,8 +71,8 @@ class ModelFigures:
 
     Attributes
     ----------
-    consistency : how well its cloud fits the capture that it was made from.
-    truth : how well it fits the ground truth; None without one.
+    consistency : of its cloud with the capture.
+    truth : against ground truth; None without it.
     """
 
     consistency: Consistency
@@ -85,8 +85,8 @@ class PhaseFigures:
 
     Attributes
     ----------
-    maps : of the phase maps, which the geometry uses.
-    pixels : of the single pixels of the capture, those neither clipped nor dark.
+    maps : of the phase maps.
+    pixels : of the single pixels of the capture that are neither clipped nor dark.
     """
 
     maps: Mapping[AngleModel, AngleStats]
@@ -100,9 +100,9 @@ class SparseFigures:
     Attributes
     ----------
     num_views : images with a pose.
-    unregistered : names of those without.
+    unregistered : names of images without a pose.
     num_tracks : sparse points.
-    num_seeds : those of them that are seeds.
+    num_seeds : sparse points that are seeds.
     """
 
     num_views: int
@@ -120,9 +120,9 @@ class Comparison:
     schema_version : of the file.
     capture : folder of the raw mosaics.
     sparse : what all models started from.
-    models : figures of each model.
-    phase : errors of the phase itself; None without ground truth.
-    best_fit : the model that the phases fit best; None where nothing tells.
+    models : metrics of each model.
+    phase : errors of the phase; None without ground truth.
+    best_fit : the model that fits the phases best; None if unknown.
     """
 
     schema_version: int = SCHEMA_VERSION
@@ -133,11 +133,11 @@ class Comparison:
     best_fit: AngleModel | None
 
     def table(self) -> str:
-        """The figures, a column for each model, in Markdown."""
+        """The metrics as a Markdown table with one column for each model."""
         return format_table(*comparison_rows(self))
 
     def summary(self) -> str:
-        """The figures as a page, in Markdown."""
+        """The metrics as a Markdown page."""
         sparse = self.sparse
         missing = sparse.unregistered
         lines = [
@@ -155,7 +155,7 @@ class Comparison:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelEstimate:
-    """What a model came to, as it is measured.
+    """Results of a model, for the metrics.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class ModelEstimate:
     tracks : sparse points with normals, quality and ``seed``.
     maps : phase maps of all views for the model.
     dense : dense depth and normals of the same views.
-    outside : pixels (H, W) of views, by name, that show what lies outside the box of the result.
+    outside : pixels (H, W) of views, by name, that show what is outside the crop box.
     """
 
     cloud: Cloud
@@ -182,7 +182,7 @@ def compare_models(
     *,
     workers: Workers | None = None,
 ) -> Comparison:
-    """Measure what several models came to.
+    """Metrics of several models.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def measure_against_truth(
     truth: GroundTruth,
     dense: DenseViews | None = None,
 ) -> TruthFigures:
-    """Figures of a dense cloud, of the normals of sparse points and of the views' dense maps.
+    """Metrics of a dense cloud, of the normals of sparse points and of the views' dense maps.
 
     Parameters
     ----------
@@ -246,19 +246,19 @@ def measure_against_truth(
 
 
 def named_as_truth(views: Sequence[View], truth: GroundTruth) -> list[View]:
-    """Views under the truth's names, which may have another suffix."""
+    """Views with the names of the ground truth, which may have another suffix."""
     matched = match_names([view.name for view in views], truth.names)
     return [replace(view, name=matched.get(view.name, view.name)) for view in views]
 
 
 def evaluate_file(cloud: Path, gt: Path, sparse: Path) -> TruthFigures:
-    """Figures of a cloud file against the truth.
+    """Metrics of a cloud file against ground truth.
 
     Parameters
     ----------
     cloud : PLY in the frame of ``sparse``.
     gt : folder of the ground truth.
-    sparse : COLMAP model; its camera centres are brought onto the true ones.
+    sparse : COLMAP model; its camera centres are aligned to the true ones.
     """
     truth = open_ground_truth(gt)
     return measure_against_truth(read_cloud(cloud), None, read_model(sparse).views, truth)
@@ -379,7 +379,7 @@ def _within_sigmas(errors: MapErrors) -> str:
 
 
 def evaluation_text(figures: TruthFigures) -> str:
-    """Table of one cloud against the truth, and how it was aligned."""
+    """Table of one cloud against ground truth, with its alignment."""
     cloud, alignment = figures.cloud, figures.alignment
     return (
         format_table(["", "value"], cloud_rows(cloud))

@@ -1,4 +1,4 @@
-"""Consistency of a cloud with the capture that it was made from; needs no ground truth."""
+"""Consistency of a cloud with its capture, without ground truth."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from polmvs.polarization.region import Region
 from polmvs.scene import PointKind, View
 
 # These define the figures; they are no tolerances of an algorithm.
-MAX_RESIDUAL_POINTS = 100_000  # of a cloud, evenly spread, that phase residuals are taken from
-CELL_PX = 4  # of coverage and occlusion: wider than the distance of the cloud's points
-MAX_RELATIVE_EXCESS = 0.01  # of a visible point's distance over the nearest one's in its cell
+MAX_RESIDUAL_POINTS = 100_000  # points of a cloud, evenly spread, for phase residuals
+CELL_PX = 4  # cell of coverage and occlusion: wider than the spacing of the cloud
+MAX_RELATIVE_EXCESS = 0.01  # ratio of a visible point's distance to the nearest one in its cell
 
 
 @dataclass(frozen=True, kw_only=True)
 class Consistency:
-    """How well a cloud's polarized surface fits the capture that it was made from.
+    """Fit of a cloud's polarized surface to its capture.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Consistency:
     phase_residual : angle between the phase that a point's normal predicts, under the cloud's
         model, and the measured one, over all views that see the point.
     coverage : share of the region's pixels, over all views, that show a point of the cloud.
-    agreement : share of the views that see a point that agree with it in place and normal.
+    agreement : share of the views that see a point which agree with it in position and normal.
     track_residual_median_deg : angle between the normals of the sparse points and their planes
         of incidence, over the points on the polarized surface.
     """
@@ -64,8 +64,8 @@ def measure_consistency(
         that of the surroundings are left out; without a ``kind`` all are of the surface.
     tracks : sparse points with ``residual`` and ``seed``.
     maps : of all views.
-    outside : pixels (H, W) of each view, by its name, that show what lies outside the box that the
-        cloud was cut to: they count for nothing.
+    outside : pixels (H, W) of each view, by its name, that show what is outside the crop box; they
+        are ignored.
     """
     cloud = cloud.only(cloud.are(PointKind.SURFACE))
     num = len(cloud.points)
@@ -88,7 +88,7 @@ def measure_consistency(
         errors.append(
             phase_residuals_deg(angle_model, cloud.points[chosen], cloud.normals[chosen], phase_map)
         )
-    # Views that the buffer of cells takes for hidden may have confirmed a point all the same.
+    # Views in which the cells hide a point may still have confirmed it.
     confirmed = np.minimum(cloud.scalars.get("num_views", np.zeros(num)), seeing)
     return Consistency(
         num_points=num,
@@ -100,9 +100,9 @@ def measure_consistency(
 
 
 def within_box(phase_map: PhaseMap, outside: Mapping[str, Mask]) -> PhaseMap:
-    """The map with a region of those pixels alone that do not show what lies outside a box.
+    """The map with a region without the pixels that show what is outside a box.
 
-    What lies behind a surface that a box cut away is then not taken for visible.
+    Points behind a surface that the box cut away then do not count as visible.
     """
     if phase_map.view.name not in outside:
         return phase_map
@@ -124,12 +124,12 @@ def _track_residual(tracks: Cloud) -> float:
 def first_seen(
     points: Floats, normals: Floats, view: View, shows: Callable[[Floats], Mask]
 ) -> tuple[Mask, NDArray[np.float64]]:
-    """Points that face a view, are shown where they fall, and have none clearly nearer there.
+    """Points that face a view, project into shown pixels, and have no clearly nearer point there.
 
     Parameters
     ----------
     points, normals : (N, 3), world.
-    shows : whether image coordinates (M, 2), which lie in the image then, show the points.
+    shows : whether image coordinates (M, 2), inside the image, may show points.
 
     Returns
     -------
@@ -181,10 +181,10 @@ def phase_residuals_deg(
 
 
 def best_fitting_model(found: Mapping[AngleModel, Consistency]) -> AngleModel | None:
-    """The model under which the planes of incidence of many views meet best in one normal.
+    """The model under which the planes of incidence of many views best intersect in one normal.
 
-    It is told by the sparse points on the surface alone, whose place no model has touched: the
-    median angle between their normals and their planes of incidence. None without such points.
+    The criterion is the median angle between normals and planes of incidence of the sparse points
+    on the surface, whose positions do not depend on a model. None without such points.
     """
     residuals = {angle_model: one.track_residual_median_deg for angle_model, one in found.items()}
     known = {angle_model: value for angle_model, value in residuals.items() if np.isfinite(value)}

@@ -1,4 +1,4 @@
-"""Deviation of a part from its reference: a drawing's mesh, a scan, or another run of it."""
+"""Deviation of a part from its reference: a CAD mesh, a scan, or another run of the part."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from polmvs.geometry import SimilarityTransform, dots, lengths
 
 UNITS_M: Mapping[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254, "um": 1e-6}
 PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
-# Of a unit that is inferred: sizes of result and reference may differ by that factor, as where a
-# part stands on its lower side. Guess; the units lie 2.5 and more apart.
+# For an inferred unit, the sizes of result and reference may differ by this factor, as if the lower
+# side of a part is hidden. Guess; units differ by a factor of 2.5 and more.
 SIZE_RATIO = 1.5
-AMBIGUOUS = 1.3  # of the second-best place's mean distance to the best one's, under which both fit
-# Beyond it a point is no point of the part, but of something beside it. Share of the size. Guess.
+AMBIGUOUS = 1.3  # ratio of the second-best mean distance to the best, below which both fit
+# Distance beyond which a point is not on the part. Share of the size. Guess.
 FAR_SHARE = 0.1
 
 
@@ -46,24 +46,24 @@ class MeasuredPart:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviationFigures:
-    """Distances from a reference in numbers; lengths in millimetres.
+    """Statistics of the distances from a reference; lengths in millimetres.
 
     Attributes
     ----------
-    num_points : that were compared; ``num_far`` more are none of the part.
+    num_points : compared points; ``num_far`` more are not on the part.
     mean, rms, standard_deviation : of the signed distances; positive is outside.
     percentiles : of the signed distances, by percent.
     median_sigma : median of the distances' stated standard deviations; NaN where none is stated.
-    significant_share : of the points farther off than three of these.
-    tolerance : that was asked for, and ``share_within`` it.
-    least_share : that must be within it, and whether that ``passed``; None without a tolerance.
-    scale : of the result that was estimated; 1 where it was given.
+    significant_share : share of the points farther away than three of these.
+    tolerance : given tolerance, and ``share_within`` it.
+    least_share : required share within it, and whether that ``passed``; None without a tolerance.
+    scale : estimated scale of the result; 1 if it was given.
     unit : of the reference, and whether it was ``unit_inferred``.
-    ambiguous : another place fits about as well: the part looks alike when it is turned.
-    reference_from_result : rows of the 4 x 4 matrix that laid the result, in the reference's unit.
-    repeatability : where the reference is another run of the part: standard deviation of one run,
-        as that of two runs' differences over the square root of two.
-    result, reference : what was compared; ``result_digest`` tells the result's content.
+    ambiguous : another registration fits about as well, as of a part with rotational symmetry.
+    reference_from_result : rows of the 4 x 4 matrix of the registration, in the reference's unit.
+    repeatability : if the reference is another run of the part: standard deviation of one run, that
+        of the differences of two runs over the square root of two.
+    result, reference : compared files; ``result_digest`` identifies the result's content.
     """
 
     num_points: int
@@ -95,13 +95,13 @@ class Deviation:
 
     Attributes
     ----------
-    index : (N,) of the points among those that were given.
-    points : (N, 3) where they lie on the reference, in its unit.
+    index : (N,) of the points among the given ones.
+    points : (N, 3) registered to the reference, in its unit.
     normals : (N, 3) of the reference there.
     distance : (N,) positive outside.
-    sigma : (N,) standard deviation; NaN where the result states none.
-    figures : of them.
-    reference_from_result : where the result was laid.
+    sigma : (N,) standard deviation; NaN if the result states none.
+    figures : their statistics.
+    reference_from_result : the registration.
     """
 
     index: NDArray[np.intp]
@@ -114,12 +114,12 @@ class Deviation:
 
 
 def infer_unit(result_m: Array, reference: Array) -> str:
-    """The unit in which a reference (M, 3) is as large as a result (N, 3) in metres.
+    """The unit in which a reference (M, 3) has the size of a result (N, 3) in metres.
 
     Raises
     ------
     OptionError
-        There is none.
+        No unit fits.
     """
     size_m, size = (float(np.linalg.norm(np.ptp(p, axis=0))) for p in (result_m, reference))
     ratios = {name: size * unit / size_m for name, unit in UNITS_M.items()}
@@ -215,7 +215,7 @@ def measure_deviation(
 def _statistics(
     distance: Array, sigma: Array, tolerance: float | None, least_share: float
 ) -> dict[str, Any]:
-    """The figures that follow from distances and their standard deviations alone."""
+    """The statistics of distances and their standard deviations."""
     known = np.isfinite(sigma)
     beyond = np.abs(distance[known]) > 3 * sigma[known]
     within = None if tolerance is None else float(np.mean(np.abs(distance) <= tolerance))

@@ -1,8 +1,8 @@
-"""Errors of dense depth and normal maps against the truth, pixel by pixel.
+"""Errors of dense depth and normal maps against ground truth, pixel by pixel.
 
-The truth is known at the centres of the pixels, the maps at the points of a lattice between them.
-Inverse depth, which is linear on a plane, is interpolated; only where all pixels about a lattice
-point are on the part and continue one surface is there a truth to compare with.
+Ground truth is known at the centres of the pixels, the maps at the points of a lattice between
+them. Inverse depth, which is linear on a plane, is interpolated. A lattice point is compared only
+if all pixels about it are on the part and on one surface.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ MAX_SLOPE = 20.0  # depth per width of a pixel's gsd: a surface seen under 3 deg
 class MapErrors:
     """Errors of depth and normal maps over the part's pixels of all views together.
 
-    All figures but ``outside`` are over the lattice points that lie wholly on the part; those of
-    errors are NaN where no such point has a value.
+    All values except ``outside`` are over the lattice points that are wholly on the part; errors
+    are NaN if no such point has a value.
 
     Attributes
     ----------
-    num_pixels : lattice points with a value and a truth.
+    num_pixels : lattice points with a value and ground truth.
     coverage : their share of all lattice points of the part, also in views without a map.
-    outside : share of the lattice points with a value that show nothing of the part.
+    outside : share of the lattice points with a value that are off the part.
     depth_rmse_m, depth_median_m, depth_p95_m : of the absolute error of depth, m.
     depth_bias_m : mean error, positive behind the surface, m.
     depth_within_1mm : share of the errors below 1 mm.
-    normals : angles between normals and truth.
-    sigma_ratio_median : median of the range's absolute error over its standard deviation; 0.67
-        where errors are normal and the deviations true.
+    normals : angles between normals and ground truth.
+    sigma_ratio_median : median of the range's absolute error over its standard deviation; 0.67 for
+        normal errors and true deviations.
     within_one_sigma, within_two_sigma : shares of the errors below one and two standard
         deviations; 0.68 and 0.95 likewise.
     """
@@ -70,8 +70,8 @@ class LatticeErrors:
 
     Attributes
     ----------
-    on_part : bool, points that lie wholly on one surface of the part.
-    off_part : bool, points that show nothing of the part.
+    on_part : bool, points wholly on one surface of the part.
+    off_part : bool, points off the part.
     known : bool, points with a range.
     depth_m : error of the depth, positive behind the surface, m; NaN where not ``on_part`` or not
         ``known``.
@@ -101,19 +101,19 @@ def map_errors(
 ) -> MapErrors:
     """Compare dense views with the true depth and normal maps.
 
-    The estimated world is brought onto the true one by the camera centres, which fixes the scale;
-    each map is then compared in its own camera, so that errors of single poses do not count.
+    The estimated world is aligned to the true one by the camera centres, which determines the
+    scale. Each map is then compared in its own camera, so errors of single poses have no influence.
 
     Parameters
     ----------
-    views : V estimated views, named as the truth's; those that it does not know are left out.
-    dense : V maps of the same views, in the same world; None where a view has none.
+    views : V estimated views, named as in the ground truth; others are ignored.
+    dense : V maps of the same views, in the same world; None for a view without maps.
     truth : maps of the same camera.
 
     Raises
     ------
     DataError
-        When the cameras do not fix the alignment, or the truth's maps have another size.
+        The cameras do not determine the alignment, or the true maps have another size.
     """
     truth_from_world, _ = align_views(views, truth.views, source=truth.cameras)
     strides = [one.stride_px for one in dense if one is not None]
@@ -137,15 +137,15 @@ def lattice_errors(
 
     Parameters
     ----------
-    view : estimated, of an image that the truth knows.
-    dense : its maps; None where it has none, which leaves all unknown.
-    truth_from_world : of which the scale counts.
-    stride_px : of the lattice where there are no maps.
+    view : estimated, of an image with ground truth.
+    dense : its maps; None: all values are unknown.
+    truth_from_world : only its scale is used.
+    stride_px : of the lattice without maps.
 
     Raises
     ------
     DataError
-        When the truth's maps have another size.
+        The true maps have another size.
     """
     camera = view.camera
     if dense is None:

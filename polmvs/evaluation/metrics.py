@@ -1,31 +1,31 @@
-"""Measures of normals, phase angles and clouds against truth; arrays in, results out.
+"""Metrics of normals, phase angles and clouds against ground truth.
 
-Definitions of the cloud's figures (all distances in metres, all surfaces of the scene sampled):
+Definitions of the cloud's metrics (all distances in metres, all surfaces of the scene sampled):
 
 on the part
-    A cloud point whose nearest true point, of all surfaces, lies on the part. So a floater near
+    A cloud point whose nearest true point, of all surfaces, lies on the part. So an outlier near
     the part counts against it, and a point of the table beside it does not.
 distance of a cloud point
-    To the tangent plane of its nearest true point where that has a normal and the offset along
-    the plane is under 1.5 times the sampling's spacing (the sampling is not the surface), else
-    to the point itself.
+    To the tangent plane of its nearest true point if that has a normal and the offset along the
+    plane is below 1.5 times the sampling's spacing (the sampling is not the surface), else to the
+    point itself.
 accuracy at t
-    Share of the cloud points on the part that lie within t of the truth.
+    Share of the cloud points on the part within t of the true surface.
 completeness at t
     Share of the true points of the part that have a cloud point within t, plain Euclidean.
 F-score at t
     Harmonic mean of the two; 0 where both are 0.
 chamfer
     Mean of the mean distance of the cloud points on the part and the mean distance of the true
-    points of the part to the cloud. Nothing is clipped: floaters count with their full distance.
+    points of the part to the cloud. Nothing is clipped: outliers count with their full distance.
 normal error
     Angle between the normals of a cloud point on the part and of its nearest true point, 0 to
     180 degrees: a normal that points into the part is 180 degrees wrong.
 off-surface share
     Share of all cloud points, on the part or not, farther than 5 mm from every true surface.
 
-Nearest points farther than 20 mm are searched among points about 4 mm apart: that may lengthen
-such a distance by a millimetre or so, which matters to no threshold below 20 mm.
+Nearest points farther than 20 mm are searched among points about 4 mm apart. This may lengthen such
+a distance by about a millimetre, which does not affect a threshold below 20 mm.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from polmvs.polarization.stokes import axial_difference
 # These define the figures; they are no tolerances of an algorithm.
 THRESHOLDS_M = (0.001, 0.002, 0.005)
 FAR_M = 0.02
-TANGENT_REACH = 1.5  # in spacings of the truth
-MIN_DOLP = RegionOptions.min_dolp  # of pixels whose phase is compared
-MAX_QUERIES = 2_000_000  # a larger cloud's accuracy is taken from a random subset of this size
+TANGENT_REACH = 1.5  # in spacings of the true points
+MIN_DOLP = RegionOptions.min_dolp  # least DoLP of pixels whose phase is compared
+MAX_QUERIES = 2_000_000  # the accuracy of a larger cloud is that of a random subset of this size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ class AngleStats:
 
     @classmethod
     def from_degrees(cls, errors_deg: Floats) -> AngleStats:
-        """Statistics of errors of any shape, degrees; NaN are left out, signs ignored."""
+        """Statistics of errors of any shape, degrees; NaN and signs are ignored."""
         errors = np.abs(np.asarray(errors_deg, np.float64).ravel())
         errors = errors[np.isfinite(errors)]
         if len(errors) == 0:
@@ -84,14 +84,14 @@ class AngleStats:
 
 @dataclass(frozen=True, kw_only=True)
 class CloudMetrics:
-    """Figures of a cloud against truth; the module's docstring defines them.
+    """Metrics of a cloud against ground truth; the module's docstring defines them.
 
     Attributes
     ----------
     thresholds_m : (T,) distances at which the shares are taken, m
     accuracy, completeness, f_score : (T,) shares from 0 to 1; 0 for a cloud without points
-    accuracy_mean_m, accuracy_median_m : distance of cloud points on the part to the truth, m
-    completeness_mean_m, completeness_median_m : distance of the part's truth to the cloud, m
+    accuracy_mean_m, accuracy_median_m : distance to ground truth of cloud points on the part, m
+    completeness_mean_m, completeness_median_m : distance of true points of the part to the cloud, m
     chamfer_m : mean of the two means, m
     normal_mean_deg, normal_median_deg : normal error, degrees
     num_points : finite points of the cloud
@@ -175,7 +175,7 @@ def evaluate_cloud(
     Raises
     ------
     ValueError
-        For arrays whose shapes do not fit, or a truth without points of the part.
+        The shapes of arrays do not fit, or there are no true points of the part.
     """
     _check_shapes(points, normals, truth_points, truth_normals, truth_is_part)
     finite = np.isfinite(points).all(axis=1)

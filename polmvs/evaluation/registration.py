@@ -1,7 +1,7 @@
-"""A result laid onto a reference surface: coarse from many starts, fine by robust least squares.
+"""Registration of a result to a reference: coarse from many starts, fine by robust least squares.
 
-The fine fit moves the points so that their distances along the reference's normals get small, with
-weights of Geman and McClure: a dent or a missing part is an outlier and does not pull.
+The fine fit minimizes the distances of the points along the reference's normals, with weights of
+Geman and McClure: a dent or a missing part is an outlier without influence.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationTolerances:
-    """How a result is laid onto a reference.
+    """Tolerances of the registration.
 
     Attributes
     ----------
-    coarse_points, fine_points : of the result, that are looked at. They cost time only.
-    coarse_steps, fine_steps : of each start, and of the best. More move nothing by a thousandth of
-        the deviation on the captures of the tests.
-    num_kept : starts that go on after the first steps. Guess.
+    coarse_points, fine_points : number of points of the result to use. They cost time only.
+    coarse_steps, fine_steps : of each start, and of the best. More change the result by less than a
+        thousandth of the deviation on the captures of the tests.
+    num_kept : starts that continue after the first steps. Guess.
     width : of the loss, standard deviations of the residuals; about that of 95 % efficiency.
-    last_width_share : of the part's size; the loss begins so wide and narrows. Guess.
-    max_scale_ratio : of an estimated scale to the one by which both are as large. Guess.
-    backward_points : of the reference, whose distances from the result count as well where the
-        scale is estimated: else the result would shrink into a flat spot of the reference.
+    last_width_share : initial width of the loss, share of the part's size; it narrows. Guess.
+    max_scale_ratio : of an estimated scale to the ratio of the sizes. Guess.
+    backward_points : points of the reference whose distances from the result are also used if the
+        scale is estimated: otherwise the result would shrink into a flat spot of the reference.
     """
 
     coarse_points: int = 1500
@@ -51,14 +51,14 @@ class RegistrationTolerances:
 
 
 class Reference(Protocol):
-    """A surface that distances are measured to."""
+    """A surface to measure distances to."""
 
     @property
     def points(self) -> Array:
-        """Places (M, 3) all over it."""
+        """Points (M, 3) all over it."""
 
     def closest(self, points: Array) -> tuple[Array, Array]:
-        """The closest places (N, 3) and the unit normals (N, 3) there."""
+        """The closest points (N, 3) and the unit normals (N, 3) there."""
 
 
 class MeshReference:
@@ -73,20 +73,20 @@ class MeshReference:
         self.points: Array = np.einsum("nk,nkd->nd", place, mesh.corners[face])
 
     def closest(self, points: Array) -> tuple[Array, Array]:
-        """The closest places, and the normals of their faces."""
+        """The closest points, and the normals of their faces."""
         place, face, _ = self._scene.closest(points)
         return place, self._mesh.face_normals[face]
 
 
 class CloudReference:
-    """A cloud with normals: between its points the surface is flat."""
+    """A cloud with normals; the surface is flat between its points."""
 
     def __init__(self, points: Array, normals: Array) -> None:
         self.points, self._normals = points, normals
         self._tree = cKDTree(points)
 
     def closest(self, points: Array) -> tuple[Array, Array]:
-        """The closest places on the tangent plane of the nearest point."""
+        """The closest points on the tangent plane of the nearest point."""
         _, index = self._tree.query(points)
         normals = self._normals[index]
         height = dots(points - self.points[index], normals)
@@ -95,16 +95,17 @@ class CloudReference:
 
 @dataclass(frozen=True, kw_only=True)
 class Registration:
-    """Where a result lies on a reference.
+    """Result of a registration.
 
     Attributes
     ----------
-    reference_from_result : the similarity; of scale 1 unless it was estimated.
-    covariance : (7, 7) of the turn (rad, about ``center``), the shift and the scale's logarithm.
-    center : (3,) of the result after it was moved.
+    reference_from_result : the similarity, with scale 1 unless it was estimated.
+    covariance : (7, 7) of the rotation (rad, about ``center``), the shift and the scale's
+        logarithm.
+    center : (3,) of the result after the registration.
     rms : robust standard deviation of the distances, reference's unit.
-    runner_up : mean distance at the best other place over that at this one, by which an ambiguous
-        one is known; infinite where there was none.
+    runner_up : mean distance of the best other registration over that of this one, which shows an
+        ambiguous one; infinite if there is none.
     """
 
     reference_from_result: SimilarityTransform
@@ -114,7 +115,7 @@ class Registration:
     runner_up: float
 
     def distance_sigmas(self, points: Array, normals: Array) -> Array:
-        """Standard deviations (N,) of distances that the registration leaves, at moved points."""
+        """Standard deviations (N,) of distances by the registration, at registered points."""
         rows = _rows(points - self.center, normals)
         return np.asarray(
             np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", rows, self.covariance, rows), 0))
@@ -141,13 +142,13 @@ def register(
     with_scale: bool = False,
     tolerances: RegistrationTolerances = RegistrationTolerances(),
 ) -> Registration:
-    """Lay points onto a reference.
+    """Register points to a reference.
 
     Parameters
     ----------
     points : (N, 3) of the result.
-    normals : (N, 3) unit, outwards; they keep thin parts from being taken for their other side.
-    with_scale : estimate the scale as well.
+    normals : (N, 3) unit, outwards; they separate the two sides of thin parts.
+    with_scale : also estimate the scale.
     """
     chosen = _some(points, normals, tolerances.fine_points)
     few = _some(points, normals, tolerances.coarse_points)
@@ -196,7 +197,7 @@ def _axes(points: Array) -> tuple[Array, Array, float]:
     """Middle, main axes as columns, and radius of points."""
     center = 0.5 * (points.min(axis=0) + points.max(axis=0))
     _, axes = np.linalg.eigh(np.cov(points.T))
-    # The middle of the box along these axes: it depends least on where points are dense.
+    # The middle of the box along these axes depends least on the density of points.
     along = (points - center) @ axes
     center = center + axes @ (0.5 * (along.min(axis=0) + along.max(axis=0)))
     return center, axes, float(np.sqrt(np.mean(lengths(points - center) ** 2)))
@@ -219,8 +220,8 @@ def _spread(
 ) -> float:
     """Mean distance of the points, those that face the wrong way counted with the largest.
 
-    And the mean distance of the reference from them, by which a place that leaves half of it bare
-    is no better one.
+    It includes the mean distance of the reference from them, so that a registration that covers
+    only half of it is not better.
     """
     moved = np.asarray(place * given[0])
     closest, normals = reference.closest(moved)
@@ -266,7 +267,7 @@ def _refined(
             rows = np.concatenate([rows, back[0]])
             distance = np.concatenate([distance, back[1]])
             weights = np.concatenate([weights, share * back[2]])
-        # A direction that nothing decides, as the turn of a disc, stays where it is.
+        # An undetermined direction, such as the rotation of a disc, does not change.
         length = np.array([size, size, size, 1, 1, 1, size][:number])
         scaled = rows / length
         normal = scaled.T @ (weights[:, None] * scaled)

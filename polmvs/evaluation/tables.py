@@ -1,4 +1,4 @@
-"""Figures as tables to read."""
+"""Results as tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NONE = "-"
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown, aligned for the eye; the first column is text, the others numbers."""
+    """An aligned Markdown table; the first column is text, the others are numbers."""
     cells = [[printable(cell) for cell in row] for row in (header, *rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
     lines = [_line(row, widths) for row in cells]
@@ -50,7 +50,7 @@ def mean_and_median(stats: AngleStats | None) -> str:
 
 
 def cloud_rows(cloud: CloudMetrics) -> list[list[str]]:
-    """Name and figure of every measure of a cloud against the truth."""
+    """Name and value of every metric of a cloud against ground truth."""
     rows = []
     for name, shares in (
         ("F-score", cloud.f_score),

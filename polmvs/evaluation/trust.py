@@ -1,8 +1,8 @@
-"""Self-assessment of a reconstruction: one verdict, and figures with their normal ranges.
+"""Quality checks of a reconstruction with their normal ranges, and its verdict.
 
-No truth is needed. What can be derived is; the rest was measured on reconstructions that are right
-and on wrong ones: see :class:`NormalRanges`. Some figures are of what the surface was fitted to;
-those of views that were left out, and of the mesh as such, can contradict it.
+They need no ground truth. Some ranges are derived; the others were measured on right and wrong
+reconstructions: see :class:`NormalRanges`. Some checks use the data to which the surface was
+fitted; those of held-out views and of the mesh are independent.
 """
 
 from __future__ import annotations
@@ -36,37 +36,37 @@ from polmvs.surface.soundness import Soundness
 
 LIGHT_OPTIONS = "`region.light`, `capture.pattern`, `capture.gamma`"
 MIN_CHECKED = 4  # views: three make a surface, and one checks it
-# Phases that a prediction is measured by, under which it tells nothing.
+# Least number of phases for the error of a prediction.
 MIN_PHASES = 50
 
 
 @dataclass(frozen=True, kw_only=True)
 class NormalRanges:
-    """Where the figures of right reconstructions lie, as (least, most).
+    """Ranges (least, most) of the quality checks for right reconstructions.
 
     Attributes
     ----------
-    residual_sigmas : derived: 0.67 where the stated deviations hold all that errs. Those of a phase
-        map hold more than noise; what an angle model leaves out comes on top. Right ones had 0.05
-        to 0.9, OPA's 6.
-    residual_deg : measured, 0.04 to 1.1; OPA's 7. Noise adds to it, so that the end is a guess.
-    agreement : measured, 0.95 to 1; 0.70 of the views one by one of ``step``, whose faces they
-        bridge (24 % within a millimetre).
+    residual_sigmas : derived: 0.67 if the stated deviations include all errors. Those of a phase
+        map include more than noise; errors of an angle model come on top. Right ones have 0.05 to
+        0.9, OPA's 6.
+    residual_deg : measured, 0.04 to 1.1; OPA's 7. Noise adds to it, so the end is a guess.
+    agreement : measured, 0.95 to 1; 0.70 with `integrate` on ``step``, which bridges its parallel
+        patches (24 % within a millimetre).
     inside : measured, 0.95 to 1; marks in a region and its uncertain border cost the rest.
-    determined : measured, 0.79 to 1 where every part has marks; parts without any lower it rightly,
-        so that the end is a guess.
+    determined : measured, 0.79 to 1 if every part has marks; parts without any lower it correctly,
+        so the end is a guess.
     sigma_share : measured, 0.0003 to 0.0019. The end is derived: twice the bending that the
         camera's model is allowed (`propagation.bending`).
 
-    predicted_deg : of views that were left out. Measured, 0.6 to 2.5; wrong ones 5 to 78. The end
-        is a guess in the gap.
+    predicted_deg : of held-out views. Measured, 0.6 to 2.5; wrong ones 5 to 78. The end is a guess
+        in the gap.
     overlap : of their silhouettes. Measured, 0.93 to 0.99; wrong masks 0.28 and 0.79, wrong gamma
         0.18.
     unexplained : share of the phases that the surface explains under neither kind of light.
         Measured, 0.000 to 0.03; wrong angles 0.1 to 0.6.
     layered, overlapping : shares of the views' rays. Measured, 0 to 0.004, and 0; the ends are
         guesses.
-    left_out : share of the views that have no pose or contradict the others. Guess.
+    left_out : share of the views without a pose or inconsistent. Guess.
     cut : measured, see :mod:`polmvs.polarization.mask_check`.
 
     Measured on right reconstructions: five rendered captures (``board``, ``dome``, ``demo``,
@@ -92,16 +92,16 @@ class NormalRanges:
 
 @dataclass(frozen=True, kw_only=True)
 class TrustFigure:
-    """One figure and what is normal.
+    """One quality check: a number with its normal range.
 
     Attributes
     ----------
-    name : what it is, with its unit.
-    value : None where there is nothing to tell it from.
+    name : what it measures, with its unit.
+    value : None if unknown.
     least, most : normal range.
-    remedy : what to check where it lies outside.
-    decides : whether a result for which it is not normal is not to be trusted; else it is weaker
-        than others, or a part of it is missing.
+    remedy : what to check if it is outside.
+    decides : whether the result is not to be trusted if it is outside; otherwise the result is less
+        accurate or incomplete.
     """
 
     name: str
@@ -113,7 +113,7 @@ class TrustFigure:
 
     @property
     def is_normal(self) -> bool:
-        """Whether it is known and within its range."""
+        """Whether the value is known and within its range."""
         return self.value is not None and self.least <= self.value <= self.most
 
     def __str__(self) -> str:
@@ -144,27 +144,27 @@ def _figure(
 
 @dataclass(frozen=True, kw_only=True)
 class Trust:
-    """How far a cloud of one angle model is to be trusted.
+    """Quality checks of a cloud of one angle model, and the verdict.
 
     Attributes
     ----------
     residual_deg : median angle between measured phases and those that the cloud's normals predict.
     residual_sigmas : the same in the deviations that the phase maps state.
-    agreement : share of the views that see a point that agree with it in place and normal.
-    inside : share of the points that views see, nothing before them, that lie in the views'
-        polarized regions: what lies outside contradicts their silhouettes.
+    agreement : share of the views that see a point which agree with it in position and normal.
+    inside : share of the points visible in views that lie in the views' polarized regions: other
+        points contradict the silhouettes.
     determined : share of the regions, over all views, that show a point.
-    sigma_share : median stated deviation of a place along its normal, share of its distance from
-        the nearest camera.
-    num_views : of the capture.
-    left_out : those of them that have no pose, or contradict the others.
-    predicted : views left out, from a surface of the others; None where none was made.
-    fitted : all views, from the surface; None where the views were integrated one by one.
+    sigma_share : median position uncertainty (1 sigma), share of the distance from the nearest
+        camera.
+    num_views : number of views of the capture.
+    left_out : views without a pose, and inconsistent views.
+    predicted : held-out views, predicted from a surface of the others; None if not made.
+    fitted : all views, predicted from the surface; None if the views were integrated one by one.
     soundness : of the mesh; likewise.
-    complaints : what earlier stages found wrong (cameras, pattern, light), a clause each.
-    cut_share : of what lies along the user's masks, outside of them, how much is polarized as a
-        surface is; None without masks.
-    is_trusted, verdict : what all that comes to, in one sentence.
+    complaints : errors that earlier stages found (cameras, pattern, light), one clause each.
+    cut_share : share of the band outside of the user's masks that is as polarized as a surface;
+        None without masks.
+    is_trusted, verdict : the verdict, in one sentence.
     """
 
     residual_deg: float
@@ -187,7 +187,7 @@ class Trust:
         return self.verdict
 
     def figures(self, ranges: NormalRanges = NormalRanges()) -> tuple[TrustFigure, ...]:
-        """The figures with their normal ranges, for people; first those that can contradict."""
+        """The quality checks with their normal ranges; the independent ones first."""
         return (*self._contradicting(ranges), *self._fitted(ranges))
 
     def _contradicting(self, ranges: NormalRanges) -> Iterator[TrustFigure]:
@@ -214,12 +214,12 @@ class Trust:
             yield _figure(name, self.fitted.unexplained, ranges.unexplained, LIGHT_OPTIONS)
         if self.soundness is not None:
             views = "views that contradict each other: poses, `region.mask`"
-            name = "lines of sight through two sheets of surface upon each other, %"
+            name = "lines of sight through a double layer of the surface, %"
             yield _figure(name, self.soundness.layered, ranges.layered, views)
             name = "lines of sight through a surface that intersects itself, %"
             yield _figure(name, self.soundness.overlapping, ranges.overlapping, views)
         if self.num_views:
-            name = "views without a pose or that contradict the others, %"
+            name = "views without a pose or inconsistent, %"
             remedy = "the images of these views, `sfm.intrinsics`, `region.mask`"
             yield _figure(name, self.left_out / self.num_views, ranges.left_out, remedy)
         if self.cut_share is not None:
@@ -241,7 +241,7 @@ class Trust:
         yield _figure(name, self.agreement, ranges.agreement, remedy)
         name = "points within the silhouettes of the views, %"
         yield _figure(name, self.inside, ranges.inside, "`region.mask`, poses")
-        name = "part of the polarized regions determined, %"
+        name = "coverage of the polarized regions, %"
         remedy = "marks on the part; more views"
         yield _figure(name, self.determined, ranges.determined, remedy, decides=False)
         name = "position uncertainty (1 sigma), median, % of the distance"
@@ -249,11 +249,11 @@ class Trust:
         yield _figure(name, self.sigma_share, ranges.sigma_share, remedy, decides=False)
 
     def doubts(self) -> tuple[str, ...]:
-        """A line for each figure that is not normal."""
+        """A line for each quality check outside its range."""
         return tuple(str(figure) for figure in self.figures() if not figure.is_normal)
 
     def judged(self) -> Trust:
-        """The same with its verdict."""
+        """The quality checks with their verdict."""
         if np.isnan(self.inside) and np.isnan(self.residual_deg):
             verdict = "Not to be trusted: no view sees a point of a surface in the result."
             return replace(self, is_trusted=False, verdict=verdict)
@@ -291,15 +291,15 @@ def measure_trust(
     maps: Sequence[PhaseMap],
     outside: Mapping[str, Mask] = MappingProxyType({}),
 ) -> Trust:
-    """Measure a cloud against the capture that it was made from.
+    """Quality checks of a cloud against its capture.
 
     Parameters
     ----------
     angle_model : of the cloud.
     cloud : dense, with ``kind``, ``num_views`` and ``sigma``.
-    tracks : sparse points, as :func:`polmvs.evaluation.consistency.measure_consistency` takes them.
+    tracks : sparse points, as in :func:`polmvs.evaluation.consistency.measure_consistency`.
     maps : of all views, for the model.
-    outside : as :func:`polmvs.evaluation.consistency.measure_consistency` takes it.
+    outside : as in :func:`polmvs.evaluation.consistency.measure_consistency`.
     """
     consistency = measure_consistency(angle_model, cloud, tracks, maps, outside)
     surface = cloud.only(cloud.are(PointKind.SURFACE))

@@ -1,4 +1,4 @@
-"""Clouds, normals of sparse points, and measured phases against the ground truth."""
+"""Errors of clouds, normals of sparse points and measured phases against ground truth."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from polmvs.polarization.stokes import Stokes
 from polmvs.poses.alignment import Alignment, align_views
 from polmvs.scene import View, match_names
 
-# Of a sparse point that counts as one of the part; definitions, see `track_normal_errors`.
+# Of a sparse point on the part; definitions, see `track_normal_errors`.
 ON_PART_M = 0.003
 IN_FRONT_M = 0.010
 
@@ -60,7 +60,7 @@ def evaluate(
     views: Sequence[View],
     truth: GroundTruth,
 ) -> tuple[CloudMetrics, Alignment]:
-    """Align a cloud by its cameras and compare it with the truth.
+    """Align a cloud by its cameras and compare it with ground truth.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def evaluate(
     Raises
     ------
     DataError
-        When the cameras do not fix the alignment.
+        The cameras do not determine the alignment.
     """
     truth_from_world, report = align_views(views, truth.views, source=truth.cameras)
     surface = truth.surface_points()
@@ -104,7 +104,7 @@ def track_normal_errors(
     Parameters
     ----------
     points, normals : (N, 3), estimated world
-    valid : (N,) bool, which normals count
+    valid : (N,) bool, normals to use
     views : estimated views, in the same world.
     """
     if normals.shape != points.shape or valid.shape != points.shape[:1]:
@@ -156,14 +156,14 @@ def phase_errors(
 
     Parameters
     ----------
-    capture : whose single pixels are measured too.
+    capture : its single pixels are also compared.
     maps : phase maps, as OPA and PPA use them.
-    truth : with the true normals.
+    truth : ground truth with normals.
 
     Returns
     -------
-    ``maps``: of the phase maps, which the geometry uses. ``pixels``: of the single pixels of the
-    capture, those neither clipped nor dark.
+    ``maps``: errors of the phase maps. ``pixels``: errors of the single pixels of the capture that
+    are neither clipped nor dark.
     """
     raw = match_names([phase_map.view.name for phase_map in maps], capture.names)
     errors: dict[str, dict[AngleModel, AngleStats]] = {}
@@ -172,7 +172,7 @@ def phase_errors(
         if source == "maps":
             measured = (_of_map(as_tilted(one) if tilted else one) for one in maps)
         else:
-            # A folder holds the mosaics of all maps: they were made of it.
+            # The folder has the mosaics of all maps, which were made from it.
             measured = (
                 _of_pixels(one, capture.load(raw[one.view.name]), tilted=tilted) for one in maps
             )
@@ -190,12 +190,12 @@ def phase_errors_on_part(measured: Measured, truth: GroundTruth) -> dict[AngleMo
     Parameters
     ----------
     measured : name, phase (not AoLP), rad modulo pi, and DoLP (H, W) of each image, one at a
-        time; pixels whose phase is NaN or whose DoLP is not above 0.1 and images without a truth
-        are left out.
+        time. Pixels whose phase is NaN or whose DoLP is at most 0.1, and images without ground
+        truth, are ignored.
 
     Returns
     -------
-    For OPA and PPA, the statistics over all pixels of the part in all images that have a truth.
+    For OPA and PPA, the statistics over all pixels of the part in all images with ground truth.
     """
     errors: dict[AngleModel, list[Array]] = {AngleModel.OPA: [], AngleModel.PPA: []}
     for name, phase, dolp in measured:

@@ -1,9 +1,9 @@
 """Experiment 4: contours traced from seeds on the part's edge (paper, 5.4).
 
-Of each view: 20 true points along the edge of the part are the seeds. ``opa``: iso-depth contours
-in the OPA direction. ``ppa_normals``: the same 2D paths, the distance stepped along them with
-normals from two views at the place reached so far (the paper's way). ``ppa_tangent`` and
-``tilted_tangent``: iso-range contours of the view alone. All use the package's phase maps.
+In each view, 20 true points along the edge of the part are the seeds. ``opa``: iso-depth contours
+in the OPA direction. ``ppa_normals``: the same 2D paths, with the distance integrated along them
+from normals of two views at the current point (the paper's method). ``ppa_tangent`` and
+``tilted_tangent``: iso-range contours of one view. All use the phase maps of polmvs.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from polmvs.scene import MIN_DISTANCE
 from polmvs.surface.contour import Contours, direction_field, trace_contours
 from polmvs.surface.log_range import log_range_increment
 
-# What the experiment measures; these define the figures.
-INSET_PX = 4  # of the seeds: nearer to the edge the blurred light of the background is mixed in
-MEASURED_PX = 1.0  # distance between the points of a contour that are measured
-MIN_SEEN_SHARE = 0.9  # of the seeds, that a second view must see
+# These define the results of the experiment.
+INSET_PX = 4  # of the seeds from the edge: nearer to it the background's light is mixed in
+MEASURED_PX = 1.0  # distance between the measured points of a contour
+MIN_SEEN_SHARE = 0.9  # share of the seeds that a second view must see
 
 CONTOUR_LABELS = {
     "opa": "OPA, iso-depth",
@@ -65,7 +65,7 @@ class Lines:
 
     Attributes
     ----------
-    points : (N, 3), true world, metres, one a pixel; those of a curve in order.
+    points : (N, 3), true world, metres, one per pixel; those of a curve in order.
     curve : (N,) int, index of the seed.
     heights : (N,), signed distance to the true surface, metres.
     """
@@ -87,7 +87,7 @@ class ViewContours:
     Attributes
     ----------
     name : of the image.
-    second : name of the image that gave the second rows of ``ppa_normals``; None without seeds.
+    second : name of the image of the second rows of ``ppa_normals``; None without seeds.
     lines : by method.
     """
 
@@ -103,7 +103,7 @@ class LineStats:
     Attributes
     ----------
     rmse_mm, median_mm, p95_mm : of the absolute distances; NaN without points.
-    num_points, num_curves : that were measured.
+    num_points, num_curves : numbers of measured points and curves.
     """
 
     rmse_mm: float
@@ -123,11 +123,11 @@ def measure_contours(
     num_seeds: int = ExperimentOptions.num_seeds,
     step_px: float = ExperimentOptions.step_px,
 ) -> list[ViewContours]:
-    """Contours of some views; all views may give the second rows.
+    """Contours of some views; the second rows may come from all views.
 
     Parameters
     ----------
-    indices : of the views that contours are traced in.
+    indices : of the views with contours.
     num_seeds : in each view.
     step_px : of the tracing, px.
 
@@ -226,8 +226,8 @@ def trace_view(
 def edge_seeds(part: Mask, num: int) -> NDArray[np.float32]:
     """Image coordinates (S, 2) spread evenly along the outline of the part, a little inside.
 
-    The outline is that of the largest connected piece, without what the image's border cuts off:
-    that is no edge of the part. No seeds where nothing is left.
+    The outline is that of the largest connected piece, without the image's border, which is not an
+    edge of the part. There are no seeds if nothing remains.
     """
     eroded = cv2.erode(
         part.astype(np.uint8), np.ones((2 * INSET_PX + 1,) * 2, np.uint8), borderValue=0
@@ -277,7 +277,7 @@ def _measured(points: Array, curve: NDArray[np.int64], surface: TrueSurface) -> 
 
 
 def second_view(maps: Sequence[PhaseMap], index: int, seeds: Array) -> int | None:
-    """The view whose rows cross those of another at the largest angle, seen from its seeds.
+    """The view whose rows have the largest angle to those of another view at its seeds.
 
     Parameters
     ----------
@@ -287,8 +287,8 @@ def second_view(maps: Sequence[PhaseMap], index: int, seeds: Array) -> int | Non
 
     Returns
     -------
-    Among the views that have rows for at least 90 % of the seeds (or, failing that, the most)
-    the one with the largest median angle; None without seeds or a second view.
+    Among the views with rows for at least 90 % of the seeds (else with the most), the one with the
+    largest median angle; None without seeds or a second view.
     """
     if len(seeds) == 0 or len(maps) < 2:
         return None
@@ -310,19 +310,19 @@ def step_with_normals(
     paths: Contours,
     seed_range: Floats,
 ) -> Array:
-    """Distances along 2D paths, with the normal of two views at every place reached.
+    """Distances along 2D paths, with the normal of two views at every point.
 
     Parameters
     ----------
     maps : of the view of the paths, and of the second view.
-    range_maps : of the same views, by which occluded rows are told; see
+    range_maps : of the same views, for occlusion; see
         :func:`polmvs.normals.rows.gather_rows`.
     paths : nodes of each curve ordered by their arc, seeds at arc 0; ``curve`` counts in seeds.
     seed_range : (S,), distance of each seed from the camera centre.
 
     Returns
     -------
-    (N,), NaN from where on the second view has no row, or the two rows give no normal.
+    (N,), NaN from the first point where the second view has no row or the two rows give no normal.
     """
     nodes = _halves(paths)
     view = maps[0].view
@@ -368,7 +368,7 @@ def _normals(
     """Normals (N, 3) in the frame of the first view, NaN where the views do not give one."""
     first = maps[0].view.cam_from_world
     rows = gather_rows(AngleModel.PPA, first.inverse() * points_in_cam, maps, range_maps)
-    # As in the paper, which knows of no noise: two rows that cross give a normal.
+    # As in the paper, which has no noise model: two rows that are not parallel give a normal.
     sigma = np.where(np.isfinite(rows.sigma), EXACT_SIGMA, np.inf)
     estimate = solve_normals(rows.rows, rows.rays, sigma, robust=False)
     return np.asarray(estimate.normals @ first.rotation.T, np.float64)
@@ -379,7 +379,7 @@ class TrueSurface(Protocol):
 
     @property
     def description(self) -> str:
-        """What it is, for the record."""
+        """Description for the record."""
 
     def heights(self, points: Floats) -> Array:
         """Signed distance (N,) of points (N, 3), true world; positive outside, in its units."""
@@ -400,7 +400,7 @@ class PlaneSurface:
 
 @dataclass(frozen=True, eq=False)
 class SampledSurface:
-    """Points (N, 3) of a surface with unit normals (N, 3): distances are to tangent planes."""
+    """Points (N, 3) of a surface with unit normals (N, 3); distances are to tangent planes."""
 
     points: Array
     normals: Array
@@ -408,7 +408,7 @@ class SampledSurface:
     description: str = "tangent plane of the nearest true point"
 
     def heights(self, points: Floats) -> Array:
-        """Signed distance (N,); to the nearest point itself where the surface has ended."""
+        """Signed distance (N,); to the nearest point beyond the end of the surface."""
         distances, nearest = nearest_points(self.points, np.asarray(points, np.float64), far=FAR_M)
         offsets = points - self.points[nearest]
         heights = np.einsum("ij,ij->i", offsets, self.normals[nearest])
@@ -418,12 +418,12 @@ class SampledSurface:
 
 
 def open_surface(truth: Truth) -> TrueSurface:
-    """The part's surface: exact where the truth tells that it is a plane, else sampled.
+    """The part's surface: exact if the ground truth has a plane, else sampled.
 
     Raises
     ------
     DataError
-        The truth has neither.
+        The ground truth has neither.
     """
     if isinstance(truth, BoardTruth):
         return PlaneSurface(truth.normal, truth.offset)
@@ -460,12 +460,12 @@ def _plane(normal: Any, offset: Any) -> PlaneSurface:
 
 
 def line_set_bytes(lines: Sequence[Lines], *, stride: int = 4) -> bytes:
-    """A binary PLY of contours; neighbours on a curve are joined.
+    """A binary PLY of contours; neighbours on a curve are connected.
 
     Parameters
     ----------
     lines : of any number of views, true world, metres.
-    stride : every how many-th point of a curve is kept.
+    stride : between the kept points of a curve.
 
     Returns
     -------

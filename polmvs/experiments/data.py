@@ -1,4 +1,4 @@
-"""Scene of the experiments: a capture, its ground truth, and poses in the truth's world."""
+"""Scene of the experiments: a capture, its ground truth, and poses in the true world."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from polmvs.poses.alignment import Alignment, align_views
 from polmvs.poses.image_check import intensity_loader, require_cameras_of_images
 from polmvs.scene import View, find_name, match_names, short_list
 
-EXACT_SIGMA = 1e-3  # rad; stands for no noise, far below that of any phase
-BLUR_REACH = 2.0  # deviations of the blur within which a mark spoils a pixel
+EXACT_SIGMA = 1e-3  # rad; represents no noise, far below that of any phase
+BLUR_REACH = 2.0  # deviations of the blur within which a mark affects a pixel
 
 
 class Truth(Protocol):
-    """What an experiment needs of a ground truth; maps are ``(H, W)`` of the half-size images."""
+    """Interface of a ground truth; maps are ``(H, W)`` of the half-size images."""
 
     @property
     def folder(self) -> Path:
-        """Where it lies, for messages."""
+        """Its folder, for messages."""
 
     @property
     def views(self) -> Mapping[str, View]:
@@ -52,7 +52,7 @@ class Truth(Protocol):
         """Whether each pixel shows the part."""
 
     def depth(self, name: str) -> Image:
-        """True z, m; NaN where there is nothing."""
+        """True z, m; NaN without a surface."""
 
     def normals(self, name: str) -> Image:
         """True normals (H, W, 3), unit, camera frame; NaN off the part."""
@@ -63,16 +63,16 @@ MODEL_LABELS = {AngleModel.OPA: "OPA", AngleModel.PPA: "PPA", AngleModel.TILTED:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A capture with poses in the world of its truth.
+    """A capture with poses in the world of its ground truth.
 
     Attributes
     ----------
-    capture, truth : where pixels and true maps are read from.
-    views : posed views under the truth's image names, true world, metres.
+    capture, truth : sources of pixels and true maps.
+    views : posed views with the image names of the ground truth, true world, metres.
     raw_names : file name of each view's mosaic, in the order of ``views``.
-    region : light, DoLP threshold, and a folder of masks that narrows the truth's.
-    blur_px : deviation of the Gaussian that the images are blurred with, px; 0: none.
-    alignment : how estimated poses were brought into the true world; None for true poses.
+    region : light, DoLP threshold, and a folder of masks that restrict the true ones.
+    blur_px : deviation of the Gaussian blur of the images, px; 0: none.
+    alignment : of estimated poses to the true world; None for true poses.
     """
 
     capture: Capture
@@ -84,7 +84,7 @@ class Scene:
     alignment: Alignment | None = None
 
     def settings(self) -> dict[str, Any]:
-        """What the results depend on, for their record."""
+        """Settings of the results, for their record."""
         return {
             "capture": str(self.capture.folder),
             "truth": str(self.truth.folder),
@@ -104,7 +104,7 @@ class ViewData:
     Attributes
     ----------
     view : posed camera.
-    light : which reflection dominates.
+    light : dominant kind of light.
     rays : (H, W, 3) float32, unit, camera frame.
     sharp, blurred : Stokes images as captured, and blurred as in the paper.
     part : (H, W) bool, the part by the true mask.
@@ -125,7 +125,7 @@ class ViewData:
     range_map: Image
 
     def blurred_for(self, angle_model: AngleModel) -> Stokes:
-        """Blurred Stokes images as the model takes them: corrected under ``tilted``."""
+        """Blurred Stokes images for the model: corrected under ``tilted``."""
         return self._for(angle_model, self.blurred)
 
     def axial(self, angle_model: AngleModel) -> Image:
@@ -139,19 +139,19 @@ class ViewData:
         return find_region(s.s0, s.s1, s.s2, s.valid, min_dolp=min_dolp, mask=self.part)
 
     def beside_marks(self, region: Region, blur_px: float) -> Mask:
-        """Pixels that printed marks (or other unreliable pixels) reach through the blur."""
+        """Pixels within the blur of printed marks or other unreliable pixels."""
         return grow_mask(self.part & ~region.reliable, math.ceil(BLUR_REACH * blur_px))
 
     def phase_map(self, angle_model: AngleModel, region: Region) -> PhaseMap:
-        """The package's own phase map, with precisions."""
+        """The phase map of polmvs, with precisions."""
         s = self.sharp
         measured = build_phase_map(self.view, s, region, self.light)
         return as_tilted(measured) if angle_model is AngleModel.TILTED else measured
 
     def plain_map(self, angle_model: AngleModel) -> PhaseMap:
-        """A phase map of the paper's kind: blurred pixels over the threshold, all alike.
+        """A phase map as in the paper: blurred pixels above the threshold, with equal weights.
 
-        The paper knows of no noise: its rows count as exact, so that only their geometry decides
+        The paper has no noise model: its rows count as exact, so only their geometry decides
         whether they give a normal.
         """
         axial = self.axial(angle_model) / np.maximum(self.blurred.s0, 1e-6)[..., None]
@@ -175,7 +175,7 @@ def open_scene(
     blur_px: float = ExperimentOptions.blur_px,
     sparse: Path | None = None,
 ) -> Scene:
-    """Match a capture with its truth, and with estimated poses where they are given.
+    """Match a capture with its ground truth, and with estimated poses if given.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def open_scene(
     Raises
     ------
     DataError
-        No image has a truth, sizes differ, or the poses are of other images.
+        No image has ground truth, sizes differ, or the poses are of other images.
     """
     raw_of = _raw_names(capture, truth)
     views = [view for name, view in truth.views.items() if name in raw_of]
@@ -295,7 +295,7 @@ def _blur(stokes: Stokes, blur_px: float) -> Stokes:
 
 
 def require_counted(scene: Scene, num_counted: Sequence[int] | int) -> None:
-    """Refuse to go on without a single pixel to measure on.
+    """Raise an error if no pixel is usable.
 
     Raises
     ------
@@ -316,14 +316,14 @@ def open_experiment(
     capture: CaptureOptions,
     region: RegionOptions,
 ) -> Scene:
-    """The scene of a capture with truth, of either layout.
+    """The scene of a capture with ground truth, of either layout.
 
     Parameters
     ----------
     folder : of the capture.
-    options : truth, poses and blur.
-    capture : how the mosaics are read; for the layout of the authors' demo only what differs from
-        the defaults, which are not its own.
+    options : ground truth, poses and blur.
+    capture : how to read the mosaics; for the layout of the authors' demo, which has its own
+        defaults, only values other than the usual defaults.
     region : light, DoLP threshold and masks.
 
     Raises
@@ -349,16 +349,16 @@ def _open_data(folder: Path, gt: Path | None, options: CaptureOptions) -> tuple[
 def open_author_capture(
     folder: Path, options: CaptureOptions | None = None
 ) -> tuple[Capture, BoardTruth]:
-    """Open a capture in the layout of the authors' demo, with its truth.
+    """Open a capture in the layout of the authors' demo, with its ground truth.
 
     Parameters
     ----------
-    options : how mosaics become polarization images; None: the authors' own.
+    options : how to read the mosaics; None: the authors' options.
 
     Raises
     ------
     DataError
-        A file is missing, damaged, or of another size or count.
+        A file is missing, damaged, or of another size, or the number of files is wrong.
     """
     capture = open_capture(folder / "images", AUTHOR_OPTIONS if options is None else options)
     return capture, read_author_truth(folder, capture.names, capture.width, capture.height)

@@ -19,7 +19,7 @@ from polmvs.experiments.plane import ESTIMATES, PLANE_LABELS, PlaneResult
 from polmvs.experiments.tracks import ESTIMATORS, TRACK_LABELS, TrackResult
 from polmvs.polarization.kinds import FORMULAS
 
-# Okabe and Ito's palette, which people with any kind of colour blindness tell apart.
+# Okabe and Ito's palette, distinguishable with any kind of colour blindness.
 VERMILLION, ORANGE, SKY, BLUE, GREEN, GREY = (
     "#D55E00", "#E69F00", "#56B4E9", "#0072B2", "#009E73", "#666666",
 )  # fmt: skip
@@ -129,7 +129,7 @@ def _add_wheel(figure: Figure) -> None:
 
 
 def draw_plane(result: PlaneResult) -> bytes:
-    """Angular error of each image, and what the twin normal leaves."""
+    """Angular error of each image, and the residual of the twin normal."""
     figure = _figure(9.5, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(2.4, 1))
     for name in ESTIMATES:
@@ -259,7 +259,7 @@ def draw_track_boxes(result: TrackResult) -> bytes:
 
 
 def draw_contours(view: ViewContours) -> bytes:
-    """Contours of one view seen along the surface: height over it against the horizontal place.
+    """Contours of one view in profile: height above the surface against the horizontal position.
 
     The upper row has the same scale for all methods, the lower one that of the PPA tangents.
     """

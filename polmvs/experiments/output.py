@@ -1,4 +1,4 @@
-"""Results as files: ``NAME.json``, ``NAME.md`` and what belongs to them, whole or not at all."""
+"""Results as files: ``NAME.json``, ``NAME.md`` and their figures, written whole or not at all."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Report:
     name : of the experiment.
     title : of its section.
     content : of ``NAME.json``.
-    text : Markdown: what was done and the tables.
+    text : Markdown: the procedure and the tables.
     figures : caption and PNG by file name.
     lines : PLY line sets by file name.
     """
@@ -47,7 +47,7 @@ class Report:
         return "\n".join([f"{'#' * level} {self.title}\n", self.text, *images])
 
     def files(self) -> dict[str, bytes]:
-        """All files by name, the JSON last: where it is, the others are."""
+        """All files by name, the JSON last: if it exists, the others do."""
         return {
             **{name: png for name, (_, png) in self.figures.items()},
             **self.lines,
@@ -80,12 +80,12 @@ def check_output(out: Path, name: str, *, overwrite: bool) -> None:
 def write_report(out: Path, report: Report) -> None:
     """Write all files of a report under temporary names, then rename them.
 
-    Older results of the same experiment are replaced; nothing else is touched.
+    Older results of the same experiment are replaced; other files stay unchanged.
 
     Raises
     ------
     DataError
-        The system refuses; then no file has its name yet.
+        The system refuses; then no file has its final name.
     """
     write_files(out, report.files())
     for path in out.iterdir():

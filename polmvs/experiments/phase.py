@@ -1,8 +1,8 @@
 """Experiment 1: error of the phase that each model predicts from true normals (paper, 5.2).
 
-Measured is the phase of the Stokes images blurred as in the paper; counted are the pixels of the
-part over the DoLP threshold. The third model predicts, beside the normal's phase, what a tilted
-polarizer makes of it: the same error as that of the corrected measured phase under PPA.
+The measured phase is that of the Stokes images blurred as in the paper, at the pixels of the part
+above the DoLP threshold. The third model also predicts the effect of tilted polarizers: its error
+is that of the corrected measured phase under PPA.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ANGLES = ("viewing", "azimuth", "zenith")
 ANGLE_LIMITS_DEG = {"viewing": 90.0, "azimuth": 180.0, "zenith": 90.0}
 ANGLE_BINS = 90
 ERROR_BINS = 180  # over -90 to 90 degrees
-MIN_COLUMN_PIXELS = 200  # of an angle's bin: of fewer there is no density
+MIN_COLUMN_PIXELS = 200  # least number of pixels for the density in an angle's bin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,12 +55,11 @@ class PhaseResult:
     Attributes
     ----------
     all_pixels : over the counted pixels of all views.
-    unmarked : over those that no printed mark (not ``reliable`` in
-    :class:`polmvs.polarization.region.Region`)
-        reaches through the blur.
+    unmarked : over those outside the blur of printed marks (not ``reliable`` in
+        :class:`polmvs.polarization.region.Region`).
     per_view : root mean square error of each view, degrees, by image name.
     densities : by model, (3, ANGLE_BINS, ERROR_BINS), for the angles of ``ANGLES``: share of the
-        pixels of an angle's bin in each bin of the error; NaN where an angle has too few pixels.
+        pixels of an angle's bin in each bin of the error; NaN for an angle with too few pixels.
     """
 
     all_pixels: Mapping[AngleModel, SignedStats]
@@ -88,7 +87,7 @@ class PhaseImages:
     name : of the image.
     intensity : (H, W), s0.
     part : (H, W) bool.
-    measured : (H, W), phase, rad; NaN where it is not counted.
+    measured : (H, W), phase, rad; NaN where it is not used.
     predicted : by model, (H, W), rad; NaN off the part.
     """
 
@@ -107,7 +106,7 @@ def measure_phase(
     Raises
     ------
     DataError
-        No pixel is counted, or a file is at fault.
+        No pixel is usable, or a file is unusable.
     """
     views = []
     for view in workers.map(partial(measure_view, scene), range(len(scene.views))):
@@ -228,7 +227,7 @@ class SignedStats:
     ----------
     mean_deg : of the signed errors, as in the paper.
     mean_abs_deg, rmse_deg, median_deg, p95_deg : of their absolute values; the last two to 0.01.
-    num_pixels : how many.
+    num_pixels : number of errors.
     """
 
     mean_deg: float
@@ -241,7 +240,7 @@ class SignedStats:
 
 @dataclass(frozen=True)
 class ErrorTally:
-    """Sums of signed axial errors, from which their statistics follow; tallies add up.
+    """Sums of signed axial errors for their statistics; tallies can be added.
 
     Attributes
     ----------

@@ -1,9 +1,8 @@
 """Experiment 2: normal of a planar region from one view (paper, 5.3, M1).
 
-The paper's eigenvector and the robust maximum likelihood of
-:mod:`polmvs.normals.single_view.plane` see the same
-pixels. On a curved part the region of each view is the patch of the part whose true normals lie
-within a few degrees of one of them and that has the most pixels; its truth is their mean.
+The paper's eigenvector and the robust maximum likelihood of :mod:`polmvs.normals.single_view.plane`
+use the same pixels. On a curved part, the region of each view is the largest patch whose true
+normals lie within a few degrees of one of them; its true normal is their mean.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ NUM_CANDIDATES = 64  # normals tried as the middle of a patch
 MAX_SPREAD_DEG = 0.2  # of the true normals of a plane; 16-bit maps have less
 
 # A lens may or may not tilt the polarizers (:mod:`polmvs.polarization.angle_models`), and PPA
-# leaves that out: what it would turn a pixel's phase by is part of the phase's uncertainty. It is
-# common to a whole part of the image and does not average out as noise does over the pixels, hence
-# the factor.
+# ignores the tilt: its rotation of a pixel's phase is part of the phase's uncertainty. It is common
+# to a whole part of the image and does not average out over the pixels as noise does, hence the
+# factor.
 TILT_FACTOR = 4.0
 
 
 class Weights(StrEnum):
-    """How the pixels of an estimate are weighed."""
+    """Weights of the pixels of an estimate."""
 
     ALIKE = "alike"
     NOISE = "noise"
@@ -71,8 +70,8 @@ class ImagePlane:
     name : of the image.
     num_pixels : of the region.
     spread_deg : root mean square angle of the region's true normals to their mean, degrees.
-    error_deg : angle to the true normal; NaN where none was found.
-    sigma_deg : as the estimator reports it.
+    error_deg : angle to the true normal; NaN without an estimate.
+    sigma_deg : as stated by the estimator.
     seconds : wall time of the estimate.
     """
 
@@ -86,13 +85,13 @@ class ImagePlane:
 
 @dataclass(frozen=True, kw_only=True)
 class Ambiguity:
-    """The normal against its twin, turned by pi about the optical axis.
+    """Comparison of the normal with its twin, turned by pi about the optical axis.
 
     Attributes
     ----------
     rmse_deg, rmse_turned_deg : phase residual of the true normal and of the twin, root mean
         square over all views.
-    determined_share : of the views, those whose rows determine a single normal.
+    determined_share : share of the views whose rows determine a single normal.
     """
 
     rmse_deg: float
@@ -128,7 +127,7 @@ class PlaneResult:
 
     @property
     def is_planar(self) -> bool:
-        """Whether the regions are planes rather than patches of a curved part."""
+        """Whether the regions are planes and not patches of a curved part."""
         return self.spread_deg < MAX_SPREAD_DEG
 
 
@@ -143,12 +142,12 @@ def measure_plane(
 
     Parameters
     ----------
-    planar_deg : how far true normals of the region may lie from its middle one, degrees.
+    planar_deg : largest angle of the region's true normals to the middle one, degrees.
 
     Raises
     ------
     DataError
-        No view has enough pixels, or a file is at fault.
+        No view has enough pixels, or a file is unusable.
     """
     images, residuals = [], []
     work = partial(measure_image, scene, planar_deg=planar_deg)

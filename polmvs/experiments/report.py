@@ -1,4 +1,4 @@
-"""Each experiment from a scene to its report: measured, drawn and put into words."""
+"""Each experiment from a scene to its report: measurement, figures and text."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from polmvs.polarization.kinds import AngleModel
 
 NUM_FIGURE_VIEWS = 3
 
-# What the paper measured on its own data, 282 images of a real board.
+# Results of the paper on its own data, 282 images of a real board.
 PAPER = {
     "phase": "OPA -0.18° and 20.90° (mean, RMSE), PPA 0.35° and 5.90°, ratio 28 %",
     "plane": "eigenvector 2.68° mean, 1.16° RMSE (as the paper calls it)",
@@ -55,18 +55,18 @@ PAPER = {
 
 
 def check_options(scene: Scene, options: ExperimentOptions, names: Sequence[str]) -> None:
-    """Refuse what cannot be done before anything is measured.
+    """Refuse impossible options before anything is measured.
 
     Parameters
     ----------
-    scene : what is measured on.
+    scene : data of the experiments.
     options : of the experiments.
-    names : the experiments that are to be run.
+    names : experiments to run.
 
     Raises
     ------
     OptionError
-        A view is unknown, or more views are asked for than there are.
+        A view is unknown, or there are fewer views than requested.
     """
     view_indices(options.views, scene)
     if "tracks" in names:
@@ -81,7 +81,7 @@ def run_experiment(
     Raises
     ------
     PolmvsError
-        The capture or its truth does not allow it.
+        The capture or its ground truth does not allow it.
     """
     runners = {
         "phase": _run_phase,
@@ -93,7 +93,7 @@ def run_experiment(
 
 
 def num_steps(name: str, scene: Scene, options: ExperimentOptions) -> int:
-    """How often an experiment reports progress."""
+    """Number of steps that an experiment reports."""
     num = len(scene.views)
     if name != "contours":
         return num
@@ -102,7 +102,7 @@ def num_steps(name: str, scene: Scene, options: ExperimentOptions) -> int:
 
 
 def figure_views(scene: Scene, options: ExperimentOptions) -> tuple[int, ...]:
-    """Indices of the views that are shown: the user's, or a few evenly spread."""
+    """Indices of the shown views: the user's, or a few evenly spread."""
     chosen = view_indices(options.views, scene)
     if chosen is not None:
         return chosen

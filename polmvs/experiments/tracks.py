@@ -1,12 +1,12 @@
 """Experiment 3: normals of surface points from K views (paper, 5.3, M2).
 
-Points are random pixels of the part, taken into the world by the true depth. A view counts for a
-point when it sees it (by the true depth) and the blurred pixel there is over the DoLP threshold;
-K of those views are chosen, the same for every estimator, and more views include the fewer.
+Points are random pixels of the part, back-projected with the true depth. A view is usable for a
+point if it sees it (by the true depth) and the blurred pixel there is above the DoLP threshold. K
+of these views are chosen, the same for every estimator; a larger K includes the views of a smaller
+one.
 
-Rows of ``opa`` and ``ppa_algebraic`` are the blurred pixels themselves, all alike, as in the
-paper. Those of the weighted robust estimators are the package's phase maps, weighted by their
-precision.
+Rows of ``opa`` and ``ppa_algebraic`` are the blurred pixels with equal weights, as in the paper.
+Those of the weighted robust estimators are from phase maps, weighted by their precision.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CHUNK_ROWS = 200_000  # solved at a time: bounds the memory of many views
 
 
 class Source(StrEnum):
-    """Where rows come from."""
+    """Source of rows."""
 
     PIXELS = "pixels"
     MAP = "map"
@@ -64,20 +64,20 @@ class TrackErrors:
 
     Attributes
     ----------
-    errors_deg : for each K those of the P points that have K views, 0 to 180 degrees; NaN where
-        the estimator gives no normal.
+    errors_deg : for each K, the errors of the P points with K views, 0 to 180 degrees; NaN without
+        a normal.
     """
 
     errors_deg: tuple[Array, ...]
 
     def over(self, statistic: Callable[[Array], np.floating]) -> list[float]:
-        """A statistic of the finite errors for each K; NaN where there are none."""
+        """A statistic of the finite errors for each K; NaN if there are none."""
         finite = [errors[np.isfinite(errors)] for errors in self.errors_deg]
         return [float(statistic(errors)) if len(errors) else np.nan for errors in finite]
 
     @property
     def under(self) -> list[float]:
-        """Share of the points with an error under 25 degrees; a missing normal is none."""
+        """Share of the points with an error below 25 degrees; missing normals do not count."""
         shares = [(errors < UNDER_DEG) for errors in self.errors_deg]
         return [float(share.mean()) if len(share) else np.nan for share in shares]
 
@@ -123,9 +123,9 @@ def measure_tracks(
     Raises
     ------
     OptionError
-        A K is under 2 or over the number of views.
+        A K is below 2 or above the number of views.
     DataError
-        No point is on the part, or a file is at fault.
+        No point is on the part, or a file is unusable.
     """
     ks = check_k(options.k, len(scene.views))
     rng = np.random.default_rng(options.seed)
@@ -160,7 +160,7 @@ def measure_tracks(
 def sample_points(
     scene: Scene, num_points: int, rng: np.random.Generator, workers: Workers
 ) -> TruePoints:
-    """Random pixels of the part in all views, at their true places; as many from each view."""
+    """Random pixels of the part in all views, back-projected; the same number from each view."""
     seeds = rng.integers(0, 2**63, len(scene.views)).tolist()
     quotas = np.diff(np.linspace(0, num_points, len(scene.views) + 1).round().astype(int)).tolist()
     parts = list(workers.map(partial(_sample_view, scene), range(len(scene.views)), quotas, seeds))
@@ -246,12 +246,12 @@ DEFAULT_K = tuple(range(2, 21))
 
 
 def check_k(k: Sequence[int] | None, num_views: int) -> tuple[int, ...]:
-    """Numbers of views in ascending order; those of the default that the capture has.
+    """Numbers of views in ascending order; of the default only those possible with the capture.
 
     Raises
     ------
     OptionError
-        One is under 2 or over ``num_views``, or the capture has fewer than two views.
+        One is below 2 or above ``num_views``, or the capture has fewer than two views.
     """
     if num_views < 2:
         raise OptionError(f"normals from tracks need 2 views or more, this capture has {num_views}")
@@ -267,7 +267,7 @@ def check_k(k: Sequence[int] | None, num_views: int) -> tuple[int, ...]:
 
 
 def order_at_random(usable: Mask, rng: np.random.Generator) -> Indices:
-    """Views of each point (V, N) in random order, those that do not count last."""
+    """Views of each point (V, N) in random order, unusable ones last."""
     keys = np.where(usable, rng.random(usable.shape), 2.0)
     return np.argsort(keys, axis=0, kind="stable")
 
@@ -278,8 +278,8 @@ def order_by_angle(rays: Floats, usable: Mask, num: int, rng: np.random.Generato
     Parameters
     ----------
     rays : (3, V, N), unit, world, from the views to the points.
-    usable : (V, N) bool; views that do not count come last.
-    num : views to choose.
+    usable : (V, N) bool; unusable views come last.
+    num : number of views to choose.
     """
     points = np.arange(usable.shape[1])
     order = order_at_random(usable, rng)[:num]

@@ -1,1 +1,1 @@
-"""Images, arrays, clouds and other files, each fault a ``DataError``."""
+"""Images, arrays, clouds and other files; a faulty file is a ``DataError``."""

@@ -1,4 +1,4 @@
-"""Frames that a program holds in memory, as the files of a capture that every reader takes."""
+"""Frames in memory, written as the files of a capture."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def are_frames(value: Any) -> bool:
 
 
 def write_frames(frames: Frames, folder: Path) -> CaptureKind:
-    """Write frames into a folder that is there, losslessly, as a capture is read.
+    """Write frames losslessly into an existing folder, as a capture.
 
     Parameters
     ----------
@@ -36,12 +36,12 @@ def write_frames(frames: Frames, folder: Path) -> CaptureKind:
 
     Returns
     -------
-    What the files hold; all frames must be of one kind.
+    The kind of the files; all frames must be of one kind.
 
     Raises
     ------
     OptionError
-        A frame, its name or its angles are none, or two frames differ in kind.
+        A frame, its name or its angles are invalid, or two frames differ in kind.
     """
     named = frames if isinstance(frames, Mapping) else _numbered(frames)
     kinds = {name: _write_frame(folder, name, frame) for name, frame in named.items()}

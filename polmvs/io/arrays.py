@@ -1,7 +1,7 @@
-"""Arrays on disk that are mapped into memory: what keeps the peak independent of the views.
+"""Arrays on disk that are mapped into memory, so that the peak is independent of the views.
 
-An object whose arrays are stored is pickled as the path of its files, so that handing it to a
-worker costs nothing.
+An object with stored arrays is pickled as the path of its files, so passing it to a worker costs
+nothing.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class StoredArray:
 
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an ``.npy`` file whole or not at all, into a folder that there is.
+    """Write an ``.npy`` file whole or not at all, into an existing folder.
 
-    A worker that is late must not make the folder of a stage again that was given up.
+    A late worker must not create the folder of an aborted stage again.
     """
     buffer = io.BytesIO()
     np.save(buffer, array)
@@ -47,7 +47,7 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def kept_array(array: NDArray[Any], path: Path | None) -> NDArray[Any] | StoredArray:
-    """The array itself, or where a path is given, what finds it there."""
+    """The array itself; with a path, the array stored there."""
     if path is None:
         return array
     save_array(path, array)
@@ -59,12 +59,12 @@ def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:
 
     Parameters
     ----------
-    kind : type of its rows, or a kind of number that it must hold; None for any.
+    kind : type of its rows, or required kind of number; None: any.
 
     Raises
     ------
     DataError
-        If the file is missing, damaged or of another type.
+        The file is missing, damaged or of another type.
     """
     try:
         require_plain(path)
@@ -79,7 +79,7 @@ def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:
     return array
 
 
-# Those of the views that are being looked at: what is mapped and read counts as resident memory.
+# Arrays of the current views: mapped and read pages count as resident memory.
 @lru_cache(maxsize=32)
 def _map_array(path: Path, stamp: int) -> NDArray[Any]:
     # A plain array over the map: OpenCV takes it without a copy.

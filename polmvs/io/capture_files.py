@@ -1,6 +1,6 @@
-"""Which files of a folder make which view of a capture; told by their names, nothing is opened.
+"""The files of each view of a capture, recognized by their names; no file is opened.
 
-Images directly in the folder, or in its ``raw`` where it has none, are raw mosaics, one a view,
+Images directly in the folder, or in its ``raw`` if it has none, are raw mosaics, one for each view,
 unless *all* their names end in
 
 - polarizer angles, the same set for every view: ``a_000 a_045 a_090 a_135``, ``a_0 a_60 a_120``,
@@ -13,10 +13,9 @@ A folder without images may hold them in folders by angle (``pol000 pol045``, ``
 Stokes parameter (``s0 s1 s2``), by map (``aolp dolp image``), or by view (``left/I0.png``). Other
 names are given as a template (```capture.naming```).
 
-Files with all three Stokes images each, arrays (H, W, 3), look like mosaics: ```capture.kind```
-says so. Numbers of frames look like angles. So an ending counts as an angle only if the whole set
-is one that polarizers are used at (``ANGLE_SETS``); any other needs the template or
-```capture.kind```.
+Files with all three Stokes images, arrays (H, W, 3), look like mosaics and need ```capture.kind```.
+Numbers of frames look like angles. So an ending counts as an angle only if the whole set is a usual
+one of polarizers (``ANGLE_SETS``); any other set needs the template or ```capture.kind```.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ from polmvs.errors import DataError, OptionError, as_data_error
 from polmvs.io.folders import require_unicode
 from polmvs.io.raw_formats import DUMP_SUFFIXES, FLOAT_SUFFIXES, LOSSY_SUFFIXES, SUFFIXES
 
-# Files of one folder are taken from the first of these groups that has any, so that a preview or
-# an array beside the images does not count as one.
+# The first of these groups with files in a folder is used, so that a preview or an array beside the
+# images does not count as an image.
 SUFFIX_GROUPS = (
     frozenset({".png", ".tif", ".tiff", ".bmp", ".pgm"}),
     frozenset({".npy"}),
@@ -97,8 +96,9 @@ class ViewFiles:
 
     Attributes
     ----------
-    name : of the view: the mosaic's file name, else what its files' names share, with a suffix.
-    files : by role, and of each role by exposure; the roles are those of :class:`CaptureFiles`.
+    name : of the view: the mosaic's file name, else the common part of its file names, with a
+        suffix.
+    files : by role, then by exposure; the roles are those of :class:`CaptureFiles`.
     """
 
     name: str
@@ -112,17 +112,17 @@ class ViewFiles:
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureFiles:
-    """A capture's views and what their files hold.
+    """A capture's views and the content of their files.
 
     Attributes
     ----------
     folder : as given by the user.
     kind : of the files.
-    angles_deg : of the roles of an ``ANGLES`` capture, as their names say; empty for others.
-    exposures_s : exposure times, longest first; one entry, 1, where there is one exposure a view.
+    angles_deg : angles of the roles of an ``ANGLES`` capture, from the names; empty for others.
+    exposures_s : exposure times, longest first; one entry, 1, if each view has one exposure.
     views : sorted by name. Roles are one mosaic; an image for each of ``angles_deg``;
-        ``STOKES_ROLES``, or one file with all three; ``MAP_ROLES``, of which an intensity or a
-        DoLP may be missing (no file).
+        ``STOKES_ROLES``, or one file with all three; ``MAP_ROLES``, of which intensity or DoLP may
+        be missing (no file).
     """
 
     folder: Path
@@ -138,7 +138,7 @@ class CaptureFiles:
 
 
 class _Named(NamedTuple):
-    """A file and what its name says."""
+    """A file and the information of its name."""
 
     path: Path
     view: str
@@ -153,18 +153,18 @@ def find_capture(
     naming: str | None = None,
     angles: Sequence[float] | None = None,
 ) -> CaptureFiles:
-    """Tell the views of a capture and their files by name; see the head of this module.
+    """Find the views of a capture and their files by name; see the module's docstring.
 
     Parameters
     ----------
-    kind : the only one to look for; None for all.
-    naming : template of the files' paths below the folder; None for those known here.
+    kind : the only kind to look for; None: all.
+    naming : template of the files' paths below the folder; None: the usual names.
     angles : of the files of a view in the order of ``{index}``, degrees.
 
     Raises
     ------
     DataError
-        The folder is missing, holds no images, or a view lacks a file that others have.
+        The folder is missing or has no images, or a view lacks a file that others have.
     OptionError
         The template is malformed.
     """

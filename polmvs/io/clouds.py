@@ -1,4 +1,4 @@
-"""Point clouds and meshes: as files, and as Open3D's, which takes seconds to import."""
+"""Point clouds and meshes: files, and conversion to Open3D, which takes seconds to import."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Cloud:
     scalars: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
     def only(self, kept: NDArray[np.bool_]) -> Cloud:
-        """The ``kept`` (N,) points as a cloud of their own."""
+        """The ``kept`` (N,) points as a new cloud."""
         return Cloud(
             points=self.points[kept],
             normals=None if self.normals is None else self.normals[kept],
@@ -53,7 +53,7 @@ class Cloud:
         )
 
     def are(self, *kinds: PointKind) -> Mask:
-        """Which points (N,) are of these kinds; all where the cloud tells none."""
+        """Which points (N,) are of these kinds; all if the cloud has no kinds."""
         if "kind" not in self.scalars:
             return np.ones(len(self.points), np.bool_)
         return np.isin(self.scalars["kind"], kinds)
@@ -77,7 +77,7 @@ class Mesh:
     colors: NDArray[np.uint8] | None = None
 
     def only(self, kept: NDArray[np.bool_]) -> Mesh:
-        """The triangles of which all three vertices are ``kept`` (V,), and their vertices."""
+        """The triangles whose three vertices are all ``kept`` (V,), and their vertices."""
         triangles = self.triangles[kept[self.triangles].all(axis=1)]
         used = np.unique(triangles)
         index = np.zeros(len(self.vertices), np.int32)
@@ -91,14 +91,14 @@ class Mesh:
 
 
 def preload() -> threading.Thread:
-    """Begin to import Open3D beside other work, such as that of COLMAP's mapper on one core.
+    """Start to import Open3D in parallel with other work, such as COLMAP's mapper on one core.
 
-    The thread is to be joined before an array is read: in CPython 3.11 parsing fails now and then
-    (SystemError) where two threads do, as an import and NumPy's reader of headers.
+    Join the thread before an array is read: in CPython 3.11 parsing sometimes fails (SystemError)
+    in two threads, here the import and NumPy's reader of headers.
     """
 
     def load() -> None:
-        # What is missing is said when it is needed; a program that ends meanwhile breaks it off.
+        # A missing library is reported when it is needed; a program that ends stops the import.
         with suppress(Exception):
             import_open3d()
 
@@ -160,7 +160,7 @@ def read_cloud(path: str | Path) -> Cloud:
     Raises
     ------
     DataError
-        If the file is missing, truncated, no point cloud, or has points that are nowhere.
+        The file is missing, truncated, not a point cloud, or has points that are not finite.
     """
     source = Path(path)
     columns = dict(read_ply(source).vertices)
@@ -195,7 +195,7 @@ def _taken(columns: dict[str, NDArray[Any]], names: Sequence[str]) -> NDArray[An
 
 
 def _as_bytes(colors: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colours of any type as 0 to 255: floats are shares of 1, wider integers of their range."""
+    """Colours of any type as 0 to 255: floats are from 0 to 1, wider integers over their range."""
     if colors.dtype == np.uint8:
         return colors
     largest = 1.0 if colors.dtype.kind == "f" else float(np.iinfo(colors.dtype).max)
@@ -209,7 +209,7 @@ def has_triangles(path: str | Path) -> bool:
     Raises
     ------
     DataError
-        The file is missing or no PLY.
+        The file is missing or not a PLY.
     """
     faces = read_ply_header(Path(path)).find("face")
     return faces is not None and faces.num > 0
@@ -223,7 +223,7 @@ def show_in_viewer(paths: Sequence[str | Path]) -> None:
     DataError
         A file is unusable.
     PolmvsError
-        There is no window to be had.
+        No window can be opened.
     """
     o3d = import_open3d()
     shown = [
@@ -246,7 +246,7 @@ def solve_poisson(
 ) -> tuple[Array, NDArray[np.int32]]:
     """Vertices ``(V, 3)`` and triangles ``(F, 3)`` of the closed Poisson surface of a cloud.
 
-    On one thread: with several the result depends on which is first.
+    It runs on one thread: with several the result depends on their timing.
 
     Parameters
     ----------
@@ -284,12 +284,12 @@ FOREIGN_MESHES = frozenset({".stl", ".obj", ".glb", ".gltf", ".off"})
 
 
 def read_any_mesh(path: str | Path) -> Mesh:
-    """Read a mesh of another program: STL, OBJ, GLB, OFF, or PLY; corners at one place are joined.
+    """Read a mesh of another program: STL, OBJ, GLB, OFF, or PLY; equal corners are joined.
 
     Raises
     ------
     DataError
-        The file is missing, of none of these types, damaged, or holds no faces.
+        The file is missing, of another type, damaged, or has no faces.
     """
     source = Path(path)
     if source.suffix.lower() == ".ply":
@@ -317,12 +317,12 @@ def read_any_mesh(path: str | Path) -> Mesh:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a PLY mesh; normals that it lacks are computed.
+    """Read a PLY mesh; missing normals are computed.
 
     Raises
     ------
     DataError
-        If the file is missing, truncated or no mesh.
+        The file is missing, truncated or not a mesh.
     """
     source = Path(path)
     content = read_ply(source, faces=True)

@@ -1,4 +1,4 @@
-"""Public multi-view polarization sets: their layouts, told by the names of files and folders.
+"""Public multi-view polarization sets, recognized by the names of their files and folders.
 
 ====================  ===========================================================================
 ``ppa4p3d``           ``images/`` raw mosaics with gamma 0.5, ``cams/`` MVSNet texts
@@ -17,11 +17,11 @@
 ====================  ===========================================================================
 
 ``cameras.npz``, ``cameras_sphere.npz`` and ``cameras_new.npz`` are those of IDR and NeuS:
-``world_mat_<i or name>`` is the projection ``K [R t]`` (4x4), pixels counted from the centre of the
-first.
+``world_mat_<i or name>`` is the projection ``K [R t]`` (4x4) with the pixel origin at the centre of
+the first pixel.
 
-A set is described by :class:`DataSet`; what is not in a form that a capture is read from (PANDORA's
-images, azimuth maps) is converted to Stokes images by :func:`load_converted`.
+:class:`DataSet` describes a set. :func:`load_converted` converts images that are not in the form of
+a capture (PANDORA's images, azimuth maps) to Stokes images.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ from polmvs.io.raw_formats import read_npy, read_raw
 from polmvs.polarization.kinds import Light
 from polmvs.scene import stem_of
 
-BAYER = BayerOrder.RGGB  # of raw colour mosaics, where nothing else is given
+BAYER = BayerOrder.RGGB  # of raw colour mosaics, by default
 CAMERA_FILES = ("cameras.npz", "cameras_sphere.npz", "cameras_new.npz")
 PANDORA_SIZE = (2448, 2048)  # of its dumps, px
 MAX_NPZ_BYTES = 1 << 28
 
 
 class DataSetKind(StrEnum):
-    """Whose layout a set has."""
+    """Kind of layout of a set."""
 
     PPA4P3D = "ppa4p3d"
     PISR = "PISR"
@@ -78,7 +78,7 @@ class DataSetKind(StrEnum):
 
 
 class PosedImage(NamedTuple):
-    """A camera as a set gives it.
+    """A camera of a set.
 
     Attributes
     ----------
@@ -98,16 +98,17 @@ class DataSet:
 
     Attributes
     ----------
-    kind : whose layout.
+    kind : kind of layout.
     folder : as given.
-    capture : folder that a capture is read from as it is; None where :func:`load_converted` makes
-        its Stokes images first.
-    options : how it is read.
+    capture : folder of the capture; None if :func:`load_converted` must first make its Stokes
+        images.
+    options : how to read it.
     names : stems of the images, sorted.
-    cameras : given poses; empty where ``sparse`` has them.
-    sparse : COLMAP model of the set, if it brings one.
-    masks : file of the mask by stem; in the alpha channel where it has one, else where not black.
-    light : reflection that the angles are of, where the set says so.
+    cameras : given poses; empty if ``sparse`` has them.
+    sparse : COLMAP model of the set, if it has one.
+    masks : file of the mask by stem; the alpha channel if it has one, else pixels that are not
+        black.
+    light : kind of light of the angles, if the set states it.
     """
 
     kind: DataSetKind
@@ -122,7 +123,7 @@ class DataSet:
 
 
 def recognise_data_set(folder: Path) -> DataSetKind | None:
-    """Whose layout a folder has; None of none known."""
+    """Kind of layout of a folder; None if unknown."""
 
     def has(*names: str) -> bool:
         return all((folder / name).exists() for name in names)
@@ -150,13 +151,13 @@ def read_data_set(folder: Path, options: CaptureOptions | None = None) -> DataSe
     Parameters
     ----------
     folder : of one object or scene.
-    options : what is not the default goes before what the set's layout says; ``bayer``, the
-        colours of raw colour mosaics, no set says: by default RGGB.
+    options : values other than the defaults take precedence over those of the layout. No set states
+        ``bayer``, the colours of raw colour mosaics: by default RGGB.
 
     Raises
     ------
     DataError
-        The layout is none known, or a file of it is missing or damaged.
+        The layout is unknown, or a file of it is missing or damaged.
     """
     if not folder.is_dir():
         raise DataError(folder, "no such folder.")
@@ -189,8 +190,8 @@ def _overridden(options: CaptureOptions, given: CaptureOptions) -> CaptureOption
 def load_converted(data_set: DataSet, stem: str) -> tuple[Image, Image, Image]:
     """Stokes images s0, s1, s2 ``(H, W)`` or ``(H, W, 3)`` of an image of PANDORA or MVAS.
 
-    Of an azimuth map the light is taken as fully polarized in the mask and unpolarized off it, and
-    s0 is the intensity image's where there is one of that name and size, else 1.
+    For an azimuth map the light is assumed fully polarized in the mask and unpolarized outside; s0
+    is the intensity image of the same name and size if there is one, else 1.
 
     Raises
     ------
@@ -212,7 +213,7 @@ def load_converted(data_set: DataSet, stem: str) -> tuple[Image, Image, Image]:
 
 
 def read_set_mask(path: Path) -> Mask:
-    """A mask (H, W): where alpha is not 0, else where any channel is not.
+    """A mask (H, W): alpha not 0; without alpha, any channel not 0.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Folders that appear whole or not at all, and names that the libraries can take."""
+"""Folders that are written whole or not at all, and checks of their names."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from polmvs.io.temporary import remove_temporary, temporary_path
 
 
 def require_unicode(path: str | PathLike[str]) -> None:
-    """Refuse a name that is no text: COLMAP's binding takes none, and crashes on some.
+    """Refuse a name that is not valid text: COLMAP's binding rejects it or crashes.
 
     Raises
     ------
     DataError
-        The name's bytes are not UTF-8, or Python runs in a locale that knows no others.
+        The name's bytes are not UTF-8, or Python's locale cannot represent the name.
     """
     try:
         str(path).encode()
@@ -34,7 +34,7 @@ def resolved(path: Path) -> Path:
     Raises
     ------
     DataError
-        Its links lead in a circle.
+        Its links form a circle.
     """
     try:
         return path.resolve()
@@ -44,11 +44,11 @@ def resolved(path: Path) -> Path:
 
 @contextmanager
 def new_folder(folder: str | PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
-    """A temporary folder beside a new one, which takes its name when all went well, else goes.
+    """A temporary folder that gets its final name on success and is removed otherwise.
 
     Parameters
     ----------
-    overwrite : a folder of that name, with all that is in it, is replaced at the end.
+    overwrite : replace an existing folder, with its content, at the end.
 
     Raises
     ------

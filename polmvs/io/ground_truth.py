@@ -34,7 +34,7 @@ from polmvs.scene import View, find_name, stem_of
 DEPTH_UNIT_M = 20e-6
 PART_SPACING_M = 0.0005
 OTHER_SPACING_M = 0.002
-NEAR_PART_M = 0.01  # other surfaces this near the part are sampled as finely as the part
+NEAR_PART_M = 0.01  # other surfaces this near to the part are sampled as finely
 MAX_RELATIVE_BEND = 0.005  # second difference of inverse depth above which depth is discontinuous
 _REMEDY = "copy the ground truth again"
 
@@ -59,11 +59,11 @@ class SurfacePoints:
 
 @dataclass(frozen=True, kw_only=True)
 class GroundTruth:
-    """True cameras and maps of a capture; the maps are read from disk when asked for.
+    """True cameras and maps of a capture; the maps are read from disk when they are used.
 
     Attributes
     ----------
-    folder : where ``cameras.json`` lies.
+    folder : folder of ``cameras.json``.
     views : posed true cameras by image name, of the half-size images, metres.
     """
 
@@ -101,7 +101,7 @@ class GroundTruth:
         return tuple(self.views)
 
     def find(self, name: str) -> View | None:
-        """True view of an image by its name, else by the only one of the same stem."""
+        """True view of an image by its name, else the only one with the same stem."""
         found = find_name(name, self.views)
         return None if found is None else self.views[found]
 
@@ -131,19 +131,19 @@ class GroundTruth:
 
         Parameters
         ----------
-        spacing_m : voxel side of the part and of what lies within about 10 mm of it, m.
+        spacing_m : voxel side of the part and of surfaces within about 10 mm of it, m.
         other_spacing_m : voxel side of the rest of the scene, m.
 
         Returns
         -------
         SurfacePoints
-            Pixels of the part beside a depth discontinuity are left out. No closer together than
-            the pixels of all views are; kept in memory for the next call.
+            Pixels of the part next to a depth discontinuity are left out. Points are not denser
+            than the pixels of all views; they are kept in memory for the next call.
 
         Raises
         ------
         DataError
-            When no pixel of any view lies on the part.
+            No pixel of any view lies on the part.
         """
         key = (spacing_m, other_spacing_m)
         if key not in self._surfaces:
@@ -180,7 +180,7 @@ def open_ground_truth(folder: str | Path) -> GroundTruth:
     Raises
     ------
     DataError
-        When the folder, ``cameras.json`` or a map is missing, or ``cameras.json`` is malformed.
+        The folder, ``cameras.json`` or a map is missing, or ``cameras.json`` is malformed.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -333,7 +333,7 @@ def write_true_maps(stem: Path, depth: Array, normals_in_cam: Array, mask: Mask)
 
     Parameters
     ----------
-    depth : (H, W), m; what is too far for 16 bits is unknown.
+    depth : (H, W), m; depths too large for 16 bits become unknown.
     normals_in_cam : (H, W, 3), of the part.
     mask : (H, W), where the part is seen.
 

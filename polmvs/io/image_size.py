@@ -1,4 +1,4 @@
-"""Image headers: declared sizes and tags, read before anything is decoded.
+"""Sizes and tags in image headers, checked before decoding.
 
 A compressed file of a megabyte may declare an image of a terabyte. Only containers whose header is
 read here are decoded.
@@ -37,11 +37,11 @@ _PNM_NUMBER = rb"(?:\s|#[^\n\r]*[\n\r])+(\d{1,11})"
 
 
 class ImageSize(NamedTuple):
-    """What a header declares.
+    """Size declared by a header.
 
     Attributes
     ----------
-    width, height : px; of a tiled image at least those of a tile, which is decoded whole.
+    width, height : px; for a tiled image at least those of a tile, which is decoded whole.
     num_bytes : of the decoded samples.
     """
 
@@ -71,7 +71,7 @@ def declared_size(path: str | PathLike[str], data: bytes) -> ImageSize:
     Raises
     ------
     DataError
-        It is none of these, or its header is not whole.
+        It is none of these, or its header is incomplete.
     """
     try:
         found = _declared(data)
@@ -101,13 +101,13 @@ def require_size(
 
     Parameters
     ----------
-    max_pixels : of width times height; eight bytes each is what all samples may take.
-    remedy : what to do about it, a sentence.
+    max_pixels : limit of width times height; all samples may take eight bytes per pixel.
+    remedy : a sentence for the message.
 
     Raises
     ------
     DataError
-        It is larger.
+        The image is larger.
     """
     if size.width * size.height > max_pixels or size.num_bytes > BYTES_OF_PIXEL * max_pixels:
         raise DataError(
@@ -145,7 +145,7 @@ def tiff_images(data: bytes) -> Iterator[dict[int, TiffTag]]:
     Raises
     ------
     ValueError
-        The chain is not whole.
+        The chain is incomplete.
     """
     order = "<" if data[:2] == b"II" else ">"
     offset, counter, length = ("Q", "Q", 20) if data[:4] in BIG_TIFF_SIGNATURES else ("I", "H", 12)
@@ -187,7 +187,7 @@ def _of_tiff(data: bytes) -> ImageSize:
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Markers of a JPEG, and what belongs to each, as far as its samples.
+    """Markers of a JPEG with their segments, up to the samples.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Image files: decoding, masks, PNG output; every fault is a ``DataError``."""
+"""Image files: decoding, masks, PNG output; a faulty file is a ``DataError``."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def read_mask(path: PathArg, shape: tuple[int, int]) -> NDArray[np.bool_]:
 
     Parameters
     ----------
-    path : an image; a pixel is inside where any colour channel is not 0, alpha is ignored.
-    shape : (H, W) that the mask must have, px.
+    path : an image; a pixel is inside if any colour channel is not 0; alpha is ignored.
+    shape : required (H, W), px.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def read_mask(path: PathArg, shape: tuple[int, int]) -> NDArray[np.bool_]:
     Raises
     ------
     DataError
-        The file is missing, truncated, no image or of another size.
+        The file is missing, truncated, not an image or of another size.
     """
     image = decode_image(path, read_bytes(path), max_pixels=max(shape[0] * shape[1], MAX_PIXELS))
     height, width = image.shape[:2]
@@ -68,7 +68,7 @@ def read_gray(path: PathArg) -> NDArray[np.uint8]:
     Raises
     ------
     DataError
-        The file is missing, truncated, no image or not of 8 bit.
+        The file is missing, truncated, not an image or not 8-bit.
     """
     image = decode_image(path, read_bytes(path))
     if image.dtype != np.uint8:
@@ -78,7 +78,7 @@ def read_gray(path: PathArg) -> NDArray[np.uint8]:
 
 
 def write_png(path: PathArg, image: NDArray[Any]) -> None:
-    """Write a PNG whole or not at all, whatever the suffix of its name.
+    """Write a PNG whole or not at all, with any suffix.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def write_mask(path: PathArg, mask: NDArray[np.bool_]) -> None:
 
 
 def encode_png(image: NDArray[Any]) -> bytes:
-    """An image as :func:`write_png` takes it, as the bytes of a PNG."""
+    """The bytes of a PNG of an image as for :func:`write_png`."""
     if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or image.size == 0:
         raise ValueError(f"{image.dtype=}, {image.shape=} but expected a uint8 or uint16 image.")
     encoded, data = cv2.imencode(".png", np.ascontiguousarray(image))
@@ -109,12 +109,12 @@ def encode_png(image: NDArray[Any]) -> bytes:
 
 
 def write_bytes(path: PathArg, data: bytes) -> None:
-    """Write a file whole or not at all: a temporary name beside it, then a rename.
+    """Write a file whole or not at all: under a temporary name, which is then renamed.
 
     Raises
     ------
     DataError
-        The system refuses; the temporary file is gone and an older file of that name is intact.
+        The system refuses; the temporary file is removed and an existing file is unchanged.
     """
     target = Path(path)
     # A rename would put a plain file in the place of a device such as /dev/null.
@@ -134,7 +134,7 @@ def read_bytes(path: PathArg, most: int | None = None) -> bytes:
 
     Parameters
     ----------
-    most : bytes that it may have.
+    most : largest number of bytes.
     """
     with as_data_error(path, "read", missing="no such file."), open_plain(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -157,12 +157,12 @@ def _set_log_level(level: int) -> int:
 def decode_image(
     path: PathArg, data: bytes, *, max_pixels: int = MAX_PIXELS, remedy: str = SCALE_DOWN
 ) -> NDArray[Any]:
-    """Pixels of an encoded image, unchanged; OpenCV's own complaints are kept off the terminal.
+    """Pixels of an encoded image, unchanged; OpenCV's messages are not shown on the terminal.
 
     Parameters
     ----------
-    max_pixels : that its header may declare.
-    remedy : what to do about one that declares more, a sentence.
+    max_pixels : limit for the header.
+    remedy : a sentence for the message about a larger image.
     """
     if data.startswith(PNG_SIGNATURE):
         check_png(path, data)
@@ -180,7 +180,7 @@ def decode_image(
 
 
 def check_png(path: PathArg, data: bytes) -> None:
-    """Walk the chunks to IEND: OpenCV may fill the missing part of a truncated PNG with zeros."""
+    """Check the chunks up to IEND: OpenCV may fill a truncated PNG with zeros."""
     view = memoryview(data)
     position = len(PNG_SIGNATURE)
     kind = b""

@@ -1,8 +1,9 @@
 """Cameras from calibration files: OpenCV's, ROS's, Kalibr's, COLMAP's lines, in COLMAP's models.
 
-OpenCV, ROS and Kalibr count pixels from the centre of the first, COLMAP from the corner of the
-image, so half a pixel is added to their principal points. A file of the full mosaic is scaled to
-the polarization images exactly, since in COLMAP's convention scaling is multiplication.
+The pixel origin of OpenCV, ROS and Kalibr is the centre of the first pixel, that of COLMAP the
+corner of the image, so half a pixel is added to their principal points. A camera of the full mosaic
+is scaled to the polarization images exactly, since scaling is multiplication in COLMAP's
+convention.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ COLMAP_MODELS = {
     "FOV": ("fx", "fy", "cx", "cy", "omega"),
 }
 LENGTHS = frozenset({"f", "fx", "fy", "cx", "cy"})
-MAX_ASPECT_CHANGE = 0.01  # of the image's sides, before a file is of another crop (rounding)
+MAX_ASPECT_CHANGE = 0.01  # of the image's sides, above which a file is of another crop (rounding)
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 4  # of lists in a matrix
 _MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "K", "intrinsic_matrix", "Camera_Matrix", "mtx")
@@ -55,7 +56,7 @@ class Intrinsics:
     Attributes
     ----------
     model : a key of ``COLMAP_MODELS``.
-    width, height : of the images that it is of, px.
+    width, height : of its images, px.
     params : in the order of ``COLMAP_MODELS[model]``.
     """
 
@@ -70,7 +71,7 @@ class Intrinsics:
         Raises
         ------
         ValueError
-            The sizes are of another shape, as after a crop.
+            The aspect ratios differ, as after a crop.
         """
         scale = width / self.width
         if abs(height / self.height / scale - 1) > MAX_ASPECT_CHANGE:
@@ -87,7 +88,7 @@ class Intrinsics:
 
     @property
     def pinhole(self) -> PinholeCamera:
-        """The camera without its distortion."""
+        """The camera without distortion."""
         named = dict(zip(COLMAP_MODELS[self.model], self.params, strict=True))
         focal = named.get("f", 0.0)
         return PinholeCamera(
@@ -101,13 +102,13 @@ class Intrinsics:
 
     @property
     def line(self) -> str:
-        """As in COLMAP's ``cameras.txt``."""
+        """The camera as a line of COLMAP's ``cameras.txt``."""
         numbers = " ".join(repr(float(value)) for value in self.params)
         return f"1 {self.model} {self.width} {self.height} {numbers}"
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
-    """Read a camera from a calibration file; what it is, its content tells.
+    """Read a camera from a calibration file; its format is recognized from its content.
 
     OpenCV (YAML or JSON with ``camera_matrix`` and ``distortion_coefficients``), ROS
     ``camera_info``, Kalibr's camchain (its first camera), a line or a ``cameras.txt`` of COLMAP
@@ -116,7 +117,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
     Raises
     ------
     DataError
-        The file is missing, of none of these kinds, or its camera is none that COLMAP has.
+        The file is missing or of another kind, or COLMAP does not have its camera model.
     """
     try:
         with as_data_error(path, "read"):
@@ -159,14 +160,14 @@ def from_opencv_matrix(
 
     Parameters
     ----------
-    matrix : (3, 3) nested sequences, pixels counted from the centre of the first.
-    distortion : (N,), ``k1, k2, p1, p2, k3, k4, k5, k6``, zeros left out at the end; of a fisheye
+    matrix : (3, 3) nested sequences, OpenCV's pixel origin.
+    distortion : (N,), ``k1, k2, p1, p2, k3, k4, k5, k6`` without zeros at the end; for a fisheye
         lens ``k1 .. k4``.
 
     Raises
     ------
     ValueError
-        The camera is none that COLMAP has.
+        COLMAP does not have the camera model.
     """
     fx, fy = float(matrix[0][0]), float(matrix[1][1])
     if abs(float(matrix[0][1])) > 1e-9 * abs(fx):

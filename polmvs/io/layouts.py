@@ -1,4 +1,4 @@
-"""The layout of the demo that the authors of the paper published.
+"""The layout of the demo published by the paper's authors.
 
 The authors' demo is a folder with
 
@@ -10,8 +10,8 @@ The authors' demo is a folder with
 - ``normal_w.npy`` (3x1) and ``pts_3d_corners_w.npy`` (4x3): the board's normal and corners in the
   world.
 
-The board is all the truth there is: masks, depths and normals follow from it by geometry, as if
-nothing stood before it.
+The board is the only ground truth: masks, depths and normals follow from its geometry, without
+occlusion.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ MAX_OFF_PLANE = 0.02  # of the corners from the plane, in sizes of the board; a 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoardTruth:
-    """Truth of a capture of one flat board: true maps of any view by intersecting its rays.
+    """Ground truth of a capture of one flat board: true maps of any view from ray intersections.
 
     Attributes
     ----------
-    folder : where it was read from.
+    folder : folder of the files.
     views : posed views by image name, half-size images, units of the corners.
     normal : (3,), unit, world, towards the cameras.
     corners : (4, 3), world, in order around the board.
@@ -63,7 +63,7 @@ class BoardTruth:
         return np.isfinite(self.depth(name))
 
     def depth(self, name: str) -> Image:
-        """Depth z of the board, (H, W) float32; NaN beside it."""
+        """Depth z of the board, (H, W) float32; NaN off the board."""
         view = self.views[name]
         xy = pixel_centers(view.camera.width, view.camera.height)
         rays, world_rays = view.camera.rays(xy), view.rays_in_world(xy)
@@ -75,7 +75,7 @@ class BoardTruth:
         return np.where(inside, distance * rays[..., 2], np.nan).astype(np.float32)
 
     def normals(self, name: str) -> Image:
-        """Normals (H, W, 3) float32, camera frame, facing it; NaN beside the board."""
+        """Normals (H, W, 3) float32, camera frame, facing the camera; NaN off the board."""
         view = self.views[name]
         normal = view.cam_from_world.rotation @ self.normal
         if view.center_in_world @ self.normal < self.offset:
@@ -95,12 +95,12 @@ class BoardTruth:
 
 
 def is_author_layout(folder: Path) -> bool:
-    """Whether a folder is laid out as the authors' demo."""
+    """Whether a folder has the layout of the authors' demo."""
     return (folder / "images").is_dir() and (folder / "cams").is_dir()
 
 
 def read_author_truth(folder: Path, names: Sequence[str], width: int, height: int) -> BoardTruth:
-    """Read the truth of a capture in the layout of the authors' demo.
+    """Read the ground truth of a capture in the layout of the authors' demo.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def read_author_truth(folder: Path, names: Sequence[str], width: int, height: in
     Raises
     ------
     DataError
-        A file is missing, damaged, or of another count.
+        A file is missing or damaged, or the number of files is wrong.
     """
     views = read_author_views(folder, names, width, height)
     normal = _read_npy(folder / "normal_w.npy", 3).reshape(3)
@@ -152,12 +152,12 @@ def _board(folder: Path, views: dict[str, View], normal: Array, corners: Array) 
 
 
 def read_camera_text(path: Path, name: str, width: int, height: int) -> View:
-    """Read a camera in the text form of MVSNet and ACMM; its intrinsics count from pixel centres.
+    """Read a camera in the text form of MVSNet and ACMM, whose pixel origin is a pixel centre.
 
     Parameters
     ----------
     name : of the image.
-    width, height : of the image that the intrinsics are of, px.
+    width, height : of the image of the intrinsics, px.
 
     Raises
     ------

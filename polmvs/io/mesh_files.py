@@ -1,7 +1,7 @@
 """Meshes as files of other programs: PLY, OBJ with its MTL and texture, STL, GLB.
 
-What each can hold is in :data:`MESH_FORMATS`. Coordinates stay those of the mesh, in its unit and
-axes; GLB and STL hold them as 32-bit floats.
+:data:`MESH_FORMATS` has the content of each. Coordinates keep the unit and axes of the mesh; GLB
+and STL have 32-bit floats.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ GLB_MAGIC, GLB_VERSION, GLB_JSON, GLB_BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E494
 FLOAT, UNSIGNED_INT = 5126, 5125  # component types of glTF
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 LINEAR, MIPMAPPED, CLAMPED = 9729, 9987, 33071  # of a glTF sampler
-ROUGHNESS = 0.6  # of the material, where a viewer lights it: neither a mirror nor chalk
+ROUGHNESS = 0.6  # of the material, for viewers with lighting: neither mirror nor chalk
 
 
 @dataclass(frozen=True, kw_only=True)
 class Texture:
-    """A picture that lies on a mesh.
+    """A texture of a mesh.
 
     Attributes
     ----------
-    image : (H, W, 3) uint8, red, green, blue, as a screen shows them.
-    uv : (V, 2) place of each vertex, shares of width and height, from the lower left corner.
+    image : (H, W, 3) uint8, red, green, blue, encoded for display.
+    uv : (V, 2) texture coordinates, shares of width and height from the lower left corner.
     """
 
     image: NDArray[np.uint8]
@@ -46,11 +46,11 @@ class Texture:
 
 @dataclass(frozen=True, kw_only=True)
 class MeshFormat:
-    """What a mesh's file can hold.
+    """A format of mesh files.
 
     Attributes
     ----------
-    normals, colors, texture : whether it holds them.
+    normals, colors, texture : whether it supports them.
     write : called with path, mesh and texture.
     """
 
@@ -61,21 +61,21 @@ class MeshFormat:
 
 
 def write_mesh_file(path: Path, mesh: Mesh, texture: Texture | None = None) -> tuple[Path, ...]:
-    """Write a mesh in the format that the file's name ends in.
+    """Write a mesh in the format of the file's suffix.
 
     Parameters
     ----------
     path : ends in one of :data:`MESH_FORMATS`.
-    texture : for formats that hold one; its ``uv`` are of the mesh's vertices.
+    texture : for formats that support one; its ``uv`` are of the mesh's vertices.
 
     Returns
     -------
-    The files written, ``path`` first; beside an OBJ lie its MTL and texture.
+    The written files, ``path`` first; an OBJ has an MTL and a texture file.
 
     Raises
     ------
     OptionError
-        The name ends otherwise, or the format holds no texture.
+        The suffix is unknown, or the format has no texture.
     DataError
         A file cannot be written.
     """
@@ -87,12 +87,12 @@ def write_mesh_file(path: Path, mesh: Mesh, texture: Texture | None = None) -> t
 
 
 def mesh_format_of(path: Path) -> MeshFormat:
-    """The format that a file's name ends in.
+    """The format of a file's suffix.
 
     Raises
     ------
     OptionError
-        It is none known here.
+        The suffix is unknown.
     """
     kind = MESH_FORMATS.get(path.suffix.lower())
     if kind is None:
@@ -102,7 +102,7 @@ def mesh_format_of(path: Path) -> MeshFormat:
 
 
 def linear_of_display(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Linear components 0 to 1 of colours as a screen shows them (sRGB)."""
+    """Linear components 0 to 1 of colours encoded for display (sRGB)."""
     share = np.asarray(colors, np.float64) / 255
     curved = ((share + 0.055) / 1.055) ** 2.4
     return np.where(share <= 0.04045, share / 12.92, curved).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Import of Open3D; a library that its wheel lacks is found, or named with its remedy."""
+"""Import of Open3D; a missing system library is found, or the message names the remedy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SYSTEM_PACKAGES = {
 
 
 def import_open3d() -> Any:
-    """Open3D, imported where it is needed: that takes seconds.
+    """Open3D, imported when it is needed, which takes seconds.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def import_open3d() -> Any:
 
 
 def remedy(reason: str) -> str:
-    """What to do about an import that failed for this reason, a clause without its end."""
+    """Remedy for an import that failed for this reason, a clause without its end."""
     found = re.search(r"(lib[\w+.-]+?)\.so", reason)
     if found is None:
         return "run 'pip install open3d' again"
@@ -51,10 +51,10 @@ def remedy(reason: str) -> str:
 
 
 def find_libusb() -> None:
-    """Load libusb from its wheel where the system has none.
+    """Load libusb from its wheel if the system has none.
 
-    Open3D 0.20, the only one for Python 3.13, is linked against it for depth cameras. A library
-    that is loaded already satisfies a later one of the same name.
+    Open3D 0.20, the only version for Python 3.13, is linked against it for depth cameras. The
+    linker reuses a loaded library of the same name.
     """
     try:
         ctypes.CDLL("libusb-1.0.so.0")

@@ -1,8 +1,7 @@
-"""The one way to open what a user names: plain files only.
+"""Opening of a user's files: plain files only.
 
-A pipe would be waited for until something is written into it, and a device may never end.
-Nothing else in this package opens files of a user's; libraries that open theirs by a path get one
-that was checked here.
+Reading a pipe would wait until something is written, and a device may never end. All user files are
+opened here; libraries that open a path get one that was checked here.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ from pathlib import Path
 
 from polmvs.errors import DataError, as_data_error
 
-MAX_TEXT_BYTES = 1 << 28  # of a text that is read whole; lists of a million pairs have 2^26
+MAX_TEXT_BYTES = 1 << 28  # largest text; lists of a million pairs have 2^26
 
 
 def require_plain(path: str | PathLike[str]) -> None:
-    """Refuse what is no plain file, nor a link to one.
+    """Refuse anything but a plain file or a link to one.
 
     Raises
     ------
@@ -51,14 +50,14 @@ def open_plain(path: str | PathLike[str]) -> BufferedReader:
 
 
 def read_text(path: str | PathLike[str], encoding: str = "utf-8") -> str:
-    """The text of a plain file, its ends of lines as newlines.
+    """The text of a plain file, with newlines as line ends.
 
     Raises
     ------
     OSError
-        As of :func:`open_plain`, or it is too long for any text that is read here.
+        As of :func:`open_plain`, or it is too long.
     UnicodeDecodeError
-        It is not of that encoding.
+        The text has another encoding.
     """
     with open_plain(path) as file:
         data = file.read(MAX_TEXT_BYTES + 1)

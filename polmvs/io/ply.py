@@ -1,8 +1,8 @@
 """Reader and writer of PLY files as columns of numbers; input is untrusted.
 
-Open3D's readers abort, crash or fill up with zeros where a header promises what the file does not
-hold. Here every count is checked against the length of the file before memory is taken for it, and
-every index of a face against the number of vertices.
+If a header declares more than the file has, Open3D's readers abort, crash or fill up with zeros.
+Here every count is checked against the length of the file before memory is allocated, and every
+index of a face against the number of vertices.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ TYPES = {
     "int16": "i2", "uint16": "u2", "int": "i4", "uint": "u4", "int32": "i4", "uint32": "u4",
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
-NAMES = {"u1": "uchar", "i4": "int", "f4": "float"}  # of the types that are written
+NAMES = {"u1": "uchar", "i4": "int", "f4": "float"}  # of the written types
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _COUNT = re.compile(r"\d{1,15}", re.ASCII)
 _TRUNCATED = "is truncated; write or copy it again."
 
 
 class Property(NamedTuple):
-    """A column: a value of each row, or a list of values where ``length`` is given.
+    """A column: a value for each row, or a list of values if ``length`` is given.
 
     Attributes
     ----------
     name : of the column.
-    type : of a value, as NumPy names it without byte order.
+    type : of a value, NumPy's name without byte order.
     length : type of the length of a list; empty for a single value.
     """
 
@@ -69,7 +69,7 @@ class Element(NamedTuple):
         return any(column.length for column in self.properties)
 
     def least_bytes(self, *, ascii_format: bool) -> int:
-        """Of all rows: an ASCII value takes two bytes, a list its length at least."""
+        """Least size of all rows: an ASCII value takes two bytes, a list at least its length."""
         if ascii_format:
             return max(2 * len(self.properties) * self.num - 1, 0)
         widths = [np.dtype(column.length or column.type).itemsize for column in self.properties]
@@ -78,7 +78,7 @@ class Element(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class PlyHeader:
-    """What a PLY promises.
+    """The header of a PLY.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class PlyContent:
     Attributes
     ----------
     vertices : columns (N,) by name, in the types of the file.
-    triangles : (F, 3) int64, polygons cut into fans; None where there are no faces.
+    triangles : (F, 3) int64, polygons cut into fans; None without faces.
     """
 
     vertices: Mapping[str, NDArray[Any]]
@@ -116,7 +116,7 @@ def read_ply_header(path: Path) -> PlyHeader:
     Raises
     ------
     DataError
-        The file is missing, no PLY, or too short for what it promises.
+        The file is missing, not a PLY, or too short for its header.
     """
     with as_data_error(path, "read", missing="no such file; give a PLY point cloud."):
         head, size = read_head(path, MAX_HEADER_BYTES)
@@ -163,12 +163,12 @@ def _with(path: Path, element: Element, name: str, kind: str, count: str = "") -
 
 
 def read_ply(path: Path, *, faces: bool = False) -> PlyContent:
-    """Read the vertices of a PLY, and its faces if they are asked for.
+    """Read the vertices of a PLY, and on request its faces.
 
     Raises
     ------
     DataError
-        The file is missing, truncated, no PLY, or a face names a vertex that there is not.
+        The file is missing, truncated, not a PLY, or a face has an invalid vertex index.
     """
     header = read_ply_header(path)
     vertex = header.find("vertex")
@@ -347,8 +347,8 @@ def write_ply(
 
     Parameters
     ----------
-    path : file to write or replace; its folder is made.
-    vertices : columns (N,) by name, uint8 as they are and all others as float32.
+    path : file to write or replace; its folder is created.
+    vertices : columns (N,) by name; uint8 is kept, all others become float32.
     triangles : (F, 3), indices of vertices.
 
     Raises

@@ -1,12 +1,12 @@
-"""Samples of one image file as the camera stored them, whatever the container.
+"""Samples of one image file as the camera stored them, from any container.
 
-PNG, TIFF, PGM, BMP, JPEG and Radiance HDR are decoded by OpenCV, NPY here, OpenEXR by its own
-library (OpenCV reads it only after an environment variable was set before its import), and dumps
-without a header, packed or not, from their size in pixels. Nothing is scaled, turned or converted:
-what a sample's value means is decided in :mod:`polmvs.polarization.bit_depth`.
+OpenCV decodes PNG, TIFF, PGM, BMP, JPEG and Radiance HDR. This module decodes NPY, and dumps
+without a header, packed or not, from their size in pixels. OpenEXR has its own library (OpenCV
+reads it only if an environment variable is set before its import). Nothing is scaled, turned or
+converted: :mod:`polmvs.polarization.bit_depth` decides the meaning of sample values.
 
 A TIFF's orientation tag is reported and not applied: turning the samples would turn the cells of
-the mosaic, and views of one camera that differ in it would differ in their camera.
+the mosaic, and views of one camera with different tags would have different cameras.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ MAX_HEADER_BYTES = 1 << 20  # beside the samples
 PNG_GRAY = 0  # colour type of a monochrome PNG without alpha
 UPRIGHT = 1  # orientation tag of an image that is stored as it is shown
 TIFF_BITS, TIFF_COMPRESSION, TIFF_ORIENTATION = 258, 259, 274
-TIFF_SUBFILE, TIFF_REDUCED = 254, 1  # tag of what an image is for; bit of one that is a preview
+TIFF_SUBFILE, TIFF_REDUCED = 254, 1  # tag of an image's purpose; bit of a preview
 TIFF_JPEG = (6, 7)
 JPEG_TABLES = 0xDB
 # Order of an 8x8 block's coefficients in a JPEG file, as (row, column).
@@ -69,12 +69,12 @@ _PACKED_BITS = {
 
 
 class DumpSize(NamedTuple):
-    """What a dump without a header does not say; None is decided from the file's size.
+    """Size and packing of a dump without a header; None: from the length of the file.
 
     Attributes
     ----------
     width, height : px.
-    packing : how samples lie in the bytes.
+    packing : layout of the samples in the bytes.
     """
 
     width: int | None = None
@@ -83,16 +83,16 @@ class DumpSize(NamedTuple):
 
 
 class RawImage(NamedTuple):
-    """One file's samples and what it says about them.
+    """Samples and metadata of one file.
 
     Attributes
     ----------
     samples : (H, W), or (H, W, 3) in the order red, green, blue; uint8, uint16 or float32.
-    declared_bits : bits that the file itself says its samples have, if fewer than their type.
+    declared_bits : bits of the samples by the file itself, if fewer than their type.
     orientation : 1 to 8 as in TIFF's tag 274; the samples are as stored, not turned.
     quantization : (8, 8) float64, steps of a JPEG's luminance coefficients, rows for vertical
-        frequencies; None where the file is not known to be a JPEG.
-    lossy : the container compressed with loss; the steps may be unknown.
+        frequencies; None if the file is not known to be a JPEG.
+    lossy : the container has lossy compression; the steps may be unknown.
     """
 
     samples: NDArray[Any]
@@ -152,14 +152,14 @@ def read_raw(
     ----------
     path : a file with one of ``SUFFIXES``; its content decides where it has a signature.
     dump : size and packing of a ``.raw`` or ``.bin`` file.
-    max_pixels : that a file of a capture may have; None for files that are none of a capture's.
+    max_pixels : limit for files of a capture; None for other files.
 
     Raises
     ------
     DataError
-        The file is missing, damaged, too large, or of a type that holds no intensities.
+        The file is missing, damaged, too large, or of a type without intensities.
     OptionError
-        A dump's size or packing is not given and does not follow from its length.
+        The size or packing of a dump is not given and does not follow from its length.
     """
     suffix = Path(path).suffix.lower()
     limit = _limit(max_pixels)
@@ -190,7 +190,7 @@ def read_radiance(path: PathArg) -> NDArray[np.float32]:
     Raises
     ------
     DataError
-        The file is missing, truncated or no image of floats, or EXR lacks its package.
+        The file is missing, truncated or not an image of floats, or the package for EXR is missing.
     """
     image = read_raw(path).samples
     if image.dtype != np.float32:
@@ -201,9 +201,9 @@ def read_radiance(path: PathArg) -> NDArray[np.float32]:
 
 
 def probe_raw(path: PathArg, *, max_pixels: int | None = None) -> RawHeader | None:
-    """Size and type of a monochrome PNG without decoding it; None of all other files.
+    """Size and type of a monochrome PNG without decoding it; None for all other files.
 
-    Its checksums are verified, so that it will decode later.
+    Its checksums are verified, so it can be decoded later.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def unpack(path: PathArg, data: bytes, dump: DumpSize) -> NDArray[Any]:
     DataError
         The length does not fit the size.
     OptionError
-        The size is not given, or the packing is not and two of them have this length.
+        The size is not given, or the packing is not given and is ambiguous for this length.
     """
     if dump.width is None or dump.height is None:
         raise OptionError(
@@ -332,7 +332,7 @@ def read_npy(path: PathArg, data: bytes) -> NDArray[Any]:
     Raises
     ------
     DataError
-        The content is no NPY file, or truncated.
+        The content is not an NPY file, or is truncated.
     """
     stream = io.BytesIO(data)
     try:

@@ -1,7 +1,7 @@
-"""Names of unfinished files and folders: each carries a token that only this run knows.
+"""Names of unfinished files and folders; each has a token that only this run knows.
 
-Whoever must clean up after a process that was killed removes what has its token in the name, and
-nothing else: no file of a user's can look like it by chance.
+The clean-up after a killed process removes only names with its token; no file of a user has such a
+name by chance.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 TOKEN = secrets.token_hex(8)
 PREFIX = ".polmvs-"
 SHOWN = (
-    24  # characters of the final name that a temporary one ends in, so that it never is too long
+    24  # characters of the final name at the end of a temporary one, so that it is never too long
 )
 
 _NAME = re.compile(re.escape(PREFIX) + r"([0-9a-f]{16})-\d{1,10}-\d{1,10}-(.+)", re.DOTALL)
@@ -25,21 +25,21 @@ _numbers = itertools.count()
 
 
 def work_for(token: str) -> None:
-    """Give names with the token of the run that this process, a worker, is at work for."""
+    """Use the token of the run for which this process, a worker, works."""
     global TOKEN
     TOKEN = token
 
 
 def temporary_path(target: Path) -> Path:
-    """A new name beside ``target``, of the same suffix, for what will take its place."""
+    """A temporary name beside ``target``, with the same suffix, for its replacement."""
     number = f"{os.getpid()}-{next(_numbers)}"
     return target.with_name(f"{PREFIX}{TOKEN}-{number}-{target.name[-SHOWN:]}")
 
 
 def is_temporary(path: Path, token: str, names: Collection[str]) -> bool:
-    """Whether a name is one that the process with this token gave to what would have one of these.
+    """Whether a name is a temporary one with this token for one of these final names.
 
-    A file that lists tokens may be forged: what it can name is no more than this.
+    A file that lists tokens may be forged; it can only name such files.
     """
     found = _NAME.fullmatch(path.name)
     if found is None or found[1] != token:
@@ -48,7 +48,7 @@ def is_temporary(path: Path, token: str, names: Collection[str]) -> bool:
 
 
 def remove_temporary(path: Path) -> None:
-    """Remove a file or folder that may not exist, without hiding the error that led here."""
+    """Remove a file or folder that may not exist, without hiding the current error."""
     try:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)

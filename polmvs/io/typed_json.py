@@ -1,4 +1,4 @@
-"""JSON files of typed results: dataclasses written whole, and read back as what they were."""
+"""JSON files of typed results: dataclasses are written, and read back with their types."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def parse_json(text: str, pairs: Pairs | None = None) -> Any:
-    """What a JSON text holds.
+    """The value of a JSON text.
 
     Parameters
     ----------
-    pairs : makes something else than a dictionary of an object's keys and values.
+    pairs : converts an object's keys and values, instead of a dictionary.
 
     Raises
     ------
     ValueError
-        It is no JSON, nested too deeply, or has an integer of thousands of digits.
+        It is not JSON, nested too deeply, or has an integer of thousands of digits.
     """
     try:
         return json.loads(text, object_pairs_hook=pairs)
@@ -49,14 +49,14 @@ def parse_json(text: str, pairs: Pairs | None = None) -> Any:
 
 
 def from_json(kind: type[T], value: Any, where: str = "") -> T:
-    """A value of a type from what JSON holds of it.
+    """A value of a type from its JSON form.
 
     Parameters
     ----------
-    kind : a dataclass, or what its fields may be: ``bool``, ``int``, ``float``, ``str``, ``Path``,
+    kind : a dataclass, or a type of its fields: ``bool``, ``int``, ``float``, ``str``, ``Path``,
         enums, tuples, mappings, other dataclasses, ``Any``, and each of these or None.
-    value : as ``json.loads`` gives it. A null is None, or NaN where a float must be.
-    where : place of the value in the file, for messages.
+    value : from ``json.loads``. A null is None, or NaN for a float.
+    where : path of the value in the file, for messages.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Many captures, one after the other or side by side: a list of them, a folder each, one table.
+"""Reconstruction of a list of captures, in sequence or in parallel, with one table.
 
-A capture is one task (:mod:`polmvs.parallel`): on this machine each has a process of its own, on a
-cluster a worker. One that fails stops no other.
+A capture is one task (:mod:`polmvs.parallel`) with its own process on this machine, or a worker of
+a cluster. A failed capture does not stop the others.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from polmvs.polarization.kinds import AngleModel
 
 logger = logging.getLogger(__name__)
 
-FOLDER = ("folder", "capture")  # names of the column of a capture's folder
+FOLDER = ("folder", "capture")  # names of the column with a capture's folder
 TABLE_FILE, JSON_FILE = "batch.md", "batch.json"
 LOST = "its worker was lost: out of memory? Give `run.workers` 1, or workers more memory."
 
@@ -60,7 +60,7 @@ class BatchEntry:
 
     Attributes
     ----------
-    name : of its folder in OUT.
+    name : name of its folder in OUT.
     capture : folder.
     angle_model : of its reconstruction.
     options : of all stages.
@@ -73,7 +73,7 @@ class BatchEntry:
 
 
 class State(StrEnum):
-    """What has become of a capture."""
+    """State of a capture."""
 
     FINISHED = "finished"
     EMPTY = "empty"
@@ -82,17 +82,17 @@ class State(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class BatchRow:
-    """What has become of one capture of a list.
+    """Result of one capture of a list.
 
     Attributes
     ----------
     name, capture : as in the list.
     state : ``empty`` is a finished run whose cloud has no points.
-    num_images, num_views : of the capture, and those with a pose.
+    num_images, num_views : images of the capture, and those with a pose.
     num_tracks, num_points : sparse and dense points.
     seconds : of all calls.
     peak_rss_mb : the largest of its stages.
-    message : why there is no cloud, or none with points.
+    message : why there is no cloud with points.
     """
 
     name: str
@@ -112,23 +112,23 @@ def read_batch(
 ) -> tuple[BatchEntry, ...]:
     """Captures of a list, a TOML or CSV file; paths in it are relative to its folder.
 
-    TOML: a table ``[[captures]]`` for each, with ``folder`` of the capture, ``name``, by default
-    that of the folder, ``model``, and tables of options by group. CSV: a line for each under a
-    header with ``folder`` and as needed ``name``, ``model`` and options as ``group.name``; an
-    empty cell is one that is not there. The folder may be called ``capture`` too where no option
-    of that group is given, whose name it is.
+    TOML: a table ``[[captures]]`` for each capture with its ``folder``, ``name`` (by default that
+    of the folder), ``model``, and tables of options by group. CSV: a header with ``folder`` and
+    optionally ``name``, ``model`` and options as ``group.name``, and a line for each capture; an
+    empty cell means not given. The key ``capture`` may replace ``folder`` if no option of the group
+    of this name is given.
 
     Parameters
     ----------
     path : of the list.
-    options, angle_model : of what the list leaves open.
+    options, angle_model : defaults for the list.
 
     Raises
     ------
     DataError
         The list cannot be read or is empty, or a capture's folder is missing.
     OptionError
-        A key or value is unusable, or a name is there twice.
+        A key or value is unusable, or a name occurs twice.
     """
     text = read_list(path, "captures", "utf-8-sig")
     suffix = path.suffix.lower()
@@ -148,7 +148,7 @@ def read_batch(
                 f"{path}: a capture cannot be named {entry.name!r}, as a file in OUT is; give it "
                 "another `name`."
             )
-        if entry.name.casefold() in seen:  # some systems do not tell them apart
+        if entry.name.casefold() in seen:  # some systems do not distinguish them
             raise OptionError(f"{path}: two captures are named {entry.name!r}; give `name`s.")
         seen[entry.name.casefold()] = entry.name
     for entry in entries:
@@ -167,25 +167,24 @@ def run_batch(
     run_options: RunOptions,
     on_done: Callable[[BatchRow], None] = lambda row: None,
 ) -> list[BatchRow]:
-    """Reconstruct captures, each into ``OUT/NAME``; ``OUT/batch.md`` and ``.json`` grow with them.
+    """Reconstruct captures, each into ``OUT/NAME``, and update ``OUT/batch.md`` and ``.json``.
 
-    Captures that an earlier list brought to OUT keep their rows there.
+    Captures of an earlier list in OUT keep their rows.
 
     Parameters
     ----------
     entries : from :func:`read_batch`.
     out : folder of all runs.
-    run_options : ``workers`` processes are shared among the captures, of each of which at least
-        one; with ``scheduler`` each capture is one task of the cluster.
-    on_done : told of each capture, in the list's order.
+    run_options : ``workers`` processes are divided among the captures, at least one for each; with
+        ``scheduler`` each capture is one task of the cluster.
+    on_done : called for each capture, in the list's order.
 
     Raises
     ------
     OptionError
-        A capture's folder in OUT holds something, and neither ``overwrite`` nor ``resume`` is
-        given.
+        A capture's folder in OUT is not empty, and neither ``overwrite`` nor ``resume`` is given.
     DataError
-        OUT cannot be made, its ``batch.json`` is none of a batch, or the cluster is unusable.
+        OUT cannot be created, its ``batch.json`` is not of a batch, or the cluster is unusable.
 
     Returns
     -------
@@ -307,7 +306,7 @@ def _run_one(out: Path, run_options: RunOptions, entry: BatchEntry) -> BatchRow:
 
 
 def row_of(entry: BatchEntry, outcome: Callable[[], BatchRow]) -> BatchRow:
-    """Row of a capture, whose error, or lost process, makes a row as well."""
+    """Row of a capture; an error or a lost process also makes a row."""
     try:
         return outcome()
     except BrokenProcessPool:

@@ -1,4 +1,4 @@
-"""What must hold before a run begins: that the input is usable, and apart from the output."""
+"""Checks before a run begins: the input is usable, and separate from the output."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ from polmvs.poses.image_check import (
 from polmvs.poses.metric_frame import check_reference, frame_from_distance, read_centers
 from polmvs.scene import SparseModel, View, find_name, match_names, short_list
 
-MAX_CAMERA_DIFFERENCE = 0.01  # of the focal length, between options that say the same; a guess
+MAX_CAMERA_DIFFERENCE = 0.01  # of the focal length, between equivalent options; a guess
 
 
 def inputs_of(options: Options) -> dict[str, Path]:
-    """Files and folders that are read beside the capture, by the option that names them."""
+    """Input files and folders other than the capture, by their option."""
     named = {path: get_option(options, path) for path in option_paths()}
     named["sfm.pairs"] = options.sfm.pairs_file
     return {path: value for path, value in named.items() if isinstance(value, Path)}
 
 
 def digest_of(path: Path) -> str:
-    """What tells the content of a file, or of all files in a folder, from another.
+    """Digest of the content of a file, or of all files in a folder.
 
     Raises
     ------
@@ -65,18 +65,18 @@ def digest_of(path: Path) -> str:
 def require_apart(
     run_folder: RunFolder, *, capture: Path, others: Sequence[Path], written: Iterable[str]
 ) -> None:
-    """Refuse a run folder whose results would be mixed with the input, or delete it.
+    """Refuse a run folder whose results would mix with the input or delete it.
 
     Parameters
     ----------
     capture : folder of the raw mosaics.
-    others : further files and folders that are read.
-    written : names of what a run may write in its folder.
+    others : further input files and folders.
+    written : names that a run may write in its folder.
 
     Raises
     ------
     OptionError
-        The run folder is the capture's, or the input lies where results go.
+        The run folder is the capture's, or input is in the place of results.
     """
     root = resolved(run_folder.root)
     if root in (resolved(capture), resolved(capture / "raw")):
@@ -98,7 +98,7 @@ def _real_places(path: Path) -> list[Path]:
 
 
 def identity_of(capture: Capture) -> CaptureIdentity:
-    """What tells this capture from another one."""
+    """Identity of this capture."""
     return CaptureIdentity(
         folder=capture.folder.absolute(),
         width=capture.width,
@@ -113,12 +113,12 @@ def _path_in(path: Path, folder: Path) -> str:
 
 
 def require_same_capture(record: Record, identity: CaptureIdentity, run_folder: RunFolder) -> None:
-    """Finished stages must be of this capture.
+    """Refuse finished stages of another capture.
 
     Raises
     ------
     DataError
-        They are of another one.
+        They are of another capture.
     """
     before = record.capture
     if record.stages and (before is None or not before.is_same(identity)):
@@ -131,11 +131,11 @@ def require_same_capture(record: Record, identity: CaptureIdentity, run_folder: 
 
 
 def check_input(capture: Capture, options: Options, min_images: int) -> SparseModel | None:
-    """All that can be known to be wrong before the work begins.
+    """Check all input that can be checked before the work begins.
 
     Returns
     -------
-    The model of ``options.sfm.sparse``, fitted to the capture; None where it names none.
+    The model of ``options.sfm.sparse``, fitted to the capture; None without it.
 
     Raises
     ------
@@ -190,16 +190,16 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
 
 
 def require_truth_of_capture(truth: GroundTruth, capture: Capture, load_image: ImageLoader) -> None:
-    """Refuse ground truth of another capture: by its names, its images' size, its cameras.
+    """Refuse ground truth of another capture, by its names, image size and cameras.
 
     Parameters
     ----------
-    load_image : of :func:`polmvs.poses.image_check.intensity_loader`.
+    load_image : from :func:`polmvs.poses.image_check.intensity_loader`.
 
     Raises
     ------
     DataError
-        It is of another one.
+        It is of another capture.
     """
     names = image_names(capture)
     matched = match_names(list(names), truth.names)

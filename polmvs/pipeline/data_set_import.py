@@ -1,7 +1,7 @@
-"""A public set made ready for ``reconstruct``: images, a COLMAP model of its poses, masks.
+"""Import of a public set for ``reconstruct``: images, a COLMAP model of its poses, masks.
 
-:func:`import_data_set` does it; :func:`as_capture` is what ``reconstruct`` and ``inspect`` call
-with any folder, sets or not.
+:func:`import_data_set` imports a set. ``reconstruct`` and ``inspect`` call :func:`as_capture` with
+any folder.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from polmvs.scene import View, stem_of
 
 logger = logging.getLogger(__name__)
 
-IMPORT_FILE = "import.json"  # that a folder is an import, and of what
+IMPORT_FILE = "import.json"  # file that marks an import and names its source
 SAME_CAMERA = 1e-6  # relative difference by the rounding of a set's matrices
 
 
@@ -54,18 +54,18 @@ class _Made:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportedSet:
-    """What a set became; paths that it lacks are None.
+    """An imported set; missing paths are None.
 
     Attributes
     ----------
-    data_set : as it was read.
-    capture : folder to read the images from.
+    data_set : description of the set.
+    capture : folder of the images.
     options_file : TOML file of the capture's options.
     sparse : COLMAP model, for ``sfm.sparse``.
     masks : folder, for ``region.mask``.
-    num_points : of the model where it was triangulated here.
+    num_points : of the model, if it was triangulated here.
     light : for ``region.light``.
-    options : of the capture, as the file has them.
+    options : of the capture, as in the file.
     """
 
     data_set: DataSet
@@ -79,13 +79,13 @@ class ImportedSet:
 
 
 def import_data_set(folder: Path, out: Path, options: CaptureOptions | None = None) -> ImportedSet:
-    """Read a public set and write what ``reconstruct`` takes beside it.
+    """Read a public set and write the input of ``reconstruct``.
 
     Parameters
     ----------
-    folder : the set, which is not changed; images that a capture is read from stay there.
-    out : folder to make.
-    options : of the capture; what is not the default goes before what the set's layout says.
+    folder : the set, which is not changed; images in the form of a capture stay there.
+    out : folder to create.
+    options : of the capture; values other than the defaults take precedence over the layout.
 
     Raises
     ------
@@ -109,18 +109,18 @@ def import_data_set(folder: Path, out: Path, options: CaptureOptions | None = No
 
 
 def as_capture(folder: Path, out: Path, options: Options) -> tuple[Path, Options]:
-    """A capture and its options; of a public set those of its import, which is made or found.
+    """A capture and its options; for a public set those of its import, which is made or reused.
 
     Parameters
     ----------
     folder : a capture, or a public set.
     out : of the run; the import lies beside it, ``OUT_import``.
-    options : as the user gave them. Where they give poses, the set's own are left alone.
+    options : from the user. If they give poses, those of the set are ignored.
 
     Raises
     ------
     DataError
-        The set is incomplete, or what lies at ``OUT_import`` is no import of it.
+        The set is incomplete, or ``OUT_import`` is not an import of it.
     """
     kind = recognise_data_set(folder) if folder.is_dir() else None
     place = out.absolute().with_name(f"{out.name}_import")

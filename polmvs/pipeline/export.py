@@ -88,14 +88,14 @@ class ExportRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Exported:
-    """What was written.
+    """Files and content of an export.
 
     Attributes
     ----------
-    files : or the folder.
-    num_points, num_triangles, num_views : of what was exported; 0 of what was not.
-    texture_px : sides of the texture; 0 without one.
-    is_metric : whether its unit is the metre; else it is the model's own.
+    files : written files, or the folder.
+    num_points, num_triangles, num_views : of the export; 0 if it has none.
+    texture_px : side of the texture; 0 without one.
+    is_metric : whether its unit is the metre; else it is the model's.
     """
 
     files: tuple[Path, ...]
@@ -107,12 +107,12 @@ class Exported:
 
 
 def export_format(target: Path, given: ExportFormat | None) -> ExportFormat:
-    """The format that is asked for, or that a file's name ends in.
+    """The format of the options, or of a file's suffix.
 
     Raises
     ------
     OptionError
-        The name says none, or another than is asked for.
+        The suffix is unknown, or contradicts the format.
     """
     suffix = target.suffix.lower()
     if given is None:
@@ -136,7 +136,7 @@ def export_run(run_folder: RunFolder, wanted: ExportRequest) -> Exported:
     Raises
     ------
     DataError, OptionError, PolmvsError
-        The run lacks what is asked for, the target exists, or a library is missing.
+        The run lacks the data, the target exists, or a library is missing.
     """
     record = load_record(run_folder)
     model = surface_of(run_folder, dense_models(record), wanted.model)
@@ -189,12 +189,12 @@ def _export_mesh(
 def surface_of(
     run_folder: RunFolder, there: tuple[AngleModel, ...], model: AngleModel | None
 ) -> AngleModel:
-    """The angle model whose surface is asked for, of those that are there.
+    """The requested angle model, among those of the run.
 
     Raises
     ------
     DataError, OptionError
-        There is none, or not that.
+        The run has no surface, or not that one.
     """
     if not there:
         raise DataError(run_folder.root, "has no dense cloud. Run 'polmvs densify' first.")
@@ -227,7 +227,7 @@ def _existing(path: Path, what: str) -> Path:
 
 
 def part_of(cloud: Cloud) -> Cloud:
-    """The points of a cloud that lie on the part, without its surroundings."""
+    """The points of a cloud on the part, without its surroundings."""
     return cloud.only(cloud.are(PointKind.SURFACE, PointKind.INFERRED))
 
 
@@ -324,11 +324,11 @@ class _Painter:
 
 
 def unpolarized_image(capture: Capture, name: str) -> NDArray[np.float32]:
-    """Linear intensities of a raw image without what is polarized; NaN where they are clipped.
+    """Linear intensities of the unpolarized light of a raw image; NaN where clipped.
 
     Returns
     -------
-    (H, W), or (H, W, 3) red, green, blue of a colour camera, unless the capture's options choose
+    (H, W), or (H, W, 3) red, green, blue for a colour camera, unless the capture's options select
     one of its colours.
     """
     channels: tuple[Channel, ...] = (capture.options.channel,)

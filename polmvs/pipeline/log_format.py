@@ -1,4 +1,4 @@
-"""How a line of a run's log looks."""
+"""Format of a run's log."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 
 class LogFormatter(logging.Formatter):
-    """Writes out what a terminal would act on that shows the log.
+    """Escapes control characters in the log.
 
-    Further lines of a record are indented, so that no name can look like a record of its own.
+    Further lines of a record are indented, so that no name can look like a new record.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The record of a run, ``run.json``: what is finished, what it found, and on what machine."""
+"""The record of a run, ``run.json``: finished stages, their results, and the machine."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ class StageRecord:
     Attributes
     ----------
     name : of the stage.
-    angle_model : that it is of; None for those of all.
-    reads : what it was made from, paths in the run folder.
-    wrote : what it left there: how many files, by path in the run folder.
-    options : values of the options that decided its result, by path, in terms of JSON.
-    inputs : digests of the files and folders that these options name, by path of the option.
-    is_lost : its files are gone and are not made again yet. What was made of them holds, as long as
-        they are made with the same options.
+    angle_model : its angle model; None for stages of all models.
+    reads : its input, paths in the run folder.
+    wrote : number of its files, by path in the run folder.
+    options : values of the options that decided its result, by path, as JSON.
+    inputs : digests of the files and folders of these options, by path of the option.
+    is_lost : its files are missing and not yet made again. Results from them stay valid if they are
+        made with the same options.
     seconds : wall time.
     cpu_s : processor time, see :func:`polmvs.memory.cpu_seconds`; not of a cluster's.
     peak_rss_mb : largest resident memory of the run's processes together during it, see
         :class:`polmvs.memory.PeakMemory`; not of a cluster's.
-    warnings : what it warned of.
-    result : what it found, of the type that the stage table says.
+    warnings : its warnings.
+    result : its result, of the type in the stage table.
     """
 
     name: str
@@ -65,7 +65,7 @@ class StageRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureIdentity:
-    """What tells a capture from another one.
+    """Identity of a capture.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class CaptureIdentity:
     digests: Mapping[str, str]
 
     def is_same(self, other: CaptureIdentity) -> bool:
-        """Whether the images are the same, wherever they lie."""
+        """Whether the images are the same, in any folder."""
         mine, others = (self.width, self.height), (other.width, other.height)
         return mine == others and self.digests == other.digests
 
@@ -92,15 +92,15 @@ class Record:
     Attributes
     ----------
     schema_version : of the file.
-    command_line : how the run was last called; empty where a script did.
-    capture : the images that it is of.
+    command_line : of the last call; empty for a script.
+    capture : identity of its images.
     images : names of the files in ``images/``.
-    notes : what was recognised of the capture and decided about it, one line each.
-    options : resolved options of the last call, in terms of JSON.
+    notes : what was recognized and decided about the capture, one line each.
+    options : resolved options of the last call, as JSON.
     versions : of the software.
     stages : finished ones, in order.
     wall_s : seconds of all calls together.
-    finished : whether what was asked for has come to its end.
+    finished : whether the last call completed.
     """
 
     schema_version: int = SCHEMA_VERSION
@@ -119,22 +119,22 @@ class Record:
         return next((stage for stage in self.stages if stage.name == name), None)
 
     def forget(self, names: Iterable[str]) -> None:
-        """Drop stages that are to be done again."""
+        """Remove stages that must run again."""
         dropped = set(names)
         self.stages = tuple(stage for stage in self.stages if stage.name not in dropped)
 
     def put(self, stage: StageRecord) -> None:
-        """Have a stage recorded so, in the place of what was."""
+        """Record a stage, replacing its former record."""
         self.forget([stage.name])
         self.stages = (*self.stages, stage)
 
     def find(self, kind: type[R], model: AngleModel | None = None) -> R | None:
-        """Result of the finished stage that gives this type; None where it is not finished.
+        """Result of the finished stage with this result type; None if it is not finished.
 
         Parameters
         ----------
         kind : type of the result; each belongs to one stage, or to one stage of each angle model.
-        model : of the stage, if it is of one.
+        model : angle model of the stage, if it has one.
         """
         for stage in self.stages:
             if isinstance(stage.result, kind) and stage.angle_model is model:
@@ -142,7 +142,7 @@ class Record:
         return None
 
     def result(self, kind: type[R], model: AngleModel | None = None) -> R:
-        """As :meth:`find`; KeyError where the stage is not finished."""
+        """As :meth:`find`; KeyError if the stage is not finished."""
         found = self.find(kind, model)
         if found is None:
             raise KeyError(f"no stage with a {kind.__name__} {model or ''} is finished")
@@ -183,7 +183,7 @@ def _with_result(stage: StageRecord, result_types: Mapping[str, type]) -> StageR
 
 
 def read_options(run_folder: RunFolder) -> Mapping[str, Any]:
-    """Options of the run in a folder, in terms of JSON; empty where none has a finished stage.
+    """Options of the run in a folder, as JSON; empty if no stage is finished.
 
     Raises
     ------
@@ -266,6 +266,6 @@ def _no_record(run_folder: RunFolder, why: object) -> DataError:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, this package and what it stands on."""
+    """Versions of Python, this package and its dependencies."""
     installed = installed_versions((*PACKAGES, "open3d"))
     return {"python": platform.python_version(), **installed}

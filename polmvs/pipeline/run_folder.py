@@ -1,6 +1,6 @@
-"""The run folder: the paths of its files, how they are written, and which of them are its own.
+"""The run folder: the paths of its files, and how they are written and deleted.
 
-Everything is written whole or not at all. Only what a run wrote is ever deleted: what carries its
+Everything is written whole or not at all. Only files of a run are ever deleted: those with its
 token (:mod:`polmvs.pipeline.run_lock`), and results by their names. Links are not followed.
 """
 
@@ -22,9 +22,9 @@ RUN_FILE = "run.json"
 LOG_FILE = "polmvs.log"
 SURFACE_MESH = "surface.ply"  # among dense views: the mesh that they are rendered from
 NOT_OURS = "was not written by polmvs. Move it out of the way."
-CAMERA_MODES = "camera_modes.npy"  # beside the model of SfM: what its camera leaves open
-POSE_COVARIANCES = "pose_covariances.npy"  # likewise: what its adjustment leaves of the poses
-SURFACE_LEVELS = "surface_{number}.ply"  # and those on its way: its hull, then after each level
+CAMERA_MODES = "camera_modes.npy"  # beside the model of SfM: uncertainty of its camera
+POSE_COVARIANCES = "pose_covariances.npy"  # likewise: uncertainty of its poses
+SURFACE_LEVELS = "surface_{number}.ply"  # and those before it: its hull, then after each level
 DENSE_MARKER = "polmvs-files.txt"  # in a COLMAP workspace: the files that were written with it
 
 
@@ -41,12 +41,12 @@ class RunFolder:
 
     @property
     def images(self) -> Path:
-        """Images that COLMAP was given."""
+        """Images for COLMAP."""
         return self.root / "images"
 
     @property
     def sfm(self) -> Path:
-        """COLMAP model as SfM found it, in its own frame."""
+        """COLMAP model of SfM, in its own frame."""
         return self.root / "sfm"
 
     @property
@@ -56,12 +56,12 @@ class RunFolder:
 
     @property
     def camera_modes(self) -> Path:
-        """What an estimated camera leaves open, in the frame of ``sparse``."""
+        """Uncertainty of an estimated camera, in the frame of ``sparse``."""
         return self.root / "tracks" / "camera.npy"
 
     @property
     def pose_covariances(self) -> Path:
-        """What estimated poses leave open, in the frame of ``sparse``."""
+        """Uncertainty of estimated poses, in the frame of ``sparse``."""
         return self.root / "tracks" / "poses.npy"
 
     @property
@@ -71,22 +71,22 @@ class RunFolder:
 
     @property
     def metrics(self) -> Path:
-        """Figures of a comparison."""
+        """Metrics of a comparison."""
         return self.root / "metrics.json"
 
     @property
     def summary(self) -> Path:
-        """The same as a table to read."""
+        """The same as a table."""
         return self.root / "summary.md"
 
     @property
     def report(self) -> Path:
-        """The page that shows all results."""
+        """The report."""
         return self.root / "report.html"
 
     @property
     def deviation(self) -> Path:
-        """How far the part is from its reference, as ``polmvs deviation`` found it."""
+        """Results of ``polmvs deviation``."""
         return self.root / "deviation"
 
     @property
@@ -173,7 +173,7 @@ DENSE_FOLDERS = frozenset(HERE.dense(model).name for model in AngleModel)
 
 @contextmanager
 def scratch(target: Path) -> Iterator[Path]:
-    """A new folder beside ``target`` that goes when the work is done or fails."""
+    """A temporary folder beside ``target``, removed at the end."""
     folder = temporary_path(target)
     try:
         folder.mkdir(parents=True)
@@ -184,7 +184,7 @@ def scratch(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing(target: Path) -> Iterator[Path]:
-    """A new folder that takes the place of ``target`` when all went well, else goes.
+    """A new folder that replaces ``target`` on success and is removed otherwise.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def replacing(target: Path) -> Iterator[Path]:
 
 
 def replace_folder(folder: Path, target: Path) -> None:
-    """Put a finished folder in the place of another one.
+    """Replace a folder by a finished one.
 
     Raises
     ------
@@ -216,17 +216,17 @@ def replace_folder(folder: Path, target: Path) -> None:
 def require_own(
     folder: Path, images: Set[str] = frozenset(), *, also: Set[str] = frozenset()
 ) -> None:
-    """Refuse to delete a folder with files other than those that a run writes in it.
+    """Refuse to delete a folder with files that no run writes in it.
 
     Parameters
     ----------
     images : names of the run's images.
-    also : names of further files that may go.
+    also : names of further files that may be deleted.
 
     Raises
     ------
     DataError
-        There is one; it is named.
+        There is such a file; the message names it.
     """
     require_no_link(folder)
     if not folder.is_dir():
@@ -245,7 +245,7 @@ def require_own(
 
 
 def require_no_link(path: Path) -> None:
-    """Refuse a link in the place of a result: what it leads to is not the run's.
+    """Refuse a link in place of a result: its target does not belong to the run.
 
     Raises
     ------
@@ -257,13 +257,12 @@ def require_no_link(path: Path) -> None:
 
 
 def discard(paths: Iterable[Path], images: Set[str] = frozenset()) -> None:
-    """Delete files and folders that a run wrote, those that are there.
+    """Delete existing files and folders of a run.
 
     Raises
     ------
     DataError
-        A folder holds files other than those that a run of these images writes; nothing is
-        deleted.
+        A folder has files that no run of these images writes; nothing is deleted.
     """
     present = [path for path in paths if os.path.lexists(path)]
     for path in present:
@@ -294,7 +293,7 @@ def _require_own_workspace(folder: Path) -> None:
 
 
 def mark_own_workspace(folder: Path) -> None:
-    """List the files of a COLMAP workspace in it, so that what a user adds is told from them."""
+    """List the files of a COLMAP workspace in it, to recognize a user's files later."""
     files = (path for path in folder.rglob("*") if path.is_file())
     lines = sorted(path.relative_to(folder).as_posix() for path in files)
     (folder / DENSE_MARKER).write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -306,12 +305,12 @@ def files_in(folder: Path) -> list[Path]:
 
 
 def num_files(path: Path) -> int:
-    """Number of files that a path stands for: one, or those in a folder; none where it is gone."""
+    """Number of files of a path: 1, or those in a folder; 0 if it does not exist."""
     return len(files_in(path)) if path.is_dir() else int(path.exists())
 
 
 def has_content(folder: Path, apart_from: Set[str] = frozenset()) -> bool:
-    """Whether a folder exists and holds anything but these names.
+    """Whether a folder exists and has other entries than these names.
 
     Raises
     ------

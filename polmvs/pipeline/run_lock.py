@@ -1,10 +1,10 @@
-"""One run at a time in a run folder, and what a killed one left half done.
+"""Lock of a run folder, and clean-up after a killed run.
 
-The lock is the system's on an open file in the run folder: it ends with its process, however that
-ends. The file lists the tokens of the runs whose temporary names may still lie there (see
-:mod:`polmvs.io.temporary`): a run adds its own before it makes anything, and removes what carries
-that of an earlier one. Nothing else is ever taken for half done. A run that comes to its end,
-good or bad, leaves no such file.
+The lock is a system lock on an open file in the run folder: it ends with its process in any case.
+The file lists the tokens of the runs whose temporary names may still exist there (see
+:mod:`polmvs.io.temporary`). A run first adds its own token, and removes files with tokens of
+earlier runs. No other file counts as unfinished. A run that ends, with or without an error, removes
+the file.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ logger = logging.getLogger(__name__)
 LOCK_FILE = ".polmvs-lock"
 MAX_BYTES = 1 << 16
 _LINE = re.compile(r"([0-9a-f]{16}) (\d{1,10})")  # token and number of a process
-# Folders in which a run gives temporary names, and what that is to be named in the end.
+# Folders in which a run uses temporary names, and their final names.
 _PLACES = {Path(): ROOT_NAMES, HERE.seeds.parent: FOLDER_FILES[HERE.seeds.parent.name]}
 _HELD_ELSEWHERE = (errno.EWOULDBLOCK, errno.EACCES)
 
 
 @contextmanager
 def locked(root: Path) -> Iterator[None]:
-    """Keep other runs out of a run folder, which is made if need be, and clean up after dead ones.
+    """Lock a run folder, which is created if necessary, and clean up after killed runs.
 
     Raises
     ------
     DataError
-        Another run is at work in it, or it cannot be written.
+        Another run uses it, or it cannot be written.
     """
     path = root / LOCK_FILE
     is_new = not root.exists()
@@ -74,7 +74,7 @@ def locked(root: Path) -> Iterator[None]:
 
 
 def left_over_names(root: Path) -> frozenset[str]:
-    """Names in a run folder of the lock and of what a killed run left; no results, no user's."""
+    """Names of the lock and of files of a killed run in a run folder; no results or user files."""
     path = root / LOCK_FILE
     if not path.is_file() or path.is_symlink():
         return frozenset()

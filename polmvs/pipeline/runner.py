@@ -1,9 +1,9 @@
-"""A run in a run folder: checked before it begins, recorded stage by stage, able to go on.
+"""A run in a run folder: checks before the start, a record after each stage, and resume.
 
-A stage is recorded in ``run.json`` when its files are whole. A run that goes on skips recorded
-stages; the options that decided these must be the same. Every stage reads its input from the run
-folder, so that a run that was stopped gives the same result as one that was not. What is decided
-about a stage is decided when it begins, when all that it reads is known.
+A stage is recorded in ``run.json`` when its files are complete. A resumed run skips recorded
+stages; their options must be the same. Every stage reads its input from the run folder, so a run
+that was stopped and resumed gives the same result. Decisions about a stage are made when it begins,
+when all of its input is known.
 """
 
 from __future__ import annotations
@@ -81,23 +81,23 @@ FILE_ONLY = {"file_only": True}  # of records that a monitor is told of as well
 
 
 class Monitor(Protocol):
-    """Who watches a run: what a terminal, a notebook or a test implements to follow it."""
+    """Interface to follow a run, for a terminal, a notebook or a test."""
 
     def opened(self, run_folder: RunFolder) -> None:
         """The run folder is ready."""
 
     def stage(self, name: str, total: int | None) -> AbstractContextManager[OnProgress]:
-        """A stage begins, of ``total`` steps if that is known; gives who is told of its steps."""
+        """A stage begins, with ``total`` steps if known; gives the function for its steps."""
 
     def finished(self, name: str, seconds: float, summary: str) -> None:
-        """A stage is finished and recorded; the summary is what it found, in a few words."""
+        """A stage is finished and recorded; the summary is its result in a few words."""
 
     def skipped(self, name: str) -> None:
         """A stage was finished earlier."""
 
 
 class NoMonitor:
-    """Nobody watches."""
+    """A monitor that ignores everything."""
 
     def opened(self, run_folder: RunFolder) -> None:
         """Do nothing."""
@@ -115,7 +115,7 @@ class NoMonitor:
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What every job is called with.
+    """Arguments of every job.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class Job:
     out : run folder.
     options : of all stages.
     run_options : workers, overwrite and resume.
-    monitor : who watches, if anybody.
+    monitor : follows the run, if given.
     command_line : for the record.
     """
 
@@ -146,13 +146,13 @@ class Job:
 
 @dataclass(kw_only=True)
 class Run(StageInput):
-    """A run in progress; a stage is given what :class:`StageInput` says of it.
+    """A run in progress; stages get their input as :class:`StageInput`.
 
     Attributes
     ----------
-    monitor : who watches.
+    monitor : follows the run.
     table : all stages, in order.
-    budget_gb : of memory, that stages are held to; None: none.
+    budget_gb : memory budget of the stages; None: none.
     """
 
     monitor: Monitor
@@ -162,7 +162,7 @@ class Run(StageInput):
     _digests: dict[str, str] = field(default_factory=dict)
 
     def is_finished(self, spec: StageSpec) -> bool:
-        """Whether a stage is recorded and what it wrote is still there."""
+        """Whether a stage is recorded and its files still exist."""
         finished = self.record.stage(spec.name)
         return finished is not None and not finished.is_lost and not self._lost(finished)
 
@@ -172,14 +172,14 @@ class Run(StageInput):
         return [path for path, number in wrote.items() if num_files(root / path) < number]
 
     def do(self, spec: StageSpec) -> None:
-        """Do a stage, unless it is finished, and record it; see :meth:`do_all`."""
+        """Run a stage, unless it is finished, and record it; see :meth:`do_all`."""
         self.do_all([spec])
 
     def do_all(self, specs: Sequence[StageSpec]) -> None:
-        """Do stages that read nothing of each other, unless they are finished, and record them.
+        """Run independent stages, unless they are finished, and record them.
 
-        They are done side by side where they can be (``StageSpec.call``), there are workers for it
-        on this machine, and no memory is to be kept free.
+        They run in parallel if they can (``StageSpec.call``), if this machine has workers for them,
+        and without a memory budget.
 
         Raises
         ------
@@ -322,17 +322,17 @@ class Run(StageInput):
         return {path: self._digests[path] for path in used}
 
     def forget(self, names: Collection[str]) -> None:
-        """Have stages done again, and all that are made from their files; their files go.
+        """Forget stages and all stages made from their files, and delete their files.
 
         Raises
         ------
         DataError
-            A folder of theirs holds files that no run wrote; nothing is deleted.
+            One of their folders has files that no run wrote; nothing is deleted.
         """
         self._delete(with_dependent(names, self.table))
 
     def take_out(self, names: Sequence[str], reasons: Sequence[str]) -> None:
-        """Take images out of the model: what was made with them is done again without.
+        """Remove images from the model; stages that used them run again without them.
 
         Parameters
         ----------
@@ -360,12 +360,12 @@ class Run(StageInput):
         discard(paths, images)
 
     def require_same_options(self, names: Collection[str]) -> None:
-        """Refuse finished stages that are to be taken over and are of other options.
+        """Refuse to reuse finished stages with other options.
 
         Raises
         ------
         OptionError
-            One is; the option is named with both values. Or a file has changed that one names.
+            An option differs (the message has both values), or a file of an option has changed.
         """
         for spec in self.table:
             finished = self.record.stage(spec.name)
@@ -468,24 +468,23 @@ def open_run(
     taken_over: Collection[str],
     continues: bool = False,
 ) -> Iterator[Run]:
-    """Check the input, make the run folder ready, and give the run.
+    """Check the input, prepare the run folder, and give the run.
 
-    Nothing is written or deleted before all input is found sound, and no other run may work in the
-    folder meanwhile.
+    Nothing is written or deleted before all input is checked. No other run may use the folder at
+    the same time.
 
     Parameters
     ----------
-    job : as the user gave it.
+    job : from the user.
     table : all stages, in order.
-    min_images : the fewest that will do.
-    taken_over : names of the stages that are not done again if they are finished.
-    continues : the folder must hold a run, and its finished stages stay, whatever the job's
-        ``run_options`` say.
+    min_images : least number of images.
+    taken_over : names of the stages that are reused if they are finished.
+    continues : the folder must have a run, whose finished stages are kept for any ``run_options``.
 
     Raises
     ------
     DataError, OptionError
-        The input is unusable, or the run folder is, or another run is at work in it.
+        The input or the run folder is unusable, or another run uses the folder.
     """
     monitor = job.monitor if job.monitor is not None else NoMonitor()
     run_options = job.run_options
@@ -561,24 +560,24 @@ def load_record(run_folder: RunFolder) -> Record:
 
 
 def dense_models(record: Record) -> tuple[AngleModel, ...]:
-    """Models that a run has made a dense cloud of."""
+    """Models with a dense cloud in a run."""
     return tuple(m for m in AngleModel if record.find(DensifyResult, m) is not None)
 
 
 def prepare_output(run_folder: RunFolder, *, overwrite: bool, resume: bool) -> Record:
-    """Make the run folder ready, which is locked, and give the record that the run starts from.
+    """Prepare the locked run folder, and give the initial record of the run.
 
     Parameters
     ----------
-    overwrite : delete the results of an earlier run. Only what polmvs wrote is deleted.
-    resume : keep them and go on.
+    overwrite : delete the results of an earlier run. Only files of polmvs are deleted.
+    resume : keep them and continue.
 
     Raises
     ------
     OptionError
-        The folder holds something and neither was asked for.
+        The folder is not empty and neither option is given.
     DataError
-        It cannot be made, or holds files with our names that no run of polmvs wrote.
+        It cannot be created, or has files with names of results that no run of polmvs wrote.
     """
     occupied = require_usable(run_folder, overwrite=overwrite, resume=resume)
     if occupied and resume:
@@ -589,11 +588,11 @@ def prepare_output(run_folder: RunFolder, *, overwrite: bool, resume: bool) -> R
 
 
 def require_usable(run_folder: RunFolder, *, overwrite: bool, resume: bool) -> bool:
-    """Refuse a run folder that holds something else than what is to be taken over or deleted.
+    """Refuse a run folder with content that is neither reused nor deleted.
 
     Returns
     -------
-    Whether it holds anything; what a killed run left half done does not count.
+    Whether it has content; unfinished files of a killed run do not count.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Alignment of an estimated world with a known one by the camera centres."""
+"""Alignment of an estimated world to a known one by the camera centres."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ from polmvs.fitting import like_most
 from polmvs.geometry import SimilarityTransform, align_points, rotation_angle
 from polmvs.scene import View, match_names
 
-MIN_CAMERAS = 3  # that fix a similarity
-# Of a search for the majority: the fewest that fix a fit, drawn anew. A guess, bounds the time; of
-# data half of which are wrong one triple in eight is right, and one pair in four.
+MIN_CAMERAS = 3  # that determine a similarity
+# Random minimal samples in the search for the majority. A guess, bounds the time; if half of the
+# data are wrong, one triple in eight is right, and one pair in four.
 MAX_STARTS = 500
 
 
 @dataclass(frozen=True, kw_only=True)
 class AlignmentTolerances:
-    """Which cameras count as misregistered; see :func:`polmvs.fitting.like_most`.
+    """Tolerances of misregistered cameras; see :func:`polmvs.fitting.like_most`.
 
     Attributes
     ----------
-    outlier_floor : residual that is always allowed, as a share of the cameras' spread; a guess,
-        centres are usually good to 0.1 %.
-    max_relative_rms : residual over the cameras' spread, beyond which they are of other captures;
-        a guess, unrelated centres give about 1.
-    max_turn_deg : median angle between the orientations, likewise. Three centres always fit well;
-        unrelated cameras about one object then look 30 degrees and more past each other. Guess.
+    outlier_floor : residual that is always allowed, as a share of the cameras' spread; a guess:
+        centres are usually exact to 0.1 %.
+    max_relative_rms : residual over the cameras' spread above which they are of different captures;
+        a guess: unrelated centres give about 1.
+    max_turn_deg : likewise, the median angle between the orientations. Three centres always fit
+        well; the orientations of unrelated cameras about one object differ by 30 degrees and more.
+        Guess.
     """
 
     outlier_floor: float = 0.005
@@ -43,7 +44,7 @@ class AlignmentTolerances:
 
 @dataclass(frozen=True, kw_only=True)
 class Alignment:
-    """How the estimated cameras were brought onto the true ones.
+    """Alignment of the estimated cameras to the true ones.
 
     Attributes
     ----------
@@ -72,14 +73,14 @@ def align_views(
     """Similarity ``truth_from_world`` that takes the estimated camera centres to the true ones.
 
     With five cameras or more, those whose residual exceeds five times the median (and 0.5 % of
-    the cameras' spread) are left out; the search starts from the best of many triples, so that
-    one camera far away does not hide itself.
+    the cameras' spread) are left out. The search starts from the best of many triples, so that one
+    distant camera does not dominate the fit.
 
     Parameters
     ----------
     views : of the estimated world.
     true_views : by image name, metres; names match exactly, else by stem.
-    source : where the true ones came from, for messages.
+    source : origin of the true ones, for messages.
 
     Raises
     ------

@@ -15,10 +15,10 @@ from polmvs.io.intrinsics import Intrinsics, from_opencv_matrix
 
 Gray = NDArray[np.uint8]
 
-MIN_VIEWS = 4  # with a corner grid each; below, focal length and distortion cannot be told apart
+MIN_VIEWS = 4  # with a corner grid each; fewer do not separate focal length and distortion
 MIN_CORNERS = 8  # of a view
-# Corners of a sharp board are found to a tenth of a pixel; a mean error beyond this is another
-# board than was said, or a bent one (guess).
+# Corners of a sharp board are found to a tenth of a pixel; a larger mean error shows another board
+# than stated, or a bent one (guess).
 MAX_ERROR_PX = 1.5
 MIN_TILT_DEG = 10.0  # between views: with all boards parallel the focal length is not determined
 
@@ -44,17 +44,17 @@ class Board:
 
 @dataclass(frozen=True, kw_only=True)
 class BoardCalibration:
-    """What the pictures of a board give.
+    """Result of a calibration with a board.
 
     Attributes
     ----------
     intrinsics : in COLMAP's convention.
-    sigma : standard deviations of its parameters, in their order; of the adjustment alone.
+    sigma : standard deviations of its parameters, in their order, from the adjustment.
     rms_px : reprojection error.
-    views : names of the pictures that were used.
+    views : names of the used pictures.
     errors_px : rms error of each.
     skipped : names of the pictures without a board.
-    coverage : share of the image, in a grid of 8x8, that corners were seen in.
+    coverage : share of the image with corners, in a grid of 8x8.
     """
 
     intrinsics: Intrinsics
@@ -72,12 +72,12 @@ def calibrate_camera(pictures: Mapping[str, Gray], board: Board) -> BoardCalibra
     Parameters
     ----------
     pictures : (H, W) uint8 by name, all of one size and one camera.
-    board : what is in them.
+    board : the board in them.
 
     Raises
     ------
     ValueError
-        Too few pictures show the board, they are all alike, or the board is another one.
+        Too few pictures show the board, all boards are parallel, or it is another board.
     """
     sizes = {picture.shape for picture in pictures.values()}
     if len(sizes) != 1:

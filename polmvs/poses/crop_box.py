@@ -1,4 +1,4 @@
-"""The box that a result is cut to, in the frame of the model or of a printed marker."""
+"""The crop box of a result, in the frame of the model or of a printed marker."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from polmvs.geometry import RigidTransform, align_points
 from polmvs.poses.markers import detect_markers, parse_marker_option, triangulate_together
 from polmvs.scene import View, short_list
 
-MOST = (2, 98)  # percentiles of the coordinates of sparse points that a message names
-# Corners of a marker of unit side in its own frame, clockwise from its first, as OpenCV has them.
+MOST = (2, 98)  # percentiles of the coordinates of sparse points for messages
+# Corners of a marker of unit side in its own frame, clockwise from its first, in OpenCV's order.
 UNIT_MARKER = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
 
@@ -29,7 +29,7 @@ class CropBox:
 
     Attributes
     ----------
-    frame_from_world : frame along whose axes its edges lie.
+    frame_from_world : its edges are parallel to the axes of this frame.
     low, high : (3,), its corners there.
     """
 
@@ -38,7 +38,7 @@ class CropBox:
     high: Array
 
     def contains(self, points: NDArray[np.floating]) -> Mask:
-        """Which points (..., 3), world, lie in it."""
+        """Which points (..., 3), world, are in the box."""
         inside = self.frame_from_world * np.asarray(points, np.float64)
         return np.asarray(((inside >= self.low) & (inside <= self.high)).all(axis=-1), np.bool_)
 
@@ -55,10 +55,10 @@ class CropBox:
         return np.asarray((leaves < np.maximum(enters, 0)).reshape(height, width))
 
     def require_possible(self, points: NDArray[np.floating], centers: Array) -> Mask:
-        """Refuse a box that cannot hold anything that the cameras see.
+        """Refuse a box that cannot contain anything that the cameras see.
 
-        A surface without sparse points may lie in a box. But what is seen lies before what has
-        points, or among it: between them and the cameras.
+        A box may contain a surface without sparse points. But such a surface lies between sparse
+        points and the cameras, or among the points.
 
         Parameters
         ----------
@@ -72,7 +72,7 @@ class CropBox:
         Raises
         ------
         OptionError
-            It lies beside them all; says where they are.
+            The box is outside of all points; the message says where they are.
         """
         kept = self.contains(points)
         scene = np.asarray(self.frame_from_world * np.concatenate([points, centers]))
@@ -103,7 +103,7 @@ class CropBox:
         Raises
         ------
         OptionError
-            It holds none of them; says where they are.
+            The box contains none of them; the message says where they are.
         """
         kept = self.contains(points)
         if len(points) and not kept.any():
@@ -116,7 +116,7 @@ class CropBox:
 
 
 def _corners(ends: Array) -> str:
-    """Two corners (2, 3) as the option takes them."""
+    """Two corners (2, 3) in the form of the option."""
     return ",".join(f"{value:.4g}" for value in ends.reshape(-1))
 
 
@@ -131,7 +131,7 @@ def crop_box(
     Parameters
     ----------
     aruco : ``DICT:SIZE`` of the markers in the scene, if there are any.
-    views : posed, metric where the box is in a marker's frame.
+    views : posed, metric if the box is in a marker's frame.
     load_image : gives the 8-bit intensity image ``(H, W)`` of a view by its name.
 
     Raises
@@ -160,10 +160,10 @@ def crop_box(
 def marker_frames(
     views: Sequence[View], aruco: str, load_image: Callable[[str], NDArray[np.uint8]]
 ) -> Mapping[int, RigidTransform]:
-    """``marker_from_world`` of the printed markers that two views or more agree on, by id.
+    """``marker_from_world`` of the printed markers on which two views or more agree, by id.
 
-    The origin is in a marker's middle, x to its right, y to its top, z out of it; the unit is that
-    of the world.
+    The origin is the middle of a marker, x to its right, y to its top, z out of it; the unit is
+    that of the world.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def marker_frames(
     Raises
     ------
     DataError, OptionError
-        An image is not of its camera's size, or the dictionary is unknown.
+        An image has not its camera's size, or the dictionary is unknown.
     """
     dictionary, _ = parse_marker_option(aruco)
     found = detect_markers(views, dictionary, load_image)

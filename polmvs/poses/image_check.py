@@ -1,8 +1,8 @@
 """Check of given cameras against the images by epipolar distances of matches.
 
-Features of the images are matched with no camera known. Matches that some epipolar geometry of a
-pair explains are mostly right ones; under the given poses they lie on each other's epipolar lines,
-or the poses are of other images.
+Features of the images are matched without cameras. Matches that an epipolar geometry of a pair
+explains are mostly correct. If the given poses belong to the images, these matches lie on each
+other's epipolar lines.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ ImageLoader = Callable[[str], NDArray[np.uint8]]
 
 @dataclass(frozen=True, kw_only=True)
 class ImageCheckTolerances:
-    """How images and cameras are compared.
+    """Tolerances of the comparison of images and cameras.
 
     Attributes
     ----------
-    max_views : that are looked at, evenly spread; costs time only. Derived: as many
-        as are compared with a dense workspace.
+    max_views : number of compared views, evenly spread; costs time only. Derived: as for a dense
+        workspace.
     max_features : of an image, the strongest; costs time only.
-    max_ratio : of the distances of the best and the next descriptor. Lowe's own advice.
-    epipolar_px : of a match from the geometry that its pair's own matches have. Guess; features
-        are good to about a pixel.
-    min_matches : of a pair that one geometry explains. Derived: eight fix a geometry, and of the
-        20 to 100 false matches of unrelated images 8 to 15 fit the best one (simulated).
+    max_ratio : of the distances of the best and the next descriptor. As Lowe advises.
+    epipolar_px : of a match from the geometry of its pair's matches. Guess; features are exact to
+        about a pixel.
+    min_matches : of a pair that one geometry explains. Derived: eight determine a geometry, and of
+        the 20 to 100 false matches of unrelated images 8 to 15 fit the best one (simulated).
     min_share : of a pair's matches that one geometry explains. Guess.
     max_distance : of a match from the given cameras' epipolar line, as a share of the image's
-        diagonal: what poses may err and still be those of the images. Guess. By chance 2 to 4 % of
-        the matches lie so near.
-    min_fitting : share of the matches that near, under which the cameras are of other images.
-        Measured: cameras of five captures on the images of each have 0.71 to 0.99 where they are
-        their own (least where a pattern repeats), 0.00 to 0.16 where they are not; a guess between.
+        diagonal: the error of poses that still belong to the images. Guess. By chance 2 to 4 % of
+        the matches are so near.
+    min_fitting : share of matches within this distance below which the cameras are of other images.
+        Measured: cameras of five captures on the images of each have 0.71 to 0.99 on their own
+        images (least with a repeating pattern), 0.00 to 0.16 on others; a guess between.
     """
 
     max_views: int = MatchTolerances.max_compared_views
@@ -61,13 +61,13 @@ class ImageCheckTolerances:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageFit:
-    """How cameras fit images.
+    """Fit of cameras to images.
 
     Attributes
     ----------
-    num_matches : that the images' own geometry explains.
-    fitting : share of them that the cameras explain as well; NaN where there are too few.
-    fits : None where there are too few.
+    num_matches : matches that the images' own geometry explains.
+    fitting : share of them that the cameras also explain; NaN if there are too few.
+    fits : None if there are too few.
     """
 
     num_matches: int
@@ -78,7 +78,7 @@ class ImageFit:
 def require_cameras_of_images(
     views: Sequence[View], load_image: ImageLoader, source: str | PathLike[str], remedy: str
 ) -> ImageFit:
-    """Refuse cameras that cannot be those of the images of their names.
+    """Refuse cameras that cannot belong to the images of their names.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def require_cameras_of_images(
     Raises
     ------
     DataError
-        The images contradict the cameras. Images that do not tell pass.
+        The images contradict the cameras. Images with too few matches pass.
     """
     fit = fit_to_images(views, load_image)
     if fit.fits is False:
@@ -109,7 +109,7 @@ def fit_to_images(
     *,
     tolerances: ImageCheckTolerances = ImageCheckTolerances(),
 ) -> ImageFit:
-    """Compare cameras with the matches of the images' features; see there."""
+    """Compare cameras with the matches of the images' features."""
     t = tolerances
     chosen = [views[k] for k in _evenly(len(views), t.max_views)]
     sift = feature_detector(t)
@@ -120,7 +120,7 @@ def fit_to_images(
         if matches is not None:
             distances.append(epipolar_distances(first, second, *matches))
     shares = np.concatenate(distances)
-    if len(shares) < 2 * t.min_matches:  # one pair alone tells little
+    if len(shares) < 2 * t.min_matches:  # one pair alone is not reliable
         return ImageFit(num_matches=len(shares), fitting=float("nan"), fits=None)
     fitting = float(np.mean(shares < t.max_distance))
     return ImageFit(num_matches=len(shares), fitting=fitting, fits=fitting >= t.min_fitting)
@@ -148,14 +148,14 @@ def _evenly(num: int, most: int) -> list[int]:
 
 
 def feature_detector(t: ImageCheckTolerances) -> cv2.SIFT:
-    """Without the quarter of a pixel by which OpenCV's enlarged image is shifted by default."""
+    """SIFT without the shift by a quarter of a pixel of OpenCV's enlarged image."""
     return cv2.SIFT.create(nfeatures=t.max_features, enable_precise_upscale=True)
 
 
 def find_features(
     sift: cv2.SIFT, image: NDArray[np.uint8]
 ) -> tuple[Array, NDArray[np.float32], tuple[int, int]]:
-    """Places (N, 2), COLMAP's pixels, descriptors (N, 128), and the image's shape."""
+    """Positions (N, 2), COLMAP's pixels, descriptors (N, 128), and the image's shape."""
     keypoints, descriptors = sift.detectAndCompute(image, None)
     xy = np.array([keypoint.pt for keypoint in keypoints], np.float64).reshape(-1, 2) + 0.5
     if not keypoints:  # then OpenCV gives None for the descriptors
@@ -190,8 +190,8 @@ def _consistent_matches(
 def epipolar_distances(first: View, second: View, a: Array, b: Array) -> Array:
     """Distances (N,) of matches from each other's epipolar plane, shares of the diagonal.
 
-    The larger of an angle at either camera, times its focal length. A match behind a camera does
-    not fit at all.
+    It is the larger of the angles at the two cameras, times the focal length. A match behind a
+    camera has no finite distance.
     """
     rays, others = first.rays_in_world(a), second.rays_in_world(b)
     base = second.center_in_world - first.center_in_world

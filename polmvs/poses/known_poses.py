@@ -1,7 +1,7 @@
-"""A sparse model with known poses in the place of its own, its points triangulated anew.
+"""A sparse model with its poses replaced by known ones and its points triangulated again.
 
-For rigs and robot arms whose cameras are calibrated, and to measure with true poses: the matches
-stay, only where the cameras stand and what follows from it is replaced.
+This is for calibrated rigs and robot arms, and for evaluation with true poses: the matches are
+kept, and the cameras and points are replaced.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from polmvs.scene import SparseModel, Tracks, View, match_names, some_tracks
 
 logger = logging.getLogger(__name__)
 
-# Mean of a track, px: as SfM asks of its own, several keypoints' noise and less than a mismatch.
+# Mean error of a track, px: the limit of SfM, several times a keypoint's noise, below a mismatch.
 MAX_ERROR_PX = SfmTolerances().max_reproj_error_px
 
 
@@ -40,7 +40,7 @@ def write_known_poses(sparse: Path, cameras: Path, new: Path) -> SparseModel:
     Raises
     ------
     DataError
-        A file is at fault, fewer than two images are known, or no track fits the poses.
+        A file is unusable, fewer than two images are known, or no track fits the poses.
     OptionError
         ``new`` exists.
     """
@@ -55,19 +55,19 @@ def write_known_poses(sparse: Path, cameras: Path, new: Path) -> SparseModel:
 def with_known_poses(
     sparse_model: SparseModel, known: Mapping[str, View], *, source: str | Path = "known poses"
 ) -> SparseModel:
-    """Put known views in the place of a model's and triangulate its tracks anew.
+    """Replace a model's views by known ones and triangulate its tracks again.
 
     Parameters
     ----------
     sparse_model : of the same images; its cameras may have another size of the same aspect ratio.
     known : views by image name, all of one size; names match exactly, else by stem.
-    source : where they came from, for messages.
+    source : their origin, for messages.
 
     Returns
     -------
     SparseModel
-        In the frame and unit of the known poses, with their names; images that are not known
-        and tracks that do not fit (:func:`retriangulate`) are left out.
+        In the frame and unit of the known poses, with their names. Unknown images and tracks that
+        do not fit (:func:`retriangulate`) are left out.
 
     Raises
     ------

@@ -1,10 +1,9 @@
-"""Printed ArUco markers: found in the images, triangulated, and measured, which gives the scale.
+"""Scale from printed ArUco markers: detection, triangulation and measurement.
 
-The detector gives corners to about a pixel, and OpenCV's refinement pulls those of a blurred
-square inwards by several tenths of a pixel, all alike, which would make the scale wrong by a
-per cent. So lines are fitted to the four edges instead, in linear light, where a symmetric blur
-leaves an edge in its place, and as planes through the camera's centre, so that lens distortion
-does not bend them.
+The detector gives corners to about a pixel. OpenCV's refinement pulls all corners of a blurred
+square inwards by several tenths of a pixel, an error of the scale of about one per cent. So lines
+are fitted to the four edges instead: in linear light, where a symmetric blur does not move an edge,
+and as planes through the camera's centre, which lens distortion does not bend.
 """
 
 from __future__ import annotations
@@ -42,12 +41,12 @@ DIFFERENCE = float(np.cbrt(np.finfo(np.float64).eps))
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeTolerances:
-    """How the edges of a marker are found; lengths in px, which are those of the lens's blur.
+    """Tolerances of the edges of a marker; lengths in px, from the blur of the lens.
 
     Attributes
     ----------
-    corner_share : of an edge's length beside each corner that is left out; a guess, there the
-        blur of the other edge reaches.
+    corner_share : share of an edge's length next to each corner that is not used; a guess: the blur
+        of the other edge reaches there.
     reach_px : of a profile to each side, least and most; a guess: it covers the blur and the
         error of the detector's corners, and ends half-way into the marker's outer module.
     """
@@ -58,14 +57,13 @@ class EdgeTolerances:
 
 @dataclass(frozen=True, kw_only=True)
 class TriangulationTolerances:
-    """Which views agree on a marker, and what a corner's error is; px, those of a keypoint.
+    """Tolerances of the views that agree on a marker, and of corner errors, px.
 
     Attributes
     ----------
-    huber_px : of the robust loss, and a view's error that is always allowed. Derived: a keypoint's
-        deviation, which is beyond the noise of a refined corner (0.1 px) and of a usual pose
-        (0.3 px).
-    max_residual_px : error that never is allowed. Derived: COLMAP drops observations beyond this.
+    huber_px : of the robust loss, and an always allowed error of a view. Derived: a keypoint's
+        deviation, larger than the noise of a refined corner (0.1 px) and of a usual pose (0.3 px).
+    max_residual_px : largest error. Derived: COLMAP drops observations beyond this.
     min_sigma_px : of a corner; a guess: few residuals can be small by chance.
     """
 
@@ -76,12 +74,12 @@ class TriangulationTolerances:
 
 @dataclass(frozen=True, kw_only=True)
 class ScaleTolerances:
-    """When two measures of one length agree, and when one is too uncertain to be of use.
+    """Tolerances of the agreement of two measured lengths, and of their uncertainty.
 
     Attributes
     ----------
-    floor : relative difference that is always allowed, beside what chance makes of the deviations;
-        a guess, paper and print are no better.
+    floor : relative difference that is always allowed, in addition to that by the deviations; a
+        guess: paper and print are not more exact.
     max_relative_sigma : of a marker's side; a guess.
     """
 
@@ -89,7 +87,7 @@ class ScaleTolerances:
     max_relative_sigma: float = 0.1
 
     def allowed(self, relative_sigma: float) -> float:
-        """Relative difference that is allowed at a standard deviation of it."""
+        """Allowed relative difference, given its standard deviation."""
         return max(BEYOND_CHANCE * relative_sigma, self.floor)
 
 
@@ -149,7 +147,7 @@ def detect_markers(
     Returns
     -------
     list of Detection
-        An id that an image shows twice is left out there, as is a marker cut by the border.
+        An id that an image shows twice is ignored in it, and so is a marker cut by the border.
 
     Raises
     ------
@@ -205,7 +203,7 @@ def refine_corners(
     ----------
     linear : (H, W) float32, linear light, 1 is white.
     corners : (4, 2), image coordinates, clockwise, good to about a pixel.
-    num_modules : that the square is wide; the profiles must not reach into the next one.
+    num_modules : width of the square in modules; the profiles must not reach into the next one.
 
     Returns
     -------
@@ -482,9 +480,8 @@ def measure_markers(
     Raises
     ------
     DataError
-        No marker is seen from two views that agree, one is not square by more than its
-        uncertainty and 1 %, two differ in size by more than that, or the size is not known to
-        10 %.
+        No marker is seen in two views that agree, one is not square within its uncertainty and 1 %,
+        two differ in size by more than that, or the size is not known to 10 %.
     """
     by_id: dict[int, list[Detection]] = {}
     for detection in detections:

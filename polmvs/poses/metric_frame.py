@@ -1,7 +1,7 @@
-"""Metric scale and frame of a reconstruction, whose own are arbitrary.
+"""Metric scale and frame of a reconstruction, from references.
 
-Known camera centres give a whole similarity; printed markers and a known distance give the scale
-only, and the frame's origin and axes stay. Several sources must agree in scale.
+Known camera centres give a full similarity. Printed markers and a known distance give only the
+scale; origin and axes stay. Several sources must agree in scale.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class FrameTolerances:
-    """When known camera centres fix a frame.
+    """Tolerances of a frame from known camera centres.
 
     Attributes
     ----------
-    min_breadth : breadth of the camera centres over their length; derived: centres are good to
-        about 0.1 % of their spread, so that 1 % leaves the rotation about the line through them
+    min_breadth : breadth of the camera centres over their length; derived: centres are exact to
+        about 0.1 % of their spread, so with 1 % the rotation about the line through them is
         uncertain by 0.1 rad.
-    max_turn_sigma : rad, of the same rotation as the residuals tell it. Derived: places at the side
-        err by that share of their distance, as by the scale of markers.
+    max_turn_sigma : rad, deviation of this rotation from the residuals. Derived: the relative error
+        of points at the side, as by the scale of markers.
     max_relative_rms : RMS residual over the cameras' spread. Derived: that of an alignment.
     """
 
@@ -68,18 +68,18 @@ class FrameTolerances:
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """How the reconstruction's world becomes metric, and how well that is known.
+    """Transformation of the reconstruction's world to metric units, with its uncertainty.
 
     Attributes
     ----------
     metric_from_world : similarity; for markers and distances a scale about the origin.
     source : ``reference``, ``aruco`` or ``scale``.
-    relative_sigma : standard deviation of the scale as a share of it; None where unknown.
+    relative_sigma : relative standard deviation of the scale; None if unknown.
     rms_residual : of the camera centres used, m (``reference``), or of the markers' corners, px
         (``aruco``); None for a distance.
     num_used : cameras, or views that show a marker, or ends of the distance.
     dropped : names of cameras left out as inconsistent; for markers ``ID in NAME``.
-    checked_by : scales of the other sources that agree, m per world unit.
+    checked_by : scales of the other sources, which agree, m per world unit.
     """
 
     metric_from_world: SimilarityTransform
@@ -97,7 +97,7 @@ class Frame:
 
 
 def check_reference(options: ReferenceOptions) -> None:
-    """Refuse what is wrong with the options or the file, before a model is there.
+    """Check the options and the file before there is a model.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def check_reference(options: ReferenceOptions) -> None:
 def metric_frame(
     sparse_model: SparseModel, options: ReferenceOptions, load_image: ImageLoader
 ) -> Frame | None:
-    """Metric frame from the sources that the options name; None where they name none.
+    """Metric frame from the sources of the options; None without a source.
 
     Parameters
     ----------
@@ -125,7 +125,8 @@ def metric_frame(
     Raises
     ------
     DataError
-        A source does not fix the scale (too few cameras, no marker, contradictory markers, ...).
+        A source does not determine the scale (too few cameras, no marker, contradictory markers,
+        ...).
     OptionError
         An option is malformed, names what the model lacks, or two sources contradict each other.
     """
@@ -154,7 +155,7 @@ def frame_from_markers(sparse_model: SparseModel, option: str, load_image: Image
     Raises
     ------
     DataError
-        No marker is found in two views, or markers contradict themselves or each other.
+        No marker is found in two views, or markers contradict each other.
     OptionError
         The option is malformed or the dictionary unknown.
     """
@@ -183,7 +184,7 @@ def frame_from_centers(
     Parameters
     ----------
     known_centers : ``(3,)`` by image name, m; names match exactly, else by stem.
-    source : where they came from, for messages.
+    source : their origin, for messages.
 
     Raises
     ------
@@ -228,7 +229,7 @@ def _extents(points: Array) -> Array:
 def _require_breadth(
     centers: Array, known: Array, source: str | Path, tolerances: FrameTolerances
 ) -> None:
-    """The cameras must not lie on one line, in neither frame."""
+    """Refuse cameras on one line, in either frame."""
     for points, name in ((known, "known"), (centers, "reconstructed")):
         length, breadth, _ = _extents(points)
         if not breadth > tolerances.min_breadth * length:
@@ -266,7 +267,7 @@ def frame_from_distance(
     Raises
     ------
     OptionError
-        An end is unknown, or the two are one, or their distance in the model is none.
+        An end is unknown, or both ends are the same, or their distance in the model is 0.
     """
     if not 0 < distance_m < np.inf:
         raise OptionError(f"needs a positive distance, not {distance_m}.", field="reference.scale")
@@ -317,17 +318,17 @@ def _end_of_distance(sparse_model: SparseModel, text: str) -> tuple[Array, float
 
 
 def scaling(scale: float) -> SimilarityTransform:
-    """A change of unit; the origin and the axes stay."""
+    """A change of unit; origin and axes stay."""
     return SimilarityTransform(scale, np.eye(3), np.zeros(3))
 
 
 def require_agreement(first: Frame, other: Frame) -> None:
-    """Two sources must give one scale, within what their uncertainties allow and 1 %.
+    """Refuse two sources whose scales differ by more than their uncertainties and 1 %.
 
     Raises
     ------
     OptionError
-        They contradict each other.
+        The sources contradict each other.
     """
     sigma = np.hypot(first.relative_sigma or 0.0, other.relative_sigma or 0.0)
     allowed = ScaleTolerances().allowed(float(sigma))
@@ -344,7 +345,7 @@ def require_agreement(first: Frame, other: Frame) -> None:
 def transform_model(
     sparse_model: SparseModel, target_from_world: SimilarityTransform
 ) -> SparseModel:
-    """The model in another frame; poses stay rigid, so depths scale, and pixels stay.
+    """The model in another frame; poses stay rigid, so depths scale and pixels do not change.
 
     Parameters
     ----------

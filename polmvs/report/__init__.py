@@ -1,1 +1,1 @@
-"""What people look at: the report page, its pictures, plots and 3D view, and still renderings."""
+"""The report page with its pictures, plots and 3D view, and still renderings."""

@@ -1,7 +1,7 @@
-"""Contents of a report: figures, pictures of the views and the 3D scene of a finished run.
+"""Contents of a report: metrics, pictures of the views and the 3D scene of a finished run.
 
-Views are taken one after another and leave nothing but their coded pictures behind, so that the
-memory does not grow with them.
+Views are processed one after another and only their encoded pictures are kept, so the memory does
+not grow with them.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from polmvs.surface.dense_view import DenseView
 from polmvs.surface.mesh_geometry import RayScene
 
 MAX_ERROR_DEG = 20.0  # top of the colour scales: OPA's phase errors on oblique surfaces
-MAX_ERROR_M = max(THRESHOLDS_M)  # of distances from the truth
-MAX_SAMPLES_A_VIEW = 4000  # of errors for the plots: quartiles of 16 views then err by under 1 %
+MAX_ERROR_M = max(THRESHOLDS_M)  # of distances to ground truth
+MAX_SAMPLES_A_VIEW = 4000  # errors for the plots: quartiles of 16 views are then exact to 1 %
 
 
 @dataclass(frozen=True)
 class DisplayUnit:
-    """In which lengths of the model are shown.
+    """Unit of the shown lengths.
 
     Attributes
     ----------
     name : of the unit.
-    factor : units for each of the model's.
+    factor : its number in one unit of the model.
     """
 
     name: str
@@ -56,13 +56,13 @@ class DisplayUnit:
 
 @dataclass(kw_only=True)
 class ErrorSamples:
-    """Errors of a model at some pixels of all views, and what may cause them.
+    """Errors of a model at some pixels of all views, and their possible causes.
 
     Attributes
     ----------
-    residual_deg : phase that the surface predicts against the measured one.
+    residual_deg : difference of the phase of the surface and the measured one.
     viewing_deg : angle between the normal and the ray, at the same pixels.
-    depth_m, normal_deg, true_viewing_deg : against the truth, where there is one.
+    depth_m, normal_deg, true_viewing_deg : against ground truth, if there is one.
     """
 
     residual_deg: list[Floats] = field(default_factory=list)
@@ -74,13 +74,13 @@ class ErrorSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewInput:
-    """What is known of one view.
+    """Data of one view.
 
     Attributes
     ----------
     maps : phase map for each model.
-    stokes : raw Stokes images; None where the capture is gone.
-    dense : dense result under each model, None where there is none.
+    stokes : raw Stokes images; None without the capture.
+    dense : dense result under each model, or None.
     """
 
     view: View
@@ -103,11 +103,11 @@ def view_page(
     Parameters
     ----------
     given : of the view.
-    truth : the truth and ``truth_from_world``.
+    truth : ground truth and ``truth_from_world``.
     samples : for each model that ``given`` has; added to.
-    white : intensity that is shown white.
-    length : in which depths are shown.
-    mesh : of the part, to be shown as the view sees it; None without one.
+    white : intensity of white.
+    length : unit of depths.
+    mesh : of the part, for its picture in the view; None without one.
     """
     first = next(iter(given.maps.values()))
     shown = [*_measured(given, first, white)]

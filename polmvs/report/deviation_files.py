@@ -1,4 +1,4 @@
-"""Files of a deviation: a coloured cloud, a picture with its scale, a histogram, figures."""
+"""Files of a deviation: a coloured cloud, a picture with its scale, a histogram, statistics."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BAR_PX = 18
 
 
 def write_deviation(folder: Path, found: Deviation) -> None:
-    """Write ``deviation.ply``, ``.png``, ``.svg`` and ``.json`` into a folder that is there."""
+    """Write ``deviation.ply``, ``.png``, ``.svg`` and ``.json`` into an existing folder."""
     limit_mm = color_limit(found.figures, found.distance)
     colors = deviation_colors(found.distance, limit_mm)
     cloud = Cloud(

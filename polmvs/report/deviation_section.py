@@ -1,4 +1,4 @@
-"""The part against its reference, as the report shows it."""
+"""The report's comparison of the part with its reference."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class FoundDeviation:
-    """What ``polmvs deviation --report`` left in the run folder.
+    """Results of ``polmvs deviation --report`` in the run folder.
 
     Attributes
     ----------
-    cloud : the compared points, laid on the reference.
+    cloud : the compared points, registered to the reference.
     histogram : SVG text.
-    picture : coded.
-    is_stale : the run's cloud is another one now.
+    picture : encoded.
+    is_stale : the run's cloud has changed since.
     """
 
     figures: DeviationFigures
@@ -47,7 +47,7 @@ class FoundDeviation:
 
 
 def open_deviation(folder: RunFolder, models: Iterable[AngleModel]) -> FoundDeviation | None:
-    """The comparison with a reference, if there is a whole one."""
+    """The comparison with a reference, if there is a complete one."""
     made = folder.deviation
     if not made.is_dir():
         return None
@@ -93,7 +93,7 @@ def deviation_layer(found: FoundDeviation) -> tuple[Layer, PointColoring]:
 
 
 def deviation_section(found: FoundDeviation | None) -> DeviationSection | None:
-    """The part against its reference, in words, figures and pictures."""
+    """The comparison with the reference, in words, numbers and pictures."""
     if found is None or found.is_stale:
         return None
     f = found.figures

@@ -1,8 +1,8 @@
-"""Clouds and meshes as the report's 3D view reads them: quantised, packed, a few bytes a point.
+"""Clouds and meshes in the format of the report's 3D view: quantized, a few bytes per point.
 
 A scene has one box for all its layers. Positions are 16-bit shares of its longest edge (0.004 mm
-for a part of a quarter of a metre), normals 8 bit an axis, and each further channel one byte a
-point with the range that it spans. ``viewer/viewer.js`` is the other side of this format.
+for a part of a quarter of a metre), normals have 8 bits per axis, and each further channel has one
+byte per point with its range. ``viewer/viewer.js`` reads this format.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ KIND_COLORS = ("#0072b2", "#999999", "#e69f00", "#009e73", "#cc79a7")  # by Poin
 
 @dataclass(frozen=True, kw_only=True)
 class PointColoring:
-    """Something that points can be coloured by.
+    """A quantity for the colours of points.
 
     Attributes
     ----------
-    label : what it is called on the page.
+    label : its name on the page.
     unit : of its values; "" without one.
-    low, high : the range that colours span; all layers share it.
+    low, high : the range of the colours; all layers share it.
     colors : name of the colour map; None for grey.
-    classes : names of the values 0, 1, ... where they are kinds and not amounts.
-    note : what it says, in a sentence.
-    may_lack : some points have no value, NaN, and are grey; else what is NaN counts as the worst.
+    classes : names of the values 0, 1, ... of a kind.
+    note : its meaning, in a sentence.
+    may_lack : points without a value (NaN) are grey; otherwise NaN counts as the worst value.
     """
 
     label: str
@@ -58,13 +58,13 @@ class PointColoring:
 
 @dataclass(frozen=True)
 class BoxFrame:
-    """A frame that a box may be given in.
+    """A frame of a crop box.
 
     Attributes
     ----------
     label : its name on the page.
-    option : flag that says so on the command line; "" for the model's.
-    frame_from_world : where it lies.
+    option : its flag on the command line; "" for the model's frame.
+    frame_from_world : its pose.
     """
 
     label: str
@@ -79,7 +79,7 @@ KIND = PointColoring(
     low=0,
     high=len(PointKind),
     classes=("polarized surface", "sparse point", "stereo", "given workspace", "inferred"),
-    note="Where a point comes from; inferred is surface that no phase shows, as a rim suggests it.",
+    note="Origin of a point; inferred is surface that no phase shows, behind an opening.",
 )
 
 
@@ -91,7 +91,7 @@ class Layer:
     ----------
     label : its name on the page.
     points : (N, 3), world.
-    normals : (N, 3), unit; NaN or 0 where there is none.
+    normals : (N, 3), unit; NaN or 0 if there is none.
     values : (N,) by name of the channel.
     triangles : (F, 3) or None.
     """
@@ -104,7 +104,7 @@ class Layer:
 
 
 def thinned(layer: Layer, max_points: int) -> Layer:
-    """At most so many points, spread evenly over the order in which they come; meshes stay."""
+    """At most this many points, spread evenly over their order; meshes are kept."""
     num = len(layer.points)
     if num <= max_points or layer.triangles is not None:
         return layer
@@ -120,7 +120,7 @@ def thinned(layer: Layer, max_points: int) -> Layer:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene3D:
-    """What the page's 3D view is given.
+    """Data of the page's 3D view.
 
     Attributes
     ----------
@@ -147,12 +147,12 @@ def pack_scene(
     Parameters
     ----------
     layers : at least one with a point.
-    channels : by the names that the layers' values use.
-    views : whose frusta can be shown.
+    channels : by the names of the layers' values.
+    views : views whose frusta can be shown.
     start : layers shown first in the left and the right pane; None: one pane.
     color : channel, or ``normal``, that is shown first.
     unit : name of the unit of lengths, and units for each of the world's.
-    frames : that a box may be given in, beside the world.
+    frames : of a crop box, in addition to the world.
     """
     everything = np.concatenate([layer.points for layer in layers if len(layer.points)])
     origin, top = everything.min(axis=0), everything.max(axis=0)

@@ -1,4 +1,4 @@
-"""The report: one HTML file with everything in it, made from a finished run."""
+"""The report: one self-contained HTML file, made from a finished run."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class PagePicture:
     Attributes
     ----------
     title : under the thumbnail.
-    alt : for who cannot see it.
-    uri : the coded picture.
+    alt : alternative text.
+    uri : the encoded picture.
     scale : lowest, highest and colour map of the legend; None without one.
     """
 
@@ -56,8 +56,8 @@ class Plot:
     Attributes
     ----------
     svg : its text.
-    caption : what it shows, in a sentence.
-    wide : whether it takes the whole width.
+    caption : its content, in a sentence.
+    wide : whether it has the whole width.
     """
 
     svg: str
@@ -75,14 +75,14 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class DeviationSection:
-    """The part against its reference.
+    """Comparison of the part with its reference.
 
     Attributes
     ----------
-    sentence : what came out.
-    passed : whether it keeps to the tolerance; None without one.
-    table : figures.
-    picture : coded picture of the coloured cloud.
+    sentence : the result.
+    passed : whether it is within the tolerance; None without one.
+    table : statistics.
+    picture : encoded picture of the coloured cloud.
     histogram : SVG text.
     """
 
@@ -95,22 +95,22 @@ class DeviationSection:
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """All that the page shows.
+    """Content of the page.
 
     Attributes
     ----------
     title : of the page.
-    sentence : what came out, in one or two sentences.
-    facts : name and value of what counts most.
+    sentence : the result, in one or two sentences.
+    facts : names and values of the main numbers.
     warnings : of the run, each with its remedy.
-    tables : of the models' figures, if there are any: those to begin with, and all.
-    trust : figures of the result about itself, with what is normal.
-    deviation : the part against its reference; None where it was not compared.
+    tables : of the models' metrics, if there are any: the main ones, and all.
+    trust : the quality checks with their ranges.
+    deviation : comparison with a reference, if there is one.
     views, plots : in order.
-    scene : of the 3D view; None where no cloud has a point.
-    thinned : points above which the clouds on the page are thinned; 0 if none is.
+    scene : of the 3D view; None if no cloud has a point.
+    thinned : number of points to which clouds on the page are thinned; 0 if none is.
     stages : name, seconds and peak memory of each stage.
-    record : options, versions and command line, in terms of JSON.
+    record : options, versions and command line, as JSON.
     """
 
     title: str
@@ -129,7 +129,7 @@ class Page:
 
 
 def page_text(page: Page) -> str:
-    """The page as HTML that needs nothing beside itself.
+    """The page as self-contained HTML.
 
     Every text is escaped; file names and warnings may hold anything.
     """

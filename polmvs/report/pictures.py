@@ -1,8 +1,7 @@
-"""Maps as pictures: false colours that everybody can read, and their code for a page.
+"""Maps as pictures in false colours, and their encoding for a page.
 
-Every function takes arrays and gives RGB ``(H, W, 3)`` uint8. Colours come from perceptually
-uniform maps that people with any kind of colour blindness can read; angles, which are cyclic, from
-a cyclic one.
+Every function takes arrays and gives RGB ``(H, W, 3)`` uint8. The colour maps are perceptually
+uniform and suitable for all kinds of colour blindness; angles have a cyclic one.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def angle_picture(angle: Floats, *, strength: Floats | None = None) -> Rgb:
 
     Parameters
     ----------
-    strength : (H, W), 0 to 1, how far the colour shows before a grey ground.
+    strength : (H, W), 0 to 1, share of the colour over grey.
     """
     share = np.mod(np.asarray(angle, np.float64), np.pi) / np.pi
     picture = _colored(share, palette(CYCLIC))
@@ -59,9 +58,9 @@ def angle_picture(angle: Floats, *, strength: Floats | None = None) -> Rgb:
 
 
 def angle_wheel(size_px: int = 96) -> NDArray[np.uint8]:
-    """Key to :func:`angle_picture`: RGBA ``(size, size, 4)``, the colour of each direction.
+    """Legend of :func:`angle_picture`: RGBA ``(size, size, 4)``, the colour of each direction.
 
-    Angles count anticlockwise from +x as displayed, so that opposite directions are alike.
+    Angles are axial, anticlockwise from +x as displayed.
     """
     axis = np.arange(size_px) + 0.5 - size_px / 2
     x, y = np.meshgrid(axis, -axis)  # y up, as displayed
@@ -82,14 +81,14 @@ def normal_picture(normals_in_cam: Floats) -> Rgb:
 
 
 def gray_picture(intensity: Floats, white: float) -> Rgb:
-    """Linear intensities ``(H, W)`` as they look on a screen; ``white`` and above is white."""
+    """Linear intensities ``(H, W)`` encoded for display; ``white`` and above is white."""
     share = np.clip(np.nan_to_num(np.asarray(intensity, np.float64)) / white, 0, 1)
     gray = (255 * share ** (1 / 2.2) + 0.5).astype(np.uint8)
     return np.repeat(gray[..., None], 3, axis=-1)
 
 
 def outline_picture(intensity: Floats, white: float, inside: Mask) -> Rgb:
-    """The intensity with what lies outside a mask dimmed and the mask's outline drawn."""
+    """The intensity, dimmed outside of a mask, with the mask's outline."""
     picture = gray_picture(intensity, white)
     picture[~inside] = (0.35 * picture[~inside]).astype(np.uint8)
     picture[_border(inside)] = OUTLINE
@@ -101,7 +100,7 @@ def mesh_picture(intensity: Floats, white: float, normals_in_cam: Floats) -> Rgb
 
     Parameters
     ----------
-    normals_in_cam : (H, W, 3), camera frame, NaN where the mesh is not.
+    normals_in_cam : (H, W, 3), camera frame, NaN off the mesh.
     """
     picture = gray_picture(intensity, white).astype(np.float64)
     shown = np.asarray(np.isfinite(normals_in_cam).all(axis=-1))
@@ -125,7 +124,7 @@ def _colored(share: Floats, colors: Rgb) -> Rgb:
 
 
 def data_uri(picture: NDArray[np.uint8]) -> str:
-    """A picture, RGB or RGBA, as text that a page takes for an image (WebP)."""
+    """A picture, RGB or RGBA, as a data URI (WebP)."""
     order = cv2.COLOR_RGBA2BGRA if picture.shape[-1] == 4 else cv2.COLOR_RGB2BGR
     _, code = cv2.imencode(
         ".webp", cv2.cvtColor(picture, order), [cv2.IMWRITE_WEBP_QUALITY, QUALITY]

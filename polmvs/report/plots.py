@@ -1,4 +1,4 @@
-"""Plots of a report as SVG text that takes its colours from the page."""
+"""Plots of a report as SVG text with the colours of the page."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DASHES = {
 }
 LABELS = {model: model.label for model in AngleModel}
 INK = "#123456"  # replaced by the page's text colour
-MIN_IN_BIN = 30  # values for a median to be drawn; its quartiles then err by a tenth or so
+MIN_IN_BIN = 30  # values for a median; its quartiles are then exact to about a tenth
 
 
 def error_curves(errors: Mapping[AngleModel, Floats], unit: str, title: str) -> str:
@@ -63,7 +63,7 @@ def error_against(
     edges: Floats,
     names: tuple[str, str],
 ) -> str:
-    """Median error, and its quartiles, against something that may cause it.
+    """Median error, and its quartiles, against a possible cause.
 
     Parameters
     ----------
@@ -104,10 +104,10 @@ def time_bars(stages: Sequence[tuple[str, float]]) -> str:
 
 
 def deviation_histogram(distance_mm: Floats, tolerance_mm: float | None, limit_mm: float) -> str:
-    """Histogram of signed distances from a reference, with the tolerance where there is one."""
+    """Histogram of signed distances from a reference, with the tolerance if there is one."""
     figure, (axes,) = _figure(1)
     edges = np.linspace(-2 * limit_mm, 2 * limit_mm, 81)
-    inside = np.clip(distance_mm, edges[0], edges[-1])  # what lies beyond is in the last bins
+    inside = np.clip(distance_mm, edges[0], edges[-1])  # values beyond are in the last bins
     share = 100 * np.histogram(inside, edges)[0] / max(len(distance_mm), 1)
     axes.stairs(share, edges, fill=True, color=COLORS[AngleModel.PPA], alpha=0.6)
     if tolerance_mm is not None:

@@ -42,7 +42,7 @@ PIXEL_POINTS = 1.5  # radius of a point on the screen, px
 
 
 def require_rerun(path: Path) -> None:
-    """Say what is wrong before a long run, not after it.
+    """Check the conditions of a recording before a long run.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def require_rerun(path: Path) -> None:
 
 
 def num_recorded_steps(run_folder: RunFolder) -> int:
-    """How often :func:`write_recording` reports."""
+    """Number of steps that :func:`write_recording` reports."""
     record = load_record(run_folder)
     found = record.find(PosesResult)
     return (found.num_views if found is not None else 0) + len(dense_models(record))
@@ -71,7 +71,7 @@ def write_recording(
 
     Parameters
     ----------
-    run_folder : with poses, and what further stages have found.
+    run_folder : with poses, and results of further stages.
     path : file to write, ``.rrd``; replaced whole.
     on_progress : called with 1 for each view and for each angle model.
 
@@ -196,7 +196,7 @@ class _Recorder:
             self.mesh(f"world/{model}/surface", mesh)
         if (views / SURFACE_MESH).is_file():
             mesh = read_mesh(views / SURFACE_MESH)
-            self.begin(f"surface_{model}", f"borne out, {len(mesh.triangles)} triangles")
+            self.begin(f"surface_{model}", f"supported, {len(mesh.triangles)} triangles")
             self.mesh(f"world/{model}/surface", mesh)
         self.begin(f"densify_{model}", str(self.record.result(DensifyResult, model)))
         self.cloud(model, read_cloud(self.folder.cloud(model)))

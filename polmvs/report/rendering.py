@@ -1,7 +1,7 @@
 """Still pictures of clouds and meshes, made without a display or a graphics driver.
 
-Points are splatted with a depth buffer and shaded by their normals; of a mesh, points are taken
-from its triangles, so close together that no background shows through.
+Points are splatted with a depth buffer and shaded by their normals. A mesh is drawn as points on
+its triangles, dense enough to hide the background.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ POINTS_A_PIXEL = 4.0  # of a mesh: of 1.8e5 pixels then one in 50 (exp -4) has n
 
 @dataclass(frozen=True, kw_only=True)
 class Viewpoint:
-    """Where a picture is taken from, about the middle of the part.
+    """Viewpoint of a picture, about the middle of the part.
 
     Attributes
     ----------
-    elevation_deg : over the mean plane of the part.
+    elevation_deg : above the mean plane of the part.
     azimuth_deg : about the plane's normal, from the part's longest direction.
     """
 
@@ -42,7 +42,7 @@ class Viewpoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """Middle, size and axes of what is looked at.
+    """Middle, size and axes of the subject of a picture.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Subject:
 
     @staticmethod
     def of(points: Floats, normals: Floats | None) -> Subject:
-        """The subject that points ``(N, 3)`` make; up is where their normals look."""
+        """The subject of points ``(N, 3)``; up is the main direction of their normals."""
         finite = np.isfinite(points).all(axis=1)
         center = np.median(points[finite], axis=0) if finite.any() else np.zeros(3)
         spread = points[finite] - center
@@ -101,12 +101,12 @@ def render_cloud(
 
     Parameters
     ----------
-    radius_px : half the side of a point's square, less half a pixel.
-    plain : without the points' own colours.
+    radius_px : half the side of a point's square, minus half a pixel.
+    plain : ignore the points' colours.
 
     Notes
     -----
-    Points whose normal looks away are left out; those without a normal are drawn half bright.
+    Points that face away are left out; those without a normal are drawn half bright.
     """
     in_cam = cam_from_world * cloud.points
     shade = np.full(len(in_cam), 0.6)
@@ -135,7 +135,7 @@ def render_cloud(
 def mesh_points(mesh: Mesh, num: int) -> Cloud:
     """Points spread evenly over the triangles of a mesh, with its normals and colours.
 
-    Of a mesh without area they are its vertices.
+    For a mesh without area they are its vertices.
     """
     corners = mesh.vertices[mesh.triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -167,7 +167,7 @@ def contact_sheet(
 ) -> Rgb:
     """One column for each cloud or mesh, one row for each viewpoint, all seen by one camera.
 
-    The last subject says where the middle is, so that the others are compared in its frame.
+    The middle and the axes are those of the last subject.
     """
     width, height = size_px
     focal = float(min(width, height)) * 1.5  # the part's radius spans 0.44 of the shorter side

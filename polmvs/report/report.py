@@ -69,7 +69,7 @@ logger = logging.getLogger(__name__)
 
 MAX_POINTS = 150_000  # of each cloud on the page: two clouds turn smoothly, and 2 MB each
 ANGLE_BINS_DEG = np.arange(0.0, 91.0, 5.0)
-# Rows of the comparison that tell the models apart at a glance.
+# Rows of the comparison that best show the difference of the models.
 HEADLINE = (
     "coverage, %",
     "phase residual over all views, RMSE / median, deg",
@@ -81,9 +81,9 @@ HEADLINE = (
 # Colour scales that end where 95 % of the worst layer's values do, and at most here.
 ADAPTED = {"residual": MAX_ERROR_DEG, "normal_error": MAX_ERROR_DEG, "error": 1e3 * MAX_ERROR_M}
 SIZE_PERCENTILES = (0.5, 99.5)
-MIN_SIZED = 100  # points for a size to be told
-SIZED = 5000  # points that a size is told from: its ends err by some of their spacings
-# Who stands for the run, and for OPA, in order: people know OPA as the paper has it.
+MIN_SIZED = 100  # least number of points for a size
+SIZED = 5000  # points for a size: its ends are exact to some of their spacings
+# Models that represent the run, and OPA, in order of preference: OPA is best known as published.
 MAIN = (
     AngleModel.PPA,
     AngleModel.TILTED,
@@ -100,8 +100,8 @@ class ReportInput:
 
     Attributes
     ----------
-    models : those that have a cloud with points, OPA first.
-    capture : None where it is gone or has changed.
+    models : those with points, OPA first.
+    capture : None if it is missing or has changed.
     truth : with ``truth_from_world``; None without ground truth.
     """
 
@@ -118,7 +118,7 @@ class ReportInput:
 
     @property
     def main(self) -> AngleModel:
-        """Who stands for the run."""
+        """The model that represents the run."""
         return next(model for model in MAIN if model in self.models)
 
     @property
@@ -128,14 +128,14 @@ class ReportInput:
 
     @property
     def length(self) -> DisplayUnit:
-        """In which lengths are shown; the truth is metric, and so is the scale that it gives."""
+        """Unit of the shown lengths; with ground truth the scale is metric."""
         if self.truth is not None:
             return DisplayUnit("mm", 1e3 * self.truth[1].scale)
         return DisplayUnit("mm", 1e3) if self.is_metric else DisplayUnit("model units")
 
 
 def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress) -> Path:
-    """Make the report of a run, again if there is one.
+    """Write the report of a run; an existing one is replaced.
 
     Parameters
     ----------
@@ -592,7 +592,7 @@ def _uncertainty_words(given: ReportInput) -> list[str]:
 
 
 def warnings_of(given: ReportInput) -> tuple[str, ...]:
-    """Those of the run, and of what stands beside it."""
+    """Warnings of the run, and of its comparison with a reference."""
     warnings = [w for stage in given.record.stages for w in stage.warnings]
     if given.deviation is not None and given.deviation.is_stale:
         warnings.append(
@@ -674,7 +674,7 @@ def _plots(given: ReportInput, samples: Mapping[AngleModel, ErrorSamples]) -> li
         Plot(
             svg=plots.error_curves(residual, "deg", "residual phase"),
             caption="Angle between the measured phase and that of the surface found, at pixels of "
-            "all views. No truth is needed for it.",
+            "all views. It needs no ground truth.",
             wide=True,
         ),
         Plot(

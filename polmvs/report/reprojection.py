@@ -13,9 +13,9 @@ MAX_RAYS = 160_000  # a picture, which a thumbnail and half a screen show; 0.1 s
 
 
 def mesh_normals_in_cam(scene: RayScene, view: View) -> Array:
-    """Normals ``(H, W, 3)``, camera frame, of the mesh that each pixel shows; NaN where none.
+    """Normals ``(H, W, 3)``, camera frame, of the mesh at each pixel; NaN off the mesh.
 
-    Of a large image one ray serves a few neighbouring pixels.
+    In a large image one ray serves a few neighbouring pixels.
     """
     camera = view.camera
     step = max(1, int(np.ceil(np.sqrt(camera.width * camera.height / MAX_RAYS))))

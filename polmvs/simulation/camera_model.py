@@ -1,4 +1,4 @@
-"""The camera: its lens, the rays of the file's samples, and what blurs them."""
+"""The camera: its lens, the rays of the file's samples, and their blur."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ FOCAL_LENGTH_M = 0.008  # of the lens that has an f-number
 
 
 def polarization_intrinsics(options: SensorOptions) -> Intrinsics:
-    """Camera of the polarization images: half the size of a mosaic, all of a rotating filter's.
+    """Camera of the polarization images: half a mosaic's size, full size for a rotating filter.
 
     Raises
     ------
     OptionError, DataError
-        The camera's file is unreadable or of images of another shape.
+        The camera's file is unreadable or for images of another aspect ratio.
     """
     width, height = options.image_size
     if options.sensor is SensorKind.MOSAIC:
@@ -70,7 +70,7 @@ def lens_of(options: SensorOptions, camera: Camera, distance: float, seed: int) 
     Parameters
     ----------
     camera : of the polarization images.
-    distance : of the object's centre, which is in focus, metres.
+    distance : to the object's centre, which is in focus, metres.
     seed : of the direction of the motion.
 
     Raises

@@ -1,4 +1,4 @@
-"""Where the pictures are taken from: paths about the object, or poses that are given."""
+"""Camera poses: paths about the object, or given poses."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def camera_views(
     Parameters
     ----------
     camera : of the polarization images.
-    target : (3,), what the cameras look at, metres, world.
-    distance : from it, metres.
-    seed : of random places and rolls.
+    target : (3,), point at which the cameras look, metres, world.
+    distance : from the target, metres.
+    seed : of random positions and rolls.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def camera_views(
 
 
 def given_views(path: Path, camera: Camera) -> list[View]:
-    """Views of given poses, metres, sorted by name, all by one camera.
+    """Views with given poses, metres, sorted by name, and one camera.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""A rendered capture: folders that ``polmvs reconstruct`` and ``compare --gt`` read.
+"""A rendered capture, in folders for ``polmvs reconstruct`` and ``compare --gt``.
 
-``OUT/raw/`` the files of the sensor, ``OUT/camera.txt`` its intrinsics for ``--camera``,
-``OUT/capture.toml`` what its samples mean for ``--config``, ``OUT/masks/`` if they are wanted,
+``OUT/raw/`` has the files of the sensor, ``OUT/camera.txt`` its intrinsics for ``--camera``,
+``OUT/capture.toml`` the options of its samples for ``--config``, ``OUT/masks/`` optional masks,
 ``OUT/gt/`` the ground truth (:mod:`polmvs.simulation.truth`) with the mesh, ``OUT/simulation.json``
-all options and what followed from them. A view's first file in ``raw/`` is its last to be written:
-what has one is finished, and ``resume`` goes on after it.
+all options and derived values. The first file of a view in ``raw/`` is written last: a view that
+has it is finished, and ``resume`` continues after it.
 """
 
 from __future__ import annotations
@@ -64,24 +64,24 @@ logger = logging.getLogger(__name__)
 
 RECORD = "simulation.json"
 FILLED = 0.8  # of the image's smaller side by the object's circumscribed sphere
-METERED_VIEWS = 4  # that the exposure is taken from
+METERED_VIEWS = 4  # views for the exposure
 METERED_STEP = 13  # samples between two that are metered; coprime with the mosaic's cell
 METERED_PERCENTILE, METERED_LEVEL = 99.0, 0.85  # of the light, and its level in full scales
-CHECKED_SIDE = 96  # px of the images in which the views are checked before they are rendered
-MIN_SEEN = 50  # px of them that must show the object: 0.5 %
+CHECKED_SIDE = 96  # px, size of the images that check the views before rendering
+MIN_SEEN = 50  # px of these that must show the object: 0.5 %
 PLACES = 30  # spacing of baked light on the object, of its size
 MOVING_SHARE = 4  # by which directions are fewer where light is baked for each view
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedView:
-    """What is known of a finished view.
+    """Statistics of a finished view.
 
     Attributes
     ----------
-    rays : of a sample of the file, mean.
+    rays : mean number of rays of a sample of the file.
     noise : median over the samples of the rendering's noise over the sensor's.
-    noisier : share of the samples whose rendering is noisier than it should be.
+    noisier : share of the samples whose rendering is noisier than required.
     """
 
     rays: float
@@ -96,7 +96,7 @@ class SimulatedCapture:
     Attributes
     ----------
     folder : of it.
-    views : by name, those that this call rendered.
+    views : by name, rendered by this call.
     num_views : of the whole capture.
     exposure : full scales for each unit of radiance.
     variant : Mitsuba's.
@@ -140,8 +140,8 @@ def simulate_capture(
     mesh : file of the object or name of a built-in shape.
     out : folder of the capture.
     simulation : what is rendered.
-    run : whether an earlier capture is replaced or gone on with.
-    on_progress : told of each view.
+    run : whether to replace or continue an earlier capture.
+    on_progress : called for each view.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def simulate_capture(
         if view.name not in finished:
             found[view.name] = _write_view(out, studio, index, exposure)
         on_progress(1)
-    write_cameras(out / "gt", plan.views)  # what makes the truth complete
+    write_cameras(out / "gt", plan.views)  # written last: it completes the ground truth
     return SimulatedCapture(
         folder=out,
         views=found,

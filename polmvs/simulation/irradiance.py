@@ -1,10 +1,10 @@
 """Irradiance that enters the diffuse base at every vertex, by Mitsuba's path tracer.
 
-The base under a dielectric receives ``E = int L T(theta) / T(0) cos(theta) dw``, T Fresnel's
-transmittance; a matte surface the same with T = 1. Light is gathered at some of the vertices,
-spread over surface and orientation, by emitter and hemisphere samples weighted against each other
-(the balance heuristic), on one low-discrepancy set of directions shifted at random for each; the
-others are interpolated.
+The base under a dielectric receives ``E = int L T(theta) / T(0) cos(theta) dw`` with Fresnel's
+transmittance T; a matte surface the same with T = 1. Light is gathered at some of the vertices,
+spread over surface and orientation, by emitter and hemisphere samples with the balance heuristic,
+on one low-discrepancy set of directions with a random shift for each vertex. The others are
+interpolated.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from polmvs.simulation.scene import SPREAD_NM, MitsubaScene
 
 CHUNK = 1 << 21  # paths at a time: about 100 MB
 NORMAL_WEIGHT = 3.0  # a right angle between normals counts as 4.2 spacings: edges stay sharp
-NORMAL_CELLS = 2.5  # places whose normals differ by more than some 23 degrees are apart
+NORMAL_CELLS = 2.5  # normals that differ by more than about 23 degrees are separate
 NEIGHBORS = 16
 SPREAD_CHUNK = 1 << 16  # vertices at a time: about 50 MB
 
 
 def bake(scene: MitsubaScene, *, bounces: int, samples: int, spacing: float, seed: int) -> None:
-    """Fill in the irradiance of all vertices.
+    """Compute the irradiance of all vertices.
 
     Parameters
     ----------
-    bounces : reflections that light is followed over.
-    samples : directions at each place.
-    spacing : between the places of the object, metres.
+    bounces : number of traced reflections.
+    samples : directions at each vertex.
+    spacing : between the vertices of the object at which light is gathered, metres.
     seed : of the directions.
     """
     material = scene.description.material

@@ -1,7 +1,7 @@
-"""Light: presets and files as environments at infinity, all of it unpolarized.
+"""Unpolarized light: presets and files as environments at infinity.
 
-An environment is an equirectangular image of radiances: its rows go from the zenith down, its
-columns with the azimuth. A ring light is no environment: it moves with the camera.
+An environment is an equirectangular image of radiances: rows from the zenith down, columns by
+azimuth. A ring light is not an environment: it moves with the camera.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def environment(options: LightingOptions) -> Image:
     Raises
     ------
     OptionError, DataError
-        A file is missing, not given or no environment.
+        A file is missing, not given or not an environment.
     """
     is_file = options.light is LightName.FILE
     if is_file != (options.environment is not None):

@@ -1,4 +1,4 @@
-"""Printed marks on the object: where SfM finds sparse points on a part without texture."""
+"""Printed marks on the object, which give SfM sparse points on a part without texture."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 PRINT_CELLS = 8  # along a mark's side
 CELL_TEXELS = 8
 CANDIDATES = 4000
-LOWEST = -0.3  # z of a mark's normal: what faces further down is seen by few views
-# The surface about a mark is flat: a disc of this radius stands off it by this gap at most, both in
-# radii of the mark. So a mark is half a radius from an edge: at an edge it would break the outline.
+LOWEST = -0.3  # z of a mark's normal: few views see surfaces that face farther down
+# The surface about a mark is flat: a disc of this radius deviates from it by at most this gap, both
+# in radii of the mark. So a mark is half a radius from an edge: there it would break the outline.
 FLAT_RADIUS, MAX_GAP = 2.0, 0.5
 EDGE_POINTS = 12  # of the disc's circle, where that is tested
 KMEANS_ITERATIONS = 50  # at most; nine parts of a plate stay as they are after fewer
@@ -34,8 +34,8 @@ class Marks:
 
     Attributes
     ----------
-    centers, axes : (M, 3) and (M, 3, 3), world; rows of the axes are the print's x and y and the
-        surface's normal.
+    centers, axes : (M, 3) and (M, 3, 3), world; the rows of the axes are the print's x and y and
+        the surface's normal.
     radius : metres.
     print_atlas : (N, M N) float32, albedo, one print beside the other.
     """
@@ -47,17 +47,17 @@ class Marks:
 
 
 def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
-    """Marks spread evenly over what of a surface faces the sky or sideways.
+    """Marks spread evenly over the surface that faces upwards or sideways.
 
-    They lie where the surface is flat enough for them: of a plate that is lower than a mark is
-    wide, on its top, away from its edges. Where that is nowhere, they lie anywhere.
+    They lie where the surface is flat enough: for a plate that is thinner than a mark, on its top,
+    away from its edges. If the surface is nowhere flat enough, they lie anywhere.
 
     Parameters
     ----------
     mesh : of the object, metres.
     number : of marks.
     diameter : of a mark, metres.
-    seed : of their places and prints.
+    seed : of their positions and prints.
     """
     rng = np.random.default_rng(seed)
     points, normals = _on_surface(mesh, rng)
@@ -73,20 +73,20 @@ def marks_on(mesh: Mesh, number: int, diameter: float, seed: int) -> Marks:
 
 
 def marks_at(mesh: Mesh, file: Path, diameter: float, seed: int) -> Marks:
-    """Marks at given places.
+    """Marks at given points.
 
     Parameters
     ----------
     mesh : of the object, metres.
-    file : text, a line ``x y z`` for each mark, in the mesh's frame, metres; a mark lies on the
-        surface's closest point.
+    file : text, a line ``x y z`` for each mark, in the mesh's frame, metres; a mark lies at the
+        closest point of the surface.
     diameter : of a mark, metres.
     seed : of their prints.
 
     Raises
     ------
     DataError
-        The file is missing or malformed, or a place is further than a mark's radius from the
+        The file is missing or malformed, or a point is farther than a mark's radius from the
         surface.
     """
     places = _read_places(file)
@@ -162,8 +162,8 @@ def _fits(mesh: Mesh, points: Array, normals: Array, radius: float) -> NDArray[n
 def _spread(points: Array, normals: Array, number: int, seed: int) -> list[int]:
     """Indices of points in the middle of parts of equal spread (k-means), normals counted as well.
 
-    A mark then lies about half its distance to the next one from an edge. Points as far apart as
-    can be would lie at the edges, in the corners first, and there a print breaks the outline.
+    The distance of a mark from an edge is then about half of its distance to the next mark.
+    Farthest points would lie at edges and corners, where a print breaks the outline.
     """
     number = min(number, len(points))
     if not number:

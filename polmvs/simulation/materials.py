@@ -1,8 +1,8 @@
-"""Materials: presets with the names that users know, and their Fresnel curves in closed form.
+"""Materials: presets with common names, and their Fresnel curves in closed form.
 
 Dielectrics are a rough interface of Beckmann's slopes over a Lambertian base (Baek et al., SIGGRAPH
-Asia 2018): light is reflected specularly by the interface, or enters it, is depolarized by the base
-and is polarized by leaving it. Conductors reflect by their complex refractive index alone.
+Asia 2018): light is reflected specularly by the interface, or it enters, is depolarized by the base
+and polarized when it leaves. Conductors only reflect, by their complex refractive index.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ METALS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """What the object is made of.
+    """Material of the object.
 
     Attributes
     ----------
-    albedo : of the base under the interface, red, green, blue; 0 of conductors.
+    albedo : of the base under the interface, red, green, blue; 0 for conductors.
     roughness : alpha of Beckmann's slopes.
-    ior : of the dielectric; None of conductors.
-    metal : of the conductor; None of dielectrics.
+    ior : of the dielectric; None for conductors.
+    metal : of the conductor; None for dielectrics.
     """
 
     albedo: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -70,7 +70,7 @@ PRESETS = {
 
 
 def material_of(options: ObjectOptions) -> Material:
-    """The preset with what the options change of it.
+    """The preset, changed by the options.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def material_of(options: ObjectOptions) -> Material:
 
 
 def fresnel(cos_incidence: Array, index: complex) -> tuple[Array, Array]:
-    """Reflectances ``(R_s, R_p)`` of light that meets a smooth surface from the air.
+    """Reflectances ``(R_s, R_p)`` of a smooth surface in air.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def transmittance(cos_incidence: Array, index: complex) -> Array:
 
 
 def bsdf_of(material: Material, *, colour: bool) -> dict[str, Any]:
-    """The material as Mitsuba has it; its diffuse base of its own albedo."""
+    """Mitsuba's description of the material, with its own albedo."""
     if material.metal is not None:
         # A named table of spectra in colour; the values at 550 nm for one brightness.
         n, k, name = METALS[material.metal]

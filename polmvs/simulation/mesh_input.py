@@ -1,9 +1,9 @@
 """The object's mesh: a built-in shape or a file, in metres, standing on the plane z = 0.
 
-Light follows the normals of a mesh, the truth its triangles: normals that are interpolated over
-coarse triangles make a capture whose shading belongs to another surface than its depths. So a file
-is rendered with the normals of its facets, or as a subdivision surface (Loop's) so fine that facets
-and normals agree to a fraction of a millimetre, which is measured and said.
+Shading follows the normals of a mesh, ground truth its triangles: with normals interpolated over
+coarse triangles, the shading would belong to another surface than the depths. So a file is rendered
+with the normals of its facets, or as a fine subdivision surface (Loop) whose facets and normals
+agree to a fraction of a millimetre; the difference is measured and reported.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ DEFAULT_SIZE = 0.2  # metres
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 METRIC_SUFFIXES = (".glb", ".gltf")  # whose format says metres
 MAX_TRIANGLES = 1_500_000  # 2 GB at the most
-FINE_TRIANGLES = 200_000  # a subdivision goes on to that many at most
+FINE_TRIANGLES = 200_000  # limit of a subdivision
 FINE_SAG = 2e-4  # of the size, between facets and their normals: 40 um at 0.2 m
-LARGEST_M, SMALLEST_M = 20.0, 0.002  # beyond which a file's unit is doubted
+LARGEST_M, SMALLEST_M = 20.0, 0.002  # beyond which a file's unit is doubtful
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,7 +42,7 @@ class ObjectMesh:
     Attributes
     ----------
     source : its file or name.
-    mesh : metres, on the plane z = 0 over the origin; its normals are those that light follows.
+    mesh : metres, on the plane z = 0 over the origin; its normals are those of the shading.
     vertex_albedo : (V, 3) float32, linear, of a file with colours; else None.
     """
 
@@ -83,10 +83,10 @@ def object_mesh(source: str | Path | Mesh, options: ObjectOptions) -> ObjectMesh
 
 
 def surface_sag(mesh: Mesh) -> float:
-    """Largest distance between facets and the surface that interpolated normals belong to, metres.
+    """Largest distance between facets and the surface of interpolated normals, metres.
 
-    Along an edge whose normals turn by an angle t about it the surface bulges by ``l tan(t / 2) /
-    4`` from the chord of length l (a circle's arc).
+    Along an edge of length l whose normals turn by an angle t, the surface bulges by ``l tan(t / 2)
+    / 4`` (a circular arc).
     """
     edges = mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     first, second = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]]

@@ -1,4 +1,4 @@
-"""Options of a simulated capture, by what they describe: object, light, scenery, path, sensor."""
+"""Options of a simulated capture: object, light, scenery, path, sensor."""
 
 from __future__ import annotations
 

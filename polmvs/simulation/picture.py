@@ -1,4 +1,4 @@
-"""One view: as many rays as its noise needs, and the samples that the sensor makes of them."""
+"""One view: rays until the noise is low enough, and the samples of the sensor."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ FILTERS_NM = {"r": (610.0, 35.0), "g": (535.0, 35.0), "b": (460.0, 30.0)}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Picture:
-    """What was rendered of a view, without the sensor's noise.
+    """Rendering of a view, without the sensor's noise.
 
     Attributes
     ----------
     stokes : (H, W, 3), mean over each sample's area, in the rays' transverse planes.
-    diffuse : (H, W, 2), s1, s2 of the part's own diffuse light; None where it is not known apart.
+    diffuse : (H, W, 2), s1, s2 of the part's diffuse light; None if unknown.
     sigma : (H, W), standard deviation of the rendering behind the sample's polarizer.
-    rays : (H, W), of each sample.
+    rays : (H, W), number of rays of each sample.
     """
 
     stokes: Array
@@ -64,7 +64,7 @@ def render_picture(
     Parameters
     ----------
     exposure : full scales for each unit of radiance; infinite for one pass without a target.
-    step : only each such sample is rendered, row by row; the others stay 0.
+    step : stride of the rendered samples, row by row; the others stay 0.
     """
     sensor, rendering, bounces = options.sensor, options.rendering, options.lighting.bounces
     rows, cols = lens.shape
@@ -146,7 +146,7 @@ def expose_picture(
     centers = sample_centers(view.camera, sensor.sensor)
 
     def behind(angles: Array) -> Array:
-        """Light (H, W) behind polarizers at these angles (H, W), some rows at a time."""
+        """Light (H, W) behind polarizers at angles (H, W), computed some rows at a time."""
         light = np.empty(shape)
         for first in range(0, shape[0], BAND_ROWS):
             rows = np.s_[first : first + BAND_ROWS]

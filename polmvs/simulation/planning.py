@@ -1,4 +1,4 @@
-"""How many views under which light a part needs, from a few small simulations of it."""
+"""Number of views and light for a part, from a few small simulations."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from polmvs.simulation.options import LightName, PlanOptions, Simulation
 from polmvs.simulation.trial import TrialResult, run_trial, trial_table
 
 ENOUGH_OF_BEST = 0.02  # F-score given up for fewer views; defines the recommendation
-USELESS = 0.5  # F-score at 2 mm under which nothing is recommended; defines it as well
+USELESS = 0.5  # F-score at 2 mm below which nothing is recommended; defines it as well
 TABLE_FILE, PLOT_FILE = "plan.md", "plan.png"
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedTrial:
-    """A trial and what it was of."""
+    """A trial with its light and number of views."""
 
     light: LightName
     trial: TrialResult
@@ -32,13 +32,13 @@ class PlannedTrial:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What the trials say.
+    """Result of the trials.
 
     Attributes
     ----------
     trials : of each light and number of views.
     recommendation : one sentence.
-    folder : where table and plot lie.
+    folder : of table and plot.
     """
 
     trials: tuple[PlannedTrial, ...]
@@ -65,7 +65,7 @@ def make_plan(
     ----------
     simulation : of the part; its light, number of views and size of images are those of
         ``options``.
-    on_progress : told of each trial. Finished ones are kept in the folder and not done again.
+    on_progress : called for each trial. Finished ones are kept in the folder and do not run again.
 
     Raises
     ------

@@ -1,8 +1,7 @@
-"""The only place that imports Mitsuba: which variant runs here, and what to install for one.
+"""Import of Mitsuba: the variant for this machine, and what to install for it.
 
-Mitsuba's variants that compute many rays at once compile themselves with LLVM, a library of the
-system. Where it is not found in the usual folders, or is too old, the scalar variant serves, which
-is slower.
+Mitsuba's vectorized variants are compiled with LLVM, a library of the system. If it is not in the
+usual folders, or is too old, the scalar variant is used, which is slower.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ class Renderer:
 
     @property
     def is_scalar(self) -> bool:
-        """Whether rays are computed one at a time."""
+        """Whether the variant computes one ray at a time."""
         return self.variant.startswith("scalar")
 
 
@@ -66,7 +65,7 @@ def import_renderer(*, colour: bool = False, variant: str | None = None) -> Rend
     Parameters
     ----------
     colour : spectra instead of one brightness.
-    variant : to use this one and no other.
+    variant : required variant.
 
     Raises
     ------
@@ -99,7 +98,7 @@ def import_renderer(*, colour: bool = False, variant: str | None = None) -> Rend
 
 
 def find_llvm() -> str | None:
-    """Path of the newest library of LLVM in the usual folders, be it too old; None of none."""
+    """Path of the newest library of LLVM in the usual folders, even if too old; None if none."""
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         return given if os.path.exists(given) else None

@@ -1,8 +1,8 @@
 """Rendering without LLVM: Mitsuba's own path tracer, one ray at a time, on all cores.
 
 A picture is a film of Mitsuba's ``stokes`` integrator about the optical axis, wide enough for all
-samples and as fine as they are, from which the samples are interpolated. Its noise is that of the
-number of rays, and marks, defocus and motion are not rendered, which is said.
+samples and at their resolution. The samples are interpolated from it. Its noise follows from the
+number of rays. Marks, defocus and motion are not rendered; a message says so.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ def render_stokes(
     """Stokes vectors (H, W, C, 3) of the samples of a file, and the deviation of s0 (H, W).
 
     C is 1, or red, green and blue of a scene with colours. The basis is that of
-    :mod:`polmvs.simulation.transport`. Half of the rays are rendered apart from the others, which
-    tells the deviation.
+    :mod:`polmvs.simulation.transport`. The rays are rendered in two halves, whose difference gives
+    the deviation.
 
     Raises
     ------

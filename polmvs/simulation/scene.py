@@ -1,8 +1,8 @@
-"""The scene as Mitsuba has it: object, surroundings and light, with the light baked into vertices.
+"""Mitsuba's scene: object, surroundings and light, with diffuse light baked into vertices.
 
-What diffuse surfaces send out does not depend on the view, so it is computed once: each vertex gets
-the irradiance that enters its diffuse base (:mod:`polmvs.simulation.irradiance`). A view then only
-follows specular reflections (:mod:`polmvs.simulation.transport`).
+The light from diffuse surfaces does not depend on the view, so it is computed once: each vertex
+gets the irradiance that enters its diffuse base (:mod:`polmvs.simulation.irradiance`). A view then
+only traces specular reflections (:mod:`polmvs.simulation.transport`).
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ RING_IRRADIANCE = 2.0  # at the camera's distance, facing it
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneDescription:
-    """All that is seen, without a renderer.
+    """Description of the scene, independent of the renderer.
 
     Attributes
     ----------
     part : the object, metres, world.
     material : of the object.
-    vertex_albedo : (V, 3) of the object's vertices, in place of the material's; None for that.
+    vertex_albedo : (V, 3) of the object's vertices; None: the material's albedo.
     marks : printed on it.
-    surroundings : matte surfaces about it.
+    surroundings : matte surfaces around it.
     environment : (H, 2 H, 3) float32, see :func:`polmvs.simulation.lights.environment`.
     colour : whether spectra are rendered.
     """
@@ -53,7 +53,7 @@ class SceneDescription:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MitsubaScene:
-    """A scene that rays can be sent into.
+    """Mitsuba's scene for ray tracing.
 
     Attributes
     ----------
@@ -62,8 +62,8 @@ class MitsubaScene:
     scene : Mitsuba's.
     part : the object's shape.
     shapes : all shapes with a diffuse base, the object's first.
-    base : the object's material with a diffuse base of albedo 1; None of conductors.
-    albedo : texture of the object's base; None of conductors.
+    base : the object's material with a diffuse base of albedo 1; None for conductors.
+    albedo : texture of the object's base; None for conductors.
     mark_prints : Mitsuba's texture of the marks' prints; None without marks.
     illuminant : texture of the spectrum of white light, D65; None without colours.
     """
@@ -90,8 +90,8 @@ def build_scene(
 
     Parameters
     ----------
-    turn : of the light about the vertical axis, rad.
-    ring : pose of the camera that carries a ring light, and its distance; None for no such light.
+    turn : rotation of the light about the vertical axis, rad.
+    ring : pose of the camera with a ring light, and its distance; None without one.
     """
     mi = renderer.mi
     material = description.material

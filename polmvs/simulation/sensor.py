@@ -2,9 +2,9 @@
 
 A polarizer in the image plane is tilted for an oblique ray: it absorbs the field along the
 projection ``a = normalise(A - (A . v) v)`` of its absorbing axis A on the ray's transverse plane,
-so that ``I = (S0 - d (cos 2 psi S1 + sin 2 psi S2)) / 2`` with psi the angle of a in the basis of
-that plane and d the diattenuation. Behind a lens that is telecentric on the image side each ray
-meets the sensor along its axis, and psi is the angle of A itself.
+so that ``I = (S0 - d (cos 2 psi S1 + sin 2 psi S2)) / 2`` with the angle psi of a in the basis of
+that plane and the diattenuation d. Behind an image-side telecentric lens each ray meets the sensor
+perpendicularly, and psi is the angle of A.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ MOST_WELLS = 1e3  # of light on a sample: far over what it holds
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Channels:
-    """Faults of the polarizers, by nominal angle 0, 45, 90, 135 degrees.
+    """Errors of the polarizers, by nominal angle 0, 45, 90, 135 degrees.
 
     Attributes
     ----------
     angles_deg : (4,), true angles of the transmission axes.
-    gains : (4,), relative to the mean channel's.
+    gains : (4,), relative to the mean channel.
     diattenuation : of all, ``(r - 1) / (r + 1)`` of the extinction ratio r.
     """
 
@@ -87,8 +87,7 @@ def transmitted_axis(rays: Array, angles: Array, optics: Optics) -> tuple[Array,
 def across(axis: Array, rays: Array) -> tuple[Array, Array]:
     """Cosine and sine of twice the angle of the direction across an axis, transverse plane.
 
-    Angles count from the image's x, turned by the shortest rotation from the optical axis to the
-    ray.
+    Angles are from the image's x, turned by the shortest rotation from the optical axis to the ray.
     """
     x, y, z = rays[..., 0], rays[..., 1], rays[..., 2]
     axis = unit(axis - (axis * rays).sum(axis=-1, keepdims=True) * rays)
@@ -106,7 +105,7 @@ def sample_angles(options: SensorOptions, shape: tuple[int, int]) -> NDArray[np.
 
 
 def vignette(options: SensorOptions, camera: Camera, xy: Array) -> Array:
-    """Share of the light that reaches each place (..., 2); 1 on the axis."""
+    """Share of the light that reaches each point (..., 2); 1 on the axis."""
     if options.vignetting == 0:
         return np.ones(xy.shape[:-1])
     center = 0.5 * np.array([camera.width, camera.height])
@@ -117,7 +116,7 @@ def vignette(options: SensorOptions, camera: Camera, xy: Array) -> Array:
 def expose(
     light: Array, options: SensorOptions, exposure: float, rng: np.random.Generator
 ) -> NDArray[np.unsignedinteger]:
-    """Light as the numbers of a file, with photon and read noise, black level and clipping.
+    """Samples of a file from light, with photon and read noise, black level and clipping.
 
     Parameters
     ----------

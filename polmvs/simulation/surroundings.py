@@ -1,7 +1,7 @@
-"""What lies about the object: a table with printed clutter, or a calibration board.
+"""Surroundings of the object: a table with printed clutter, or a calibration board.
 
-SfM needs features that stand still about a part that has none. Everything here is matte: its light
-is unpolarized and the same from every side.
+SfM needs static features around a part that has none. Everything here is matte: its light is
+unpolarized and the same in all directions.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class Surrounding:
 
     Attributes
     ----------
-    mesh : metres, world; fine enough for the light on it to be linear in its triangles.
-    uv : (V, 2) float32, places of the vertices on the print, 0 to 1, v downwards.
+    mesh : metres, world; fine enough for linear interpolation of the light in its triangles.
+    uv : (V, 2) float32, texture coordinates of the vertices, 0 to 1, v downwards.
     print : (H, W) float32, albedo.
     """
 
@@ -54,13 +54,13 @@ class Surrounding:
 def surroundings(
     options: SceneryOptions, size: float, radius: float, seed: int
 ) -> list[Surrounding]:
-    """What lies about an object on the plane z = 0.
+    """Surroundings of an object on the plane z = 0.
 
     Parameters
     ----------
     size : largest side of the object, metres.
-    radius : of the circle about the origin that the object stands in, metres.
-    seed : of the prints and places.
+    radius : of the circle about the origin that contains the object, metres.
+    seed : of the prints and positions.
     """
     if options.surroundings is Scenery.NOTHING:
         return []

@@ -1,10 +1,10 @@
-"""From rays to Stokes vectors: specular reflections are followed, diffuse light is looked up.
+"""From rays to Stokes vectors: specular reflections are traced, diffuse light is looked up.
 
-A ray collects, at each surface that it meets, what its diffuse base sends out (the baked
-irradiance times the albedo, polarized by leaving the interface) and goes on along a sampled
-specular reflection, whose Mueller matrix it carries; the sky ends it. Stokes vectors come out in
-the basis of the ray's transverse plane that is the image's x and upward y turned by the shortest
-rotation from the optical axis to the ray (as in :mod:`polmvs.polarization.angle_models`).
+At each surface, a ray collects the light of the diffuse base (the baked irradiance times the
+albedo, polarized at the interface). It continues along a sampled specular reflection with its
+Mueller matrix, and ends at the sky. The basis of the Stokes vectors is that of the ray's transverse
+plane: the image's x and upward y, turned by the shortest rotation from the optical axis to the ray
+(as in :mod:`polmvs.polarization.angle_models`).
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ CHUNK_RAYS = 1 << 21  # at a time: about 300 MB
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lens:
-    """Where the rays of a file's samples go, and how they are blurred.
+    """Rays of a file's samples, and their blur.
 
     Attributes
     ----------
     corners : (H + 1, W + 1, 2) float32, ``(x / z, y / z)`` of the rays through the corners of the
         samples, camera frame; between them rays are interpolated.
-    aperture : radius, metres; 0 of a pinhole.
+    aperture : radius, metres; 0: pinhole.
     focus : distance of the plane in focus, metres.
-    motion : (3,), metres that the camera moves during an exposure, camera frame.
+    motion : (3,), motion of the camera during an exposure, metres, camera frame.
     """
 
     corners: NDArray[np.float32]
@@ -58,7 +58,7 @@ class Traced:
     Attributes
     ----------
     stokes : (N, 3), s0, s1, s2 of all light.
-    diffuse : (N, 2), s1, s2 of the part's own diffuse light alone.
+    diffuse : (N, 2), s1, s2 of the part's diffuse light only.
     variance : (N,), of one ray in its stratum, of the light behind the sample's own polarizer.
     """
 
@@ -69,13 +69,13 @@ class Traced:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Samples:
-    """N samples of a file, which rays go through.
+    """N samples of a file.
 
     Attributes
     ----------
     places : (N,), flat indices of samples, row by row.
-    angles : (N,), of each one's polarizer, rad.
-    wavelengths : (N, 4), nm, that each sample's rays have; None without colours.
+    angles : (N,), of each polarizer, rad.
+    wavelengths : (N, 4), nm, of each sample's rays; None without colours.
     """
 
     places: NDArray[np.int64]
@@ -110,14 +110,14 @@ def trace(
     bounces: int,
     seed: int,
 ) -> Iterator[tuple[slice, Traced]]:
-    """Send ``RAYS`` rays through each sample, evenly spread over its area.
+    """Trace ``RAYS`` rays through each sample, evenly spread over its area.
 
-    Part after part of the samples, as a large file needs much memory at once.
+    Samples are processed in parts to bound the memory.
 
     Parameters
     ----------
-    bounces : reflections that are followed.
-    seed : of all that is random.
+    bounces : number of traced reflections.
+    seed : of the random numbers.
     """
     per_chunk = CHUNK_RAYS // RAYS
     num = len(samples.places)

@@ -1,4 +1,4 @@
-"""One trial: render a capture, reconstruct it from its images alone, and measure the result."""
+"""One trial: render a capture, reconstruct it from its images only, and evaluate the result."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ HEADER = (  # but for the name
 
 @dataclass(frozen=True, kw_only=True)
 class TrialResult:
-    """What came of one capture.
+    """Result of one capture.
 
     Attributes
     ----------
-    name : of it.
-    views, posed : number of views, and of those that SfM found.
+    name : of the capture.
+    views, posed : number of views, and of registered views.
     points : of the cloud's surface.
-    completeness, f_score : at 1 and 2 mm, shares; NaN where nothing was measured.
+    completeness, f_score : at 1 and 2 mm, shares; NaN without a result.
     normal_median_deg : error of the cloud's normals.
     seconds : of the reconstruction.
-    message : why there is no result; empty where there is one.
+    message : why there is no result, else empty.
     """
 
     name: str
@@ -81,7 +81,7 @@ def run_trial(
     folder: Path,
     simulation: Simulation,
 ) -> TrialResult:
-    """Render a capture into a folder, reconstruct it and measure it; a failure is a result.
+    """Render a capture into a folder, reconstruct and evaluate it; a failure is a result.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def run_trial(
 
 
 def options_of(capture: Path, sensor: SensorOptions) -> Options:
-    """What a rendered capture is reconstructed and measured by."""
+    """Options for the reconstruction of a rendered capture."""
     return Options(
         capture=CaptureOptions(
             pattern=sensor.pattern, full_scale=float(2**sensor.bits - 1), bayer=sensor.colour
@@ -115,13 +115,13 @@ def measure(
     models: Sequence[AngleModel] = (MODEL,),
     workers: int = 1,
 ) -> list[TrialResult]:
-    """Reconstruct a capture under each model and measure it; a failure is a result.
+    """Reconstruct a capture under each model and evaluate it; a failure is a result.
 
     Parameters
     ----------
-    run : folder of the results; what is in it is replaced.
+    run : folder of the results; its content is replaced.
     options : with the capture's ground truth.
-    views : number of the capture's.
+    views : number of views of the capture.
     """
     begun = time.perf_counter()
     job = Job(

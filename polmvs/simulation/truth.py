@@ -1,9 +1,9 @@
-"""Ground truth of a rendered view, in the layout that ``--gt`` reads, and what lies beside it.
+"""Ground truth of a rendered view, in the layout of ``--gt``, and further files.
 
-Beside depth, normals and mask: ``STEM_light.png``, which light dominates the polarization of a
-pixel of the part (255 specular, 128 diffuse, 0 not the part), and ``STEM_stokes.npy``, (3, H, W)
-float32, the light itself without the sensor: s0, s1, s2 in units of radiance, in the transverse
-plane of each pixel's ray (see :mod:`polmvs.simulation.transport`).
+In addition to depth, normals and mask there are ``STEM_light.png``, the dominant kind of light of
+each pixel of the part (255 specular, 128 diffuse, 0 not the part), and ``STEM_stokes.npy``, (3, H,
+W) float32, the light before the sensor: s0, s1, s2 in units of radiance, in the transverse plane of
+each pixel's ray (see :mod:`polmvs.simulation.transport`).
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def _cast_one_by_one(
 def write_truth(
     folder: Path, view: View, maps: tuple[Array, Array, Mask], picture: Picture
 ) -> None:
-    """Write one view's truth.
+    """Write the ground truth of one view.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def write_truth(
 
 
 def write_cameras(folder: Path, views: Sequence[View]) -> None:
-    """Write ``cameras.json``: of a distorted lens the camera without distortion, and its rays.
+    """Write ``cameras.json``; for a distorted lens the camera without distortion, and its rays.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Colours of a mesh's vertices as the albedo of a plastic, which asks a texture for its mean."""
+"""Vertex colours of a mesh as the albedo of a plastic, which needs the mean of its texture."""
 
 from __future__ import annotations
 

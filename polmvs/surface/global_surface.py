@@ -1,7 +1,8 @@
-"""One surface from all views: from phase maps to a mesh with what is known of it.
+"""One surface from all views: from phase maps to a mesh with its support and uncertainty.
 
-Silhouettes, their hull, its refinement by all phases, and what the views bear out of it. Clouds,
-meshes and the depth and normal maps of the views are made from that one surface.
+The steps are silhouettes, their visual hull, its refinement by all phases, and the selection of the
+part that the views support. Clouds, meshes and the depth and normal maps of the views are made from
+this one surface.
 """
 
 from __future__ import annotations
@@ -92,36 +93,36 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-MAX_FILLED_SHARE = 0.35  # of the image's border on the objects, where a silhouette bounds little
+MAX_FILLED_SHARE = 0.35  # of the image's border on the objects: a silhouette then bounds little
 REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured on spheres
-# While a mesh's edges were round, outlines drew its faces outwards by what the edges lacked: 0.2 to
-# 0.4 px. Each step takes about half of what the one before has left: measured on analytic boxes.
+# Before edges are sharp, outlines pull the faces outwards by what rounding removes: 0.2 to 0.4 px.
+# Each polishing step halves this error. Measured on analytic boxes.
 SHARP_STEPS = 4
-DEVIATION_EDGE_PX = 6.0  # of the mesh that positions' uncertainty is worked out on
+DEVIATION_EDGE_PX = 6.0  # of the mesh on which the position uncertainty is computed
 NUM_FINAL_STEPS = 3  # of the progress: evidence, normals, deviations
 
 
 @dataclass(frozen=True)
 class GlobalSurface:
-    """A surface and what is known of it.
+    """A surface with its support and uncertainty.
 
     Attributes
     ----------
-    mesh : all of it, closed, parts that no view bears out included.
-    supported : (F,) bool, faces that the views bear out.
+    mesh : closed, with the parts that no view supports.
+    supported : (F,) bool, faces that the views support.
     evidence : of the faces.
     light : (3, F) means over a face's observations: probabilities of specular and of diffuse light,
         and the degree of polarization.
-    normals : (F, 3, 3) unit, from the phases, of each corner of the faces: two sides of an edge
-        have their own.
+    normals : (F, 3, 3) unit, from the phases, of each corner of the faces: the two sides of an edge
+        have different ones.
     sigma_deg : (F,) standard deviation of the normal, degrees; inf where unknown.
-    sigma : (V,) standard deviation of the place along the normal, world units; inf where unknown.
-    gsd : length that a pixel covers at the surface, world units.
-    contradictions : with the data.
-    inferred : (F,) bool, faces that no phase shows: walls of cavities, inferred as thick inside as
-        the rim shows them.
+    sigma : (V,) standard deviation of the position along the normal, world units; inf if unknown.
+    gsd : ground sampling distance at the surface, world units.
+    contradictions : between the surface and the data.
+    inferred : (F,) bool, faces that no phase shows: walls of cavities, inferred with the thickness
+        that the opening shows.
     tilt_share : as in :class:`polmvs.surface.observations.Looking`.
-    left_out : (K,) bool, views that contradict the others; the surface is made without them.
+    left_out : (K,) bool, inconsistent views; the surface is made without them.
     """
 
     mesh: TriangleMesh
@@ -151,7 +152,7 @@ class Undetermined:
 
 
 def num_surface_steps(num_views: int) -> int:
-    """How many steps :func:`reconstruct_surface` and the rendering of its views report."""
+    """Number of steps that :func:`reconstruct_surface` and the rendering of its views report."""
     return SolverTolerances().num_steps + NUM_FINAL_STEPS + num_views
 
 
@@ -177,22 +178,22 @@ def reconstruct_surface(
     angle_model : of the rows.
     maps : of all views.
     seeds : points of the surface.
-    surroundings : (N, 3), sparse points beside it.
+    surroundings : (N, 3), sparse points of the surroundings.
     masks_given : the maps' regions are the user's masks.
-    light : that the user states; None: inferred for each observation.
-    tilt_aware : as of :class:`polmvs.surface.observations.Looking`.
-    min_views : that must support a part.
+    light : given by the user; None: inferred for each observation.
+    tilt_aware : as in :class:`polmvs.surface.observations.Looking`.
+    min_views : number of views that must support a part.
     tolerances : of the solver.
     on_progress : called with 1 after each step.
-    on_mesh : called at the end with the hull, and with the mesh after each level of its refinement.
-    folder : where what is made of each view is kept meanwhile; None: in memory.
+    on_mesh : called at the end with the hull, and with the mesh after each level.
+    folder : for temporary results of each view; None: in memory.
     """
 
     def look_at(phase_map: PhaseMap) -> SurfaceView:
         silhouette = find_silhouette(phase_map, mask_given=masks_given)
         return surface_view(phase_map, silhouette, folder=folder)
 
-    # Threads, for nearly all of it is OpenCV's; each view's depends on itself alone.
+    # Threads, as nearly all of the work is OpenCV's; each view depends on itself alone.
     with ThreadPoolExecutor(default_num_workers()) as pool:
         views = list(pool.map(look_at, maps))
     if reason := _no_hull(views):
@@ -234,7 +235,7 @@ def reconstruct_surface(
     if not len(refined.mesh.faces):
         return Undetermined("the surface vanishes under the phases of the views")
     given = replace(given, scene=given.scene.of(~refined.left_out))
-    # Refined walls place a cavity better than the hull's, and may hide its opening.
+    # Refined walls locate a cavity better than those of the hull, but may hide its opening.
     cavities = _cavities(given.scene, refined.mesh, hull.gsd, before=cavities) or cavities
     mesh = _carved(refined.mesh, hull.mesh, steps, cavities)
     if not len(mesh.faces):
@@ -245,11 +246,11 @@ def reconstruct_surface(
 
 @dataclass(frozen=True, kw_only=True)
 class _Given:
-    """What a surface is made from, beside the views.
+    """Input of a surface other than the views.
 
     Attributes
     ----------
-    scene : of the views, to look at planar patches.
+    scene : of the views, for planar patches.
     seeds, min_views : as of :func:`reconstruct_surface`.
     on_progress : called with the number of steps done.
     """
@@ -260,7 +261,7 @@ class _Given:
     on_progress: OnProgress
 
     def steps(self, mesh: TriangleMesh) -> tuple[SteppedFaces, ...]:
-        """Planar patches that silhouettes do not tell apart."""
+        """Planar patches that silhouettes do not separate."""
         return tuple(
             stepped_faces(
                 find_faces(self.seeds),
@@ -273,10 +274,10 @@ class _Given:
 
 
 def consistent_hull(views: Sequence[SurfaceView], plane: Plane | None) -> VisualHull:
-    """The hull whose outlines match the silhouettes best: of all views, or but for some wrong ones.
+    """The hull whose outlines best match the silhouettes: of all views, or with some wrong ones.
 
-    A single wrong silhouette carves the object away, and to allow for some makes a hull of few
-    views wide.
+    A single wrong silhouette carves the object away; tolerating some makes a hull of few views too
+    wide.
     """
     strict = visual_hull(views, plane, num_wrong=0)
     if len(strict.mesh.faces):
@@ -293,7 +294,7 @@ def consistent_hull(views: Sequence[SurfaceView], plane: Plane | None) -> Visual
 def _warn_of_inconsistent(
     angle_model: AngleModel, views: Sequence[SurfaceView], refined: Refined
 ) -> None:
-    """Name the views that are left out, and what to look at."""
+    """Warn of the views that are left out, with what to check."""
     shares = zip(views, refined.unexplained, strict=True)
     for view, share in compress(shares, refined.left_out):
         logger.warning(
@@ -316,7 +317,7 @@ def _carved(
     """A refined mesh with height steps and cavities carved, their walls sharp."""
     if not steps and not cavities:
         return mesh
-    # Smoothness rounds the walls of steps; what is carved out of the refined surface is sharp.
+    # Smoothness rounds the walls of height steps; carving the refined surface makes them sharp.
     return remeshed(
         mesh,
         mesh.mean_edge / REMESHED_EDGE,
@@ -336,7 +337,7 @@ class _Polished:
     fit : of the views.
     labelled : its observations, with their light.
     normals : (F, 3) unit, of the sides of edges.
-    sigma_deg : (F,) of the normals that the phases show.
+    sigma_deg : (F,) of the normals from the phases.
     """
 
     mesh: TriangleMesh
@@ -374,7 +375,7 @@ def _polished(
 
     sharp = _converged(sharpened(mesh, normals), normals, polish, fit)
     given.on_progress(1)
-    # Detail as fine as the mesh passes for noise of the normals: phases know it from edges.
+    # Detail as fine as the mesh looks like noise of the normals; the phases distinguish the two.
     is_sharp = label(sharp, fit).mean_loss(sharp) <= label(mesh, fit).mean_loss(mesh)
     logger.info("the surface is %s.", "sharpened" if is_sharp else "left as smooth as it is")
     mesh = sharp if is_sharp else mesh
@@ -441,7 +442,8 @@ def _converged(
     while not has_converged and steps_left:
         mesh, has_converged = polish(mesh)
         mesh, steps_left = sharpened(mesh, normals), steps_left - 1
-        # Phases read by a model that their camera does not follow sink it, OPA's by millimetres.
+        # Phases under a model that the camera does not follow shift it inwards, under OPA by
+        # millimetres.
         if fit.known is not None and points_deny(mesh, sharp, fit.known, fit.gsd):
             return sharp
     return mesh
@@ -450,7 +452,7 @@ def _converged(
 def _cavities(
     scene: FaceScene, mesh: TriangleMesh, gsd: float, before: Sequence[Cavity] = ()
 ) -> tuple[Cavity, ...]:
-    """Cavities of a mesh that see only themselves, ``before`` of an earlier state of it."""
+    """Cavities of a mesh; ``before`` are those of an earlier state of it."""
     faces = SurfaceFaces(
         mesh.centers,
         mesh.face_normals,
@@ -477,7 +479,7 @@ def _within(
 ) -> Callable[[Array], Array]:
     """Signed distances to what is solid and enclosed by a mesh, for a new one of such edges.
 
-    Far off what is solid they are not less than the distance to it, which is enough.
+    Far from the solid they are at least the distance to it, which is enough.
     """
     scene = RayScene(mesh)
 
@@ -493,7 +495,7 @@ def _within(
 
 
 def _lie_on(mesh: TriangleMesh, carvings: Sequence[Callable[[Array], Floats]]) -> Mask:
-    """Which faces ``(F,)`` are borders of carved space."""
+    """Which faces ``(F,)`` border carved space."""
     found = np.zeros(len(mesh.faces), np.bool_)
     for values in carvings:
         found |= np.abs(values(mesh.centers)) < mesh.mean_edge
@@ -534,10 +536,10 @@ def _deviations(mesh: TriangleMesh, fit: Fit) -> Array:
 
 
 def supported_mesh(surface: GlobalSurface) -> Mesh:
-    """What the views bear out of the surface, with the normals of the phases."""
+    """The part of the surface that the views support, with the normals from the phases."""
     faces = surface.mesh.faces[surface.supported]
     used, compact = np.unique(faces, return_inverse=True)
-    # A file has one normal for each vertex: on an edge the mean of its sides'.
+    # A file has one normal for each vertex: on an edge the mean of its sides.
     sums = np.zeros_like(surface.mesh.vertices)
     np.add.at(sums, faces, surface.normals[surface.supported])
     normals = sums[used]
@@ -556,9 +558,9 @@ class SurfacePoints:
     Attributes
     ----------
     cloud : N points.
-    inferred : (N,) bool, those that no phase shows.
-    light : (3, N) probabilities that a view shows specular and diffuse light there, and the degree
-        of polarization: means over the views.
+    inferred : (N,) bool, points that no phase shows.
+    light : (3, N) probabilities of specular and of diffuse light, and the degree of polarization:
+        means over the views.
     """
 
     cloud: FusedCloud
@@ -566,7 +568,7 @@ class SurfacePoints:
     light: Array
 
     def scalars(self) -> dict[str, NDArray[np.float32]]:
-        """The light by the names that it has in files."""
+        """The light by the names of the columns in files."""
         names = ("specular", "diffuse", "dolp")
         return dict(zip(names, self.light.astype(np.float32), strict=True))
 
@@ -581,13 +583,13 @@ def surface_points(
     surface : of all views.
     maps : of the views, for the intensity.
     spacing : mean distance of neighbours, world units.
-    max_points : the spacing grows beyond that.
+    max_points : largest number of points; above it the spacing grows.
     """
     mesh = surface.mesh
     area = float(mesh.face_areas[surface.supported].sum())
     if area <= 0:
         return SurfacePoints(no_points(), np.zeros(0, np.bool_), np.zeros((3, 0)))
-    # Random places leave gaps: of three times as many, one in each voxel.
+    # Random points leave gaps: three times as many are drawn, and one is kept in each voxel.
     num = int(min(max(3 * area / spacing**2, 1), 3 * max_points))
     face, barycentric = sample_surface(
         mesh, surface.supported.astype(np.float64), num, np.random.default_rng(0)
@@ -608,7 +610,7 @@ def surface_points(
 
 
 def _finite(values: Array) -> NDArray[np.float32]:
-    """Deviations as they are written: NaN where unknown."""
+    """Deviations for writing: NaN where unknown."""
     return np.where(np.isfinite(values), values, np.nan).astype(np.float32)
 
 
@@ -642,12 +644,12 @@ def _intensity(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> NDArr
 def render_view(
     surface: GlobalSurface, scene: RayScene, view: View, stride_px: int
 ) -> DenseView | None:
-    """Depth and normals of the surface in one view; None where it sees nothing of it.
+    """Depth and normals of the surface in one view; None if the view does not see it.
 
     Parameters
     ----------
     surface : of all views.
-    scene : of the surface's mesh, all of it: parts that no view bears out hide others as well.
+    scene : of the whole mesh: parts that no view supports occlude others as well.
     view : to render.
     stride_px : distance of the lattice's points, px.
     """

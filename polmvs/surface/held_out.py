@@ -1,10 +1,9 @@
-"""What a surface of some views says of the others: a check by data that it was not made from.
+"""Held-out views: a check of a surface with data that it was not fitted to.
 
-A surface that was fitted to phases and silhouettes agrees with them, right or wrong: two kinds of
-light are open at each place, and a bent surface follows what it is given. So some views are left
-out, the surface is made again of the others, coarsely, and what the views that are left out show is
-predicted from it. With wrong poses, a wrong camera, wrong light or wrong masks it is not what they
-show.
+A surface that was fitted to phases and silhouettes agrees with them, right or wrong: each point may
+have either kind of light, and a bent surface follows its data. So some views are left out, a coarse
+surface is made from the others, and the left-out views are predicted from it. With wrong poses, a
+wrong camera, wrong light or wrong masks, the predictions fail.
 """
 
 from __future__ import annotations
@@ -30,34 +29,34 @@ from polmvs.surface.visual_hull import Plane, visual_hull
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-MIN_PREDICTING = MIN_VIEWS  # views that a surface of the others is made of
+MIN_PREDICTING = MIN_VIEWS  # least number of views for a surface
 STRIDE_PX = 4
-# Of two kinds of light the nearer one errs by 0 to 45 deg, evenly, where nothing is known: 22.5 deg
-# in the median; of one kind by 0 to 90.
+# By chance, the error under the nearer of two kinds of light is uniform in 0 to 45 deg: 22.5 deg in
+# the median; under one kind it is in 0 to 90.
 CHANCE_DEG = (22.5, 45.0)
-# A phase that is known less well than this says little: chance agrees with it to two deviations at
-# half of the places.
+# A phase with a larger deviation has little information: by chance it agrees within two deviations
+# at half of the pixels.
 MAX_SIGMA_DEG = 6.0
-# Farther from the phases of both kinds of light than this, a normal has another cause than noise
-# (facets, marks, light from elsewhere): chance is at 78 % of places. Guess.
+# A residual larger than this under both kinds of light is not noise (facets, marks, light from
+# elsewhere); by chance it is larger at 78 % of the pixels. Guess.
 UNEXPLAINED_DEG = 10.0
-MIN_PHASES = 50  # of one view, for their median to be one
+MIN_PHASES = 50  # least number of phases of one view for a median
 MIN_SINE = 0.1  # between ray and normal, for a phase to be defined
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutTolerances:
-    """How views are left out.
+    """Tolerances of held-out views.
 
     Attributes
     ----------
-    share : of the views that are left out at a time, one of so many. Guess.
-    levels : of the refinement, coarse. Measured: on three captures its predictions err by as much
-        as those of the solver's first two levels, in 0.45 of the time; on one by 15 % more.
-    careful_levels : of a second trial where the first predicts badly: it may have been too short.
-    doubtful_deg : error from which there is one. Measured: right results had 1.1 to 2.4 deg; one of
-        them 10 at first, and 0.6 at the second trial.
-    width_px : of the smoothing of the phases that are predicted.
+    share : one of so many views is left out at a time. Guess.
+    levels : of the coarse refinement. Measured: on three captures the error of its predictions is
+        that of the solver's first two levels, in 0.45 of the time; on one it is 15 % larger.
+    careful_levels : of a second trial if the first predicts badly, as it may have been too short.
+    doubtful_deg : error above which there is a second trial. Measured: right results had 1.1 to 2.4
+        deg; one of them 10 at first, and 0.6 at the second trial.
+    width_px : of the smoothing of the predicted phases.
     """
 
     share: int = 4
@@ -80,21 +79,21 @@ class ViewError:
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """How well views are predicted by a surface.
+    """How well a surface predicts views.
 
     Attributes
     ----------
-    num_views : that were predicted.
-    num_phases : of them, at every few pixels, that are known well enough to tell.
-    error_deg : median of the angles about the ray between the measured plane of incidence,
-        under the kind of light that is nearer, and the surface's normal.
-    chance_deg : that median for normals that have nothing to do with the phases.
+    num_views : number of predicted views.
+    num_phases : number of their phases, at every few pixels, with a small enough deviation.
+    error_deg : median angle about the ray between the measured plane of incidence, under the
+        nearer kind of light, and the surface's normal.
+    chance_deg : this median for normals that are independent of the phases.
     within : share of the phases within two of their stated deviations.
-    unexplained : share that neither kind of light explains: farther from both than 10 deg and three
-        deviations.
-    overlap : silhouettes and their predictions, intersection over union; what a view leaves open
-        counts for neither.
-    views : errors of each view that tells one.
+    unexplained : share that neither kind of light explains: farther from both than 10 deg and
+        three deviations.
+    overlap : intersection over union of silhouettes and their predictions; unknown pixels are
+        ignored.
+    views : errors of each view that has enough phases.
     """
 
     num_views: int
@@ -107,7 +106,7 @@ class Prediction:
     views: tuple[ViewError, ...] = ()
 
     def odd_view(self, limit_deg: float) -> str | None:
-        """The one view, of several, that is predicted worse than a limit; None: none or more."""
+        """The view, if exactly one of several, that is predicted worse than a limit."""
         odd = [view.name for view in self.views if view.error_deg > limit_deg]
         return odd[0] if len(odd) == 1 < len(self.views) else None
 
@@ -126,17 +125,17 @@ def predict_left_out(
 
     Parameters
     ----------
-    views : that a surface was made of.
+    views : from which the surface was made.
     plane : on which the objects stand.
-    looking : angle model and the share of the tilt that the whole surface took back.
+    looking : angle model and the share of the tilt that the whole surface corrects.
     known : points of the surface.
     light : as of :func:`polmvs.surface.global_surface.reconstruct_surface`.
-    outside : pixels (H, W) of each view, by its name, that are not compared: they show what lies
-        outside a box that the result was cut to.
+    outside : pixels (H, W) of each view, by its name, that are not compared: they show what is
+        outside the crop box.
 
     Returns
     -------
-    None where too few views are left to make a surface of.
+    None if too few views remain for a surface.
     """
     tol = tolerances or HeldOutTolerances()
     left_out = np.zeros(len(views), np.bool_)
@@ -171,7 +170,7 @@ def predict(
     outside: Mapping[str, Mask] = MappingProxyType({}),
     width_px: float = HeldOutTolerances.width_px,
 ) -> Prediction:
-    """Hold what views show against a mesh; parameters as of :func:`predict_left_out`."""
+    """Compare views with a mesh; parameters as of :func:`predict_left_out`."""
     scene = RayScene(mesh) if len(mesh.faces) else None
     common, either = 0, 0
     of_views: list[ViewError] = []

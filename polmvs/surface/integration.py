@@ -1,14 +1,14 @@
 """Integration: range and normal of every pixel of a polarized region, coarse to fine.
 
-Each view's lattice is one sparse least-squares problem for the logarithm of its ranges: normals
-from the phases of all views say how it changes from pixel to pixel, seeds where it lies, and what
-the other views see, of the round before, ties the views to one surface. Where a view sees the
-surface at a grazing angle, a small error of its normals is a large one of its ranges; others see
-the same place better. Views depend on each other through the round before only.
+Each view's lattice is one sparse least-squares problem for the logarithm of its ranges. Normals
+from the phases of all views give its change from pixel to pixel, seeds give its value, and the
+surfaces of the other views in the previous round tie the views to one surface. At a grazing angle a
+small error of the normals is a large error of the ranges; other views see the same point better.
+Views depend on each other only through the previous round.
 
-Normals need the nodes' places in the other views and ranges come from the normals, so the two
-alternate (:func:`relax`); normals depend on the places weakly and few rounds suffice. Contour
-propagation (:mod:`polmvs.surface.contour`) differs only in which nodes it joins.
+Normals need the nodes' positions in the other views, and ranges come from the normals, so the two
+alternate (:func:`relax`). Normals depend weakly on the positions, so few rounds suffice. Contour
+propagation (:mod:`polmvs.surface.contour`) differs only in which nodes it connects.
 """
 
 from __future__ import annotations
@@ -61,26 +61,26 @@ from polmvs.surface.view_selection import choose_neighbors
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-REFINEMENTS = (4, 2, 1)  # strides of the coarsest lattice and those that follow, of the last one's
+REFINEMENTS = (4, 2, 1)  # strides of the lattices, coarsest first, in strides of the last one
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class IntegrationTolerances:
-    """How views are started from seeds and tied to each other.
+    """Tolerances of the start from seeds and of the ties between views.
 
     Attributes
     ----------
-    min_agreeing : views that tie a node: the error of a single one must not return to it as
-        another's agreement. Derived.
-    correlation_px : Errors of another view's map are alike over about this distance: its
-        points within it are worth one. Measured on the shared captures.
-    common_share : of a tie's deviation that all ties of a view have in common, as the views
-        share seeds and rows. Measured on a curved part: the stated deviations came out half of
-        the errors at 0 and twice the errors at 1.
-    min_own_weight : of a view's own row, under which it denies the node; that of a row 4
-        deviations off. Derived.
+    min_agreeing : least number of views that tie a node: the error of a single view must not return
+        to it as the agreement of another. Derived.
+    correlation_px : errors of another view's map are correlated over about this distance: its
+        points within it count as one. Measured on the shared captures.
+    common_share : share of a tie's deviation that all ties of a view have in common, as the views
+        share seeds and rows. Measured on a curved part: the stated deviations are half of the
+        errors at 0 and twice the errors at 1.
+    min_own_weight : weight of a view's own row below which the row contradicts the node; that of a
+        row 4 deviations off. Derived.
     """
 
     min_agreeing: int = 2
@@ -116,7 +116,7 @@ def integrate(
 
     Returns
     -------
-    Per view its dense result, or None where neither a seed nor another view reaches it.
+    Dense result of each view, or None if neither a seed nor another view reaches it.
     """
     workers = workers or Workers(1)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
@@ -126,7 +126,7 @@ def integrate(
 
 @dataclass(frozen=True)
 class RoundPlan:
-    """One round: its lattice, and whether the other views' surfaces tie the view's own."""
+    """One round: its lattice, and whether the surfaces of other views tie the view's own."""
 
     stride_px: int
     use_consensus: bool
@@ -135,9 +135,9 @@ class RoundPlan:
 def plan_rounds(options: PropagationOptions) -> list[RoundPlan]:
     """``num_rounds`` on the coarsest lattice, then one on each finer one.
 
-    The last on the coarsest and those on finer ones are tied to the other views. The first ranges
-    come from a few seeds and are wrong by centimetres on a curved part: each view mends its own
-    fast, and ties to others would hold it back.
+    The last round on the coarsest lattice and those on finer ones use ties to the other views. The
+    first ranges come from a few seeds and are wrong by centimetres on a curved part: each view
+    corrects its own fast, and ties would slow this down.
     """
     coarse, *finer = [options.stride_px * factor for factor in REFINEMENTS]
     alone = [RoundPlan(coarse, False)] * (options.num_rounds - 1)
@@ -151,7 +151,7 @@ class ViewTask:
     Attributes
     ----------
     maps, dense : of the view and its neighbours.
-    nodes : of the view, if the round before handed any on.
+    nodes : of the view, if the previous round provides them.
     plan : of the round.
     path : stem of the files of the view's result.
     """
@@ -173,18 +173,18 @@ def in_rounds(
     on_progress: OnProgress,
     nodes: Sequence[Nodes | None] | None = None,
 ) -> list[DenseView | None]:
-    """Solve all views anew in every round, from what the round before made of them.
+    """Solve all views in every round, from the results of the previous round.
 
     Parameters
     ----------
-    solve : one view's nodes for its next round, and its dense result.
+    solve : gives one view's nodes for the next round, and its dense result.
     plans : of the rounds.
     maps : of the views.
-    neighbors : per view the indices of the views that help it, itself first.
+    neighbors : for each view the indices of the views that it uses, itself first.
     folder : for the dense views.
-    workers : processes to share the views among.
+    workers : processes for the views.
     on_progress : called with 1 for each view of each round.
-    nodes : per view those of the first round; None: ``solve`` makes its own.
+    nodes : nodes of each view for the first round; None: ``solve`` makes its own.
     """
     folder.mkdir(parents=True, exist_ok=True)
     dense: list[DenseView | None] = [None] * len(maps)
@@ -270,7 +270,7 @@ def _lattice_nodes(
 def surface_at_seeds(phase_map: PhaseMap, seeds: Seeds, xy: Floats) -> SurfaceSamples | None:
     """A first guess of the surface at some pixels: range and normal of the nearest seeds.
 
-    None where the view sees no seed.
+    None if the view sees no seed.
     """
     visible, seed_xy = visible_seeds(phase_map, seeds)
     if not visible.any() or not len(xy):
@@ -310,14 +310,14 @@ def relax(
     Parameters
     ----------
     angle_model : of the rows.
-    maps, dense : phase maps, and dense views of the round before where there are any, the view's
-        own first.
-    nodes : of the first view, with the ranges and normals of the round before.
+    maps, dense : phase maps, and dense views of the previous round if there are any, the view's own
+        first.
+    nodes : of the first view, with the ranges and normals of the previous round.
     seeds : points on the surface.
     bending : deviation of the smooth modes, as a share of the distance; 0: none.
     tilt_aware : of the rows' weights.
     along_contours : ranges (OPA: depths) are constant along the nodes' contours.
-    use_consensus : the surfaces that the other views see tie the nodes, too.
+    use_consensus : the surfaces of the other views also tie the nodes.
     tolerances : of this step.
     """
     center = maps[0].view.center_in_world
@@ -376,7 +376,7 @@ def tie_to_consensus(
 ) -> SeedTies:
     """Tie the nodes of the first view to the surface on which the other views agree.
 
-    Each tie is a seed of its own.
+    Each tie counts as a separate seed.
     """
     surface, center = nodes.surface, maps[0].view.center_in_world
     distance = np.exp(surface.log_range)

@@ -1,4 +1,4 @@
-"""The points of the depth maps that COLMAP itself made, where no polarized surface was found."""
+"""Points of COLMAP's own depth maps where no polarized surface was found."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class KeptDepthTolerances:
-    """Which points of COLMAP's depth maps are kept; lengths in GSD.
+    """Tolerances of the points of COLMAP's depth maps that are kept; lengths in GSD.
 
     Attributes
     ----------
-    stride_px : every how many-th pixel is used, and the side of the voxel in which a second view
-        must have a point. Derived: as dense as the polarized surface.
-    min_agreement : share of the points that have a second view, below which the maps are doubted;
-        a guess: COLMAP keeps what other views confirm, so that most have one, and hardly one by
-        chance where the maps are of another unit or frame than the poses.
-    normal_sigma_deg : that COLMAP's fusion allows between views. Derived: its own default.
-    clearance_px : from the polarized surface; a guess.
+    stride_px : stride of the used pixels, and side of the voxel in which a second view must have a
+        point. Derived: as dense as the polarized surface.
+    min_agreement : share of the points with a second view below which the maps are doubtful; a
+        guess: COLMAP keeps points that other views confirm, so most have one. If unit or frame of
+        the maps and poses differ, hardly any has one.
+    normal_sigma_deg : difference that COLMAP's fusion allows between views. Derived: its default.
+    clearance_px : distance from the polarized surface; a guess.
     """
 
     stride_px: int = PropagationOptions.stride_px
@@ -48,16 +48,16 @@ def kept_cloud(
     *,
     tolerances: KeptDepthTolerances = KeptDepthTolerances(),
 ) -> FusedCloud:
-    """Fuse the maps of a workspace, leaving out what lies on a polarized surface.
+    """Fuse the maps of a workspace without the points on polarized surfaces.
 
     Parameters
     ----------
     workspace : with maps of some views; one view is in memory at a time.
-    surface_points : (N, 3), world, of the polarized surfaces, which have their own points.
+    surface_points : (N, 3), world, of the polarized surfaces.
 
     Returns
     -------
-    Points that two views or more put into one voxel.
+    Points of voxels that two views or more have points in.
     """
     clouds, gsds = [], []
     for item in workspace.views:

@@ -1,19 +1,19 @@
-"""Which light dominates each observation: specular, diffuse or neither, inferred with the shape.
+"""Labels of the observations: specular, diffuse or neither, inferred together with the shape.
 
 Let ``r_s = m_s . n`` and ``r_d = m_d . n`` be the residuals of an observation under the two kinds
 of light. Its likelihood is the mixture
 
     p = w_s N(r_s; 0, v) + w_d f(dolp, theta) N(r_d; 0, v) + w_o U,
 
-v the variance of the row, widened by the error that the current normal may have, which shrinks from
-iteration to iteration; f falls where the degree of polarization exceeds what diffuse light can have
-at this angle (Fresnel, for the largest refractive index of dielectrics). Labels of neighbouring
-faces in one view are alike unless the polarization between them turns by a right angle, which takes
-it through zero: a mean field (Ising) couples them by the cosine of the angle between their axial
-vectors.
+Here v is the variance of the row plus the assumed error of the current normal, which shrinks from
+iteration to iteration. The factor f falls where the degree of polarization exceeds that of diffuse
+light at this angle (Fresnel, for the largest refractive index of dielectrics). Labels of
+neighbouring faces in one view are equal unless the polarization between them turns by a right
+angle, which takes it through zero: a mean field (Ising) couples them by the cosine of the angle
+between their axial vectors.
 
-A normal that all observations of a face's surroundings contradict is no ground for labels:
-:func:`vote` tries normals about it with both labels open.
+A normal that all observations around a face contradict cannot give labels: :func:`vote` tries
+normals about it with both labels open.
 """
 
 from __future__ import annotations
@@ -39,25 +39,25 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class LabelTolerances:
-    """Numbers of the labels.
+    """Tolerances of the labels.
 
     Attributes
     ----------
-    refractive_index : the largest of common dielectrics (glazes, lacquers); it bounds the degree of
+    refractive_index : largest of common dielectrics (glazes, lacquers); it bounds the degree of
         polarization of diffuse light. Derived.
-    angle_margin : rad, of the mesh's normal in that bound, beside its annealed error. Guess.
+    angle_margin : rad, of the mesh's normal in that bound, beyond its annealed error. Guess.
     excess_scale : relative excess over the bound by which diffuse light becomes less likely by e.
         Guess.
     outlier : density of observations of neither light, over the peak of a normal's. Guess.
-    coupling : of neighbours' labels. Guess: an observation's say against one neighbour's.
+    coupling : of neighbours' labels. Guess: one neighbour has the weight of the observation.
     coupling_rounds : of the mean field.
     vote_tilts : rad, from the mesh's normal to the candidates, rings of ten.
-    vote_rings : of faces that share their votes. Measured: 1 and 3 alike on a public ceramic; a
-        ledge beside a box lies 0.3 and 0.57 px off.
-    vote_sigma : rad, error of a candidate: half the distance of neighbouring ones.
+    vote_rings : rings of faces that share their votes. Measured, 1 and 3: equal on a public
+        ceramic; a ledge beside a box is 0.3 and 0.57 px off.
+    vote_sigma : rad, error of a candidate: half the distance of neighbouring candidates.
     vote_prior : cost per square of a candidate's tilt. Guess.
     vote_margin : mean cost by which a candidate must win. Guess.
-    max_cost : of an observation in a vote: that of 3 deviations.
+    max_cost : largest cost of an observation in a vote: that of 3 deviations.
     """
 
     refractive_index: float = 1.7
@@ -77,7 +77,7 @@ class LabelTolerances:
 def neighbors(
     observations: Observations, pairs: tuple[Indices, Indices], num: int
 ) -> sparse.csr_array:
-    """How surely the labels of two observations are the same (K, K), in [0, 1].
+    """Coupling (K, K) of the labels of two observations, in [0, 1].
 
     It is not 0 for observations of one view on faces that share an edge.
 
@@ -114,7 +114,7 @@ def neighbors(
 
 
 def _excess(dolp: Floats, sigma_dolp: Floats, angle: Floats, tol: LabelTolerances) -> Array:
-    """Log-likelihood that diffuse light loses by a degree of polarization beyond its bound."""
+    """Loss of the log-likelihood of diffuse light by a degree of polarization above its bound."""
     bound = fresnel_dolp(np.cos(np.minimum(angle, 1.5)), Light.DIFFUSE, tol.refractive_index)
     bound = bound + 2 * sigma_dolp + 0.01
     log = np.log(np.maximum(dolp, 1e-6) / bound)
@@ -131,16 +131,16 @@ def responsibilities(
     weights: tuple[float, float] = (0.5, 0.5),
     tolerances: LabelTolerances | None = None,
 ) -> Array:
-    """Probabilities (2, K) that an observation's light is specular, and diffuse; else neither.
+    """Probabilities (2, K) of specular and of diffuse light of observations; the rest is neither.
 
     Parameters
     ----------
     observations : of a mesh with F faces.
     normals : (F, 3) unit, assumed.
-    normal_sigma : rad, error of these.
-    row_sigma : (2, K) of ``m . n``, that noise does not explain.
-    near : as of :func:`neighbors`; None: neighbouring observations do not count.
-    weights : shares of specular and of diffuse light among all; 0 for one that is known not to be.
+    normal_sigma : rad, their error.
+    row_sigma : (2, K) deviation of ``m . n`` that noise does not explain.
+    near : from :func:`neighbors`; None: no coupling.
+    weights : prior shares of specular and of diffuse light; 0 for one that does not occur.
     """
     tol = tolerances or LabelTolerances()
     o = observations
@@ -170,7 +170,7 @@ class Vote:
     Attributes
     ----------
     normals : (F, 3) unit: the winner, or the mesh's own.
-    has_won : (F,) bool, where it is not the mesh's own.
+    has_won : (F,) bool, True where it is not the mesh's own.
     """
 
     normals: Array
@@ -185,7 +185,7 @@ def vote(
     row_sigma: Floats,
     tolerances: LabelTolerances | None = None,
 ) -> Vote:
-    """Try normals about those of the mesh with the labels of all observations open.
+    """Try normals about those of the mesh, with the labels of all observations open.
 
     Parameters
     ----------

@@ -2,8 +2,7 @@
 
 Between two pixels of a surface with normal ``n`` the distances along the rays ``v`` obey
 ``log r_j - log r_i = log((n . v_i) / (n . v_j))``, exactly so on a plane and for any camera model.
-Seeds fix the value of some nodes; robust losses let wrong seeds and edges across depth jumps
-lose.
+Seeds fix the value of some nodes. Robust losses reject wrong seeds and edges across depth jumps.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ Floats = NDArray[np.floating]
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-NUM_DRAWS = 16  # of the noise, for the deviation of the solution: 18 % uncertain where alone
+NUM_DRAWS = 16  # of the noise, for the deviation of the solution, which is then 18 % uncertain
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +40,8 @@ class Edges:
 class SeedTies:
     """Seeds tied to nodes: ``log_range[node] = value`` with deviation ``sigma``; by seed index.
 
-    ``common`` is the deviation of an error that all ties share, whatever their number; it does
-    not change their weight, only how certain the solution is.
+    ``common`` is the deviation of an error that all ties share. It does not change their weight,
+    only the uncertainty of the solution.
     """
 
     node: Indices
@@ -73,7 +72,7 @@ class RangeSolution:
 def log_range_increment(normals: Floats, rays_tail: Floats, rays_head: Floats) -> Array:
     """``log r_head - log r_tail`` on a plane with normal ``n`` (all ``(..., 3)``, one frame).
 
-    The normal may be of any length. What is flatter than can be seen counts as what just can.
+    The normal may have any length. Surfaces flatter than a limit count as that limit.
     """
     least = -MIN_FACING_COSINE * np.maximum(lengths(normals), 1e-12)
     tail = np.minimum(dots(normals, rays_tail), least)
@@ -96,7 +95,7 @@ def solve_log_ranges(
     modes: Array | None = None,
     num_rounds: int = 4,
 ) -> RangeSolution:
-    """Robust least squares for the log-ranges of the nodes that seeds reach.
+    """Robust least squares for the log-ranges of the nodes connected to seeds.
 
     Iteratively reweighted with Cauchy losses on seeds and edges; each round is one sparse
     factorisation (SuperLU on the normal matrix).
@@ -104,11 +103,11 @@ def solve_log_ranges(
     Parameters
     ----------
     num_nodes : N.
-    edges, ties : what is known, with deviations of independent errors.
-    num_seeds : S; a seed is tied to several nodes and right or wrong as a whole.
-    modes : (N, M), smooth functions of the nodes. The log-range is the integral of the edges
-        plus a combination of these: the errors of the increments are not independent, a wrong
-        camera model bends the whole surface. Each as large as one standard deviation of it.
+    edges, ties : the constraints, with deviations of independent errors.
+    num_seeds : S; a seed is tied to several nodes and is right or wrong as a whole.
+    modes : (N, M), smooth functions of the nodes. The log-range is the integral of the edges plus a
+        combination of these, as the errors of the increments are not independent: a wrong camera
+        model bends the whole surface. The size of each is one standard deviation.
     num_rounds : of reweighting.
     """
     modes = np.zeros((num_nodes, 0)) if modes is None else modes

@@ -1,4 +1,4 @@
-"""A COLMAP dense workspace of dense views: their depth and normals at the pixels of its maps."""
+"""Export of dense views to a COLMAP dense workspace: depth and normals at its map pixels."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 DenseLoader = Callable[[str], DenseView | None]
 
-BAND_ROWS = 128  # worked on at once: what bounds the memory
+BAND_ROWS = 128  # processed at once, to bound the memory
 CORNERS = ((0, 0), (0, 1), (1, 0), (1, 1))
 # From a ray to the nearest known point, strides: a lattice point stands for its cell, up to the
 # corners.
 REACH = float(np.sqrt(0.5))
-# Of a surface between neighbouring lattice points, rad; more is what the fusion of clouds takes for
+# Angle of a surface between neighbouring lattice points, rad; the fusion of clouds takes more for
 # two surfaces.
 MAX_TURN = float(np.radians(FusionOptions.max_normal_difference_deg))
 
@@ -45,8 +45,8 @@ def export_dense_workspace(
 
     Parameters
     ----------
-    load_dense : gives an image's dense result by name, None for a view without; such a view has
-        no maps and is not in ``fusion.cfg``.
+    load_dense : gives an image's dense result by name, or None; a view without has no maps and is
+        not in ``fusion.cfg``.
     folder, sparse_model, load_image, blank_pixels, max_image_size : see
         :func:`polmvs.colmap.dense_workspace.write_dense_workspace`.
 
@@ -73,9 +73,9 @@ def export_dense_workspace(
 def warp_dense_view(dense: DenseView, view: View, target: PinholeCamera) -> DepthNormals:
     """Depth and normals of a dense view at the map pixels of an undistorted camera.
 
-    Every known lattice point beside a pixel's ray extends its plane to that ray. Those that agree
-    with the nearest one are averaged bilinearly; across a depth edge or a crease the nearest one
-    decides. A ray further from every known point than ``REACH`` has no depth.
+    Every known lattice point next to a pixel's ray extends its plane to that ray. Points that agree
+    with the nearest one are averaged bilinearly; across a depth edge or a crease only the nearest
+    one is used. A ray farther than ``REACH`` from every known point has no depth.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def _extend(dense: DenseView, view: View, rays: Array, position: Array) -> tuple
 
 
 def _some_known(known: Mask) -> Mask:
-    """Whether any corner of a lattice square (h + 1, w + 1) is known, those of the rim included."""
+    """Whether any corner of a lattice square (h + 1, w + 1) is known, border squares included."""
     padded = np.pad(known, 1)
     return np.asarray(padded[:-1, :-1] | padded[:-1, 1:] | padded[1:, :-1] | padded[1:, 1:])
 
@@ -195,7 +195,7 @@ def _blend(neighbours: _Neighbours, rays: Array, stride: float) -> tuple[Array, 
     log_range, normals, distance, weight = neighbours
     nearest = distance.argmin(axis=0), np.arange(len(rays))
     known = distance[nearest] <= REACH
-    # Of two surfaces the one seen more steeply sets the bound: a limb must not hide an edge.
+    # Of two surfaces the one seen less obliquely sets the bound: a limb must not hide an edge.
     cosine = -dots(normals, np.broadcast_to(rays, normals.shape))
     cosine = np.maximum(np.maximum(cosine, cosine[nearest]), MIN_FACING_COSINE)
     same: Mask = np.abs(log_range - log_range[nearest]) <= MAX_TURN * stride / cosine**2

@@ -1,6 +1,6 @@
 """Triangle meshes as arrays: normals, neighbourhoods, ray casting, and extraction from a grid.
 
-Ray casting is Open3D's (Embree), imported where a mesh is first cast on.
+Ray casting uses Open3D (Embree), which is imported at the first cast.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Floats = NDArray[np.floating]
 Faces = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-# Of rays whose majority tells inside from outside, should one graze an edge; along no axis.
+# Directions of rays whose majority decides inside or outside, as one may graze an edge; not axes.
 SIGN_DIRECTIONS = (
     np.array([0.36, 0.48, 0.80]),
     np.array([-0.70, 0.10, 0.71]),
@@ -35,7 +35,7 @@ BAND_CELLS = 3  # half width of the band about a mesh in which distances are com
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """A triangle mesh; what is derived from it is computed once.
+    """A triangle mesh; derived quantities are computed once.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class TriangleMesh:
 
     @cached_property
     def vertex_normals(self) -> Array:
-        """Unit normals ``(V, 3)``, means of the faces' weighted by area; 0 without any."""
+        """Unit normals ``(V, 3)``, means of the face normals weighted by area; 0 without faces."""
         total: Array = np.stack(
             [
                 np.bincount(self.faces.ravel(), np.repeat(column, 3), len(self.vertices))
@@ -118,7 +118,7 @@ class TriangleMesh:
 
     @cached_property
     def face_pairs(self) -> sparse.csr_array:
-        """How many vertices two faces share, ``(F, F)``, where they share any."""
+        """Number of vertices that two faces share, sparse ``(F, F)``."""
         return sparse.csr_array(self.incidence @ self.incidence.T)
 
     @cached_property
@@ -149,8 +149,8 @@ class RayHits:
 
     Attributes
     ----------
-    distance : (N,) in lengths of the ray's direction; inf where it meets nothing.
-    face : (N,) int64, -1 where it meets nothing.
+    distance : (N,) in lengths of the ray's direction; inf without a hit.
+    face : (N,) int64, -1 without a hit.
     barycentric : (N, 3) of the hit in its face.
     """
 
@@ -176,7 +176,7 @@ class Crossings:
 
 
 class RayScene:
-    """A ``mesh`` to cast rays on and to measure distances to."""
+    """A ``mesh`` for ray casting and distances."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
         o3d = import_open3d()
@@ -189,7 +189,7 @@ class RayScene:
             self._tensor(self._local(mesh.vertices)),
             self._tensor(np.ascontiguousarray(mesh.faces, np.uint32)),
         )
-        if len(mesh.faces):  # the first question builds the tree, which two threads must not
+        if len(mesh.faces):  # the first query builds the tree, which two threads must not do
             self._scene.cast_rays(self._tensor(np.ones((1, 6), np.float32)))
 
     def _local(self, points: Floats) -> NDArray[np.float32]:
@@ -208,7 +208,7 @@ class RayScene:
         return RayHits(distance, np.where(np.isfinite(distance), face, -1), barycentric)
 
     def closest(self, points: Floats) -> tuple[Array, NDArray[np.int64], NDArray[np.float32]]:
-        """Closest points ``(N, 3)``, their faces ``(N,)`` and places in these ``(N, 3)``."""
+        """Closest points ``(N, 3)``, their faces ``(N,)`` and barycentrics ``(N, 3)``."""
         found = self._scene.compute_closest_points(self._tensor(self._local(points)))
         uv = found["primitive_uvs"].numpy()
         place = found["points"].numpy().astype(np.float64) + self._origin
@@ -220,12 +220,12 @@ class RayScene:
     ) -> NDArray[np.float32]:
         """Distance ``(N,)`` to the mesh, negative inside of it.
 
-        Inside is what the mesh winds about: where it overlaps itself too.
+        A point is inside if the mesh winds about it, also where the mesh overlaps itself.
 
         Parameters
         ----------
         points : (N, 3).
-        num_rays : odd, up to 3, whose majority decides: one may graze an edge.
+        num_rays : number of rays whose majority decides, odd, up to 3: one may graze an edge.
         """
         if not len(points):  # Open3D crashes on none
             return np.zeros(0, np.float32)
@@ -241,14 +241,14 @@ class RayScene:
         return np.asarray(2 * votes > num_rays)
 
     def crossed_faces(self, depth: float) -> NDArray[np.int64]:
-        """Faces that do not part inside from outside: sheets of the mesh have crossed.
+        """Faces that do not separate inside from outside, because sheets of the mesh have crossed.
 
         Parameters
         ----------
-        depth : distance of the points on both sides of a face that are compared.
+        depth : distance of the compared points on both sides of a face.
         """
         suspects = np.arange(len(self.mesh.faces))
-        # One ray clears nearly all faces; the others are looked at by three.
+        # One ray decides nearly all faces; the others get three.
         for num_rays in (1, len(SIGN_DIRECTIONS)):
             if not len(suspects):
                 break
@@ -260,16 +260,16 @@ class RayScene:
         return suspects
 
     def inside_along(self, origins: Floats, direction: Array, distances: Array) -> Mask:
-        """Which places ``(D, N)`` on parallel rays lie inside.
+        """Which points ``(D, N)`` on parallel rays lie inside.
 
         Parameters
         ----------
         origins : (N, 3).
         direction : (3,) unit.
-        distances : (D,) of the places from the origins, ascending.
+        distances : (D,) of the points from the origins, ascending.
         """
         ray, leaves, length = self._crossings(self._local(origins), direction)
-        # What a place's ray leaves beyond it, more often than it enters.
+        # Beyond an inside point, the ray leaves the mesh more often than it enters it.
         last = np.searchsorted(distances, length)
         shape = (len(distances) + 1, len(origins))
         count = np.bincount(np.ravel_multi_index((last, ray), shape), leaves, shape[0] * shape[1])
@@ -289,7 +289,7 @@ class RayScene:
         return Crossings(ray[order], length[order], cosine)
 
     def _windings(self, local: NDArray[np.float32], direction: Array) -> NDArray[np.int64]:
-        """How often ``(N,)`` more a ray leaves the mesh than it enters it."""
+        """Number ``(N,)`` of times a ray leaves the mesh minus the times it enters it."""
         ray, leaves, _ = self._crossings(local, direction)
         return np.rint(np.bincount(ray, leaves, len(local))).astype(np.int64)
 
@@ -313,11 +313,11 @@ def visible_points(
     *,
     min_cosine: float,
 ) -> tuple[NDArray[np.int64], Array, Array]:
-    """Which points of the surface a camera sees.
+    """Points of the surface that a camera sees.
 
     Parameters
     ----------
-    scene : the mesh that may hide them; by less than half an edge it does not.
+    scene : the mesh, for occlusion; by less than half an edge length it does not count.
     center : (3,), of the camera.
     points, normals : (N, 3).
     min_cosine : between normal and direction to the camera.
@@ -342,13 +342,13 @@ def visible_points(
 def mesh_from_grid(values: NDArray[np.float32], origin: Array, step: float) -> TriangleMesh:
     """Surface at zero of a function on a grid, by surface nets.
 
-    One vertex for each cell that the surface passes, at the mean of its crossings of the cell's
-    edges, and a quad for each edge of the grid that it crosses: triangles are far more even than
+    Each cell that the surface passes has one vertex, at the mean of its crossings of the cell's
+    edges, and each crossed edge of the grid has one quad. The triangles are far more regular than
     those of marching cubes. Values are negative inside.
 
     Parameters
     ----------
-    values : (X, Y, Z); positive on the grid's border, or the surface is open there.
+    values : (X, Y, Z); if not positive on the grid's border, the surface is open there.
     origin : (3,), place of ``values[0, 0, 0]``.
     step : distance of neighbours.
     """
@@ -433,19 +433,19 @@ def remeshed(
     smoothing: float = 0.5,
     min_cells: int = 30,
 ) -> TriangleMesh:
-    """The mesh again with edges of about ``step``, through its signed distance on a grid.
+    """The mesh, remeshed with edges of about ``step`` from its signed distance on a grid.
 
-    The new mesh does not intersect itself; pieces that met are joined, and pieces that enclose
-    fewer than ``min_cells`` cells are gone.
+    The new mesh does not intersect itself; touching pieces are joined, and pieces that enclose
+    fewer than ``min_cells`` cells are removed.
 
     Parameters
     ----------
     mesh : closed.
     step : of the grid, world units.
-    solid : functions of points ``(N, 3)`` that give signed distances ``(N,)``, negative where
-        something is: it is added.
-    free : functions of points ``(N, 3)`` that give signed distances ``(N,)``, positive where space
-        is free: it is carved out, its borders unsmoothed.
+    solid : functions of points ``(N, 3)`` that give signed distances ``(N,)``, negative in solid
+        to add.
+    free : functions of points ``(N, 3)`` that give signed distances ``(N,)``, positive in free
+        space to carve; its borders are not smoothed.
     smoothing : width of a Gaussian on the distances, in steps.
     """
     if not len(mesh.faces):
@@ -465,7 +465,7 @@ def remeshed(
     limit = np.float32(BAND_CELLS * step)
     values = np.full(shape, np.nan, np.float32)
     values[band] = scene.signed_distance(origin + step * index, num_rays=1)
-    # The sign cannot change between neighbours that are farther from the mesh than each other.
+    # The sign cannot change between neighbours that are farther from the mesh than from each other.
     doubtful = np.zeros(shape, np.bool_)
     for axis in range(3):
         first, second = (np.moveaxis(values, axis, 0)[part] for part in (slice(-1), slice(1, None)))
@@ -478,7 +478,7 @@ def remeshed(
     values[band] = np.clip(values[band], -limit, limit)
     values[~band] = limit
     pieces, num_pieces = ndimage.label(~band)
-    # Outside of the band a piece has the sign that the band has beside it.
+    # Outside of the band a piece has the sign of the adjacent band.
     if num_pieces > 1:
         beside = ndimage.grey_dilation(np.where(band, 0, pieces), size=(3, 3, 3))
         touching = band & (beside > 0)
@@ -489,7 +489,7 @@ def remeshed(
         values = ndimage.gaussian_filter(values, smoothing)
     if solid:
         rest = np.stack(np.meshgrid(*map(np.arange, shape[1:]), indexing="ij"), axis=-1)
-        for number, slab in enumerate(values):  # what bounds the memory
+        for number, slab in enumerate(values):  # to bound the memory
             cells = np.concatenate([np.full((*shape[1:], 1), number), rest], axis=-1)
             points = origin + step * cells.reshape(-1, 3)
             for function in solid:
@@ -524,12 +524,12 @@ def _simplex_lattice(num: int) -> Array:
 def sample_surface(
     mesh: TriangleMesh, weights: Floats, num: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Array]:
-    """Faces ``(N,)`` and barycentric coordinates ``(N, 3)`` of points spread evenly over a mesh.
+    """Faces ``(N,)`` and barycentric coordinates ``(N, 3)`` of evenly spread points on a mesh.
 
     Parameters
     ----------
     mesh : the surface.
-    weights : (F,), share of each face that counts, 0 to 1.
+    weights : (F,), weight of each face, 0 to 1.
     num : expected number of points.
     rng : random numbers.
     """

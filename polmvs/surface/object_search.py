@@ -1,10 +1,10 @@
-"""The object in each view, found by what it hides: the surface on which it stands.
+"""The object in each view, found by the textured plane that it hides.
 
-Polarization does not show the outline of grey and white things. The plane beneath them does, where
-it has a texture: its image in one view is predicted from the others. What agrees with the
-prediction shows the plane, and space between it and the camera is free; what is left of the space
-above the plane is the object. Each view's outline then is where the image changes from the plane's
-prediction to the object's brightness, as in matting against a known background.
+Polarization does not show the outline of grey and white objects. The plane on which they stand
+does, if it has a texture: its image in one view is predicted from the others. Pixels that agree
+with the prediction show the plane, so the space between it and the camera is free. The remaining
+space above the plane is the object. The outline in each view is where the image changes from the
+predicted plane to the brightness of the object, as in matting against a known background.
 """
 
 from __future__ import annotations
@@ -29,34 +29,36 @@ Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-MAX_ODDS = 4.0  # logarithm, of one pixel: whatever it shows, something else may be wrong
-LEAST_SIGMA = 1e-3  # of a logarithm of intensity, and its least spread: what no image shows
-LEAST_ODDS = 0.7  # of what shows the plane, on the average of neighbours: two to one
+MAX_ODDS = 4.0  # log-odds of one pixel at most: any pixel may be wrong
+LEAST_SIGMA = 1e-3  # of a logarithm of intensity, and its least spread: no image is that exact
+LEAST_ODDS = 0.7  # log-odds of the plane, on the average of neighbours: two to one
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchTolerances:
-    """Numbers of the search.
+    """Tolerances of the search.
 
     Attributes
     ----------
     working_px : longest side of the images in which the object and its outline are searched.
     window_px : of the correlation with other views, working pixels.
-    num_near : other views that a view is correlated with.
-    num_others : other views that predict the plane, at most.
-    detail_px : deviation of the average that texture is told from.
+    num_near : number of other views with which a view is correlated.
+    num_others : largest number of other views that predict the plane.
+    detail_px : deviation of the average that is subtracted to get texture.
     lighting_px : window over which the plane's brightness may differ between views, and in which
-        what lies beyond the plane is compared with the object, working pixels.
+        the background beyond the plane is compared with the object, working pixels.
     num_levels : of brightness, in that comparison. Guess.
     extent_cells : of the grid on which the plane's extent is found, along its side. Guess.
     extent_gap : width of gaps in the extent that are closed, in those cells. Guess.
-    least_share : of a pixel's texture that is the plane's in two other views. Guess.
-    wrong_share : views that may deny a place of the object wrongly; two at least must deny it.
-    seen_share : views that must see a place; the objects lie in the common field of view.
+    least_share : share of a pixel's texture that agrees with the plane in two other views. Guess.
+    wrong_share : share of the views that may deny a point of the object wrongly; at least two must
+        deny it.
+    seen_share : share of the views that must see a point; the objects lie in the common field of
+        view.
     num_cells : of the coarse grid, along its side; the fine one has as many along the object's.
     num_rounds : of prediction and carving; a third changes the outlines by 0.1 px.
-    core_px, blend_px : an outline's object and surroundings are averaged this far from it, and over
-        this deviation, working pixels.
+    core_px, blend_px : distance from the outline at which object and surroundings are averaged, and
+        deviation of the average, working pixels.
     along_px : deviation of the average along the outline, working pixels.
     reach_px : of the search for the outline, working pixels.
     """
@@ -81,7 +83,7 @@ class SearchTolerances:
     reach_px: float = 4.0
 
     def needed(self, num_views: int) -> int:
-        """Views that must deny a place."""
+        """Number of views that must deny a point."""
         return max(2, round(self.wrong_share * num_views))
 
 
@@ -92,9 +94,9 @@ class FoundObject:
     Attributes
     ----------
     mask : (H, W) bool.
-    outline_shift : (H, W) float32 px, by how much the outline lies outside of the mask's border, at
-        each pixel that of the border's nearest place.
-    inner : (H, W) bool, what lies well within it, whatever the outline.
+    outline_shift : (H, W) float32 px, distance of the outline outside of the mask's border, at each
+        pixel that of the nearest border pixel.
+    inner : (H, W) bool, pixels well within the object for any outline.
     """
 
     mask: Mask
@@ -119,15 +121,15 @@ def find_object(
 
     Returns
     -------
-    None where the plane shows too little texture to tell what hides it, or its light moves.
+    None if the plane has too little texture to find what hides it, or if its light moves.
     """
     tol = tolerances or SearchTolerances()
     near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
     shows_plane: list[Mask] = []
-    for scale in (4, 2, 1):  # what has no fine texture may have a coarse one
+    for scale in (4, 2, 1):  # a plane without fine texture may have a coarse one
         small = [_working(phase_map, plane, tol.working_px / scale) for phase_map in maps]
         shares = _showing_plane(small, near, tol)
-        # A window at an outline on the plane shows the outline, within the object as well.
+        # A window next to an outline on the plane contains the outline, also inside the object.
         size = 2 * round(0.5 * tol.window_px + tol.detail_px) - 1
         found = [
             (cv2.erode(share, np.ones((size, size), np.uint8)) > tol.least_share) & ~view.polarized
@@ -199,7 +201,7 @@ class _Working:
         return np.asarray(self.view.project(points) / self.factor)
 
     def sees(self, xy: Floats, margin: float = 1.0) -> Mask:
-        """Whether working coordinates lie in the image."""
+        """Which working coordinates lie in the image."""
         height, width = self.log.shape
         x, y = xy[..., 0], xy[..., 1]
         return np.asarray(
@@ -236,7 +238,7 @@ def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
 
 
 def _showing_plane(views: Sequence[_Working], points: Floats, tol: SearchTolerances) -> list[Image]:
-    """Share (h, w) of each view's texture that is the plane's, as two other views see it too."""
+    """Share (h, w) of each view's texture on the plane, which two other views also see there."""
     details = [view.log - cv2.GaussianBlur(view.log, (0, 0), tol.detail_px) for view in views]
     correlations, variances, unexplained = [], [], []
     for index, view in enumerate(views):
@@ -279,7 +281,7 @@ def _marked(pixels: Mask, xy: Floats) -> Mask:
 
 @dataclass(frozen=True)
 class _Cells:
-    """Space on a grid, and which cells of it may hold the object.
+    """Grid cells that may hold the object.
 
     Attributes
     ----------
@@ -305,17 +307,17 @@ class _Cells:
         needed: int,
         testable: Sequence[Mask] | None = None,
     ) -> _Cells | None:
-        """Without the cells that some views see through; what is left of the middle one's part.
+        """The cells without those that some views see through; only the part around the middle.
 
         Parameters
         ----------
-        free : pixels of each view that see through.
-        needed : views that must see through a cell.
-        testable : pixels of each view that could see through; a cell must lie in those of two.
+        free : pixels of each view that show the background.
+        needed : number of views that must see through a cell.
+        testable : pixels of each view that could show it; a cell must lie in those of two views.
 
         Returns
         -------
-        None where nothing is left.
+        None if nothing is left.
         """
         points = self.centers()
         num_free, num_seen, num_tests = np.zeros((3, len(points)), np.int32)
@@ -332,7 +334,7 @@ class _Cells:
         parts, num = ndimage.label(held)
         if not num:
             return None
-        # The middle of the grid lies where the cameras look: the part that has most about it.
+        # The middle of the grid is where the cameras look: the part with most cells about it.
         x, y, _ = np.meshgrid(*(np.linspace(-1, 1, n) for n in held.shape), indexing="ij")
         nearness = ndimage.sum(np.exp(-8 * (x * x + y * y)), parts, np.arange(num + 1))
         nearness[0] = 0
@@ -340,13 +342,13 @@ class _Cells:
 
     @property
     def ends_at_sides(self) -> bool:
-        """Whether what is held goes on where the grid ends."""
+        """Whether the part reaches the sides of the grid."""
         held = self.held
         sides = (held[0], held[-1], held[:, 0], held[:, -1], held[:, :, -1])
         return any(side.any() for side in sides)
 
     def finer(self, tol: SearchTolerances) -> _Cells:
-        """The part that is held with a cell around it, on a finer grid."""
+        """The part, with a margin of one cell, on a finer grid."""
         inside = np.argwhere(self.held)
         low, high = inside.min(axis=0) - 1.0, inside.max(axis=0) + 1.0
         # The plane bounds the grid below.
@@ -375,7 +377,7 @@ class _Cells:
 
 
 def _space(views: Sequence[_Working], plane: Plane, tol: SearchTolerances) -> _Cells:
-    """Cells over the plane about the point where the cameras look, as far as most views reach."""
+    """Cells above the plane about the point where the cameras look, within the view of most."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
         camera = view.view.camera
@@ -403,10 +405,10 @@ def _space(views: Sequence[_Working], plane: Plane, tol: SearchTolerances) -> _C
 def _bounded(
     space: _Cells, views: Sequence[_Working], free: Sequence[Mask], tol: SearchTolerances
 ) -> _Cells | None:
-    """What is left of the space about the middle, if it ends within the space.
+    """The part around the middle that remains, if it ends within the space.
 
-    A view may deny a place wrongly, so that others must as well; among clutter fewer views see the
-    plane, and where what is left has no end one is enough.
+    A view may deny a point wrongly, so others must deny it as well. Among clutter fewer views see
+    the plane; if the remaining part does not end, one view is enough.
     """
     testable = [view.has_plane for view in views]
     for needed in (tol.needed(len(views)), 1):
@@ -468,13 +470,14 @@ def _along(plane: Plane) -> Array:
 
 @dataclass(frozen=True)
 class _Plate:
-    """What a view would show of the plane if nothing stood on it.
+    """Predicted image of the plane in a view, without the object.
 
     Attributes
     ----------
-    log : (h, w) float32, logarithm of the intensity; NaN where no two other views see the plane.
+    log : (h, w) float32, logarithm of the intensity; NaN where fewer than two other views see the
+        plane.
     deviation : (h, w) float32, of the views that see it.
-    changes : (n,), by how much the light on the plane varies over the image from view to view.
+    changes : (n,), variation of the light on the plane over the image from view to view.
     """
 
     log: Image
@@ -483,7 +486,7 @@ class _Plate:
 
 
 def _others(views: Sequence[_Working], index: int, tol: SearchTolerances) -> NDArray[np.int64]:
-    """Views that predict the plane in one: half near it, half from all around, which see behind."""
+    """Views that predict the plane in a view: half nearby, half from around, which see behind."""
     near, far = np.split(_nearest(views, index), [tol.num_others // 2])
     chosen = np.linspace(0, max(len(far) - 1, 0), tol.num_others // 2).round().astype(int)
     return np.concatenate([near, far[np.unique(chosen)] if len(far) else far])
@@ -492,10 +495,10 @@ def _others(views: Sequence[_Working], index: int, tol: SearchTolerances) -> NDA
 def _plates(
     views: Sequence[_Working], masks: Sequence[Mask], tol: SearchTolerances
 ) -> list[_Plate]:
-    """The plane in each view, as the others see it beside the object.
+    """The plane in each view, predicted from the others where the object does not hide it.
 
-    A lamp that moves with the camera, and gloss, change the plane's brightness from view to view;
-    over more than ``lighting_px`` each prediction is brought to the brightness of the view.
+    A lamp that moves with the camera, and gloss, change the plane's brightness from view to view.
+    At scales above ``lighting_px``, each prediction is adjusted to the brightness of the view.
     """
     kernel = np.ones((3, 3), np.uint8)
     free = [cv2.dilate(mask.astype(np.uint8), kernel) == 0 for mask in masks]
@@ -557,12 +560,11 @@ def _denied(
     masks: Sequence[Mask],
     tol: SearchTolerances,
 ) -> tuple[list[Mask], list[Mask]]:
-    """Where each view shows the plane, or what lies beyond it, rather than the object.
+    """Pixels of each view that show the plane, or the background beyond it, and not the object.
 
     Returns
     -------
-    Where all about a pixel shows it, so that no chance likeness is possible, and where single
-    pixels do.
+    Pixels whose whole neighbourhood shows it, which excludes chance, and single pixels that do.
     """
     noise = _residual(views, plates, masks)
     spread = np.mean([np.diff(np.percentile(view.log, (1, 99)))[0] for view in views])
@@ -581,10 +583,10 @@ def _denied(
 
 
 def _shows_beyond(view: _Working, mask: Mask, tol: SearchTolerances) -> Mask:
-    """Where a view shows what lies beyond the plane's end, a wall or another table (h, w).
+    """Pixels (h, w) that show the background beyond the plane, such as a wall or another table.
 
-    No other view predicts it. Its brightness tells it from the object, if theirs differ: that of
-    the object is known where the plane is behind it, that beyond the plane from beside the object.
+    No other view predicts it. It differs from the object in brightness, if at all: that of the
+    object is known in front of the plane, that of the background away from the object.
     """
     pixels = mask.astype(np.uint8)
     near = cv2.dilate(pixels, np.ones((tol.lighting_px, tol.lighting_px), np.uint8)) > 0
@@ -609,7 +611,7 @@ def _shows_beyond(view: _Working, mask: Mask, tol: SearchTolerances) -> Mask:
 
 
 def _odds(residual: Image, sigma: Image, spread: float) -> Image:
-    """Logarithm, that an image shows what was predicted rather than anything of a spread."""
+    """Log-odds that an image shows the prediction against a wide distribution."""
     sigma, spread = np.maximum(sigma, LEAST_SIGMA), max(spread, LEAST_SIGMA)
     # The noise is infinite where no place beside the object is predicted: then nothing is told.
     odds = np.log(spread / np.sqrt(2 * np.pi)) - np.log(sigma) - 0.5 * (residual / sigma) ** 2
@@ -619,11 +621,11 @@ def _odds(residual: Image, sigma: Image, spread: float) -> Image:
 def _outlined(
     view: _Working, mask: Mask, plate: _Plate, noise: float, tol: SearchTolerances
 ) -> FoundObject:
-    """The object in a view's own pixels, with the place of its outline between them.
+    """The object in a view's own pixels, with the sub-pixel position of its outline.
 
-    Along a line across the outline the share of the object in what a pixel shows (its alpha, from
-    the plane's prediction to the object's brightness) falls from 1 to 0; its sum is the outline's
-    place whatever the blur.
+    Along a line across the outline, the share of the object in a pixel's light (its alpha, between
+    the predicted plane and the brightness of the object) falls from 1 to 0. Its sum is the position
+    of the outline, for any blur.
     """
     distance = signed_distance_px(mask)
     border = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
@@ -649,7 +651,7 @@ def _outlined(
         np.stack([columns + 0.5, rows + 0.5], axis=1) - outwards * distance[rows, columns][:, None]
     )
     places = onto[:, None] + outwards[:, None] * along[:, None]
-    # Shading goes on to the outline: the object's brightness there is that of its trend.
+    # Shading continues to the outline: the object's brightness there is extrapolated.
     level, slope, own_variance = (
         sample_image(part, onto - outwards * tol.core_px)[:, None] for part in inner
     )
@@ -662,8 +664,8 @@ def _outlined(
     of_object[1, rows, columns] = weight * contrast**2
     total, most = (_blurred(part, tol.along_px)[rows, columns] for part in of_object)
     alpha = np.clip(total / np.maximum(most, 1e-9), 0, 1)
-    # One deviation of contrast on the average tells an outline. Beyond it the plane shows; where
-    # something else does, it hides the outline.
+    # An outline needs a mean contrast of one deviation. Beyond it the plane is visible; anything
+    # else there hides the outline.
     told = np.minimum(most.mean(axis=1) * 2 * np.pi * tol.along_px, 1)
     told *= (known | ~view.has_plane)[rows, columns] & (alpha[:, -4:].mean(axis=1) < 0.5)
     found, certainty = np.zeros((2, *mask.shape), np.float32)

@@ -1,8 +1,7 @@
-"""What the views' polarization says of a mesh: an observation for each face and view that sees it.
+"""Observations of a mesh: the polarization of each face in each view that sees it.
 
-An observation holds the plane of incidence twice, as specular and as diffuse light would have it;
-which of the two it is :mod:`polmvs.surface.labels` infers. OPA, PPA and tilted differ in the rows
-alone.
+An observation has two planes of incidence, one for specular and one for diffuse light;
+:mod:`polmvs.surface.labels` infers which one holds. OPA, PPA and tilted differ only in the rows.
 """
 
 from __future__ import annotations
@@ -30,20 +29,20 @@ Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
-SPECULAR, DIFFUSE = 0, 1  # kinds of light: the first axis of what is known of both
+SPECULAR, DIFFUSE = 0, 1  # kinds of light: the first axis of arrays of both
 KINDS = (SPECULAR, DIFFUSE)
 OF_BOTH = ("rows", "turn_variance", "tilt", "slope")  # fields with these on their first axis
 
 
 @dataclass(frozen=True)
 class RowsOfBoth:
-    """Rows of one view at N points, under either kind of light.
+    """Rows of one view at N points, under both kinds of light.
 
     Attributes
     ----------
     rows : (2, N, 3) unit, world; 0 where the view shows no polarization.
-    turn_variance : (2, N) of the row's angle about the ray, rad^2; inf where it shows none.
-    tilt : (2, N) by how much tilted polarizers would have turned the row about the ray, rad.
+    turn_variance : (2, N) of the row's angle about the ray, rad^2; inf without polarization.
+    tilt : (2, N) rotation of the row about the ray by tilted polarizers, rad.
     axial : (N, 2) measured ``s1 / s0`` and ``s2 / s0``.
     dolp, sigma_dolp : (N,) degree of polarization and its deviation.
     """
@@ -57,10 +56,10 @@ class RowsOfBoth:
 
 
 def level_image(view: SurfaceView, width_px: float) -> Image:
-    """Polarization of a view (H, W, 3): s1 / s0, s2 / s0, their variance, 0 where nothing is known.
+    """Polarization of a view (H, W, 3): s1 / s0, s2 / s0, their variance, 0 where unknown.
 
-    It is smoothed over a Gaussian of ``width_px``: Stokes images are averaged, never phases. What
-    lies beside the possible silhouette does not count.
+    It is smoothed with a Gaussian of ``width_px``: Stokes images are averaged, never phases. Pixels
+    outside of the possible silhouette are ignored.
     """
     return smoothed_polarization(view.phase_map.polarization, width_px, view.silhouette.possible)
 
@@ -78,13 +77,12 @@ def rows_of_both(
 
     Parameters
     ----------
-    view : whose camera and pose they are.
+    view : its camera and pose.
     image : (H, W, 3), as :func:`level_image` makes it.
     angle_model : OPA, PPA or tilted.
     points : (N, 3), world.
-    tilt_aware : tell by how much a tilt of the polarizers would have turned the rows, which OPA and
-        PPA leave out.
-    tilt_share : of that turn that is taken back.
+    tilt_aware : compute the rotation of the rows by tilted polarizers, which OPA and PPA ignore.
+    tilt_share : share of that rotation that is corrected.
     """
     in_cam = view.to_camera(points)
     xy = view.view.camera.project(in_cam)
@@ -131,12 +129,12 @@ class Observations:
 
     Attributes
     ----------
-    face, view : (K,) indices; the observations of a view lie together, in the order of the views.
+    face, view : (K,) indices; the observations are sorted by view.
     rays : (K, 3) unit, from the camera to the face.
     cosine : (K,) between the face's normal and the direction to the camera.
     rows, turn_variance, tilt, axial, dolp, sigma_dolp : as of :class:`RowsOfBoth`.
-    slope : (2, K) change of ``m . n`` per length as the face moves along its normal, the normal
-        held.
+    slope : (2, K) change of ``m . n`` per length as the face moves along its normal, with the
+        normal fixed.
     """
 
     face: Indices
@@ -158,21 +156,21 @@ class Observations:
     def variances(self, normals: Array, row_sigma: Floats) -> Array:
         """Variance of ``m . n`` (2, K) about the normals (F, 3).
 
-        A turn of the row by psi about the ray changes it by the sine of the angle between ray and
-        normal times psi; ``row_sigma``, which broadcasts, is what noise does not explain (facets,
-        light from elsewhere).
+        A rotation of the row by psi about the ray changes it by the sine of the angle between ray
+        and normal times psi. ``row_sigma``, which broadcasts, is the deviation that noise does not
+        explain (facets, light from elsewhere).
         """
         cosine = dots(self.rays, normals.take(self.face, axis=0))
         return np.asarray((1 - cosine**2) * self.turn_variance + row_sigma**2)
 
     def tilt_slopes(self, normals: Array) -> Array:
-        """Change of ``m . n`` (2, K) were the polarizers' tilt taken back."""
+        """Change of ``m . n`` (2, K) by a correction of the polarizers' tilt."""
         own = normals.take(self.face, axis=0)
         across = np.stack([dots(np.cross(self.rays, rows), own) for rows in self.rows])
         return np.asarray(-self.tilt * across)
 
     def only(self, kept: NDArray[np.bool_]) -> Observations:
-        """The ``kept`` (K,) of them."""
+        """The ``kept`` (K,) observations."""
         values = {
             one.name: getattr(self, one.name)[:, kept]
             if one.name in OF_BOTH
@@ -184,13 +182,13 @@ class Observations:
 
 @dataclass(frozen=True, kw_only=True)
 class Looking:
-    """How views are looked at.
+    """How views are observed.
 
     Attributes
     ----------
     angle_model : of the rows.
-    tilt_aware, tilt_share : as of :func:`rows_of_both`.
-    min_cosine : between normal and direction to the camera; flatter sight is not counted.
+    tilt_aware, tilt_share : as in :func:`rows_of_both`.
+    min_cosine : between normal and direction to the camera; more oblique views are ignored.
     """
 
     angle_model: AngleModel
@@ -212,13 +210,13 @@ def observe(
 
     Parameters
     ----------
-    mesh, scene : the mesh, and the same to cast rays on.
-    views, images : what each view shows, smoothed (:func:`level_image`).
-    looking : how.
-    gsd : length that a pixel covers, for the slopes; None: they are 0.
+    mesh, scene : the mesh, and its scene for ray casting.
+    views, images : the views, and their smoothed images (:func:`level_image`).
+    looking : how to observe.
+    gsd : ground sampling distance, for the slopes; None: they are 0.
     """
     look = partial(_observe_view, mesh, scene, looking, gsd)
-    # Threads, for products of large arrays and the casting of rays let go of Python's lock.
+    # Threads, as products of large arrays and ray casting release Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
         found = list(pool.map(look, range(len(views)), views, images))
     joined = {}

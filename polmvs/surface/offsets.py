@@ -1,14 +1,14 @@
-"""Flat faces whose offset silhouettes and phases do not see: steps, lids, recesses.
+"""Planar patches whose offset silhouettes and phases do not show: height steps, lids, recesses.
 
-Phases fix normals; on parallel faces they are alike, and a silhouette's cones stay above whatever
-lies lower than its rim. Sparse points on the faces know better: those that share a plane, and
-whose phases have its normal, show that there is a face and where. How far it reaches is decided on
-a grid in the face's own plane. Seen in all views at the right offset, its border and its marks
-stay where they are, and lines that lie on other faces wander from view to view: a line that
-several views show at the same place is a border. Each face's points then claim what they reach
-without crossing such a line (a random walker, Grady 2006), and what their phases do not
-contradict. Space above a claimed place is free: its signed distance carves the first surface, with
-walls between the faces that no smoothness has rounded.
+In this module a *face* is a planar patch. Phases give normals, which are the same on parallel
+patches, and a silhouette does not show what lies below its outline. Sparse points do: points that
+share a plane, and whose phases have its normal, show a patch and its offset. Its extent is found on
+a grid in its own plane. At the right offset, its border and its marks have the same position in all
+views, and lines on other patches do not: a line that several views show at the same position is a
+border. The points of each patch then claim the cells that they reach without crossing such a line
+(a random walker, Grady 2006) and that their phases do not contradict. Space above a claimed cell is
+free: its signed distance carves the first surface. Smoothness does not round the walls that this
+leaves between the patches.
 """
 
 from __future__ import annotations
@@ -54,51 +54,51 @@ FirstHit: TypeAlias = Callable[[Array, Array], tuple[Floats, Floats]]
 NO_FACE = -1
 BESIDE, ACROSS = ((0, 1), (1, 0)), ((1, 1), (1, -1))  # neighbours of a cell: down, right
 SPACING = 0.25  # of samples across a border, cells
-CUT_UNIT = 10_000  # of the weights of a cut, which are whole numbers
+CUT_UNIT = 10_000  # scale of the weights of a cut, which are integers
 MAX_COST = 0.5  # median loss beyond which phases contradict a face: that of ``sigmas`` deviations
 
 
 @dataclass(frozen=True, kw_only=True)
 class OffsetTolerances:
-    """Numbers of the search for faces and of their borders.
+    """Tolerances of the search for planar patches and of their borders.
 
     Attributes
     ----------
-    min_points : of a face. Three lie in a plane by chance. As many neighbours tell whether a
-        point lies among those of another face.
+    min_points : of a face. Three always share a plane. The same number of neighbours decides
+        whether a point lies among those of another face.
     num_trials : random triples of points per face; a face of a tenth of the points is then missed
         once in 1000 searches. Derived.
-    sigmas : distance of a point to its face, and residual of a phase on it, in deviations: what
-        lies beyond is not of the face. Derived (99.7 %).
+    sigmas : largest distance of a point to its face, and residual of a phase on it, in deviations.
+        Derived (99.7 %).
     normal_deg : largest angle between a point's normal and its face. Guess: several deviations.
-    min_normal_sigma_deg : deviation of the mean of the points' normals (sensor and model, alike
-        for all points). Measured on board: 0.2.
+    min_normal_sigma_deg : least deviation of the mean of the points' normals (sensor and model, the
+        same for all points). Measured on board: 0.2.
     max_cells : of a grid. Memory and time: one solution takes 7 us a cell.
-    smoothing_px : of the intensity before its steps are measured.
-    dark : intensity by which a mark must at least be brighter, full scales, and least step of noise
-        per cell. Derived: one count of 8 bits; synthetic images have less. Not varied.
-    view_share : share of the views that see a place, which must show a line there. A wall of a
-        convex part is seen by about half of the views around it. Guess: half of these.
-    line_steps : of noise, from which a step hampers the walk. Guess.
+    smoothing_px : of the intensity before its edges are measured.
+    dark : least excess brightness of a mark, full scales, and least noise of a difference between
+        cells. Derived: one count of 8 bits; synthetic images have less. Not varied.
+    view_share : share of the views of a point that must show a line there. About half of the views
+        around a convex part see a wall of it. Guess: half of these.
+    line_steps : intensity edge, in units of noise, that hampers the walk. Guess.
     mark_px : greatest width of a printed mark, at a focal length of 445 px. Guess.
-    mark_contrast : of a mark's intensity to what is about it. As for the region's marks.
-    mark_share : of the views that show a place, which must show a mark there. A wall of a convex
-        part is seen by half of them. Measured, 0.5: F at 1 mm of an analytic bracket falls by 0.9
-        points.
+    mark_contrast : of a mark's intensity to its surroundings. As for the region's marks.
+    mark_share : share of the views of a point that must show a mark there. Half of them see a wall
+        of a convex part. Measured, 0.5: F at 1 mm of an analytic bracket falls by 0.9 points.
     seed_cells : radius about a sparse point that belongs to its face, and distance of a face's
-        points to the given surface from which it does not explain them; a cell is a gsd.
+        points to the given surface above which the surface does not explain them; a cell is a GSD.
         Guess: a point's uncertainty, and the size of a first surface's cells.
-    leak : conductance to nowhere of a place that contradicts its face. Measured, 0.2: F at 1 mm of
-        an analytic bracket falls by 0.2 points.
-    seed_weight : chance that a walk ends on a point that it passes, over that of a step. Guess.
-    min_total : chance that a walk from a place ends on any face's points at all. Guess: one in a
+    leak : conductance to ground of a cell that contradicts its face. Measured, 0.2: F at 1 mm of an
+        analytic bracket falls by 0.2 points.
+    seed_weight : probability that a walk ends on a point that it passes, relative to a move. Guess.
+    min_total : probability that a walk from a cell ends on the points of any face. Guess: one in a
         hundred gets through where the phases contradict.
-    min_share : of the seen views in whose region a place must lie. Guess: one view in six wrong.
+    min_share : share of the views of a point in whose region it must lie. Guess: one view in six
+        wrong.
     min_radius_cells : of a face's area: smaller ones are tangent planes of curved surfaces. Guess.
-        A border is moved to the lines in a band of this width: every face has a core. Measured on
+        A border moves to the lines in a band of this width: every face has a core. Measured on
         `step`: bands of 8, 12 and 20 give the same corners.
-    better_by : median loss by which the given surface must explain the views better than a face
-        to keep its place. Guess.
+    better_by : median loss by which the given surface must explain the views better than a face to
+        remain. Guess.
     """
 
     min_points: int = 4
@@ -125,13 +125,13 @@ class OffsetTolerances:
 
 @dataclass(frozen=True)
 class Face:
-    """A plane that sparse points show: points x with ``normal . x = offset``.
+    """A planar patch that sparse points show: points x with ``normal . x = offset``.
 
     Attributes
     ----------
     normal : (3,) unit, towards the cameras.
     offset : world units.
-    members : (M,) int64, the seeds on it.
+    members : (M,) int64, indices of the seeds on it.
     """
 
     normal: Array
@@ -145,11 +145,11 @@ class Face:
 
 @dataclass(frozen=True)
 class FaceGrid:
-    """A grid of cells across a direction; each face is a height over it.
+    """A grid of cells perpendicular to a direction; each face is a height over it.
 
     Attributes
     ----------
-    origin : (3,), place of cell (0, 0) at height 0.
+    origin : (3,), position of cell (0, 0) at height 0.
     first, second, axis : (3,) unit, along rows, along columns, and the direction of heights.
     step : side of a cell, world units.
     shape : rows, columns.
@@ -182,14 +182,14 @@ class FaceGrid:
 
 @dataclass(frozen=True)
 class SteppedFaces:
-    """Faces of about one normal, and where on a grid each is what the cameras see.
+    """Faces of about one normal, and the cells of a grid where the cameras see each.
 
     Attributes
     ----------
     faces : by number.
     grid : of the labels.
     labels : (H, W) int64, number of the face, ``NO_FACE`` where none is shown.
-    shown : (H, W) bool, where the views show the face; beside, its label is carried on.
+    shown : (H, W) bool, cells where the views show the face; next to them its label is extended.
     beside : (G, H, W), signed distance in cells to the cells that are not below each face,
         negative inside; its border lies between cells.
     """
@@ -201,11 +201,11 @@ class SteppedFaces:
     beside: Image
 
     def values(self, points: Floats) -> Array:
-        """Signed distance ``(N,)`` of points to what the faces leave: positive in free space.
+        """Signed distance ``(N,)`` of points, positive in the free space above the faces.
 
-        Space is free above a face's own cells, in the direction of the axis; above cells without
-        a face nothing is said, and the value is negative there. The maximum of this and of another
-        shape's signed distance is that shape, carved.
+        Space is free above a face's own cells, in the direction of the axis. Above cells without a
+        face it is unknown, and the value is negative. The maximum of this and of another shape's
+        signed distance is that shape, carved.
         """
         points = np.asarray(points, np.float64)
         cells = np.moveaxis(self.grid.cells(points), -1, 0)
@@ -232,17 +232,17 @@ class SteppedFaces:
     def not_below(self, number: int) -> Mask:
         """Cells (H, W) of a face, of those above it, and of none.
 
-        A face goes on below those that stand on it: no border inside of the solid.
+        A face continues below those that stand on it: it has no border inside the solid.
         """
         heights = np.stack([self._rise(face) for face in self.faces])
         at_label = np.take_along_axis(heights, np.maximum(self.labels, 0)[None], axis=0)[0]
         return np.asarray((self.labels == NO_FACE) | (at_label >= heights[number]))
 
     def solid(self, points: Floats) -> Array:
-        """Signed distance ``(N,)`` of points to what stands on the lowest face: negative in it.
+        """Signed distance ``(N,)`` of points to the solid on the lowest face, negative inside.
 
-        What a face shows reaches down to the lowest one, for all that the faces say; inf farther
-        than two cells aside of it.
+        The solid below each face is assumed to reach down to the lowest face; inf more than two
+        cells beside it.
         """
         points = np.asarray(points, np.float64)
         found = np.full(len(points), np.inf)
@@ -282,18 +282,18 @@ class SteppedFaces:
 def find_faces(
     seeds: Seeds, tolerances: OffsetTolerances | None = None, *, max_faces: int | None = None
 ) -> tuple[Face, ...]:
-    """Planes through seeds whose normals agree with them, those of most seeds first.
+    """Planes through seeds whose normals agree with them, the largest number of seeds first.
 
     Parameters
     ----------
     seeds : sparse points on the part with normals from the phases.
     tolerances : numbers of the search.
-    max_faces : after which it ends.
+    max_faces : largest number of faces.
 
     Returns
     -------
-    Faces without common seeds. Points among those of a larger face, but below it, are no face of
-    their own (mirror images).
+    Faces without common seeds. Points among those of a larger face but below it are mirror images
+    and not a separate face.
     """
     tol = tolerances or OffsetTolerances()
     points, normals = seeds.points_in_world, seeds.normals_in_world
@@ -393,18 +393,18 @@ def stepped_faces(
     first_hit: FirstHit | None = None,
     tolerances: OffsetTolerances | None = None,
 ) -> tuple[SteppedFaces, ...]:
-    """Groups of faces of like normal that a first surface does not explain, with their extents.
+    """Groups of parallel faces that a first surface does not explain, with their extents.
 
     Parameters
     ----------
-    faces : of :func:`find_faces`.
-    seeds : whose members they are.
+    faces : from :func:`find_faces`.
+    seeds : their members.
     scene : the views.
     signed_distance : of points ``(N, 3)`` to the first surface. Groups whose seeds all lie on it
-        are left out. None: all are looked at.
+        are skipped. None: no group is skipped.
     first_hit : distance and normal where rays from ``(N, 3)`` along ``(3,)`` first meet the first
-        surface (inf where they do not): it keeps the places that it explains better.
-    tolerances : numbers of the search.
+        surface (inf without a hit); this surface remains where it explains the views better.
+    tolerances : of the search.
     """
     tol = tolerances or OffsetTolerances()
     found = []
@@ -443,16 +443,16 @@ def border_of_steps(
 ) -> Image:
     """Signed distance (H, W) in cells to the border of a region on a face, negative inside.
 
-    Labels follow lines of polarization, too, which the phases' smoothing draws outwards. The border
-    is where the views together show the step of intensity that is nearest.
+    Labels also follow lines of polarization, which the smoothing of phases moves outwards. The
+    border is the nearest intensity edge that the views show together.
 
     Parameters
     ----------
     inside : (H, W) bool, the region.
-    own : (H, W) bool, cells whose part of the border may move.
-    face, grid : over which the region is one.
+    own : (H, W) bool, cells where the border may move.
+    face, grid : of the region.
     scene : the views.
-    face_tol : numbers.
+    face_tol : tolerances.
     """
     is_border = inside & ndimage.binary_dilation(~inside)
     if not (is_border & own).any():
@@ -544,7 +544,7 @@ def _grid_over(
             low[k], high[k] = place.min(axis=0), place.max(axis=0)
     if np.isfinite(low).all(axis=1).sum() < 2:
         return None
-    # A region may run to the horizon in one view: what half of the views show is enough.
+    # A region may reach the horizon in one view: cells that half of the views show are enough.
     own = np.stack([(points - center) @ first, (points - center) @ second], axis=1)
     margin = tol.min_radius_cells * gsd
     start = np.minimum(np.nanmedian(low, axis=0), own.min(axis=0)) - margin
@@ -559,9 +559,9 @@ def _grid_over(
 
 @dataclass(frozen=True)
 class FaceScene:
-    """Phase maps, which rows they have, and the images (H, W, 4) whose steps show borders.
+    """Phase maps, the model of their rows, and the images (H, W, 4) whose edges show borders.
 
-    The images may be on disk: ``np.asarray`` makes arrays of them.
+    The images may be on disk: ``np.asarray`` converts them to arrays.
     """
 
     maps: Sequence[PhaseMap]
@@ -570,7 +570,7 @@ class FaceScene:
     features: Sequence[ArrayLike]
 
     def of(self, kept: Mask) -> FaceScene:
-        """The same with some of the views, ``(K,)`` bool."""
+        """The same for some of the views, ``(K,)`` bool."""
         maps, features = list(compress(self.maps, kept)), list(compress(self.features, kept))
         return replace(self, maps=maps, features=features)
 
@@ -593,9 +593,9 @@ def face_scene(
     tolerances: OffsetTolerances | None = None,
     folder: Path | None = None,
 ) -> FaceScene:
-    """What is asked about faces, from the views' phase maps; kept in a folder or in memory.
+    """The scene for planar patches, from the views' phase maps; stored in a folder or in memory.
 
-    ``angle_model`` and ``tilt_aware`` are those of :func:`polmvs.normals.rows.gather_rows`.
+    ``angle_model`` and ``tilt_aware`` are as in :func:`polmvs.normals.rows.gather_rows`.
     """
     tol = tolerances or OffsetTolerances()
 
@@ -610,9 +610,9 @@ def face_scene(
 
 @dataclass(frozen=True)
 class FaceEvidence:
-    """What the views say about a face over the cells of a grid.
+    """Evidence of the views for a face at the cells of a grid.
 
-    ``jump`` (H, W): steps of the image in units of noise that a share of the views exceeds;
+    ``jump`` (H, W): intensity edges in units of noise that a share of the views exceeds;
     ``cost`` (H, W): median robust loss of the phases, 1 where no view has one;
     ``possible`` (H, W): whether the views show the part there.
     """
@@ -635,7 +635,7 @@ def _labels(
     rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
     surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit, tol)
     labels, shown = np.full(grid.shape, NO_FACE), np.zeros(grid.shape, np.bool_)
-    # Which face hides which shows in labels alone: a second time with those of the first.
+    # Occlusion between faces needs labels: a second pass uses those of the first.
     for is_labelled in (False, True):
         claims, jumps = np.zeros((2, len(group), *grid.shape))
         possible, fits = np.zeros((2, len(group), *grid.shape), np.bool_)
@@ -651,13 +651,13 @@ def _labels(
             fits[number] = better & (evidence.cost < MAX_COST)
             claims[number] = _claim(number, group, seeds, grid, evidence, better, tol)
             jumps[number] = evidence.jump
-        # What walks a long way to its few points has a small chance of reaching them, and is the
-        # face's all the same if no other face can be there.
+        # A cell far from few points has a small probability of reaching them, but belongs to the
+        # face if no other face can be there.
         total = claims.sum(axis=0)
         claimed = (total > tol.min_total) & (claims.max(axis=0) > 0.5 * total)
         labels = np.where(claimed, claims.argmax(axis=0), NO_FACE)
         labels = _without_small(labels, len(group), tol)
-        # The lowest ends where others stand on it, and where they do their own borders count.
+        # The lowest face ends where others stand on it; there their own borders count.
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1))[1:]:
             labels = snapped_border(
                 labels, int(number), jumps[number], tol.min_radius_cells, tol.line_steps
@@ -674,10 +674,10 @@ def _labels(
 def snapped_border(
     labels: NDArray[np.int64], number: int, jump: Array, reach: float, line_steps: float
 ) -> NDArray[np.int64]:
-    """Labels (H, W), the border of one face moved to the lines near it.
+    """Labels (H, W) with the border of one face moved to the lines near it.
 
-    The cut of least weight in a band of ``reach`` cells on either side of the border, across which
-    a walk hardly steps. It follows a line around its corners, which a walk rounds off.
+    It is the minimum cut in a band of ``reach`` cells on both sides of the border, through cells
+    that a walk hardly crosses. It follows a line around its corners, which a walk rounds off.
     """
     own = labels == number
     core = ndimage.distance_transform_edt(own) > reach
@@ -694,9 +694,9 @@ def snapped_border(
     length = np.repeat(of_direction, [len(step[0]) for step in steps])
     ends = node.ravel()[np.stack([tails, heads])]
     inner = ends[0] != ends[1]
-    # It falls so slowly that the middle of a wide line still counts for more than a short cut.
+    # It falls so slowly that the middle of a wide line still outweighs a short cut.
     weight = length / (1 + between / line_steps)
-    capacity = np.rint(CUT_UNIT * weight[inner]).astype(np.int32)  # whole numbers
+    capacity = np.rint(CUT_UNIT * weight[inner]).astype(np.int32)  # integers
     pairs = np.concatenate([ends[:, inner], ends[::-1, inner]], axis=1)
     both = np.concatenate([capacity, capacity])
     graph = sparse.csr_matrix((both, (pairs[0], pairs[1])), shape=(num + 2, num + 2))
@@ -715,10 +715,10 @@ def snapped_border(
 def _continued(
     labels: NDArray[np.int64], allowed: Mask, taken: Mask, tol: OffsetTolerances
 ) -> NDArray[np.int64]:
-    """Labels carried on to cells near them where they are ``allowed`` (G, H, W) and none is taken.
+    """Labels extended to nearby free cells where they are ``allowed`` (G, H, W).
 
-    Beside a face, where the views show no part, there is nothing that a label could wrongly carve;
-    but the first surface may stand there in a rim as wide as the silhouettes are unsure.
+    Next to a face, where the views show no part, a label cannot carve wrongly; but the first
+    surface may have a margin there as wide as the uncertainty of the silhouettes.
     """
     if not (labels != NO_FACE).any():
         return labels
@@ -731,8 +731,8 @@ def _continued(
 def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
     """Images (H, W, 4): root of intensity, polarization (2), and 1 off printed marks.
 
-    The first three show borders by their steps. A mark is smaller than ``mark_px``, brighter than
-    what is about it, and less polarized.
+    The first three show borders by their edges. A mark is smaller than ``mark_px``, brighter than
+    its surroundings, and less polarized.
     """
     intensity = np.asarray(phase_map.intensity, np.float32)
     scale = phase_map.view.camera.mean_focal_px / REFERENCE_FOCAL_PX
@@ -747,7 +747,7 @@ def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
     mark = dull & (intensity > tol.mark_contrast * about + tol.dark)
     kernel = np.ones((2 * round(2 * tol.smoothing_px) + 1,) * 2, np.uint8)  # its smoothed outline
     on_mark = cv2.dilate(mark.astype(np.uint8), kernel)
-    # The root has the same photon noise everywhere; smoothed after it, a step keeps its place.
+    # The root has uniform photon noise; an edge that is smoothed after it keeps its position.
     root = cv2.GaussianBlur(np.sqrt(np.maximum(intensity, 0)), (0, 0), tol.smoothing_px)
     samples = phase_map.samples[..., :2]
     return np.dstack([root, samples, 1 - on_mark]).astype(np.float32)
@@ -756,9 +756,9 @@ def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
 def row_losses(
     rows: Rows, normals: Floats, tol: OffsetTolerances
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Loss in [0, 1] of each row (K, N), NaN where it does not count, and cosines to the views.
+    """Loss in [0, 1] of each row (K, N), NaN where it is not used, and cosines to the views.
 
-    A row counts if it would contradict at least half of all phases; others agree with anything.
+    A row is used if it would contradict at least half of all phases; others agree with anything.
 
     Parameters
     ----------
@@ -769,7 +769,7 @@ def row_losses(
     cosine = -(rows.rays * normals[:, None]).sum(axis=0)
     residual = (rows.rows * normals[:, None]).sum(axis=0)
     with np.errstate(invalid="ignore"):
-        # Half of what a curved mesh leaves unexplained: a plane has no faults of its own.
+        # Half of what a curved mesh leaves unexplained: a plane has no discretization error.
         floor = np.float32((0.5 * TermTolerances.row_sigma) ** 2)
         variance = (1 - cosine**2) * np.square(rows.sigma) + floor
         z2 = np.square(residual) / (variance * np.float32(tol.sigmas**2))
@@ -788,15 +788,15 @@ def face_evidence(
     hidden: Sequence[Mask] | None,
     tol: OffsetTolerances,
 ) -> FaceEvidence:
-    """What the views say of a face at places ``(H, W, 3)`` on it.
+    """Evidence of the views for a face at points ``(H, W, 3)`` on it.
 
     Parameters
     ----------
     places, face : the face over a grid.
     scene : the views.
-    near_points : (H, W) bool, where steps may be those of printed marks.
-    hidden : per view, places ``(H, W)`` that it does not see.
-    tol : numbers.
+    near_points : (H, W) bool, where edges may be those of printed marks.
+    hidden : for each view, points ``(H, W)`` that it does not see.
+    tol : tolerances.
     """
     shape = places.shape[:2]
     losses = scene.losses(places.reshape(-1, 3), face.normal[:, None], tol)
@@ -813,8 +813,8 @@ def face_evidence(
         losses[k] = np.where(shown, losses[k], np.nan)
         jumps[k], marks = _line_steps(scene.features[k], xy, shown, tol)
         num_marks += marks
-    # What is printed on the face is a mark in all views, what is printed on a wall beside it is
-    # not at the same place.
+    # A print on the face is a mark in all views; a print on a wall beside it has another position
+    # in each.
     printed = near_points & (num_marks > tol.mark_share * inside)
     jumps[:, printed] = np.nan
     possible = (num_seen >= 2) & (inside >= tol.min_share * num_seen)
@@ -824,7 +824,7 @@ def face_evidence(
 def face_lines(
     places: Array, face: Face, scene: FaceScene, tol: OffsetTolerances, view_share: float
 ) -> Image:
-    """Steps (H, W) in units of noise that a share of the views shows at places (H, W, 3)."""
+    """Edges (H, W) in units of noise that a share of the views shows at points (H, W, 3)."""
     jumps = np.full((len(scene.maps), *places.shape[:2]), np.nan, np.float32)
     for k, phase_map in enumerate(scene.maps):
         xy, seen = _seen(places, face, phase_map)
@@ -833,7 +833,7 @@ def face_lines(
 
 
 def _seen(places: Array, face: Face, phase_map: PhaseMap) -> tuple[Image, Mask]:
-    """Pixels (H, W, 2) of places on a face, and whether the view can see them."""
+    """Pixels (H, W, 2) of points on a face, and whether the view can see them."""
     view = phase_map.view
     xy = np.asarray(view.camera.project(view.cam_from_world * places))
     seen = in_frame(xy, view.camera.width, view.camera.height, 1)
@@ -843,14 +843,14 @@ def _seen(places: Array, face: Face, phase_map: PhaseMap) -> tuple[Image, Mask]:
 def _line_steps(
     images: ArrayLike, xy: Image, shown: Mask, tol: OffsetTolerances
 ) -> tuple[Image, Mask]:
-    """Steps (H, W) of one view's images, NaN where it shows nothing, and where it shows a mark."""
+    """Edges (H, W) of one view's images, NaN where it shows nothing, and where it shows a mark."""
     values = sample_image(np.asarray(images), xy)
     steps = np.where(shown, _steps(values[..., :3], shown, tol), np.nan)
     return steps.astype(np.float32), np.asarray(shown & (values[..., 3] < 1))
 
 
 def _shared_lines(jumps: Image, view_share: float) -> Image:
-    """Steps (H, W) that a share of the views (K, H, W) exceeds."""
+    """Edges (H, W) that a share of the views (K, H, W) exceeds."""
     count = np.isfinite(jumps).sum(axis=0)
     ordered = -np.sort(-np.nan_to_num(jumps, nan=-1.0), axis=0)
     rank = np.floor(view_share * np.maximum(count - 1, 0)).astype(np.int64)
@@ -867,7 +867,7 @@ def median_loss(losses: Image) -> Image:
 
 
 def _steps(values: Image, shown: Mask, tol: OffsetTolerances) -> Image:
-    """Steps (H, W) of images (H, W, C) over the cells, each in units of its own noise."""
+    """Edges (H, W) of images (H, W, C) over the cells, each in units of its own noise."""
     total = np.zeros(shown.shape, np.float32)
     well = ndimage.binary_erosion(shown, border_value=0)
     if not well.any():
@@ -911,7 +911,7 @@ def _hidden(
     labels: NDArray[np.int64],
     maps: Sequence[PhaseMap],
 ) -> list[Mask]:
-    """Per view, the cells (H, W) of a face that others of the group hide, as they are labelled."""
+    """For each view, the cells (H, W) of a face that other labelled faces of the group hide."""
     hidden = []
     size = np.array(grid.shape)
     for phase_map in maps:
@@ -942,7 +942,7 @@ def _claim(
     possible: Mask,
     tol: OffsetTolerances,
 ) -> Array:
-    """Chance (H, W) that a walk from a cell, hampered by lines, ends on this face's points."""
+    """Probability (H, W) that a walk from a cell, hampered by lines, ends on this face's points."""
     own, others = (np.full(grid.shape, np.inf) for _ in range(2))
     for other, face in enumerate(group):
         near = _distance_to(grid.cells(seeds.points_in_world[face.members]), grid.shape)
@@ -955,7 +955,7 @@ def _claim(
     if not starts.any():
         return np.zeros(grid.shape)
     adjacency, degree = _walk(evidence.jump.astype(np.float64), tol)
-    # A walk may end on any point it passes, so that a single false one does not decide.
+    # A walk may end on any point that it passes, so a single false point does not decide.
     ending = tol.seed_weight * (starts | ends).ravel()
     leak = tol.leak * np.clip(evidence.cost.astype(np.float64).ravel() / MAX_COST - 1, 0, 1)
     free = np.flatnonzero(possible)
@@ -968,17 +968,17 @@ def _claim(
 def _steps_between(
     jump: Array, down: int, right: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Neighbours (E,) and (E,) in a direction, and the step of the image (E,) between them."""
+    """Neighbours (E,) and (E,) in a direction, and the edge of the image (E,) between them."""
     cells = np.arange(jump.size).reshape(jump.shape)
     rows, cols = jump.shape[0] - down, jump.shape[1] - abs(right)
     tails = cells[:rows, max(-right, 0) :][:, :cols].ravel()
     heads = cells[down:, max(right, 0) :][:, :cols].ravel()
-    # The step is where both cells show it, not on either side of them.
+    # The edge is where both cells show it, not on either side of them.
     return tails, heads, 0.5 * (jump.ravel()[tails] + jump.ravel()[heads])
 
 
 def _walk(jump: Array, tol: OffsetTolerances) -> tuple[sparse.csr_array, Array]:
-    """Chances of a step between neighbouring cells ``(H W, H W)``, and their sums."""
+    """Weights of moves between neighbouring cells ``(H W, H W)``, and their sums."""
     steps = [_steps_between(jump, *direction) for direction in BESIDE]
     tails, heads, between = (np.concatenate(part) for part in zip(*steps, strict=True))
     weight = geman_mcclure_weights(between, tol.line_steps**2)
@@ -1013,7 +1013,7 @@ def _distance_to(cells: Array, shape: tuple[int, int]) -> Array:
 def _without_small(
     labels: NDArray[np.int64], num_faces: int, tol: OffsetTolerances
 ) -> NDArray[np.int64]:
-    """Labels without pieces smaller than a disc of ``min_radius_cells``; these go to none."""
+    """Labels in which pieces smaller than a disc of ``min_radius_cells`` become ``NO_FACE``."""
     least = np.pi * tol.min_radius_cells**2
     kept = labels.copy()
     for number in range(num_faces):

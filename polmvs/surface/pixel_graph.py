@@ -1,4 +1,4 @@
-"""The network of a view's nodes: the edges between them, and what ties them to known places."""
+"""The graph of a view's nodes: edges between them, and ties to seeds."""
 
 from __future__ import annotations
 
@@ -29,18 +29,19 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class GraphTolerances:
-    """How nodes are joined, and tied to seeds.
+    """Tolerances of the edges between nodes, and of ties to seeds.
 
     Attributes
     ----------
     normal_error : systematic error of multi-view normals between nodes an angle apart, rad, times
-        the root of that angle. Errors of edges count as independent: that of denser ones must be
-        larger to add up to the same. Measured on the shared captures: 0.012 rad at 0.0135 rad.
-    crease_factor : by which a crease turns the normal more than noise or local curvature does.
-        Derived: on a cylinder half of the edges of a lattice turn, their local mean is a
-        quarter of a turn, which must pass.
-    filled_sigma : rad, of a normal taken from the neighbours, and from which one is: what errs by
-        more tells nothing. Seeds whose normal is as far from a node's are of another face. Guess.
+        the root of that angle. Errors of edges count as independent, so those of denser edges must
+        be larger to have the same sum. Measured on the shared captures: 0.012 rad at 0.0135 rad.
+    crease_factor : factor by which a crease turns the normal more than noise or local curvature.
+        Derived: on a cylinder half of the edges of a lattice turn, their local mean is a quarter of
+        a turn, which must pass.
+    filled_sigma : rad, deviation of a normal from the neighbours, and limit above which a normal is
+        replaced by one. Seeds whose normal differs from a node's by more are of another surface.
+        Guess.
     """
 
     normal_error: float = 0.0014
@@ -54,11 +55,11 @@ class Nodes:
 
     Attributes
     ----------
-    surface : the nodes with what is known of the surface there; NaN where unknown.
+    surface : ranges and normals at the nodes; NaN where unknown.
     ray_z : (N,), z component of the nodes' rays in the camera frame.
     spacing_px : distance between neighbouring nodes.
     focal_px : of the view.
-    tail, head : (E,) indices of the nodes that an edge joins.
+    tail, head : (E,) indices of the two nodes of an edge.
     on_contour : (E,) bool, edges between consecutive nodes of a contour.
     """
 
@@ -77,7 +78,7 @@ class Nodes:
 
 
 def visible_seeds(phase_map: PhaseMap, seeds: Seeds) -> tuple[NDArray[np.bool_], Array]:
-    """Which seeds project into the view's region facing it, and where."""
+    """Seeds that face the view and project into its region, and their projections."""
     view, points, normals = phase_map.view, seeds.points_in_world, seeds.normals_in_world
     xy = view.project(points)
     facing = view.faces(points, normals) | ~np.isfinite(normals).all(axis=-1)
@@ -99,7 +100,7 @@ def lattice_edges(wanted: NDArray[np.bool_]) -> tuple[Indices, Indices]:
 
 
 def uncrossed(phase_map: PhaseMap, start_xy: Floats, end_xy: Floats) -> NDArray[np.bool_]:
-    """Which lines between pixels cross no crease and stay in the region."""
+    """Lines between pixels that cross no crease and stay in the region."""
     open_pixels = (phase_map.region.inside & ~phase_map.region.edges).astype(np.float32)
     clear = np.ones(len(start_xy), bool)
     for share in (0.25, 0.5, 0.75):
@@ -109,10 +110,10 @@ def uncrossed(phase_map: PhaseMap, start_xy: Floats, end_xy: Floats) -> NDArray[
 
 
 def bending_modes(xy: Image) -> Array:
-    """Polynomials of the nodes' place up to the second degree, of order one over the region.
+    """Polynomials of the nodes' position up to the second degree, of order one over the region.
 
-    The errors of multi-view normals that a camera model leaves are smooth over a view: they tilt
-    and bend the surface as a whole, which the seeds can tell.
+    Errors of multi-view normals by the camera model are smooth over a view: they tilt and bend the
+    surface as a whole, which the seeds correct.
     """
     low, high = xy.min(axis=0), xy.max(axis=0)
     x, y = (2 * (xy - low) / np.maximum(high - low, 1e-9) - 1).T.astype(np.float64)
@@ -124,7 +125,7 @@ def bending_modes(xy: Image) -> Array:
 def fill_normals(
     nodes: Nodes, estimate: NormalEstimate, *, tolerances: GraphTolerances = GraphTolerances()
 ) -> tuple[Array, Array]:
-    """Normals with the gaps filled from neighbours, which widens their deviation."""
+    """Normals with gaps filled from neighbours, with a larger deviation."""
     sigma = np.radians(estimate.sigma_deg)
     good = estimate.valid & (estimate.num_rows >= MIN_VIEWS) & (sigma < tolerances.filled_sigma)
     if not good.any():
@@ -150,9 +151,9 @@ def node_edges(
 
     Parameters
     ----------
-    angle_model : decides what is constant on a contour.
+    angle_model : sets the constant of a contour.
     nodes : with normals.
-    own_sigma : (N,), deviation of the turn of the view's own row about its ray, rad.
+    own_sigma : (N,), deviation of the rotation of the view's own row about its ray, rad.
     along_contours : use that constancy.
     tolerances : of this step.
     """

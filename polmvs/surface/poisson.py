@@ -1,8 +1,8 @@
-"""A mesh of the polarized surface: Poisson reconstruction, cut back to where points support it.
+"""A mesh of the polarized surface: Poisson reconstruction, trimmed to the support of the points.
 
-Poisson reconstruction closes every surface: beyond the last point and across holes it makes one
-up. What no point supports is cut off again, so that the mesh ends where the cloud ends and holes
-of the cloud stay holes, while those that are no wider than the scatter of its points are closed.
+Poisson reconstruction closes every surface: it extrapolates beyond the last point and across holes.
+Parts without support are cut off, so the mesh ends where the cloud ends and holes of the cloud stay
+holes. Holes that are not wider than the scatter of the points are closed.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ KIND = "kind"
 
 @dataclass(frozen=True, kw_only=True)
 class MeshTolerances:
-    """Where the points of a cloud support a mesh; lengths in spacings of the points.
+    """Tolerances of the support of a mesh; lengths in spacings of the points.
 
     Attributes
     ----------
-    support : vertices farther than this from any point go. Derived: points scattered at random
-        leave a void of this radius with probability exp(-pi 2.5^2) = 3e-9.
-    min_island : side of a square; separate pieces of a smaller area go. Guess.
-    min_depth : of the octree, that Open3D takes.
-    max_depth : of the octree, whatever the points' spacing: 1024 cells a side, about 2 GB for a
+    support : vertices farther than this from any point are removed. Derived: points scattered at
+        random leave a void of this radius with probability exp(-pi 2.5^2) = 3e-9.
+    min_island : side of a square; separate pieces of a smaller area are removed. Guess.
+    min_depth : of the octree, that Open3D accepts.
+    max_depth : of the octree, for any spacing of the points: 1024 cells a side, about 2 GB for a
         surface that fills them.
-    cube_scale : of Poisson's cube over the cloud's extent; Open3D's own.
+    cube_scale : of Poisson's cube over the cloud's extent; Open3D's default.
     """
 
     support: float = 2.5
@@ -64,28 +64,28 @@ def poisson_mesh(
 ) -> Mesh:
     """Poisson mesh of a cloud's oriented points, where the points support it.
 
-    The octree's cells are at least as wide as the points are apart. The mesh reaches half a
+    The octree's cells are at least as wide as the spacing of the points. The mesh reaches half a
     spacing beyond the outermost points; holes of the cloud narrower than twice the support are
-    closed. Its normals are those of the nearest points: they were measured, and are better than
-    what the triangles' slopes make of the points' places.
+    closed. Its normals are those of the nearest points: measured normals are better than those of
+    the triangles.
 
     Parameters
     ----------
     cloud : with normals that point away from the surface; if it has a scalar ``kind``, only
-        points of the given kinds count. Points and normals that are not finite do not.
+        points of the given kinds are used. Points and normals that are not finite are ignored.
     kinds : of points to use, see :class:`polmvs.scene.PointKind`.
-    source : where the cloud came from, for messages.
+    source : origin of the cloud, for messages.
     tolerances : of this step.
 
     Returns
     -------
-    Mesh, in the cloud's frame, with colours where the cloud has them. It may be empty. The same
-    cloud gives the same mesh.
+    Mesh, in the cloud's frame, with colours if the cloud has them. It may be empty. The same cloud
+    gives the same mesh.
 
     Raises
     ------
     DataError
-        If the cloud has no normals, too few usable points, or most of them coincide.
+        The cloud has no normals or too few usable points, or most of them coincide.
     """
     points, normals, colors = _usable(cloud, kinds, source)
     spacings = point_spacings(points)
@@ -102,10 +102,10 @@ def poisson_mesh(
     tree = cKDTree(points)
     distance, nearest = tree.query(vertices, k=NUM_NEAREST, workers=-1)
     near_normals = unit_or_zero(normals[nearest].sum(axis=1))
-    # One that faces away from the points beside it is of the other side of a sheet.
+    # A vertex that faces away from the nearest points belongs to the other side of a sheet.
     supported = dots(surface.vertex_normals, near_normals) > 0
     supported &= distance[:, 0] <= tolerances.support * spacing
-    # A point stands for its cell, which ends half-way to the next one.
+    # A point represents its cell, which ends half-way to the next one.
     supported = _without_rim(surface, supported, (tolerances.support - 0.5) * spacing)
     islands = TriangleMesh(vertices, surface.faces[supported[surface.faces].all(axis=1)])
     areas = np.bincount(islands.face_components, islands.face_areas)
@@ -149,7 +149,7 @@ def octree_depth(
 
 
 def _without_rim(surface: TriangleMesh, supported: Mask, width: float) -> Mask:
-    """Take back by ``width`` from its edges what reached beyond the points by more than that.
+    """Trim what extends beyond the points by more than ``width`` from the mesh's edges.
 
     Together with the support this closes narrow holes and leaves the outline, and that of wide
     holes, where the points end (a morphological closing).

@@ -1,9 +1,9 @@
-"""Silhouettes of the polarized objects with doubt: on, off or unknown, for each pixel of each view.
+"""Silhouettes of the polarized objects: each pixel of each view is on, off or unknown.
 
 The polarized region of a view is on the objects. Where they are dark, frontal or show mixed light
-they are hardly polarized, and the region ends too early: pixels that continue it and look like it
-rather than like the surroundings (a cut of the graph of pixels by intensity) are unknown. Views
-check one another: what a view alone claims, or alone denies, is unknown as well.
+they are hardly polarized, and the region ends too early. Pixels that continue it and look more like
+it than like the surroundings (a graph cut on intensity) are unknown. Views check one another: a
+claim or denial by only one view is also unknown.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class SilhouetteTolerances:
-    """Numbers of the search for silhouettes; lengths are for a focal length of 445 px.
+    """Tolerances of the search for silhouettes; lengths are for a focal length of 445 px.
 
     Attributes
     ----------
@@ -42,11 +42,11 @@ class SilhouetteTolerances:
     far_px : reach in pixels that resemble it much: the inside of a mug is 60 px across.
     object_quantile : share of the region's pixels whose intensity stands for it. Guess; measured
         with the two before.
-    cut_rounds : of the graph cut; a fourth changes under 0.5 % of the pixels (mug).
-    edge_reach_px : of the search for a step of intensity about an outline. The region's Stokes
-        images are smoothed over 2 px, so that strong polarization leaks by about as much.
-    edge_prior_px : deviation of that step from the region's border. Guess.
-    edge_contrast : least step, as a share of the brighter side. Guess.
+    cut_rounds : of the graph cut; a fourth changes less than 0.5 % of the pixels (mug).
+    edge_reach_px : of the search for an intensity edge about an outline. The region's Stokes images
+        are smoothed over 2 px, so strong polarization leaks by about as much.
+    edge_prior_px : deviation of that edge from the region's border. Guess.
+    edge_contrast : least contrast of the edge, as a share of the brighter side. Guess.
     edge_smoothing_px : of the shifts along the outline. Guess.
     """
 
@@ -71,7 +71,7 @@ def find_silhouette(
     Parameters
     ----------
     phase_map : of the view.
-    mask_given : the region is the user's mask; it is certain.
+    mask_given : the region is the user's mask, which is certain.
     """
     tol = tolerances or SilhouetteTolerances()
     inside = np.asarray(phase_map.region.inside, np.bool_)
@@ -124,7 +124,7 @@ def _ellipse(radius: int) -> NDArray[np.uint8]:
 
 
 def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTolerances) -> Mask:
-    """The mask and the pixels that continue it, by a graph cut on intensity (GrabCut)."""
+    """The mask with the pixels that continue it, by a graph cut on intensity (GrabCut)."""
     white = max(float(np.percentile(intensity, 95)), 1e-9)
     bright = np.sqrt(np.clip(intensity / white, 0, 1)).astype(np.float32)
     smooth = cv2.GaussianBlur(bright, (0, 0), 1.5)
@@ -169,18 +169,18 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
     found_mask = np.isin(pieces, held[held > 0])
     found_mask = ~_without_small(~found_mask, tol.min_piece_px * scale**2, connectivity=4)
     if 2 * (found_mask & ~certain).sum() > certain.size:
-        return certain  # the cut has run into the surroundings
+        return certain  # the cut has leaked into the surroundings
     return np.asarray(found_mask)
 
 
 def _outline_shift(
     mask: Mask, intensity: Image, scale: float, tol: SilhouetteTolerances
 ) -> Image | None:
-    """By how much the step of intensity at a mask's border lies outside of it.
+    """Distance of the intensity edge at a mask's border outside of it.
 
     Returns
     -------
-    (H, W) px, at each pixel that of the nearest place of the border; None without a border.
+    (H, W) px, at each pixel that of the nearest border pixel; None without a border.
     """
     border = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
     rows, cols = np.nonzero(border)
@@ -221,19 +221,19 @@ def step_slope(profile: Image) -> Image:
 def nearest_steps(
     contrast: Floats, along: Array, scale: float, tolerances: SilhouetteTolerances | None = None
 ) -> tuple[Array, Array]:
-    """Places ``(N,)`` of steps that borders choose on profiles across them, and their contrasts.
+    """Positions ``(N,)`` of the edges chosen on profiles across a border, and their contrasts.
 
     Parameters
     ----------
-    contrast : (N, S), how steep each profile is.
-    along : (S,) equidistant, distances from the border, of ``scale`` times the tolerances' unit.
+    contrast : (N, S), steepness of each profile.
+    along : (S,) equidistant, distances from the border, in ``scale`` times the tolerances' unit.
     """
     tol = tolerances or SilhouetteTolerances()
     step = float(along[1] - along[0])
     score = contrast * np.exp(-0.5 * (along / (tol.edge_prior_px * max(scale, 1.0))) ** 2)
     score[:, np.abs(along) > tol.edge_reach_px * max(scale, 1.0)] = 0
     best, index = score.argmax(axis=1), np.arange(len(score))
-    # The border only chooses among steps: their places are their own.
+    # The border only chooses among edges; it does not shift their positions.
     for _ in range(round(1 / step)):
         beside = np.stack([contrast[index, best + side] for side in (-1, 0, 1)])
         best = np.clip(best + beside.argmax(axis=0) - 1, 1, len(along) - 2)
@@ -242,7 +242,7 @@ def nearest_steps(
 
 
 def _vertex_of_parabola(before: Floats, at: Floats, after: Floats) -> Array:
-    """Place of the maximum of a parabola through three values, in steps from the middle one."""
+    """Position of the maximum of a parabola through three values, in spacings from the middle."""
     bend = before - 2 * at + after
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(bend < 0, np.clip(0.5 * (before - after) / bend, -0.5, 0.5), 0.0)

@@ -1,6 +1,6 @@
 """One surface from all views: the energy of :mod:`polmvs.surface.terms`, solved coarse to fine.
 
-Each iteration observes the mesh in all views, infers the light of every observation, linearises all
+Each iteration observes the mesh in all views, infers the label of every observation, linearizes all
 terms and solves for one displacement per vertex::
 
     for level in levels:
@@ -66,13 +66,13 @@ from polmvs.surface.terms import (
 
 logger = logging.getLogger(__name__)
 
-POLISHING_STEPS = 2  # until a mesh made anew, which shrinks by some tenths of a pixel, converges
-CROSSED_DEPTH = 0.05  # of an edge: far above rounding, far below what a mesh resolves
-# Share of the silhouettes that a remeshed surface may lose. Measured: up to 0.011 where walls are
-# thicker than edges, 0.036 to 0.6 where they are thinner.
+POLISHING_STEPS = 2  # until a new mesh, which shrinks by some tenths of a pixel, converges
+CROSSED_DEPTH = 0.05  # of an edge: far above rounding, far below the resolution of a mesh
+# Share of the silhouettes that a remeshed surface may lose. Measured: up to 0.011 if walls are
+# thicker than edges, 0.036 to 0.6 if they are thinner.
 REMESHING_LOSS = 0.02
-MIN_LEVELS = 3  # of which the coarse ones can be left out
-MIN_RESIDUALS = 100  # of one view and kind of light, for a deviation of their own
+MIN_LEVELS = 3  # of which the coarse ones can be skipped
+MIN_RESIDUALS = 100  # least number of rows of one view and kind of light for a separate deviation
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -85,10 +85,10 @@ class Level:
 
     Attributes
     ----------
-    edge_px : edges of the mesh, in pixels' lengths at the surface.
-    num_steps : Gauss-Newton iterations at most.
+    edge_px : edge length of the mesh, GSD.
+    num_steps : largest number of Gauss-Newton iterations.
     loss_scale : of the phase rows' loss, in their standard deviations.
-    gate_px : outlines farther from a silhouette than this are not drawn to it.
+    gate_px : outlines farther from a silhouette than this are not pulled to it.
     """
 
     edge_px: float
@@ -98,7 +98,7 @@ class Level:
 
     @property
     def width_px(self) -> float:
-        """Of the Gaussian over which Stokes images are averaged: a fifth of an edge.
+        """Width of the Gaussian over which Stokes images are averaged: a fifth of an edge.
 
         Less than 1 px leaves the mosaic's interpolation in the phases (`PhaseTolerances`).
         """
@@ -107,7 +107,7 @@ class Level:
 
 @dataclass(frozen=True, kw_only=True)
 class SolverTolerances:
-    """Numbers of the solver.
+    """Tolerances of the solver.
 
     Attributes
     ----------
@@ -116,15 +116,16 @@ class SolverTolerances:
         iteration.
     vote_every : iterations from one vote to the next.
     last_steps : iterations without a vote, at the end.
-    damping : deviation of a step, in edges; it holds what neither outlines nor points place.
-    unseen_damping : of a vertex that no view sees, in edges; smoothness alone would melt it. Guess.
-    remesh_after : displacement of a fiftieth of the vertices after which a mesh is made anew, in
-        edges. Guess: triangles of a mesh that moves by less stay usable.
-    converged : root mean square of displacements of what is seen that ends a level, in edges.
-    max_lost : share of the silhouettes by which a surface may cover less than its hull before it is
-        made again without coarse levels. Guess: more than the corners that edges round.
-    max_vertices : of a mesh; finer levels are left out. From the time allowed.
-    terms, labels : of these.
+    damping : deviation of a step, in edges; it holds vertices without outlines or points.
+    unseen_damping : of a vertex that no view sees, in edges; smoothness alone would shrink it.
+        Guess.
+    remesh_after : displacement of a fiftieth of the vertices that triggers remeshing, in edges.
+        Guess: triangles of a mesh that moves by less stay usable.
+    converged : root mean square of the displacements of seen vertices that ends a level, in edges.
+    max_lost : share of the silhouettes that a surface may lose against its hull before it is made
+        again without coarse levels. Guess: more than rounded corners lose.
+    max_vertices : of a mesh; finer levels are skipped. From the time allowed.
+    terms, labels : tolerances of these.
     """
 
     levels: tuple[Level, ...] = (
@@ -147,40 +148,40 @@ class SolverTolerances:
 
     @property
     def num_steps(self) -> int:
-        """Iterations at most."""
+        """Largest number of iterations."""
         return sum(level.num_steps for level in self.levels)
 
 
 @dataclass(frozen=True)
 class Scales:
-    """Deviations that residuals show beside noise.
+    """Deviations of the residuals beyond noise.
 
     Attributes
     ----------
-    rows : (K, 2) of ``m . n``, of each view under each kind of light.
+    rows : (K, 2) of ``m . n``, for each view and kind of light.
     """
 
     rows: Array
 
     def of(self, observations: Observations) -> Array:
-        """Those of observations ``(2, N)``."""
+        """Deviations ``(2, N)`` for observations."""
         return np.asarray(self.rows[observations.view].T)
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Views and what they are fitted by.
+    """The views with the state of the fit.
 
     Attributes
     ----------
-    views : what each view shows.
-    images : the same, smoothed for the level in work.
+    views : all views.
+    images : their images, smoothed for the current level.
     looking : angle model and share of the tilt.
     scales : of the views' rows.
-    gsd : length that a pixel covers at the surface, world units.
+    gsd : ground sampling distance at the surface, world units.
     known : points of the surface.
     light : of all observations; None: inferred for each.
-    tol : numbers.
+    tol : tolerances.
     """
 
     views: Sequence[SurfaceView]
@@ -200,13 +201,13 @@ class Fit:
         return (1.0, 0.0) if self.light is Light.SPECULAR else (0.0, 1.0)
 
     def at_width(self, width_px: float) -> Fit:
-        """With images smoothed over another width."""
+        """The fit with images smoothed over another width."""
         with ThreadPoolExecutor(default_num_workers()) as pool:
             images = list(pool.map(lambda view: level_image(view, width_px), self.views))
         return replace(self, images=images)
 
     def of(self, kept: Mask) -> Fit:
-        """Of some views (K,) alone."""
+        """The fit of some views (K,)."""
         chosen = np.flatnonzero(kept).tolist()
         return replace(
             self,
@@ -225,7 +226,7 @@ def first_fit(
     light: Light | None = None,
     tolerances: SolverTolerances | None = None,
 ) -> Fit:
-    """What a first surface is fitted by; parameters as of :class:`Fit`."""
+    """The fit of a first surface; parameters as of :class:`Fit`."""
     tol = tolerances or SolverTolerances()
     rows = np.full((len(views), 2), tol.terms.row_sigma)
     return Fit(views, [], looking, Scales(rows), gsd, known, light, tol)
@@ -238,9 +239,9 @@ class Refined:
     Attributes
     ----------
     mesh : closed.
-    fit : of the views that are consistent, with the tilt's share and scales that they show.
-    left_out : (K,) bool, views that contradict the others.
-    unexplained : (K,) share of what each view shows that the first level does not explain.
+    fit : of the consistent views, with their share of the tilt and scales.
+    left_out : (K,) bool, inconsistent views.
+    unexplained : (K,) share of each view that the first level does not explain.
     meshes : after each level.
     """
 
@@ -260,16 +261,16 @@ def refine(
 ) -> Refined:
     """Move a closed mesh until the views' phases and silhouettes agree with it.
 
-    What OPA and PPA leave out, the tilt of the polarizers, errs alike in all rows, so that no
-    number of them averages it out; whether the lens makes it no model can know. Its share is one
-    more unknown.
+    OPA and PPA ignore the tilt of the polarizers. Its error is common to all rows, so it does not
+    average out, and whether the lens causes it is unknown. Its share is therefore one more
+    unknown.
 
     Parameters
     ----------
     mesh : first surface, closed.
     fit : of all views.
-    stands_apart : tells from the unexplained shares ``(K,)`` which views contradict the others;
-        these count no longer after the first level.
+    stands_apart : finds inconsistent views from the unexplained shares ``(K,)``; these are left out
+        after the first level.
     on_progress : called with the number of iterations done.
     """
     tol = fit.tol
@@ -282,7 +283,7 @@ def refine(
         logger.info("walls are thinner than coarse edges; fine edges need too many vertices.")
         return found
     logger.info("walls are thinner than coarse edges; the surface is made again by fine ones.")
-    # The way is as long, and a step no longer than an edge.
+    # The distance is the same, and a step is at most an edge length.
     steps = fine.num_steps + sum(level.num_steps * level.edge_px for level in coarse) / fine.edge_px
     first = replace(coarse[0], edge_px=fine.edge_px, num_steps=round(steps))
     again = _through_levels(mesh, fit, (first, last), stands_apart, no_progress)
@@ -320,7 +321,7 @@ def _through_levels(
 
 
 def _num_vertices(mesh: TriangleMesh, edge: float) -> float:
-    """How many vertices a mesh has once its edges are of this length."""
+    """Number of vertices of the mesh with edges of this length."""
     return 1.2 * float(mesh.face_areas.sum()) / edge**2
 
 
@@ -361,8 +362,8 @@ def _refined_at(
     moved, energy = np.zeros(0), None
     first, last = tol.annealing
     for step in range(level.num_steps):
-        # A mesh that has moved far is uneven. In one that intersects itself views see the inside.
-        # Others stay as they are, because the grid rounds their creases.
+        # A mesh that has moved far is irregular. In one that intersects itself views see the
+        # inside. Other meshes stay as they are, because the grid rounds their creases.
         if step == 0:
             mesh = remeshed(mesh, edge)
             moved = np.zeros(len(mesh.vertices))
@@ -414,13 +415,13 @@ def _refined_at(
 
 @dataclass(frozen=True)
 class _Evidence:
-    """What some views say of the displacements of one mesh.
+    """Equations of some views for the displacements of one mesh.
 
     Attributes
     ----------
     equations : of their phases and outlines.
     outline_slope : (V,), change of the gradient by an error of all silhouettes, per px.
-    tilt : share of the polarizers' tilt that is still to be taken back.
+    tilt : share of the polarizers' tilt that is not yet corrected.
     """
 
     equations: Equations
@@ -434,15 +435,15 @@ class Energy:
 
     Attributes
     ----------
-    views : what all of them say.
-    of_views : the same of some of them, by their indices.
+    views : equations of all views.
+    of_views : equations of some of the views, by their indices.
     points : equations of the known points.
     smooth, pull : matrix ``(V, V)`` and gradient ``(V,)`` of the smoothness, and the matrix
         ``(V, V)`` whose product with its own transpose is the former.
     free : (V,) bool, vertices of faces that some view sees.
     sharp : (V,) bool, vertices on edges between sides.
     light : (2,) shares of the observations whose light is specular, and diffuse.
-    scales : that the rows' residuals show.
+    scales : of the rows' residuals.
     """
 
     views: _Evidence
@@ -493,9 +494,9 @@ def linearize(
     edge : length of its edges.
     normal_sigma : rad, assumed error of its normals in the labels.
     with_vote : try other normals for the labels, and turn faces towards those that win.
-    with_slope : count how a row changes as its place moves through the image. It places what no
-        outline bounds (the floor of a dish, waves).
-    sides : of a sharpened mesh, whose very outline is then held against the silhouettes.
+    with_slope : include the change of a row as its face moves through the image. It determines the
+        position of parts that no outline bounds (the floor of a dish, waves).
+    sides : of a sharpened mesh, whose exact outline is then compared with the silhouettes.
     """
     views, tol = fit.views, fit.tol
     terms, mesh = tol.terms, scene.mesh
@@ -515,7 +516,7 @@ def linearize(
     if sides is not None:
         edges = edges.only(np.all(sides.is_shown[edges.faces], axis=1))
         sharp = crease_vertices(mesh, sides.is_shown)
-        # Edges go where their sides meet: the faces there say nothing of the sides beside them.
+        # Edges move to where their sides intersect: the faces there do not constrain the sides.
         used = sides.is_fitted & ~np.any(sharp[mesh.faces], axis=1)
         observations = observations.only(used[observations.face])
     row_sigma = fit.scales.of(observations)
@@ -542,14 +543,14 @@ def linearize(
             mesh, scene, view, edges, sharp, gate_px=level.gate_px, on_outline=sides is not None
         )
 
-    # Threads, for products of large arrays and the casting of rays let go of Python's lock.
+    # Threads, as products of large arrays and ray casting release Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
         outlines = list(pool.map(outline, views))
 
     def of_views(chosen: Sequence[int]) -> _Evidence:
         equations = Equations(len(mesh.vertices))
-        # Anything between a sensor of the angle model and a tilted polarizer may be, as little
-        # known as what else the rows share.
+        # The share is anywhere between a sensor of the angle model and a tilted polarizer, and is
+        # as uncertain as other errors that the rows share.
         tilt = SharedError(
             len(mesh.vertices),
             prior=terms.phase_correlation(face_area_px),
@@ -614,13 +615,13 @@ def linearize(
 
 @dataclass(frozen=True)
 class Labelled:
-    """Observations of a refined mesh with the light that they probably are of.
+    """Observations of a refined mesh with their labels.
 
     Attributes
     ----------
     observations : K of them.
     shares : (2, K) probabilities of specular and of diffuse light.
-    row_sigma : (2, K) deviation of ``m . n`` beside noise.
+    row_sigma : (2, K) deviation of ``m . n`` beyond noise.
     num_views : of all observations.
     """
 
@@ -636,7 +637,7 @@ class Labelled:
 
     @property
     def excess(self) -> Array:
-        """(K,) by how much it is likelier than the other."""
+        """(K,) difference of the probabilities of the two."""
         return np.asarray(np.abs(self.shares[0] - self.shares[1]))
 
     def residuals(self, mesh: TriangleMesh) -> tuple[Array, Array]:
@@ -647,13 +648,13 @@ class Labelled:
         return residuals[kind, index], variances[kind, index]
 
     def contradicts(self, mesh: TriangleMesh) -> Mask:
-        """(K,) bool, beyond what noise explains, and what tells the sides of a crease apart."""
+        """(K,) bool, residuals beyond noise and beyond the difference between sides of a crease."""
         residual, variance = self.residuals(mesh)
         limit = np.maximum(3 * np.sqrt(variance), CreaseTolerances.like_sine)
         return np.asarray(np.abs(residual) > limit)
 
     def mean_loss(self, mesh: TriangleMesh) -> float:
-        """Mean of a robust loss of the residuals, in [0, 1]: how badly the mesh fits its phases."""
+        """Mean robust loss of the residuals, in [0, 1]; 0 if the mesh fits its phases exactly."""
         residual, variance = self.residuals(mesh)
         square = residual**2 / variance
         area = mesh.face_areas[self.observations.face]
@@ -669,11 +670,11 @@ class Labelled:
 
 
 def label(mesh: TriangleMesh, fit: Fit, *, min_cosine: float | None = None) -> Labelled:
-    """The observations of a refined mesh with their light.
+    """The observations of a refined mesh with their labels.
 
     Parameters
     ----------
-    min_cosine : flatter sight is not counted; by default as in the refinement.
+    min_cosine : more oblique views are ignored; by default as in the refinement.
     """
     looking = fit.looking if min_cosine is None else replace(fit.looking, min_cosine=min_cosine)
     edges = shared_edges(mesh)
@@ -693,9 +694,9 @@ def label(mesh: TriangleMesh, fit: Fit, *, min_cosine: float | None = None) -> L
 
 
 def _shown_scales(observations: Observations, normals: Array, shares: Array, fit: Fit) -> Scales:
-    """Deviations of rows beside their noise, of each view under each kind of light.
+    """Deviations of rows beyond their noise, for each view and kind of light.
 
-    Where a view has few observations of a kind, those of all views stand for it.
+    If a view has few observations of a kind, those of all views replace them.
     """
     least = fit.tol.terms.row_sigma
     residuals = observations.residuals(normals)
@@ -730,13 +731,13 @@ def _step(
 
 
 def polishing_step(mesh: TriangleMesh, fit: Fit, sides: KnownSides) -> tuple[TriangleMesh, bool]:
-    """A mesh with sharp edges, one step nearer to where outlines, points and phases have it.
+    """One polishing step of a mesh with sharp edges, under outlines, points and phases.
 
     Parameters
     ----------
-    mesh : sharpened; its triangles stay.
+    mesh : sharpened; its triangles are kept.
     fit : of a refined surface.
-    sides : what is known of its faces.
+    sides : of its faces.
 
     Returns
     -------
@@ -752,7 +753,7 @@ def polishing_step(mesh: TriangleMesh, fit: Fit, sides: KnownSides) -> tuple[Tri
 
 
 def certain_rays(view: SurfaceView, stride_px: int) -> Array:
-    """Unit rays ``(N, 3)``, world, of every so many-th pixel of a view's certain silhouette."""
+    """Unit rays ``(N, 3)``, world, of pixels of a view's certain silhouette, at a stride."""
     half = stride_px // 2
     rows, cols = np.nonzero(view.silhouette.certain[half::stride_px, half::stride_px])
     xy = np.stack([cols, rows], axis=1) * stride_px + half + 0.5
@@ -760,10 +761,10 @@ def certain_rays(view: SurfaceView, stride_px: int) -> Array:
 
 
 def unexplained_shares(mesh: TriangleMesh, fit: Fit, *, stride_px: int = 4) -> Array:
-    """How little a mesh explains of each view: mean ``(K,)`` over its certain silhouette's pixels.
+    """Share ``(K,)`` of each view that a mesh does not explain: mean over its certain silhouette.
 
-    1 where it shows nothing, or a normal that the phase contradicts under both kinds of light by
-    far more than all views' rows show; 0 where they agree.
+    A pixel counts 1 if the mesh shows nothing there, or a normal that the phase contradicts under
+    both kinds of light by far more than the scales of all views; 0 if they agree.
     """
     scene, shares = RayScene(mesh), np.full(len(fit.views), np.nan)
     row_sigma = float(np.median(fit.scales.rows))
@@ -790,7 +791,7 @@ def unexplained_shares(mesh: TriangleMesh, fit: Fit, *, stride_px: int = 4) -> A
         loss = np.ones(len(rays))
         loss[hit[known]] = (square / (square + CAUCHY_SCALE**2))[known]
         kept = hits.face < 0
-        kept[hit[known]] = True  # a pixel without a phase says nothing of the mesh
+        kept[hit[known]] = True  # a pixel without a phase does not test the mesh
         if kept.any():
             shares[index] = loss[kept].mean()
     return shares
@@ -804,20 +805,20 @@ def place_deviations(
     num_samples: int = 12,
     seed: int = 0,
 ) -> Array:
-    """Standard deviation ``(V,)`` of the place along the normal of each vertex of a refined mesh.
+    """Position uncertainty ``(V,)`` (1 sigma) along the normal of each vertex of a refined mesh.
 
-    What the views contribute is taken from the views: the jackknife (Tukey 1958), how far the
-    surface moves when one of them, or one of some groups of them, is left out. Whatever a view's
-    phases and outline have in common (light, pose, blur) is in it, without a guess of what. What
-    all views share is not: the share of the polarizers' tilt and the bias of the outlines are
-    added, and samples of the errors of points and smoothness, and of the views' stated noise, below
-    which few views agree by chance. Large where only smoothness carries a vertex.
+    The contribution of the views is the jackknife (Tukey 1958): the displacement of the surface
+    when one of them, or one of some groups of them, is left out. It includes all errors that the
+    phases and the outline of a view share (light, pose, blur). It does not include errors that all
+    views share: the share of the polarizers' tilt and the bias of the outlines are added. Samples
+    of the errors of points, smoothness and the views' stated noise are also added, as few views may
+    agree by chance. It is large where only smoothness determines a vertex.
 
     Parameters
     ----------
     mesh, fit : as of :func:`refine`, refined.
-    max_groups : of views, to leave out.
-    num_samples : the deviation of a deviation is one over the root of twice as many.
+    max_groups : largest number of groups of views.
+    num_samples : the relative error of a deviation is one over the root of twice this number.
     seed : of the random numbers.
     """
     tol = fit.tol
@@ -837,12 +838,12 @@ def place_deviations(
         mesh, _ = _step(mesh, energy, edge, tol)
         energy = energy_of(mesh)
     matrix = energy.matrix()
-    # Nothing but the energy holds the surface here; what no view sees is not used.
+    # Only the energy holds the surface here; vertices that no view sees are not used.
     loose = 1 / (np.where(energy.free, 100.0, tol.unseen_damping) * edge) ** 2
     none = np.zeros(num)
     rest = -solve(matrix, energy.gradient(), loose, none)
     by_tilt = solve(matrix, energy.views.tilt.slope, loose, none)
-    # What rows share is as uncertain as their own errors would be, were they not weighted down.
+    # The shared error of rows is as large as their own errors before they are weighted down.
     by_tilt *= energy.views.tilt.deviation(by_tilt) * np.sqrt(
         tol.terms.phase_correlation(face_area_px)
     )
@@ -854,7 +855,7 @@ def place_deviations(
         variance += solve(matrix, noise, loose, none) ** 2 / num_samples
     num_groups = min(num_views, max_groups)
     for first in range(num_groups):
-        # Neighbours by name are likely to see the same: each goes to a group of its own.
+        # Neighbours by name probably see the same, so they go to different groups.
         left_out = energy.of_views(range(first, num_views, num_groups)).equations
         own = left_out.matrix()
         change = solve(sparse.csr_array(matrix - own), left_out.gradient + own @ rest, loose, none)

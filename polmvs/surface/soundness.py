@@ -1,7 +1,7 @@
-"""Whether a mesh is a surface at all: sheets that lie upon each other, and overlaps.
+"""Check of a mesh for double layers and self-intersections.
 
-Both come of views that contradict each other: each has its own sheet. A ray from a camera enters a
-sound body and leaves it, in turn, and some way apart.
+Both come from views that contradict each other: each view has its own sheet. A ray from a camera
+enters and leaves a valid solid in turn, at some distance.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 Mask = NDArray[np.bool_]
 
 STRIDE_PX = 6
-# Sheets nearer to each other than this are one within what silhouettes and phases place: their
-# deviation is a pixel at best.
+# Sheets nearer to each other than this are a double layer: the deviation of silhouettes and phases
+# is a pixel at best.
 SHEET_PX = 3.0
-MIN_COSINE = 0.3  # of a crossing: a rim that the ray grazes is thin in any body. Guess
+MIN_COSINE = 0.3  # of a crossing: a grazed outline is thin in any solid. Guess
 
 
 @dataclass(frozen=True, kw_only=True)
 class Soundness:
-    """How a mesh is crossed by the views' rays.
+    """Crossings of a mesh by the views' rays.
 
     Attributes
     ----------
-    layered : share of the rays that meet it which cross two sheets, nearly one upon the other.
+    layered : share of the rays that hit it which cross two sheets nearly at the same position.
     overlapping : share which enter it twice without leaving, or leave it twice: it intersects
         itself.
     """
@@ -50,8 +50,8 @@ def find_soundness(
     ----------
     mesh : closed, its faces anticlockwise from outside.
     views : whose rays are cast, every few pixels.
-    outside : pixels (H, W) of each view, by its name, that show what lies outside a box that the
-        result was cut to; no rays are cast there.
+    outside : pixels (H, W) of each view, by its name, that show what is outside the crop box; no
+        rays are cast there.
     """
     met, layered, overlapping = 0, 0, 0
     scene = RayScene(mesh)

@@ -1,7 +1,7 @@
-"""What is known of a surface and what is not: evidence for its faces, normals at fixed places.
+"""Support of a surface: evidence for its faces, and their normals with uncertainty.
 
-A part of the mesh that fewer than two views see, that their silhouettes deny, or that most of
-their phases contradict is no result: only smoothness, or the limits of the hull, put it there.
+A part of the mesh is not a result if fewer than two views see it, their silhouettes deny it, or
+most of their phases contradict it: it comes only from smoothness or the limits of the hull.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
-MIN_EXCESS = 1e-3  # of one kind of light over the other, that counts at all
-MAX_SIGMAS = 3.0  # of one figure, before it is called a contradiction
-MAX_SHARE = 0.1  # of a surface or its silhouettes in contradiction. Guess
+MIN_EXCESS = 1e-3  # least excess probability of one kind of light over the other
+MAX_SIGMAS = 3.0  # of a value above which it is a contradiction
+MAX_SHARE = 0.1  # share of a surface or its silhouettes in contradiction. Guess
 ONE_SIDED = 1.645  # deviations of a normal distribution, which 5 % exceed
-MIN_POINTS = 10  # on the surface, for their median to be one
-# Of what the median view shows explained, that a view which belongs to the surface has. Measured on
-# eleven captures, each with the pose of one view exchanged: 0.80 and more; wrong ones under PPA had
-# 0.47 and less.
+MIN_POINTS = 10  # least number on the surface for a median
+# Explained share of a consistent view, relative to the median view. Measured on eleven captures,
+# each with the pose of one view exchanged: 0.80 and more; wrong ones under PPA had 0.47 and
+# less.
 MIN_EXPLAINED = 0.65
 MAX_ROWS = 500_000  # faces times views at a time; bounds memory
 
 
 @dataclass(frozen=True, kw_only=True)
 class QualityTolerances:
-    """When a part of a surface counts as a result.
+    """Tolerances of the support of a surface.
 
     Attributes
     ----------
-    outside_px : by which a face must lie beyond a silhouette to be denied by it. Twice the
-        deviation of an outline with its bias. Measured with the next: halves cost `mug` 0.4 points
-        of F at 1 mm, doubles none.
-    max_outside_share : of the views that see a face, to deny it: two of six.
+    outside_px : distance outside of a silhouette at which it denies a face. Twice the deviation of
+        an outline with its bias. Measured with the next: halves cost `mug` 0.4 points of F at 1 mm,
+        doubles none.
+    max_outside_share : of the views that see a face, above which it is denied: two of six.
     """
 
     outside_px: float = 1.5
@@ -59,14 +59,14 @@ class QualityTolerances:
 
 @dataclass(frozen=True)
 class FaceEvidence:
-    """What the views say of each face of a mesh.
+    """Evidence of the views for each face of a mesh.
 
     Attributes
     ----------
     num_views : (F,) int, views that see it.
-    num_outside : (F,) int, those whose silhouettes it lies outside of.
-    num_rows : (F,) int, those with a phase there.
-    num_contradicting : (F,) int, those whose phase contradicts its normal.
+    num_outside : (F,) int, views whose silhouettes deny it.
+    num_rows : (F,) int, views with a phase there.
+    num_contradicting : (F,) int, views whose phase contradicts its normal.
     """
 
     num_views: NDArray[np.int64]
@@ -88,7 +88,7 @@ def face_evidence(
     *,
     tolerances: QualityTolerances | None = None,
 ) -> FaceEvidence:
-    """Ask all views about all faces.
+    """Evidence of all views for all faces.
 
     Parameters
     ----------
@@ -125,13 +125,13 @@ def supported_faces(
     min_views: int = 2,
     tolerances: QualityTolerances | None = None,
 ) -> Mask:
-    """Which faces ``(F,)`` the views bear out.
+    """Which faces ``(F,)`` the views support.
 
     Parameters
     ----------
-    mesh : that the evidence is of.
+    mesh : of the evidence.
     evidence : of its faces.
-    min_views : that must see a face, and have a phase there.
+    min_views : number of views that must see a face and have a phase there.
     """
     tol = tolerances or QualityTolerances()
     if not len(mesh.faces):
@@ -163,11 +163,11 @@ def _smoothed(mesh: TriangleMesh, values: Array) -> Array:
 
 @dataclass(frozen=True)
 class FaceNormals:
-    """Normals of a mesh's faces at their places.
+    """Normals of a mesh's faces.
 
     Attributes
     ----------
-    normals : (F, 3) unit, world: the phases' where they agree with the mesh, else the mesh's.
+    normals : (F, 3) unit, world: from the phases where they agree with the mesh, else the mesh's.
     sigma_deg : (F,) standard deviation, degrees; inf where the phases give none.
     """
 
@@ -176,16 +176,16 @@ class FaceNormals:
 
     @property
     def is_fitted(self) -> Mask:
-        """(F,), whether a normal is the phases'."""
+        """(F,), whether a normal is from the phases."""
         return np.isfinite(self.sigma_deg)
 
 
 def fit_normals(mesh: TriangleMesh, labelled: Labelled) -> FaceNormals:
-    """Normals from the phases of all views at the places of the mesh, which stay.
+    """Normals from the phases of all views at the faces of the mesh, which does not move.
 
-    A mesh's own normals are noisier: they are differences of places. Their deviations are those
-    that the phases' noise states, times the root of by how much the rows about a face miss it
-    (Birge 1932): light that is not the model's errs more than noise.
+    A mesh's own normals are noisier, as they are differences of positions. The deviations are those
+    of the phases' noise, times the Birge ratio (1932) of the rows about a face: light outside of
+    the model has larger errors than noise.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def fit_normals(mesh: TriangleMesh, labelled: Labelled) -> FaceNormals:
         estimate = solve_normals(rows, rays, turns, initial_normals=own.T)
         cosine = np.clip((estimate.normals * own).sum(axis=1), -1, 1)
         apart = np.degrees(np.arccos(cosine))
-        # A mesh rounds a right-angled edge: a face there is turned by 45 deg, most by less.
+        # A mesh rounds a right-angled edge: a face there is turned by at most 45 deg.
         good = estimate.valid & (apart < CreaseTolerances.crease_deg + 3 * estimate.sigma_deg)
         good &= estimate.residual < 3 * row_sigma
         normals[part][good] = estimate.normals[good]
@@ -239,8 +239,8 @@ def _chi_squared(rows: Floats, rays: Floats, turns: Floats, estimate: NormalEsti
 def _excess_variance(mesh: TriangleMesh, chi_squared: Array) -> Array:
     """Chi squared over degrees of freedom (F,), at least 1, from both (F, 2) about each face.
 
-    A face has few degrees of freedom: those of its surroundings are counted with them, and as many
-    as one row's of the whole surface.
+    A face has few degrees of freedom: those of its surroundings are added, and one row of the mean
+    of the whole surface.
     """
     whole = chi_squared.sum(axis=0)
     expected = whole[0] / whole[1] if whole[1] else 1.0
@@ -250,18 +250,18 @@ def _excess_variance(mesh: TriangleMesh, chi_squared: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Contradictions:
-    """How far a surface and the data that it was made from disagree.
+    """Disagreement between a surface and the data from which it was made.
 
     Attributes
     ----------
     phase_sine : median of the absolute residuals of the phases.
-    contradicted_share : of the area that two views see, where most phases contradict the normal.
-    denied_share : of that area, which silhouettes deny.
+    contradicted_share : share of the area that two views see where most phases contradict the
+        normal.
+    denied_share : share of that area which silhouettes deny.
     uncovered_share : mean over the views of the share of the silhouette that the surface leaves
         uncovered.
-    point_offset_px : by which the surface lies outside of the known points on it, in the median
-        and in GSD (length of a pixel at the surface).
-    point_offset_sigmas : the same in standard deviations of it.
+    point_offset_px : median distance of the surface outside of the known points on it, GSD.
+    point_offset_sigmas : the same in its standard deviations.
     """
 
     phase_sine: float
@@ -272,7 +272,7 @@ class Contradictions:
     point_offset_sigmas: float = 0.0
 
     def warnings(self) -> list[str]:
-        """Sentences for what a user should know; none if the surface fits its data."""
+        """Warnings for the user; none if the surface fits its data."""
         found = []
         if self.contradicted_share > MAX_SHARE:
             found.append(
@@ -309,13 +309,13 @@ def find_contradictions(
     *,
     tolerances: QualityTolerances | None = None,
 ) -> Contradictions:
-    """Hold a surface against the views.
+    """Compare a surface with the views.
 
     Parameters
     ----------
     mesh, evidence : the surface.
     supported : (F,) faces that are kept.
-    views : what each view says.
+    views : all views.
     phase_sine : median of the absolute residuals of the phases.
     """
     tol = tolerances or QualityTolerances()
@@ -334,9 +334,9 @@ def find_contradictions(
 def outline_mismatch(
     mesh: TriangleMesh, views: Sequence[SurfaceView], *, stride_px: int = 4
 ) -> Array:
-    """Share ``(K,)`` of what each view shows of a mesh or of objects that it shows of one alone.
+    """Share ``(K,)`` of the union of mesh and silhouette in each view that is of only one of them.
 
-    NaN where it shows nothing of either.
+    NaN if a view shows neither.
     """
     scene, shares = RayScene(mesh), np.full(len(views), np.nan)
     for index, view in enumerate(views):
@@ -355,21 +355,21 @@ def outline_mismatch(
 
 
 def stand_apart(unexplained: Array, least: float) -> Mask:
-    """Which views a surface explains much less well than the median one.
+    """Which views a surface explains much worse than the median view.
 
-    Either by the share of what they show that is explained, or by the share that is not: a wrong
-    pose may agree with the surface by chance on most pixels, for two kinds of light are open, and
-    still leave many times more unexplained than right ones do.
+    The criterion is the explained share or the unexplained share. A view with a wrong pose may
+    agree with the surface by chance on most pixels, as either kind of light is possible, and still
+    leave many times more unexplained than a correct one.
 
     Parameters
     ----------
     unexplained : (K,) shares; NaN where unknown.
-    least : share explained that is enough, of the median one.
+    least : sufficient explained share, relative to the median view.
 
     Returns
     -------
-    (K,) bool. No view stands apart if fewer than three would be left (two agree by chance), or if
-    half of the median view or more is unexplained (the surface itself is wrong).
+    (K,) bool. None if fewer than three views would remain (two agree by chance), or if half of the
+    median view or more is unexplained (the surface itself is wrong).
     """
     explained = 1 - unexplained
     known = np.isfinite(explained)
@@ -381,10 +381,10 @@ def stand_apart(unexplained: Array, least: float) -> Mask:
 
 
 def points_deny(moved: TriangleMesh, mesh: TriangleMesh, known: KnownPoints, gsd: float) -> bool:
-    """Whether known points lie nearer to a mesh than to the same mesh moved.
+    """Whether known points lie nearer to a mesh than to the same mesh after a move.
 
-    By the signed-rank test (Wilcoxon 1945), at 5 %. What few points say is no objection. (The test
-    of scipy.stats takes most of a second to be imported.)
+    It uses the signed-rank test (Wilcoxon 1945) at 5 %. Few points never deny a move. (The test of
+    scipy.stats takes most of a second to import.)
     """
     (far, _, on_moved), (near, _, on_mesh) = (
         _offsets(surface, known, gsd) for surface in (moved, mesh)
@@ -403,30 +403,30 @@ def points_deny(moved: TriangleMesh, mesh: TriangleMesh, known: KnownPoints, gsd
 def _offsets(
     mesh: TriangleMesh, known: KnownPoints, gsd: float
 ) -> tuple[Array, NDArray[np.int64], Mask]:
-    """By how much (N,) a surface lies outside of points, at which face, and which are on it."""
+    """Distance (N,) of a surface outside of points, the faces there, and which points are on it."""
     if not len(known.points):
         return np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.bool_)
     place, face, _ = RayScene(mesh).closest(known.points)
     offset = dots(place - known.points, mesh.face_normals[face])
-    # What lies farther than the hull's cells are wide is not on the surface.
+    # Points farther than the width of the hull's cells are not on the surface.
     return offset, face, np.abs(offset) < HullTolerances.step_px * gsd
 
 
 def point_offset(
     mesh: TriangleMesh, supported: Mask, sigma: Array, known: KnownPoints, gsd: float
 ) -> tuple[float, float]:
-    """By how much a surface lies outside of the known points on it.
+    """Distance of a surface outside of the known points on it.
 
     Parameters
     ----------
     mesh, supported : the surface, with V vertices and F faces; (F,) those that are kept.
     sigma : (V,) its stated deviation, world units.
     known : points of the surface.
-    gsd : length that a pixel covers, world units.
+    gsd : ground sampling distance, world units.
 
     Returns
     -------
-    The median, in GSDs, and the same in standard deviations; 0 where few points are near.
+    The median, in GSD, and the same in standard deviations; 0 if few points are near.
     """
     if len(known.points) < MIN_POINTS or not supported.any():
         return 0.0, 0.0
@@ -437,7 +437,7 @@ def point_offset(
     if near.sum() < MIN_POINTS:
         return 0.0, 0.0
     offset, middle = offset[near], float(np.median(offset[near]))
-    # A median of normal errors is known to 1.25 deviations over the root of their number.
+    # The deviation of a median of normal errors is 1.25 deviations over the root of their number.
     own = max(robust_deviation(offset - middle), float(np.median(known.sigma[near])))
     noise = np.hypot(1.25 * own / np.sqrt(len(offset)), np.median(stated[near]))
     return middle / gsd, middle / max(float(noise), 1e-300)

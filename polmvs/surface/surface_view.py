@@ -1,4 +1,4 @@
-"""What one view says about points and surfaces in space: its record for the global surface."""
+"""One view for the surface of all views: its silhouette, phase map and camera."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-REFERENCE_FOCAL_PX = 445.0  # of the images that lengths on the image were chosen on
-FIELD_SMOOTHING_PX = 0.8  # of the distance to a silhouette; takes the steps of its pixels out
-FAR_PX = 1000.0  # distance to a silhouette that the view does not have
+REFERENCE_FOCAL_PX = 445.0  # focal length of the images for which lengths were chosen
+FIELD_SMOOTHING_PX = 0.8  # of the distance to a silhouette; it smooths its pixel staircase
+FAR_PX = 1000.0  # distance to a missing silhouette
 
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Outline of the polarized objects in one view, with doubt.
+    """Silhouette of the polarized objects in one view, with unknown pixels.
 
     Attributes
     ----------
     certain : (H, W) bool, on an object.
-    possible : (H, W) bool, on an object or unknown; holds ``certain``.
-    inner_shift, outer_shift : (H, W) float32, px, by how much the outlines of the two lie farther
-        outside than the borders of their pixels; None: not at all.
+    possible : (H, W) bool, on an object or unknown; includes ``certain``.
+    inner_shift, outer_shift : (H, W) float32, px, distance of the outlines of the two outside of
+        the borders of their pixels; None: 0.
     """
 
     certain: Mask
@@ -59,7 +59,7 @@ class Silhouette:
 
 
 class _StoredSilhouette(Silhouette):
-    """A silhouette whose arrays are on disk and mapped when they are asked for."""
+    """A silhouette whose arrays are on disk and mapped when they are used."""
 
     def __init__(self, made: Silhouette, folder: Path, name: str) -> None:
         names = ("certain", "possible", "inner") + (() if made.is_sharp else ("outer",))
@@ -86,7 +86,7 @@ def signed_distance_px(mask: Mask) -> Image:
 
 def _distance_px(pixels: NDArray[np.uint8]) -> Image:
     """Distance (H, W) to the nearest pixel that is 0, px, the same in every run."""
-    # IPP rounds it as its memory happens to lie; OpenCV's own code is as fast.
+    # IPP's rounding depends on memory alignment; OpenCV's own code is as fast.
     used = cv2.ipp.useIPP()
     cv2.ipp.setUseIPP(False)
     try:
@@ -109,13 +109,13 @@ def _distance_field(mask: Mask, shift: Image | None) -> Image:
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """One posed view for the global surface.
+    """One posed view for the surface of all views.
 
     Attributes
     ----------
-    phase_map : its phase; looked at anew each time, as it may be on disk.
+    phase_map : its phase; read anew each time, as it may be on disk.
     silhouette : of the objects.
-    has_outline : whether the silhouette may carve and pull: some pixels on it and some off it.
+    has_outline : whether the silhouette may carve and pull: it has pixels on and off the objects.
     """
 
     phase_map: PhaseMap
@@ -156,7 +156,7 @@ class SurfaceView:
         return in_frame(xy, self.width, self.height, margin_px)
 
     def gsd(self, points: Floats) -> Array:
-        """Length ``(N,)`` in space that a pixel covers at points, across the optical axis."""
+        """Ground sampling distance ``(N,)`` at points, perpendicular to the optical axis."""
         return np.abs(self.to_camera(points)[:, 2]) / self.view.camera.mean_focal_px
 
 
@@ -169,7 +169,7 @@ def surface_view(
     ----------
     phase_map : of the view.
     silhouette : of the objects in this view.
-    folder : where what is made here is kept; None: in memory, some 30 bytes a pixel.
+    folder : for the derived arrays; None: in memory, some 30 bytes a pixel.
     """
     name = phase_map.view.name
     return SurfaceView(

@@ -1,8 +1,8 @@
-"""What lies about the polarized parts: sparse points, and stereo of textured surfaces.
+"""Surroundings of the polarized parts: sparse points, and stereo of textured surfaces.
 
-The surroundings are textured and unpolarized, so that matching features and patches works there
-and on the parts it does not: a glossy surface shows mirror images, which make sparse points as
-good as any, behind it. Where a view shows a part is known, and what is seen there is left out.
+The surroundings are textured and unpolarized, so features and patches match there. On the parts
+they do not: a glossy surface shows mirror images, which make good sparse points behind it. The
+region of the parts in each view is known, and points in it are left out.
 
 Stereo is OpenCV's semi-global matching on rectified pairs of views. Any camera model is rectified
 through its rays: both views are turned into one frame whose x axis is the baseline, and resampled
@@ -50,35 +50,33 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class SurroundingsTolerances:
-    """Which sparse points are kept, which views are paired, and which matches count.
+    """Tolerances of sparse points, pairs of views, and matches.
 
     Attributes
     ----------
-    min_observations : two rays that meet say nothing about whether they belong together.
-        Derived. As many views must agree on a point of stereo. Points of which more than one in
-        so many observations lies on parts are left out: they are on the part, which has its own
-        cloud, or mirror images behind it.
-    max_relative_sigma : points are left out whose place is less certain than this share of their
-        mean distance from the cameras, along the worst axis. Measured on `dome`: twice as much
-        keeps 1.2 times as many.
+    min_observations : of a sparse point: two rays may meet by chance. Derived. As many views must
+        agree on a point of stereo. A point is left out if more than one in so many observations is
+        on a part: it is on the part, which has its own cloud, or a mirror image behind it.
+    max_relative_sigma : largest position uncertainty, as a share of the mean distance from the
+        cameras, along the worst axis. Measured on `dome`: twice as much keeps 1.2 times as many.
     min_angle_deg : of triangulation: half a pixel of disparity is 1 % of the distance there.
         Derived.
-    max_angle_deg : of triangulation: patches of slanted surfaces look too different beyond.
+    max_angle_deg : of triangulation: beyond it patches of slanted surfaces look too different.
         Guess.
-    max_axis_angle_deg : between the directions in which two views look, and between their
-        baseline and the plane across them: an epipole in the image is no use. Guess.
-    min_shared_points : of two views, for their angle to be known, the range to search, and their
-        overlap to be worth it. Guess.
-    block_px : side of the patches that are compared, and of the planes that are fitted, in points
-        of the lattice. Guess.
+    max_axis_angle_deg : between the optical axes of two views, and between their baseline and the
+        plane perpendicular to the axes: no epipole may be in the image. Guess.
+    min_shared_points : of two views, for their angle, their range of depths and a useful overlap.
+        Guess.
+    block_px : side of the matched patches, and of the fitted planes, in points of the lattice.
+        Guess.
     min_texture : standard deviation, grey levels. Derived: noise of a full well of 10,000
         electrons makes 0.6.
     min_ray_z : rays more than 60 deg from the rectified axis would be stretched fourfold.
         Derived.
     range_percentiles : of the sparse points' distances; few of them are wrong. Guess.
     range_margin : of the disparities beyond those of the sparse points. Guess.
-    max_disparities : searched; more means that the sparse points are no guide. Guess.
-    min_window_share : of a plane's lattice points that are known. Guess.
+    max_disparities : largest number to search; with more, the sparse points are useless. Guess.
+    min_window_share : share of a plane's lattice points that are known. Guess.
     """
 
     min_observations: int = MIN_VIEWS
@@ -97,20 +95,20 @@ class SurroundingsTolerances:
 
     @property
     def border_px(self) -> int:
-        """How far a patch and the filter before it look."""
+        """Reach of a patch and of the filter before it."""
         return self.block_px // 2 + 2
 
 
 @dataclass(frozen=True)
 class SparseSurroundings:
-    """Sparse points that lie on no polarized part.
+    """Sparse points off the polarized parts.
 
     Attributes
     ----------
     points : (N, 3) float64, world frame.
     colors : (N, 3) uint8
     num_views : (N,) int32, observations of each point.
-    is_kept : (T,) bool, which of the tracks they are.
+    is_kept : (T,) bool, the tracks among them.
     """
 
     points: Array
@@ -125,7 +123,7 @@ def sparse_surroundings(
     *,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> SparseSurroundings:
-    """Sparse points that are certain in place and neither on a polarized part nor mirrored in one.
+    """Sparse points of certain position, neither on a polarized part nor mirrored in one.
 
     Parameters
     ----------
@@ -133,7 +131,7 @@ def sparse_surroundings(
     maps : phase maps of the views.
     tolerances : of this step.
     """
-    # A keypoint this near a part's outline may owe its place to the outline.
+    # A keypoint this near to a part's outline may be on the outline.
     part_share = part_shares(tracks, maps, tolerances.border_px)
     num_views = np.bincount(tracks.obs_track, minlength=len(part_share))
     sigma = relative_sigmas(tracks, [phase_map.view for phase_map in maps])
@@ -163,10 +161,10 @@ def part_shares(tracks: Tracks, maps: Sequence[PhaseMap], margin_px: int) -> Arr
 
 
 def relative_sigmas(tracks: Tracks, views: Sequence[View]) -> Array:
-    """Standard deviation ``(T,)`` of the points' places as shares of their mean distances.
+    """Standard deviation ``(T,)`` of the points' positions as shares of their mean distances.
 
-    That of the geometry of rays, larger where the reprojection error shows worse keypoints than
-    are usual. Infinite for points with fewer than two observations.
+    It follows from the geometry of the rays, and is larger if the reprojection error shows worse
+    keypoints than usual. Infinite for points with fewer than two observations.
     """
     num_tracks = len(tracks.points_in_world)
     count = np.bincount(tracks.obs_track, minlength=num_tracks)
@@ -192,14 +190,14 @@ def choose_partners(
     *,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> list[list[int]]:
-    """For each view the views to match it with, those with the most points in common first.
+    """For each view the views to match it with, those with the most common points first.
 
-    Partners see the shared points under a useful angle of triangulation, look into a similar
-    direction and stand beside the view rather than before or behind it. A view may have none.
+    Partners see the common points under a useful angle of triangulation, have a similar viewing
+    direction and stand beside the view and not before or behind it. A view may have none.
 
     Parameters
     ----------
-    tracks : points to go by; ``obs_view`` counts in ``views``.
+    tracks : common points; ``obs_view`` counts in ``views``.
     tolerances : of this step.
     """
     sees = np.zeros((len(views), len(tracks.points_in_world)), bool)
@@ -241,7 +239,7 @@ def _angle_deg(a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True)
 class _WholeView(PhaseMap):
-    """A view that may show a surface at any pixel, so that fusing takes no part for background."""
+    """A view whose region is the whole image, so that fusion treats no pixel as background."""
 
     def shows_surface(self, xy: NDArray[np.floating]) -> Mask:
         """True everywhere."""
@@ -274,11 +272,11 @@ def stereo_surroundings(
 
     Parameters
     ----------
-    tracks : sparse points; ``obs_view`` counts in ``maps``. They choose the pairs and bound the
+    tracks : sparse points; ``obs_view`` counts in ``maps``. They select the pairs and bound the
         depths.
     maps : phase maps of the views.
-    folder : where the views' ranges are kept meanwhile; the caller removes it.
-    workers : processes to share the views among; None: this one.
+    folder : for the views' ranges; the caller removes it.
+    workers : processes for the views; None: this process.
     tolerances : of this step.
     """
     workers = workers or Workers(1)
@@ -309,7 +307,7 @@ def _match_view(
     tolerances: SurroundingsTolerances,
 ) -> DenseView:
     """Match the first view with the others and store what comes of it."""
-    # A match may leak over a part's outline by its patch and a neighbour's.
+    # A match may leak across a part's outline by its patch and a neighbour's.
     excluded = grow_mask(maps[0].region.inside, 2 * tolerances.border_px)
     stride_px = PropagationOptions.stride_px  # as dense as the polarized surface
     dense = stereo_view(maps[0], maps[1:], points, excluded, stride_px, tolerances=tolerances)
@@ -336,7 +334,7 @@ class RectifiedPair:
 
     @property
     def offset_px(self) -> float:
-        """To add to a disparity: with it, depth z is ``fx * baseline / disparity``."""
+        """Offset to add to a disparity; then depth z is ``fx * baseline / disparity``."""
         return self.right.cx - self.left.cx
 
 
@@ -347,17 +345,17 @@ def rectify_pair(
     *,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> RectifiedPair | None:
-    """Virtual cameras at the centres of two views that see what both see.
+    """Virtual cameras at the centres of two views, over their common field of view.
 
     Parameters
     ----------
-    view, other : the left and the right one, whatever their roll.
+    view, other : the left and the right view, at any roll.
     points : (N, 3), world, that the view sees; they bound the depths to search.
     tolerances : of this step.
 
     Returns
     -------
-    RectifiedPair, or None where the views share no rows or the range of depths is of no use.
+    RectifiedPair, or None if the views share no rows or the range of depths is unusable.
     """
     baseline = other.center_in_world - view.center_in_world
     length = float(np.linalg.norm(baseline))
@@ -412,7 +410,7 @@ def warp(
     *,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> tuple[Image, Mask]:
-    """Resample an image of a view for a virtual camera at its centre, and where it has pixels."""
+    """An image of a view, resampled for a virtual camera at its centre, and its valid pixels."""
     rays = camera.rays(pixel_centers(camera.width, camera.height))
     xy = view.camera.project(rays @ (view.cam_from_world.rotation @ rotation.T).T)
     inside = in_frame(xy, view.camera.width, view.camera.height, tolerances.border_px)
@@ -426,7 +424,7 @@ def match(
     *,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> Image:
-    """Disparities ``(H, W)`` of the left virtual camera, px, less the pair's offset; NaN: none."""
+    """Disparities ``(H, W)`` of the left virtual camera, px, minus the pair's offset; NaN: none."""
     white = max(float(np.percentile(m.intensity, 99)) for m in (left, right))
     sides = []
     for phase_map, camera in ((left, pair.left), (right, pair.right)):
@@ -482,7 +480,7 @@ def ranges_from_disparity(
     Returns
     -------
     (...) float32 each; the distance is 0 where no disparity is known, or where those of the four
-    pixels about the ray differ by more than the match is uncertain.
+    pixels about the ray differ by more than their uncertainty.
     """
     rays = rays_in_world @ pair.rect_from_world.T
     xy = pair.left.project(np.where(rays[..., 2:] > 0, rays, np.nan))
@@ -502,8 +500,8 @@ def ranges_from_disparity(
 def combine_ranges(ranges: Image, sigmas: Image) -> tuple[Image, Image]:
     """One range of each pixel from those of several pairs ``(P, h, w)``, and its deviation.
 
-    The weighted mean of the largest group that agrees within two deviations. Where there are
-    several and none agree, none is known (0).
+    It is the weighted mean of the largest group that agrees within two deviations; 0 if there are
+    several ranges and no two agree.
     """
     known = ranges > 0
     log_range = np.log(np.where(known, ranges, 1), dtype=np.float64)
@@ -528,7 +526,7 @@ def fit_planes(
     *,
     tolerances: SurroundingsTolerances = SurroundingsTolerances(),
 ) -> tuple[Array, Array]:
-    """Planes about every lattice point: on one, the inverse range is linear in the ray.
+    """Planes about every lattice point; on a plane the inverse range is linear in the ray.
 
     Parameters
     ----------
@@ -538,7 +536,7 @@ def fit_planes(
 
     Returns
     -------
-    slope : (h, w, 3), the normal over the plane's distance from the camera, pointing away from
+    slope : (h, w, 3), the plane's normal, pointing away from the camera, over its distance from
         it; ``1 / range = slope . ray``. NaN where too little of the window is known.
     deviation : (h, w), RMS of the window's inverse ranges from the plane, relative to the centre's.
     """
@@ -578,7 +576,7 @@ def stereo_view(
     phase_map : of the view; its intensity is matched.
     partners : of the views to match it with.
     points : (N, 3), world, that the view sees; they bound the depths to search.
-    part : (H, W) bool, pixels to leave out: polarized parts and what is beside them.
+    part : (H, W) bool, pixels to ignore: polarized parts with a margin.
     stride_px : of the lattice.
     tolerances : of this step.
     """
@@ -621,7 +619,7 @@ def _on_planes(
         fitted = 1 / (slope * rays).sum(axis=-1)
         cosine = 1 / (fitted * length)
         good = (np.abs(fitted / ranges - 1) < 2 * sigma) & (deviation < 2 * sigma)
-        good &= cosine > MIN_FACING_COSINE  # steeper ones are steps of the range
+        good &= cosine > MIN_FACING_COSINE  # steeper ones are jumps of the range
         # The normal of a plane through errors of the window's points, seen under this angle.
         spread = tolerances.block_px * stride_px / np.sqrt(12) / view.camera.mean_focal_px
         turn = deviation / (tolerances.block_px * spread) * cosine**2

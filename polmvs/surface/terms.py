@@ -1,16 +1,17 @@
-"""Terms of the energy: each linearises itself about a mesh.
+"""Terms of the energy, linearized about a mesh.
 
-Over the displacements u of the vertices along their normals, and few unknowns that all views share,
+The unknowns are the displacements u of the vertices along their normals, and few that all views
+share:
 
     E(u) = sum_o  w_o rho(r_o / sigma_o)     phases      :func:`add_phases`
          + sum_v  rho(d_v / sigma_v)         outlines    :func:`add_outlines`
          + sum_p  rho(h_p / sigma_p)         points      :func:`add_points`
          + sum_i  rho(k_i / sigma_k)         smoothness  :func:`smoothness`
 
-with the residuals ``r = m . n`` of observations under the light that they probably are of
-(:mod:`polmvs.surface.labels`), distances d of the mesh's outline to the silhouettes, heights h
-above known points, and changes k of the scale-free curvature. All losses rho are robust (Geman and
-McClure 1985). One Gauss-Newton step solves the sum of all (:mod:`polmvs.surface.solver`).
+Here ``r = m . n`` are the residuals of observations under their probable label
+(:mod:`polmvs.surface.labels`), d the distances of the mesh's outline to the silhouettes, h the
+heights above known points, and k the changes of the scale-free curvature. All losses rho are robust
+(Geman and McClure 1985). One Gauss-Newton step solves the sum (:mod:`polmvs.surface.solver`).
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import KINDS, Observations
 from polmvs.surface.surface_view import SurfaceView
 
-EDGE_NOISE = 0.1  # of the sines of normals beside an edge: half of what parts its sides
-RIM_HALVINGS = 4  # of a pixel, in which a mesh's outline is looked for: to a sixteenth
+EDGE_NOISE = 0.1  # of the sines of normals beside an edge: half of the difference of its sides
+RIM_HALVINGS = 4  # bisections of a pixel in the search for a mesh's outline: to a sixteenth
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -42,28 +43,29 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True)
 class TermTolerances:
-    """Numbers of the terms.
+    """Tolerances of the terms.
 
     Attributes
     ----------
-    row_sigma : least deviation of ``m . n`` beside noise (facets, interreflection). Measured: 0.03.
-    independent_px : area over which phases err alike, px^2, where they are smoothed over 1 px;
-        smaller faces count by their area. Measured: counting each face anew costs 4 %.
-    alike_px : area over which the phases' errors are alike because the model of the light makes
-        them and not noise, px^2: outlines and points count that much more than so many rows would
-        let them. Measured on `dome`: a bias of the phases bends it by 1.5 mm with 4, by 0.7 with
-        400, by 0.4 with 1600, which dents `mug` at its sparse points.
-    alike_views : in which they are alike, too: of more views points count the more.
-    place_sigma_px : least deviation of an outline, and of a known point in pixels' lengths; an
-        outline's residuals may show a larger one. Measured: 0.3; 0.7 costs 30 % on general shapes.
-    outline_bias_px : deviation of an error of all silhouettes together, too wide or too narrow.
+    row_sigma : least deviation of ``m . n`` beyond noise (facets, interreflection). Measured: 0.03.
+    independent_px : area over which phase errors are correlated, px^2, with smoothing over 1 px;
+        smaller faces are weighted by their area. Measured: equal weights cost 4 %.
+    alike_px : area over which phase errors are correlated by the model of the light and not by
+        noise, px^2: outlines and points get more weight relative to the rows. Measured on `dome`: a
+        bias of the phases bends it by 1.5 mm with 4, by 0.7 with 400, by 0.4 with 1600, which dents
+        `mug` at its sparse points.
+    alike_views : number of views over which they are also correlated: with more views the weight of
+        points grows.
+    place_sigma_px : least deviation of an outline, px, and of a known point, GSD; an outline's
+        residuals may show a larger one. Measured: 0.3; 0.7 costs 30 % on general shapes.
+    outline_bias_px : deviation of a common error of all silhouettes, too wide or too narrow.
         Measured on the true outlines of four captures: -0.35 to 0.04. It is part of the stated
         deviations and not solved for.
-    smoothness : deviation of the scale-free curvature from its surroundings' mean. Measured: 0.02
-        to 0.08 alike.
-    smoothness_memory : share of the surroundings' curvature that is not resisted. Measured: 0.8.
-    vote_sigma : deviation of a face's normal from the one that its observations vote for. Measured,
-        0.03 and 0.07: a ledge beside a box lies 0.57 and 0.98 px off, a public ceramic alike.
+    smoothness : deviation of the scale-free curvature from the mean of its surroundings. Measured:
+        0.02 to 0.08 give the same.
+    smoothness_memory : share of the surroundings' curvature without penalty. Measured: 0.8.
+    vote_sigma : deviation of a face's normal from the winner of the vote. Measured, 0.03 and 0.07:
+        a ledge beside a box is 0.57 and 0.98 px off; a public ceramic is the same.
     """
 
     row_sigma: float = 0.03
@@ -77,22 +79,22 @@ class TermTolerances:
     vote_sigma: float = 0.03
 
     def phase_correlation(self, face_area_px: float) -> float:
-        """Rows whose errors are alike, of faces of such an area, px^2."""
+        """Number of rows with correlated errors, for faces of this area, px^2."""
         return max(self.alike_px / max(face_area_px, self.independent_px), 1.0)
 
     def point_weight(self, num_views: int, face_area_px: float) -> float:
-        """Weight of the known points' rows, whose errors are not alike."""
+        """Weight of the known points' rows, whose errors are independent."""
         return self.phase_correlation(face_area_px) * max(1.0, num_views / self.alike_views)
 
 
 @dataclass(frozen=True)
 class KnownPoints:
-    """Points of the surface known from elsewhere.
+    """Known points of the surface.
 
     Attributes
     ----------
     points : (N, 3), world.
-    sigma : (N,), of the place, world units.
+    sigma : (N,), position uncertainty, world units.
     """
 
     points: Array
@@ -101,14 +103,14 @@ class KnownPoints:
 
 @dataclass(frozen=True)
 class KnownSides:
-    """What is known of the sides of a sharpened mesh with F faces.
+    """Known sides of edges of a sharpened mesh with F faces.
 
     Attributes
     ----------
-    is_shown : (F,) bool, faces of sides whose normal is known: edges between others are still
-        round. Their outlines do not count, and smoothness holds them.
-    is_fitted : (F,) bool, faces whose normal phases show. Those of others are no one side's, or
-        what they mirror: they push a step's walls out by up to 1.3 mm (`step`).
+    is_shown : (F,) bool, faces of sides with a known normal. Edges between other faces are still
+        round; their outlines are ignored, and smoothness holds them.
+    is_fitted : (F,) bool, faces with a normal from phases. Observations of other faces are of no
+        side or of mirror images: they push the walls of a height step out by up to 1.3 mm (`step`).
     """
 
     is_shown: Mask
@@ -117,7 +119,7 @@ class KnownSides:
 
 @dataclass
 class Equations:
-    """Normal equations of displacements that are being summed."""
+    """Sum of normal equations of displacements."""
 
     num: int
     gradient: Array = field(init=False)
@@ -162,7 +164,7 @@ class Equations:
 
 @dataclass
 class SharedError:
-    """One unknown error that many residuals share, solved for and left out of the equations.
+    """One unknown error that many residuals share, eliminated from the equations.
 
     With residuals ``J x + r - f b`` of weights w and ``b`` of weight ``prior`` about ``expected``,
     the equations lose ``u uT`` and their right side ``u`` times :meth:`offset`, u being
@@ -204,11 +206,11 @@ class SharedError:
         return self._residual / float(np.sqrt(self._weight + self.prior))
 
     def solved(self, displacement: Array) -> float:
-        """The error itself, given the solution ``(num,)``."""
+        """The error, given the solution ``(num,)``."""
         return (self._residual + float(self.slope @ displacement)) / (self._weight + self.prior)
 
     def deviation(self, response: Array) -> float:
-        """Deviation of the error itself once all is solved.
+        """Deviation of the error after the solution.
 
         ``response`` (num,) is the solution, without the error, for ``slope`` as right side.
         """
@@ -219,7 +221,7 @@ class SharedError:
 def normal_changes(mesh: TriangleMesh) -> Array:
     """Change of a face's normal, ``(F, 3, 3)``, by the displacement of each vertex along its own.
 
-    The part along the normal is not taken out: residuals do that.
+    The component along the normal is not removed: the residuals do that.
     """
     a, b, c = np.moveaxis(mesh.corners, 1, 0)
     opposite = np.stack([c - b, a - c, b - a], axis=1)
@@ -240,16 +242,16 @@ def add_phases(
 ) -> None:
     """Add the rows of observations.
 
-    ``r_s^2 + r_d^2`` is about the squared sine of the angle between normal and ray: where the label
-    is undecided, both rows together would turn the normal towards the ray. What the precision of
-    one kind has beyond that of the other is what pulls.
+    ``r_s^2 + r_d^2`` is about the squared sine of the angle between normal and ray: with an
+    undecided label, both rows together would turn the normal towards the ray. Only the excess of
+    one precision over the other has weight.
 
     Parameters
     ----------
-    tilt : the share of the polarizers' tilt that is still to be taken back.
+    tilt : the share of the polarizers' tilt that is not yet corrected.
     shares : (2, K) probabilities of both kinds of light.
     variances : (2, K) of the residuals.
-    independent_area : over which phases err alike; smaller faces count by their area.
+    independent_area : area of correlated phase errors; smaller faces are weighted by their area.
     loss_scale : of the loss, in deviations.
     """
     o, num = observations, len(mesh.faces)
@@ -313,7 +315,7 @@ class SharedEdges:
     faces: Indices
 
     def only(self, kept: Mask) -> SharedEdges:
-        """The ``kept`` (E,) of them."""
+        """The ``kept`` (E,) edges."""
         return SharedEdges(self.ends[kept], self.faces[kept])
 
 
@@ -331,14 +333,14 @@ def shared_edges(mesh: TriangleMesh) -> SharedEdges:
 
 @dataclass(frozen=True)
 class Rim:
-    """Points of a mesh on its outline against the background of one view.
+    """Contour generator: points of a mesh on its outline in one view.
 
     Attributes
     ----------
     ends : (K, 2) vertices; the points lie in the middle between them.
     faces : (K, 2) that share these edges.
     xy : (K, 2) image coordinates of the points, or of the mesh's outline beside them.
-    length_px : (K,) of the outline that each stands for.
+    length_px : (K,) length of the outline of each point.
     """
 
     ends: Indices
@@ -355,7 +357,7 @@ def find_rim(
     *,
     on_outline: bool = False,
 ) -> Rim:
-    """The outline of a mesh in a view: edges between faces to and fro with nothing behind them.
+    """The contour generator in a view: edges between front and back faces with nothing behind.
 
     With ``on_outline`` each point is moved outwards to where rays begin to pass the mesh.
     """
@@ -376,7 +378,7 @@ def find_rim(
     away = middle - view.center
     distance = lengths(away)[:, None]
     outwards = unit_or_zero(outwards - dots(outwards, away)[:, None] / distance**2 * away)
-    # A pixel beyond the outline there is nothing, a pixel before it the surface itself.
+    # One pixel outside of the outline there is nothing, one pixel inside the surface itself.
     beyond = scene.cast(view.center, away + 1.0 * pixel[:, None] * outwards).distance
     before = scene.cast(view.center, away - 1.0 * pixel[:, None] * outwards).distance
     slack = 4 * mesh.mean_edge / distance[:, 0]
@@ -396,7 +398,7 @@ def find_rim(
 def rim_residuals(view: SurfaceView, xy: Array) -> tuple[Array, Array]:
     """Signed distance ``(K,)`` of points to the silhouette, px, and its gradient ``(K, 2)``.
 
-    Where the silhouette is in doubt the nearer of its two outlines counts.
+    Where the silhouette has unknown pixels, the nearer of its two outlines is used.
     """
     inner = sample_image(view.silhouette.inner, xy).astype(np.float64)
     if view.silhouette.is_sharp:
@@ -446,15 +448,15 @@ def outline_rows(
 def outline_moves(
     mesh: TriangleMesh, ends: Indices, faces: Indices, sharp: Mask
 ) -> tuple[Indices, Array]:
-    """How the middles of edges move with two vertices each ``(K, 2)``: directions ``(K, 2, 3)``.
+    """Derivatives ``(K, 2, 3)`` of edge midpoints by the displacements of two vertices ``(K, 2)``.
 
-    Both ends move the middle by half of their own displacements. An edge between two sides of the
-    object is where these meet: it moves with them, each along what leaves the other in its plane.
+    Both ends move the midpoint by half of their own displacements. An edge between two sides of the
+    object is their intersection: it moves with each side within the plane of the other.
     """
     directions = 0.5 * mesh.vertex_normals[ends]
     one, other = np.moveaxis(mesh.face_normals[faces], 1, 0)
     cosine = dots(one, other)
-    # Of a fold, too, whose sides turn their backs on each other, the middle is its own.
+    # This also holds for a fold, whose sides face away from each other.
     apart = np.abs(cosine) < np.cos(np.radians(CreaseTolerances.crease_deg))
     meets = np.all(sharp[ends], axis=1) & apart
     opposite = mesh.faces[faces].sum(axis=2) - ends.sum(axis=1, keepdims=True)
@@ -467,7 +469,7 @@ def outline_moves(
 
 
 def outline_sigma(rows: OutlineRows, tol: TermTolerances) -> float:
-    """Deviation of a view's outline that its residuals show, px."""
+    """Deviation of a view's outline from its residuals, px."""
     if not len(rows.residual):
         return tol.place_sigma_px
     centred = rows.residual - np.median(rows.residual)
@@ -484,13 +486,13 @@ def add_outlines(
 ) -> Array:
     """Add the outlines of some views.
 
-    Returns how the gradient (V,) changes with an error of all of them, per px.
+    Returns the change of the gradient (V,) by a common error of all outlines, per px.
     """
     slope = np.zeros(equations.num)
     scale = max(3 * tol.place_sigma_px, 0.5 * gate_px) ** 2
     for own in rows:
         weight = own.length_px * geman_mcclure_weights(own.residual, scale)
-        # An outline crosses an area over which errors are alike along the root of its pixels.
+        # An outline crosses an area of correlated errors over the root of its pixels.
         weight *= np.sqrt(tol.phase_correlation(face_area_px)) / outline_sigma(own, tol) ** 2
         equations.add(own.vertices, own.jacobian, own.residual, weight)
         change = (weight[:, None] * own.jacobian).ravel()
@@ -510,7 +512,7 @@ def add_points(
     face_area_px: float,
     gate_px: float,
 ) -> None:
-    """Draw the faces that are ``seen`` (F,), not those behind them, to known points near them."""
+    """Pull the ``seen`` (F,) faces, not those behind them, to nearby known points."""
     visible = TriangleMesh(mesh.vertices, mesh.faces[seen])
     place, face, barycentric = RayScene(visible).closest(known.points)
     face = np.flatnonzero(seen)[face]
@@ -530,9 +532,9 @@ def add_points(
 def smoothness(
     mesh: TriangleMesh, edge: float, tol: TermTolerances, sharp: Mask
 ) -> tuple[sparse.csr_array, Array, sparse.csr_array]:
-    """Curvature free of scale, drawn to most of its own surroundings' mean.
+    """Smoothness: the scale-free curvature is pulled to a share of its surroundings' mean.
 
-    That of ``sharp`` (V,) vertices is what it is: to smooth an edge draws the faces beside it in.
+    ``sharp`` (V,) vertices are excluded: smoothing an edge would pull in the faces beside it.
     """
     normals = mesh.vertex_normals
     laplacian = sparse.eye_array(len(mesh.vertices)) - mesh.neighbor_mean
@@ -552,9 +554,9 @@ def smoothness(
 
 
 def with_edges(mesh: TriangleMesh, moves: Array, sharp: Mask) -> Array:
-    """Moves ``(V, 3)`` of vertices, those of ``sharp`` ones (V,) such that their sides meet there.
+    """Moves ``(V, 3)`` of vertices; ``sharp`` ones (V,) move to the intersection of their sides.
 
-    A side moves as those of its vertices do that lie on no edge.
+    A side moves as its vertices that are not on an edge.
     """
     if not sharp.any():
         return moves
@@ -581,8 +583,8 @@ def solve(matrix: sparse.csr_array, right: Array, damping: Array, shared: Array)
 
     s is ``shared`` (V,), see :class:`SharedError`.
 
-    Conditions are good: the damping bounds the smallest eigenvalue, and low frequencies were
-    solved on coarser meshes.
+    The system is well conditioned: the damping bounds the smallest eigenvalue, and low frequencies
+    were solved on coarser meshes.
     """
     num = len(right)
     damped = sparse.csr_array(matrix + sparse.diags_array(damping))

@@ -1,4 +1,4 @@
-"""Which other views help a view: those that see its places, from directions far apart."""
+"""Selection of the views that see another view's points from widely different directions."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import Seeds
 from polmvs.surface.pixel_graph import visible_seeds
 
-MAX_PLACES = 64  # of a view's seeds, spread evenly, that the choice is made for
+MAX_PLACES = 64  # largest number of a view's seeds, spread evenly, for the choice
 
 
 def choose_neighbors(maps: Sequence[PhaseMap], seeds: Seeds, max_neighbors: int) -> list[list[int]]:
-    """For each view, itself first, then others, the most helpful first.
+    """For each view itself, then the others, the most useful first.
 
-    One after the other the view is taken that sees most of the view's seeds under the greatest
-    angles to all views taken before: planes of incidence determine a normal where they cross
-    each other at wide angles, and of a dense ring of views the nearest ones say the same.
+    The choice is greedy: the next view sees most of the view's seeds under the largest angles to
+    all views chosen before. Planes of incidence determine a normal if they intersect at large
+    angles; the nearest views of a dense ring are redundant.
 
     Parameters
     ----------
     maps : phase maps of the views.
-    seeds : places on the surface. A view that sees none is helped by those that see any.
-    max_neighbors : others per view.
+    seeds : points on the surface. A view that sees none gets views that see any.
+    max_neighbors : largest number of others for each view.
     """
     seen = np.array([visible_seeds(m, seeds)[0] for m in maps], bool).reshape(len(maps), -1)
     centers = np.array([m.view.center_in_world for m in maps])

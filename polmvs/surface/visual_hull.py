@@ -1,8 +1,8 @@
-"""The visual hull of silhouettes, robust against single wrong views, bounded by what is around.
+"""The visual hull of silhouettes, robust against some wrong views.
 
-The value of a point is, of its signed distances to the views' silhouettes (pixels times the
-length that one covers there), the k-th largest: k - 1 views may deny it wrongly. Space behind the
-plane on which the objects stand, as the sparse points of the surroundings show it, is outside.
+The value of a point is the k-th largest of its signed distances to the views' silhouettes (pixels
+times the GSD there), so k - 1 views may deny it wrongly. The sparse points of the surroundings show
+the plane on which the objects stand; space behind it is outside.
 """
 
 from __future__ import annotations
@@ -29,18 +29,19 @@ MAX_VALUES = 8_000_000  # of points and views at a time; bounds memory
 
 @dataclass(frozen=True, kw_only=True)
 class HullTolerances:
-    """Numbers of the hull.
+    """Tolerances of the hull.
 
     Attributes
     ----------
-    step_px : of the finest grid, in GSD. Two thirds of the first mesh's edges.
-        Below the supporting plane, where no view sees it, the hull reaches down by three of the
-        usual ones: two edges of that mesh. Measured: a plate on the demo's table vanishes without,
+    step_px : spacing of the finest grid, GSD. Two thirds of the first mesh's edges. Below the
+        supporting plane, where no view sees it, the hull extends by three default spacings: two
+        edges of that mesh. Measured: a plate on the demo's table vanishes without this extension,
         and with half of it a thin bowl loses 0.3 points of F at 1 mm.
     wrong_share : of the views that may deny a point wrongly. Measured: 3 of 18 to 20 views.
-    min_seen_share : of the views that must have a point in their image. Measured with the two of
-        the plane on an analytic vase: both factors of two within 0.01 points of F at 1 mm.
-    min_piece_share : of the largest piece's volume; smaller ones are no objects. Guess.
+    min_seen_share : of the views that must have a point in their image. Measured with the two
+        tolerances of the plane on an analytic vase: both factors of two within 0.01 points of F at
+        1 mm.
+    min_piece_share : of the largest piece's volume; smaller pieces are removed. Guess.
     plane_distance : of inliers to the supporting plane, as a share of the cameras' distance.
         Measured, 0.005: Chamfer of an analytic torus 0.31 -> 0.34 mm.
     min_plane_share : of the sparse points of the surroundings that lie in a supporting plane.
@@ -56,7 +57,7 @@ class HullTolerances:
 
 @dataclass(frozen=True)
 class Plane:
-    """Points x with ``normal . x = offset``; free space is where it is greater."""
+    """Points x with ``normal . x = offset``; free space has ``normal . x > offset``."""
 
     normal: Array
     offset: float
@@ -85,8 +86,8 @@ def supporting_plane(
 
     Returns
     -------
-    None where fewer than ``min_plane_share`` of the points lie in one plane, or cameras are on
-    both sides.
+    None if fewer than ``min_plane_share`` of the points lie in one plane, or cameras are on both
+    sides.
     """
     tol = tolerances or HullTolerances()
     num = len(surroundings)
@@ -129,7 +130,7 @@ class VisualHull:
     values : (X, Y, Z) float32 on a grid, negative inside; see :func:`hull_values`.
     origin : (3,), place of the first grid point.
     step : distance of neighbours.
-    gsd : length that a pixel covers at the objects, world units.
+    gsd : ground sampling distance at the objects, world units.
     """
 
     values: NDArray[np.float32]
@@ -139,7 +140,7 @@ class VisualHull:
 
     @cached_property
     def mesh(self) -> TriangleMesh:
-        """Closed surface; empty where the silhouettes have nothing in common."""
+        """Closed surface; empty if the silhouettes have nothing in common."""
         return relaxed(mesh_from_grid(self.values, self.origin, self.step))
 
     def carved(
@@ -147,7 +148,7 @@ class VisualHull:
         free: Sequence[Callable[[Array], Floats]],
         tolerances: HullTolerances | None = None,
     ) -> VisualHull:
-        """Without what is known to be free space.
+        """The hull without known free space.
 
         Parameters
         ----------
@@ -174,9 +175,9 @@ def visual_hull(
 
     Parameters
     ----------
-    views : those without an outline are left out.
-    plane : what lies behind it is outside.
-    num_wrong : views that may deny a point wrongly; by default a share of the views.
+    views : those without an outline are ignored.
+    plane : space behind it is outside.
+    num_wrong : number of views that may deny a point wrongly; by default a share of the views.
     """
     tol = tolerances or HullTolerances()
     used = [view for view in views if view.has_outline]
@@ -232,7 +233,7 @@ def hull_values(
         of_views[index] = np.where(seen, pixels * (z / view.view.camera.mean_focal_px), -OUTSIDE)
         num_seen += seen
     largest = np.sort(of_views, axis=0)[::-1]
-    # Of few views that see a point, fewer may be wrong.
+    # If few views see a point, fewer may be wrong.
     chosen = np.minimum((tol.wrong_share * num_seen + 0.5).astype(np.int64), num_wrong)
     values = largest[chosen, np.arange(len(points))]
     values = np.where(num_seen < max(2, tol.min_seen_share * len(views)), OUTSIDE, values)

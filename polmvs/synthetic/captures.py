@@ -1,11 +1,11 @@
 """Analytic captures for tests, examples and experiments: exact phase, depth, normals and noise.
 
-Planes, spheres and cylinders under a uniform sky. What is rendered is the light's geometry, not
+Planes, spheres and cylinders under a uniform sky. The rendering has the geometry of the light, not
 its radiance: every visible point has the same ``s0``, and its polarization follows Fresnel's
-equations, so each quantity has a closed form. Three sensors: ``ppa`` and ``opa`` obey the models
-of :mod:`polmvs.polarization.angle_models` exactly; ``tilted`` is a polarizer in the image plane
-that absorbs the
-field along the projection of its absorbing axis on the plane transverse to the ray.
+equations, so each quantity has a closed form. There are three sensors: ``ppa`` and ``opa`` obey the
+models of :mod:`polmvs.polarization.angle_models` exactly; ``tilted`` is a polarizer in the image
+plane that absorbs the field along the projection of its absorbing axis on the plane transverse to
+the ray.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SENSORS = ("ppa", "opa", "tilted")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SyntheticView:
-    """One rendered view; (H, W) float64 at the pixel centres, NaN beside the surface.
+    """One rendered view; (H, W) float64 at the pixel centres, NaN off the surface.
 
     Attributes
     ----------
@@ -40,11 +40,11 @@ class SyntheticView:
     depth, range : z, and distance from the camera's centre, of the point seen.
     normals_in_cam : (H, W, 3), unit, facing the camera.
     mask : (H, W) bool, True on the surface.
-    phase, aolp : rad in [0, pi), as the sensor measures them without noise; NaN too where the
-        light is unpolarized (the ray meets the surface head on).
-    dolp : of the light itself, by Fresnel.
+    phase, aolp : rad in [0, pi), as the sensor measures them without noise; also NaN where the
+        light is unpolarized (the ray is parallel to the normal).
+    dolp : of the light before the sensor, by Fresnel.
     intensities : (4, H, W), behind polarizers at 0, 45, 90, 135 degrees, share of full scale;
-        half of ``background`` beside the surface.
+        half of ``background`` off the surface.
     """
 
     view: View
@@ -72,7 +72,7 @@ def render_view(
 
     Parameters
     ----------
-    light : which reflection polarizes: "specular" across the plane of incidence, "diffuse" in it.
+    light : kind of light: "specular" is polarized across the plane of incidence, "diffuse" in it.
     sensor : "ppa", "opa" or "tilted".
     ior : refractive index of the surface; sets the degree of polarization.
     s0, background : ``I0 + I90`` of the surface and of the unpolarized rest, in full scales.
@@ -92,7 +92,7 @@ def render_mosaic(
     s0: float = 0.8,
     background: float = 0.0,
 ) -> Array:
-    """Render a raw mosaic ``(2 H, 2 W)``, every sample at its own place and polarizer.
+    """Render a raw mosaic ``(2 H, 2 W)``, every sample at its own position and polarizer.
 
     ``view`` is of the half-size image, ``pattern`` the angles of a cell in degrees, row by row;
     the rest as in :func:`render_view`. Share of full scale, not rounded.
@@ -109,7 +109,7 @@ def render_mosaic(
 
 
 def quantize(values: NDArray[np.floating], bits: int = 8) -> NDArray[np.unsignedinteger[Any]]:
-    """Share of full scale to integers, clipped: uint8 for up to 8 bits, uint16 above."""
+    """Convert shares of full scale to integers, clipped: uint8 for up to 8 bits, uint16 above."""
     largest = 2**bits - 1
     rounded = np.rint(np.clip(values, 0.0, 1.0) * largest)
     return np.asarray(rounded, np.uint8) if bits <= 8 else np.asarray(rounded, np.uint16)
@@ -127,7 +127,7 @@ def add_noise(
     Parameters
     ----------
     intensities : (...), share of full scale, not negative.
-    full_well, read_noise : electrons at full scale, and of the read noise's deviation.
+    full_well, read_noise : electrons at full scale, and deviation of the read noise in electrons.
 
     Returns
     -------
@@ -139,7 +139,7 @@ def add_noise(
 
 
 def look_at(center: ArrayLike, target: ArrayLike, up: ArrayLike = (0, 0, 1)) -> RigidTransform:
-    """``cam_from_world`` of a camera at ``center`` that looks at ``target``, ``up`` upwards."""
+    """``cam_from_world`` of a camera at ``center`` that looks at ``target``; ``up`` is upwards."""
     position = np.asarray(center, np.float64)
     forward = unit(np.asarray(target, np.float64) - position)
     right = np.cross(forward, np.asarray(up, np.float64))
@@ -159,7 +159,7 @@ def ring_of_views(
     elevation_deg: float = 45.0,
     roll_deg: float = 0.0,
 ) -> list[View]:
-    """Views all around a target, names ``000.png`` on; elevation is counted from the x-y plane."""
+    """Views all around a target, names ``000.png`` on; elevation is relative to the x-y plane."""
     elevation, roll = np.radians([elevation_deg, roll_deg])
     views = []
     for i, azimuth in enumerate(np.arange(num_views) * (2 * np.pi / num_views)):
@@ -170,13 +170,13 @@ def ring_of_views(
 
 
 def direction(azimuth: float, elevation: float) -> Array:
-    """Unit vector (3,) of two angles in rad; elevation is counted from the x-y plane."""
+    """Unit vector (3,) of two angles in rad; elevation is relative to the x-y plane."""
     across = np.cos(elevation)
     return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
 
 
 def rolled(pose: RigidTransform, roll: float) -> RigidTransform:
-    """The pose of a camera that is turned about its own axis, by an angle in rad."""
+    """The pose of a camera after a rotation about its optical axis by an angle in rad."""
     cos, sin = np.cos(roll), np.sin(roll)
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return RigidTransform(turn @ pose.rotation, turn @ pose.translation)

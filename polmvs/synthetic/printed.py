@@ -1,10 +1,10 @@
-"""Captures with printed texture, cheap enough for hundreds of views: SfM finds their poses.
+"""Captures with printed texture for SfM, cheap enough for hundreds of views.
 
-A dark glossy part lies in printed surroundings. Light from the print is unpolarized and the same
-from every side, that from the part polarized as Fresnel's equations say; labels on the part are
-printed too, so that sparse points lie on it. Every ray has a closed form, as in
-:mod:`polmvs.synthetic.captures`; the print is sampled at the resolution that a pixel covers, so
-that features are found again from other distances.
+A dark glossy part lies in printed surroundings. Light from the print is unpolarized and the same in
+all directions; light from the part is polarized by Fresnel's equations. Labels on the part are also
+printed, so that sparse points lie on it. Every ray has a closed form, as in
+:mod:`polmvs.synthetic.captures`. The print is sampled at the resolution of a pixel, so features
+match at different distances.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ class PrintedScene:
 
     Attributes
     ----------
-    part : polarizes the light.
-    surroundings : what is printed, by x and y.
+    part : glossy surface, which polarizes the light.
+    surroundings : printed surface, textured by x and y.
     labels : (L, 3), centres of round printed labels on the part, world.
     label_radius : of each label.
     texel : side of a texel of the print in the scene's unit; on labels a quarter of it.
     seed : of the print.
-    part_s0 : ``I0 + I90`` of the part beside its labels, full scales.
+    part_s0 : ``I0 + I90`` of the part off its labels, full scales.
     """
 
     part: Surface
@@ -75,7 +75,7 @@ def render_printed_mosaic(view: View, scene: PrintedScene) -> Array:
     Parameters
     ----------
     view : camera of the half-size image, and pose.
-    scene : what is seen.
+    scene : part and surroundings.
     """
     mosaic = render_mosaic(view, scene.part, sensor="tilted", s0=scene.part_s0)
     num_rows, num_cols = mosaic.shape
@@ -90,7 +90,7 @@ def render_printed_mosaic(view: View, scene: PrintedScene) -> Array:
 
 
 def render_printed_truth(view: View, scene: PrintedScene) -> tuple[SyntheticView, Array]:
-    """The part alone as :func:`render_view` gives it, and the depth (H, W) of all that is seen."""
+    """The part alone, as by :func:`render_view`, and the depth (H, W) of the whole scene."""
     part = render_view(view, scene.part, s0=scene.part_s0)
     everything = render_view(view, scene.all_surfaces)
     return part, everything.depth
@@ -103,7 +103,7 @@ def orbit_views(
     seed: int = 0,
     ordered: bool = False,
 ) -> list[View]:
-    """Views from all around, as a hand would take them; their names' order tells nothing.
+    """Views from all around, as of a hand-held camera, with names in random order.
 
     Azimuths advance by the golden angle, so that any number of views surrounds the origin; places,
     directions and rolls vary by a few percent and degrees.

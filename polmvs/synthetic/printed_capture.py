@@ -19,7 +19,7 @@ from polmvs.synthetic.captures import add_noise, quantize
 from polmvs.synthetic.printed import PrintedScene, render_printed_mosaic, render_printed_truth
 from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
-SAME_PLACE = 1e-4  # relative: of a point and of what its view sees there
+SAME_PLACE = 1e-4  # relative difference of the ranges of a point and of the surface in its view
 
 
 class Part(StrEnum):
@@ -30,7 +30,7 @@ class Part(StrEnum):
 
 
 def scene_of(part: Part, seed: int = 0) -> PrintedScene:
-    """A board of 240 x 200 mm, or a dome of 180 mm across, labelled, on a printed bumpy table."""
+    """A board of 240 x 200 mm, or a dome of 180 mm, with labels, on a printed bumpy table."""
     corners = [(x, y) for x in (-0.24, 0.24) for y in (-0.22, 0.22)]
     bumps = [Sphere((x, y, -0.06), 0.12) for x, y in corners]
     surroundings = Group((Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), *bumps))
@@ -57,7 +57,7 @@ def scene_of(part: Part, seed: int = 0) -> PrintedScene:
 
 
 def camera_of(width: int) -> PinholeCamera:
-    """A lens of 69 degrees across, its principal point half a percent off the centre."""
+    """A camera with 69 degrees field of view, its principal point half a percent off the centre."""
     height = round(width * 5 / 12) * 2
     focal = 0.727 * width
     return PinholeCamera(
@@ -101,9 +101,9 @@ def write_printed_capture(
 def printed_model(
     scene: PrintedScene, views: Sequence[View], num_points: int = 2000
 ) -> SparseModel:
-    """The true cameras, and points on labels and surroundings as all views see them.
+    """A sparse model with the true cameras and points on labels and surroundings.
 
-    In place of SfM's, where what comes after is measured alone.
+    It replaces SfM to evaluate the later stages alone.
     """
     rng = np.random.default_rng(scene.seed)
     labels = np.asarray(scene.labels, np.float64).reshape(-1, 3)

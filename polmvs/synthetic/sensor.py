@@ -1,4 +1,4 @@
-"""A polarization sensor with faults: gains, angles and extinction of its polarizers, dark level."""
+"""A polarization sensor with errors: gains, angles and extinction of its polarizers, dark level."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from polmvs.synthetic.captures import add_noise
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FaultySensor:
-    """What each sample of a mosaic truly measures: ``g / 2 (s0 + d (cos 2a s1 + sin 2a s2)) + b``.
+    """Response of each sample of a mosaic: ``g / 2 (s0 + d (cos 2a s1 + sin 2a s2)) + b``.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class FaultySensor:
     dark: Array
 
     def expose(self, stokes: Array, rng: np.random.Generator | None = None) -> Array:
-        """Samples (H, W) of light ``(3, H, W)``, full scales; with noise where ``rng`` is given."""
+        """Samples (H, W) of light ``(3, H, W)``, full scales; with noise if ``rng`` is given."""
         twice = 2.0 * np.radians(self.angle_deg)
         polarized = np.cos(twice) * stokes[1] + np.sin(twice) * stokes[2]
         light = 0.5 * self.gain * (stokes[0] + self.diattenuation * polarized)
@@ -45,14 +45,14 @@ def faulty_sensor(
     sample_share: float = 0.0,
     dark: float = 0.01,
 ) -> FaultySensor:
-    """Draw a sensor's faults, one of each kind a channel, and a part of it for every sample.
+    """Draw a sensor's errors, one of each kind per channel, and a share of it for every sample.
 
     Parameters
     ----------
     shape : (H, W), even.
     gain_sigma, angle_sigma_deg : deviations over the four channels.
     extinction_ratio : mean; channels differ by a quarter of it.
-    sample_share : deviation of single samples from their channel, shares of those.
+    sample_share : deviation of single samples from their channel, as a share of these.
     dark : level without light, full scales.
     """
     gain, angle, strength = (np.empty(shape) for _ in range(3))

@@ -1,7 +1,7 @@
-"""Named shapes as triangle meshes with their exact normals: what a capture can be made of.
+"""Named shapes as triangle meshes with their exact normals, for simulated captures.
 
-They stand on the plane z = 0, centred over the origin, with their largest side of unit length. The
-curved ones have so many segments that the triangles lie within ``MAX_SAG`` of the surface.
+They stand on the plane z = 0, centred over the origin, with their largest side of unit length.
+Curved shapes have enough segments for triangles within ``MAX_SAG`` of the surface.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def named_shape(name: str) -> Mesh:
     Raises
     ------
     KeyError
-        There is none of that name.
+        There is no shape of that name.
     """
     mesh = _SHAPES[name]()
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)

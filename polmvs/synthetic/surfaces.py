@@ -1,4 +1,4 @@
-"""Surfaces of synthetic captures: where a ray meets them, in closed form."""
+"""Surfaces of synthetic captures, with ray intersection in closed form."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from polmvs.scene import MIN_DISTANCE
 
 
 class Surface(Protocol):
-    """Anything a ray can meet."""
+    """Interface of a surface for ray intersection."""
 
     def intersect(self, origins: Array, rays: Array) -> tuple[Array, Array]:
         """Distances ``(...)`` along unit rays and unit normals ``(..., 3)`` that face them.
@@ -28,8 +28,8 @@ class Surface(Protocol):
 class Plane:
     """A plane, seen from both sides.
 
-    ``extent``: half sides of a rectangle about ``point``; None is endless. Its first axis is the
-    world's x projected on the plane (y, where the normal lies along x), see :attr:`axes`.
+    ``extent``: half sides of a rectangle about ``point``; None: unbounded. Its first axis is the
+    world's x projected on the plane (y if the normal is along x), see :attr:`axes`.
     """
 
     point: ArrayLike
@@ -60,7 +60,7 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class Sphere:
-    """A sphere; concave where the camera is inside."""
+    """A sphere; concave if the camera is inside."""
 
     center: ArrayLike
     radius: float
@@ -77,7 +77,7 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Cylinder:
-    """The side of a round cylinder, endless unless ``half_length`` is given; open at its ends."""
+    """The side of a round cylinder, unbounded unless ``half_length`` is given; open at its ends."""
 
     point: ArrayLike
     axis: ArrayLike

@@ -47,7 +47,7 @@ def names(trust: Trust) -> list[str]:
 def test_a_right_surface_is_normal(scene):
     trust = measure_trust(AngleModel.PPA, cloud_of(scene), NO_TRACKS, scene.maps)
     # No more than the border of the region is in doubt, and a part of it has no points.
-    assert names(trust) in ([], ["part of the polarized regions determined"])
+    assert names(trust) in ([], ["coverage of the polarized regions"])
     assert trust.inside > 0.99
     assert trust.residual_deg < 0.1
     assert trust.sigma_share == pytest.approx(5e-4 / 0.5, rel=0.2)
@@ -164,9 +164,9 @@ def test_a_right_result_says_why_it_is_to_be_trusted():
         ({"predicted": replace(PREDICTED, num_phases=20)}, "median error.* unknown"),
         ({"predicted": replace(PREDICTED, overlap=0.7)}, "silhouettes of views left out.* 70 "),
         ({"fitted": replace(PREDICTED, unexplained=0.5)}, "neither kind of light explains.* 50 "),
-        ({"soundness": Soundness(layered=0.2, overlapping=0.0)}, "two sheets.* 20 "),
+        ({"soundness": Soundness(layered=0.2, overlapping=0.0)}, "double layer.* 20 "),
         ({"soundness": Soundness(layered=0.0, overlapping=0.1)}, "intersects itself.* 10 "),
-        ({"left_out": 5}, "contradict the others, %: 41.7 "),
+        ({"left_out": 5}, "a pose or inconsistent, %: 41.7 "),
         ({"num_views": 3}, "3 views leave none to check"),
         ({"complaints": ("the pose of 7.png is off.",)}, r"the pose of 7.png is off\.$"),
         ({"agreement": 0.4}, "agree with a point they see, %: 40 "),
@@ -196,7 +196,7 @@ def test_the_first_of_several_reasons_is_told_and_the_others_counted():
 def test_a_part_that_is_missing_is_a_reservation():
     found = replace(RIGHT, determined=0.3).judged()
     assert found.is_trusted
-    assert "But part of the polarized regions determined, %: 30 " in found.verdict
+    assert "But coverage of the polarized regions, %: 30 " in found.verdict
 
 
 def test_views_integrated_one_by_one_say_that_none_was_left_out():

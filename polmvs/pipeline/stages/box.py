@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class BoxResult:
-    """What the stage found.
+    """Result of the stage.
 
     Attributes
     ----------

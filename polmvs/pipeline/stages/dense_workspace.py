@@ -23,7 +23,7 @@ from polmvs.surface.map_export import export_dense_workspace, warp_dense_view
 
 @dataclass(frozen=True, kw_only=True)
 class DenseWorkspaceResult:
-    """What the stage made.
+    """Result of the stage.
 
     Attributes
     ----------

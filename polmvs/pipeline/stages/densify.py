@@ -89,7 +89,7 @@ FINEST_SPACING_PX = 0.25
 
 @dataclass(frozen=True, kw_only=True)
 class DensifyResult:
-    """What the stage found.
+    """Result of the stage.
 
     Attributes
     ----------

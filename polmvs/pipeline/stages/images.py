@@ -15,7 +15,7 @@ from polmvs.polarization.capture import Capture, intensity_image_8bit
 
 @dataclass(frozen=True, kw_only=True)
 class ImagesResult:
-    """What the stage found.
+    """Result of the stage.
 
     Attributes
     ----------

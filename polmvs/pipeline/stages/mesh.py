@@ -13,7 +13,7 @@ from polmvs.surface.poisson import MIN_POINTS, poisson_mesh
 
 @dataclass(frozen=True, kw_only=True)
 class MeshResult:
-    """What the stage made.
+    """Result of the stage.
 
     Attributes
     ----------

@@ -34,7 +34,7 @@ NORMALS_TYPE = np.dtype(
 
 @dataclass(frozen=True, kw_only=True)
 class NormalsResult:
-    """What the stage found.
+    """Result of the stage.
 
     Attributes
     ----------

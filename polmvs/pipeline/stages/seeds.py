@@ -32,7 +32,7 @@ SEEDS_TYPE = np.dtype(
 
 @dataclass(frozen=True, kw_only=True)
 class SeedsResult:
-    """What the stage found.
+    """Result of the stage.
 
     Attributes
     ----------

@@ -45,7 +45,7 @@ LARGE_BENDING = PropagationOptions.bending
 
 @dataclass(frozen=True, kw_only=True)
 class SfmResult:
-    """What the stage found.
+    """Result of the stage.
 
     Attributes
     ----------

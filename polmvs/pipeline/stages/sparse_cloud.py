@@ -14,7 +14,7 @@ from polmvs.polarization.kinds import AngleModel
 
 @dataclass(frozen=True, kw_only=True)
 class SparseCloudResult:
-    """What the stage wrote.
+    """Result of the stage.
 
     Attributes
     ----------
