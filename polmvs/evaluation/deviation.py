@@ -175,9 +175,8 @@ def measure_deviation(
     place = found.reference_from_result
     moved = place * scaled
     closest, facing = reference.closest(moved)
-    near = lengths(moved - closest) < FAR_SHARE * float(
-        np.linalg.norm(np.ptp(reference.points, axis=0))
-    )
+    size = float(np.linalg.norm(np.ptp(reference.points, axis=0)))
+    near = lengths(moved - closest) < FAR_SHARE * size
     if part.normals is not None:
         near &= dots(part.normals @ place.rotation.T, facing) > 0
     distance = to_mm * dots(moved - closest, facing)[near]

@@ -110,7 +110,7 @@ def align_views(
         for (view, true), is_used in zip(pairs, used, strict=True)
         if is_used
     ]
-    spread = float(np.sqrt(((true_centers - true_centers.mean(axis=0)) ** 2).sum(1).mean()))
+    spread = spread_of(true_centers)
     rms, turn_deg = float(np.sqrt((residuals**2).mean())), float(np.degrees(np.median(turns)))
     if rms > tolerances.max_relative_rms * spread or turn_deg > tolerances.max_turn_deg:
         raise DataError(
@@ -159,6 +159,11 @@ def align_residuals(transform: SimilarityTransform, source: Array, target: Array
     return np.asarray(np.linalg.norm(transform * source - target, axis=1))
 
 
+def spread_of(points: Array) -> float:
+    """Root mean square distance of points ``(N, 3)`` from their mean."""
+    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
 def _consistent_cameras(
     centers: Array, true_centers: Array, tolerances: AlignmentTolerances
 ) -> Mask:
@@ -166,7 +171,7 @@ def _consistent_cameras(
     majority = max(len(centers) // 2 + 1, MIN_CAMERAS + 1)  # any three agree well enough
     if len(centers) <= majority:
         return np.ones(len(centers), np.bool_)
-    spread = float(np.sqrt(((true_centers - true_centers.mean(axis=0)) ** 2).sum(1).mean()))
+    spread = spread_of(true_centers)
     used = _best_majority(centers, true_centers, majority)
     for _ in range(len(centers)):
         transform = align_points(centers[used], true_centers[used])

@@ -26,6 +26,7 @@ from polmvs.poses.alignment import (
     AlignmentTolerances,
     align_cameras,
     align_residuals,
+    spread_of,
 )
 from polmvs.poses.markers import (
     ScaleTolerances,
@@ -247,7 +248,7 @@ def _fit_quality(
     """RMS distance of the cameras from their mean, and standard deviation of a coordinate."""
     num = len(known)
     _, breadth, _ = _extents(known)
-    spread = float(np.sqrt(((known - known.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    spread = spread_of(known)
     rms = float(np.sqrt((residuals**2).mean()))
     sigma = float(np.sqrt((residuals**2).sum() / (3 * num - 7)))  # a similarity has 7 parameters
     if rms > tolerances.max_relative_rms * spread or sigma > tolerances.max_turn_sigma * breadth:
