@@ -1,4 +1,4 @@
-"""Materials: presets with common names, and their Fresnel curves in closed form.
+"""Materials: presets with common names, and their optical constants.
 
 Dielectrics are a rough interface of Beckmann's slopes over a Lambertian base (Baek et al., SIGGRAPH
 Asia 2018): light is reflected specularly by the interface, or it enters, is depolarized by the base
