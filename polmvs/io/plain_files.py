@@ -49,8 +49,10 @@ def open_plain(path: str | PathLike[str]) -> BufferedReader:
     return file
 
 
-def read_text(path: str | PathLike[str], encoding: str = "utf-8") -> str:
+def read_text(path: str | PathLike[str], encoding: str = "utf-8", errors: str = "strict") -> str:
     """The text of a plain file, with newlines as line ends.
+
+    ``errors`` is as in :meth:`bytes.decode`.
 
     Raises
     ------
@@ -63,7 +65,7 @@ def read_text(path: str | PathLike[str], encoding: str = "utf-8") -> str:
         data = file.read(MAX_TEXT_BYTES + 1)
     if len(data) > MAX_TEXT_BYTES:
         raise OSError(errno.EFBIG, "it is too large for a text", os.fspath(path))
-    return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+    return data.decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_list(path: Path, what: str, encoding: str = "utf-8") -> str:
@@ -89,8 +91,8 @@ def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     DataError
         It cannot be read.
     """
-    with as_data_error(path, "read"), open_plain(path) as file:
-        text = file.read().decode("utf-8", "replace")
+    with as_data_error(path, "read"):
+        text = read_text(path, errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
         if words and not words[0].startswith("#"):

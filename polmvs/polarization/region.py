@@ -33,8 +33,8 @@ class RegionTolerances:
     max_growth_rounds : Guess.
     mark_area_px : holes up to this area are filled whatever they show (printed marks).
         Guess.
-    gap_px : width of a gap between a hole and the background that does not open it: a mark's
-        margin beside an outline. Derived: twice the smoothing, which widens both.
+    gap_px : a gap up to this width does not join a mark with the background. Derived: twice the
+        smoothing, which widens both.
     mark_reach_px : deviation of the window that gives the mean intensity of the surface about a
         mark, with which the mark is compared. Guess.
     min_phase_jump : change of (cos 2 phase, sin 2 phase) per px that counts as a crease; the

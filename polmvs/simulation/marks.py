@@ -94,11 +94,11 @@ def marks_at(mesh: Mesh, file: Path, diameter: float, seed: int) -> Marks:
     points, triangles, weights = surface.closest(places)
     away = np.linalg.norm(points - places, axis=1)
     if away.max() > 0.5 * diameter:
-        first = int(away.argmax())
+        farthest = int(away.argmax())
         raise DataError(
             file,
-            f"place {first + 1} is {away[first]:.3g} m from the object's surface; places are in "
-            "metres, in the object's frame (gt/mesh.ply).",
+            f"place {farthest + 1} is {away[farthest]:.3g} m from the object's surface; places are "
+            "in metres, in the object's frame (gt/mesh.ply).",
         )
     corners = mesh.normals[mesh.triangles[triangles]]
     normals = unit(np.einsum("nk,nkd->nd", weights, corners))

@@ -185,7 +185,7 @@ def find_cavities(
 def _flat_pieces(
     surface: SurfaceFaces, tol: CavityTolerances, face_tol: OffsetTolerances
 ) -> tuple[Face, ...]:
-    """The largest planes of a surface, with the faces (of all) that lie in them."""
+    """The largest planes of a surface; their members are faces of a sample."""
     rng = np.random.default_rng(0)
     share = surface.areas / surface.areas.sum()
     num = min(face_tol.num_trials, len(share))
@@ -199,8 +199,7 @@ def _flat_pieces(
         normal_deg=CreaseTolerances.crease_deg,
         min_normal_sigma_deg=CreaseTolerances.crease_deg,
     )
-    faces = find_faces(seeds, search, max_faces=tol.max_planes)
-    return tuple(replace(face, members=chosen[face.members]) for face in faces)
+    return find_faces(seeds, search, max_faces=tol.max_planes)
 
 
 def _on_surface(rim: Face, surface: SurfaceFaces) -> Face:
@@ -343,7 +342,7 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: CavityTol
 def _is_bright(places: Array, maps: Sequence[PhaseMap], tol: CavityTolerances) -> Mask:
     """Which faces ``(N, 3)`` of a plane are not much darker than its brightest ones.
 
-    As many are the brightest as a rim has at least.
+    The brightest are the share ``min_part`` that a rim has at least.
     """
     among_all = np.nan_to_num(_brightness(places, places, maps))
     brightest = among_all >= np.quantile(among_all, 1 - tol.min_part)

@@ -35,8 +35,8 @@ class SilhouetteTolerances:
     min_piece_px : least area of a piece of the region, and of a hole in it: smaller ones are marks.
         Guess.
     closing_px : width of gaps that are closed. Guess.
-    mark_area_px : greatest area of what lies between an object and the image's border and is
-        unknown: it may be a mark that the border cuts. That of the region's.
+    mark_area_px : a piece up to this area that the object and the image's border enclose is
+        unknown: it may be a mark that the border cuts. From `RegionTolerances`.
     near_px : reach of the continuation in pixels that resemble the region a little. Measured with
         the next two on an analytic vase: both factors of two within 0.07 points of F at 1 mm.
     far_px : reach in pixels that resemble it much: the inside of a mug is 60 px across.
