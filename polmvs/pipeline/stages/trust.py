@@ -16,6 +16,8 @@ from polmvs.colmap.models import read_model
 from polmvs.config import Options, default_num_workers
 from polmvs.evaluation.trust import Trust, measure_trust
 from polmvs.io.clouds import read_cloud, read_mesh
+from polmvs.normals.camera_check import PhaseRows, fit_camera
+from polmvs.normals.tracks import evenly_chosen
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
 from polmvs.pipeline.stages.densify import DensifyResult, open_outside
@@ -23,23 +25,24 @@ from polmvs.pipeline.stages.maps import MapsResult, open_maps
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.pipeline.stages.sfm import SfmResult
-from polmvs.polarization.kinds import AngleModel
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind
-from polmvs.surface.held_out import predict, predict_left_out
-from polmvs.surface.mesh_geometry import TriangleMesh
-from polmvs.surface.observations import Looking
+from polmvs.surface.held_out import HeldOutTolerances, predict, predict_left_out
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
+from polmvs.surface.observations import DIFFUSE, SPECULAR, Looking, level_image, observe
 from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.soundness import find_soundness
 from polmvs.surface.surface_view import SurfaceView, surface_view
 from polmvs.surface.surroundings import sparse_surroundings
-from polmvs.surface.terms import KnownPoints
+from polmvs.surface.terms import KnownPoints, TermTolerances
 from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
 # Number of views compared with the surface, spread evenly among more: it bounds the time.
 MAX_TRIED_VIEWS = 24
+MAX_CAMERA_POINTS = 6000  # of the surface that check the camera. More narrow its deviation little
 
 
 def find_trust(model: AngleModel, folder: RunFolder, record: Record, options: Options) -> Trust:
@@ -103,8 +106,11 @@ def _contradicted(
     look = partial(_surface_view, masks_given=options.region.mask is not None)
     with ThreadPoolExecutor(default_num_workers()) as pool:
         seen = list(pool.map(look, maps))
+    mesh = _read_mesh(views / SURFACE_MESH)
+    wrong_camera = _camera_complaint(mesh, seen, looking, light)
     return replace(
         trust,
+        complaints=(*trust.complaints, *(() if wrong_camera is None else (wrong_camera,))),
         predicted=predict_left_out(
             seen,
             plane,
@@ -113,13 +119,49 @@ def _contradicted(
             light=light,
             outside=outside,
         ),
-        fitted=predict(
-            _read_mesh(views / SURFACE_MESH), seen, looking, light=light, outside=outside
-        ),
+        fitted=predict(mesh, seen, looking, light=light, outside=outside),
         soundness=find_soundness(
             _read_mesh(_last_level(views)), [phase_map.view for phase_map in maps], outside
         ),
     )
+
+
+def _camera_complaint(
+    mesh: TriangleMesh, views: Sequence[SurfaceView], looking: Looking, light: Light | None
+) -> str | None:
+    """Which camera fits the phases of a surface, if the given one does not."""
+    camera = views[0].view.camera
+    if looking.angle_model.formula is AngleModel.OPA or any(
+        one.view.camera != camera for one in views
+    ):
+        return None  # OPA has no rays, and cameras are checked together only if they are one
+    chosen = evenly_chosen(len(mesh.faces), MAX_CAMERA_POINTS)
+    images = [level_image(view, HeldOutTolerances.width_px) for view in views]
+    found = observe(mesh, RayScene(mesh), views, images, looking)
+    found = found.only(chosen[found.face])
+    faces = np.flatnonzero(chosen)
+    residuals = np.abs(found.residuals(mesh.face_normals))
+    if light is None:
+        kind = residuals.argmin(axis=0)
+    else:
+        kind = np.full(len(found.face), SPECULAR if light is Light.SPECULAR else DIFFUSE)
+    index = np.arange(len(kind))
+    sigma = np.array([TermTolerances().row_sigma])
+    fit = fit_camera(
+        PhaseRows(
+            rows=found.rows[kind, index],
+            rays=found.rays,
+            variance=found.variances(mesh.face_normals, sigma)[kind, index],
+            point=np.searchsorted(faces, found.face),
+            view=found.view,
+        ),
+        mesh.face_normals[faces],
+        np.array([one.view.cam_from_world.rotation for one in views]),
+    )
+    if fit is None:
+        return None
+    logger.info("%s", fit.message(camera))
+    return None if fit.agrees else fit.message(camera)
 
 
 def _surface_view(phase_map: PhaseMap, *, masks_given: bool) -> SurfaceView:
