@@ -9,8 +9,8 @@ no longer belong to one normal. For camera parameters ``c`` and normals ``n_p`` 
 
 with Gauss-Newton steps from which the normals are eliminated. Derivatives are taken at the
 predicted phase: at the measured one they would depend on its noise, which would favour long focal
-lengths. The check needs no matches, so it serves objects without texture as well. Its deviations are those
-of the jackknife over the views, as errors of light and pose are common to a view.
+lengths. The check needs no matches, so it serves objects without texture as well. Its deviations
+are those of the jackknife over the views, as errors of light and pose are common to a view.
 """
 
 from __future__ import annotations

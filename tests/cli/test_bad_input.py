@@ -154,6 +154,7 @@ def test_sfm_that_finds_no_model(cli, capture: Path, tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_sfm_that_registers_few_views_names_the_others(
     cli, demo_capture: Path, tmp_path: Path
 ) -> None:
@@ -526,6 +527,7 @@ def test_full_disk(
     assert names == [stage["name"] for stage in record["stages"]]
 
 
+@pytest.mark.slow
 def test_with_room_again_it_comes_to_the_same(
     demo_run: Path, demo_capture: Path, tmp_path: Path
 ) -> None:
@@ -554,6 +556,7 @@ def test_with_room_again_it_comes_to_the_same(
             assert found[name] == data, name
 
 
+@pytest.mark.slow
 def test_no_room_for_a_copy_of_a_database(
     demo_capture: Path, demo_run: Path, tmp_path: Path
 ) -> None:

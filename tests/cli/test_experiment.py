@@ -19,6 +19,7 @@ DEMO = Path(polmvs.__file__).parent / "demo_capture"
 FAST = ("--num-points", 300, "--k", "2,3", "--num-seeds", 6, "--workers", 1)
 
 
+@pytest.mark.slow
 def test_all_experiments_on_the_bundled_capture(cli, tmp_path):
     out = tmp_path / "out"
     for name in output.NAMES:

@@ -57,6 +57,7 @@ def test_a_name_too_long_for_its_results_is_refused_at_the_start(
     )
 
 
+@pytest.mark.slow
 def test_text_works_in_every_locale_and_the_longest_names_do(
     demo_capture: Path, tmp_path: Path
 ) -> None:

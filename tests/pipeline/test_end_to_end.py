@@ -141,6 +141,7 @@ def test_sparse_normals_carry_their_quality(demo_run: Path) -> None:
     np.testing.assert_array_equal(other.scalars["seed"], tracks.scalars["seed"])
 
 
+@pytest.mark.slow
 def test_16_bit_tiff_with_own_poses_and_names(
     demo_run: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:

@@ -368,6 +368,7 @@ def test_a_box_cuts_cloud_maps_and_mesh(go_on: Continue, run: Path, demo_capture
     assert "--box-marker needs --aruco" in err
 
 
+@pytest.mark.slow
 def test_a_box_cuts_the_surface_of_all_views(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     shutil.copytree(run, out)
@@ -409,6 +410,7 @@ def test_more_views_must_agree(go_on: Continue, run: Path) -> None:
     assert 0 < on_surface.sum() < len(fewer)
 
 
+@pytest.mark.slow
 def test_surroundings_by_stereo(go_on: Continue, run: Path, truth: GroundTruth) -> None:
     out = go_on("sparse_cloud_ppa", "densify", "--surroundings", "stereo", *QUICK)
     cloud = read_cloud(out / "ppa.ply")
@@ -525,6 +527,7 @@ def own(given: Path, tmp_path: Path) -> Path:
     return shutil.copytree(given, tmp_path / "own")
 
 
+@pytest.mark.slow
 def test_in_place_changes_the_workspace_and_keeps_a_backup(
     filled: Path, given: Path, own: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:

@@ -160,6 +160,7 @@ def test_a_run_interrupted_in_any_stage_goes_on(
     assert results_of(out) == expected
 
 
+@pytest.mark.slow
 def test_stages_alone_and_two_workers_give_the_same(
     call: Call, given, undisturbed, tmp_path: Path
 ) -> None:
@@ -178,6 +179,7 @@ def test_stages_alone_and_two_workers_give_the_same(
     assert results_of(out) == expected
 
 
+@pytest.mark.slow
 def test_a_comparison_killed_in_its_surfaces_goes_on_to_the_same(
     call: Call, given, tmp_path: Path
 ) -> None:

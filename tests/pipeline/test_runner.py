@@ -411,6 +411,7 @@ class Snapshots(Recorder):
         self.changed[name] = {path.relative_to(self.root) for path in changed}
 
 
+@pytest.mark.slow
 def test_stages_keep_to_their_entries(
     demo_run: Path, demo_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
