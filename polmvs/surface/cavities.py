@@ -314,7 +314,8 @@ def _mouth(
     """
     nothing_near = np.zeros(grid.shape, np.bool_)
     places = grid.points(rim)
-    evidence = face_evidence(places, rim, scene, nothing_near, None, face_tol)
+    losses = scene.losses_on(places, rim, face_tol)
+    evidence = face_evidence(places, rim, scene, losses, nothing_near, None, face_tol)
     brightness = _brightness(places.reshape(-1, 3), on_rim, scene.maps).reshape(grid.shape)
     # Outlines may have cut off a part of the rim, so `evidence.possible` is not used.
     supported = (brightness > tol.max_brightness) & (evidence.cost < MAX_COST)

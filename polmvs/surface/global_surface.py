@@ -23,6 +23,7 @@ from polmvs.config import default_num_workers
 from polmvs.geometry import lengths
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
+from polmvs.normals.tracks import evenly_chosen
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
@@ -99,6 +100,7 @@ REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured 
 # Each polishing step halves this error. Measured on analytic boxes.
 SHARP_STEPS = 4
 DEVIATION_EDGE_PX = 6.0  # of the mesh on which the position uncertainty is computed
+MAX_PATCH_VIEWS = 24  # evenly chosen views that show planar patches: it bounds time and memory
 NUM_FINAL_STEPS = 3  # of the progress: evidence, normals, deviations
 
 
@@ -266,7 +268,7 @@ class _Given:
             stepped_faces(
                 find_faces(self.seeds),
                 self.seeds,
-                self.scene,
+                self.scene.of(evenly_chosen(len(self.scene.maps), MAX_PATCH_VIEWS)),
                 signed_distance=RayScene(mesh).signed_distance,
                 first_hit=_first_hit(mesh),
             )

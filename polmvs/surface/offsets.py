@@ -580,9 +580,19 @@ class FaceScene:
         return gather_rows(self.angle_model, points, chosen, tilt_aware=self.tilt_aware)
 
     def losses(self, points: Array, normals: Floats, tol: OffsetTolerances) -> Image:
-        """Loss (K, N) of the rows of points, as :func:`row_losses`, with one view's rows held."""
-        each = [row_losses(self.rows(points, [one]), normals, tol)[0] for one in self.maps]
-        return np.concatenate(each)
+        """Loss (K, N) of the rows of points, as :func:`row_losses`."""
+
+        def of_view(one: PhaseMap) -> Image:
+            return row_losses(self.rows(points, [one]), normals, tol)[0]
+
+        # Threads, as sampling images releases Python's lock; each holds one view's rows.
+        with ThreadPoolExecutor(default_num_workers()) as pool:
+            return np.concatenate(list(pool.map(of_view, self.maps)))
+
+    def losses_on(self, places: Array, face: Face, tol: OffsetTolerances) -> Image:
+        """Loss (K, H, W) of the rows of points ``(H, W, 3)`` on a face."""
+        losses = self.losses(places.reshape(-1, 3), face.normal[:, None], tol)
+        return losses.reshape(-1, *places.shape[:2])
 
 
 def face_scene(
@@ -635,6 +645,7 @@ def _labels(
     rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
     surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit, tol)
     labels, shown = np.full(grid.shape, NO_FACE), np.zeros(grid.shape, np.bool_)
+    losses = [scene.losses_on(*own, tol) for own in zip(places, group, strict=True)]
     # Occlusion between faces needs labels: a second pass uses those of the first.
     for is_labelled in (False, True):
         claims, jumps = np.zeros((2, len(group), *grid.shape))
@@ -645,7 +656,7 @@ def _labels(
                 hidden = _hidden(number, group, places[number], grid, labels, scene.maps)
             on_grid = grid.cells(seeds.points_in_world[face.members])
             near = _distance_to(on_grid, grid.shape) < 0.5 * tol.mark_px
-            evidence = face_evidence(places[number], face, scene, near, hidden, tol)
+            evidence = face_evidence(places[number], face, scene, losses[number], near, hidden, tol)
             possible[number] = evidence.possible
             better = evidence.possible & (evidence.cost < surface_cost + tol.better_by)
             fits[number] = better & (evidence.cost < MAX_COST)
@@ -784,6 +795,7 @@ def face_evidence(
     places: Array,
     face: Face,
     scene: FaceScene,
+    losses: Image,
     near_points: Mask,
     hidden: Sequence[Mask] | None,
     tol: OffsetTolerances,
@@ -794,14 +806,13 @@ def face_evidence(
     ----------
     places, face : the face over a grid.
     scene : the views.
+    losses : (K, H, W) of :meth:`FaceScene.losses_on`.
     near_points : (H, W) bool, where edges may be those of printed marks.
     hidden : for each view, points ``(H, W)`` that it does not see.
     tol : tolerances.
     """
     shape = places.shape[:2]
-    losses = scene.losses(places.reshape(-1, 3), face.normal[:, None], tol)
-    losses = losses.reshape(-1, *shape)
-    jumps = np.full(losses.shape, np.nan, np.float32)
+    own, jumps = np.full((2, *losses.shape), np.nan, np.float32)
     inside, num_seen, num_marks = np.zeros((3, *shape))
     for k, phase_map in enumerate(scene.maps):
         xy, seen = _seen(places, face, phase_map)
@@ -810,7 +821,7 @@ def face_evidence(
         shown = seen & phase_map.shows_surface(xy)
         num_seen += seen
         inside += shown
-        losses[k] = np.where(shown, losses[k], np.nan)
+        own[k] = np.where(shown, losses[k], np.nan)
         jumps[k], marks = _line_steps(scene.features[k], xy, shown, tol)
         num_marks += marks
     # A print on the face is a mark in all views; a print on a wall beside it has another position
@@ -818,7 +829,7 @@ def face_evidence(
     printed = near_points & (num_marks > tol.mark_share * inside)
     jumps[:, printed] = np.nan
     possible = (num_seen >= 2) & (inside >= tol.min_share * num_seen)
-    return FaceEvidence(_shared_lines(jumps, tol.view_share), median_loss(losses), possible)
+    return FaceEvidence(_shared_lines(jumps, tol.view_share), median_loss(own), possible)
 
 
 def face_lines(

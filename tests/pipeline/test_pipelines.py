@@ -156,3 +156,16 @@ def test_wrong_settings_are_what_their_names_say(
     assert [frame.read_bytes()[0] for frame in frames] == [0, 3, 2, 3, 4, 5]
     settings["three views"].frames(frames)
     assert [frame.exists() for frame in frames] == [True] * 3 + [False] * 3
+
+
+def test_figures_stand_beside_those_of_another_version() -> None:
+    figures = load("figures")
+    old = figures.Figures(name="board", f_score=99.46, is_trusted=True, seconds=30.0)
+    new = figures.Figures(name="board", f_score=99.5, is_trusted=False, seconds=20.04)
+    other = figures.Figures(name="dome", message="no views")
+    table = figures.figures_table([new, other], {"board": old})
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
+    assert cells[0][:3] == ["board", "-", "99.5"]  # the same as printed
+    assert cells[0][6:8] == ["yes > no", "30.0 > 20.0"]
+    assert cells[1][0] == "dome"
+    assert cells[1][-1] == "no views"
