@@ -10,6 +10,7 @@ predicted plane to the brightness of the object, as in matting against a known b
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from polmvs.camera import pixel_centers, sample_image
+from polmvs.config import default_num_workers
 from polmvs.geometry import lengths
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
@@ -242,13 +244,14 @@ def _showing_plane(views: Sequence[_Working], points: Floats, tol: SearchToleran
     details = [view.log - cv2.GaussianBlur(view.log, (0, 0), tol.detail_px) for view in views]
     correlations, variances, unexplained = [], [], []
     for index, view in enumerate(views):
-        best = np.full((2, *view.log.shape), -1, np.float32)
+        best, second = np.full((2, *view.log.shape), -1, np.float32)
         for other in _nearest(views, index)[: tol.num_near]:
             xy = views[other].project(view.on_plane)
             value = _correlation(details[index], sample_image(details[other], xy), tol.window_px)
             seen = np.where(views[other].sees(xy), value, -1).astype(np.float32)
-            best = np.sort(np.concatenate([best, seen[None]]), axis=0)[1:]
-        correlations.append(np.clip(best[0], 0, 1))
+            second = np.maximum(second, np.minimum(best, seen))
+            best = np.maximum(best, seen)
+        correlations.append(np.clip(second, 0, 1))
         variances.append(_local_variance(details[index], tol.window_px))
         xy = view.project(points)
         left = np.asarray(variances[-1] * (1 - correlations[-1] ** 2), np.float32)
@@ -503,9 +506,9 @@ def _plates(
     kernel = np.ones((3, 3), np.uint8)
     free = [cv2.dilate(mask.astype(np.uint8), kernel) == 0 for mask in masks]
     beside = [mask.astype(np.float32) for mask in free]
-    plates = []
-    for index, view in enumerate(views):
-        shown, changes = [], []
+
+    def plate(index: int) -> _Plate:
+        view, shown, changes = views[index], [], []
         for other in _others(views, index, tol):
             xy = views[other].project(view.on_plane)
             seen = views[other].sees(xy) & (sample_image(beside[other], xy) >= 1)
@@ -520,8 +523,11 @@ def _plates(
         log = _median(stack)
         deviation = np.nan_to_num(1.4826 * _median(np.abs(stack - log)))
         log[~view.has_plane] = np.nan
-        plates.append(_Plate(log, deviation, np.array(changes)))
-    return plates
+        return _Plate(log, deviation, np.array(changes))
+
+    # Threads, as sampling images and sorting release Python's lock.
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        return list(pool.map(plate, range(len(views))))
 
 
 def _local_mean(values: Image, where: Mask, window_px: int) -> Image:
