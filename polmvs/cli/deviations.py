@@ -16,7 +16,7 @@ from polmvs.cli.terminal import Terminal
 from polmvs.errors import DataError, OptionError
 from polmvs.evaluation.deviation import Deviation, MeasuredPart, measure_deviation
 from polmvs.evaluation.registration import CloudReference, MeshReference, Reference
-from polmvs.io.clouds import Cloud, Mesh, has_triangles, read_any_mesh, read_cloud, read_mesh
+from polmvs.io.clouds import Cloud, has_triangles, read_any_mesh, read_cloud, read_mesh
 from polmvs.io.folders import new_folder
 from polmvs.pipeline.checks import digest_of
 from polmvs.pipeline.export import part_of, surface_of
@@ -145,15 +145,11 @@ def _reference(
         sigma = cloud.scalars.get("sigma", np.full(len(cloud.points), np.nan))
         own = (cloud.points, np.nan_to_num(sigma))
         if mesh_file.is_file():
-            return _of_mesh(read_mesh(mesh_file)), unit, own
+            return MeshReference(TriangleMesh.of(read_mesh(mesh_file))), unit, own
         return _of_cloud(path, cloud), unit, own
     if path.suffix.lower() == ".ply" and not has_triangles(path):
         return _of_cloud(path, read_cloud(path)), None, None
-    return _of_mesh(read_any_mesh(path)), None, None
-
-
-def _of_mesh(mesh: Mesh) -> MeshReference:
-    return MeshReference(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64)))
+    return MeshReference(TriangleMesh.of(read_any_mesh(path))), None, None
 
 
 def _of_cloud(path: Path, cloud: Cloud) -> CloudReference:

@@ -234,7 +234,7 @@ def part_of(cloud: Cloud) -> Cloud:
 def _export_cameras(run_folder: RunFolder, model: AngleModel, wanted: ExportRequest) -> Exported:
     workspace = open_dense_workspace(_existing(run_folder.dense(model), "COLMAP workspace"))
     mesh = read_mesh(_existing(run_folder.mesh(model), "mesh"))
-    scene = RayScene(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64)))
+    scene = RayScene(TriangleMesh.of(mesh))
 
     def mask(view: View) -> NDArray[np.bool_]:
         camera = view.camera
@@ -257,7 +257,7 @@ class _Painter:
     """Colours of a mesh from the views of its run."""
 
     def __init__(self, run_folder: RunFolder, mesh: Mesh) -> None:
-        self.mesh = TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64))
+        self.mesh = TriangleMesh.of(mesh)
         self.scene = RayScene(self.mesh)
         self.model: SparseModel = read_model(run_folder.sparse)
         self.images = run_folder.images

@@ -90,7 +90,7 @@ def marks_at(mesh: Mesh, file: Path, diameter: float, seed: int) -> Marks:
         surface.
     """
     places = _read_places(file)
-    surface = RayScene(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64)))
+    surface = RayScene(TriangleMesh.of(mesh))
     points, triangles, weights = surface.closest(places)
     away = np.linalg.norm(points - places, axis=1)
     if away.max() > 0.5 * diameter:
@@ -153,7 +153,7 @@ def _fits(mesh: Mesh, points: Array, normals: Array, radius: float) -> NDArray[n
     x, y, _ = (axis[:, None, :] for axis in np.moveaxis(_axes(normals, 0.0), -2, 0))
     circle = FLAT_RADIUS * radius * np.stack([np.cos(angle), np.sin(angle)])[..., None]
     edge = points[:, None] + circle[0] * x + circle[1] * y
-    surface = RayScene(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64)))
+    surface = RayScene(TriangleMesh.of(mesh))
     closest = surface.closest(edge.reshape(-1, 3))[0].reshape(edge.shape)
     gap = np.linalg.norm(closest - edge, axis=-1).max(axis=1)
     return np.asarray(gap <= MAX_GAP * radius)

@@ -16,6 +16,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 
 from polmvs.geometry import dots, lengths, unit_or_zero
+from polmvs.io.clouds import Mesh
 from polmvs.io.open3d_import import import_open3d
 
 Array = NDArray[np.float64]
@@ -45,6 +46,11 @@ class TriangleMesh:
 
     vertices: Array
     faces: Faces
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> TriangleMesh:
+        """The triangles of a mesh of a file."""
+        return cls(mesh.vertices, mesh.triangles.astype(np.int64))
 
     @cached_property
     def corners(self) -> Array:
