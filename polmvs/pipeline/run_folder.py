@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count, takewhile
 from pathlib import Path
 
 from polmvs.errors import DataError
@@ -145,22 +146,6 @@ FOLDER_FILES = {
     HERE.deviation.name: {f"deviation.{suffix}" for suffix in ("ply", "png", "svg", "json")},
     **{HERE.views(model).name: _SURFACES for model in AngleModel},
 }
-# Names of all that a run may write in its folder itself.
-ROOT_NAMES = frozenset(
-    path.parts[0]
-    for path in (
-        *(HERE.images, HERE.sfm, HERE.sparse, HERE.seeds, HERE.metrics, HERE.summary),
-        *(HERE.report, HERE.deviation, HERE.run_file, HERE.log),
-        *(
-            path
-            for model in AngleModel
-            for path in (
-                *(HERE.maps(model), HERE.sparse_cloud(model), HERE.cloud(model)),
-                *(HERE.views(model), HERE.mesh(model), HERE.dense(model)),
-            )
-        ),
-    )
-)
 # In these, files named IMAGE.part.npy as well; images are known by name from the record.
 FOLDERS_BY_IMAGE = frozenset(
     name for model in AngleModel for name in (HERE.maps(model).name, HERE.views(model).name)
@@ -302,6 +287,12 @@ def mark_own_workspace(folder: Path) -> None:
 def files_in(folder: Path) -> list[Path]:
     """All files in a folder and those within it."""
     return [path for path in folder.rglob("*") if path.is_file()]
+
+
+def surface_levels(views: Path) -> list[Path]:
+    """The closed meshes among dense views: the hull, then after each level of the surface."""
+    paths = (views / SURFACE_LEVELS.format(number=number) for number in count())
+    return list(takewhile(Path.is_file, paths))
 
 
 def num_files(path: Path) -> int:

@@ -22,7 +22,8 @@ from pathlib import Path
 from polmvs.errors import DataError, as_data_error
 from polmvs.io.plain_files import open_plain
 from polmvs.io.temporary import TOKEN, is_temporary, remove_temporary
-from polmvs.pipeline.run_folder import FOLDER_FILES, HERE, ROOT_NAMES
+from polmvs.pipeline.run_folder import FOLDER_FILES, HERE
+from polmvs.pipeline.stage_table import written_names
 
 if sys.platform == "win32":
     import msvcrt
@@ -35,7 +36,7 @@ LOCK_FILE = ".polmvs-lock"
 MAX_BYTES = 1 << 16
 _LINE = re.compile(r"([0-9a-f]{16}) (\d{1,10})")  # token and number of a process
 # Folders in which a run uses temporary names, and their final names.
-_PLACES = {Path(): ROOT_NAMES, HERE.seeds.parent: FOLDER_FILES[HERE.seeds.parent.name]}
+_PLACES = {Path(): written_names(), HERE.seeds.parent: FOLDER_FILES[HERE.seeds.parent.name]}
 _HELD_ELSEWHERE = (errno.EWOULDBLOCK, errno.EACCES)
 
 
@@ -82,7 +83,7 @@ def left_over_names(root: Path) -> frozenset[str]:
     found = [
         entry.name
         for entry in root.iterdir()
-        if any(is_temporary(entry, token, ROOT_NAMES) for token in tokens)
+        if any(is_temporary(entry, token, written_names()) for token in tokens)
     ]
     return frozenset((LOCK_FILE, *found))
 

@@ -8,7 +8,7 @@ extra, imported when a recording is made.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
 from polmvs.io.images import read_gray
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.record import Record
-from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
+from polmvs.pipeline.run_folder import SURFACE_MESH, RunFolder, surface_levels
 from polmvs.pipeline.runner import dense_models, load_record
 from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.maps import open_maps
@@ -190,7 +190,7 @@ class _Recorder:
     def surface(self, model: AngleModel) -> None:
         """The surface as it refines, the cloud, and the mesh."""
         views = self.folder.views(model)
-        for number, mesh in enumerate(_levels(views)):
+        for number, mesh in enumerate(map(read_mesh, surface_levels(views))):
             name = "hull of the silhouettes" if number == 0 else f"after level {number}"
             self.begin(f"surface_{model}", f"{name}, {len(mesh.triangles)} triangles")
             self.mesh(f"world/{model}/surface", mesh)
@@ -236,14 +236,6 @@ class _Recorder:
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)
         centers = np.array([view.center_in_world for view in self.model.views])
         return float(np.median(np.linalg.norm(centers - middle, axis=1))) / 40
-
-
-def _levels(views: Path) -> Iterator[Mesh]:
-    """The hull and the levels that a run left, in their order."""
-    number = 0
-    while (path := views / SURFACE_LEVELS.format(number=number)).is_file():
-        yield read_mesh(path)
-        number += 1
 
 
 def _principal_point(camera: Camera) -> tuple[Sequence[float], Sequence[float]]:

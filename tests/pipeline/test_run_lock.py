@@ -12,9 +12,8 @@ from helpers import content_of
 from polmvs.cli.terminal import Terminal, TerminalOptions
 from polmvs.errors import DataError
 from polmvs.io.temporary import PREFIX, TOKEN, temporary_path
-from polmvs.pipeline.run_folder import ROOT_NAMES, RunFolder, scratch
+from polmvs.pipeline.run_folder import RunFolder, scratch
 from polmvs.pipeline.run_lock import LOCK_FILE, left_over_names, locked
-from polmvs.pipeline.stage_table import written_names
 
 HOLDER = """
 import sys
@@ -135,7 +134,3 @@ def test_links_are_not_followed(tmp_path: Path) -> None:
 def test_long_names_have_short_temporary_names(tmp_path: Path) -> None:
     with scratch(tmp_path / (255 * "x")) as folder:
         assert len(folder.name) < 100
-
-
-def test_all_that_a_run_writes_may_be_left_half_done() -> None:
-    assert set(written_names()) <= ROOT_NAMES

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from itertools import count
-from pathlib import Path
 
 import numpy as np
 
@@ -19,7 +17,7 @@ from polmvs.io.clouds import read_cloud, read_mesh
 from polmvs.normals.camera_check import PhaseRows, fit_camera
 from polmvs.normals.tracks import evenly_chosen
 from polmvs.pipeline.record import Record
-from polmvs.pipeline.run_folder import SURFACE_LEVELS, SURFACE_MESH, RunFolder
+from polmvs.pipeline.run_folder import SURFACE_MESH, RunFolder, surface_levels
 from polmvs.pipeline.stages.densify import DensifyResult, open_outside
 from polmvs.pipeline.stages.maps import MapsResult, open_maps
 from polmvs.pipeline.stages.poses import PosesResult
@@ -27,7 +25,7 @@ from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.pipeline.stages.sfm import SfmResult
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import PointKind
+from polmvs.scene import PointKind, evenly_spread
 from polmvs.surface.held_out import HeldOutTolerances, predict, predict_left_out
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import DIFFUSE, SPECULAR, Looking, level_image, observe
@@ -97,8 +95,7 @@ def _contradicted(
     around = sparse_surroundings(read_model(folder.sparse).tracks, maps).points
     plane = supporting_plane(around, np.array([one.view.center_in_world for one in maps]))
     maps = [one for one in maps if one.view.name not in made.left_out]
-    chosen = np.linspace(0, len(maps) - 1, min(len(maps), MAX_TRIED_VIEWS)).round().astype(int)
-    maps = [maps[index] for index in chosen]
+    maps = [maps[index] for index in evenly_spread(len(maps), MAX_TRIED_VIEWS)]
     known = load_seeds(folder, model)
     outside, light = open_outside(folder, model), options.region.light
     tilt_aware = options.normals.tilt_aware_weights
@@ -106,7 +103,7 @@ def _contradicted(
     look = partial(_surface_view, masks_given=options.region.mask is not None)
     with ThreadPoolExecutor(default_num_workers()) as pool:
         seen = list(pool.map(look, maps))
-    mesh = _read_mesh(views / SURFACE_MESH)
+    mesh = TriangleMesh.of(read_mesh(views / SURFACE_MESH))
     wrong_camera = _camera_complaint(mesh, seen, looking, light)
     return replace(
         trust,
@@ -120,8 +117,11 @@ def _contradicted(
             outside=outside,
         ),
         fitted=predict(mesh, seen, looking, light=light, outside=outside),
+        # Of the last closed mesh: the surface has holes where nothing is known.
         soundness=find_soundness(
-            _read_mesh(_last_level(views)), [phase_map.view for phase_map in maps], outside
+            TriangleMesh.of(read_mesh([views / SURFACE_MESH, *surface_levels(views)][-1])),
+            [phase_map.view for phase_map in maps],
+            outside,
         ),
     )
 
@@ -166,19 +166,3 @@ def _camera_complaint(
 
 def _surface_view(phase_map: PhaseMap, *, masks_given: bool) -> SurfaceView:
     return surface_view(phase_map, find_silhouette(phase_map, mask_given=masks_given))
-
-
-def _last_level(views: Path) -> Path:
-    """The last closed mesh on the way to the surface, which has holes where nothing is known."""
-    found = views / SURFACE_MESH
-    for number in count():
-        path = views / SURFACE_LEVELS.format(number=number)
-        if not path.is_file():
-            return found
-        found = path
-    raise AssertionError
-
-
-def _read_mesh(path: Path) -> TriangleMesh:
-    mesh = read_mesh(path)
-    return TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64))
