@@ -29,19 +29,11 @@ from polmvs.config import (
     RunOptions,
     SfmOptions,
     default_num_workers,
+    groups_of,
     option,
 )
 from polmvs.polarization.kinds import COMPARED_MODELS, AngleModel
-from polmvs.simulation.options import (
-    LightingOptions,
-    ObjectOptions,
-    PathOptions,
-    PlanOptions,
-    RenderingOptions,
-    SceneryOptions,
-    SensorOptions,
-    SimulationRun,
-)
+from polmvs.simulation.options import PlanOptions, Simulation, SimulationRun
 
 ABOUT = "Dense clouds of glossy, textureless surfaces from polarization cameras."
 DEMO_OUT = Path("polmvs-demo")
@@ -372,14 +364,7 @@ TO_POSES = (CaptureOptions, SfmOptions, ReferenceOptions)
 TO_NORMALS = (*TO_POSES, RegionOptions, NormalOptions)
 TO_CLOUD = (*TO_NORMALS, PropagationOptions, FusionOptions, CropOptions)
 SHOWN = (ReportChoice, RecordingOptions)
-SIMULATION = (
-    ObjectOptions,
-    LightingOptions,
-    SceneryOptions,
-    PathOptions,
-    SensorOptions,
-    RenderingOptions,
-)
+SIMULATION = tuple(groups_of(Simulation).values())
 EXECUTION = (RunOptions, FileOptions, TerminalOptions)
 
 COMMANDS = (

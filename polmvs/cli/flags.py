@@ -39,29 +39,13 @@ from polmvs.config import (
     groups_of,
     show_value,
 )
-from polmvs.simulation.options import (
-    LightingOptions,
-    ObjectOptions,
-    PathOptions,
-    RenderingOptions,
-    SceneryOptions,
-    SensorOptions,
-)
+from polmvs.simulation.options import Simulation
 
 _NAMED_IN_MESSAGES: tuple[type[OptionGroup], ...] = (
     *groups_of(Options).values(),
-    RunOptions,
-    PlaneOptions,
-    ExperimentOptions,
-    FileOptions,
-    RecordingOptions,
-    TerminalOptions,
-    ObjectOptions,
-    LightingOptions,
-    SceneryOptions,
-    PathOptions,
-    SensorOptions,
-    RenderingOptions,
+    *(RunOptions, PlaneOptions, ExperimentOptions),
+    *(FileOptions, RecordingOptions, TerminalOptions),
+    *groups_of(Simulation).values(),
 )
 
 HELP_ALL = "--help-all"

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import shlex
+from typing import Any
 
 from polmvs.cli.call import Call
 from polmvs.cli.commands import PlanArguments, SimulateArguments
 from polmvs.cli.terminal import Terminal
+from polmvs.config import groups_of
 from polmvs.simulation.capture import simulate_capture
-from polmvs.simulation.options import (
-    LightingOptions,
-    ObjectOptions,
-    PathOptions,
-    PlanOptions,
-    RenderingOptions,
-    SceneryOptions,
-    SensorOptions,
-    Simulation,
-    SimulationRun,
-)
+from polmvs.simulation.options import PlanOptions, Simulation, SimulationRun
 from polmvs.simulation.planning import PLOT_FILE, TABLE_FILE, make_plan
 
 
@@ -59,11 +51,5 @@ def plan(call: Call, terminal: Terminal) -> int:
 
 def _simulation(call: Call) -> Simulation:
     """All options of what is rendered."""
-    return Simulation(
-        object=call.get(ObjectOptions),
-        lighting=call.get(LightingOptions),
-        scenery=call.get(SceneryOptions),
-        path=call.get(PathOptions),
-        sensor=call.get(SensorOptions),
-        rendering=call.get(RenderingOptions),
-    )
+    groups: dict[str, Any] = {name: call.get(c) for name, c in groups_of(Simulation).items()}
+    return Simulation(**groups)
