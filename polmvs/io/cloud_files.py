@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.errors import DataError, PolmvsError
-from polmvs.io.clouds import Cloud, write_cloud
+from polmvs.io.clouds import NORMALS, Cloud, write_cloud
 from polmvs.io.images import write_bytes
 
 LAS_STEPS = 2**30  # of the coordinates' range: LAS holds them as 32-bit integers
@@ -46,16 +47,8 @@ def _write_xyz(path: Path, cloud: Cloud) -> None:
     write_bytes(path, lines.getvalue().encode())
 
 
-def _write_las(path: Path, cloud: Cloud) -> None:
+def _write_las(path: Path, cloud: Cloud, *, compressed: bool) -> None:
     """LAS 1.2 with colours; further values of the points as extra dimensions."""
-    _write_laspy(path, cloud, compressed=False)
-
-
-def _write_laz(path: Path, cloud: Cloud) -> None:
-    _write_laspy(path, cloud, compressed=True)
-
-
-def _write_laspy(path: Path, cloud: Cloud, *, compressed: bool) -> None:
     try:
         import laspy
     except ImportError as error:
@@ -71,7 +64,7 @@ def _write_laspy(path: Path, cloud: Cloud, *, compressed: bool) -> None:
         name: np.asarray(values, np.float32) for name, values in cloud.scalars.items()
     }
     if cloud.normals is not None:
-        extra |= dict(zip(("nx", "ny", "nz"), cloud.normals.T.astype(np.float32), strict=True))
+        extra |= dict(zip(NORMALS, cloud.normals.T.astype(np.float32), strict=True))
     header.add_extra_dims([laspy.ExtraBytesParams(name=n, type=np.float32) for n in extra])
     las = laspy.LasData(header)
     las.x, las.y, las.z = cloud.points.T
@@ -93,6 +86,6 @@ def _colors(cloud: Cloud) -> NDArray[np.uint8]:
 CLOUD_FORMATS: Mapping[str, Callable[[Path, Cloud], None]] = {
     "ply": write_cloud,
     "xyz": _write_xyz,
-    "las": _write_las,
-    "laz": _write_laz,
+    "las": partial(_write_las, compressed=False),
+    "laz": partial(_write_las, compressed=True),
 }

@@ -32,7 +32,6 @@ DASHES = {
     AngleModel.PPA: (1, 0),
     AngleModel.TILTED: (1, 1.5),
 }
-LABELS = {model: model.label for model in AngleModel}
 INK = "#123456"  # replaced by the page's text colour
 MIN_IN_BIN = 30  # values for a median; its quartiles are then exact to about a tenth
 
@@ -148,7 +147,7 @@ def _style(model: AngleModel) -> dict[str, Any]:
     return {
         "color": COLORS[model],
         "linestyle": (0, DASHES[model]),
-        "label": LABELS[model],
+        "label": model.label,
         "linewidth": 1.6,
     }
 

@@ -253,7 +253,7 @@ def _view_pages(
     mesh = _mesh_of(given, given.main)
     surface = None
     if mesh is not None:
-        surface = RayScene(TriangleMesh(mesh.vertices, mesh.triangles.astype(np.int64)))
+        surface = RayScene(TriangleMesh.of(mesh))
     if given.truth is not None:
         views = tuple(named_as_truth(views, given.truth[0]))
     for index, view in enumerate(views):
@@ -371,7 +371,7 @@ def _point_colorings(given: ReportInput) -> dict[str, PointColoring]:
 
 def _mesh_layer(model: AngleModel, mesh: Mesh, layers: Sequence[Layer]) -> Layer:
     """A mesh with the values of the cloud's nearest points."""
-    label = plots.LABELS[model]
+    label = model.label
     values: dict[str, NDArray[Any]] = {}
     of_cloud = next((layer for layer in layers if layer.label == f"{label} cloud"), None)
     if of_cloud is not None:
@@ -413,7 +413,7 @@ def _cloud_layer(given: ReportInput, model: AngleModel, cloud: Cloud, factor: fl
             shown[name] = np.asarray(values, np.float64) * (factor if name == "sigma" else 1.0)
     layer = thinned(
         Layer(
-            label=f"{plots.LABELS[model]} cloud",
+            label=f"{model.label} cloud",
             points=cloud.points,
             normals=np.zeros((num, 3)) if cloud.normals is None else cloud.normals,
             values=shown,
@@ -461,7 +461,7 @@ def _scene(
     labels = [layer.label for layer in layers]
 
     def index(model: AngleModel) -> int | None:
-        name = f"{plots.LABELS[model]} cloud"
+        name = f"{model.label} cloud"
         return labels.index(name) if name in labels else None
 
     main = next((i for i in map(index, MAIN) if i is not None), 0)
@@ -547,10 +547,10 @@ def _quality_words(given: ReportInput) -> list[str]:
     figures = given.comparison.models if given.comparison is not None else {}
     if main not in figures:
         return _uncertainty_words(given)
-    name, truth = plots.LABELS[main], figures[main].truth
+    name, truth = main.label, figures[main].truth
     opa = next((m for m in ORTHOGRAPHIC if m in figures and m is not main), None)
     other = None if opa is None else figures[opa]
-    older = "" if opa is None else f"the older orthographic model ({plots.LABELS[opa]})"
+    older = "" if opa is None else f"the older orthographic model ({opa.label})"
     if truth is not None:
         near = f"{1e3 * truth.cloud.thresholds_m[0]:g} mm"
         right, covered = truth.cloud.accuracy[0], truth.cloud.completeness[0]
@@ -611,7 +611,7 @@ def _facts(given: ReportInput) -> list[tuple[str, str]]:
         ("sparse points", f"{poses.num_tracks:,}"),
         ("seeds on the part", f"{seeds.num_seeds:,}"),
         (
-            f"points, {plots.LABELS[main]}",
+            f"points, {main.label}",
             f"{given.record.result(DensifyResult, main).num_points:,}",
         ),
     ]
@@ -642,7 +642,7 @@ def _verdict(given: ReportInput) -> list[str]:
     found = given.record.find(Trust, main)
     if found is None or not found.verdict:
         return []
-    return [f"{plots.LABELS[main]}: {found.verdict.replace('`', '')}"]
+    return [f"{main.label}: {found.verdict.replace('`', '')}"]
 
 
 def trust_table(given: ReportInput) -> Table | None:
@@ -660,7 +660,7 @@ def trust_table(given: ReportInput) -> Table | None:
         ]
         for figure in found.figures()
     ]
-    return Table(header=[plots.LABELS[main], "value", "normal", ""], rows=rows)
+    return Table(header=[main.label, "value", "normal", ""], rows=rows)
 
 
 def _plots(given: ReportInput, samples: Mapping[AngleModel, ErrorSamples]) -> list[Plot]:
