@@ -37,6 +37,7 @@ from polmvs.polarization.capture import open_capture
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.mosaic import ANGLES_DEG, split_mosaic, split_mosaic_full
 from polmvs.polarization.stokes import Stokes, axial_difference, stokes_from_intensities
+from polmvs.scene import evenly_spread
 
 Way = Callable[[Image], Image]
 
@@ -141,13 +142,9 @@ class Figures:
 def measure(folder: Path) -> dict[str, Figures]:
     """Figures of all ways on a capture."""
     capture, truth = open_capture(folder), open_ground_truth(folder)
-    chosen = [truth.names[k] for k in _spread(len(truth.names))]
+    chosen = [truth.names[k] for k in evenly_spread(len(truth.names), NUM_VIEWS)]
     frames = [capture.load_mosaic(name) for name in chosen]
     return {name: _figures(way, frames, chosen, truth) for name, way in {**HALF, **FULL}.items()}
-
-
-def _spread(num: int) -> list[int]:
-    return sorted({round(float(k)) for k in np.linspace(0, num - 1, min(num, NUM_VIEWS))})
 
 
 def _figures(

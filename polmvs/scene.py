@@ -124,6 +124,11 @@ def short_list(names: Sequence[str]) -> str:
     return ", ".join(names[:MAX_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
+def evenly_spread(num: int, most: int) -> NDArray[np.int64]:
+    """Indices of at most so many of ``num`` things, spread evenly over their order."""
+    return np.linspace(0, num - 1, min(num, most)).round().astype(np.int64)
+
+
 @dataclass(frozen=True)
 class Tracks:
     """Sparse points and their observations as flat arrays.

@@ -28,7 +28,7 @@ from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
 from polmvs.normals.tracks import MAX_ROWS, in_tiles, observe, tracks_on_parts
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import MIN_VIEWS, Tracks
+from polmvs.scene import MIN_VIEWS, Tracks, evenly_spread
 
 LIGHTS = (AS_MEASURED, OTHER_LIGHT)  # that of the maps, and the other
 
@@ -171,7 +171,7 @@ def _pixel_votes(
     slots : pixels of all parts.
     maps : of all views, under the assumption of specular light.
     """
-    seen_by = _looked_up(len(maps), t)
+    seen_by = evenly_spread(len(maps), t.max_pixel_views)
     asked = np.isin(slots.view, seen_by)
     points, owner = slots.points[asked], slots.owner[asked]
     total, sums = np.zeros(slots.num), np.zeros((2, slots.num))
@@ -215,7 +215,7 @@ def _pooled_votes(
     """
     placed = np.maximum(np.bincount(slots.owner, minlength=slots.num), 1)
     covered, passed, known = np.zeros(slots.num), np.zeros(slots.num), np.zeros(slots.num)
-    for k in _looked_up(len(maps), t):
+    for k in evenly_spread(len(maps), t.max_pixel_views):
         elsewhere = slots.view != k
         xy = maps[k].view.project(slots.points[elsewhere])
         part = sample_image(_parts_of(maps[k]).astype(np.float32), xy, nearest=True).astype(int)
@@ -231,12 +231,6 @@ def _pooled_votes(
         total = np.nan_to_num(own) + passed_on
         pooled.append(np.where(np.isfinite(own) | (num_known > 0), total, np.nan))
     return pooled
-
-
-def _looked_up(num_views: int, t: LightTolerances) -> NDArray[np.int64]:
-    """Views, evenly spread, that pixels placed in space are looked up in."""
-    chosen = np.linspace(0, num_views - 1, min(num_views, t.max_pixel_views))
-    return np.asarray(chosen.round(), np.int64)
 
 
 @dataclass(frozen=True)
@@ -284,7 +278,7 @@ def _place_pixels(maps: Sequence[PhaseMap], points: Array, t: LightTolerances) -
     """
     chosen = [_choose_pixels(phase_map, points, t) for phase_map in maps]
     support = [np.zeros((len(one.distances), len(one.rays)), np.int16) for one in chosen]
-    for k in _looked_up(len(maps), t):
+    for k in evenly_spread(len(maps), t.max_pixel_views):
         inside, camera = maps[k].region.inside.astype(np.float32), maps[k].view.camera
         for one, views in zip(chosen, support, strict=True):
             xy = maps[k].view.project(one.places())
@@ -358,22 +352,17 @@ def _choose_pixels(phase_map: PhaseMap, points: Array, t: LightTolerances) -> _C
     )
 
 
-def row_costs(
-    estimate: NormalEstimate, *, max_cost: float = LightTolerances.max_row_cost
-) -> Floats:
-    """Cauchy costs (K, N) of the rows of normals, log-likelihoods.
-
-    The robust weight is ``1 / (1 + z^2 / c^2)``: minus its logarithm is the row's cost.
-    """
-    return np.asarray(-np.log(np.maximum(estimate.row_weights, np.exp(-max_cost))))
-
-
 def _costs_of_both(
     specular: NormalEstimate, diffuse: NormalEstimate, max_cost: float
 ) -> tuple[list[Floats], Mask]:
-    """Costs (K, N) of the rows under either light, and which rows count under both."""
-    costs = [row_costs(estimate, max_cost=max_cost) for estimate in (specular, diffuse)]
-    return costs, np.asarray((specular.row_weights > 0) & (diffuse.row_weights > 0))
+    """Costs (K, N) of the rows under either light, and which rows count under both.
+
+    The robust weight is ``1 / (1 + z^2 / c^2)``: minus its logarithm, a log-likelihood, is the
+    row's cost.
+    """
+    weights = specular.row_weights, diffuse.row_weights
+    costs: list[Floats] = [-np.log(np.maximum(of_light, np.exp(-max_cost))) for of_light in weights]
+    return costs, np.asarray((weights[0] > 0) & (weights[1] > 0))
 
 
 def _dolp_votes(maps: Sequence[PhaseMap], t: LightTolerances) -> float:

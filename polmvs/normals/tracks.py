@@ -23,7 +23,7 @@ from polmvs.normals.mixture_estimator import MixtureEstimate, row_scales, solve_
 from polmvs.normals.observations import Observations, gather_observations
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import MIN_VIEWS, Seeds, Tracks, point_sigmas, some_tracks
+from polmvs.scene import MIN_VIEWS, Seeds, Tracks, evenly_spread, point_sigmas, some_tracks
 
 logger = logging.getLogger(__name__)
 
@@ -81,8 +81,7 @@ def matched_views(tracks: Tracks, num_views: int) -> Mask:
 def evenly_chosen(num_points: int, limit: int) -> Mask:
     """Of points (N,) some that are spread evenly over them, ``limit`` at most."""
     chosen = np.zeros(num_points, bool)
-    limit = min(num_points, limit)
-    chosen[np.linspace(0, num_points - 1, limit).round().astype(np.int64)] = True
+    chosen[evenly_spread(num_points, limit)] = True
     return chosen
 
 

@@ -22,7 +22,7 @@ from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.capture import Capture, intensity_image_8bit
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
-from polmvs.scene import MIN_VIEWS, short_list
+from polmvs.scene import MIN_VIEWS, evenly_spread, short_list
 
 Picture = NDArray[np.uint8]
 
@@ -191,11 +191,9 @@ def contact_sheet(capture: Capture, worded: Callable[[str], str] = str) -> Pictu
     (H, W, 3) uint8, BGR. Clipped pixels are red in the intensity. The hue is the AoLP, paler and
     darker where the DoLP is below 0.5.
     """
-    count = min(SHEET_VIEWS, len(capture.names))
-    chosen = np.linspace(0, len(capture.names) - 1, count).round().astype(int)
     white = capture.exposure()
     tiles = []
-    for name in [capture.names[k] for k in chosen]:
+    for name in [capture.names[k] for k in evenly_spread(len(capture.names), SHEET_VIEWS)]:
         stokes = capture.load(name)
         shown = (intensity_picture(stokes, white), aolp_picture(stokes), dolp_picture(stokes))
         captions = (f"{name}  intensity", "AoLP", f"DoLP, white: {SHOWN_DOLP:g}")

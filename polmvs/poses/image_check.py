@@ -21,7 +21,7 @@ from polmvs.arrays import Array
 from polmvs.colmap.dense_workspace import MatchTolerances
 from polmvs.errors import DataError
 from polmvs.polarization.capture import WHITE_PERCENTILE, Capture, intensity_image_8bit
-from polmvs.scene import View
+from polmvs.scene import View, evenly_spread
 
 ImageLoader = Callable[[str], NDArray[np.uint8]]
 
@@ -111,7 +111,7 @@ def fit_to_images(
 ) -> ImageFit:
     """Compare cameras with the matches of the images' features."""
     t = tolerances
-    chosen = [views[k] for k in _evenly(len(views), t.max_views)]
+    chosen = [views[k] for k in evenly_spread(len(views), t.max_views)]
     sift = feature_detector(t)
     found = [find_features(sift, load_image(view.name)) for view in chosen]
     distances = [np.zeros(0)]
@@ -141,10 +141,6 @@ def intensity_loader(capture: Capture, names: Mapping[str, str]) -> ImageLoader:
         return intensity_image_8bit(stokes, white if white > 0 else 1.0)
 
     return load
-
-
-def _evenly(num: int, most: int) -> list[int]:
-    return sorted({round(float(k)) for k in np.linspace(0, num - 1, min(num, most))})
 
 
 def feature_detector(t: ImageCheckTolerances) -> cv2.SIFT:

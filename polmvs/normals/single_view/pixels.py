@@ -96,13 +96,13 @@ def load_stokes(path: Path, options: CaptureOptions) -> Stokes:
     return open_image(path, options).load(path.name)
 
 
-def phase_sigma(stokes: Stokes, *, tolerances: PhaseTolerances | None = None) -> Image:
+def phase_sigma(stokes: Stokes) -> Image:
     """Deviation of the phase (H, W), rad: noise, the model's error, and light of the other kind.
 
     As in :mod:`polmvs.polarization.phase_map`, for single pixels; infinite or NaN where there is
     no polarization.
     """
-    t = tolerances or PhaseTolerances()
+    t = PhaseTolerances()
     with np.errstate(divide="ignore", invalid="ignore"):
         noise = t.mixture_sigma**2 + np.square(0.5 * stokes.sigma / stokes.s0)
         return np.asarray(np.sqrt(t.model_sigma**2 + noise / np.square(stokes.dolp)), np.float32)

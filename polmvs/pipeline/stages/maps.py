@@ -41,7 +41,7 @@ from polmvs.polarization.phase_map import (
     turned,
 )
 from polmvs.polarization.region import find_region
-from polmvs.scene import MIN_VIEWS, Tracks, View
+from polmvs.scene import MIN_VIEWS, Tracks, View, evenly_spread
 from polmvs.surface.object_search import FoundObject, find_object
 from polmvs.surface.visual_hull import supporting_plane
 
@@ -320,7 +320,7 @@ def _wrong_setting(
 
 def _some_views(tracks: Tracks, maps: Sequence[PhaseMap]) -> tuple[Tracks, list[PhaseMap]]:
     """Evenly spread views, so many as a check may hold at a time, and what these observe."""
-    chosen = np.linspace(0, len(maps) - 1, min(len(maps), MAX_CHECKED_VIEWS)).round().astype(int)
+    chosen = evenly_spread(len(maps), MAX_CHECKED_VIEWS)
     kept = np.isin(np.arange(len(maps)), chosen)
     return tracks.in_views(kept), [maps[k] for k in chosen]
 
