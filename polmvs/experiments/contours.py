@@ -151,7 +151,10 @@ def measure_contours(
             result = ViewContours(
                 name=scene.views[indices[len(results)]].name,
                 second=second,
-                lines={m: _measured(*line, surface) for m, line in traced.items()},
+                lines={
+                    method: Lines(points=points, curve=curve, heights=surface.heights(points))
+                    for method, (points, curve) in traced.items()
+                },
             )
             results.append(result)
             on_progress(1)
@@ -270,10 +273,6 @@ def _true_ranges(scene: Scene, index: int) -> Array:
     name = scene.views[index].name
     depth = scene.truth.depth(name).astype(np.float64)
     return depth / view_rays(scene.truth.views[name])[..., 2]
-
-
-def _measured(points: Array, curve: NDArray[np.int64], surface: TrueSurface) -> Lines:
-    return Lines(points=points, curve=curve, heights=surface.heights(points))
 
 
 def second_view(maps: Sequence[PhaseMap], index: int, seeds: Array) -> int | None:

@@ -126,7 +126,9 @@ class ViewData:
 
     def blurred_for(self, angle_model: AngleModel) -> Stokes:
         """Blurred Stokes images for the model: corrected under ``tilted``."""
-        return self._for(angle_model, self.blurred)
+        if angle_model is not AngleModel.TILTED:
+            return self.blurred
+        return correct_stokes(self.blurred, self.rays, diffuse=self.light is Light.DIFFUSE)
 
     def axial(self, angle_model: AngleModel) -> Image:
         """``(s0 cos 2 phase, s0 sin 2 phase)`` times the DoLP of the blurred images, (H, W, 2)."""
@@ -144,8 +146,7 @@ class ViewData:
 
     def phase_map(self, angle_model: AngleModel, region: Region) -> PhaseMap:
         """The phase map of polmvs, with precisions."""
-        s = self.sharp
-        measured = build_phase_map(self.view, s, region, self.light)
+        measured = build_phase_map(self.view, self.sharp, region, self.light)
         return as_tilted(measured) if angle_model is AngleModel.TILTED else measured
 
     def plain_map(self, angle_model: AngleModel) -> PhaseMap:
@@ -160,11 +161,6 @@ class ViewData:
         region = Region(self.part, self.counted, np.zeros_like(self.part))
         base = self.phase_map(AngleModel.PPA, region)
         return replace(base, samples=samples.astype(np.float32))
-
-    def _for(self, angle_model: AngleModel, stokes: Stokes) -> Stokes:
-        if angle_model is not AngleModel.TILTED:
-            return stokes
-        return correct_stokes(stokes, self.rays, diffuse=self.light is Light.DIFFUSE)
 
 
 def open_scene(

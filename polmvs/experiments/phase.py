@@ -67,16 +67,6 @@ class PhaseResult:
     per_view: Mapping[str, Mapping[AngleModel, float]]
     densities: Mapping[AngleModel, Density]
 
-    def ratio(self, angle_model: AngleModel) -> float:
-        """Root mean square error over that of OPA, all pixels."""
-        return ratio(
-            self.all_pixels[angle_model].rmse_deg, self.all_pixels[AngleModel.OPA].rmse_deg
-        )
-
-    def ratio_unmarked(self, angle_model: AngleModel) -> float:
-        """Root mean square error over that of OPA, outside of marks."""
-        return ratio(self.unmarked[angle_model].rmse_deg, self.unmarked[AngleModel.OPA].rmse_deg)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PhaseImages:
@@ -287,6 +277,11 @@ class ErrorTally:
         index = int(np.searchsorted(cumulative, target))
         before = cumulative[index - 1] if index else 0
         return float(BIN_DEG * (index + (target - before) / max(self.counts[index], 1)))
+
+
+def ratio_to_opa(stats: Mapping[AngleModel, SignedStats], angle_model: AngleModel) -> float:
+    """Root mean square error of a model over that of OPA."""
+    return ratio(stats[angle_model].rmse_deg, stats[AngleModel.OPA].rmse_deg)
 
 
 def ratio(numerator: float, denominator: float) -> float:

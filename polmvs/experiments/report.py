@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -23,7 +23,14 @@ from polmvs.experiments.contours import (
 )
 from polmvs.experiments.data import MODEL_LABELS, Scene, view_indices
 from polmvs.experiments.output import Report
-from polmvs.experiments.phase import PhaseResult, SignedStats, measure_phase, phase_images, ratio
+from polmvs.experiments.phase import (
+    PhaseResult,
+    SignedStats,
+    measure_phase,
+    phase_images,
+    ratio,
+    ratio_to_opa,
+)
 from polmvs.experiments.plane import (
     ESTIMATES,
     PLANE_LABELS,
@@ -291,30 +298,28 @@ def _poses(scene: Scene) -> str:
 def phase_json(result: PhaseResult) -> dict[str, Any]:
     """Content of ``phase.json`` beside the settings."""
     return {
-        **_with_ratios(result.all_pixels, result.ratio),
-        "outside_marks": _with_ratios(result.unmarked, result.ratio_unmarked),
+        **_with_ratios(result.all_pixels),
+        "outside_marks": _with_ratios(result.unmarked),
         "rmse_deg_per_view": result.per_view,
     }
 
 
-def _with_ratios(
-    stats: Mapping[AngleModel, SignedStats], share: Callable[[AngleModel], float]
-) -> dict[str, Any]:
+def _with_ratios(stats: Mapping[AngleModel, SignedStats]) -> dict[str, Any]:
     return {
         **{angle_model.value: of_model for angle_model, of_model in stats.items()},
-        "ratio_ppa_opa": share(AngleModel.PPA),
-        "ratio_tilted_opa": share(AngleModel.TILTED),
+        "ratio_ppa_opa": ratio_to_opa(stats, AngleModel.PPA),
+        "ratio_tilted_opa": ratio_to_opa(stats, AngleModel.TILTED),
     }
 
 
 def phase_table(result: PhaseResult) -> str:
     """Phase errors, all pixels and those outside of printed marks."""
     rows = []
-    for where, stats, share in (
-        ("all valid pixels", result.all_pixels, result.ratio),
-        ("outside printed marks", result.unmarked, result.ratio_unmarked),
+    for where, stats in (
+        ("all valid pixels", result.all_pixels),
+        ("outside printed marks", result.unmarked),
     ):
-        rows += [[where, *_phase_row(m, s, share(m))] for m, s in stats.items()]
+        rows += [[where, *_phase_row(m, s, ratio_to_opa(stats, m))] for m, s in stats.items()]
     head = ["pixels", "model", "mean", "RMSE", "median", "95 %", "RMSE / OPA", "number"]
     return _table(head, rows)
 

@@ -27,7 +27,7 @@ from polmvs.experiments.contours import (
     pool_lines,
 )
 from polmvs.experiments.data import Scene, load_view, open_experiment, open_scene
-from polmvs.experiments.phase import ErrorTally, measure_phase, phase_images
+from polmvs.experiments.phase import ErrorTally, measure_phase, phase_images, ratio_to_opa
 from polmvs.experiments.plane import measure_plane
 from polmvs.experiments.tracks import check_k, measure_tracks, order_at_random, order_by_angle
 from polmvs.io.images import write_png
@@ -89,7 +89,7 @@ def test_phase_of_the_sensors_own_model_is_exact(tmp_path, sensor):
     # Interpolating the mosaic of a curved phase field costs about 0.05 degrees.
     assert medians[AngleModel(sensor)] < 0.1
     assert min(m for model, m in medians.items() if model != sensor) > 0.2
-    assert result.ratio(AngleModel.OPA) == 1
+    assert ratio_to_opa(result.all_pixels, AngleModel.OPA) == 1
     columns = result.densities[AngleModel.PPA].sum(axis=-1)
     np.testing.assert_allclose(columns[np.isfinite(columns)], 1)
     images = phase_images(scene, 0)
