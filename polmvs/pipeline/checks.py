@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from hashlib import blake2b, file_digest
 from pathlib import Path
 
@@ -33,7 +34,7 @@ from polmvs.poses.image_check import (
     require_cameras_of_images,
 )
 from polmvs.poses.metric_frame import check_reference, frame_from_distance, read_centers
-from polmvs.scene import SparseModel, View, find_name, match_names, short_list
+from polmvs.scene import SparseModel, find_name, match_names, short_list
 
 MAX_CAMERA_DIFFERENCE = 0.01  # of the focal length, between equivalent options; a guess
 
@@ -210,11 +211,7 @@ def require_truth_of_capture(truth: GroundTruth, capture: Capture, load_image: I
             f"its names are like {truth.names[0]!r}, the images' like {next(iter(names))!r}. Give "
             "the ground truth of this capture.",
         )
-    views = [
-        View(name=name, camera=true.camera, cam_from_world=true.cam_from_world)
-        for name, other in matched.items()
-        for true in (truth.views[other],)
-    ]
+    views = [replace(truth.views[other], name=name) for name, other in matched.items()]
     camera = views[0].camera
     if (camera.width, camera.height) != (capture.width, capture.height):
         raise DataError(

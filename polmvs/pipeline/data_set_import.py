@@ -223,12 +223,7 @@ def _triangulate(data_set: DataSet, capture: Capture, out: Path) -> int:
                 f"its cameras are of {intrinsics.width}x{intrinsics.height} px, the polarization "
                 f"images {capture.width}x{capture.height} px.",
             )
-        camera = ColmapCamera(
-            model=intrinsics.model,
-            width=intrinsics.width,
-            height=intrinsics.height,
-            params=intrinsics.params,
-        )
+        camera = ColmapCamera(**vars(intrinsics))
         views.append(View(name=name, camera=camera, cam_from_world=pose))
     images, work = out / "images", out / "work"
     write_images(capture, images)
