@@ -99,36 +99,6 @@ def test_gray_radiances_are_of_all_colours(tmp_path: Path) -> None:
         read_radiance(tmp_path / "a.png")
 
 
-RED, GREEN, BLUE = (np.full((2, 3), value, np.float32) for value in (0.5, 1.5, 2.5))
-ALL = np.dstack([RED, GREEN, BLUE])
-
-
-@pytest.mark.parametrize(
-    ("channels", "expected"),
-    [
-        ({"RGB": ALL}, ALL),
-        ({"RGBA": np.dstack([ALL, RED])}, ALL),
-        ({"B": BLUE, "G": GREEN, "R": RED, "Z": RED}, ALL),
-        ({"Y": GREEN}, np.dstack([GREEN] * 3)),
-        ({"intensity": GREEN}, np.dstack([GREEN] * 3)),
-        ({"A": RED, "Z": GREEN}, None),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
-)
-def test_openexr_of_every_kind_of_channels(
-    tmp_path: Path, channels: dict[str, np.ndarray], expected: np.ndarray | None
-) -> None:
-    exr = pytest.importorskip("OpenEXR")
-    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
-    with exr.File(header, channels) as file:
-        file.write(str(tmp_path / "a.exr"))
-    if expected is None:
-        with pytest.raises(DataError, match="has the channels A, Z; one or RGB is read"):
-            read_radiance(tmp_path / "a.exr")
-    else:
-        np.testing.assert_array_equal(read_radiance(tmp_path / "a.exr"), expected)
-
-
 def test_files_are_read_whole_or_named(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(b"12345")

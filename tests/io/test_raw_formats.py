@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polmvs.errors import DataError
-from polmvs.io.raw_formats import read_raw
+from polmvs.io.raw_formats import read_radiance, read_raw
 
 ROWS = np.arange(24).reshape(4, 6)
 
@@ -53,29 +53,40 @@ def test_the_largest_integers_are_samples(tmp_path: Path) -> None:
     assert read_raw(tmp_path / "a.npy").samples.max() == 65535
 
 
-RED, GREEN = (np.full((4, 6), value, np.float32) for value in (0.5, 1.5))
+RED, GREEN, BLUE = (np.full((4, 6), value, np.float32) for value in (0.5, 1.5, 2.5))
+ALL = np.dstack([RED, GREEN, BLUE])
 
 
 @pytest.mark.parametrize(
     ("channels", "expected"),
     [
-        ({"RGB": np.dstack([RED, GREEN, RED])}, np.dstack([RED, GREEN, RED])),
-        ({"RGBA": np.dstack([RED, GREEN, RED, RED])}, np.dstack([RED, GREEN, RED])),
+        ({"RGB": ALL}, ALL),
+        ({"RGBA": np.dstack([ALL, RED])}, ALL),
+        ({"B": BLUE, "G": GREEN, "R": RED, "Z": RED}, ALL),
+        ({"Y": GREEN}, GREEN),
         ({"Y": GREEN, "Z": RED}, GREEN),
         ({"Z": RED}, RED),
+        ({"intensity": GREEN}, GREEN),
         ({"V": RED, "W": GREEN}, None),
+        ({"A": RED, "Z": GREEN}, None),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
 )
 def test_channels_of_openexr(
     tmp_path: Path, channels: dict[str, np.ndarray], expected: np.ndarray | None
 ) -> None:
+    """As samples, and as radiances, which are of all colours."""
     exr = pytest.importorskip("OpenEXR")
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    path = tmp_path / "a.exr"
     with exr.File(header, channels) as file:
-        file.write(str(tmp_path / "a.exr"))
+        file.write(str(path))
     if expected is None:
-        with pytest.raises(DataError, match="has the channels V, W; one or RGB is read"):
-            read_raw(tmp_path / "a.exr")
+        for read in (read_raw, read_radiance):
+            names = ", ".join(channels)
+            with pytest.raises(DataError, match=f"has the channels {names}; one or RGB is read"):
+                read(path)
     else:
-        np.testing.assert_array_equal(read_raw(tmp_path / "a.exr").samples, expected)
+        np.testing.assert_array_equal(read_raw(path).samples, expected)
+        radiances = np.dstack([expected] * 3) if expected.ndim == 2 else expected
+        np.testing.assert_array_equal(read_radiance(path), radiances)
