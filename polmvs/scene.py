@@ -153,9 +153,11 @@ class Tracks:
 
     def of_views(self, num_views: int) -> list[NDArray[np.int64]]:
         """Indices of the observations of each view, in their order."""
-        order = np.argsort(self.obs_view, kind="stable")
-        starts = np.searchsorted(self.obs_view[order], np.arange(num_views + 1))
-        return [order[a:b] for a, b in pairwise(starts)]
+        return _by_owner(self.obs_view, num_views)
+
+    def of_tracks(self) -> list[NDArray[np.int64]]:
+        """Indices of the observations of each track, in their order."""
+        return _by_owner(self.obs_track, len(self.point3D_ids))
 
     def in_views(self, kept: Mask) -> Tracks:
         """All tracks with the observations of the chosen ``(V,)`` views, which count anew."""
@@ -167,6 +169,12 @@ class Tracks:
             obs_view=index[self.obs_view[seen]],
             obs_xy=self.obs_xy[seen],
         )
+
+
+def _by_owner(owners: NDArray[np.int64], num: int) -> list[NDArray[np.int64]]:
+    order = np.argsort(owners, kind="stable")
+    starts = np.searchsorted(owners[order], np.arange(num + 1))
+    return [order[a:b] for a, b in pairwise(starts)]
 
 
 def some_tracks(tracks: Tracks, chosen: Mask) -> Tracks:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -215,14 +214,12 @@ def write_bundler(export: CameraExport, folder: Path) -> None:
         lines.append(f"{item.camera.mean_focal_px!r} 0 0")
         lines += [_row(row) for row in turn @ np.asarray(pose.rotation)]
         lines.append(_row(turn @ np.asarray(pose.translation)))
-    order = np.argsort(tracks.obs_track, kind="stable")
-    starts = np.searchsorted(tracks.obs_track[order], np.arange(len(tracks.point3D_ids) + 1))
     count = np.zeros(len(views), np.int64)
-    for track, (start, end) in enumerate(pairwise(starts)):
+    for track, own in enumerate(tracks.of_tracks()):
         lines.append(_row(tracks.points_in_world[track]))
         lines.append(" ".join(map(str, tracks.colors[track].tolist())))
-        words = [str(end - start)]
-        for index in order[start:end]:
+        words = [str(len(own))]
+        for index in own:
             number = int(tracks.obs_view[index])
             camera, focal = views[number].camera, views[number].camera.mean_focal_px
             x, y = tracks.obs_xy[index]

@@ -25,6 +25,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from polmvs.arrays import Array
 from polmvs.camera import MAX_SIDE, Camera
 from polmvs.colmap.cameras import (
     camera_from_colmap,
@@ -429,64 +430,47 @@ def reconstruction_of_views(
     ----------
     single_camera : all views share the camera of the first; else each has its own.
     """
+    camera_ids = [1] * len(views) if single_camera else range(1, len(views) + 1)
+    return _posed(views, camera_ids, [np.zeros((0, 2))] * len(views))
+
+
+def _posed(
+    views: Sequence[View], camera_ids: Sequence[int], keypoints: Sequence[Array]
+) -> pycolmap.Reconstruction:
+    """Posed images, each with its keypoints and a camera, which is of the first view of its id."""
     reconstruction = pycolmap.Reconstruction()
-    for index, view in enumerate(views):
-        if index == 0 or not single_camera:
+    of_views = zip(views, camera_ids, keypoints, strict=True)
+    for image_id, (view, camera_id, points) in enumerate(of_views, start=1):
+        if not reconstruction.exists_camera(camera_id):
             camera = camera_to_colmap(view.camera)
-            camera.camera_id = index + 1
+            camera.camera_id = camera_id
             reconstruction.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(
-            name=view.name, camera_id=1 if single_camera else index + 1, image_id=index + 1
+            name=view.name, keypoints=points, camera_id=camera_id, image_id=image_id
         )
-        _add_image(reconstruction, image, view.cam_from_world)
+        pose = np.column_stack([view.cam_from_world.rotation, view.cam_from_world.translation])
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
     return reconstruction
-
-
-def _add_image(
-    reconstruction: pycolmap.Reconstruction, image: pycolmap.Image, pose: RigidTransform
-) -> None:
-    matrix = np.column_stack([pose.rotation, pose.translation])
-    reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix))
 
 
 def _reconstruction(sparse_model: SparseModel) -> pycolmap.Reconstruction:
     """The model in pycolmap's types; ids of points are kept."""
-    reconstruction = pycolmap.Reconstruction()
-    cameras = list(dict.fromkeys(view.camera for view in sparse_model.views))
-    for index, camera in enumerate(cameras):
-        colmap_camera = camera_to_colmap(camera)
-        colmap_camera.camera_id = index + 1
-        reconstruction.add_camera_with_trivial_rig(colmap_camera)
-    tracks = sparse_model.tracks
+    views, tracks = sparse_model.views, sparse_model.tracks
+    observations = tracks.of_views(len(views))
+    cameras = list(dict.fromkeys(view.camera for view in views))
+    camera_ids = [cameras.index(view.camera) + 1 for view in views]
+    reconstruction = _posed(views, camera_ids, [tracks.obs_xy[own] for own in observations])
     # Index of an observation among those of its image.
-    observations = tracks.of_views(len(sparse_model.views))
     point2D_idx = np.empty(len(tracks.obs_view), np.int64)
-    for index, (view, own) in enumerate(zip(sparse_model.views, observations, strict=True)):
+    for own in observations:
         point2D_idx[own] = np.arange(len(own))
-        image = pycolmap.Image(
-            name=view.name,
-            keypoints=tracks.obs_xy[own],
-            camera_id=cameras.index(view.camera) + 1,
-            image_id=index + 1,
-        )
-        _add_image(reconstruction, image, view.cam_from_world)
-    _add_points(reconstruction, tracks, point2D_idx)
-    return reconstruction
-
-
-def _add_points(
-    reconstruction: pycolmap.Reconstruction, tracks: Tracks, point2D_idx: NDArray[np.int64]
-) -> None:
-    """Add all tracks; ``point2D_idx`` is each observation's index in its image."""
-    order = np.argsort(tracks.obs_track, kind="stable")
-    starts = np.searchsorted(tracks.obs_track[order], np.arange(len(tracks.point3D_ids) + 1))
-    # Plain numbers, handed over one by one, take two thirds of the time of a list of elements.
-    image_ids = (tracks.obs_view[order] + 1).tolist()
-    indices = point2D_idx[order].tolist()
-    for index, point3D_id in enumerate(tracks.point3D_ids):
+    for index, (point3D_id, own) in enumerate(
+        zip(tracks.point3D_ids, tracks.of_tracks(), strict=True)
+    ):
         track = pycolmap.Track()
-        own = slice(starts[index], starts[index + 1])
-        for image_id, point2D_index in zip(image_ids[own], indices[own], strict=True):
+        # Plain numbers, handed over one by one, take two thirds of the time of a list of elements.
+        image_ids, indices = (tracks.obs_view[own] + 1).tolist(), point2D_idx[own].tolist()
+        for image_id, point2D_index in zip(image_ids, indices, strict=True):
             track.add_element(image_id, point2D_index)
         point = pycolmap.Point3D(
             xyz=tracks.points_in_world[index],
@@ -495,6 +479,7 @@ def _add_points(
             track=track,
         )
         reconstruction.add_point3D_with_id(int(point3D_id), point)
+    return reconstruction
 
 
 # Records of the binary files, from COLMAP's reconstruction_io_binary.cc. A pose is a quaternion and
