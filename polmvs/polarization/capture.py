@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,8 +59,9 @@ from polmvs.polarization.stokes import (
 
 logger = logging.getLogger(__name__)
 
-_scratch = threading.local()
+T = TypeVar("T")
 
+_scratch = threading.local()
 
 DISPLAY_GAMMA = 2.2
 WHITE_PERCENTILE = 99.5
@@ -542,10 +543,13 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
             )
         full_scale = full_scale if full_scale is not None else calibration.full_scale
     header, levels, orientations, sampled = _survey(files, options, full_scale)
-    steps = _lossy_steps(sampled)
-    divisor = 1
-    if files.kind is CaptureKind.MOSAIC:
-        divisor = 1 if options.resolution is Resolution.FULL else 2
+    mosaic = files.kind is CaptureKind.MOSAIC
+    divisor = 2 if mosaic and options.resolution is Resolution.HALF else 1
+    pattern_check = linearity_check = None
+    if mosaic and options.bayer is None:
+        samples = [raw.samples for raw in sampled]
+        pattern_check = _check_pattern(files, options, levels, samples)
+        linearity_check = _check_linearity(options, levels, samples)
     capture = Capture(
         folder=files.folder,
         files=files,
@@ -555,14 +559,14 @@ def _open(files: CaptureFiles, options: CaptureOptions) -> Capture:
         levels=levels,
         options=options,
         calibration=calibration,
-        lossy_steps=steps,
+        lossy_steps=_lossy_steps(sampled),
         orientations=orientations,
-        pattern_check=_check_pattern(files, options, levels, sampled),
-        linearity_check=_check_linearity(files, options, levels, sampled),
+        pattern_check=pattern_check,
+        linearity_check=linearity_check,
     )
     if files.kind is CaptureKind.ANGLES:
-        looked_at = np.linspace(0, len(files.views) - 1, min(CHECKED_IMAGES, len(files.views)))
-        gains = tuple(capture.find_gains(capture.names[int(k)]) for k in looked_at)
+        looked_at = _evenly_chosen(capture.names)
+        gains = tuple(capture.find_gains(name) for name in looked_at)
         capture = replace(capture, angle_gains=gains)
     for warning in capture.warnings:
         logger.warning("%s: %s.", files.folder, warning)
@@ -627,10 +631,7 @@ def _survey(
     """Header and levels of all files, their orientations, and a few of them decoded."""
     counts = LevelCounts()
     orientations: set[int] = set()
-    looked_at = {
-        files.paths[int(k)]
-        for k in np.linspace(0, len(files.paths) - 1, min(CHECKED_IMAGES, len(files.paths)))
-    }
+    looked_at = _evenly_chosen(files.paths)
     first: tuple[Path, RawHeader] | None = None
     sampled = []
     for view in files.views:
@@ -649,7 +650,8 @@ def _survey(
                     continue
                 orientations.add(raw.orientation)
                 # Of Stokes images s0 has the scale; the maps have each their own.
-                if (files.kind is not CaptureKind.AOLP and role == 0) or _has_levels(files):
+                has_scale = role == 0 or files.kind is not CaptureKind.STOKES
+                if files.kind is not CaptureKind.AOLP and has_scale:
                     counts.add(raw.samples, raw.declared_bits)
                 if path in looked_at:
                     sampled.append(raw)
@@ -667,9 +669,10 @@ def _survey(
     return first[1], levels, tuple(sorted(orientations)) or (UPRIGHT,), sampled
 
 
-def _has_levels(files: CaptureFiles) -> bool:
-    """Whether every file holds intensities."""
-    return files.kind in (CaptureKind.MOSAIC, CaptureKind.ANGLES)
+def _evenly_chosen(things: Sequence[T]) -> list[T]:
+    """Those that are looked at closely."""
+    places = np.linspace(0, len(things) - 1, min(CHECKED_IMAGES, len(things)))
+    return [things[int(place)] for place in places]
 
 
 def _require_usable(
@@ -740,14 +743,10 @@ def _lossy_steps(sampled: Sequence[RawImage]) -> tuple[float, ...] | None:
 
 
 def _check_pattern(
-    files: CaptureFiles, options: CaptureOptions, levels: Levels, sampled: Sequence[RawImage]
-) -> PatternCheck | None:
+    files: CaptureFiles, options: CaptureOptions, levels: Levels, sampled: Sequence[NDArray[Any]]
+) -> PatternCheck:
     """Check the pattern of a monochrome mosaic; one that does not fit is refused."""
-    if files.kind is not CaptureKind.MOSAIC or options.bayer is not None:
-        return None
-    linear = [
-        linearize(raw.samples, gamma=options.gamma, full_scale=levels.full_scale) for raw in sampled
-    ]
+    linear = [linearize(s, gamma=options.gamma, full_scale=levels.full_scale) for s in sampled]
     check = check_pattern(linear, options.pattern, clip=options.saturation)
     if check.fits is False:
         raise OptionError(f"{files.folder}: {check.message}.")
@@ -755,14 +754,12 @@ def _check_pattern(
 
 
 def _check_linearity(
-    files: CaptureFiles, options: CaptureOptions, levels: Levels, sampled: Sequence[RawImage]
+    options: CaptureOptions, levels: Levels, sampled: Sequence[NDArray[Any]]
 ) -> LinearityCheck | None:
-    """Check the gamma of a monochrome mosaic."""
-    if files.kind is not CaptureKind.MOSAIC or options.bayer is not None:
-        return None
+    """Check the gamma of a monochrome mosaic; None for too few images."""
     if len(sampled) < CHECKED_IMAGES:
         return None
-    shares = [linearize(raw.samples, gamma=1.0, full_scale=levels.full_scale) for raw in sampled]
+    shares = [linearize(s, gamma=1.0, full_scale=levels.full_scale) for s in sampled]
     return check_linearity(shares, options.pattern, options.saturation, options.gamma)
 
 
