@@ -123,10 +123,10 @@ def find_region(
     texture = _relative_gradient(s0)
     core = (dolp > min_dolp) & valid
     core = _open(core, 3)
-    inside = mask if mask is not None else _grow(core, intensity, texture, tolerances=tolerances)
+    inside = mask if mask is not None else _grow(core, intensity, texture, tolerances)
     marks = _marks(s0, inside & core, tolerances.mark_reach_px)
     reliable = inside & valid & ~marks & (dolp > 0.3 * min_dolp)
-    edges = inside & _phase_jumps(axial, dolp, min_dolp, tolerances=tolerances)
+    edges = inside & _phase_jumps(axial, dolp, min_dolp, tolerances)
     return Region(inside, reliable, edges)
 
 
@@ -149,7 +149,7 @@ def _relative_gradient(s0: Image) -> Image:
     return np.asarray(np.hypot(dx, dy) / np.maximum(smooth(s0, 3.0), 1e-6), np.float32)
 
 
-def _grow(core: Mask, intensity: Image, texture: Image, *, tolerances: RegionTolerances) -> Mask:
+def _grow(core: Mask, intensity: Image, texture: Image, tolerances: RegionTolerances) -> Mask:
     """Core plus textureless neighbours of like intensity, holes filled, small regions dropped.
 
     The intensity that a neighbour must resemble is that of the region next to it, and follows
@@ -159,10 +159,7 @@ def _grow(core: Mask, intensity: Image, texture: Image, *, tolerances: RegionTol
     flat = texture < tolerances.low_texture
     grown = core
     for _ in range(tolerances.max_growth_rounds):
-        weight = smooth(grown.astype(np.float32), tolerances.growth_px)
-        reference = smooth(np.where(grown, intensity, 0), tolerances.growth_px) / np.maximum(
-            weight, 1e-6
-        )
+        reference, weight = _mean_about(intensity, grown, tolerances.growth_px)
         similar = (
             flat
             & (intensity < tolerances.similar_intensity * reference)
@@ -173,16 +170,18 @@ def _grow(core: Mask, intensity: Image, texture: Image, *, tolerances: RegionTol
         grown = _touching(_open(grown | similar, 5), core)
         if grown.sum() < 1.02 * before:
             break
-    grown = _substantial(
-        _fill_holes(grown, texture, tolerances=tolerances),
-        core,
-        tolerances.min_core_share,
-        tolerances=tolerances,
-    )
-    alone = _substantial(
-        _fill_holes(core, texture, tolerances=tolerances) & ~grown, core, 0.0, tolerances=tolerances
-    )
-    return _fill_holes(grown | alone, texture, tolerances=tolerances)
+    grown = _fill_holes(grown, texture, tolerances)
+    grown = _substantial(grown, core, tolerances.min_area_px, tolerances.min_core_share)
+    alone = _fill_holes(core, texture, tolerances) & ~grown
+    alone = _substantial(alone, core, tolerances.min_area_px, 0.0)
+    return _fill_holes(grown | alone, texture, tolerances)
+
+
+def _mean_about(image: Image, mask: Mask, reach_px: float) -> tuple[Image, Image]:
+    """Mean of an image over the mask's pixels near each pixel, and the mask's share there."""
+    share = smooth(mask.astype(np.float32), reach_px)
+    total = smooth(np.where(mask, image, 0).astype(np.float32), reach_px)
+    return np.asarray(total / np.maximum(share, 1e-6), np.float32), share
 
 
 def _touching(mask: Mask, core: Mask) -> Mask:
@@ -194,19 +193,17 @@ def _touching(mask: Mask, core: Mask) -> Mask:
     return np.asarray(held[labels])
 
 
-def _substantial(
-    mask: Mask, core: Mask, min_core_share: float, *, tolerances: RegionTolerances
-) -> Mask:
+def _substantial(mask: Mask, core: Mask, min_area_px: int, min_core_share: float) -> Mask:
     """Connected parts with enough of the core, in px and as a share of the part."""
     num, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     core_area = np.bincount(labels[core & mask], minlength=num)
     area = stats[:, cv2.CC_STAT_AREA]
-    keep = (core_area >= tolerances.min_area_px) & (core_area >= min_core_share * area)
+    keep = (core_area >= min_area_px) & (core_area >= min_core_share * area)
     keep[0] = False
     return np.asarray(keep[labels])
 
 
-def _fill_holes(mask: Mask, texture: Image, *, tolerances: RegionTolerances) -> Mask:
+def _fill_holes(mask: Mask, texture: Image, tolerances: RegionTolerances) -> Mask:
     """Fill holes that are small or show no texture, and small ones that a narrow gap opens."""
     labels, area = _holes(mask)
     flat = np.bincount(labels.ravel(), (texture < tolerances.low_texture).ravel(), len(area))
@@ -238,16 +235,13 @@ def _holes(mask: Mask) -> tuple[NDArray[np.int32], Array]:
 
 def _marks(s0: Image, polarized: Mask, reach_px: float) -> Mask:
     """Pixels much brighter or darker than the polarized surface about them, with a margin."""
-    weight = smooth(polarized.astype(np.float32), reach_px)
-    reference = smooth(np.where(polarized, s0, 0).astype(np.float32), reach_px) / np.maximum(
-        weight, 1e-6
-    )
+    reference, weight = _mean_about(s0, polarized, reach_px)
     deviation = smooth(s0, 0.8) / np.maximum(reference, 1e-6)
     return grow_mask((weight > 0.02) & ((deviation > 1.5) | (deviation < 0.5)), 1)
 
 
 def _phase_jumps(
-    axial: Floats, dolp: Floats, min_dolp: float, *, tolerances: RegionTolerances
+    axial: Floats, dolp: Floats, min_dolp: float, tolerances: RegionTolerances
 ) -> Mask:
     """Where the phase changes abruptly between two polarized sides."""
     unit = axial / np.maximum(np.linalg.norm(axial, axis=-1, keepdims=True), 1e-9)
