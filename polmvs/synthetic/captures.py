@@ -67,8 +67,9 @@ def render_view(
     ior: float = 1.5,
     s0: float = 0.8,
     background: float = 0.0,
+    xy: Array | None = None,
 ) -> SyntheticView:
-    """Render a surface at the pixel centres of a view.
+    """Render a surface at the pixel centres of a view, or at other places.
 
     Parameters
     ----------
@@ -76,9 +77,47 @@ def render_view(
     sensor : "ppa", "opa" or "tilted".
     ior : refractive index of the surface; sets the degree of polarization.
     s0, background : ``I0 + I90`` of the surface and of the unpolarized rest, in full scales.
+    xy : (H, W, 2), image coordinates; None: the pixel centres.
     """
-    xy = pixel_centers(view.camera.width, view.camera.height)
-    return _render(view, surface, xy, light, sensor, ior, s0, background)
+    if light not in LIGHTS or sensor not in SENSORS:
+        raise ValueError(f"{light=}, {sensor=} but expected one of {LIGHTS} and of {SENSORS}.")
+    if xy is None:
+        xy = pixel_centers(view.camera.width, view.camera.height)
+    rays = view.camera.rays(xy)
+    rotation = view.cam_from_world.rotation
+    distance, normals = surface.intersect(view.center_in_world, rays @ rotation)
+    mask = np.isfinite(distance)
+    distance = np.where(mask, distance, np.nan)
+    normals = normals @ rotation.T
+    dolp = fresnel_dolp(-(rays * normals).sum(axis=-1), light, ior)
+    across = unit(np.cross(rays, normals))  # the light's polarization if it is specular
+    axis = across if light == "specular" else np.cross(rays, across)
+    if sensor == "tilted":
+        intensities = _tilted_intensities(rays, axis, dolp, s0)
+        s1, s2 = intensities[0] - intensities[2], intensities[1] - intensities[3]
+        aolp = 0.5 * np.arctan2(s2, s1)
+    else:
+        # Paper, eq. model: z x (v x n) lies along d = (cos, -sin, 0).
+        v = rays if sensor == "ppa" else np.broadcast_to([0.0, 0.0, 1.0], rays.shape)
+        plane_normal = np.cross(v, normals)
+        phase = np.arctan2(-plane_normal[..., 0], -plane_normal[..., 1])
+        aolp = phase + (np.pi / 2 if light == "specular" else 0.0)
+        angles = np.radians(ANGLES_DEG)[:, None, None]
+        intensities = 0.5 * s0 * (1 + dolp * np.cos(2 * (angles - aolp)))
+    polarized = mask & np.isfinite(across[..., 0]) & (dolp > 0)
+    intensities = np.where(polarized, intensities, 0.5 * np.where(mask, s0, background))
+    aolp = np.where(polarized, aolp, np.nan)
+    return SyntheticView(
+        view=view,
+        depth=distance * rays[..., 2],
+        range=distance,
+        normals_in_cam=normals,
+        mask=mask,
+        phase=wrap_axial(aolp - (np.pi / 2 if light == "specular" else 0.0)),
+        aolp=wrap_axial(aolp),
+        dolp=dolp,
+        intensities=intensities,
+    )
 
 
 def render_mosaic(
@@ -86,16 +125,12 @@ def render_mosaic(
     surface: Surface,
     *,
     pattern: tuple[int, int, int, int] = CaptureOptions.pattern,
-    light: str = "specular",
-    sensor: str = "ppa",
-    ior: float = 1.5,
-    s0: float = 0.8,
-    background: float = 0.0,
+    **appearance: Any,
 ) -> Array:
     """Render a raw mosaic ``(2 H, 2 W)``, every sample at its own position and polarizer.
 
     ``view`` is of the half-size image, ``pattern`` the angles of a cell in degrees, row by row;
-    the rest as in :func:`render_view`. Share of full scale, not rounded.
+    ``appearance`` as in :func:`render_view`. Share of full scale, not rounded.
     """
     mosaic = np.empty((2 * view.camera.height, 2 * view.camera.width))
     centers = pixel_centers(view.camera.width, view.camera.height)
@@ -103,7 +138,7 @@ def render_mosaic(
         row, col = divmod(cell, 2)
         # Samples of a cell lie a quarter of a half-size pixel about its centre.
         xy = centers + np.array([0.5 * col - 0.25, 0.5 * row - 0.25])
-        rendered = _render(view, surface, xy, light, sensor, ior, s0, background)
+        rendered = render_view(view, surface, xy=xy, **appearance)
         mosaic[row::2, col::2] = rendered.intensities[index]
     return mosaic
 
@@ -180,56 +215,6 @@ def rolled(pose: RigidTransform, roll: float) -> RigidTransform:
     cos, sin = np.cos(roll), np.sin(roll)
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return RigidTransform(turn @ pose.rotation, turn @ pose.translation)
-
-
-def _render(
-    view: View,
-    surface: Surface,
-    xy: Array,
-    light: str,
-    sensor: str,
-    ior: float,
-    s0: float,
-    background: float,
-) -> SyntheticView:
-    """Render at image coordinates ``xy``, (H, W, 2)."""
-    if light not in LIGHTS or sensor not in SENSORS:
-        raise ValueError(f"{light=}, {sensor=} but expected one of {LIGHTS} and of {SENSORS}.")
-    rays = view.camera.rays(xy)
-    rotation = view.cam_from_world.rotation
-    distance, normals = surface.intersect(view.center_in_world, rays @ rotation)
-    mask = np.isfinite(distance)
-    distance = np.where(mask, distance, np.nan)
-    normals = normals @ rotation.T
-    dolp = fresnel_dolp(-(rays * normals).sum(axis=-1), light, ior)
-    across = unit(np.cross(rays, normals))  # the light's polarization if it is specular
-    axis = across if light == "specular" else np.cross(rays, across)
-    if sensor == "tilted":
-        intensities = _tilted_intensities(rays, axis, dolp, s0)
-        s1, s2 = intensities[0] - intensities[2], intensities[1] - intensities[3]
-        aolp = 0.5 * np.arctan2(s2, s1)
-    else:
-        # Paper, eq. model: z x (v x n) lies along d = (cos, -sin, 0).
-        v = rays if sensor == "ppa" else np.broadcast_to([0.0, 0.0, 1.0], rays.shape)
-        plane_normal = np.cross(v, normals)
-        phase = np.arctan2(-plane_normal[..., 0], -plane_normal[..., 1])
-        aolp = phase + (np.pi / 2 if light == "specular" else 0.0)
-        angles = np.radians(ANGLES_DEG)[:, None, None]
-        intensities = 0.5 * s0 * (1 + dolp * np.cos(2 * (angles - aolp)))
-    polarized = mask & np.isfinite(across[..., 0]) & (dolp > 0)
-    intensities = np.where(polarized, intensities, 0.5 * np.where(mask, s0, background))
-    aolp = np.where(polarized, aolp, np.nan)
-    return SyntheticView(
-        view=view,
-        depth=distance * rays[..., 2],
-        range=distance,
-        normals_in_cam=normals,
-        mask=mask,
-        phase=wrap_axial(aolp - (np.pi / 2 if light == "specular" else 0.0)),
-        aolp=wrap_axial(aolp),
-        dolp=dolp,
-        intensities=intensities,
-    )
 
 
 def _tilted_intensities(rays: Array, axis: Array, dolp: Array, s0: float) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from polmvs.arrays import Array
-from polmvs.geometry import unit
+from polmvs.geometry import dots, unit
 from polmvs.scene import MIN_DISTANCE
 
 
@@ -69,7 +69,7 @@ class Sphere:
         """See :class:`Surface`."""
         start = np.broadcast_to(origins - np.asarray(self.center, np.float64), rays.shape)
         distance, hit = _quadratic(
-            np.ones(rays.shape[:-1]), _dot(start, rays), _dot(start, start) - self.radius**2
+            np.ones(rays.shape[:-1]), dots(start, rays), dots(start, start) - self.radius**2
         )
         position = start + np.where(hit, distance, 0.0)[..., None] * rays
         return _finish(distance, hit, position / self.radius, rays)
@@ -90,8 +90,8 @@ class Cylinder:
         start = np.broadcast_to(origins - np.asarray(self.point, np.float64), rays.shape)
         across = start - (start @ axis)[..., None] * axis
         rays_across = rays - (rays @ axis)[..., None] * axis
-        a, b = _dot(rays_across, rays_across), _dot(across, rays_across)
-        c = _dot(across, across) - self.radius**2
+        a, b = dots(rays_across, rays_across), dots(across, rays_across)
+        c = dots(across, across) - self.radius**2
         limit = np.inf if self.half_length is None else self.half_length
 
         def within(distance: Array) -> NDArray[np.bool_]:
@@ -121,10 +121,6 @@ class Group:
         )
 
 
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(np.einsum("...i,...i", a, b))
-
-
 def _quadratic(
     a: Array, b: Array, c: Array, inside: Callable[[Array], NDArray[np.bool_]] | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -147,5 +143,5 @@ def _finish(
     distance: Array, hit: NDArray[np.bool_], normals: Array, rays: Array
 ) -> tuple[Array, Array]:
     """Misses to infinity and NaN; unit normals towards the camera."""
-    facing = np.where(_dot(normals, rays)[..., None] > 0, -normals, normals)
+    facing = np.where(dots(normals, rays)[..., None] > 0, -normals, normals)
     return np.where(hit, distance, np.inf), np.where(hit[..., None], facing, np.nan)
