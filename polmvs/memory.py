@@ -96,7 +96,7 @@ class PeakMemory:
     """
 
     def __init__(self) -> None:
-        self._ended = _largest_ended_mb()
+        self._ended = _rusage_mb("RUSAGE_CHILDREN")
         for pid in _living():
             try:
                 Path(f"/proc/{pid}/clear_refs").write_text(RESET_PEAK, encoding="ascii")
@@ -105,8 +105,10 @@ class PeakMemory:
 
     def mb(self) -> float:
         """The sum so far, MB; a process that has ended counts if it is the largest of all such."""
-        total = _own_peak_mb() + sum(_peak_mb(pid) for pid in _living() if pid != os.getpid())
-        ended = _largest_ended_mb()
+        # getrusage starts from the peak of the process that started this one: the second choice.
+        own = _peak_mb(os.getpid()) or _rusage_mb("RUSAGE_SELF")
+        total = own + sum(_peak_mb(pid) for pid in _living() if pid != os.getpid())
+        ended = _rusage_mb("RUSAGE_CHILDREN")
         return total + (ended if ended > self._ended else 0.0)
 
 
@@ -132,18 +134,8 @@ def _living() -> Iterable[int]:
     return [os.getpid(), *(child.pid for child in active_children() if child.pid is not None)]
 
 
-def _own_peak_mb() -> float:
-    # getrusage starts from the peak of the process that started this one: the second choice.
-    peak = _peak_mb(os.getpid())
-    return peak or _rusage_mb("RUSAGE_SELF")
-
-
-def _largest_ended_mb() -> float:
-    """Largest peak of the ended children of this process, MB."""
-    return _rusage_mb("RUSAGE_CHILDREN")
-
-
 def _rusage_mb(who: str) -> float:
+    """Peak memory of this process, or the largest of its ended children, MB."""
     try:
         import resource
     except ImportError:  # Windows

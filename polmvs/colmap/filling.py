@@ -19,7 +19,6 @@ import numpy as np
 
 from polmvs.colmap.dense_workspace import (
     FUSION_FILE,
-    GEOMETRIC,
     IMAGES,
     SPARSE,
     STEREO,
@@ -126,17 +125,13 @@ def _write_filled(source: DenseWorkspace, stereo: Path, load_fill: FillLoader) -
         if fill is not None:
             _require_size(item, fill)
             write_maps(stereo, item.view.name, fill_maps(item.load_maps(), fill))
-        elif item.depth is not None and not _is_geometric(source, item):
+        elif item.depth not in (None, map_files(source.stereo, item.view.name)[0]):
             maps = item.load_maps()
             assert maps is not None  # has a depth map
             write_maps(stereo, item.view.name, maps)
         if fill is not None or item.depth is not None:
             fused.append(item.view.name)
     write_lines(stereo / FUSION_FILE, fused)
-
-
-def _is_geometric(source: DenseWorkspace, item: WorkspaceView) -> bool:
-    return item.depth == map_files(source.stereo, item.view.name, GEOMETRIC)[0]
 
 
 def _require_size(item: WorkspaceView, fill: DepthNormals) -> None:

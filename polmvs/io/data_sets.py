@@ -262,11 +262,11 @@ def _read_pisr(folder: Path, given: CaptureOptions) -> DataSet:
         if match is None:
             raise DataError(path, "names no gamma; gamma0.5.txt is expected.")
         gamma = float(match[1])
-    lens = read_npz(folder / "intrinsics.npz")
+    path = folder / "intrinsics.npz"
+    lens = read_npz(path)
     width, height = _size_of(next(iter(images.values())))
     if raw:
         width, height = width // 2, height // 2
-    path = folder / "intrinsics.npz"
     try:
         matrix = _matrix(lens["camera_matrix"], (3, 3))
         distortion = np.ravel(lens["dist_coeffs"]).astype(np.float64)

@@ -112,7 +112,8 @@ def check_axes(
     chosen = evenly_chosen(len(on_parts.points_in_world), t.max_points)
     some, options = some_tracks(on_parts, chosen), NormalOptions()
     # Under both kinds of light, which a rotation of all angles by 90 degrees exchanges.
-    readings = [r for way in (AS_MEASURED, *CHANGES) for r in (way, _other_light(way))]
+    ways = (AS_MEASURED, *CHANGES)
+    readings = [r for (a, b), (c, d) in ways for r in (((a, b), (c, d)), ((-a, -b), (-c, -d)))]
     observed = gather_observations_under(
         readings, AngleModel.PPA, some.points_in_world, maps, window_px=options.window_px
     )
@@ -170,8 +171,3 @@ def changed_pattern(
     if usual in found:
         return usual
     return max(found, key=lambda p: sum(x == y for x, y in zip(p, pattern, strict=True)))
-
-
-def _other_light(reading: Reading) -> Reading:
-    (a, b), (c, d) = reading
-    return (-a, -b), (-c, -d)

@@ -32,6 +32,8 @@ from polmvs.surface.mesh_geometry import RayScene
 
 MAX_ERROR_DEG = 20.0  # top of the colour scales: OPA's phase errors on oblique surfaces
 MAX_ERROR_M = max(THRESHOLDS_M)  # of distances to ground truth
+# OPA, in order of preference: it is best known as published.
+ORTHOGRAPHIC = (AngleModel.TEXTBOOK_OPA, AngleModel.OPA)
 MAX_SAMPLES_A_VIEW = 4000  # errors for the plots: quartiles of 16 views are then exact to 1 %
 
 
@@ -238,7 +240,7 @@ def _wipe(
     of_model: Mapping[AngleModel, Sequence[PagePicture]],
 ) -> tuple[PagePicture, PagePicture] | None:
     """The last picture of OPA and of the best of the others: errors if known, else residuals."""
-    opa = next((m for m in (AngleModel.TEXTBOOK_OPA, AngleModel.OPA) if m in of_model), None)
+    opa = next((m for m in ORTHOGRAPHIC if m in of_model), None)
     others = (AngleModel.PPA, AngleModel.TILTED, AngleModel.TEXTBOOK_PPA)
     other = next((m for m in others if m in of_model), None)
     if opa is None or other is None:

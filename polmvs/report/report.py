@@ -48,6 +48,7 @@ from polmvs.report import pictures, plots
 from polmvs.report.contents import (
     MAX_ERROR_DEG,
     MAX_ERROR_M,
+    ORTHOGRAPHIC,
     DisplayUnit,
     ErrorSamples,
     ViewInput,
@@ -83,7 +84,7 @@ ADAPTED = {"residual": MAX_ERROR_DEG, "normal_error": MAX_ERROR_DEG, "error": 1e
 SIZE_PERCENTILES = (0.5, 99.5)
 MIN_SIZED = 100  # least number of points for a size
 SIZED = 5000  # points for a size: its ends are exact to some of their spacings
-# Models that represent the run, and OPA, in order of preference: OPA is best known as published.
+# Models that represent the run, in order of preference.
 MAIN = (
     AngleModel.PPA,
     AngleModel.TILTED,
@@ -91,7 +92,6 @@ MAIN = (
     AngleModel.OPA,
     AngleModel.TEXTBOOK_OPA,
 )
-ORTHOGRAPHIC = (AngleModel.TEXTBOOK_OPA, AngleModel.OPA)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,10 +160,11 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
     layers, channels = scene_layers(given)
     scene = _scene(given, layers, channels)
     is_thinned = any(len(cloud.points) > MAX_POINTS for cloud in given.clouds.values())
+    size = [f"The part is about {sides} in size." for sides in _size(given)]
     text = page_text(
         Page(
             title=_title(given),
-            sentence=" ".join([*_verdict(given), *_size_words(given), *_quality_words(given)]),
+            sentence=" ".join([*_verdict(given), *size, *_quality_words(given)]),
             facts=_facts(given),
             warnings=warnings_of(given),
             tables=_tables(given),
@@ -511,19 +512,14 @@ def _title(given: ReportInput) -> str:
     return f"{name}: {num_views} views became a surface of {points:,} points"
 
 
-def _size_words(given: ReportInput) -> list[str]:
-    size = _size(given)
-    return [] if size is None else [f"The part is about {size} in size."]
-
-
-def _size(given: ReportInput) -> str | None:
-    """Extents of the part along its main directions; None where lengths have no unit."""
+def _size(given: ReportInput) -> list[str]:
+    """Extents of the part along its main directions; empty where lengths have no unit."""
     surface = given.clouds[given.main]
     points = surface.points[surface.are(PointKind.SURFACE)]
     if not (given.is_metric or given.truth is not None) or len(points) < MIN_SIZED:
-        return None
+        return []
     sides = " x ".join(f"{given.length.factor * side:.0f}" for side in _sides(points))
-    return f"{sides} {given.length.name}"
+    return [f"{sides} {given.length.name}"]
 
 
 def _sides(points: Floats) -> Floats:
@@ -615,8 +611,7 @@ def _facts(given: ReportInput) -> list[tuple[str, str]]:
             f"{given.record.result(DensifyResult, main).num_points:,}",
         ),
     ]
-    if (size := _size(given)) is not None:
-        facts.append(("size", size))
+    facts += [("size", sides) for sides in _size(given)]
     if given.comparison is not None and main in given.comparison.models:
         coverage = given.comparison.models[main].consistency.coverage
         facts.append(("region covered", f"{number(coverage, 100, 1)} %"))
