@@ -7,7 +7,7 @@ Geman and McClure: a dent or a missing part is an outlier without influence.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 from typing import Protocol
 
@@ -150,33 +150,23 @@ def register(
     normals : (N, 3) unit, outwards; they separate the two sides of thin parts.
     with_scale : also estimate the scale.
     """
-    chosen = _some(points, normals, tolerances.fine_points)
-    few = _some(points, normals, tolerances.coarse_points)
     size = float(np.linalg.norm(np.ptp(reference.points, axis=0)))
+    whole = _Fit(points, normals, reference, size, with_scale, tolerances)
+    few, more = whole.some(tolerances.coarse_points), whole.some(tolerances.fine_points)
 
     def ranked(
         places: Iterable[SimilarityTransform], steps: int
     ) -> list[tuple[float, SimilarityTransform]]:
-        refined = [
-            _refined(few, reference, place, with_scale, steps, size, tolerances) for place in places
-        ]
-        found = [(_spread(few, reference, place), place) for place in refined]
-        return sorted(found, key=lambda pair: pair[0])
+        refined = [few.refined(place, steps) for place in places]
+        return sorted(((few.spread(place), place) for place in refined), key=lambda pair: pair[0])
 
     found = ranked(_starts(points, reference.points, with_scale=with_scale), 4)
     kept = [place for _, place in found[: tolerances.num_kept]]
     found = ranked(kept, tolerances.coarse_steps)
-    best = _refined(
-        chosen, reference, found[0][1], with_scale, tolerances.fine_steps, size, tolerances
-    )
+    best = more.refined(found[0][1], tolerances.fine_steps)
     least = max(found[0][0], 1e-300)
     others = [spread / least for spread, place in found[1:] if _differ(place, found[0][1])]
-    return _described(chosen, reference, best, with_scale, min(others, default=np.inf))
-
-
-def _some(points: Array, normals: Array | None, num: int) -> tuple[Array, Array | None]:
-    index = np.random.default_rng(0).permutation(len(points))[:num]
-    return points[index], None if normals is None else normals[index]
+    return more.described(best, min(others, default=np.inf))
 
 
 def _starts(points: Array, target: Array, *, with_scale: bool) -> Iterator[SimilarityTransform]:
@@ -203,124 +193,121 @@ def _axes(points: Array) -> tuple[Array, Array, float]:
     return center, axes, float(np.sqrt(np.mean(lengths(points - center) ** 2)))
 
 
-def _residuals(
-    given: tuple[Array, Array | None], reference: Reference, place: SimilarityTransform
-) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Moved points, normals of the reference, distances along them, and which points count."""
-    moved = np.asarray(place * given[0])
-    closest, normals = reference.closest(moved)
-    counts = np.ones(len(moved), np.bool_)
-    if given[1] is not None:
-        counts = dots(given[1] @ np.asarray(place.rotation).T, normals) > 0
-    return moved, normals, dots(moved - closest, normals), counts
+@dataclass(frozen=True)
+class _Fit:
+    """Points (N, 3) of a result, their normals, and what they are registered to, of some size."""
 
+    points: Array
+    normals: Array | None
+    reference: Reference
+    size: float
+    with_scale: bool
+    tolerances: RegistrationTolerances
 
-def _spread(
-    given: tuple[Array, Array | None], reference: Reference, place: SimilarityTransform
-) -> float:
-    """Mean distance of the points, those that face the wrong way counted with the largest.
+    def some(self, num: int) -> _Fit:
+        """With that many of the points."""
+        index = np.random.default_rng(0).permutation(len(self.points))[:num]
+        normals = None if self.normals is None else self.normals[index]
+        return replace(self, points=self.points[index], normals=normals)
 
-    It includes the mean distance of the reference from them, so that a registration that covers
-    only half of it is not better.
-    """
-    moved = np.asarray(place * given[0])
-    closest, normals = reference.closest(moved)
-    distance = lengths(moved - closest)
-    missed = cKDTree(moved).query(reference.points[::20])[0].mean()
-    if given[1] is not None:
-        facing = dots(given[1] @ np.asarray(place.rotation).T, normals) > 0
-        distance = np.where(facing, distance, distance.max())
-    return float(distance.mean() + missed)
+    def _offsets(self, place: SimilarityTransform) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+        """Moved points, their offsets from the reference, its normals, and which points count."""
+        moved = np.asarray(place * self.points)
+        closest, normals = self.reference.closest(moved)
+        counts = np.ones(len(moved), np.bool_)
+        if self.normals is not None:
+            counts = dots(self.normals @ np.asarray(place.rotation).T, normals) > 0
+        return moved, moved - closest, normals, counts
+
+    def spread(self, place: SimilarityTransform) -> float:
+        """Mean distance of the points, those that face the wrong way counted with the largest.
+
+        It includes the mean distance of the reference from them, so that a registration that covers
+        only half of it is not better.
+        """
+        moved, offsets, _, facing = self._offsets(place)
+        distance = lengths(offsets)
+        missed = cKDTree(moved).query(self.reference.points[::20])[0].mean()
+        return float(np.where(facing, distance, distance.max()).mean() + missed)
+
+    def refined(self, place: SimilarityTransform, num_steps: int) -> SimilarityTransform:
+        """A place after some steps of weighted least squares."""
+        t, number = self.tolerances, 7 if self.with_scale else 6
+        size, fitting = self.size, 1.0
+        if self.with_scale:
+            fitting = _axes(self.reference.points)[2] / _axes(self.points)[2]
+        scales = fitting / t.max_scale_ratio, fitting * t.max_scale_ratio
+        for step in range(num_steps):
+            moved, offsets, normals, counts = self._offsets(place)
+            if counts.sum() < 2 * number:
+                return place
+            distance = dots(offsets, normals)
+            deviation = max(robust_deviation(distance[counts]), 1e-9 * size)
+            widest = t.last_width_share * size * 0.5 ** min(step, 30)
+            width = max(t.width * deviation, widest if step < num_steps // 2 else 0.0)
+            weights = np.where(counts, geman_mcclure_weights(distance, width**2), 0)
+            center = moved.mean(axis=0)
+            rows = _rows(moved - center, normals)[:, :number]
+            if self.with_scale:
+                back = self._backward(moved, center, width)
+                share = counts.sum() / max(len(back[1]), 1)
+                rows = np.concatenate([rows, back[0]])
+                distance = np.concatenate([distance, back[1]])
+                weights = np.concatenate([weights, share * back[2]])
+            # An undetermined direction, such as the rotation of a disc, does not change.
+            length = np.array([size, size, size, 1, 1, 1, size][:number])
+            scaled = rows / length
+            normal = scaled.T @ (weights[:, None] * scaled)
+            normal += 1e-9 * np.trace(normal) / number * np.eye(number)
+            change = -np.linalg.solve(normal, scaled.T @ (weights * distance)) / length
+            turn = Rotation.from_rotvec(change[:3]).as_matrix()
+            factor = 1.0
+            if self.with_scale:
+                low, high = (limits / place.scale for limits in scales)
+                factor = float(np.clip(np.exp(change[6]), low, high))
+            arm = factor * turn @ (np.asarray(place.translation) - center)
+            place = SimilarityTransform(
+                scale=factor * place.scale,
+                rotation=turn @ np.asarray(place.rotation),
+                translation=arm + center + change[3:6],
+            )
+        return place
+
+    def _backward(self, moved: Array, center: Array, width: float) -> tuple[Array, Array, Array]:
+        """Rows, distances and weights of places on the reference from the nearest points."""
+        points = self.reference.points
+        chosen = np.random.default_rng(1).permutation(len(points))
+        places = points[chosen[: self.tolerances.backward_points]]
+        distance, nearest = cKDTree(moved).query(places)
+        towards = (moved[nearest] - places) / np.maximum(distance, 1e-300)[:, None]
+        weights = geman_mcclure_weights(distance, width**2)
+        return _rows(moved[nearest] - center, towards), distance, weights
+
+    def described(self, place: SimilarityTransform, runner_up: float) -> Registration:
+        """A place with its uncertainty."""
+        moved, offsets, normals, counts = self._offsets(place)
+        distance = dots(offsets, normals)
+        deviation = robust_deviation(distance[counts])
+        loss = geman_mcclure_weights(distance, (3 * deviation) ** 2 or 1e-300)
+        weights = np.where(counts, loss, 0)
+        center = moved.mean(axis=0)
+        number = 7 if self.with_scale else 6
+        rows = _rows(moved - center, normals)[:, :number]
+        covariance = np.zeros((7, 7))
+        information = rows.T @ (weights[:, None] * rows)
+        covariance[:number, :number] = deviation**2 * np.linalg.pinv(information)
+        return Registration(
+            reference_from_result=place,
+            covariance=covariance,
+            center=center,
+            rms=deviation,
+            runner_up=runner_up,
+        )
 
 
 def _rows(arms: Array, normals: Array) -> Array:
     """Derivatives (N, 7) of distances by turn, shift and the scale's logarithm."""
     return np.column_stack([np.cross(arms, normals), normals, dots(arms, normals)])
-
-
-def _refined(
-    given: tuple[Array, Array | None],
-    reference: Reference,
-    place: SimilarityTransform,
-    with_scale: bool,
-    num_steps: int,
-    size: float,
-    tolerances: RegistrationTolerances,
-) -> SimilarityTransform:
-    """A place after some steps of weighted least squares."""
-    number = 7 if with_scale else 6
-    fitting = _axes(reference.points)[2] / _axes(given[0])[2] if with_scale else 1.0
-    scales = fitting / tolerances.max_scale_ratio, fitting * tolerances.max_scale_ratio
-    for step in range(num_steps):
-        moved, normals, distance, counts = _residuals(given, reference, place)
-        if counts.sum() < 2 * number:
-            return place
-        deviation = max(robust_deviation(distance[counts]), 1e-9 * size)
-        widest = tolerances.last_width_share * size * 0.5 ** min(step, 30)
-        width = max(tolerances.width * deviation, widest if step < num_steps // 2 else 0.0)
-        weights = np.where(counts, geman_mcclure_weights(distance, width**2), 0)
-        center = moved.mean(axis=0)
-        rows = _rows(moved - center, normals)[:, :number]
-        if with_scale:
-            back = _backward(moved, center, reference, width, tolerances.backward_points)
-            share = counts.sum() / max(len(back[1]), 1)
-            rows = np.concatenate([rows, back[0]])
-            distance = np.concatenate([distance, back[1]])
-            weights = np.concatenate([weights, share * back[2]])
-        # An undetermined direction, such as the rotation of a disc, does not change.
-        length = np.array([size, size, size, 1, 1, 1, size][:number])
-        scaled = rows / length
-        normal = scaled.T @ (weights[:, None] * scaled)
-        normal += 1e-9 * np.trace(normal) / number * np.eye(number)
-        change = -np.linalg.solve(normal, scaled.T @ (weights * distance)) / length
-        turn = Rotation.from_rotvec(change[:3]).as_matrix()
-        factor = 1.0
-        if with_scale:
-            low, high = (limits / place.scale for limits in scales)
-            factor = float(np.clip(np.exp(change[6]), low, high))
-        place = SimilarityTransform(
-            scale=factor * place.scale,
-            rotation=turn @ np.asarray(place.rotation),
-            translation=factor * turn @ (np.asarray(place.translation) - center)
-            + center
-            + change[3:6],
-        )
-    return place
-
-
-def _backward(
-    moved: Array, center: Array, reference: Reference, width: float, num: int
-) -> tuple[Array, Array, Array]:
-    """Rows, distances and weights of places on the reference from the nearest points."""
-    places = reference.points[np.random.default_rng(1).permutation(len(reference.points))[:num]]
-    distance, nearest = cKDTree(moved).query(places)
-    towards = (moved[nearest] - places) / np.maximum(distance, 1e-300)[:, None]
-    weights = geman_mcclure_weights(distance, width**2)
-    return _rows(moved[nearest] - center, towards), distance, weights
-
-
-def _described(
-    given: tuple[Array, Array | None],
-    reference: Reference,
-    place: SimilarityTransform,
-    with_scale: bool,
-    runner_up: float,
-) -> Registration:
-    moved, normals, distance, counts = _residuals(given, reference, place)
-    deviation = robust_deviation(distance[counts])
-    weights = np.where(counts, geman_mcclure_weights(distance, (3 * deviation) ** 2 or 1e-300), 0)
-    center = moved.mean(axis=0)
-    number = 7 if with_scale else 6
-    rows = _rows(moved - center, normals)[:, :number]
-    covariance = np.zeros((7, 7))
-    covariance[:number, :number] = deviation**2 * np.linalg.pinv(rows.T @ (weights[:, None] * rows))
-    return Registration(
-        reference_from_result=place,
-        covariance=covariance,
-        center=center,
-        rms=deviation,
-        runner_up=runner_up,
-    )
 
 
 def _differ(first: SimilarityTransform, second: SimilarityTransform) -> bool:
