@@ -321,18 +321,29 @@ def triangulate_together(
     start = _best_pair(views, xy) if num >= 2 else None
     if start is None:
         return None
-    points, used = start, _agreeing(_errors(views, start, xy), tolerances)
+    t, points, errors = tolerances, start, _errors(views, start, xy)
+    used = like_most(errors, floor=t.huber_px, ceiling=t.max_residual_px)
     for _ in range(ROUNDS):
         if used.sum() < 2 or 2 * used.sum() <= num:
             return None
-        points = _refine(views, points, xy, used, tolerances)
-        again = _agreeing(_errors(views, points, xy), tolerances)
-        if np.array_equal(again, used):
+        for _ in range(ROUNDS):  # of Gauss-Newton
+            information, gradient, _ = _normal_equations(views, points, xy, used, t.huber_px)
+            points = points - np.linalg.solve(information, gradient[..., None])[..., 0]
+        errors, before = _errors(views, points, xy), used
+        used = like_most(errors, floor=t.huber_px, ceiling=t.max_residual_px)
+        if np.array_equal(used, before):
             break
-        used = again
     if used.sum() < 2 or 2 * used.sum() <= num:
         return None
-    return _with_uncertainty(views, points, xy, used, tolerances)
+    information, _, squared = _normal_equations(views, points, xy, used, t.huber_px)
+    num_free = 2 * int(used.sum()) * len(points) - 3 * len(points)
+    sigma = max(float(np.sqrt(squared.sum() / num_free)), t.min_sigma_px)
+    return Triangulation(
+        points=points,
+        covariances=np.asarray(sigma**2 * np.linalg.inv(information), np.float64),
+        used=used,
+        rms_px=float(np.sqrt((errors[used] ** 2).mean())),
+    )
 
 
 def _best_pair(views: Sequence[View], xy: Array) -> Array | None:
@@ -357,25 +368,6 @@ def _errors(views: Sequence[View], points: Array, xy: Array) -> Array:
     offsets = np.array([view.project(points) for view in views], np.float64) - xy
     rms = np.sqrt(np.square(offsets).sum(axis=-1).mean(axis=-1))
     return np.where(np.isfinite(rms), rms, np.inf)
-
-
-def _agreeing(errors: Array, tolerances: TriangulationTolerances) -> Mask:
-    """Views whose error is like that of most."""
-    return like_most(errors, floor=tolerances.huber_px, ceiling=tolerances.max_residual_px)
-
-
-def _refine(
-    views: Sequence[View],
-    points: Array,
-    xy: Array,
-    used: Mask,
-    tolerances: TriangulationTolerances,
-) -> Array:
-    """A few rounds of Gauss-Newton on the pixels of the used views."""
-    for _ in range(ROUNDS):
-        information, gradient, _ = _normal_equations(views, points, xy, used, tolerances.huber_px)
-        points = points - np.linalg.solve(information, gradient[..., None])[..., 0]
-    return points
 
 
 def _normal_equations(
@@ -407,25 +399,6 @@ def _residuals(view: View, points: Array, xy: Array) -> tuple[Array, Array]:
     by_cam = ((ahead - behind) / (2 * step[:, None, None])).swapaxes(1, 2)
     residuals = np.asarray(view.camera.project(in_cam) - xy, np.float64)
     return residuals, np.asarray(by_cam @ view.cam_from_world.rotation, np.float64)
-
-
-def _with_uncertainty(
-    views: Sequence[View],
-    points: Array,
-    xy: Array,
-    used: Mask,
-    tolerances: TriangulationTolerances,
-) -> Triangulation:
-    information, _, squared = _normal_equations(views, points, xy, used, tolerances.huber_px)
-    num_free = 2 * int(used.sum()) * len(points) - 3 * len(points)
-    sigma = max(float(np.sqrt(squared.sum() / num_free)), tolerances.min_sigma_px)
-    errors = _errors(views, points, xy)[used]
-    return Triangulation(
-        points=points,
-        covariances=np.asarray(sigma**2 * np.linalg.inv(information), np.float64),
-        used=used,
-        rms_px=float(np.sqrt((errors**2).mean())),
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
