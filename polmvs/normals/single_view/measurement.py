@@ -234,18 +234,9 @@ def _figures(plane: PlaneEstimate, mask: Mask | None = None) -> PlaneFigures:
     if mask is not None:
         row, col = np.argwhere(mask).mean(axis=0)
         center = (float(col + 0.5), float(row + 0.5))
-    x, y, z = plane.normal.tolist()
-    return PlaneFigures(
-        normal=(x, y, z),
-        valid=plane.valid,
-        conditioning=plane.conditioning,
-        sigma_deg=plane.sigma_deg,
-        rmse_deg=plane.rmse_deg,
-        median_deg=plane.median_deg,
-        num_pixels=plane.num_pixels,
-        outlier_share=plane.outlier_share,
-        center_xy=center,
-    )
+    given = vars(plane) | {"normal": tuple(plane.normal.tolist()), "center_xy": center}
+    del given["covariance"]
+    return PlaneFigures(**given)
 
 
 def _focal_figures(focal: FocalEstimate) -> FocalFigures:

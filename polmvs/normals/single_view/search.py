@@ -163,7 +163,16 @@ def find_planes(
         if all(abs(float(normal @ other)) < apart for other in normals):
             normals.append(normal)
     labels = _assign(blocks, normals)
-    return _finish(angle_model, axial, rays, sigma, mask, labels)
+    grown = labels.repeat(BLOCK_PX, axis=0).repeat(BLOCK_PX, axis=1)
+    full = np.full(mask.shape, -1, np.int64)
+    full[: grown.shape[0], : grown.shape[1]] = grown
+    found = []
+    for index in range(labels.max() + 1):  # again from all pixels
+        inside = mask & (full == index)
+        if inside.any():
+            estimate = plane_normal(angle_model, axial[:, inside], rays[:, inside], sigma[inside])
+            found.append(FoundPlane(estimate=estimate, mask=inside))
+    return sorted(found, key=lambda plane: -plane.estimate.num_pixels)
 
 
 def _average(
@@ -287,24 +296,3 @@ def _mean_where(blocks: _Blocks, image: Floats) -> Floats:
     known, window = blocks.known, (blocks.tolerances.coherence_blocks,) * 2
     total = cv2.blur(np.where(known, image, 0).astype(np.float32), window)
     return np.asarray(total / np.maximum(cv2.blur(known.astype(np.float32), window), 1e-6))
-
-
-def _finish(
-    angle_model: AngleModel,
-    axial: Floats,
-    rays: Floats,
-    sigma: Floats,
-    mask: Mask,
-    labels: NDArray[np.int64],
-) -> list[FoundPlane]:
-    """Planes at the full size, from all pixels of their blocks."""
-    full = np.full(mask.shape, -1, np.int64)
-    grown = labels.repeat(BLOCK_PX, axis=0).repeat(BLOCK_PX, axis=1)
-    full[: grown.shape[0], : grown.shape[1]] = grown
-    found = []
-    for index in range(labels.max() + 1):
-        inside = mask & (full == index)
-        if inside.any():
-            estimate = plane_normal(angle_model, axial[:, inside], rays[:, inside], sigma[inside])
-            found.append(FoundPlane(estimate=estimate, mask=inside))
-    return sorted(found, key=lambda plane: -plane.estimate.num_pixels)
