@@ -14,6 +14,7 @@ import typing
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -281,10 +282,14 @@ def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Pa
     if kind in (Path, Path | None):
         common["converter"] = _read_path
     elif _is_list(kind):
-        common |= {"converter": _several(elements[0]), "n_tokens": 1, "consume_multiple": True}
+        common |= {
+            "converter": partial(_read_several, elements[0]),
+            "n_tokens": 1,
+            "consume_multiple": True,
+        }
     elif elements and not _is_mixed(kind):
         numbers = elements[0] in (int, float)  # the first of them may be negative
-        common |= {"converter": _one_list(kind), "n_tokens": 1}
+        common |= {"converter": partial(_read_one, kind), "n_tokens": 1}
         common |= {"allow_leading_hyphen": numbers}
         # The converter checks the length.
         kind = types.GenericAlias(tuple, (elements[0], ...))
@@ -331,22 +336,14 @@ def _read_path(_: Any, tokens: Sequence[Token]) -> Path:
     return Path(text)
 
 
-def _one_list(kind: Any) -> Callable[[Any, Sequence[Token]], tuple[Any, ...]]:
+def _read_one(kind: Any, _: Any, tokens: Sequence[Token]) -> tuple[Any, ...]:
     """Reads a list with commas."""
-
-    def read(_: Any, tokens: Sequence[Token]) -> tuple[Any, ...]:
-        return _read_list(kind, tokens[0].value)
-
-    return read
+    return _read_list(kind, tokens[0].value)
 
 
-def _several(kind: Any) -> Callable[[Any, Sequence[Token]], tuple[Any, ...]]:
+def _read_several(kind: Any, _: Any, tokens: Sequence[Token]) -> tuple[Any, ...]:
     """Reads several lists with commas."""
-
-    def read(_: Any, tokens: Sequence[Token]) -> tuple[Any, ...]:
-        return tuple(_read_list(kind, token.value) for token in tokens)
-
-    return read
+    return tuple(_read_list(kind, token.value) for token in tokens)
 
 
 def _read_list(kind: Any, text: str) -> tuple[Any, ...]:
