@@ -92,12 +92,12 @@ def _require_sound(folder: Path, views: Sequence[View], tracks: Tracks | None = 
         raise DataError(
             folder, "has no registered image. Run COLMAP again or leave out `sfm.sparse`."
         )
-    if (reason := _unsound_views(views) or (tracks and _unsound_tracks(tracks))) is not None:
+    if (reason := _unsound(views, tracks)) is not None:
         raise DataError(folder, f"is no sound COLMAP model ({reason}). Export it again.")
 
 
-def _unsound_views(views: Iterable[View]) -> str | None:
-    """What is wrong with the numbers of views, if anything is."""
+def _unsound(views: Iterable[View], tracks: Tracks | None) -> str | None:
+    """What is wrong with the numbers of a model, if anything is."""
     for view in views:
         camera, pose = view.camera, view.cam_from_world
         sides = (camera.width, camera.height)
@@ -110,14 +110,9 @@ def _unsound_views(views: Iterable[View]) -> str | None:
             return f"the pose of {view.name} is none"
         if not (np.abs(pose.translation) <= MAX_COORDINATE).all():
             return f"the place of {view.name} is not finite or absurd"
-    return None
-
-
-def _unsound_tracks(tracks: Tracks) -> str | None:
-    """What is wrong with the numbers of sparse points, if anything is."""
-    if not (np.abs(tracks.points_in_world) <= MAX_COORDINATE).all():
+    if tracks is not None and not (np.abs(tracks.points_in_world) <= MAX_COORDINATE).all():
         return "a point is not finite or absurd"
-    if not (np.abs(tracks.obs_xy) <= MAX_SIDE).all():
+    if tracks is not None and not (np.abs(tracks.obs_xy) <= MAX_SIDE).all():
         return "a keypoint is not finite or far from its image"
     return None
 

@@ -20,7 +20,7 @@ from polmvs.config import ExperimentOptions
 from polmvs.evaluation.metrics import AngleStats, angular_errors_deg
 from polmvs.experiments.data import Scene, ViewData, load_view, require_counted
 from polmvs.normals.single_view.measurement import MIN_PIXELS
-from polmvs.normals.single_view.plane import PlaneEstimate, phase_residuals, plane_normal
+from polmvs.normals.single_view.plane import phase_residuals, plane_normal
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.polarization.kinds import FORMULAS, AngleModel
 from polmvs.polarization.stokes import Stokes
@@ -178,7 +178,10 @@ def measure_image(
     pixels = {angle_model: _pixels(data, angle_model, region) for angle_model in FORMULAS}
     estimates, seconds = {}, {}
     enough = int(region.sum()) >= MIN_PIXELS
-    turn = _tilt_turn(pixels[AngleModel.PPA][0], pixels[AngleModel.TILTED][0])
+    # What tilted polarizers turn the phase by, rad.
+    axial, corrected = (pixels[model][0] for model in (AngleModel.PPA, AngleModel.TILTED))
+    sine = axial[1] * corrected[0] - axial[0] * corrected[1]
+    turn = 0.5 * np.arctan2(sine, (axial * corrected).sum(axis=0))
     for name, (angle_model, weights) in ESTIMATES.items() if enough else ():
         axial, rays, sigma = pixels[angle_model]
         start = time.perf_counter()
@@ -187,11 +190,15 @@ def measure_image(
         robust = weights is not Weights.ALIKE
         estimates[name] = plane_normal(angle_model, axial, rays, sigma, robust=robust)
         seconds[name] = time.perf_counter() - start
+    spread = angular_errors_deg(data.normals_in_cam[region], true_normal)
     image = ImagePlane(
         name=data.view.name,
         num_pixels=int(region.sum()),
-        spread_deg=_spread_deg(data.normals_in_cam[region], true_normal),
-        error_deg={name: _error_deg(e, true_normal) for name, e in estimates.items()},
+        spread_deg=AngleStats.from_degrees(spread).rmse_deg,
+        error_deg={
+            name: float(angular_errors_deg(e.normal, true_normal)) if e.valid else np.nan
+            for name, e in estimates.items()
+        },
         sigma_deg={name: e.sigma_deg for name, e in estimates.items()},
         seconds=seconds,
     )
@@ -225,20 +232,6 @@ def _pixels(data: ViewData, angle_model: AngleModel, region: Mask) -> tuple[Floa
     axial = np.ascontiguousarray(data.axial(angle_model)[region].T)
     rays = np.ascontiguousarray(data.rays[region].T)
     return axial, rays, stokes.sigma_aolp[region]
-
-
-def _tilt_turn(axial: Floats, corrected: Floats) -> Floats:
-    """What tilted polarizers turn the phase by, (N,) rad, of axial pairs (2, N)."""
-    sine = axial[1] * corrected[0] - axial[0] * corrected[1]
-    return np.asarray(0.5 * np.arctan2(sine, (axial * corrected).sum(axis=0)))
-
-
-def _spread_deg(normals: Floats, mean: Array) -> float:
-    return AngleStats.from_degrees(angular_errors_deg(normals, mean)).rmse_deg
-
-
-def _error_deg(estimate: PlaneEstimate, true_normal: Array) -> float:
-    return float(angular_errors_deg(estimate.normal, true_normal)) if estimate.valid else np.nan
 
 
 def _ambiguity(

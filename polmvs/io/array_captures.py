@@ -43,7 +43,10 @@ def write_frames(frames: Frames, folder: Path) -> CaptureKind:
     OptionError
         A frame, its name or its angles are invalid, or two frames differ in kind.
     """
-    named = frames if isinstance(frames, Mapping) else _numbered(frames)
+    named = frames
+    if not isinstance(named, Mapping):
+        digits = max(3, len(str(len(named))))
+        named = {f"{number:0{digits}d}": frame for number, frame in enumerate(named)}
     kinds = {name: _write_frame(folder, name, frame) for name, frame in named.items()}
     first = next(iter(kinds.values()), None)
     if first is None:
@@ -52,11 +55,6 @@ def write_frames(frames: Frames, folder: Path) -> CaptureKind:
         if kind is not first:
             raise OptionError(f"frame {name!r} holds {kind} images, the first one {first}.")
     return first
-
-
-def _numbered(frames: Sequence[Frame]) -> dict[str, Frame]:
-    digits = max(3, len(str(len(frames))))
-    return {f"{number:0{digits}d}": frame for number, frame in enumerate(frames)}
 
 
 def _write_frame(folder: Path, name: str, frame: Frame) -> CaptureKind:

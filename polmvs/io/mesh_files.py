@@ -135,7 +135,9 @@ def _write_obj(path: Path, mesh: Mesh, texture: Texture | None) -> tuple[Path, .
     others: tuple[Path, ...] = ()
     if texture is not None:
         material, picture = path.with_suffix(".mtl"), path.with_suffix(".png")
-        _require_plain_name(path)
+        # An MTL names the texture by its bare name, which ends at a blank for some readers.
+        if any(letter.isspace() for letter in path.name):
+            raise OptionError(f"{path}: an OBJ with a texture needs a name without blanks.")
         write_bytes(picture, encode_png(texture.image[..., ::-1]))
         words = f"newmtl surface\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture.name}\n"
         write_bytes(material, words.encode())
@@ -155,12 +157,6 @@ def _write_obj(path: Path, mesh: Mesh, texture: Texture | None) -> tuple[Path, .
     np.savetxt(lines, np.repeat(mesh.triangles + 1, times, axis=1), fmt=pattern)
     write_bytes(path, lines.getvalue().encode())
     return (path, *others)
-
-
-def _require_plain_name(path: Path) -> None:
-    """An MTL names the texture by its bare name, which ends at a blank for some readers."""
-    if any(letter.isspace() for letter in path.name):
-        raise OptionError(f"{path}: an OBJ with a texture needs a name without blanks.")
 
 
 class _Buffer:

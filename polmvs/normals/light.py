@@ -22,7 +22,7 @@ from polmvs.arrays import Array, Floats, Mask
 from polmvs.camera import in_image, sample_image
 from polmvs.config import NormalOptions
 from polmvs.geometry import lengths, points_on_rays
-from polmvs.normals.estimator import NormalEstimate, solve_normals
+from polmvs.normals.estimator import solve_normals
 from polmvs.normals.mixture_estimator import solve_mixture
 from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, gather_rows_under
 from polmvs.normals.tracks import MAX_ROWS, in_tiles, observe, tracks_on_parts
@@ -178,14 +178,16 @@ def _pixel_votes(
     step = max(1, max_rows // max(len(seen_by), 1))
     for start in range(0, len(owner), step):
         tile, here = points[start : start + step], owner[start : start + step]
-        specular, diffuse = (
-            solve_normals(rows.rows, rows.rays, rows.sigma)
+        weights = [
+            solve_normals(rows.rows, rows.rays, rows.sigma).row_weights
             for rows in gather_rows_under(LIGHTS, AngleModel.PPA, tile, [maps[k] for k in seen_by])
-        )
-        costs, compared = _costs_of_both(specular, diffuse, t.max_row_cost)
+        ]
+        compared = (weights[0] > 0) & (weights[1] > 0)
         counts = compared.sum(axis=0) * (compared.sum(axis=0) >= t.min_rows)
         total += np.bincount(here, counts, slots.num)
-        for which, cost in enumerate(costs):
+        for which, of_light in enumerate(weights):
+            # A robust weight is 1 / (1 + z^2 / c^2): minus its logarithm is a log-likelihood.
+            cost = -np.log(np.maximum(of_light, np.exp(-t.max_row_cost)))
             weighted = (cost * compared).sum(axis=0) * (counts > 0)
             sums[which] += np.bincount(here, weighted, slots.num)
     mean = np.divide(sums, total, out=np.full((2, slots.num), np.inf), where=total > 0)
@@ -350,19 +352,6 @@ def _choose_pixels(phase_map: PhaseMap, points: Array, t: LightTolerances) -> _C
         num_parts=num_parts,
         distances=np.geomspace(near / t.widening, far * t.widening, t.num_steps),
     )
-
-
-def _costs_of_both(
-    specular: NormalEstimate, diffuse: NormalEstimate, max_cost: float
-) -> tuple[list[Floats], Mask]:
-    """Costs (K, N) of the rows under either light, and which rows count under both.
-
-    The robust weight is ``1 / (1 + z^2 / c^2)``: minus its logarithm, a log-likelihood, is the
-    row's cost.
-    """
-    weights = specular.row_weights, diffuse.row_weights
-    costs: list[Floats] = [-np.log(np.maximum(of_light, np.exp(-max_cost))) for of_light in weights]
-    return costs, np.asarray((weights[0] > 0) & (weights[1] > 0))
 
 
 def _dolp_votes(maps: Sequence[PhaseMap], t: LightTolerances) -> float:

@@ -106,7 +106,11 @@ def place_model(
     modes = load_floats(source / CAMERA_MODES)
     covariances = load_floats(source / POSE_COVARIANCES)
     if without:
-        model, kept, points = without_views(model, _images_named(without, names))
+        named = match_names(without, names)
+        for name in without:
+            if name not in named:
+                raise OptionError(f"{name!r} is no image of the capture.", field="sfm.without")
+        model, kept, points = without_views(model, set(named.values()))
         modes = modes[:, points]
         covariances = covariances[kept] if len(covariances) else covariances
     frame = metric_frame(
@@ -136,21 +140,6 @@ def place_model(
         num_tracks=len(model.tracks.point3D_ids),
         frame=None if frame is None else _frame_result(frame),
     )
-
-
-def _images_named(given: Sequence[str], names: Sequence[str]) -> set[str]:
-    """The images that are meant.
-
-    Raises
-    ------
-    OptionError
-        There is none of a name.
-    """
-    found = match_names(given, names)
-    for name in given:
-        if name not in found:
-            raise OptionError(f"{name!r} is no image of the capture.", field="sfm.without")
-    return set(found.values())
 
 
 def load_floats(source: Path) -> NDArray[np.float64]:
