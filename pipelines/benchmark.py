@@ -111,10 +111,10 @@ def _benchmark(call: Call, terminal: Terminal) -> int:
         print(ingest_table())
     if given.growth is not None:
         run_options = call.get(RunOptions)
-        page = growth_page(given, call.options(), run_options, terminal)
-        print(page.text)
+        text, runs, scalings = growth_page(given, call.options(), run_options, terminal)
+        print(text)
         if given.write is not None:
-            page.save(given.write)
+            save_growth(given.write, text, runs, scalings)
     if given.capture is not None:
         job = Job(
             capture=given.capture,
@@ -323,65 +323,51 @@ class Scaling:
     seconds: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class GrowthPage:
-    """Table and plot of the growth.
+def save_growth(
+    folder: Path, text: str, runs: Sequence[Growth], scalings: Sequence[Scaling]
+) -> None:
+    """Write ``growth.md`` and ``images/growth.png`` into a folder of documents."""
+    import matplotlib
 
-    Attributes
-    ----------
-    text : Markdown.
-    runs, scalings : what it shows.
-    """
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
 
-    text: str
-    runs: Sequence[Growth]
-    scalings: Sequence[Scaling]
-
-    def save(self, folder: Path) -> None:
-        """Write ``growth.md`` and ``images/growth.png`` into a folder of documents."""
-        import matplotlib
-
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-
-        (folder / "images").mkdir(parents=True, exist_ok=True)
-        figure, axes = pyplot.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
-        views = [run.num_views for run in self.runs]
-        last = self.runs[-1].seconds
-        shown = [stage for stage in last if last[stage] > SHOWN_SHARE * sum(last.values())]
-        for stage in sorted(shown, key=last.__getitem__, reverse=True):
-            axes[0].loglog(views, [run.seconds[stage] for run in self.runs], "o-", label=stage)
-            axes[1].semilogx(views, [run.peak_mb[stage] for run in self.runs], "o-", label=stage)
-        for backend in dict.fromkeys(one.backend for one in self.scalings):
-            some = [one for one in self.scalings if one.backend == backend]
-            nums, seconds = [one.num_workers for one in some], [one.seconds for one in some]
-            axes[2].semilogx(nums, seconds, "o-", label=backend)
-        workers = sorted({one.num_workers for one in self.scalings})
-        for axis, ticks, x, y in (
-            (axes[0], views, "views", "CPU seconds of a stage"),
-            (axes[1], views, "views", "peak memory of a stage, MB"),
-            (axes[2], workers, "workers", "images and maps, seconds"),
-        ):
-            axis.set(xlabel=x, ylabel=y)
-            axis.set_xticks(ticks, [str(tick) for tick in ticks])
-            axis.minorticks_off()
-            axis.grid(alpha=0.3)
-            if axis is not axes[0]:
-                axis.set_ylim(bottom=0)
-        axes[1].legend(fontsize=7, ncols=3, loc="lower center")  # under the least memory
-        axes[2].legend(fontsize=8)
-        figure.savefig(folder / "images" / "growth.png", dpi=120)
-        pyplot.close(figure)
-        picture = (
-            "![Time and memory of the stages with the views, and with workers](images/growth.png)"
-        )
-        write_bytes(folder / "growth.md", f"{self.text}\n\n{picture}\n".encode())
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    figure, axes = pyplot.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
+    views = [run.num_views for run in runs]
+    last = runs[-1].seconds
+    shown = [stage for stage in last if last[stage] > SHOWN_SHARE * sum(last.values())]
+    for stage in sorted(shown, key=last.__getitem__, reverse=True):
+        axes[0].loglog(views, [run.seconds[stage] for run in runs], "o-", label=stage)
+        axes[1].semilogx(views, [run.peak_mb[stage] for run in runs], "o-", label=stage)
+    for backend in dict.fromkeys(one.backend for one in scalings):
+        some = [one for one in scalings if one.backend == backend]
+        nums, seconds = [one.num_workers for one in some], [one.seconds for one in some]
+        axes[2].semilogx(nums, seconds, "o-", label=backend)
+    workers = sorted({one.num_workers for one in scalings})
+    for axis, ticks, x, y in (
+        (axes[0], views, "views", "CPU seconds of a stage"),
+        (axes[1], views, "views", "peak memory of a stage, MB"),
+        (axes[2], workers, "workers", "images and maps, seconds"),
+    ):
+        axis.set(xlabel=x, ylabel=y)
+        axis.set_xticks(ticks, [str(tick) for tick in ticks])
+        axis.minorticks_off()
+        axis.grid(alpha=0.3)
+        if axis is not axes[0]:
+            axis.set_ylim(bottom=0)
+    axes[1].legend(fontsize=7, ncols=3, loc="lower center")  # under the least memory
+    axes[2].legend(fontsize=8)
+    figure.savefig(folder / "images" / "growth.png", dpi=120)
+    pyplot.close(figure)
+    picture = "![Time and memory of the stages with the views, and with workers](images/growth.png)"
+    write_bytes(folder / "growth.md", f"{text}\n\n{picture}\n".encode())
 
 
 def growth_page(
     given: Arguments, options: Options, run_options: RunOptions, terminal: Terminal
-) -> GrowthPage:
-    """Make the captures, run them, and fit the exponents."""
+) -> tuple[str, list[Growth], list[Scaling]]:
+    """Make the captures, run them, and fit the exponents: Markdown, and what it shows."""
     assert given.growth is not None
     run_options = replace(run_options, workers=1, scheduler=None, overwrite=True, resume=False)
     runs = [_run_views(given, num, options, run_options, terminal) for num in sorted(given.views)]
@@ -429,7 +415,7 @@ def growth_page(
             format_table(["workers", "s", "speed-up", "efficiency"], worker_rows),
         ]
     )
-    return GrowthPage(text=text, runs=runs, scalings=scalings)
+    return text, runs, scalings
 
 
 def _machine() -> str:

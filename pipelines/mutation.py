@@ -275,9 +275,13 @@ class Coverage:
         path = fault.path.as_posix()
         if fault.in_function:
             first, last = fault.lines
-            found = self._of_lines(path, range(first, last + 1))
+            lines = range(first, last + 1)
+            found = set().union(*(self.tests_of_line.get((path, line), set()) for line in lines))
         else:
-            found = self._of_modules({path} | set(_importers(fault.path)))
+            paths = {path} | set(_importers(fault.path))
+            found = set().union(
+                *(tests for (path, _), tests in self.tests_of_line.items() if path in paths)
+            )
         words = fault.path.stem.removesuffix("s")
         folder = f"tests/{fault.path.parts[1]}/"
         return sorted(
@@ -288,14 +292,6 @@ class Coverage:
                 not test.startswith(folder),
                 self.seconds[test],
             ),
-        )
-
-    def _of_lines(self, path: str, lines: Iterable[int]) -> set[str]:
-        return set().union(*(self.tests_of_line.get((path, line), set()) for line in lines))
-
-    def _of_modules(self, paths: set[str]) -> set[str]:
-        return set().union(
-            *(tests for (path, _), tests in self.tests_of_line.items() if path in paths)
         )
 
 

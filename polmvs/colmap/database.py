@@ -218,14 +218,9 @@ def image_numbers(database: Path) -> dict[str, int]:
         return dict(connection.execute("SELECT name, image_id FROM images"))
 
 
-@contextmanager
-def opened(database: Path) -> Iterator[pycolmap.Database]:
+def opened(database: Path) -> closing[pycolmap.Database]:
     """COLMAP's own access to a database, closed at the end."""
-    opened_database = pycolmap.Database.open(database)
-    try:
-        yield opened_database
-    finally:
-        opened_database.close()
+    return closing(pycolmap.Database.open(database))
 
 
 def replace_cameras(database: Path, camera: pycolmap.Camera) -> None:

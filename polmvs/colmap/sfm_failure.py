@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from polmvs.colmap.database import opened
 from polmvs.config import SfmOptions
 from polmvs.scene import short_list
 
@@ -28,7 +28,7 @@ def why_no_model(database: Path, options: SfmOptions) -> str:
     """
     asked = pycolmap.IncrementalMapperOptions()
     to_begin, to_add = asked.init_min_num_inliers, asked.abs_pose_min_num_inliers
-    with closing(pycolmap.Database.open(database)) as content:
+    with opened(database) as content:
         images = {image.image_id: str(image.name) for image in content.read_all_images()}
         features = {i: int(content.num_keypoints_for_image(i)) for i in images}
         pairs, inliers = content.read_two_view_geometry_num_inliers()

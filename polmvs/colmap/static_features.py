@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.arrays import Mask
-from polmvs.colmap.database import opened
+from polmvs.colmap.database import opened, read_descriptors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +58,7 @@ def take_out_static(
     with opened(database) as content:
         ids = [image.image_id for image in content.read_all_images()]
         keypoints = [np.asarray(content.read_keypoints(number)) for number in ids]
-        found = [content.read_descriptors(number) for number in ids]
-        values = [np.asarray(one.to_float().data) for one in found]
+        values = [read_descriptors(content, number) for number in ids]
         still = find_static([k[:, :2] for k in keypoints], values, tolerances=tolerances)
         if still is None:
             return None
