@@ -351,7 +351,8 @@ class _MixtureProblem:
         moments = self._moments(precisions)
         eigenvalues = smallest_eigenvectors(moments)[0]
         along = _middle_directions(moments, mode.normals, eigenvalues[1])
-        spread, middle = self._spread(mode, along, np.maximum(eigenvalues[1], 0))
+        middle = np.maximum(eigenvalues[1], 0)
+        spread = self._spread(mode, along, middle)
         total = precisions.sum(axis=(0, 1), dtype=np.float64)
         squares = (precisions * np.square(mode.residuals)).sum(axis=(0, 1), dtype=np.float64)
         certain = np.abs(mode.shares.specular - mode.shares.diffuse) * mode.counted
@@ -365,7 +366,7 @@ class _MixtureProblem:
         factor *= 1 + t.correlation * np.maximum(num_certain - 1, 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             variance = factor * middle / np.square(spread) + elsewhere
-            conditioning = np.sqrt(np.maximum(eigenvalues[1], 0) / eigenvalues[2])
+            conditioning = np.sqrt(middle / eigenvalues[2])
             residual = np.sqrt(squares / total)
             sigma_deg = np.degrees(np.sqrt(variance))
         explained_share = 1 - (mode.shares.neither * self.matched).sum(axis=0) / np.maximum(
@@ -396,8 +397,8 @@ class _MixtureProblem:
             log_likelihood=mode.log_likelihood,
         )
 
-    def _spread(self, mode: _Mode, along: Array, middle: Array) -> tuple[Array, Array]:
-        """Information (N,) on the least known direction less what noise alone makes, and with it.
+    def _spread(self, mode: _Mode, along: Array, middle: Array) -> Array:
+        """Information (N,) on the least known direction less what noise alone makes of it.
 
         Where all planes of incidence are one (camera centres and normal in a plane, as on a rail)
         the noise of the rows spreads them all the same. It is 0 where it may be noise alone.
@@ -408,7 +409,7 @@ class _MixtureProblem:
         mean = noise.sum(axis=(0, 1), dtype=np.float64)
         deviation = np.sqrt(2 * np.square(noise).sum(axis=(0, 1), dtype=np.float64))
         spread = middle - mean
-        return np.where(spread > self.t.max_noise_ratio * deviation, spread, 0), middle
+        return np.where(spread > self.t.max_noise_ratio * deviation, spread, 0)
 
 
 def _middle_directions(moments: Array, normals: Array, middle: Array) -> Array:

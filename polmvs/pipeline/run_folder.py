@@ -279,8 +279,7 @@ def _require_own_workspace(folder: Path) -> None:
 
 def mark_own_workspace(folder: Path) -> None:
     """List the files of a COLMAP workspace in it, to recognize a user's files later."""
-    files = (path for path in folder.rglob("*") if path.is_file())
-    lines = sorted(path.relative_to(folder).as_posix() for path in files)
+    lines = sorted(path.relative_to(folder).as_posix() for path in files_in(folder))
     (folder / DENSE_MARKER).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
