@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -67,8 +67,7 @@ def doctor(call: Call, terminal: Terminal) -> int:
             with terminal.stage(what, None):
                 finding = _tried(f"self-test: {what}", lambda: check(Path(folder)))  # noqa: B023
             seconds = time.perf_counter() - start
-            text = f"{finding.text}, {seconds:.1f} s"
-            findings.append(Finding(what=finding.what, text=text, works=finding.works))
+            findings.append(replace(finding, text=f"{finding.text}, {seconds:.1f} s"))
     works = all(finding.works for finding in findings)
     width = max(len(finding.what) for finding in findings)
     lines = [

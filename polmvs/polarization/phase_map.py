@@ -171,17 +171,14 @@ class _StoredRegion(Region):
 
     @property
     def inside(self) -> Mask:
-        """See :class:`Region`."""
         return self._mask(1)
 
     @property
     def reliable(self) -> Mask:
-        """See :class:`Region`."""
         return self._mask(2)
 
     @property
     def edges(self) -> Mask:
-        """See :class:`Region`."""
         return self._mask(4)
 
 
