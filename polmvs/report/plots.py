@@ -18,20 +18,14 @@ if TYPE_CHECKING:
 
 
 # Okabe and Ito's colours, with a dash each, so that colour is never the only sign.
-COLORS = {
-    AngleModel.TEXTBOOK_OPA: "#d55e00",
-    AngleModel.TEXTBOOK_PPA: "#56b4e9",
-    AngleModel.OPA: "#e69f00",
-    AngleModel.PPA: "#0072b2",
-    AngleModel.TILTED: "#009e73",
+STYLES = {
+    AngleModel.TEXTBOOK_OPA: ("#d55e00", (4, 2)),
+    AngleModel.TEXTBOOK_PPA: ("#56b4e9", (6, 1.5)),
+    AngleModel.OPA: ("#e69f00", (4, 2, 1, 2)),
+    AngleModel.PPA: ("#0072b2", (1, 0)),
+    AngleModel.TILTED: ("#009e73", (1, 1.5)),
 }
-DASHES = {
-    AngleModel.TEXTBOOK_OPA: (4, 2),
-    AngleModel.TEXTBOOK_PPA: (6, 1.5),
-    AngleModel.OPA: (4, 2, 1, 2),
-    AngleModel.PPA: (1, 0),
-    AngleModel.TILTED: (1, 1.5),
-}
+COLORS = {model: color for model, (color, _) in STYLES.items()}
 INK = "#123456"  # replaced by the page's text colour
 MIN_IN_BIN = 30  # values for a median; its quartiles are then exact to about a tenth
 
@@ -144,12 +138,8 @@ def _add_legend(axes: Axes) -> None:
 
 
 def _style(model: AngleModel) -> dict[str, Any]:
-    return {
-        "color": COLORS[model],
-        "linestyle": (0, DASHES[model]),
-        "label": model.label,
-        "linewidth": 1.6,
-    }
+    color, dashes = STYLES[model]
+    return {"color": color, "linestyle": (0, dashes), "label": model.label, "linewidth": 1.6}
 
 
 def _svg(figure: Figure, title: str) -> str:

@@ -20,7 +20,7 @@ one array (5, N): cosine and sine of the doubled phase, x, y, and the precision
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -84,13 +84,13 @@ class PlaneEstimate:
 
     normal: Array
     valid: bool
-    conditioning: float
-    covariance: Array
-    sigma_deg: float
-    rmse_deg: float
-    median_deg: float
+    conditioning: float = 0.0
+    covariance: Array = field(default_factory=lambda: np.full((3, 3), np.nan))
+    sigma_deg: float = np.inf
+    rmse_deg: float = np.nan
+    median_deg: float = np.nan
     num_pixels: int
-    outlier_share: float
+    outlier_share: float = np.nan
 
 
 def plane_normal(
@@ -125,14 +125,10 @@ def plane_normal(
     samples = stack_samples(angle_model, axial, rays, sigma)
     num = samples.shape[1]
     if num < 2:
-        return _no_estimate(num)
+        return PlaneEstimate(normal=np.full(3, np.nan), valid=False, num_pixels=num)
     if not robust:
-        return _describe(
-            _facing(_eigenvector(angle_model, samples), samples),
-            samples,
-            None,
-            tolerances=tolerances,
-        )
+        normal = _facing(_eigenvector(angle_model, samples), samples)
+        return _describe(normal, samples, None, tolerances)
     coarse = np.ascontiguousarray(samples[:, :: max(1, num // tolerances.some_pixels)])
     normal = _eigenvector(angle_model, coarse)
     if initial_normal is not None:
@@ -140,10 +136,10 @@ def plane_normal(
     scale = CAUCHY_SCALE
     for loss_scale in annealed_scales(tolerances.coarse_rounds):
         scale = residual_scale(phase_errors(normal, coarse) * np.sqrt(coarse[4])) * loss_scale
-        normal = _improve(normal, normal_equations(normal, coarse, scale), tolerances=tolerances)
+        normal = _improve(normal, normal_equations(normal, coarse, scale), tolerances)
     for _ in range(tolerances.fine_rounds):
-        normal = _improve(normal, normal_equations(normal, samples, scale), tolerances=tolerances)
-    return _describe(_facing(normal, samples), samples, scale, tolerances=tolerances)
+        normal = _improve(normal, normal_equations(normal, samples, scale), tolerances)
+    return _describe(_facing(normal, samples), samples, scale, tolerances)
 
 
 def phase_residuals(angle_model: AngleModel, normal: Floats, axial: Floats, rays: Floats) -> Floats:
@@ -183,7 +179,7 @@ def residual_scale(normalized_errors: Floats) -> float:
     return max(robust_deviation(normalized_errors), EXACT)
 
 
-def _improve(normal: Array, equations: NormalEquations, *, tolerances: PlaneTolerances) -> Array:
+def _improve(normal: Array, equations: NormalEquations, tolerances: PlaneTolerances) -> Array:
     """Gauss-Newton step on the sphere, none along a direction of which nothing is known."""
     basis = tangents(normal)
     matrix = basis @ equations.matrix @ basis.T
@@ -208,7 +204,7 @@ def _facing(normal: Array, samples: Floats) -> Array:
 
 
 def _describe(
-    normal: Array, samples: Floats, scale: float | None, *, tolerances: PlaneTolerances
+    normal: Array, samples: Floats, scale: float | None, tolerances: PlaneTolerances
 ) -> PlaneEstimate:
     """Quality of a normal on the pixels that it was made from."""
     num = samples.shape[1]
@@ -249,20 +245,6 @@ def _covariance(equations: NormalEquations, solver: Array) -> Array:
     known = np.asarray(solver @ equations.noise @ solver.T)
     larger: Array = max(scatter, known, key=lambda matrix: float(np.linalg.eigvalsh(matrix)[-1]))
     return larger
-
-
-def _no_estimate(num: int) -> PlaneEstimate:
-    return PlaneEstimate(
-        normal=np.full(3, np.nan),
-        valid=False,
-        conditioning=0.0,
-        covariance=np.full((3, 3), np.nan),
-        sigma_deg=np.inf,
-        rmse_deg=np.nan,
-        median_deg=np.nan,
-        num_pixels=num,
-        outlier_share=np.nan,
-    )
 
 
 class NormalEquations(NamedTuple):
