@@ -227,14 +227,9 @@ def _by_template(
     groups = compiled.groupindex
     if "index" in groups and angles is None:
         raise OptionError("`capture.naming` has {index}; give the `capture.angles` of these files.")
-    told = CaptureKind.MOSAIC
-    for name, its_kind in (
-        ("angle", CaptureKind.ANGLES),
-        ("index", CaptureKind.ANGLES),
-        ("stokes", CaptureKind.STOKES),
-        ("map", CaptureKind.AOLP),
-    ):
-        told = its_kind if name in groups else told
+    kinds = {"map": CaptureKind.AOLP, "stokes": CaptureKind.STOKES}
+    kinds |= {"index": CaptureKind.ANGLES, "angle": CaptureKind.ANGLES}
+    told = next((its for name, its in kinds.items() if name in groups), CaptureKind.MOSAIC)
     if told is CaptureKind.MOSAIC and kind is CaptureKind.STOKES:
         told = kind  # one array a view with all three
     if kind not in (None, told):

@@ -118,24 +118,7 @@ def read_author_truth(folder: Path, names: Sequence[str], width: int, height: in
     length = float(np.linalg.norm(normal))
     if not length > 0:
         raise DataError(folder / "normal_w.npy", "is no direction; copy the data again.")
-    return _board(folder, views, normal / length, corners)
-
-
-def read_author_views(
-    folder: Path, names: Sequence[str], width: int, height: int
-) -> dict[str, View]:
-    """The cameras of the authors' demo by name; parameters and errors of its truth."""
-    views = {}
-    for index, name in enumerate(names):
-        path = folder / "cams" / f"{stem_of(name)}_cam.txt"
-        if not path.is_file():
-            path = folder / "cams" / f"{index:08d}_cam.txt"
-        views[name] = read_camera_text(path, name, width, height)
-    return views
-
-
-def _board(folder: Path, views: dict[str, View], normal: Array, corners: Array) -> BoardTruth:
-    """The board with its normal towards the cameras and its corners in order."""
+    normal = normal / length
     center = corners.mean(axis=0)
     size = float(np.linalg.norm(corners - center, axis=1).max())
     if np.abs((corners - center) @ normal).max() > MAX_OFF_PLANE * size:
@@ -149,6 +132,19 @@ def _board(folder: Path, views: dict[str, View], normal: Array, corners: Array) 
     first = corners[0] - center
     angles = np.arctan2((corners - center) @ np.cross(normal, first), (corners - center) @ first)
     return BoardTruth(folder=folder, views=views, normal=normal, corners=corners[angles.argsort()])
+
+
+def read_author_views(
+    folder: Path, names: Sequence[str], width: int, height: int
+) -> dict[str, View]:
+    """The cameras of the authors' demo by name; parameters and errors of its truth."""
+    views = {}
+    for index, name in enumerate(names):
+        path = folder / "cams" / f"{stem_of(name)}_cam.txt"
+        if not path.is_file():
+            path = folder / "cams" / f"{index:08d}_cam.txt"
+        views[name] = read_camera_text(path, name, width, height)
+    return views
 
 
 def read_camera_text(path: Path, name: str, width: int, height: int) -> View:
