@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 
 # Number of views compared with the surface, spread evenly among more: it bounds the time.
 MAX_TRIED_VIEWS = 24
-MAX_CAMERA_POINTS = 6000  # of the surface that check the camera. More narrow its deviation little
+MAX_CAMERA_POINTS = 2000  # that check the camera: errors are common to views, more narrow nothing
 
 
 def find_trust(model: AngleModel, folder: RunFolder, record: Record, options: Options) -> Trust:
