@@ -321,7 +321,7 @@ def _carved(
         return mesh
     # Smoothness rounds the walls of height steps; carving the refined surface makes them sharp.
     return remeshed(
-        mesh,
+        RayScene(mesh),
         mesh.mean_edge / REMESHED_EDGE,
         solid=[_within(group.solid, hull, mesh.mean_edge) for group in steps],
         free=[*(group.values for group in steps), *(cavity.values for cavity in cavities)],
@@ -524,7 +524,7 @@ def _border_share(mask: Mask) -> float:
 
 def _deviations(mesh: TriangleMesh, fit: Fit) -> Array:
     """Deviations of the vertices, sampled on a coarser mesh if that saves time."""
-    coarse = remeshed(mesh, DEVIATION_EDGE_PX * fit.gsd)
+    coarse = remeshed(RayScene(mesh), DEVIATION_EDGE_PX * fit.gsd)
     if not len(coarse.faces):
         coarse = mesh
     sigma = place_deviations(coarse, fit)

@@ -258,11 +258,10 @@ class RayScene:
         for num_rays in (1, len(SIGN_DIRECTIONS)):
             if not len(suspects):
                 break
-            centers = self.mesh.centers[suspects]
-            step = depth * self.mesh.face_normals[suspects]
-            inner = self.is_inside(centers - step, num_rays=num_rays)
-            outer = self.is_inside(centers + step, num_rays=num_rays)
-            suspects = suspects[outer | ~inner]
+            outer = self.mesh.centers[suspects] + depth * self.mesh.face_normals[suspects]
+            # Within its face the mesh winds once more.
+            turns = [self._windings(self._local(outer), d) for d in SIGN_DIRECTIONS[:num_rays]]
+            suspects = suspects[2 * np.count_nonzero(turns, axis=0) > num_rays]
         return suspects
 
     def inside_along(self, origins: Floats, direction: Array, distances: Array) -> Mask:
@@ -431,7 +430,7 @@ def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
 
 
 def remeshed(
-    mesh: TriangleMesh,
+    scene: RayScene,
     step: float,
     *,
     solid: Sequence[Callable[[Array], Floats]] = (),
@@ -439,14 +438,14 @@ def remeshed(
     smoothing: float = 0.5,
     min_cells: int = 30,
 ) -> TriangleMesh:
-    """The mesh, remeshed with edges of about ``step`` from its signed distance on a grid.
+    """The mesh of a scene, with edges of about ``step`` from its signed distance on a grid.
 
     The new mesh does not intersect itself; touching pieces are joined, and pieces that enclose
     fewer than ``min_cells`` cells are removed.
 
     Parameters
     ----------
-    mesh : closed.
+    scene : of a closed mesh.
     step : of the grid, world units.
     solid : functions of points ``(N, 3)`` that give signed distances ``(N,)``, negative in solid
         to add.
@@ -454,6 +453,7 @@ def remeshed(
         space to carve; its borders are not smoothed.
     smoothing : width of a Gaussian on the distances, in steps.
     """
+    mesh = scene.mesh
     if not len(mesh.faces):
         return mesh
     origin = mesh.vertices.min(axis=0) - (BAND_CELLS + 1) * step
@@ -467,7 +467,6 @@ def remeshed(
         band[tuple(place.astype(np.int64).T)] = True
     band = ndimage.binary_dilation(band, iterations=BAND_CELLS)
     index = np.argwhere(band)
-    scene = RayScene(mesh)
     limit = np.float32(BAND_CELLS * step)
     values = np.full(shape, np.nan, np.float32)
     values[band] = scene.signed_distance(origin + step * index, num_rays=1)

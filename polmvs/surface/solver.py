@@ -275,8 +275,9 @@ def refine(
     """
     tol = fit.tol
     found = _through_levels(mesh, fit, tol.levels, stands_apart, on_progress)
-    share = covered_share(found.mesh, found.fit.views)
-    if share >= covered_share(mesh, found.fit.views) - tol.max_lost or len(tol.levels) < MIN_LEVELS:
+    share = covered_share(RayScene(found.mesh), found.fit.views)
+    before = covered_share(RayScene(mesh), found.fit.views)
+    if share >= before - tol.max_lost or len(tol.levels) < MIN_LEVELS:
         return found
     *coarse, fine, last = tol.levels
     if _num_vertices(mesh, fine.edge_px * fit.gsd) > tol.max_vertices:
@@ -287,7 +288,8 @@ def refine(
     steps = fine.num_steps + sum(level.num_steps * level.edge_px for level in coarse) / fine.edge_px
     first = replace(coarse[0], edge_px=fine.edge_px, num_steps=round(steps))
     again = _through_levels(mesh, fit, (first, last), stands_apart, no_progress)
-    return again if covered_share(again.mesh, again.fit.views) > share else found
+    covered = covered_share(RayScene(again.mesh), again.fit.views)
+    return again if covered > share else found
 
 
 def _through_levels(
@@ -325,23 +327,21 @@ def _num_vertices(mesh: TriangleMesh, edge: float) -> float:
     return 1.2 * float(mesh.face_areas.sum()) / edge**2
 
 
-def covered_shares(
-    mesh: TriangleMesh, views: Sequence[SurfaceView], *, stride_px: int = 4
-) -> Array:
+def covered_shares(scene: RayScene, views: Sequence[SurfaceView], *, stride_px: int = 4) -> Array:
     """Share ``(K,)`` of each view's certain silhouette that a mesh covers; NaN without one."""
-    scene = RayScene(mesh) if len(mesh.faces) else None
+    is_empty = not len(scene.mesh.faces)
     shares = np.full(len(views), np.nan)
     for index, view in enumerate(views):
         rays = certain_rays(view, stride_px)
         if len(rays):
-            hit = 0.0 if scene is None else np.mean(scene.cast(view.center, rays).face >= 0)
+            hit = 0.0 if is_empty else np.mean(scene.cast(view.center, rays).face >= 0)
             shares[index] = hit
     return shares
 
 
-def covered_share(mesh: TriangleMesh, views: Sequence[SurfaceView]) -> float:
+def covered_share(scene: RayScene, views: Sequence[SurfaceView]) -> float:
     """Mean of :func:`covered_shares`; 1 where no view shows a silhouette."""
-    shares = covered_shares(mesh, views)
+    shares = covered_shares(scene, views)
     known = shares[np.isfinite(shares)]
     return float(known.mean()) if len(known) else 1.0
 
@@ -365,7 +365,7 @@ def _refined_at(
         # A mesh that has moved far is irregular. In one that intersects itself views see the
         # inside. Other meshes stay as they are, because the grid rounds their creases.
         if step == 0:
-            mesh = remeshed(mesh, edge)
+            mesh = remeshed(RayScene(mesh), edge)
             moved = np.zeros(len(mesh.vertices))
         scene = RayScene(mesh)
         if step > 0 and (
@@ -373,10 +373,10 @@ def _refined_at(
             or len(scene.crossed_faces(CROSSED_DEPTH * edge))
         ):
             # No smoothing: the mesh is smooth. The grid loses walls thinner than its cells.
-            again = remeshed(mesh, edge, smoothing=0)
-            if covered_share(again, fit.views) > covered_share(mesh, fit.views) - REMESHING_LOSS:
-                mesh, moved = again, np.zeros(len(again.vertices))
-                scene = RayScene(mesh)
+            again = RayScene(remeshed(scene, edge, smoothing=0))
+            if covered_share(again, fit.views) > covered_share(scene, fit.views) - REMESHING_LOSS:
+                scene, mesh = again, again.mesh
+                moved = np.zeros(len(mesh.vertices))
         if not len(mesh.faces):
             on_progress(total - done - step)
             return mesh, fit

@@ -327,7 +327,7 @@ def find_contradictions(
         phase_sine=phase_sine,
         contradicted_share=float(area[contradicted].sum()) / total,
         denied_share=float(area[denied].sum()) / total,
-        uncovered_share=1 - covered_share(mesh.only(supported), views),
+        uncovered_share=1 - covered_share(RayScene(mesh.only(supported)), views),
     )
 
 

@@ -28,7 +28,7 @@ def meshes():
     axis = np.arange(-HALF, HALF + STEP, STEP)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
     whole = mesh_from_grid(box(grid).astype(np.float32), np.full(3, -HALF), STEP)
-    return whole, remeshed(whole, 1.5 * STEP, free=[beside_the_wall], smoothing=0)
+    return whole, remeshed(RayScene(whole), 1.5 * STEP, free=[beside_the_wall], smoothing=0)
 
 
 def true_normals(mesh) -> np.ndarray:

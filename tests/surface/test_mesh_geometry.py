@@ -37,7 +37,7 @@ def test_extraction_keeps_a_hole_and_two_pieces():
 def test_extraction_of_nothing_is_empty():
     mesh = mesh_from_grid(np.ones((4, 4, 4), np.float32), np.zeros(3), 1.0)
     assert len(mesh.vertices) == len(mesh.faces) == 0
-    assert len(remeshed(mesh, 0.1).faces) == 0
+    assert len(remeshed(RayScene(mesh), 0.1).faces) == 0
 
 
 def test_triangles_are_even():
@@ -47,7 +47,7 @@ def test_triangles_are_even():
 
 @pytest.mark.parametrize("step", [0.05, 0.12])
 def test_remeshing_keeps_shape_and_topology(step):
-    mesh = remeshed(extracted(torus()), step)
+    mesh = remeshed(RayScene(extracted(torus())), step)
     assert euler_number(mesh) == 0
     assert np.abs(torus()(mesh.vertices)).max() < 0.25 * step
     assert 0.6 * step < mesh.mean_edge < 1.2 * step
@@ -57,7 +57,7 @@ def test_remeshing_joins_pieces_that_met_and_drops_specks():
     first = extracted(sphere(0.6, (-0.4, 0, 0)))
     second = extracted(sphere(0.6, (0.4, 0, 0)))
     speck = extracted(sphere(0.09, (0, 0, 1.4)))
-    mesh = remeshed(side_by_side(first, second, speck), 0.08)
+    mesh = remeshed(RayScene(side_by_side(first, second, speck)), 0.08)
     assert euler_number(mesh) == 2
     assert mesh.vertices[:, 2].max() < 1.0
 

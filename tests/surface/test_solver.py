@@ -530,7 +530,8 @@ def test_lost_walls_are_made_again_by_fine_levels_if_they_may_have_so_many_verti
     hull = visual_hull(ball)
     # Of what the views show the hull covers all, a surface half.
     monkeypatch.setattr(
-        "polmvs.surface.solver.covered_share", lambda mesh, _: 1.0 if mesh is hull.mesh else 0.5
+        "polmvs.surface.solver.covered_share",
+        lambda scene, _: 1.0 if scene.mesh is hull.mesh else 0.5,
     )
     levels = tuple(replace(QUICK.levels[0], edge_px=px, num_steps=1) for px in (8.0, 6.0, 5.0))
     widths = []
