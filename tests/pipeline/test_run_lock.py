@@ -101,6 +101,23 @@ def test_a_cut_list_names_what_it_can(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_cannot_be_removed_stays_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a folder that someone holds open elsewhere: the next run tries again."""
+    token = "0123456789abcdef"
+    (tmp_path / f"{PREFIX}{token}-1-0-maps").mkdir()
+    (tmp_path / LOCK_FILE).write_text(f"{token} 12\n")
+    with monkeypatch.context() as patched:
+        patched.setattr("polmvs.pipeline.run_lock.remove_temporary", lambda path: None)
+        with locked(tmp_path):
+            pass
+    assert token in (tmp_path / LOCK_FILE).read_text()
+    with locked(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("content", [b"mine", b"\xff\xfe", b"\n"])
 def test_a_file_of_that_name_that_no_run_wrote_is_kept(tmp_path: Path, content: bytes) -> None:
     (tmp_path / LOCK_FILE).write_bytes(content)
