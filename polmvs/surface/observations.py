@@ -218,12 +218,16 @@ def observe(
     look = partial(_observe_view, mesh, scene, looking, gsd)
     # Threads, as products of large arrays and ray casting release Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
-        found = list(pool.map(look, range(len(views)), views, images))
-    joined = {}
-    for one in fields(Observations):
-        arrays = [getattr(own, one.name) for own in found]
-        joined[one.name] = np.concatenate(arrays, axis=1 if one.name in OF_BOTH else 0)
-    return Observations(**joined)
+        found = [vars(own) for own in pool.map(look, range(len(views)), views, images)]
+    # The views' arrays are released as they are joined: together they may take gigabytes.
+    return Observations(
+        **{
+            one.name: np.concatenate(
+                [own.pop(one.name) for own in found], axis=1 if one.name in OF_BOTH else 0
+            )
+            for one in fields(Observations)
+        }
+    )
 
 
 def _observe_view(

@@ -135,12 +135,10 @@ def _camera_complaint(
         one.view.camera != camera for one in views
     ):
         return None  # OPA has no rays, and cameras are checked together only if they are one
-    chosen = evenly_chosen(len(mesh.faces), MAX_CAMERA_POINTS)
     images = [level_image(view, HeldOutTolerances.width_px) for view in views]
-    found = observe(mesh, RayScene(mesh), views, images, looking)
-    found = found.only(chosen[found.face])
-    faces = np.flatnonzero(chosen)
-    residuals = np.abs(found.residuals(mesh.face_normals))
+    some = mesh.only(evenly_chosen(len(mesh.faces), MAX_CAMERA_POINTS))
+    found = observe(some, RayScene(mesh), views, images, looking)
+    residuals = np.abs(found.residuals(some.face_normals))
     if light is None:
         kind = residuals.argmin(axis=0)
     else:
@@ -151,11 +149,11 @@ def _camera_complaint(
         PhaseRows(
             rows=found.rows[kind, index],
             rays=found.rays,
-            variance=found.variances(mesh.face_normals, sigma)[kind, index],
-            point=np.searchsorted(faces, found.face),
+            variance=found.variances(some.face_normals, sigma)[kind, index],
+            point=found.face,
             view=found.view,
         ),
-        mesh.face_normals[faces],
+        some.face_normals,
         np.array([one.view.cam_from_world.rotation for one in views]),
     )
     if fit is None:
