@@ -15,6 +15,7 @@ def run_copy(demo_run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(demo_run, tmp_path / "run"))
 
 
+@pytest.mark.slow
 def test_report_makes_the_page_again_and_escapes_names(cli, run_copy: Path) -> None:
     page = run_copy / "report.html"
     record = json.loads((run_copy / "run.json").read_text())

@@ -47,6 +47,7 @@ def captures(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_batch(cli, captures, tmp_path) -> None:
     """The sound capture is reconstructed beside the faulty one; going on repeats nothing."""
     out = tmp_path / "out"

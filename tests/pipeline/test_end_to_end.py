@@ -199,6 +199,7 @@ def copy_until(demo_run: Path, out: Path, last: str) -> None:
     cut_after(out, last)
 
 
+@pytest.mark.slow
 def test_run_killed_in_sfm_finds_the_same_model(
     demo_run: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:
@@ -252,6 +253,7 @@ def test_stage_alone_is_done_again_only_with_overwrite(
     assert (out / "opa.ply").read_bytes() == (demo_run / "opa.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_new_truth_is_measured_on_a_finished_run(
     demo_run: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:

@@ -223,6 +223,7 @@ def test_no_mesh_and_no_colmap(go_on: Continue) -> None:
     assert stages_of(out)[-1] == "trust_ppa"
 
 
+@pytest.mark.slow
 def test_export_alone(go_on: Continue, run: Path, demo_capture: Path, cli) -> None:
     out = go_on("densify_ppa", "finish")
     assert (out / "ppa_mesh.ply").read_bytes() == (run / "ppa_mesh.ply").read_bytes()

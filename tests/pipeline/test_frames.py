@@ -245,6 +245,7 @@ def test_malformed_scale(refuses, ends, message) -> None:
     assert message in refuses("--scale", *ends, status=2)
 
 
+@pytest.mark.slow
 def test_run_goes_on_with_the_same_scale_only(
     take_poses, cli, out: Path, demo_capture: Path
 ) -> None:

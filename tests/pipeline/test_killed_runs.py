@@ -108,7 +108,8 @@ def results_of(out: Path) -> dict[str, bytes]:
     return {name: data for name, data in content_of(out).items() if name not in TIMED}
 
 
-@pytest.mark.parametrize(("seed", "least"), [(0, 6), pytest.param(1, 20, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "least"), [(0, 6), (1, 20)])
 def test_a_run_killed_at_any_moments_comes_to_the_same(
     call: Call, given, undisturbed, tmp_path: Path, seed: int, least: int
 ) -> None:

@@ -304,6 +304,7 @@ def copy_of(demo_run: Path, tmp_path: Path):
     return copy
 
 
+@pytest.mark.slow
 def test_a_damaged_map_is_healed_as_its_message_says(copy_of, demo_capture: Path, cli) -> None:
     """Its own stage is done again, and alone: the normals made from the map are."""
     out = copy_of("normals_ppa")
@@ -327,6 +328,7 @@ def test_resume_with_other_neighbours_does_not_take_over_the_surface(
     assert "used 15" in err
 
 
+@pytest.mark.slow
 def test_all_models_clouds_flag_the_same_seeds(
     copy_of, demo_capture: Path, cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
