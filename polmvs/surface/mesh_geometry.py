@@ -254,14 +254,16 @@ class RayScene:
         depth : distance of the compared points on both sides of a face.
         """
         suspects = np.arange(len(self.mesh.faces))
-        # One ray decides nearly all faces; the others get three.
+        # One ray decides nearly all faces; the others get three. Walls and gaps thinner than the
+        # depth count as crossed as well.
         for num_rays in (1, len(SIGN_DIRECTIONS)):
             if not len(suspects):
                 break
-            outer = self.mesh.centers[suspects] + depth * self.mesh.face_normals[suspects]
-            # Within its face the mesh winds once more.
-            turns = [self._windings(self._local(outer), d) for d in SIGN_DIRECTIONS[:num_rays]]
-            suspects = suspects[2 * np.count_nonzero(turns, axis=0) > num_rays]
+            centers = self.mesh.centers[suspects]
+            step = depth * self.mesh.face_normals[suspects]
+            inner = self.is_inside(centers - step, num_rays=num_rays)
+            outer = self.is_inside(centers + step, num_rays=num_rays)
+            suspects = suspects[outer | ~inner]
         return suspects
 
     def inside_along(self, origins: Floats, direction: Array, distances: Array) -> Mask:
