@@ -13,7 +13,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -167,7 +167,7 @@ def _errors(folder: RunFolder, capture: Path) -> tuple[tuple[float, ...], float]
         spacing_m=surface.spacing_m,
     )
     part = surface.points[surface.is_part]
-    scene = RayScene(TriangleMesh(vertices, mesh.triangles.astype(np.int64)))
+    scene = RayScene(TriangleMesh.of(replace(mesh, vertices=vertices)))
     distances = lengths(scene.closest(part)[0] - part)
     completeness = [float(np.mean(distances <= limit)) for limit in DISTANCES_M]
     both = zip(metrics.accuracy, completeness, strict=True)
