@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from pathlib import Path
@@ -35,6 +35,8 @@ OnProgress: TypeAlias = Callable[[int], None]  # called with the steps done sinc
 OnStep: TypeAlias = Callable[[str], None]  # called with the name of a step that begins
 
 HELD_BACK = (signal.SIGINT, signal.SIGTERM)
+# The parent's to its workers. COLMAP's log takes SIGTERM while it is imported and prints a stack.
+STOP = getattr(signal, "SIGUSR1", signal.SIGTERM)
 GRACE_S = 3.0  # for a worker that is stopped to clear up
 POSIX = hasattr(signal, "pthread_sigmask")
 
@@ -197,7 +199,9 @@ class _Processes:
         if self._pool is not None:
             if cancel and POSIX:  # elsewhere a process cannot be told to clear up and end
                 for process in list((self._pool._processes or {}).values()):
-                    process.terminate()
+                    if process.pid is not None:
+                        with suppress(ProcessLookupError):  # it has ended
+                            os.kill(process.pid, STOP)
             self._pool.shutdown(wait=True, cancel_futures=cancel)
             self._pool = None
 
@@ -253,7 +257,8 @@ def _stop_worker(number: int, frame: FrameType | None) -> None:
     An exception that arrives in a callback of a library is lost; what is left then is the parent's
     to clear away.
     """
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for asking in (STOP, signal.SIGTERM):
+        signal.signal(asking, signal.SIG_IGN)
     if not _works:
         os._exit(1)
     timer = threading.Timer(GRACE_S, os._exit, (1,))
@@ -265,7 +270,8 @@ def _stop_worker(number: int, frame: FrameType | None) -> None:
 def _start_worker() -> None:
     """Ctrl-C is the parent's to handle, and one worker is one core."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _stop_worker)
+    for asking in (STOP, signal.SIGTERM):
+        signal.signal(asking, _stop_worker)
     keep_to_one_core()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -16,7 +16,6 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
-from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
 
@@ -213,17 +212,12 @@ def run_batch(
     rows: list[BatchRow] = []
     with workers:
         outcomes = workers.outcomes(partial(_run_one, out, each), entries)
-        try:
-            for entry, outcome in zip(entries, outcomes, strict=True):
-                rows.append(row_of(entry, outcome))
-                everything = [*earlier, *rows]
-                write_json(out / JSON_FILE, everything)
-                write_bytes(out / TABLE_FILE, f"{batch_table(everything)}\n".encode())
-                on_done(rows[-1])
-        except BaseException:  # Ctrl-C: captures take long, and go on with `run.resume`
-            for child in active_children():
-                child.terminate()
-            raise
+        for entry, outcome in zip(entries, outcomes, strict=True):
+            rows.append(row_of(entry, outcome))
+            everything = [*earlier, *rows]
+            write_json(out / JSON_FILE, everything)
+            write_bytes(out / TABLE_FILE, f"{batch_table(everything)}\n".encode())
+            on_done(rows[-1])
     return rows
 
 

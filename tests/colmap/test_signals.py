@@ -31,10 +31,29 @@ if __name__ == "__main__":
         os.killpg(0, signal.SIGTERM)
         next(tasks)()
 """
+# Workers that are stopped while COLMAP is imported, and its handler not yet replaced.
+WHILE_IMPORTED = """
+import pathlib, signal, sys, time
+from polmvs.parallel import Workers
+
+def import_colmap(at_it):
+    import pycolmap
+
+    at_it.touch()
+    time.sleep(60)
+
+if __name__ == "__main__":
+    files = [pathlib.Path(f"{__file__}.{i}") for i in range(2)]
+    with Workers(2) as workers:
+        workers.outcomes(import_colmap, files)
+        while not all(path.exists() for path in files):
+            time.sleep(0.01)
+        sys.exit(-signal.SIGTERM % 256)
+"""
 
 
 @pytest.mark.skipif(not POSIX, reason="there is no SIGTERM to speak of")
-@pytest.mark.parametrize("script", [ALONE, WITH_WORKERS])
+@pytest.mark.parametrize("script", [ALONE, WITH_WORKERS, WHILE_IMPORTED])
 def test_a_process_that_is_told_to_end_prints_no_stack(tmp_path, script: str) -> None:
     path = tmp_path / "script.py"
     path.write_text(script)
