@@ -29,7 +29,7 @@ def cauchy_weights(squares: Floats, scale: float | Floats = CAUCHY_SCALE) -> Flo
     return np.asarray(1.0 / (1.0 + squares / np.square(scale)))
 
 
-def geman_mcclure_weights(residuals: Array, square: float | Array) -> Array:
+def geman_mcclure_weights(residuals: Floats, square: float | Floats) -> Array:
     """Least-squares weights of the loss of Geman and McClure (1985), 1 at 0.
 
     Parameters

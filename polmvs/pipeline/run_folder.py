@@ -116,6 +116,11 @@ class RunFolder:
         """Dense cloud."""
         return self.root / f"{model}.ply"
 
+    @property
+    def silhouettes(self) -> Path:
+        """Silhouettes of the views, of all models."""
+        return self.root / "silhouettes"
+
     def views(self, model: AngleModel) -> Path:
         """Dense views: ranges, normals and deviations of each view."""
         return self.root / f"views_{model}"
@@ -148,7 +153,9 @@ FOLDER_FILES = {
 }
 # In these, files named IMAGE.part.npy as well; images are known by name from the record.
 FOLDERS_BY_IMAGE = frozenset(
-    name for model in AngleModel for name in (HERE.maps(model).name, HERE.views(model).name)
+    path.name
+    for model in AngleModel
+    for path in (HERE.maps(model), HERE.silhouettes, HERE.views(model))
 )
 DENSE_FOLDERS = frozenset(HERE.dense(model).name for model in AngleModel)
 

@@ -40,6 +40,7 @@ from polmvs.pipeline.stages import (
     poses,
     seeds,
     sfm,
+    silhouettes,
     sparse_cloud,
     trust,
 )
@@ -261,6 +262,24 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             num_steps=lambda run: run.num_views,
         ),
     ]
+    table.append(
+        StageSpec(
+            name="silhouettes",
+            command=DENSIFY,
+            reads=(HERE.sparse, HERE.maps(ppa)),
+            writes=(HERE.silhouettes,),
+            decides=("region.mask", "propagation.method"),
+            work=lambda run: silhouettes.find_silhouettes(
+                run.run_folder,
+                run.options.propagation.method,
+                masks_given=run.options.region.mask is not None,
+                workers=run.workers,
+                on_progress=run.on_progress,
+            ),
+            result=silhouettes.SilhouettesResult,
+            num_steps=lambda run: run.num_views,
+        )
+    )
     for same_kind in zip(*map(_model_stages, AngleModel), strict=True):
         table += same_kind
     table += [
@@ -329,10 +348,10 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             angle_model=model,
             reads=(
                 *(HERE.sparse, HERE.camera_modes, HERE.pose_covariances, HERE.images),
-                *(HERE.maps(model), track_normals, HERE.seeds),
+                *(HERE.maps(model), HERE.silhouettes, track_normals, HERE.seeds),
             ),
             writes=(cloud, views),
-            decides=(TILT_AWARE, "region.mask", "region.light", "propagation", "fusion", *CROPPING),
+            decides=(TILT_AWARE, "region.light", "propagation", "fusion", *CROPPING),
             work=lambda run: densify.densify(
                 model,
                 run.run_folder,
@@ -352,6 +371,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
                 HERE.sfm,
                 HERE.sparse,
                 HERE.maps(model),
+                HERE.silhouettes,
                 HERE.sparse_cloud(model),
                 HERE.track_normals(model),
                 HERE.seeds,
@@ -359,7 +379,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
                 views,
             ),
             writes=(),
-            decides=("region.mask", "region.light", "normals.tilt_aware_weights"),
+            decides=("region.light", "normals.tilt_aware_weights"),
             work=lambda run: trust.find_trust(model, run.run_folder, run.record, run.options),
             result=Trust,
         ),

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
@@ -19,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
-from polmvs.config import default_num_workers
 from polmvs.geometry import lengths
 from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
@@ -53,7 +51,6 @@ from polmvs.surface.offsets import (
     find_faces,
     stepped_faces,
 )
-from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.solver import (
     Fit,
     Labelled,
@@ -79,7 +76,7 @@ from polmvs.surface.surface_quality import (
     stand_apart,
     supported_faces,
 )
-from polmvs.surface.surface_view import SurfaceView, surface_view
+from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints, KnownSides
 from polmvs.surface.visual_hull import (
     Plane,
@@ -160,11 +157,10 @@ def num_surface_steps(num_views: int) -> int:
 
 def reconstruct_surface(
     angle_model: AngleModel,
-    maps: Sequence[PhaseMap],
+    views: Sequence[SurfaceView],
     seeds: Seeds,
     surroundings: Floats,
     *,
-    masks_given: bool = False,
     light: Light | None = None,
     tilt_aware: bool = True,
     min_views: int = 2,
@@ -178,10 +174,9 @@ def reconstruct_surface(
     Parameters
     ----------
     angle_model : of the rows.
-    maps : of all views.
+    views : all.
     seeds : points of the surface.
     surroundings : (N, 3), sparse points of the surroundings.
-    masks_given : the maps' regions are the user's masks.
     light : given by the user; None: inferred for each observation.
     tilt_aware : as in :class:`polmvs.surface.observations.Looking`.
     min_views : number of views that must support a part.
@@ -190,14 +185,6 @@ def reconstruct_surface(
     on_mesh : called at the end with the hull, and with the mesh after each level.
     folder : for temporary results of each view; None: in memory.
     """
-
-    def look_at(phase_map: PhaseMap) -> SurfaceView:
-        silhouette = find_silhouette(phase_map, mask_given=masks_given)
-        return surface_view(phase_map, silhouette, folder=folder)
-
-    # Threads, as nearly all of the work is OpenCV's; each view depends on itself alone.
-    with ThreadPoolExecutor(default_num_workers()) as pool:
-        views = list(pool.map(look_at, maps))
     if reason := _no_hull(views):
         return Undetermined(reason)
     centers = np.array([view.center for view in views])
@@ -206,7 +193,12 @@ def reconstruct_surface(
         return Undetermined("the silhouettes of the views have no common object")
     logger.info("visual hull: %d vertices.", len(hull.mesh.vertices))
     given = _Given(
-        scene=face_scene(maps, angle_model, tilt_aware=tilt_aware, folder=folder),
+        scene=face_scene(
+            [view.phase_map for view in views],
+            angle_model,
+            tilt_aware=tilt_aware,
+            folder=folder,
+        ),
         seeds=seeds,
         min_views=min_views,
         on_progress=on_progress,
@@ -357,7 +349,8 @@ def _polished(
 ) -> _Polished:
     """A carved mesh with the sides of its edges sharp, moved until it has converged."""
     fit = refined.fit
-    fitted = fit_normals(mesh, label(mesh, fit))
+    labelled = label(mesh, fit)
+    fitted = fit_normals(mesh, labelled)
     facing, is_wall = fitted.normals, np.zeros(len(mesh.faces), np.bool_)
     if carvings:
         to_uncarved = lengths(RayScene(refined.mesh).closest(mesh.centers)[0] - mesh.centers)
@@ -378,7 +371,7 @@ def _polished(
     sharp = _converged(sharpened(mesh, normals), normals, polish, fit)
     given.on_progress(1)
     # Detail as fine as the mesh looks like noise of the normals; the phases distinguish the two.
-    is_sharp = label(sharp, fit).mean_loss(sharp) <= label(mesh, fit).mean_loss(mesh)
+    is_sharp = label(sharp, fit).mean_loss(sharp) <= labelled.mean_loss(mesh)
     logger.info("the surface is %s.", "sharpened" if is_sharp else "left as smooth as it is")
     mesh = sharp if is_sharp else mesh
     labelled = label(mesh, fit, min_cosine=MIN_FACING_COSINE)

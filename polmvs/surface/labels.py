@@ -18,13 +18,15 @@ normals about it with both labels open.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from polmvs.config import default_num_workers
 from polmvs.geometry import dots, unit
 from polmvs.polarization.fresnel import fresnel_dolp
 from polmvs.polarization.kinds import Light
@@ -35,6 +37,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Pairs: TypeAlias = tuple[Indices, Indices]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,30 +77,22 @@ class LabelTolerances:
     max_cost: float = 9.0
 
 
-def neighbors(
-    observations: Observations, pairs: tuple[Indices, Indices], num: int
-) -> sparse.csr_array:
-    """Coupling (K, K) of the labels of two observations, in [0, 1].
+def neighbors(observations: Observations, pairs: Pairs, num: int) -> sparse.csr_array:
+    """Coupling (K, K) of the labels of two observations of one view, in [0, 1].
 
-    It is not 0 for observations of one view on faces that share an edge.
+    It is not 0 for faces that share an edge.
 
     Parameters
     ----------
-    observations : of a mesh with ``num`` faces.
+    observations : of one view, of a mesh with ``num`` faces.
     pairs : faces that share an edge, each pair once.
     """
-    o = observations
-    ones, others = [], []
-    starts = np.searchsorted(o.view, np.arange(int(o.view.max(initial=-1)) + 2))
-    for start, stop in pairwise(starts):
-        index = np.full(num, -1, np.int32)
-        index[o.face[start:stop]] = np.arange(start, stop)
-        one, other = index[pairs[0]], index[pairs[1]]
-        both = (one >= 0) & (other >= 0)
-        ones.append(one[both])
-        others.append(other[both])
-    nothing = np.zeros(0, np.int32)
-    one, other = np.concatenate([nothing, *ones]), np.concatenate([nothing, *others])
+    o, size = observations, len(observations.face)
+    index = np.full(num, -1, np.int32)
+    index[o.face] = np.arange(size)
+    one, other = index[pairs[0]], index[pairs[1]]
+    both = (one >= 0) & (other >= 0)
+    one, other = one[both], other[both]
     axial = o.axial.astype(np.float32)
     first, second = axial.take(one, axis=0), axial.take(other, axis=0)
     length = o.dolp.astype(np.float32)
@@ -108,7 +103,6 @@ def neighbors(
     # A vector as short as its noise has no direction.
     known = np.clip(np.minimum(near, far) / np.maximum(4 * noise, 1e-12), 0, 1)
     alike = np.clip(cosine, 0, 1) * known
-    size = len(o.face)
     upper = sparse.csr_array((alike, (one, other)), shape=(size, size))
     return sparse.csr_array(upper + upper.T)
 
@@ -127,7 +121,7 @@ def responsibilities(
     *,
     normal_sigma: float,
     row_sigma: Floats,
-    near: sparse.csr_array | None = None,
+    pairs: Pairs | None = None,
     weights: tuple[float, float] = (0.5, 0.5),
     tolerances: LabelTolerances | None = None,
 ) -> Array:
@@ -139,28 +133,39 @@ def responsibilities(
     normals : (F, 3) unit, assumed.
     normal_sigma : rad, their error.
     row_sigma : (2, K) deviation of ``m . n`` that noise does not explain.
-    near : from :func:`neighbors`; None: no coupling.
+    pairs : of faces, as of :func:`neighbors`; None: their labels are not coupled.
     weights : prior shares of specular and of diffuse light; 0 for one that does not occur.
     """
-    tol = tolerances or LabelTolerances()
-    o = observations
-    cosine = np.clip(-dots(o.rays, normals.take(o.face, axis=0)), 0, 1)
-    angle = np.arccos(cosine)
-    variance = o.variances(normals, row_sigma) + (1 - cosine**2) * normal_sigma**2
-    fits = -0.5 * o.residuals(normals) ** 2 / variance
-    margin = tol.angle_margin + 0.7 * normal_sigma
-    score = fits + np.log(np.maximum(weights, 1e-30))[:, None]
-    score[DIFFUSE] -= np.minimum(_excess(o.dolp, o.sigma_dolp, angle + margin, tol), 30)
-    own = np.clip(score[SPECULAR] - score[DIFFUSE], -60, 60)
+    tol, o = tolerances or LabelTolerances(), observations
+    row_sigma = np.broadcast_to(row_sigma, o.turn_variance.shape)
+
+    def of_view(part: slice) -> Array:
+        own = o.only(part)
+        cosine = np.clip(-dots(own.rays, normals.take(own.face, axis=0)), 0, 1)
+        variance = own.variances(normals, row_sigma[:, part]) + (1 - cosine**2) * normal_sigma**2
+        fits = -0.5 * own.residuals(normals) ** 2 / variance
+        angle = np.arccos(cosine) + tol.angle_margin + 0.7 * normal_sigma
+        score = fits + np.log(np.maximum(weights, 1e-30))[:, None]
+        score[DIFFUSE] -= np.minimum(_excess(own.dolp, own.sigma_dolp, angle, tol), 30)
+        odds = np.clip(score[SPECULAR] - score[DIFFUSE], -60, 60)
+        if pairs is not None:
+            odds = _coupled(odds, neighbors(own, pairs, len(normals)), tol)
+        specular = 1 / (1 + np.exp(-np.clip(odds, -40, 40)))
+        fit = np.where(specular > 0.5, fits[SPECULAR], fits[DIFFUSE])
+        inlier = 1 / (1 + np.exp(np.clip(np.log(tol.outlier) - fit, -40, 40)))
+        return np.stack([specular * inlier, (1 - specular) * inlier])
+
+    # Views are coupled by nothing. Threads, as products of large arrays release Python's lock.
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        return np.concatenate([np.zeros((2, 0)), *pool.map(of_view, o.of_views())], axis=1)
+
+
+def _coupled(own: Array, near: sparse.csr_array, tol: LabelTolerances) -> Array:
+    """Log odds (K,) of observations with those of their neighbours, by a mean field."""
     odds = own
-    if near is not None:
-        for _ in range(tol.coupling_rounds):
-            said = near @ np.tanh(0.5 * odds.astype(np.float32))
-            odds = own + tol.coupling * said
-    specular = 1 / (1 + np.exp(-np.clip(odds, -40, 40)))
-    fit = np.where(specular > 0.5, fits[SPECULAR], fits[DIFFUSE])
-    inlier = 1 / (1 + np.exp(np.clip(np.log(tol.outlier) - fit, -40, 40)))
-    return np.stack([specular * inlier, (1 - specular) * inlier])
+    for _ in range(tol.coupling_rounds):
+        odds = own + tol.coupling * (near @ np.tanh(0.5 * odds.astype(np.float32)))
+    return odds
 
 
 @dataclass(frozen=True)
@@ -180,7 +185,7 @@ class Vote:
 def vote(
     mesh: TriangleMesh,
     observations: Observations,
-    pairs: tuple[Indices, Indices],
+    pairs: Pairs,
     *,
     row_sigma: Floats,
     tolerances: LabelTolerances | None = None,

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ OF_BOTH = ("rows", "turn_variance", "tilt", "slope")  # fields with these on the
 
 @dataclass(frozen=True)
 class RowsOfBoth:
-    """Rows of one view at N points, under both kinds of light.
+    """Rows of one view at N points, under both kinds of light, float32.
 
     Attributes
     ----------
@@ -47,12 +48,12 @@ class RowsOfBoth:
     dolp, sigma_dolp : (N,) degree of polarization and its deviation.
     """
 
-    rows: Array
-    turn_variance: Array
-    tilt: Array
-    axial: Array
-    dolp: Array
-    sigma_dolp: Array
+    rows: Floats
+    turn_variance: Floats
+    tilt: Floats
+    axial: Floats
+    dolp: Floats
+    sigma_dolp: Floats
 
 
 def level_image(view: SurfaceView, width_px: float) -> Image:
@@ -84,43 +85,102 @@ def rows_of_both(
     tilt_aware : compute the rotation of the rows by tilted polarizers, which OPA and PPA ignore.
     tilt_share : share of that rotation that is corrected.
     """
+    sample = _sampled(view, image, points)
+    turns = _turns(sample, angle_model) if tilt_aware else None
+    found = _rows_of(sample, view, angle_model, turns, tilt_share)
+    known = np.isfinite(sample.phase_variance)
+    return RowsOfBoth(
+        rows=np.where(known[:, None], found.rows, 0.0),
+        turn_variance=np.where(known, found.turn_variance, np.inf),
+        tilt=np.where(known, found.tilt, 0.0),
+        axial=np.where(known[:, None], found.axial, 0.0),
+        dolp=found.dolp,
+        sigma_dolp=found.sigma_dolp,
+    )
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """Polarization of one view at N points.
+
+    Attributes
+    ----------
+    rays : (N, 3) unit, camera frame.
+    s1, s2, noise : (N,) relative to s0, and the variance of both.
+    dolp, phase_variance : (N,); inf where the view shows no polarization.
+    """
+
+    rays: Floats
+    s1: Floats
+    s2: Floats
+    noise: Floats
+    dolp: Floats
+    phase_variance: Floats
+
+    def only(self, kept: Indices) -> _Sample:
+        """The ``kept`` points."""
+        return _Sample(**{name: values[kept] for name, values in vars(self).items()})
+
+
+def _sampled(view: SurfaceView, image: Image, points: Floats) -> _Sample:
     in_cam = view.to_camera(points)
-    xy = view.view.camera.project(in_cam)
-    rays = unit_or_zero(in_cam)
-    s1, s2, noise = (np.asarray(c, np.float64) for c in sample_image(image, xy).T)
-    known = (noise > 0) & (rays[:, 2] > 0)
-    length = np.hypot(s1, s2)
-    dolp = np.clip(length, 0, 1)
-    of_phase = phase_variance(dolp, noise)
-    known &= np.isfinite(of_phase)
-    rotation = view.view.cam_from_world.rotation
-    rows = np.zeros((2, len(xy), 3))
-    turn_variance = np.full((2, len(xy)), np.inf)
-    tilt = np.zeros((2, len(xy)))
+    rays = unit_or_zero(in_cam).astype(np.float32)
+    sampled = sample_image(image, view.view.camera.project(in_cam))
+    s1, s2, noise = np.ascontiguousarray(sampled.T)
+    dolp = np.minimum(np.hypot(s1, s2), np.float32(1))
+    variance = np.where((noise > 0) & (rays[:, 2] > 0), phase_variance(dolp, noise), np.inf)
+    return _Sample(rays, s1, s2, noise, dolp, variance)
+
+
+def _turns(sample: _Sample, angle_model: AngleModel) -> Floats | None:
+    """Rotation (2, N) of the phases by tilted polarizers, rad; None where the model knows it."""
+    if angle_model is AngleModel.TILTED:
+        return None
+    s1, s2, rays = sample.s1, sample.s2, sample.rays
+    specular = tilt_turn(-s1, -s2, rays, diffuse=False)
+    return np.stack([specular, tilt_turn(s1, s2, rays, diffuse=True)])
+
+
+def _rows_of(
+    sample: _Sample,
+    view: SurfaceView,
+    angle_model: AngleModel,
+    turns: Floats | None,
+    tilt_share: float,
+) -> RowsOfBoth:
+    """Rows of a sample, of any value where it has no polarization."""
+    s1, s2, rays = sample.s1, sample.s2, sample.rays
+    rows = np.empty((2, len(s1), 3), np.float32)
+    factor = np.ones((2, len(s1)), np.float32)
+    rotation = view.view.cam_from_world.rotation.astype(np.float32)
     for kind in KINDS:
-        sign, diffuse = (1.0, True) if kind == DIFFUSE else (-1.0, False)
+        sign = np.float32(1.0 if kind == DIFFUSE else -1.0)
         cos2, sin2 = sign * s1, sign * s2
-        turn = np.ones(len(xy))
         if angle_model is AngleModel.TILTED:
             measured = np.stack([np.ones_like(s1), s1, s2])
-            _, c1, c2 = correct_parameters(measured, rays, diffuse=diffuse)
+            _, c1, c2 = correct_parameters(measured, rays, diffuse=kind == DIFFUSE)
             cos2, sin2 = sign * c1, sign * c2
-        elif tilt_aware:
-            turns = np.nan_to_num(tilt_turn(cos2, sin2, rays, diffuse=diffuse))
-            if tilt_share:
-                cos, sin = np.cos(2 * tilt_share * turns), np.sin(2 * tilt_share * turns)
-                cos2, sin2 = cos2 * cos - sin2 * sin, sin2 * cos + cos2 * sin
-            tilt[kind] = turns
-        found = np.nan_to_num(rows_from_axial(angle_model, cos2, sin2, rays))
+        elif turns is not None and tilt_share:
+            double = np.float32(2 * tilt_share) * turns[kind]
+            cos, sin = np.cos(double), np.sin(double)
+            cos2, sin2 = cos2 * cos - sin2 * sin, sin2 * cos + cos2 * sin
+        found = rows_from_axial(angle_model, cos2, sin2, rays)
         if angle_model is AngleModel.PPA:
             # d psi / d phase = v_z / (1 - (v.d)^2), by the row's own components; the direction
             # that the tilted model measures turns about the ray itself.
-            turn = (found[:, 0] ** 2 + found[:, 1] ** 2) / np.where(known, rays[:, 2], 1.0)
-        rows[kind] = np.where(known[:, None], found @ rotation, 0.0)
-        turn_variance[kind, known] = turn[known] ** 2 * of_phase[known]
-        tilt[kind] *= turn
-    axial = np.where(known[:, None], np.stack([s1, s2], axis=1), 0.0)
-    return RowsOfBoth(rows, turn_variance, tilt, axial, dolp, np.sqrt(np.maximum(noise, 0)))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                factor[kind] = (found[:, 0] ** 2 + found[:, 1] ** 2) / rays[:, 2]
+        np.matmul(found, rotation, out=rows[kind])
+    with np.errstate(invalid="ignore"):
+        turn_variance = factor**2 * sample.phase_variance
+    return RowsOfBoth(
+        rows=rows,
+        turn_variance=turn_variance,
+        tilt=np.zeros_like(factor) if turns is None else turns * factor,
+        axial=np.stack([s1, s2], axis=1),
+        dolp=sample.dolp,
+        sigma_dolp=np.sqrt(np.maximum(sample.noise, 0)),
+    )
 
 
 @dataclass(frozen=True)
@@ -141,13 +201,18 @@ class Observations:
     view: Indices
     rays: Array
     cosine: Array
-    rows: Array
-    turn_variance: Array
-    tilt: Array
-    axial: Array
-    dolp: Array
-    sigma_dolp: Array
+    rows: Floats
+    turn_variance: Floats
+    tilt: Floats
+    axial: Floats
+    dolp: Floats
+    sigma_dolp: Floats
     slope: Array
+
+    def of_views(self) -> list[slice]:
+        """Where the observations of each view are that has some."""
+        starts = np.flatnonzero(np.diff(self.view, prepend=-1))
+        return [slice(*ends) for ends in pairwise([*starts.tolist(), len(self.view)])]
 
     def residuals(self, normals: Array) -> Array:
         """``m . n`` (2, K) for the normals (F, 3) of the faces."""
@@ -163,14 +228,8 @@ class Observations:
         cosine = dots(self.rays, normals.take(self.face, axis=0))
         return np.asarray((1 - cosine**2) * self.turn_variance + row_sigma**2)
 
-    def tilt_slopes(self, normals: Array) -> Array:
-        """Change of ``m . n`` (2, K) by a correction of the polarizers' tilt."""
-        own = normals.take(self.face, axis=0)
-        across = np.stack([dots(np.cross(self.rays, rows), own) for rows in self.rows])
-        return np.asarray(-self.tilt * across)
-
-    def only(self, kept: NDArray[np.bool_]) -> Observations:
-        """The ``kept`` (K,) observations."""
+    def only(self, kept: NDArray[np.bool_] | slice) -> Observations:
+        """The ``kept`` observations."""
         values = {
             one.name: getattr(self, one.name)[:, kept]
             if one.name in OF_BOTH
@@ -242,38 +301,30 @@ def _observe_view(
     face, rays, cosine = visible_points(
         scene, view.center, mesh.centers, mesh.face_normals, min_cosine=looking.min_cosine
     )
-    own = partial(
-        rows_of_both,
-        view,
-        image,
-        looking.angle_model,
-        tilt_aware=looking.tilt_aware,
-        tilt_share=looking.tilt_share,
-    )
-    found = own(mesh.centers.take(face, axis=0))
-    known = np.flatnonzero(np.isfinite(found.turn_variance[0]))
-    face, rays, cosine = face[known], rays[known], cosine[known]
-    rows = found.rows[:, known]
+    centers = mesh.centers.take(face, axis=0)
+    sample = _sampled(view, image, centers)
+    known = np.flatnonzero(np.isfinite(sample.phase_variance))
+    face, rays, cosine, centers = face[known], rays[known], cosine[known], centers[known]
+    sample = sample.only(known)
+    model, share = looking.angle_model, looking.tilt_share
+    turns = _turns(sample, model) if looking.tilt_aware else None
+    found = _rows_of(sample, view, model, turns, share)
     slope = np.zeros((2, len(known)))
     if gsd is not None and len(known):
         reach = min(0.5 * mesh.mean_edge, 1.5 * gsd)
-        normals, centers = mesh.face_normals.take(face, axis=0), mesh.centers.take(face, axis=0)
-        aside = own(centers + reach * normals)
-        same = np.where(np.einsum("lki,lki->lk", aside.rows, rows) < 0, -1.0, 1.0)
-        ahead = same * np.einsum("lki,ki->lk", aside.rows, normals)
-        change = ahead - np.einsum("lki,ki->lk", rows, normals)
-        slope = np.where(np.isfinite(aside.turn_variance), change / reach, 0.0)
+        normals = mesh.face_normals.take(face, axis=0)
+        aside = _sampled(view, image, centers + reach * normals)
+        # The polarizers' tilt turns both alike.
+        moved = _rows_of(aside, view, model, turns, share).rows
+        same = np.where(np.einsum("lki,lki->lk", moved, found.rows) < 0, -1.0, 1.0)
+        change = np.einsum("lki,ki->lk", same[..., None] * moved - found.rows, normals)
+        slope = np.where(np.isfinite(aside.phase_variance), change / reach, 0.0)
         slope = np.clip(slope, -0.5 / gsd, 0.5 / gsd)
     return Observations(
         face=face,
         view=np.full(len(face), index),
         rays=rays,
         cosine=cosine,
-        rows=rows,
-        turn_variance=found.turn_variance[:, known],
-        tilt=found.tilt[:, known],
-        axial=found.axial[known],
-        dolp=found.dolp[known],
-        sigma_dolp=found.sigma_dolp[known],
         slope=slope,
+        **vars(found),
     )

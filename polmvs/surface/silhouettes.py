@@ -9,6 +9,7 @@ claim or denial by only one view is also unknown.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from polmvs.camera import sample_image
+from polmvs.io.arrays import map_array, save_array
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import RegionTolerances
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX, Silhouette, signed_distance_px
@@ -90,6 +92,30 @@ def find_silhouette(
     sharp = bool((possible == certain).all())
     outer = inner if sharp else _outline_shift(possible, intensity, scale, tol)
     return Silhouette(certain, possible, inner, outer)
+
+
+def store_silhouette(silhouette: Silhouette, folder: Path, name: str) -> None:
+    """Write the silhouette of the view ``name`` as ``.npy`` files, into an existing folder."""
+    flags = silhouette.certain * 1 | silhouette.possible * 2
+    save_array(folder / f"{name}.silhouette.npy", flags.astype(np.uint8))
+    shifts = {"inner": silhouette.inner_shift, "outer": silhouette.outer_shift}
+    for which, shift in shifts.items():
+        if shift is not None:
+            save_array(folder / f"{name}.{which}.npy", shift)
+
+
+def open_silhouette(folder: Path, name: str) -> Silhouette:
+    """The stored silhouette of the view ``name``; its shifts stay on disk.
+
+    Raises
+    ------
+    DataError
+        A file is missing or damaged.
+    """
+    flags = map_array(folder / f"{name}.silhouette.npy", np.uint8)
+    paths = (folder / f"{name}.{which}.npy" for which in ("inner", "outer"))
+    shifts = (map_array(path, np.float32) if path.exists() else None for path in paths)
+    return Silhouette(flags & 1 > 0, flags & 2 > 0, *shifts)
 
 
 def _cleaned(mask: Mask, scale: float, tol: SilhouetteTolerances) -> Mask:

@@ -17,6 +17,7 @@ import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,6 @@ from polmvs.surface.creases import CreaseTolerances, crease_vertices
 from polmvs.surface.labels import (
     LabelTolerances,
     Vote,
-    neighbors,
     responsibilities,
     vote,
 )
@@ -410,7 +410,7 @@ def _refined_at(
             on_progress(level.num_steps - step - 1)
             break
     assert energy is not None  # a level has an iteration
-    return mesh, replace(fit, scales=energy.scales)
+    return mesh, replace(fit, scales=energy.shown_scales())
 
 
 @dataclass(frozen=True)
@@ -443,7 +443,7 @@ class Energy:
     free : (V,) bool, vertices of faces that some view sees.
     sharp : (V,) bool, vertices on edges between sides.
     light : (2,) shares of the observations whose light is specular, and diffuse.
-    scales : of the rows' residuals.
+    shown_scales : those of the rows' residuals.
     """
 
     views: _Evidence
@@ -455,7 +455,7 @@ class Energy:
     free: Mask
     sharp: Mask
     light: Array
-    scales: Scales
+    shown_scales: Callable[[], Scales]
 
     def matrix(self) -> sparse.csr_array:
         """Of all parts ``(V, V)``, without damping."""
@@ -528,7 +528,7 @@ def linearize(
         voted.normals,
         normal_sigma=normal_sigma,
         row_sigma=row_sigma,
-        near=neighbors(observations, pairs, len(mesh.faces)),
+        pairs=pairs,
         weights=fit.light_weights,
         tolerances=tol.labels,
     )
@@ -609,7 +609,7 @@ def linearize(
         free=free,
         sharp=sharp,
         light=shares.mean(axis=1) if shares.size else np.zeros(2),
-        scales=_shown_scales(observations, mesh.face_normals, shares, fit),
+        shown_scales=partial(_shown_scales, observations, mesh.face_normals, shares, fit),
     )
 
 
@@ -686,7 +686,7 @@ def label(mesh: TriangleMesh, fit: Fit, *, min_cosine: float | None = None) -> L
         mesh.face_normals,
         normal_sigma=fit.tol.annealing[1],
         row_sigma=row_sigma,
-        near=neighbors(observations, pairs, len(mesh.faces)),
+        pairs=pairs,
         weights=fit.light_weights,
         tolerances=fit.tol.labels,
     )

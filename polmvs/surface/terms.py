@@ -17,7 +17,9 @@ heights above known points, and k the changes of the scale-free curvature. All l
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +27,17 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 
 from polmvs.camera import sample_image
+from polmvs.config import default_num_workers
 from polmvs.fitting import geman_mcclure_weights, robust_deviation
 from polmvs.geometry import dots, lengths, unit_or_zero
 from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
-from polmvs.surface.observations import KINDS, Observations
+from polmvs.surface.observations import DIFFUSE, SPECULAR, Observations
 from polmvs.surface.surface_view import SurfaceView
 
 EDGE_NOISE = 0.1  # of the sines of normals beside an edge: half of the difference of its sides
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # entries of a symmetric block
+PART = 100_000  # observations that a thread sums at a time: it bounds the memory
 RIM_HALVINGS = 4  # bisections of a pixel in the search for a mesh's outline: to a sixteenth
 
 Array = NDArray[np.float64]
@@ -182,20 +187,17 @@ class SharedError:
         self.slope = np.zeros(self.num)
         self._residual = self.prior * self.expected
 
-    def add(
-        self,
-        vertices: Indices,
-        jacobian: Array,
-        residual: Array,
-        weight: Array,
-        factor: Array | float = 1.0,
-    ) -> None:
-        """Residuals as in :meth:`Equations.add`, with the factors f."""
-        factor = np.broadcast_to(factor, residual.shape)
-        weighted = ((weight * factor)[:, None] * jacobian).ravel()
-        self.slope += np.bincount(vertices.ravel(), weighted, self.num)
-        self._weight += float(weight @ factor**2)
-        self._residual += float((weight * factor) @ residual)
+    def add(self, vertices: Indices, slope: Array, weight: float, residual: float) -> None:
+        """Sums over residuals as in :meth:`Equations.add`, with the factors f.
+
+        Parameters
+        ----------
+        vertices, slope : (N, 3), vertices and ``w f J``.
+        weight, residual : ``w f^2`` and ``w f r``.
+        """
+        self.slope += np.bincount(vertices.ravel(), slope.ravel(), self.num)
+        self._weight += weight
+        self._residual += residual
 
     def column(self) -> Array:
         """The vector u ``(num,)`` of the class's text."""
@@ -255,28 +257,51 @@ def add_phases(
     loss_scale : of the loss, in deviations.
     """
     o, num = observations, len(mesh.faces)
-    blocks, gradient = np.zeros((num, 9)), np.zeros((num, 3))
     change = normal_changes(mesh)
     along = dots(mesh.vertex_normals.take(mesh.faces, axis=0), mesh.face_normals[:, None]) / 3
     area = np.minimum(mesh.face_areas / independent_area, 1.0)
-    residuals, tilts = o.residuals(mesh.face_normals), o.tilt_slopes(mesh.face_normals)
-    precision = shares / variances
-    excess = precision - precision[::-1]
-    for kind in KINDS:
-        some = np.flatnonzero(excess[kind] > 0)
-        face, residual = o.face[some], residuals[kind, some]
-        weight = excess[kind, some] * area[face]
-        weight *= geman_mcclure_weights(residual, loss_scale**2 * variances[kind, some])
-        across = o.rows[kind, some] - residual[:, None] * mesh.face_normals.take(face, axis=0)
+
+    def sums(part: slice) -> tuple[Array, float, float]:
+        """Sums (F, 12) of some observations: blocks, gradients, slopes; and those of the tilt."""
+        face, precision = o.face[part], shares[:, part] / variances[:, part]
+        excess = precision[DIFFUSE] - precision[SPECULAR]
+        own = partial(_of_kind, excess > 0, part)
+        normals, rows = mesh.face_normals.take(face, axis=0), own(o.rows)
+        residual = dots(rows, normals)
+        weight = np.abs(excess) * area.take(face)
+        weight *= geman_mcclure_weights(residual, loss_scale**2 * own(variances))
+        across = rows - residual[:, None] * normals
         jacobian = np.einsum("nij,nj->ni", change.take(face, axis=0), across)
-        jacobian += along[face] * o.slope[kind, some][:, None]
-        for a in range(3):
-            weighted = weight * jacobian[:, a]
-            gradient[:, a] += np.bincount(face, weighted * residual, num)
-            for b in range(3):
-                blocks[:, 3 * a + b] += np.bincount(face, weighted * jacobian[:, b], num)
-        tilt.add(mesh.faces[face], jacobian, residual, weight, -tilts[kind, some])
-    equations.add_blocks(mesh.faces, blocks.reshape(-1, 3, 3), gradient)
+        jacobian += along.take(face, axis=0) * own(o.slope)[:, None]
+        factor = own(o.tilt) * dots(np.cross(o.rays[part], rows), normals)
+        weighted = weight[:, None] * jacobian
+        products = np.empty((len(face), 12))
+        for column, (a, b) in enumerate(UPPER):
+            products[:, column] = weighted[:, a] * jacobian[:, b]
+        products[:, 6:9] = residual[:, None] * weighted
+        products[:, 9:] = factor[:, None] * weighted
+        # Column k has its one entry in the row of the observation's face.
+        index = np.arange(len(face) + 1)
+        of_faces = sparse.csc_array((np.ones(len(face)), face, index), shape=(num, len(face)))
+        return of_faces @ products, float(weight @ factor**2), float((weight * factor) @ residual)
+
+    # Parts of a fixed length: on any number of cores the sums are rounded alike.
+    parts = [slice(k, k + PART) for k in range(0, len(o.face), PART)]
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        found = list(pool.map(sums, parts))
+    total: Array = sum((one[0] for one in found), np.zeros((num, 12)))
+    blocks = np.empty((num, 3, 3))
+    for column, (a, b) in enumerate(UPPER):
+        blocks[:, a, b] = blocks[:, b, a] = total[:, column]
+    equations.add_blocks(mesh.faces, blocks, total[:, 6:9])
+    weight, residual = sum(one[1] for one in found), sum(one[2] for one in found)
+    tilt.add(mesh.faces, total[:, 9:], weight, residual)
+
+
+def _of_kind(is_diffuse: Mask, part: slice, of_both: Floats) -> Floats:
+    """Values of one kind of light for some observations, from those of both ``(2, K, ...)``."""
+    chosen = is_diffuse.reshape(-1, *(1,) * (of_both.ndim - 2))
+    return np.where(chosen, of_both[DIFFUSE, part], of_both[SPECULAR, part])
 
 
 def add_votes(

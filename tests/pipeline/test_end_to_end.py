@@ -22,7 +22,7 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import PointKind
 
 BEFORE_CLOUDS = [
-    *("images", "sfm", "poses", "maps", "maps_tilted"),
+    *("images", "sfm", "poses", "maps", "maps_tilted", "silhouettes"),
     *(f"normals_{model}" for model in AngleModel),
     "seeds",
     *(f"sparse_cloud_{model}" for model in AngleModel),

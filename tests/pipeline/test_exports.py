@@ -144,7 +144,8 @@ def test_files_and_their_record(run: Path) -> None:
     names = {path.name for path in run.iterdir()}
     assert {"ppa.ply", "ppa_mesh.ply", "dense", "normals.ply", "run.json"} <= names
     assert stages_of(run) == [
-        *("images", "sfm", "poses", "maps", "normals_ppa", "seeds", "sparse_cloud_ppa"),
+        *("images", "sfm", "poses", "maps", "silhouettes"),
+        *("normals_ppa", "seeds", "sparse_cloud_ppa"),
         *("densify_ppa", "trust_ppa", "mesh_ppa", "dense_ppa"),
     ]
     assert Path(result_of(run, "dense_ppa")["folder"]) == run / "dense"

@@ -38,6 +38,7 @@ def finished_run(root: Path) -> RunFolder:
         ("images", "a.png"),
         ("sparse", "cameras.bin"),
         ("maps", "a.png.region.npy"),
+        ("silhouettes", "a.png.inner.npy"),
     ):
         (root / folder).mkdir(parents=True)
         (root / folder / name).write_bytes(b"x")

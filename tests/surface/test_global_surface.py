@@ -54,8 +54,13 @@ def maps():
     return phase_maps_of(sphere(), VIEWS, noise=np.radians(0.5))
 
 
-def reconstruct(maps, **kwargs):
-    return reconstruct_surface(PPA, maps, NO_SEEDS, NOTHING, tolerances=QUICK, **kwargs)
+def seen_in(maps, *, masks_given=False):
+    return [surface_view(one, find_silhouette(one, mask_given=masks_given)) for one in maps]
+
+
+def reconstruct(maps, *, tolerances=QUICK, masks_given=False, **kwargs):
+    views = seen_in(maps, masks_given=masks_given)
+    return reconstruct_surface(PPA, views, NO_SEEDS, NOTHING, tolerances=tolerances, **kwargs)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +121,7 @@ def test_the_faces_of_a_box_are_not_drawn_outwards_by_its_edges():
     """A mesh rounds edges; outlines must not make up for it by a larger box."""
     half = np.array([0.8, 0.6, 0.5])
     maps = phase_maps_of(box(half), VIEWS, noise=np.radians(0.5))
-    found = reconstruct_surface(PPA, maps, NO_SEEDS, NOTHING)
+    found = reconstruct(maps, tolerances=None)
     cloud = surface_points(found, maps, 0.5 * FOOTPRINT).cloud
     beyond = np.abs(cloud.points) - half
     side = beyond.argmax(axis=1)
@@ -197,7 +202,7 @@ def test_a_view_that_shows_half_of_the_object_takes_no_half_away(maps):
 
 
 def test_outlines_are_held_against_a_mesh(maps):
-    views = [surface_view(one, find_silhouette(one, mask_given=True)) for one in maps[:3]]
+    views = seen_in(maps[:3], masks_given=True)
     views[1] = surface_view(
         half_unpolarized(maps[1]), find_silhouette(half_unpolarized(maps[1]), mask_given=True)
     )
@@ -231,7 +236,7 @@ def test_thin_walls_are_found_by_a_finer_mesh():
     """Edges of 10 px jump over a wall of two; a level that loses it is left out."""
     maps = phase_maps_of(dish(), ring_of_views(16, elevations=(25.0, 50.0)))
     steps = []
-    found = reconstruct_surface(PPA, maps, NO_SEEDS, NOTHING, on_progress=steps.append)
+    found = reconstruct(maps, tolerances=None, on_progress=steps.append)
     assert not isinstance(found, Undetermined)
     assert found.contradictions.uncovered_share < 0.1
     assert sum(steps) <= num_surface_steps(len(maps))
@@ -260,9 +265,7 @@ def test_undetermined_is_said(maps):
 
 def test_progress_is_within_what_is_announced(maps):
     steps = []
-    reconstruct_surface(
-        PPA, maps[:4], NO_SEEDS, NOTHING, tolerances=QUICK, on_progress=steps.append
-    )
+    reconstruct(maps[:4], on_progress=steps.append)
     assert 0 < sum(steps) <= num_surface_steps(4)
 
 

@@ -66,7 +66,7 @@ def test_more_polarization_than_diffuse_light_can_have_is_specular():
 def test_neighbours_decide_where_an_observation_alone_does_not():
     mesh, seen = scene(dolp=0.009)
     pairs = pairs_of(mesh)
-    near = neighbors(seen, pairs, len(mesh.faces))
+    near = neighbors(seen.only(seen.view == 0), pairs, len(mesh.faces))
     assert (near.data >= 0).all()
     assert (near.data <= 1).all()
     assert np.median(near.data) > 0.9  # a smooth ball turns its phases slowly
@@ -77,7 +77,7 @@ def test_neighbours_decide_where_an_observation_alone_does_not():
     one = np.flatnonzero((seen.view == 0) & blind[seen.face] & (seen.cosine < 0.8))
     normals[seen.face[one]] = -seen.rays[one]
     alone = responsibilities(seen, normals, normal_sigma=0.1, row_sigma=ROW_SIGMA)
-    coupled = responsibilities(seen, normals, normal_sigma=0.1, row_sigma=ROW_SIGMA, near=near)
+    coupled = responsibilities(seen, normals, normal_sigma=0.1, row_sigma=ROW_SIGMA, pairs=pairs)
     assert np.median(alone[SPECULAR, one]) < 0.6
     assert np.median(coupled[SPECULAR, one]) > 0.9
 
@@ -85,10 +85,10 @@ def test_neighbours_decide_where_an_observation_alone_does_not():
 @pytest.mark.parametrize("light", [SPECULAR, DIFFUSE])
 def test_a_stated_light_is_that_of_all(light):
     mesh, seen = scene(diffuse_views=(1, 4))
-    near = neighbors(seen, pairs_of(mesh), len(mesh.faces))
+    pairs = pairs_of(mesh)
     weights = (1.0, 0.0) if light == SPECULAR else (0.0, 1.0)
     shares = responsibilities(
-        seen, mesh.face_normals, normal_sigma=0.1, row_sigma=ROW_SIGMA, near=near, weights=weights
+        seen, mesh.face_normals, normal_sigma=0.1, row_sigma=ROW_SIGMA, pairs=pairs, weights=weights
     )
     assert shares[1 - light].max() < 1e-6
 

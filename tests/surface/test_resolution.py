@@ -14,6 +14,8 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
 from polmvs.surface.global_surface import Undetermined, reconstruct_surface
 from polmvs.surface.integration import integrate
+from polmvs.surface.silhouettes import find_silhouette
+from polmvs.surface.surface_view import surface_view
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Sphere
 
@@ -106,7 +108,8 @@ def surfaces():
     @cache
     def at(scale):
         maps = noisy_maps_around(scale)
-        found = reconstruct_surface(AngleModel.PPA, maps, none, np.zeros((0, 3)))
+        views = [surface_view(one, find_silhouette(one, mask_given=False)) for one in maps]
+        found = reconstruct_surface(AngleModel.PPA, views, none, np.zeros((0, 3)))
         assert not isinstance(found, Undetermined)
         return found
 

@@ -6,7 +6,13 @@ import pytest
 from analytic_objects import looking_at, phase_map_of, sphere
 
 from polmvs.polarization.region import Region
-from polmvs.surface.silhouettes import SilhouetteTolerances, _outline_shift, find_silhouette
+from polmvs.surface.silhouettes import (
+    SilhouetteTolerances,
+    _outline_shift,
+    find_silhouette,
+    open_silhouette,
+    store_silhouette,
+)
 from polmvs.surface.surface_view import FAR_PX, Silhouette, signed_distance_px
 
 VIEW = looking_at((5.0, 0, 2.0))
@@ -143,3 +149,16 @@ def test_the_nearer_outline_counts_in_doubt():
     residual, gradient = rim_residuals(view, xy)
     assert residual == pytest.approx([2, -2, -2], abs=0.1)
     assert gradient[:, 0] == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("mask_given", [True, False])
+def test_stored_silhouettes_are_as_they_were(ball, tmp_path, mask_given):
+    inside = ball.region.inside.copy()
+    inside[:, 86:] = False
+    made = found_silhouette(with_region(ball, inside), mask_given=mask_given)
+    store_silhouette(made, tmp_path, "a.png")
+    read = open_silhouette(tmp_path, "a.png")
+    assert (made.inner_shift is None) == mask_given
+    assert read.is_sharp == made.is_sharp
+    for name in ("certain", "possible", "inner", "outer"):
+        assert np.array_equal(getattr(read, name), getattr(made, name)), name

@@ -271,7 +271,8 @@ def test_a_shared_error_is_eliminated_exactly():
     factor = rng.standard_normal(40)
     equations, shared = Equations(8), SharedError(8, prior=3.0, expected=0.7)
     equations.add(vertices, jacobian, residual, weight)
-    shared.add(vertices, jacobian, residual, weight, factor)
+    slope = (weight * factor)[:, None] * jacobian
+    shared.add(vertices, slope, weight @ factor**2, (weight * factor) @ residual)
     column = shared.column()
     gradient = equations.gradient - column * shared.offset()
     found = solve(equations.matrix(), -gradient, np.full(8, 0.1), column[None])

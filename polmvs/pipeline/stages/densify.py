@@ -39,6 +39,7 @@ from polmvs.pipeline.run_folder import (
 from polmvs.pipeline.stages.maps import open_maps, posed_views
 from polmvs.pipeline.stages.poses import load_floats
 from polmvs.pipeline.stages.seeds import load_seeds
+from polmvs.pipeline.stages.silhouettes import open_surface_views
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
@@ -192,7 +193,7 @@ def densify(
         new_views.mkdir()
         found = None
         if options.propagation.method is Method.SURFACE:
-            found = _global_surface(given, sparse.tracks, new_views, kept / "kept")
+            found = _global_surface(given, folder, sparse.tracks, new_views, kept / "kept")
         if found is None:
             found = _dense_surface(given, kept, new_views)
         modes = CameraModes(sparse.tracks.points_in_world, load_floats(folder.camera_modes))
@@ -284,7 +285,9 @@ def unused_options(
     return sentences
 
 
-def _global_surface(given: _Inputs, tracks: Tracks, views: Path, kept: Path) -> _Surface | None:
+def _global_surface(
+    given: _Inputs, folder: RunFolder, tracks: Tracks, views: Path, kept: Path
+) -> _Surface | None:
     """The surface of all views; None where silhouettes do not bound the objects.
 
     Its mesh and its depth in each view go to ``views``, what it is made from meanwhile to ``kept``,
@@ -296,10 +299,9 @@ def _global_surface(given: _Inputs, tracks: Tracks, views: Path, kept: Path) -> 
     kept.mkdir()
     surface = reconstruct_surface(
         model.formula,
-        maps,
+        open_surface_views(folder, maps, folder=kept),
         given.seeds,
         sparse_surroundings(tracks, maps).points,
-        masks_given=options.region.mask is not None,
         light=options.region.light,
         tilt_aware=given.tilt_aware,
         min_views=fusion.min_views,

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from polmvs.colmap.models import read_model
-from polmvs.config import Options, default_num_workers
+from polmvs.config import Options
 from polmvs.evaluation.trust import Trust, measure_trust
 from polmvs.io.clouds import read_cloud, read_mesh
 from polmvs.normals.camera_check import PhaseRows, fit_camera
@@ -23,15 +21,15 @@ from polmvs.pipeline.stages.maps import MapsResult, open_maps
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import load_seeds
 from polmvs.pipeline.stages.sfm import SfmResult
+from polmvs.pipeline.stages.silhouettes import open_surface_views
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind, evenly_spread
 from polmvs.surface.held_out import HeldOutTolerances, predict, predict_left_out
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import DIFFUSE, SPECULAR, Looking, level_image, observe
-from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.soundness import find_soundness
-from polmvs.surface.surface_view import SurfaceView, surface_view
+from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.surroundings import sparse_surroundings
 from polmvs.surface.terms import KnownPoints, TermTolerances
 from polmvs.surface.visual_hull import supporting_plane
@@ -100,9 +98,7 @@ def _contradicted(
     outside, light = open_outside(folder, model), options.region.light
     tilt_aware = options.normals.tilt_aware_weights
     looking = Looking(angle_model=model, tilt_aware=tilt_aware, tilt_share=made.tilt_share)
-    look = partial(_surface_view, masks_given=options.region.mask is not None)
-    with ThreadPoolExecutor(default_num_workers()) as pool:
-        seen = list(pool.map(look, maps))
+    seen = open_surface_views(folder, maps)
     mesh = TriangleMesh.of(read_mesh(views / SURFACE_MESH))
     wrong_camera = _camera_complaint(mesh, seen, looking, light)
     return replace(
@@ -160,7 +156,3 @@ def _camera_complaint(
         return None
     logger.info("%s", fit.message(camera))
     return None if fit.agrees else fit.message(camera)
-
-
-def _surface_view(phase_map: PhaseMap, *, masks_given: bool) -> SurfaceView:
-    return surface_view(phase_map, find_silhouette(phase_map, mask_given=masks_given))
