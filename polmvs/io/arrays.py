@@ -80,7 +80,7 @@ def map_array(path: Path, kind: npt.DTypeLike | None = None) -> NDArray[Any]:
 
 
 # Arrays of the current views: mapped and read pages count as resident memory.
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=16)
 def _map_array(path: Path, stamp: int) -> NDArray[Any]:
     # A plain array over the map: OpenCV takes it without a copy.
     return np.asarray(np.lib.format.open_memmap(path, mode="r"))

@@ -139,24 +139,25 @@ def test_a_run_killed_at_any_moments_comes_to_the_same(
     assert max(kills_of_runs) > 1
 
 
+@pytest.mark.parametrize("first", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_run_interrupted_in_any_stage_goes_on(
-    call: Call, given, undisturbed, tmp_path: Path
+    call: Call, given, undisturbed, tmp_path: Path, first: int
 ) -> None:
     """By Ctrl-C and by a plain kill: one line, whole stages only, nothing and nobody left."""
     expected, _, stages = undisturbed
     out = tmp_path / "out"
     again = ["reconstruct", given[0], out, *given[1:], *FLAGS]
     for index, stage in enumerate(stages):
-        for number in (signal.SIGINT, signal.SIGTERM):
-            done = call(*again, number=number, stage=stage)
-            assert done["status"] == 130, (stage, number)
-            line = "interrupted; finished stages are kept, go on with --resume"
-            assert (done["stdout"], done["stderr"]) == ("", f"polmvs reconstruct: {line}\n")
-            assert done["orphans"] == []
-            assert stages_of(out) == stages[:index]
-            assert [path.name for path in out.rglob(".*")] == []
-            if "--resume" not in again:
-                again.append("--resume")
+        number = (signal.SIGINT, signal.SIGTERM)[(index + first) % 2]
+        done = call(*again, number=number, stage=stage)
+        assert done["status"] == 130, (stage, number)
+        line = "interrupted; finished stages are kept, go on with --resume"
+        assert (done["stdout"], done["stderr"]) == ("", f"polmvs reconstruct: {line}\n")
+        assert done["orphans"] == []
+        assert stages_of(out) == stages[:index]
+        assert [path.name for path in out.rglob(".*")] == []
+        if "--resume" not in again:
+            again.append("--resume")
     assert call(*again)["status"] == 0
     assert results_of(out) == expected
 
