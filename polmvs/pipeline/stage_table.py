@@ -265,13 +265,12 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
     table.append(
         StageSpec(
             name="silhouettes",
-            command=DENSIFY,
+            command=NORMALS,
             reads=(HERE.sparse, HERE.maps(ppa)),
             writes=(HERE.silhouettes,),
-            decides=("region.mask", "propagation.method"),
+            decides=("region.mask",),
             work=lambda run: silhouettes.find_silhouettes(
                 run.run_folder,
-                run.options.propagation.method,
                 masks_given=run.options.region.mask is not None,
                 workers=run.workers,
                 on_progress=run.on_progress,

@@ -44,8 +44,8 @@ class BorderTolerances:
         poses add to it. Measured likewise: 0.8, 1.2, 1.5 deg with twice, once, half.
     sigmas : deviations beyond which an edge counts as false. Measured likewise: 1.3 and 1.0 deg
         with twice and half.
-    fit_decay : factor per round of the turning angle below which the penalty is quadratic: its
-        square root moves those walls by less than 0.1 deg.
+    fit_decay : the penalty is quadratic below a turning angle, which shrinks by this factor in each
+        round. Measured: with its square root those walls turn by less than 0.1 deg.
     at_rest : displacement below which the curve has converged: below the deviation.
     max_passes : searches for edges across the moved curve. Measured likewise: 1.2 and 1.1
         deg with 3 and 10.

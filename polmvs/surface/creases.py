@@ -33,10 +33,11 @@ class CreaseTolerances:
 
     Attributes
     ----------
-    like_sine : deviation of the difference of normals that are averaged. Above the noise of fitted
-        normals (1 to 3 deg) and the curvature of a face, below the edges of parts. Measured on five
-        captures: with 0.4 for 0.2 the F-score at 1 mm falls by 0.2 to 1.4 points. A face's vertices
-        are free to move if its own normal differs from the given one by half of this.
+    like_sine : width of the Gaussian, in differences of unit normals, by which neighbouring normals
+        are averaged. Above the noise of fitted normals (1 to 3 deg) and the curvature of a face,
+        below the edges of parts. Measured on five captures: with 0.4 for 0.2 the F-score at 1 mm
+        falls by 0.2 to 1.4 points. A face's vertices are free to move if its own normal differs
+        from the given one by half of this.
     crease_deg : between normals of different sides, of a mesh, of its phases and of planar patches:
         a face across a right-angled edge is turned by at most 45 deg. Measured: 60 for the corners
         costs an analytic bracket 0.24 deg, 50 for the phases' normals 0.4 points of F at 1 mm; half

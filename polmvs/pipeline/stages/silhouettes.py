@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from polmvs.config import Method, default_num_workers
+from polmvs.config import default_num_workers
 from polmvs.parallel import OnProgress, Workers, no_progress
 from polmvs.pipeline.run_folder import RunFolder, replacing
 from polmvs.pipeline.stages.maps import open_maps
@@ -27,7 +27,7 @@ class SilhouettesResult:
 
     Attributes
     ----------
-    num_silhouettes : views with pixels of an object; 0 as well where the method needs none.
+    num_silhouettes : views with pixels of an object.
     """
 
     num_silhouettes: int
@@ -38,7 +38,6 @@ class SilhouettesResult:
 
 def find_silhouettes(
     run_folder: RunFolder,
-    method: Method,
     *,
     masks_given: bool,
     workers: Workers | None = None,
@@ -49,11 +48,10 @@ def find_silhouettes(
     Parameters
     ----------
     run_folder : with the phase maps; the silhouettes are written whole or not at all.
-    method : of the surface; only that from all views uses silhouettes.
     masks_given : the maps' regions are the user's masks.
     """
     workers = workers or Workers()
-    maps = open_maps(run_folder, AngleModel.PPA) if method is Method.SURFACE else []
+    maps = open_maps(run_folder, AngleModel.PPA)
     num = 0
     with replacing(run_folder.silhouettes) as folder, workers.stopped_on_error():
         for shows_object in workers.map(partial(_find, folder, masks_given), maps):
