@@ -122,6 +122,7 @@ def test_a_scheduler_that_comes_back(tmp_path) -> None:
         cluster.close(cancel=False)
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_does_not(tmp_path) -> None:
     patience = ClusterPatience(connect_s=0.5, workers_s=0.5, return_s=1)
     first = local_cluster(1)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from fuzzing.readers import KINDS
 
 ROUNDS = 25
@@ -26,6 +27,7 @@ def test_every_reader_survives_damaged_files(tmp_path: Path) -> None:
     assert len(lines) == ROUNDS * len(KINDS) >= 1000
 
 
+@pytest.mark.slow
 def test_a_fault_is_found(tmp_path: Path) -> None:
     """Neither another exception, nor an error without a name, nor a hang passes."""
     script = """
@@ -44,6 +46,8 @@ def fail(path):
 fuzz.MAX_SECONDS = 1
 readers.KINDS = {"a": readers.text("a.txt", "sound", fail)}
 from pathlib import Path
+
+import pytest
 sys.exit(fuzz.fuzz(Path(sys.argv[3]), 0, 3, []))
 """
     for index, kind in enumerate(("name", "other", "hang")):

@@ -244,6 +244,7 @@ def assert_finished_but_empty(out: Path) -> None:
     assert result_of(out, "densify_ppa")["num_points"] == 0
 
 
+@pytest.mark.slow
 def test_no_polarized_region(cli, demo_run: Path, demo_capture: Path, tmp_path: Path) -> None:
     """The bundled capture with each cell's four samples made equal."""
     capture, out = tmp_path / "capture", tmp_path / "out"

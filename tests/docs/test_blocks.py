@@ -35,7 +35,16 @@ def runnable(page: Path) -> list[Block]:
     return [block for block in blocks(page) if block.kind in RUN and block.why_not is None]
 
 
-PAGES = [page for page in pages() if runnable(page)]
+LONG = ("tutorial",)  # more commands than others
+PAGES = [
+    pytest.param(
+        page,
+        marks=pytest.mark.slow if page.stem in LONG else (),
+        id=f"{page.parent.name}-{page.stem}",
+    )
+    for page in pages()
+    if runnable(page)
+]
 
 
 @pytest.fixture(scope="session")
@@ -74,7 +83,7 @@ def test_the_command_of_the_tests_is_one(page: str) -> None:
     assert TESTS in (ROOT / page).read_text()
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}-{page.stem}")
+@pytest.mark.parametrize("page", PAGES)
 def test_the_blocks_of_a_page(page: Path, workplace: Path) -> None:
     names: dict[str, object] = {}
     for block in runnable(page):

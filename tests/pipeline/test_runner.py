@@ -354,6 +354,7 @@ def test_all_models_clouds_flag_the_same_seeds(
         np.testing.assert_array_equal(cloud.scalars["seed"], clouds[0].scalars["seed"])
 
 
+@pytest.mark.slow
 def test_evaluation_of_other_models_is_done_again(
     demo_run: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:

@@ -267,6 +267,7 @@ def test_keys_turn_and_zoom(opened: Opened, key: str) -> None:
     assert opened.drawing() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("opened", [390], indirect=True)
 def test_colours_frusta_and_layout_can_be_chosen(opened: Opened) -> None:
     page = opened.page

@@ -162,6 +162,7 @@ def test_a_lamp_that_moves_with_the_camera_tells_nothing():
     assert find_object(capture(printed(), lamp=True), TABLE, table_points()) is None
 
 
+@pytest.mark.slow
 def test_what_polarization_shows_is_left_to_it(white):
     tracks = tracks_on_table()
     found = hidden_plane(white, tracks)
