@@ -56,7 +56,7 @@ from polmvs.normals.estimator import EstimatorTolerances, solve_normals
 from polmvs.normals.single_view.plane import plane_normal
 from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import compare, reconstruct
-from polmvs.pipeline.record import Record, versions
+from polmvs.pipeline.record import POSE_STAGES, Record, versions
 from polmvs.pipeline.run_folder import RUN_FILE, RunFolder
 from polmvs.pipeline.runner import Job, load_record
 from polmvs.pipeline.stages.images import write_images
@@ -150,7 +150,7 @@ def timing_table(records: Mapping[str, Record]) -> str:
 
 
 def _without_poses(times: Mapping[str, float]) -> float:
-    return sum(time for name, time in times.items() if name not in ("sfm", "poses"))
+    return sum(time for name, time in times.items() if name not in POSE_STAGES)
 
 
 def _stage_cells(name: str, records: Mapping[str, Record]) -> list[str]:

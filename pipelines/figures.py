@@ -27,6 +27,7 @@ from polmvs.io.plain_files import read_text
 from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.pipeline.batch import BatchEntry, read_batch
 from polmvs.pipeline.jobs import reconstruct
+from polmvs.pipeline.record import POSE_STAGES
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import Job, load_record
 from polmvs.pipeline.stages.poses import PosesResult
@@ -126,7 +127,7 @@ def _figures(entry: BatchEntry, out: Path) -> Figures:
     cloud = None
     if gt is not None and folder.cloud(model).is_file():
         cloud = evaluate_file(folder.cloud(model), gt, folder.sparse).cloud
-    stages = [stage for stage in record.stages if stage.name not in ("sfm", "poses")]
+    stages = [stage for stage in record.stages if stage.name not in POSE_STAGES]
     return Figures(
         name=entry.name,
         views=None if poses is None else poses.num_views,

@@ -32,7 +32,7 @@ from polmvs.geometry import lengths
 from polmvs.io.clouds import Mesh, read_mesh, write_mesh
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.io.images import write_bytes
-from polmvs.pipeline.record import Record
+from polmvs.pipeline.record import POSE_STAGES, Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import load_record
 from polmvs.polarization.kinds import AngleModel
@@ -181,7 +181,7 @@ def tables(results: Sequence[SizeResult]) -> str:
         header += [f"{result.width} px, s", "CPU s", "peak MB", *(["ratio of s"] if index else [])]
     rows = [[name, *_cells(results, {name})] for name in names]
     rows.append(["all", *_cells(results, set(names))])
-    rows.append(["all but poses", *_cells(results, set(names) - {"sfm", "poses"})])
+    rows.append(["all but poses", *_cells(results, set(names) - POSE_STAGES)])
     errors = [
         [str(r.width), *(f"{100 * share:.1f}" for share in r.f_score), number(r.normal_median_deg)]
         for r in results

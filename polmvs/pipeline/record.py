@@ -23,8 +23,9 @@ R = TypeVar("R")
 # 1: the first releases, which did not name it. 2: stages with their results. 3: SfM as a stage of
 # its own, trust, notes on the capture. 4: seeds are sparse points alone. 5: what stages wrote.
 # 6: covariances of the poses. 7: what tells the content of the input, number of files.
-# 8: views that a surface leaves out. 9: trust's verdict, and what it is told from.
-SCHEMA_VERSION = 9
+# 8: views that a surface leaves out. 9: trust's verdict, and what it is told from. 10: silhouettes.
+SCHEMA_VERSION = 10
+POSE_STAGES = frozenset({"sfm", "poses"})  # nearly all of their time is COLMAP's
 
 
 @dataclass(frozen=True, kw_only=True)
