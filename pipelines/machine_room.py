@@ -1,6 +1,6 @@
 """A folder of captures on a Dask cluster: efficiency, a lost worker, and equal results.
 
-    python pipelines/machine_room.py WORK [--captures 20] [--views 8] [--width 306]
+    python pipelines/machine_room.py WORK [--captures 20] [--views 12] [--width 306]
 
 Renders captures of several shapes, materials and lights, and reconstructs all of them with
 ``polmvs batch``: by one process, by two workers of a Dask cluster, and by four, of which one is
@@ -59,7 +59,7 @@ class Arguments(OptionGroup, group="arguments", in_files=False):
 
     work: Path = option(MISSING, "folder of the captures and runs", positional=True)
     captures: int = option(20, "number of captures", least=4)
-    views: int = option(8, "of each capture", least=3)
+    views: int = option(12, "of each capture", least=3)
     width: int = option(306, "of the mosaics, px", least=64)
 
 
