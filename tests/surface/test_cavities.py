@@ -11,7 +11,7 @@ from polmvs.polarization.phase_map import build_phase_map
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
 from polmvs.surface.cavities import CavityTolerances, SurfaceFaces, find_cavities
-from polmvs.surface.offsets import face_scene
+from polmvs.surface.offsets import OffsetTolerances, face_scene
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Cylinder, Group, Plane
 
@@ -130,6 +130,15 @@ def test_a_mouth_is_found_by_its_darkness(harm):
     maps = vessel_maps(**harm)
     (cavity,) = find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA))
     assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
+
+
+def test_a_plane_found_from_few_faces_has_all_of_its_faces():
+    """The planes of a surface come from a sample, in which the rim may be a few faces."""
+    surface, scene = closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA)
+    few = OffsetTolerances(num_trials=150)
+    (cavity,) = find_cavities(surface, scene, offset_tolerances=few)
+    (expected,) = find_cavities(surface, scene)
+    assert cavity.thickness == pytest.approx(expected.thickness, abs=0.1 * FOOTPRINT)
 
 
 def test_a_mouth_is_round_though_its_cells_are_not():
