@@ -93,6 +93,8 @@ def _run(call: Call, terminal: Terminal) -> int:
             start, cpu = time.monotonic(), _cpu_s()
             _reconstruct(captures, out, num, kills)
             rows = _rows(out)
+            if len(rows) != arguments.captures:
+                raise PolmvsError(f"{out}: {len(rows)} captures are done; see {out}/batch.md.")
             states = [row["state"] for row in rows]
             results.append(
                 WayResult(
@@ -140,7 +142,7 @@ def _reconstruct(captures: Path, out: Path, num_workers: int, kills: bool) -> No
     command = [sys.executable, "-m", "polmvs", "batch", str(captures), str(out)]
     command += ["--overwrite", "--quiet", "--workers", "1"]
     if not num_workers:
-        _finished(subprocess.run(command, check=False).returncode, command)
+        subprocess.run(command, check=False)
         return
     with _cluster(num_workers, out.parent) as (address, workers):
         batch = subprocess.Popen([*command, "--scheduler", address])
@@ -149,12 +151,7 @@ def _reconstruct(captures: Path, out: Path, num_workers: int, kills: bool) -> No
                 workers[0].kill()
                 break
             time.sleep(0.2)
-        _finished(batch.wait(), command)
-
-
-def _finished(status: int, command: Sequence[str]) -> None:
-    if status not in (0, 3):  # 3: there is a capture without points
-        raise PolmvsError(f"{' '.join(command)} failed.")
+        batch.wait()
 
 
 @contextmanager
