@@ -596,6 +596,10 @@ class FusionOptions(OptionGroup, group="fusion"):
         "edge of the merging voxel in units of the model, instead of `fusion.voxel_px`; 0: none",
         least=0,
     )
+    inferred: bool = option(
+        True,
+        "keep surface that no phase shows: the inner walls of a cavity, inferred from its opening",
+    )
     surroundings: Surroundings = option(
         Surroundings.SPARSE,
         "what the cloud holds beside the polarized parts: nothing, the sparse points, or points "

@@ -137,6 +137,11 @@ class GlobalSurface:
     tilt_share: float
     left_out: Mask
 
+    def shown(self) -> GlobalSurface:
+        """The surface without the inferred faces."""
+        seen = self.supported & ~self.inferred
+        return replace(self, supported=seen, inferred=np.zeros_like(seen))
+
 
 @dataclass(frozen=True)
 class Undetermined:

@@ -264,6 +264,19 @@ def test_undetermined_is_said(maps):
     assert "no common object" in reconstruct(with_regions(maps, corner)).reason
 
 
+def test_inferred_faces_can_be_left_out(surface, maps):
+    """Neither mesh nor cloud then has them."""
+    upper = surface.mesh.centers[:, 2] > 0
+    guessed = replace(surface, inferred=surface.supported & upper)
+    assert surface_points(guessed, maps, 0.5 * FOOTPRINT).inferred.any()
+    shown = guessed.shown()
+    assert supported_mesh(shown).vertices[:, 2].max() < supported_mesh(guessed).vertices[:, 2].max()
+    assert len(supported_mesh(shown).triangles) == (surface.supported & ~upper).sum()
+    cloud = surface_points(shown, maps, 0.5 * FOOTPRINT)
+    assert not cloud.inferred.any()
+    assert cloud.cloud.points[:, 2].max() < 2.5 * FOOTPRINT  # an edge of a face
+
+
 def test_progress_is_within_what_is_announced(maps):
     steps = []
     reconstruct(maps[:4], on_progress=steps.append)

@@ -70,6 +70,7 @@ T = TypeVar("T", bound=np.generic)
 
 # Options that a method ignores.
 _OF_CONTOURS = ("propagation.contour", "propagation.step_px", "propagation.spacing_px")
+_INFERRED = "fusion.inferred"
 UNUSED: Mapping[Method, tuple[str, ...]] = {
     Method.SURFACE: (
         *_OF_CONTOURS,
@@ -79,8 +80,8 @@ UNUSED: Mapping[Method, tuple[str, ...]] = {
         "fusion.max_range_difference_px",
         "fusion.max_normal_difference_deg",
     ),
-    Method.INTEGRATE: _OF_CONTOURS,
-    Method.CONTOUR: (),
+    Method.INTEGRATE: (*_OF_CONTOURS, _INFERRED),
+    Method.CONTOUR: (_INFERRED,),
 }
 
 OUTSIDE = "{name}.outside.npy"  # among dense views: pixels that show nothing within the box
@@ -316,6 +317,8 @@ def _global_surface(
             surface.reason,
         )
         return None
+    if not fusion.inferred:
+        surface = surface.shown()
     for sentence in surface.contradictions.warnings():
         logger.warning("%s: %s.", model, sentence)
     scene = RayScene(surface.mesh)
