@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from polmvs.camera import sample_image
-from polmvs.io.arrays import map_array, save_array
+from polmvs.io.arrays import StoredArray, map_array, save_array
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import RegionTolerances
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX, Silhouette, signed_distance_px
@@ -101,7 +101,7 @@ def store_silhouette(silhouette: Silhouette, folder: Path, name: str) -> None:
     shifts = {"inner": silhouette.inner_shift, "outer": silhouette.outer_shift}
     for which, shift in shifts.items():
         if shift is not None:
-            save_array(folder / f"{name}.{which}.npy", shift)
+            save_array(folder / f"{name}.{which}.npy", np.asarray(shift))
 
 
 def open_silhouette(folder: Path, name: str) -> Silhouette:
@@ -114,7 +114,7 @@ def open_silhouette(folder: Path, name: str) -> Silhouette:
     """
     flags = map_array(folder / f"{name}.silhouette.npy", np.uint8)
     paths = (folder / f"{name}.{which}.npy" for which in ("inner", "outer"))
-    shifts = (map_array(path, np.float32) if path.exists() else None for path in paths)
+    shifts = (StoredArray(path) if path.exists() else None for path in paths)
     return Silhouette(flags & 1 > 0, flags & 2 > 0, *shifts)
 
 

@@ -110,7 +110,7 @@ def face_evidence(
         seen, xy = seen[inside], xy[inside]
         counts[0, seen] += 1
         if view.has_outline:
-            beyond = sample_image(view.silhouette.outer, xy)[:, 0] > tol.outside_px
+            beyond = sample_image(view.silhouette.outer, xy) > tol.outside_px
             counts[1, seen[beyond]] += 1
     face, num = labelled.observations.face, len(mesh.faces)
     counts[2] = np.bincount(face, minlength=num)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.camera import in_frame
-from polmvs.io.arrays import kept_array
+from polmvs.io.arrays import StoredArray, kept_array
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
 
@@ -39,17 +39,17 @@ class Silhouette:
 
     certain: Mask
     possible: Mask
-    inner_shift: Image | None = None
-    outer_shift: Image | None = None
+    inner_shift: Image | StoredArray | None = None
+    outer_shift: Image | StoredArray | None = None
 
     @cached_property
     def inner(self) -> Image:
-        """(H, W, 3): signed distance to ``certain`` in px, negative inside, and its gradient."""
+        """(H, W): signed distance to the outline of ``certain``, px, negative inside."""
         return _distance_field(self.certain, self.inner_shift)
 
     @cached_property
     def outer(self) -> Image:
-        """(H, W, 3): as ``inner``, of ``possible``."""
+        """(H, W): as ``inner``, of ``possible``."""
         return self.inner if self.is_sharp else _distance_field(self.possible, self.outer_shift)
 
     @cached_property
@@ -96,15 +96,13 @@ def _distance_px(pixels: NDArray[np.uint8]) -> Image:
         cv2.ipp.setUseIPP(used)
 
 
-def _distance_field(mask: Mask, shift: Image | None) -> Image:
+def _distance_field(mask: Mask, shift: Image | StoredArray | None) -> Image:
     distance = cv2.GaussianBlur(
         signed_distance_px(mask), (0, 0), FIELD_SMOOTHING_PX, borderType=cv2.BORDER_REPLICATE
     )
     if shift is not None:
-        distance = np.asarray(distance - shift, np.float32)
-    dx = cv2.Sobel(distance, cv2.CV_32F, 1, 0, scale=1 / 8)
-    dy = cv2.Sobel(distance, cv2.CV_32F, 0, 1, scale=1 / 8)
-    return np.dstack([distance, dx, dy]).astype(np.float32)
+        distance = distance - np.asarray(shift)
+    return np.asarray(distance, np.float32)
 
 
 @dataclass(frozen=True)

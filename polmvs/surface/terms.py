@@ -38,6 +38,8 @@ from polmvs.surface.surface_view import SurfaceView
 EDGE_NOISE = 0.1  # of the sines of normals beside an edge: half of the difference of its sides
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # entries of a symmetric block
 PART = 100_000  # observations that a thread sums at a time: it bounds the memory
+# A point and those beside it by whose difference a field's gradient is computed, px.
+BESIDE_PX = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 RIM_HALVINGS = 4  # bisections of a pixel in the search for a mesh's outline: to a sixteenth
 
 Array = NDArray[np.float64]
@@ -425,12 +427,12 @@ def rim_residuals(view: SurfaceView, xy: Array) -> tuple[Array, Array]:
 
     Where the silhouette has unknown pixels, the nearer of its two outlines is used.
     """
-    inner = sample_image(view.silhouette.inner, xy).astype(np.float64)
-    if view.silhouette.is_sharp:
-        return inner[:, 0], inner[:, 1:]
-    outer = sample_image(view.silhouette.outer, xy).astype(np.float64)
-    chosen = np.where((np.abs(outer[:, 0]) < np.abs(inner[:, 0]))[:, None], outer, inner)
-    return chosen[:, 0], chosen[:, 1:]
+    places = xy[:, None] + BESIDE_PX
+    field = sample_image(view.silhouette.inner, places).astype(np.float64)
+    if not view.silhouette.is_sharp:
+        outer = sample_image(view.silhouette.outer, places).astype(np.float64)
+        field = np.where(np.abs(outer[:, :1]) < np.abs(field[:, :1]), outer, field)
+    return field[:, 0], 0.5 * (field[:, 1::2] - field[:, 2::2])
 
 
 @dataclass(frozen=True)

@@ -229,7 +229,7 @@ def hull_values(
     for index, view in enumerate(views):
         xy, z = view.project(points)
         seen = view.in_image(xy, 1.0) & (z > 0)
-        pixels = sample_image(view.silhouette.outer, xy)[:, 0]
+        pixels = sample_image(view.silhouette.outer, xy)
         of_views[index] = np.where(seen, pixels * (z / view.view.camera.mean_focal_px), -OUTSIDE)
         num_seen += seen
     largest = np.sort(of_views, axis=0)[::-1]
