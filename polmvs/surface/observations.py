@@ -185,7 +185,7 @@ def _rows_of(
 
 @dataclass(frozen=True)
 class Observations:
-    """K observations of the faces of a mesh.
+    """K observations of the faces of a mesh, in float32.
 
     Attributes
     ----------
@@ -199,15 +199,15 @@ class Observations:
 
     face: Indices
     view: Indices
-    rays: Array
-    cosine: Array
+    rays: Floats
+    cosine: Floats
     rows: Floats
     turn_variance: Floats
     tilt: Floats
     axial: Floats
     dolp: Floats
     sigma_dolp: Floats
-    slope: Array
+    slope: Floats
 
     def of_views(self) -> list[slice]:
         """Where the observations of each view are that has some."""
@@ -323,8 +323,8 @@ def _observe_view(
     return Observations(
         face=face,
         view=np.full(len(face), index),
-        rays=rays,
-        cosine=cosine,
-        slope=slope,
+        rays=rays.astype(np.float32),
+        cosine=cosine.astype(np.float32),
+        slope=slope.astype(np.float32),
         **vars(found),
     )
