@@ -6,22 +6,23 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from polmvs.parallel import Workers
 from polmvs.pipeline.runner import Job, open_run
-from polmvs.threads import one_blas_thread
+from polmvs.pipeline.stage_table import StageSpec
+from polmvs.threads import one_thread_each
 
 
-def blas_threads():
-    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+def threads(kind):
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == kind}
 
 
 def cores_taken(_):
-    return blas_threads(), cv2.getNumThreads()
+    return threads("blas"), cv2.getNumThreads()
 
 
 def test_the_users_threads_are_given_back() -> None:
     with threadpool_limits(2, user_api="blas"):
-        with one_blas_thread():
-            assert blas_threads() == {1}
-        assert blas_threads() == {2}
+        with one_thread_each():
+            assert threads("blas") == {1}
+        assert threads("blas") == {2}
 
 
 def test_each_worker_keeps_to_one_core(monkeypatch) -> None:
@@ -31,7 +32,15 @@ def test_each_worker_keeps_to_one_core(monkeypatch) -> None:
 
 
 def test_a_run_keeps_to_one_thread(demo_capture, tmp_path) -> None:
+    seen = []
+    stage = StageSpec(
+        name="toy",
+        command="toy",
+        writes=(),
+        work=lambda run: seen.append(threads("blas") | threads("openmp")),
+        result=type(None),
+    )
     job = Job(capture=demo_capture, out=tmp_path / "out")
-    run = open_run(job, table=(), min_images=3, taken_over=())
-    with threadpool_limits(2, user_api="blas"), run:
-        assert blas_threads() == {1}
+    with threadpool_limits(2), open_run(job, table=(stage,), min_images=3, taken_over=()) as run:
+        run.do(stage)
+    assert seen == [{1}]

@@ -73,7 +73,7 @@ from polmvs.pipeline.stages.densify import DensifyResult
 from polmvs.pipeline.stages.images import image_names
 from polmvs.polarization.capture import open_capture
 from polmvs.polarization.kinds import AngleModel
-from polmvs.threads import one_blas_thread
+from polmvs.threads import one_thread_each
 
 logger = logging.getLogger(__name__)
 
@@ -236,6 +236,7 @@ class Run(StageInput):
         with (
             self.monitor.stage(spec.name, spec.num_steps(self)) as self.on_progress,
             _kept(logging.WARNING) as said,
+            one_thread_each(),
         ):
             result = spec.work(self)
             peak_mb = memory.mb()
@@ -508,7 +509,6 @@ def open_run(
     # Workers end before the lock: what they were at may be cleared away then.
     with (
         quiet_colmap(),
-        one_blas_thread(),
         locked(job.out),
         _workers(job, plan) as workers,
     ):
