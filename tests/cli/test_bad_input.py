@@ -263,6 +263,7 @@ def test_no_polarized_region(cli, demo_run: Path, demo_capture: Path, tmp_path: 
     assert_finished_but_empty(out)
 
 
+@pytest.mark.slow
 def test_no_seeds(cli, demo_run: Path, demo_capture: Path, tmp_path: Path) -> None:
     model, out = without_points(demo_run / "sparse", tmp_path / "model"), tmp_path / "out"
     flags = ("--sparse", model, "--gt", demo_capture, "--models", "ppa", *QUICK)

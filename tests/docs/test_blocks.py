@@ -35,7 +35,7 @@ def runnable(page: Path) -> list[Block]:
     return [block for block in blocks(page) if block.kind in RUN and block.why_not is None]
 
 
-LONG = ("tutorial",)  # more commands than others
+LONG = ("recipes", "tutorial")  # more commands than others
 PAGES = [
     pytest.param(
         page,

@@ -48,7 +48,8 @@ def test_the_focal_length_of_a_model(cli, given, tmp_path: Path, factor: float) 
         assert "leave --sparse out" in out or "leave `sfm.sparse` out" in out
 
 
-@pytest.mark.parametrize("factor", [pytest.param(1.0, marks=pytest.mark.slow), 1.1])
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1.0, 1.1])
 def test_phases_find_a_wrong_focal_length(cli, tmp_path: Path, factor: float) -> None:
     """They need no matches: of each track one observation is left."""
     views, scene = orbit_views(10, camera_of(160)), scene_of(Part.DOME)

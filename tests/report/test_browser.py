@@ -341,7 +341,8 @@ def test_dark_mode_is_dark(browser, demo_run: Path) -> None:
     opened.page.close()
 
 
-@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_colours_in_3d_are_those_of_the_legend(browser, demo_run: Path, scheme: str) -> None:
     opened = Opened(browser, demo_run / "report.html", 1000, scheme)
     page = opened.page
