@@ -31,7 +31,7 @@ SIGN_DIRECTIONS = (
     np.array([0.25, -0.83, -0.50]),
 )
 MAX_CELLS = 6_000_000  # of a grid: 4 bytes each for a few arrays. From the memory allowed
-BAND_CELLS = 2  # half width of the band about a mesh in which distances are computed
+BAND_CELLS = 3  # half width of the band about a mesh in which distances are computed
 
 
 @dataclass(frozen=True)
