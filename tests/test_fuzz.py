@@ -46,8 +46,6 @@ def fail(path):
 fuzz.MAX_SECONDS = 1
 readers.KINDS = {"a": readers.text("a.txt", "sound", fail)}
 from pathlib import Path
-
-import pytest
 sys.exit(fuzz.fuzz(Path(sys.argv[3]), 0, 3, []))
 """
     for index, kind in enumerate(("name", "other", "hang")):

@@ -261,8 +261,6 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             result=maps.TiltedMapsResult,
             num_steps=lambda run: run.num_views,
         ),
-    ]
-    table.append(
         StageSpec(
             name="silhouettes",
             command=NORMALS,
@@ -277,8 +275,8 @@ def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[S
             ),
             result=silhouettes.SilhouettesResult,
             num_steps=lambda run: run.num_views,
-        )
-    )
+        ),
+    ]
     for same_kind in zip(*map(_model_stages, AngleModel), strict=True):
         table += same_kind
     table += [
