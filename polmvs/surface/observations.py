@@ -184,15 +184,14 @@ def _rows_of(
 
 
 @dataclass(frozen=True)
-class Observations:
-    """K observations of the faces of a mesh, in float32.
+class Observations(RowsOfBoth):
+    """Rows of K observations of the faces of a mesh, with what they are seen from.
 
     Attributes
     ----------
     face, view : (K,) indices; the observations are sorted by view.
     rays : (K, 3) unit, from the camera to the face.
     cosine : (K,) between the face's normal and the direction to the camera.
-    rows, turn_variance, tilt, axial, dolp, sigma_dolp : as of :class:`RowsOfBoth`.
     slope : (2, K) change of ``m . n`` per length as the face moves along its normal, with the
         normal fixed.
     """
@@ -201,12 +200,6 @@ class Observations:
     view: Indices
     rays: Floats
     cosine: Floats
-    rows: Floats
-    turn_variance: Floats
-    tilt: Floats
-    axial: Floats
-    dolp: Floats
-    sigma_dolp: Floats
     slope: Floats
 
     def of_views(self) -> list[slice]:
