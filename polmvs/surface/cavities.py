@@ -1,13 +1,14 @@
 """Cavities that reflect only themselves, such as the inside of a mug.
 
 The opening of a vessel is dark: light from inside has been reflected several times, and its phase
-gives no normal. Silhouettes close the opening with a flat cap, which no phase supports. Around it,
-in the same plane, is a ring that the phases do support: the top of the wall, the vessel's rim. Its
-lines in the views coincide at the right offset of its plane; its inner line is the border of the
-opening. The width of the rim is the thickness of the wall. If it is the same all around, a wall of
-that thickness is inferred to continue below, so that the inside follows the outside. This is an
-inference, not a measurement: each cavity has its thickness and the thickness's variation, and
-points on its walls should be labelled as inferred. If the rim's width varies, nothing is inferred.
+gives no normal. Silhouettes close the opening with a cap, which no phase supports. Around it is a
+ring that the phases do support: the top of the wall, the vessel's rim, flat or rounded. It gives
+the plane of the opening. The rim's lines in the views coincide at the right offset of this plane;
+the inner line of a flat rim is the border of the opening. The width of the rim is the thickness of
+the wall. If it is the same all around, a wall of that thickness is inferred to continue below, so
+that the inside follows the outside. This is an inference, not a measurement: each cavity has its
+thickness and the thickness's variation, and points on its walls should be labelled as inferred. If
+the rim's width varies, nothing is inferred.
 """
 
 from __future__ import annotations
@@ -18,15 +19,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse.csgraph import connected_components
 
 from polmvs.camera import in_frame, sample_image
 from polmvs.fitting import robust_deviation
+from polmvs.geometry import dots, unit_or_zero
 from polmvs.normals.estimator import solve_normals
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.scene import KEYPOINT_SIGMA_PX, MIN_VIEWS, Seeds
+from polmvs.scene import MIN_VIEWS
 from polmvs.surface.borders import cells_beside
 from polmvs.surface.creases import CreaseTolerances
-from polmvs.surface.mesh_geometry import MAX_CELLS
+from polmvs.surface.mesh_geometry import MAX_CELLS, RayScene, TriangleMesh
 from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
     MAX_COST,
@@ -38,7 +41,6 @@ from polmvs.surface.offsets import (
     border_of_steps,
     face_evidence,
     face_lines,
-    find_faces,
     median_loss,
     row_losses,
     snapped_border,
@@ -46,11 +48,14 @@ from polmvs.surface.offsets import (
 from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 SAME_PLANE_PX = HullTolerances.step_px  # GSDs, uncertainty of a rim's plane: a cell of the hull
+MIN_BORDER = 10  # least number of faces of a rim, and of the border of an opening
+PLANE_ROUNDS = 3  # of the fit of a plane to half of a border
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,11 +64,8 @@ class CavityTolerances:
 
     Attributes
     ----------
-    max_planes : number of planes of the surface to check, largest first: a box has six. 4 and 16
-        give the same.
-    min_part : least share of rim, and of opening, in the faces of a plane. Guess.
-    min_sectors : number of the eight sectors around faces without a phase that must have faces with
-        one. Guess: one sector may be hidden.
+    min_sectors : number of the eight sectors around an opening that must have faces of the rim.
+        Guess: one sector may be hidden.
     max_gap : half the length of a gap of the rim (a mark, a reflection). Guess. The cells that the
         closed rim encloses may be off the opening's border by as much. 2 and 8 give the same.
     max_brightness : of the opening over the rim, median over the views. A second reflection on
@@ -76,8 +78,6 @@ class CavityTolerances:
     growth : of a cavity's half width per depth. A bottle's shoulders are not inferred. Guess.
     """
 
-    max_planes: int = 8
-    min_part: float = 0.15
     min_sectors: int = 7
     max_gap: float = 4.0
     max_brightness: float = 0.3
@@ -122,13 +122,28 @@ class Cavity:
 
 
 @dataclass(frozen=True)
+class Opening:
+    """A connected patch of a closed surface that the phases do not support.
+
+    Attributes
+    ----------
+    patch : (P,) indices of its faces.
+    border : (B,) indices of the supported faces about it.
+    """
+
+    patch: Indices
+    border: Indices
+
+
+@dataclass(frozen=True)
 class SurfaceFaces:
     """Small faces of a closed surface.
 
     Attributes
     ----------
     centers, normals : (F, 3), world; unit normals outwards.
-    areas : (F,).
+    supported : (F,) bool, faces whose phases support them.
+    openings : patches that may close a cavity, largest first.
     inside_along : which points ``(D, N)`` lie inside, on rays from origins ``(N, 3)`` along one
         direction ``(3,)``, at ascending distances ``(D,)``.
     gsd : ground sampling distance at the surface, world units.
@@ -136,9 +151,47 @@ class SurfaceFaces:
 
     centers: Array
     normals: Array
-    areas: Array
+    supported: Mask
+    openings: Sequence[Opening]
     inside_along: Callable[[Array, Array, Array], Mask]
     gsd: float
+
+
+def surface_faces(mesh: TriangleMesh, seen: Mask, supported: Mask, gsd: float) -> SurfaceFaces:
+    """The faces of a closed mesh, with the openings among them.
+
+    Parameters
+    ----------
+    mesh : with F faces.
+    seen : (F,), faces that views see.
+    supported : (F,), faces whose phases support them.
+    gsd : ground sampling distance at the surface, world units.
+    """
+    pieces = _pieces(mesh, supported)
+    area = np.bincount(pieces + 1, mesh.face_areas)[1:]
+    # Phases may support islands of a cap by chance.
+    is_body = (pieces >= 0) & (pieces == (np.argmax(area) if len(area) else 0))
+    patches = _pieces(mesh, seen & ~is_body)
+    area = np.bincount(patches + 1, mesh.face_areas)[1:]
+    openings = []
+    for number in np.argsort(-area, kind="stable"):
+        if area[number] < np.pi * (CavityTolerances.rounding * gsd) ** 2:
+            break
+        patch = np.flatnonzero(patches == number)
+        touches = np.zeros(len(mesh.vertices), np.bool_)
+        touches[mesh.faces[patch]] = True
+        border = np.flatnonzero(is_body & touches[mesh.faces].any(axis=1))
+        openings.append(Opening(patch, border))
+    inside_along = RayScene(mesh).inside_along
+    return SurfaceFaces(mesh.centers, mesh.face_normals, is_body, openings, inside_along, gsd)
+
+
+def _pieces(mesh: TriangleMesh, chosen: Mask) -> Indices:
+    """Number ``(F,)`` of the connected piece of each chosen face, from 0; -1 of the others."""
+    found = np.full(len(mesh.faces), -1, np.int64)
+    index = np.flatnonzero(chosen)
+    found[index] = connected_components(mesh.face_pairs[index][:, index], directed=False)[1]
+    return found
 
 
 def find_cavities(
@@ -147,110 +200,104 @@ def find_cavities(
     *,
     tolerances: CavityTolerances | None = None,
     offset_tolerances: OffsetTolerances | None = None,
-    before: Sequence[Cavity] = (),
 ) -> tuple[Cavity, ...]:
     """Openings that a surface closes with a cap, and the cavities inferred behind them.
 
     Parameters
     ----------
-    surface : the visual hull or better; its outside determines the cavity's walls.
+    surface : refined; its outside determines the cavity's walls.
     scene : the views.
     tolerances, offset_tolerances : of the search, and of the borders.
-    before : cavities of an earlier state of the surface, whose openings are tried first: a cap that
-        phases have bent is not planar.
     """
     tol, face_tol = tolerances or CavityTolerances(), offset_tolerances or OffsetTolerances()
-    if not len(surface.centers) or len(scene.maps) < MIN_VIEWS:
+    if len(scene.maps) < MIN_VIEWS:
         return ()
     found: list[Cavity] = []
-    planes = [*(cavity.rim for cavity in before), *_flat_pieces(surface, tol, face_tol)]
-    for plane in planes:
-        rim = _rim(surface, _on_surface(plane, surface), scene, tol, face_tol)
+    for opening in surface.openings:
+        rim = _rim(surface, opening, scene, tol, face_tol)
         if rim is None or any(_is_same(rim, other.rim, surface) for other in found):
             continue
         grid = _grid_about(surface, rim, tol)
-        rim = _in_focus(rim, grid, scene, surface.gsd, tol, face_tol)
-        mouth = _mouth(rim, surface.centers[rim.members], grid, scene, tol, face_tol)
-        inner = ndimage.binary_erosion(mouth, iterations=3)
-        places = grid.points(rim)
-        if not _is_dark(places[inner], places[_ring_about(mouth, tol)], scene.maps, tol):
+        wall = _rounded_wall(surface, rim, grid, tol)
+        if wall is None:
+            wall = _flat_wall(surface, rim, grid, scene, tol, face_tol)
+        if wall is None:
             continue
-        beside = border_of_steps(mouth, mouth, rim, grid, scene, face_tol)
-        cavity = _cavity(surface, rim, grid, mouth, beside, tol)
+        cap_height = max(float(rim.height(surface.centers[opening.patch]).max()), 0.0)
+        cavity = _cavity(surface, wall, grid, cap_height, tol)
         if cavity is not None:
             found.append(cavity)
     return tuple(found)
 
 
-def _flat_pieces(
-    surface: SurfaceFaces, tol: CavityTolerances, face_tol: OffsetTolerances
-) -> tuple[Face, ...]:
-    """The largest planes of a surface; their members are faces of a sample."""
-    rng = np.random.default_rng(0)
-    share = surface.areas / surface.areas.sum()
-    num = min(face_tol.num_trials, len(share))
-    chosen = np.sort(rng.choice(len(share), num, replace=False, p=share))
-    sigma = np.full(num, KEYPOINT_SIGMA_PX * surface.gsd)
-    seeds = Seeds(surface.centers[chosen], surface.normals[chosen], sigma)
-    least = np.pi * (tol.rounding * surface.gsd) ** 2 / surface.areas.sum()
-    search = replace(
-        face_tol,
-        min_points=max(int(least * num), 10),
-        normal_deg=CreaseTolerances.crease_deg,
-        min_normal_sigma_deg=CreaseTolerances.crease_deg,
-    )
-    return find_faces(seeds, search, max_faces=tol.max_planes)
-
-
-def _on_surface(rim: Face, surface: SurfaceFaces) -> Face:
-    """A rim's plane with the faces of a surface that lie in it."""
-    near = np.abs(rim.height(surface.centers)) < SAME_PLANE_PX * surface.gsd
-    near &= surface.normals @ rim.normal > np.cos(np.radians(CreaseTolerances.crease_deg))
-    return replace(rim, members=np.flatnonzero(near))
+def _plane_of(opening: Opening, surface: SurfaceFaces) -> tuple[Array, float] | None:
+    """Normal and offset of the plane of an opening's border; None if the border is not planar."""
+    if len(opening.border) < MIN_BORDER:
+        return None
+    border = surface.centers[opening.border]
+    kept = np.ones(len(border), np.bool_)
+    for _ in range(PLANE_ROUNDS):
+        middle = border[kept].mean(axis=0)
+        normal = np.linalg.svd(border[kept] - middle, full_matrices=False)[2][2]
+        height = (border - middle) @ normal
+        kept = np.abs(height) <= max(2 * float(np.median(np.abs(height))), 1e-300)
+    if float(np.median(np.abs(height))) > SAME_PLANE_PX * surface.gsd:
+        return None
+    if surface.normals[opening.patch].mean(axis=0) @ normal < 0:
+        normal = -normal
+    return normal, float(middle @ normal)
 
 
 def _rim(
     surface: SurfaceFaces,
-    flat: Face,
+    opening: Opening,
     scene: FaceScene,
     tol: CavityTolerances,
     face_tol: OffsetTolerances,
 ) -> Face | None:
-    """The plane turned to the normal that the phases of its faces have; None without an opening.
+    """The rim about a dark opening, with the normal that the phases of its faces have.
 
-    At an opening in a rim, some faces are bright and have phases, and others are dark and have none
-    or contradicting ones. Beside the rim, dark ones may agree with its normal.
+    Its members are faces of the surface. None if the border of the opening is not planar, if the
+    rim does not surround it, or if it is not dark.
     """
-    rows = scene.rows(surface.centers[flat.members])
-    facing = -np.einsum("ikn,i->kn", rows.rays, flat.normal) > Looking.min_cosine
+    plane = _plane_of(opening, surface)
+    if plane is None:
+        return None
+    normal, offset = plane
+    # A rounded rim is higher than the border of its phases.
+    near = np.abs(surface.centers @ normal - offset) < 2 * SAME_PLANE_PX * surface.gsd
+    near &= surface.normals @ normal > np.cos(np.radians(CreaseTolerances.crease_deg))
+    members = np.flatnonzero(near & surface.supported)
+    if len(members) < MIN_BORDER:
+        return None
+    places = surface.centers[members]
+    rows = scene.rows(places)
+    facing = -np.einsum("ikn,i->kn", rows.rays, normal) > Looking.min_cosine
     sigma = np.where(facing, rows.sigma, np.inf)
-    start = np.repeat(flat.normal[:, None], len(flat.members), axis=1)
+    start = np.repeat(normal[:, None], len(members), axis=1)
     estimate = solve_normals(rows.rows, rows.rays, sigma, initial_normals=start)
-    turned = np.nan_to_num(estimate.normals) @ flat.normal
     agree = estimate.valid & (estimate.num_rows >= MIN_VIEWS)
-    agree &= turned > np.cos(np.radians(CreaseTolerances.crease_deg))
-    if agree.sum() < 10:
+    agree &= np.nan_to_num(estimate.normals) @ normal > np.cos(
+        np.radians(CreaseTolerances.crease_deg)
+    )
+    if agree.sum() < MIN_BORDER:
         return None
     normal = np.median(estimate.normals[agree], axis=0)
     normal /= np.linalg.norm(normal)
     losses = row_losses(rows, normal[:, None], face_tol)[0]
     losses = np.where(facing, losses, np.nan)
     has_phase = np.isfinite(losses).sum(axis=0) >= 0.5 * facing.sum(axis=0)
-    places = surface.centers[flat.members]
-    bright = _is_bright(places, scene.maps, tol)
-    supported = bright & has_phase & (median_loss(losses[:, None])[0] < MAX_COST)
-    share = float(supported.mean())
-    if not tol.min_part <= share <= 1 - tol.min_part:
+    fits = has_phase & (median_loss(losses[:, None])[0] < MAX_COST)
+    if not fits.any():
         return None
+    rim = Face(normal, float(np.median(places[fits] @ normal)), members[fits])
+    cap = surface.centers[opening.patch]
+    cap = cap - rim.height(cap)[:, None] * normal
     tangents = np.linalg.svd(normal[None])[2][1:]
-    x, y = tangents @ (places[supported] - np.median(places[~supported], axis=0)).T
-    sectors = np.unique(np.floor((np.arctan2(y, x) / np.pi + 1) * 4).astype(np.int64) % 8)
-    if len(sectors) < tol.min_sectors:
-        return None
-    if not _is_dark(places[~supported], places[supported], scene.maps, tol):
-        return None
-    offset = float(np.median(places[supported] @ normal))
-    return Face(normal, offset, flat.members[supported])
+    x, y = tangents @ (places[fits] - np.median(cap, axis=0)).T
+    sectors = np.unique(_sectors(x, y))
+    is_rim = len(sectors) >= tol.min_sectors and _is_dark(cap, places[fits], scene.maps, tol)
+    return rim if is_rim else None
 
 
 def _is_same(rim: Face, other: Face, surface: SurfaceFaces) -> bool:
@@ -318,8 +365,8 @@ def _mouth(
     evidence = face_evidence(places, rim, scene, losses, nothing_near, None, face_tol)
     brightness = _brightness(places.reshape(-1, 3), on_rim, scene.maps).reshape(grid.shape)
     # Outlines may have cut off a part of the rim, so `evidence.possible` is not used.
-    supported = (brightness > tol.max_brightness) & (evidence.cost < MAX_COST)
-    closed = ndimage.binary_closing(supported, iterations=round(tol.max_gap))
+    bright = brightness > tol.max_brightness
+    closed = ndimage.binary_closing(bright, iterations=round(tol.max_gap))
     enclosed = np.asarray(ndimage.binary_fill_holes(closed), np.bool_) & ~closed
     enclosed = np.asarray(ndimage.binary_opening(enclosed, iterations=2), np.bool_)
     pieces, num = ndimage.label(enclosed)
@@ -338,16 +385,6 @@ def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: CavityTol
     """Whether half of points ``(N, 3)`` are much darker than a ring ``(R, 3)``."""
     dark = _brightness(inner, ring, maps) < tol.max_brightness
     return bool(len(dark) and dark.mean() > 0.5)
-
-
-def _is_bright(places: Array, maps: Sequence[PhaseMap], tol: CavityTolerances) -> Mask:
-    """Which faces ``(N, 3)`` of a plane are not much darker than its brightest ones.
-
-    The brightest are the share ``min_part`` that a rim has at least.
-    """
-    among_all = np.nan_to_num(_brightness(places, places, maps))
-    brightest = among_all >= np.quantile(among_all, 1 - tol.min_part)
-    return np.asarray(_brightness(places, places[brightest], maps) > tol.max_brightness)
 
 
 def _brightness(points: Array, ring: Array, maps: Sequence[PhaseMap]) -> Array:
@@ -383,59 +420,145 @@ def _ring_about(mouth: Mask, tol: CavityTolerances) -> Mask:
     return np.asarray(ring & ~line, np.bool_)
 
 
-def _cavity(
+@dataclass(frozen=True)
+class _Wall:
+    """The wall of a vessel under its rim; lengths in cells of a grid.
+
+    Attributes
+    ----------
+    rim : plane of the rim.
+    thickness, sigma : of the wall, and its robust deviation around the rim.
+    top : (H, W) signed distance to the wall at the height of the rim, positive in the opening.
+    outer : (H, W) signed distance to the outside of the wall at ``start``, negative inside.
+    start : depth below which the wall has its thickness, and the outside of the surface is used.
+    radius : of a rounded rim; 0 of a flat one.
+    """
+
+    rim: Face
+    thickness: float
+    sigma: float
+    top: Array
+    outer: Array
+    start: float
+    radius: float
+
+    def free(self, depth: float) -> Array:
+        """Signed distance (H, W) to the wall at a depth above ``start``, positive in the cavity."""
+        if self.radius:
+            known = float(np.sqrt(1 - (1 - min(depth / self.radius, 1)) ** 2))
+        else:
+            known = depth / self.start
+        return known * (-self.outer - self.thickness) + (1 - known) * self.top
+
+
+def _outside_at(surface: SurfaceFaces, rim: Face, grid: FaceGrid, depth: float) -> Array:
+    """Distance (H, W) in cells to the outer wall at a depth of cells, negative inside."""
+    origins, depths = grid.points(rim).reshape(-1, 3), np.array([depth * grid.step])
+    return _outside(surface.inside_along(origins, -rim.normal, depths).reshape(grid.shape))
+
+
+def _outside(inside: Mask) -> Array:
+    # Space that the silhouettes left open inside the wall is not wall.
+    return cells_beside(np.asarray(ndimage.binary_fill_holes(inside), np.bool_))
+
+
+def _flat_wall(
     surface: SurfaceFaces,
     rim: Face,
     grid: FaceGrid,
-    mouth: Mask,
-    beside: Floats,
+    scene: FaceScene,
     tol: CavityTolerances,
-) -> Cavity | None:
-    """The cavity under an opening, its wall as thick as at the rim; None if that varies.
-
-    ``beside`` (H, W) is the signed distance of the cells to the opening's border, negative inside.
-    """
-    border = mouth & ~ndimage.binary_erosion(mouth)
-    spacing, most = 0.5 * tol.rounding, MAX_CELLS // mouth.size
-    depths = np.array([tol.rounding, *(spacing * np.arange(1, most))], np.float64)
-    order = np.argsort(depths)
-    insides = np.empty((len(depths), *grid.shape), np.bool_)
-    insides[order] = surface.inside_along(
-        grid.points(rim).reshape(-1, 3), -rim.normal, depths[order] * grid.step
-    ).reshape(insides.shape)
-
-    def outside_of(inside: Mask) -> Array:
-        """Distance (H, W) in cells to the outer wall, negative inside."""
-        # Space that the silhouettes left open inside the wall is not wall.
-        return cells_beside(np.asarray(ndimage.binary_fill_holes(inside), np.bool_))
-
-    wall = (beside - outside_of(insides[0]))[border]
-    thickness = float(np.median(wall))
-    sigma = robust_deviation(wall - thickness)
-    if thickness <= 1 or sigma > max(tol.thickness_spread * thickness, 1.0):
+    face_tol: OffsetTolerances,
+) -> _Wall | None:
+    """The wall under a flat rim: as thick as the rim is wide. None without a dark opening in it."""
+    rim = _in_focus(rim, grid, scene, surface.gsd, tol, face_tol)
+    mouth = _mouth(rim, surface.centers[rim.members], grid, scene, tol, face_tol)
+    inner = ndimage.binary_erosion(mouth, iterations=3)
+    places = grid.points(rim)
+    if not _is_dark(places[inner], places[_ring_about(mouth, tol)], scene.maps, tol):
         return None
-    free = -np.asarray(beside, np.float64)
-    layers = [free]
-    for depth, inside in zip(depths[1:], insides[1:], strict=True):
+    beside = border_of_steps(mouth, mouth, rim, grid, scene, face_tol)
+    outer = _outside_at(surface, rim, grid, tol.rounding)
+    width = (beside - outer)[mouth & ~ndimage.binary_erosion(mouth)]
+    thickness = float(np.median(width))
+    sigma = robust_deviation(width - thickness)
+    return _Wall(rim, thickness, sigma, -np.asarray(beside, np.float64), outer, tol.rounding, 0.0)
+
+
+def _rounded_wall(
+    surface: SurfaceFaces, rim: Face, grid: FaceGrid, tol: CavityTolerances
+) -> _Wall | None:
+    """The wall under a rim that is a half circle across: twice as thick as its radius r.
+
+    On such a rim the sine between vertical and normal, positive outwards, is 1 - d / r at the
+    distance d from the outside of the wall; on a flat one it is 0. None if that fits better.
+    """
+    start = tol.rounding
+    for _ in range(2):  # the outside is that of the wall only below the radius
+        outer = _outside_at(surface, rim, grid, start)
+        near = np.abs(rim.height(surface.centers)) < start * grid.step
+        near &= surface.supported & (surface.normals @ rim.normal > 0.5)
+        cells = grid.cells(surface.centers[near]).T
+        slopes = [ndimage.map_coordinates(part, cells, order=1) for part in np.gradient(outer)]
+        outwards = unit_or_zero(np.stack(slopes, axis=1))
+        sine = dots(surface.normals[near], outwards @ np.stack([grid.first, grid.second]))
+        distance = -ndimage.map_coordinates(outer, cells, order=1)
+        inner = sine < 0  # these determine the radius best
+        if inner.sum() < MIN_BORDER:
+            return None
+        radii = distance[inner] / (1 - sine[inner])
+        radius = float(np.median(radii))
+        start = max(tol.rounding, radius)
+    misfit = np.abs(sine - (1 - distance / max(radius, 1e-300)))
+    if not np.median(misfit) < np.median(np.abs(sine)):
+        return None
+    middle = np.median(cells, axis=1)
+    sector = _sectors(*(cells[:, inner] - middle[:, None]))
+    around = np.array([np.median(radii[sector == number]) for number in np.unique(sector)])
+    sigma = 2 * robust_deviation(around - radius)
+    return _Wall(rim, 2 * radius, sigma, -outer - radius, outer, start, radius)
+
+
+def _sectors(x: Floats, y: Floats) -> Indices:
+    """Which of eight sectors about the origin (N,) points lie in."""
+    return np.floor((np.arctan2(y, x) / np.pi + 1) * 4).astype(np.int64) % 8
+
+
+def _cavity(
+    surface: SurfaceFaces, wall: _Wall, grid: FaceGrid, cap_height: float, tol: CavityTolerances
+) -> Cavity | None:
+    """The cavity within a wall; None if its thickness varies.
+
+    ``cap_height`` is the height of the surface's cap above the rim.
+    """
+    rim, thickness = wall.rim, wall.thickness
+    if thickness <= 1 or wall.sigma > max(tol.thickness_spread * thickness, 1.0):
+        return None
+    most = MAX_CELLS // (grid.shape[0] * grid.shape[1])
+    lowest = -float(rim.height(surface.centers[surface.supported]).min()) / grid.step
+    spacing = max(0.5 * tol.rounding, lowest / most)
+    depths = spacing * np.arange(1, int(np.ceil(lowest / spacing)) + 2, dtype=np.float64)
+    insides = surface.inside_along(
+        grid.points(rim).reshape(-1, 3), -rim.normal, depths * grid.step
+    ).reshape(-1, *grid.shape)
+    layers = [wall.top]
+    for depth, inside in zip(depths, insides, strict=True):
         if not inside.any():
             break
-        # At the rim its line is known; below it the wall's thickness is used.
-        known = min(depth / tol.rounding, 1.0)
-        inferred = known * (-outside_of(inside) - thickness) + (1 - known) * layers[0]
-        free = np.minimum(inferred, layers[-1] + tol.growth * spacing)
+        below = depth >= wall.start
+        free = -_outside(inside) - thickness if below else wall.free(float(depth))
+        free = np.minimum(free, layers[-1] + tol.growth * spacing)
         pieces = ndimage.label(free > 0)[0]
         linked = np.unique(pieces[(layers[-1] > 0) & (pieces > 0)])
         free = np.where((pieces > 0) & ~np.isin(pieces, linked), -0.5, free)
         if not (free > 0).any():
             break
         layers.append(free)
-    depths = spacing * np.arange(len(layers), dtype=np.float64)
     # The bottom is at least as thick as the wall.
-    floor = spacing * len(layers) - thickness - depths
+    floor = spacing * len(layers) - thickness - spacing * np.arange(len(layers), dtype=np.float64)
     if floor[0] <= tol.rounding:
         return None
-    # A cap bulges above the rim by no more than its rounding.
-    above = int(np.ceil(2 * tol.rounding / spacing))
+    above = int(np.ceil(cap_height / (spacing * grid.step))) + 2
     field = np.minimum(np.stack(layers), floor[:, None, None])
     field = np.concatenate([np.repeat(field[:1], above, axis=0), field])
     field = ndimage.gaussian_filter(field, (0.5, 1.0, 1.0), mode="nearest") * grid.step
@@ -443,7 +566,7 @@ def _cavity(
         rim=rim,
         grid=grid,
         thickness=thickness * grid.step,
-        thickness_sigma=sigma * grid.step,
+        thickness_sigma=wall.sigma * grid.step,
         field=field.astype(np.float32),
         layer_step=spacing * grid.step,
         first_layer=-above,

@@ -26,7 +26,7 @@ from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, View
-from polmvs.surface.cavities import Cavity, SurfaceFaces, find_cavities
+from polmvs.surface.cavities import Cavity, find_cavities, surface_faces
 from polmvs.surface.creases import (
     corner_normals,
     sharpened,
@@ -37,7 +37,6 @@ from polmvs.surface.creases import (
 from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
 from polmvs.surface.mesh_geometry import (
-    BAND_CELLS,
     RayScene,
     TriangleMesh,
     remeshed,
@@ -212,7 +211,6 @@ def reconstruct_surface(
     if steps:
         logger.info("%d groups of planar patches that silhouettes do not part.", len(steps))
         hull = hull.carved([group.values for group in steps])
-    cavities = _cavities(given.scene, hull.mesh, hull.gsd)
     fit = first_fit(
         views,
         Looking(angle_model=angle_model, tilt_aware=tilt_aware),
@@ -234,12 +232,14 @@ def reconstruct_surface(
     if not len(refined.mesh.faces):
         return Undetermined("the surface vanishes under the phases of the views")
     given = replace(given, scene=given.scene.of(~refined.left_out))
-    # Refined walls locate a cavity better than those of the hull, but may hide its opening.
-    cavities = _cavities(given.scene, refined.mesh, hull.gsd, before=cavities) or cavities
-    mesh = _carved(refined.mesh, hull.mesh, steps, cavities)
+    labelled = label(refined.mesh, refined.fit)
+    cavities = _cavities(given, refined, labelled)
+    mesh = _carved(refined.mesh, hull, steps, cavities)
     if not len(mesh.faces):
         return Undetermined("the surface vanishes under the cavities found in it")
-    polished = _polished(given, mesh, refined, [*steps, *cavities])
+    if mesh is not refined.mesh:
+        labelled = label(mesh, refined.fit)
+    polished = _polished(given, mesh, labelled, refined, [*steps, *cavities])
     return _supported(given, polished, steps, cavities, refined.left_out)
 
 
@@ -309,18 +309,22 @@ def _warn_of_inconsistent(
 
 def _carved(
     mesh: TriangleMesh,
-    hull: TriangleMesh,
+    hull: VisualHull,
     steps: Sequence[SteppedFaces],
     cavities: Sequence[Cavity],
 ) -> TriangleMesh:
     """A refined mesh with height steps and cavities carved, their walls sharp."""
     if not steps and not cavities:
         return mesh
+    solid = [
+        lambda points, group=group: np.maximum(group.solid(points), hull.distances(points))
+        for group in steps
+    ]
     # Smoothness rounds the walls of height steps; carving the refined surface makes them sharp.
     return remeshed(
         RayScene(mesh),
         mesh.mean_edge / REMESHED_EDGE,
-        solid=[_within(group.solid, hull, mesh.mean_edge) for group in steps],
+        solid=solid,
         free=[*(group.values for group in steps), *(cavity.values for cavity in cavities)],
         smoothing=0,
     )
@@ -349,12 +353,12 @@ class _Polished:
 def _polished(
     given: _Given,
     mesh: TriangleMesh,
+    labelled: Labelled,
     refined: Refined,
     carvings: Sequence[SteppedFaces | Cavity],
 ) -> _Polished:
     """A carved mesh with the sides of its edges sharp, moved until it has converged."""
     fit = refined.fit
-    labelled = label(mesh, fit)
     fitted = fit_normals(mesh, labelled)
     facing, is_wall = fitted.normals, np.zeros(len(mesh.faces), np.bool_)
     if carvings:
@@ -449,18 +453,13 @@ def _converged(
     return mesh
 
 
-def _cavities(
-    scene: FaceScene, mesh: TriangleMesh, gsd: float, before: Sequence[Cavity] = ()
-) -> tuple[Cavity, ...]:
-    """Cavities of a mesh; ``before`` are those of an earlier state of it."""
-    faces = SurfaceFaces(
-        mesh.centers,
-        mesh.face_normals,
-        mesh.face_areas,
-        RayScene(mesh).inside_along,
-        gsd,
-    )
-    return tuple(find_cavities(faces, scene, before=before))
+def _cavities(given: _Given, refined: Refined, labelled: Labelled) -> tuple[Cavity, ...]:
+    """Cavities behind the parts of a refined mesh that no phase supports."""
+    mesh, fit = refined.mesh, refined.fit
+    evidence = face_evidence(mesh, fit, labelled)
+    supported = supported_faces(mesh, evidence, min_views=given.min_views)
+    seen = evidence.num_views >= given.min_views
+    return find_cavities(surface_faces(mesh, seen, supported, fit.gsd), given.scene)
 
 
 def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:
@@ -472,26 +471,6 @@ def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Flo
         return hits.distance, mesh.face_normals[hits.face]
 
     return first_hit
-
-
-def _within(
-    solid: Callable[[Array], Array], mesh: TriangleMesh, edge: float
-) -> Callable[[Array], Array]:
-    """Signed distances to what is solid and enclosed by a mesh, for a new one of such edges.
-
-    Far from the solid they are at least the distance to it, which is enough.
-    """
-    scene = RayScene(mesh)
-
-    def distances(points: Array) -> Array:
-        found = solid(points)
-        near = np.flatnonzero(found < (BAND_CELLS + 1) * edge / REMESHED_EDGE)
-        if not len(near):
-            return found
-        found[near] = np.maximum(found[near], scene.signed_distance(points[near], num_rays=1))
-        return found
-
-    return distances
 
 
 def _lie_on(mesh: TriangleMesh, carvings: Sequence[Callable[[Array], Floats]]) -> Mask:

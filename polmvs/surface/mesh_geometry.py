@@ -30,6 +30,7 @@ SIGN_DIRECTIONS = (
     np.array([-0.70, 0.10, 0.71]),
     np.array([0.25, -0.83, -0.50]),
 )
+LINE_OFFSET = np.array([1e-3, 7e-4])  # of rays beside lines of a grid, in its steps
 MAX_CELLS = 6_000_000  # of a grid: 4 bytes each for a few arrays. From the memory allowed
 BAND_CELLS = 3  # half width of the band about a mesh in which distances are computed
 
@@ -233,11 +234,15 @@ class RayScene:
         points : (N, 3).
         num_rays : number of rays whose majority decides, odd, up to 3: one may graze an edge.
         """
+        distance = self.distance(points)
+        return np.where(self.is_inside(points, num_rays=num_rays), -distance, distance)
+
+    def distance(self, points: Floats) -> NDArray[np.float32]:
+        """Distance ``(N,)`` of points ``(N, 3)`` to the mesh."""
         if not len(points):  # Open3D crashes on none
             return np.zeros(0, np.float32)
-        local = self._local(points)
-        distance = np.asarray(self._scene.compute_distance(self._tensor(local)).numpy(), np.float32)
-        return np.where(self.is_inside(points, num_rays=num_rays), -distance, distance)
+        found = self._scene.compute_distance(self._tensor(self._local(points)))
+        return np.asarray(found.numpy(), np.float32)
 
     def is_inside(self, points: Floats, *, num_rays: int = len(SIGN_DIRECTIONS)) -> Mask:
         """Which points ``(N, 3)`` the mesh winds about; parameters of :meth:`signed_distance`."""
@@ -304,6 +309,8 @@ class RayScene:
         self, local: NDArray[np.float32], direction: Array
     ) -> tuple[NDArray[np.int64], Array, NDArray[np.float32]]:
         """Ray, 1 where it leaves and -1 where it enters, and length of every crossing ``(C,)``."""
+        if not len(local):  # Open3D crashes on none
+            return np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.float32)
         rays = np.empty((len(local), 6), np.float32)
         rays[:, :3], rays[:, 3:] = local, direction
         hits = self._scene.list_intersections(self._tensor(rays))
@@ -468,10 +475,20 @@ def remeshed(
         place = np.rint((np.tensordot(weights, mesh.corners, (0, 1)) - origin) / step)
         band[tuple(place.astype(np.int64).T)] = True
     band = ndimage.binary_dilation(band, iterations=BAND_CELLS)
-    index = np.argwhere(band)
     limit = np.float32(BAND_CELLS * step)
     values = np.full(shape, np.nan, np.float32)
-    values[band] = scene.signed_distance(origin + step * index, num_rays=1)
+    values[band] = scene.distance(origin + step * np.argwhere(band))
+    # One ray decides for a whole line of the grid. Vertices may lie on lines; rays beside them
+    # graze no edge.
+    lines = np.argwhere(band.any(axis=2))
+    starts = np.column_stack([lines + LINE_OFFSET, np.zeros(len(lines))])
+    is_inside = np.zeros(shape, np.bool_)
+    is_inside[tuple(lines.T)] = scene.inside_along(
+        origin + step * starts,
+        np.array([0.0, 0.0, 1.0]),
+        step * np.arange(shape[2], dtype=np.float64),
+    ).T
+    values[is_inside] *= -1
     # The sign cannot change between neighbours that are farther from the mesh than from each other.
     doubtful = np.zeros(shape, np.bool_)
     for axis in range(3):

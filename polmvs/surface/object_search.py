@@ -164,6 +164,8 @@ def find_object(
         masks = [left.mask(view) for view in small]
     plates = _plates(small, masks, tol)
     noise = _residual(small, plates, masks)
+    odds = _plane_odds(small, plates, noise)
+    masks = [fill_false_holes(*pair) for pair in zip(masks, odds, strict=True)]
     changes = np.concatenate([plate.changes for plate in plates])
     if not len(changes) or float(np.median(changes)) > noise:
         return None  # the lamp moves with the camera: outlines would be pixels wide
@@ -572,13 +574,10 @@ def _denied(
     -------
     Pixels whose whole neighbourhood shows it, which excludes chance, and single pixels that do.
     """
-    noise = _residual(views, plates, masks)
-    spread = np.mean([np.diff(np.percentile(view.log, (1, 99)))[0] for view in views])
+    all_odds = _plane_odds(views, plates, _residual(views, plates, masks))
     found: tuple[list[Mask], list[Mask]] = ([], [])
-    for view, plate, mask in zip(views, plates, masks, strict=True):
+    for view, plate, mask, odds in zip(views, plates, masks, all_odds, strict=True):
         known = np.isfinite(plate.log)
-        odds = _odds(view.log - plate.log, np.hypot(plate.deviation, noise), spread)
-        odds = np.where(known, odds, 0)
         for masks_of, width, least in zip(found, (2.5, 0.8), (0.95, 0.3), strict=True):
             total = cv2.GaussianBlur(odds, (0, 0), width)
             share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), width)
@@ -586,6 +585,28 @@ def _denied(
             masks_of.append(np.asarray(shows_plane & ~view.polarized))
         found[0][-1] |= _shows_beyond(view, mask, tol)
     return found
+
+
+def _plane_odds(views: Sequence[_Working], plates: Sequence[_Plate], noise: float) -> list[Image]:
+    """Log-odds (h, w) that each view's pixels show the plane; 0 where it is not predicted."""
+    spread = float(np.mean([np.diff(np.percentile(view.log, (1, 99)))[0] for view in views]))
+    found = []
+    for view, plate in zip(views, plates, strict=True):
+        odds = _odds(view.log - plate.log, np.hypot(plate.deviation, noise), spread)
+        found.append(np.where(np.isfinite(plate.log), odds, 0).astype(np.float32))
+    return found
+
+
+def fill_false_holes(mask: Mask, odds: Floats) -> Mask:
+    """A mask (H, W) with the holes filled that do not show the plane in this view.
+
+    Mirror images of the plane in two views may carve a tunnel through the object. ``odds`` (H, W)
+    are the log-odds that a pixel shows the plane.
+    """
+    holes = np.asarray(ndimage.binary_fill_holes(mask), np.bool_) & ~mask
+    labels, num = ndimage.label(holes)
+    shown = ndimage.mean(odds, labels, np.arange(1, num + 1)) if num else np.zeros(0)
+    return mask | np.isin(labels, 1 + np.flatnonzero(shown <= LEAST_ODDS))
 
 
 def _shows_beyond(view: _Working, mask: Mask, tol: SearchTolerances) -> Mask:

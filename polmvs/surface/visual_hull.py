@@ -143,6 +143,13 @@ class VisualHull:
         """Closed surface; empty if the silhouettes have nothing in common."""
         return relaxed(mesh_from_grid(self.values, self.origin, self.step))
 
+    def distances(self, points: Floats) -> Array:
+        """Signed distance ``(N,)`` of points ``(N, 3)`` to the hull, at most some of its cells."""
+        places = (np.asarray(points, np.float64) - self.origin).T / self.step
+        outside = float(self.values.max())
+        found = ndimage.map_coordinates(self.values, places, order=1, cval=outside)
+        return np.asarray(found, np.float64)
+
     def carved(
         self,
         free: Sequence[Callable[[Array], Floats]],

@@ -10,8 +10,9 @@ from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import build_phase_map
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
-from polmvs.surface.cavities import CavityTolerances, SurfaceFaces, find_cavities
-from polmvs.surface.offsets import OffsetTolerances, face_scene
+from polmvs.surface.cavities import Opening, SurfaceFaces, find_cavities, surface_faces
+from polmvs.surface.mesh_geometry import mesh_from_grid
+from polmvs.surface.offsets import face_scene
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Cylinder, Group, Plane
 
@@ -39,17 +40,43 @@ class Annulus:
         return np.where(hit, distance, np.inf), np.where(hit[..., None], normals, np.nan)
 
 
-def vessel_maps(bore=RADIUS - WALL, offset=0.0, dark=0.02, weak_inside=False, rim_cut_in=0):
+@dataclass(frozen=True, eq=False)
+class Lip:
+    """The upper half of a torus about the vertical axis, by sphere tracing."""
+
+    z: float
+    major: float
+    minor: float
+
+    def intersect(self, origins, rays):
+        origins = np.broadcast_to(origins, rays.shape)
+        near = np.full(rays.shape[:-1], 0.3)
+        for _ in range(200):
+            point = origins + near[..., None] * rays
+            across = np.hypot(point[..., 0], point[..., 1]) - self.major
+            height = point[..., 2] - self.z
+            near = near + np.hypot(across, height) - self.minor
+        hit = (np.abs(np.hypot(across, height) - self.minor) < 1e-6) & (height > 0)
+        outwards = point[..., :2] / np.hypot(point[..., 0], point[..., 1])[..., None]
+        normals = np.dstack([outwards * across[..., None], height]) / self.minor
+        return np.where(hit, near, np.inf), np.where(hit[..., None], normals, np.nan)
+
+
+def vessel_maps(
+    bore=RADIUS - WALL, offset=0.0, dark=0.02, weak_inside=False, rim_cut_in=0, rounded=False
+):
     """Phase maps of a vessel with a bore, dark inside, on an unpolarized bright ground.
 
     The inside has no phases, or those of its noise (``weak_inside``). The outlines of some views
-    (``rim_cut_in``) leave out the rim.
+    (``rim_cut_in``) leave out the rim, which is flat or ``rounded``.
     """
-    middle = HEIGHT / 2
+    top = HEIGHT - 0.5 * WALL * rounded
     surfaces = [
-        Cylinder([0, 0, middle], [0, 0, 1], RADIUS, middle),
-        Cylinder([offset, 0, middle], [0, 0, 1], bore, middle),
-        Annulus(HEIGHT, (offset, 0.0), bore, RADIUS),
+        Cylinder([0, 0, top / 2], [0, 0, 1], RADIUS, top / 2),
+        Cylinder([offset, 0, top / 2], [0, 0, 1], bore, top / 2),
+        Annulus(HEIGHT, (offset, 0.0), bore, RADIUS)
+        if not rounded
+        else Lip(top, RADIUS - 0.5 * WALL, 0.5 * WALL),
         Annulus(WALL, (offset, 0.0), 0.0, bore),
     ]
     views = ring_of_views(
@@ -63,7 +90,7 @@ def vessel_maps(bore=RADIUS - WALL, offset=0.0, dark=0.02, weak_inside=False, ri
         xy = np.stack(np.meshgrid(np.arange(280) + 0.5, np.arange(240) + 0.5), axis=-1)
         rays = view.camera.rays(xy) @ view.cam_from_world.rotation
         point = view.center_in_world + np.where(seen.mask, seen.range, 0)[..., None] * rays
-        below = point[..., 2] < HEIGHT - 1e-6
+        below = point[..., 2] < top - 1e-6
         inside = seen.mask & below
         inside &= np.hypot(point[..., 0] - offset, point[..., 1]) < bore + 1e-6
         images = np.where(inside, dark, 1.0) * seen.intensities
@@ -83,7 +110,7 @@ def vessel_maps(bore=RADIUS - WALL, offset=0.0, dark=0.02, weak_inside=False, ri
     return maps
 
 
-def closed_cylinder():
+def closed_cylinder(bore=RADIUS - WALL, offset=0.0):
     """Faces of the vessel's outside with a flat cap over its mouth."""
     step = FOOTPRINT
     turns = np.arange(0, 2 * np.pi, step / RADIUS)
@@ -102,8 +129,43 @@ def closed_cylinder():
         across = np.hypot(points[..., 0], points[..., 1])
         return (across < RADIUS) & (points[..., 2] > 0) & (points[..., 2] < HEIGHT)
 
-    areas = np.full(len(centers), step**2)
-    return SurfaceFaces(centers, normals, areas, inside_along, FOOTPRINT)
+    across = np.hypot(centers[:, 0] - offset, centers[:, 1])
+    is_top = normals[:, 2] > 0.5
+    patch = is_top & (across < bore)
+    opening = Opening(*map(np.flatnonzero, (patch, is_top & ~patch & (across < bore + 1.5 * step))))
+    return SurfaceFaces(centers, normals, ~patch, [opening], inside_along, FOOTPRINT)
+
+
+def closed_rounded_vessel():
+    """Faces of the vessel with a rounded rim, up to a cap that bulges over its mouth."""
+    step, minor = FOOTPRINT, 0.5 * WALL
+    middle = HEIGHT - minor
+    turns = np.arange(0, 2 * np.pi, step / RADIUS)
+    heights = np.arange(0.5 * step, middle, step)
+    # The angle across the lip, from outside to where its phases end.
+    profile = [(RADIUS, z, 1.0, 0.0) for z in heights]
+    profile += [
+        (RADIUS - minor + minor * np.cos(a), middle + minor * np.sin(a), np.cos(a), np.sin(a))
+        for a in np.arange(0.5 * step / minor, np.radians(150), step / minor)
+    ]
+    bore = RADIUS - minor - minor * np.cos(np.radians(30))
+    cap = [(r, middle + 0.5 * (bore - r), 0.45, 0.89) for r in np.arange(step, bore - step, step)]
+    rows = np.array([(*one, k, t) for k, one in enumerate([*profile, *cap]) for t in turns])
+    radius, z, across, up, number, turn = rows.T
+    out = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
+    centers = radius[:, None] * out + z[:, None] * [0, 0, 1]
+    normals = across[:, None] * out + up[:, None] * [0, 0, 1]
+
+    def inside_along(origins, direction, distances):
+        points = origins + distances[:, None, None] * direction
+        far, z = np.hypot(points[..., 0], points[..., 1]), points[..., 2]
+        lip = (np.hypot(far - RADIUS + minor, z - middle) < minor) & (z > middle)
+        return ((far < RADIUS) & (z > 0) & (z < middle)) | lip | ((far < bore) & (z < middle))
+
+    patch = number >= len(profile)
+    border = number == len(profile) - 1
+    opening = Opening(np.flatnonzero(patch), np.flatnonzero(border))
+    return SurfaceFaces(centers, normals, ~patch, [opening], inside_along, FOOTPRINT)
 
 
 def test_a_dark_mouth_with_a_rim_of_one_width_opens_into_a_cavity():
@@ -132,13 +194,18 @@ def test_a_mouth_is_found_by_its_darkness(harm):
     assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
 
 
-def test_a_plane_found_from_few_faces_has_all_of_its_faces():
-    """The planes of a surface come from a sample, in which the rim may be a few faces."""
-    surface, scene = closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA)
-    few = OffsetTolerances(num_trials=150)
-    (cavity,) = find_cavities(surface, scene, offset_tolerances=few)
-    (expected,) = find_cavities(surface, scene)
-    assert cavity.thickness == pytest.approx(expected.thickness, abs=0.1 * FOOTPRINT)
+def test_a_rounded_rim_is_as_wide_as_its_wall():
+    """The width of what is bright is not: the inner half of the rim reflects the inside."""
+    scene = face_scene(vessel_maps(rounded=True), AngleModel.PPA)
+    (cavity,) = find_cavities(closed_rounded_vessel(), scene)
+    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
+    assert cavity.rim.offset == pytest.approx(HEIGHT, abs=FOOTPRINT)
+    bore = RADIUS - WALL
+    inner = np.array([[bore - 2 * FOOTPRINT, 0, 0.06], [bore + 2 * FOOTPRINT, 0, 0.06]])
+    assert (cavity.values(inner) > 0).tolist() == [True, False]
+    # The cap goes, the rim stays.
+    cap, rim = [0.2 * bore, 0, HEIGHT + 0.3 * bore], [RADIUS - 0.5 * WALL, 0, HEIGHT - 0.001]
+    assert (cavity.values(np.array([cap, rim])) > 0).tolist() == [True, False]
 
 
 def test_a_mouth_is_round_though_its_cells_are_not():
@@ -154,29 +221,55 @@ def test_a_mouth_is_round_though_its_cells_are_not():
     assert off.std() < 0.1
 
 
-def test_a_mouth_once_found_is_looked_for_at_its_place():
+def test_a_bent_cap_hides_no_mouth():
     surface, scene = closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA)
-    before = find_cavities(surface, scene)
     x, y, z = surface.centers.T
-    # Phases have bent one side of the cap up, and no plane is found in it.
-    bent_up = (surface.normals[:, 2] > 0.5) & (x > 0)
-    height = np.where(bent_up, z + 3.5 * FOOTPRINT, z)
+    is_patch = np.isin(np.arange(len(x)), surface.openings[0].patch)
+    height = np.where(is_patch & (x > 0), z + 12 * FOOTPRINT, z)
     bent = replace(surface, centers=np.stack([x, y, height], axis=1))
-    no_plane = CavityTolerances(max_planes=0)
-    assert find_cavities(bent, scene, tolerances=no_plane) == ()
-    (cavity,) = find_cavities(bent, scene, tolerances=no_plane, before=before)
+    (cavity,) = find_cavities(bent, scene)
     assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
     assert cavity.rim.offset == pytest.approx(HEIGHT, abs=0.5 * FOOTPRINT)
+    # The space above the rim is free up to the cap.
+    assert (cavity.values(bent.centers[(x > 0) & (np.hypot(x, y) < 0.03)]) > 0).all()
+
+
+def test_a_deep_cavity_has_a_bottom_however_fine_the_grid(monkeypatch):
+    """The layers of a grid are few where its memory is bounded."""
+    monkeypatch.setattr("polmvs.surface.cavities.MAX_CELLS", 12 * 97**2)
+    (cavity,) = find_cavities(closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA))
+    assert (cavity.values(np.array([[0, 0, 0.35 * HEIGHT]])) > 0).all()
+
+
+def test_islands_of_a_cap_belong_to_its_opening():
+    """A box of which the middle of the top is not supported, but for a speck in it."""
+    grid = np.ones((30, 30, 20), np.float32)
+    grid[2:-2, 2:-2, 2:-2] = -1
+    mesh = mesh_from_grid(grid, np.zeros(3), 1.0)
+    x, y, _ = np.abs(mesh.centers - mesh.vertices.mean(axis=0)).T
+    is_top = (mesh.centers[:, 2] > mesh.vertices[:, 2].max() - 0.6) & (
+        mesh.face_normals[:, 2] > 0.5
+    )
+    away = np.maximum(x, y)
+    supported = ~(is_top & (away < 9) & (away > 2))
+    found = surface_faces(mesh, np.ones(len(away), bool), supported, gsd=1.0)
+    (opening,) = found.openings
+    assert set(opening.patch) == set(np.flatnonzero(is_top & (away < 9)))
+    assert is_top[opening.border].all()
+    assert (away[opening.border] < 10.5).all()
+    assert not found.supported[opening.patch].any()
+    nothing = surface_faces(mesh, np.ones(len(away), bool), np.ones(len(away), bool), gsd=1.0)
+    assert nothing.openings == []
 
 
 def test_a_closed_body_has_no_cavity():
     maps = vessel_maps(bore=1e-4)
-    assert find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
+    assert find_cavities(closed_cylinder(0.03), face_scene(maps, AngleModel.PPA)) == ()
 
 
 def test_a_rim_of_varying_width_infers_nothing():
     maps = vessel_maps(bore=0.035, offset=0.015)
-    assert find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
+    assert find_cavities(closed_cylinder(0.035, 0.015), face_scene(maps, AngleModel.PPA)) == ()
 
 
 def test_a_bright_label_without_phase_is_no_mouth():

@@ -13,7 +13,7 @@ from polmvs.pipeline.stages.maps import hidden_plane
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import Region
 from polmvs.scene import Tracks, View
-from polmvs.surface.object_search import FoundObject, find_object
+from polmvs.surface.object_search import FoundObject, fill_false_holes, find_object
 from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.surface_view import signed_distance_px
 from polmvs.surface.visual_hull import Plane
@@ -158,6 +158,19 @@ def test_a_plane_without_texture_tells_nothing():
     assert find_object(capture(np.full((400, 400), 0.5, np.float32)), TABLE, table_points()) is None
 
 
+def test_only_holes_that_show_the_plane_stay():
+    mask = np.ones((40, 60), bool)
+    mask[:, 55:] = False  # not a hole
+    odds = np.full(mask.shape, -3.0)
+    through, mirrored, unknown = np.s_[5:15, 5:15], np.s_[20:35, 5:20], np.s_[20:35, 30:45]
+    for hole, value in ((through, 3.0), (mirrored, -2.0), (unknown, 0.0)):
+        mask[hole], odds[hole] = False, value
+    odds[20, 5] = 4.0  # a pixel of the mirrored hole looks like the plane by chance
+    expected = np.ones_like(mask)
+    expected[:, 55:] = expected[through] = False
+    np.testing.assert_array_equal(fill_false_holes(mask, odds), expected)
+
+
 def test_a_lamp_that_moves_with_the_camera_tells_nothing():
     assert find_object(capture(printed(), lamp=True), TABLE, table_points()) is None
 
@@ -176,6 +189,12 @@ def test_what_polarization_shows_is_left_to_it(white):
     for one in unpolarized:
         one.polarization[..., 2] = 1e-4
     assert hidden_plane(unpolarized, tracks) is None
+    # Where most of it is a polarized region, its phases are weak in the rest alone.
+    mostly = [
+        one.changed(region=Region(*3 * [hiding.mask & (np.indices(hiding.mask.shape)[0] % 4 > 0)]))
+        for one, hiding in zip(unpolarized, found, strict=True)
+    ]
+    assert hidden_plane(mostly, tracks) is not None
 
 
 def test_the_outline_found_is_the_silhouette(white):

@@ -257,6 +257,8 @@ def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] 
     if share >= POLARIZED_SHARE:
         return None
     # Without any phase, its outline alone would pass for a surface.
+    if share > 0.5:
+        return found
     strengths = [
         _dolp_in_sigmas(one, hiding.inner) for one, hiding in zip(maps, found, strict=True)
     ]

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from polmvs.colmap.models import read_model
 from polmvs.config import Options
 from polmvs.evaluation.trust import Trust, measure_trust
-from polmvs.io.clouds import read_cloud, read_mesh
+from polmvs.io.clouds import Cloud, read_cloud, read_mesh
 from polmvs.normals.camera_check import PhaseRows, fit_camera
 from polmvs.normals.tracks import evenly_chosen
 from polmvs.pipeline.record import Record
@@ -69,7 +71,7 @@ def find_trust(model: AngleModel, folder: RunFolder, record: Record, options: Op
         cut_share=None if mapped is None else mapped.cut_share,
     )
     if made.tilt_share is not None and (folder.views(model) / SURFACE_MESH).is_file():
-        trust = _contradicted(trust, model, made, phase_maps, folder, options)
+        trust = _contradicted(trust, model, made, dense, phase_maps, folder, options)
     trust = trust.judged()
     if (dense.scalars["kind"] == PointKind.SURFACE).any():  # else the job says what is missing
         if not trust.is_trusted:
@@ -83,6 +85,7 @@ def _contradicted(
     trust: Trust,
     model: AngleModel,
     made: DensifyResult,
+    cloud: Cloud,
     maps: Sequence[PhaseMap],
     folder: RunFolder,
     options: Options,
@@ -100,7 +103,9 @@ def _contradicted(
     looking = Looking(angle_model=model, tilt_aware=tilt_aware, tilt_share=made.tilt_share)
     seen = open_surface_views(folder, maps)
     mesh = TriangleMesh.of(read_mesh(views / SURFACE_MESH))
-    wrong_camera = _camera_complaint(mesh, seen, looking, light)
+    kind = cloud.scalars["kind"][cKDTree(cloud.points).query(mesh.centers)[1]]
+    shown = np.flatnonzero(kind == PointKind.SURFACE)
+    wrong_camera = _camera_complaint(mesh, shown, seen, looking, light)
     return replace(
         trust,
         complaints=(*trust.complaints, *(() if wrong_camera is None else (wrong_camera,))),
@@ -123,16 +128,25 @@ def _contradicted(
 
 
 def _camera_complaint(
-    mesh: TriangleMesh, views: Sequence[SurfaceView], looking: Looking, light: Light | None
+    mesh: TriangleMesh,
+    shown: NDArray[np.int64],
+    views: Sequence[SurfaceView],
+    looking: Looking,
+    light: Light | None,
 ) -> str | None:
-    """Which camera fits the phases of a surface, if the given one does not."""
+    """Which camera fits the phases of a surface, if the given one does not.
+
+    ``shown`` are the faces whose phases count, without inferred ones.
+    """
     camera = views[0].view.camera
     if looking.angle_model.formula is AngleModel.OPA or any(
         one.view.camera != camera for one in views
     ):
         return None  # OPA has no rays, and cameras are checked together only if they are one
     images = [level_image(view, HeldOutTolerances.width_px) for view in views]
-    some = mesh.only(evenly_chosen(len(mesh.faces), MAX_CAMERA_POINTS))
+    some = TriangleMesh(
+        mesh.vertices, mesh.faces[shown[evenly_chosen(len(shown), MAX_CAMERA_POINTS)]]
+    )
     found = observe(some, RayScene(mesh), views, images, looking)
     residuals = np.abs(found.residuals(some.face_normals))
     if light is None:
