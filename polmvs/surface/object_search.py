@@ -576,14 +576,15 @@ def _denied(
     """
     all_odds = _plane_odds(views, plates, _residual(views, plates, masks))
     found: tuple[list[Mask], list[Mask]] = ([], [])
-    for view, plate, mask, odds in zip(views, plates, masks, all_odds, strict=True):
+    for view, plate, odds in zip(views, plates, all_odds, strict=True):
         known = np.isfinite(plate.log)
         for masks_of, width, least in zip(found, (2.5, 0.8), (0.95, 0.3), strict=True):
             total = cv2.GaussianBlur(odds, (0, 0), width)
             share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), width)
             shows_plane = (share > least) & (total > LEAST_ODDS * share)
             masks_of.append(np.asarray(shows_plane & ~view.polarized))
-        found[0][-1] |= _shows_beyond(view, mask, tol)
+    for denied, beyond in zip(found[0], _showing_beyond(views, masks, tol), strict=True):
+        denied |= beyond
     return found
 
 
@@ -609,32 +610,47 @@ def fill_false_holes(mask: Mask, odds: Floats) -> Mask:
     return mask | np.isin(labels, 1 + np.flatnonzero(shown <= LEAST_ODDS))
 
 
-def _shows_beyond(view: _Working, mask: Mask, tol: SearchTolerances) -> Mask:
-    """Pixels (h, w) that show the background beyond the plane, such as a wall or another table.
+def _showing_beyond(
+    views: Sequence[_Working], masks: Sequence[Mask], tol: SearchTolerances
+) -> list[Mask]:
+    """Pixels (h, w) of each view that show the background beyond the plane, such as a wall.
 
     No other view predicts it. It differs from the object in brightness, if at all: that of the
-    object is known in front of the plane, that of the background away from the object.
+    object is known in front of the plane, in some views its top alone; that of the background in
+    each view, away from the object.
     """
-    pixels = mask.astype(np.uint8)
-    near = cv2.dilate(pixels, np.ones((tol.lighting_px, tol.lighting_px), np.uint8)) > 0
-    inner_px = tol.lighting_px // 4
-    inner = cv2.erode(pixels, np.ones((inner_px, inner_px), np.uint8)) > 0
-    lowest, highest = float(view.log.min()), float(view.log.max())
-    levels = (view.log - lowest) / max(highest - lowest, 1e-6) * tol.num_levels
-    levels = np.clip(levels.astype(np.int64), 0, tol.num_levels - 1)
+    lowest = min(float(view.log.min()) for view in views)
+    highest = max(float(view.log.max()) for view in views)
 
-    def shares(where: Mask) -> Array:
-        counts = np.bincount(levels[where], minlength=tol.num_levels).astype(np.float64)
-        counts = ndimage.gaussian_filter1d(counts, 1.0)
+    def levels(view: _Working) -> NDArray[np.int64]:
+        level = (view.log - lowest) / max(highest - lowest, 1e-6) * tol.num_levels
+        return np.clip(level.astype(np.int64), 0, tol.num_levels - 1)
+
+    def counts(view: _Working, where: Mask) -> Array:
+        return np.bincount(levels(view)[where], minlength=tol.num_levels).astype(np.float64)
+
+    def shares(counted: Array) -> Array:
+        counted = ndimage.gaussian_filter1d(counted, 1.0)
         # One in a hundred may have any brightness; of nothing, all are as likely.
-        counts += max(0.01 * counts.sum(), 1.0) / tol.num_levels
-        return np.asarray(counts / counts.sum())
+        counted += max(0.01 * counted.sum(), 1.0) / tol.num_levels
+        return np.asarray(counted / counted.sum())
 
-    of_object, of_beyond = shares(inner & view.has_plane), shares(near & ~mask & ~view.has_plane)
-    odds = np.log(of_beyond / of_object)[levels]
-    odds = np.clip(odds, -MAX_ODDS, MAX_ODDS).astype(np.float32)
-    smooth = cv2.GaussianBlur(odds, (0, 0), 1.5)
-    return np.asarray(~view.has_plane & ~view.polarized & (smooth > LEAST_ODDS))
+    def eroded(mask: Mask, size: int) -> Mask:
+        return cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+
+    inner = [eroded(mask, tol.lighting_px // 4) for mask in masks]
+    of_object = shares(
+        np.sum([counts(v, own & v.has_plane) for v, own in zip(views, inner, strict=True)], axis=0)
+    )
+    found = []
+    for view, mask in zip(views, masks, strict=True):
+        near = ~eroded(~mask, tol.lighting_px)
+        of_beyond = shares(counts(view, near & ~mask & ~view.has_plane))
+        odds = np.log(of_beyond / of_object)[levels(view)]
+        odds = np.clip(odds, -MAX_ODDS, MAX_ODDS).astype(np.float32)
+        smooth = cv2.GaussianBlur(odds, (0, 0), 1.5)
+        found.append(np.asarray(~view.has_plane & ~view.polarized & (smooth > LEAST_ODDS)))
+    return found
 
 
 def _odds(residual: Image, sigma: Image, spread: float) -> Image:
