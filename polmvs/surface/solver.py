@@ -359,7 +359,7 @@ def _refined_at(
     ``progress`` are the iterations done before it, and of all levels.
     """
     tol, (done, total) = fit.tol, progress
-    moved, energy = np.zeros(0), None
+    moved, energy, is_thin = np.zeros(0), None, False
     first, last = tol.annealing
     for step in range(level.num_steps):
         # A mesh that has moved far is irregular. In one that intersects itself views see the
@@ -368,13 +368,12 @@ def _refined_at(
             mesh = remeshed(RayScene(mesh), edge)
             moved = np.zeros(len(mesh.vertices))
         scene = RayScene(mesh)
-        if step > 0 and (
-            np.quantile(np.abs(moved), 0.98) > tol.remesh_after * edge
-            or len(scene.crossed_faces(CROSSED_DEPTH * edge))
-        ):
+        if step > 0 and not is_thin and _is_irregular(scene, moved, edge, tol):
             # No smoothing: the mesh is smooth. The grid loses walls thinner than its cells.
             again = RayScene(remeshed(scene, edge, smoothing=0))
-            if covered_share(again, fit.views) > covered_share(scene, fit.views) - REMESHING_LOSS:
+            lost = covered_share(scene, fit.views) - covered_share(again, fit.views)
+            is_thin = lost >= REMESHING_LOSS
+            if not is_thin:
                 scene, mesh = again, again.mesh
                 moved = np.zeros(len(mesh.vertices))
         if not len(mesh.faces):
@@ -411,6 +410,12 @@ def _refined_at(
             break
     assert energy is not None  # a level has an iteration
     return mesh, replace(fit, scales=energy.shown_scales())
+
+
+def _is_irregular(scene: RayScene, moved: Array, edge: float, tol: SolverTolerances) -> bool:
+    """Whether a mesh has moved (V,) far since it was made, or intersects itself."""
+    is_far = float(np.quantile(np.abs(moved), 0.98)) > tol.remesh_after * edge
+    return is_far or len(scene.crossed_faces(CROSSED_DEPTH * edge)) > 0
 
 
 @dataclass(frozen=True)
