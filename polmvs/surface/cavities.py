@@ -357,14 +357,14 @@ def _mouth(
     """Cells (H, W) of the opening: those inside the bright cells of the rim, up to its inner line.
 
     ``on_rim`` are centres (N, 3) of the surface's faces on the rim. Phases of the inside may
-    agree with the rim's normal by chance; darkness separates the inside from the rim.
+    agree with the rim's normal by chance, and outlines may cut off a part of the rim: brightness
+    alone separates the two.
     """
     nothing_near = np.zeros(grid.shape, np.bool_)
     places = grid.points(rim)
     losses = scene.losses_on(places, rim, face_tol)
     evidence = face_evidence(places, rim, scene, losses, nothing_near, None, face_tol)
     brightness = _brightness(places.reshape(-1, 3), on_rim, scene.maps).reshape(grid.shape)
-    # Outlines may have cut off a part of the rim, so `evidence.possible` is not used.
     bright = brightness > tol.max_brightness
     closed = ndimage.binary_closing(bright, iterations=round(tol.max_gap))
     enclosed = np.asarray(ndimage.binary_fill_holes(closed), np.bool_) & ~closed
@@ -458,6 +458,7 @@ def _outside_at(surface: SurfaceFaces, rim: Face, grid: FaceGrid, depth: float) 
 
 
 def _outside(inside: Mask) -> Array:
+    """Distance (H, W) in cells to the border of a section's outer contour, negative inside."""
     # Space that the silhouettes left open inside the wall is not wall.
     return cells_beside(np.asarray(ndimage.binary_fill_holes(inside), np.bool_))
 
