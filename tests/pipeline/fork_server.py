@@ -84,8 +84,11 @@ def serve(request: dict) -> dict:
             os.kill(child, request["signal"])
         _, status = os.waitpid(child, 0)
         seconds = time.perf_counter() - start
-        time.sleep(0.2 if status else 0)  # what has lost its parent may take a moment to notice
-        orphans = group(child)
+        # What has lost its parent notices after the native call that it is in: Open3D's keep
+        # Python's lock for up to a second.
+        until = time.perf_counter() + (5 if status else 0)
+        while (orphans := group(child)) and time.perf_counter() < until:
+            time.sleep(0.1)
         for path in (out, err):
             path.seek(0)
         return {
