@@ -222,20 +222,13 @@ class RayScene:
         face = found["primitive_ids"].numpy().astype(np.int64)
         return place, face, np.column_stack([1 - uv[:, 0] - uv[:, 1], uv])
 
-    def signed_distance(
-        self, points: Floats, *, num_rays: int = len(SIGN_DIRECTIONS)
-    ) -> NDArray[np.float32]:
-        """Distance ``(N,)`` to the mesh, negative inside of it.
+    def signed_distance(self, points: Floats) -> NDArray[np.float32]:
+        """Distance ``(N,)`` of points ``(N, 3)`` to the mesh, negative inside of it.
 
         A point is inside if the mesh winds about it, also where the mesh overlaps itself.
-
-        Parameters
-        ----------
-        points : (N, 3).
-        num_rays : number of rays whose majority decides, odd, up to 3: one may graze an edge.
         """
         distance = self.distance(points)
-        return np.where(self.is_inside(points, num_rays=num_rays), -distance, distance)
+        return np.where(self.is_inside(points), -distance, distance)
 
     def distance(self, points: Floats) -> NDArray[np.float32]:
         """Distance ``(N,)`` of points ``(N, 3)`` to the mesh."""
@@ -245,7 +238,11 @@ class RayScene:
         return np.asarray(found.numpy(), np.float32)
 
     def is_inside(self, points: Floats, *, num_rays: int = len(SIGN_DIRECTIONS)) -> Mask:
-        """Which points ``(N, 3)`` the mesh winds about; parameters of :meth:`signed_distance`."""
+        """Which points ``(N, 3)`` the mesh winds about.
+
+        ``num_rays``, odd, up to 3, is the number of rays whose majority decides: one may graze an
+        edge.
+        """
         local, votes = self._local(points), np.zeros(len(points), np.int64)
         for direction in SIGN_DIRECTIONS[:num_rays]:
             votes += self._windings(local, direction) > 0
@@ -478,8 +475,8 @@ def remeshed(
     limit = np.float32(BAND_CELLS * step)
     values = np.full(shape, np.nan, np.float32)
     values[band] = scene.distance(origin + step * np.argwhere(band))
-    # One ray decides for a whole line of the grid. Vertices may lie on lines; rays beside them
-    # graze no edge.
+    # One ray decides for a whole line of the grid. It runs beside the line, on which vertices may
+    # lie.
     lines = np.argwhere(band.any(axis=2))
     starts = np.column_stack([lines + LINE_OFFSET, np.zeros(len(lines))])
     is_inside = np.zeros(shape, np.bool_)

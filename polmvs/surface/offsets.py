@@ -279,16 +279,13 @@ class SteppedFaces:
         return np.asarray(found, np.float64)
 
 
-def find_faces(
-    seeds: Seeds, tolerances: OffsetTolerances | None = None, *, max_faces: int | None = None
-) -> tuple[Face, ...]:
+def find_faces(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tuple[Face, ...]:
     """Planes through seeds whose normals agree with them, the largest number of seeds first.
 
     Parameters
     ----------
     seeds : sparse points on the part with normals from the phases.
     tolerances : numbers of the search.
-    max_faces : largest number of faces.
 
     Returns
     -------
@@ -302,7 +299,7 @@ def find_faces(
     left: Mask = np.asarray(np.isfinite(normals).all(axis=1) & np.isfinite(points).all(axis=1))
     agree = np.cos(np.radians(tol.normal_deg))
     faces: list[Face] = []
-    while left.sum() >= tol.min_points and (max_faces is None or len(faces) < max_faces):
+    while left.sum() >= tol.min_points:
         index = np.flatnonzero(left)
         triples = index[rng.integers(0, len(index), (tol.num_trials, 3))]
         a, b, c = np.moveaxis(points[triples], 1, 0)

@@ -256,9 +256,9 @@ def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] 
     logger.info("%.1f %% of what hides its support is polarized.", 100 * share)
     if share >= POLARIZED_SHARE:
         return None
-    # Without any phase, its outline alone would pass for a surface.
-    if share > 0.5:
+    if share > 0.5:  # most of it is polarized
         return found
+    # Without any phase, its outline alone would pass for a surface.
     strengths = [
         _dolp_in_sigmas(one, hiding.inner) for one, hiding in zip(maps, found, strict=True)
     ]
