@@ -153,8 +153,8 @@ def _grow(core: Mask, intensity: Image, texture: Image, tolerances: RegionTolera
     """Core plus textureless neighbours of like intensity, holes filled, small regions dropped.
 
     The intensity that a neighbour must resemble is that of the region next to it, and follows
-    shading as the region grows. Where growth would swallow much more than the core (an open,
-    textureless background) the core stays as it is.
+    shading as the region grows. Where what is grown reaches the image's border, or swallows much
+    more than the core (an open, textureless background), the core stays as it is.
     """
     flat = texture < tolerances.low_texture
     grown = core
@@ -170,6 +170,7 @@ def _grow(core: Mask, intensity: Image, texture: Image, tolerances: RegionTolera
         grown = _touching(_open(grown | similar, 5), core)
         if grown.sum() < 1.02 * before:
             break
+    grown = _touching(_open(core | _enclosed(grown & ~core), 5), core)
     grown = _fill_holes(grown, texture, tolerances)
     grown = _substantial(grown, core, tolerances.min_area_px, tolerances.min_core_share)
     alone = _fill_holes(core, texture, tolerances) & ~grown
@@ -191,6 +192,13 @@ def _touching(mask: Mask, core: Mask) -> Mask:
     held[labels[core & mask]] = True
     held[0] = False
     return np.asarray(held[labels])
+
+
+def _enclosed(mask: Mask) -> Mask:
+    """Connected parts of the mask that do not touch the image's border."""
+    labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]
+    at_border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    return mask & ~np.isin(labels, at_border[at_border > 0])
 
 
 def _substantial(mask: Mask, core: Mask, min_area_px: int, min_core_share: float) -> Mask:

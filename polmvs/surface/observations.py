@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 SPECULAR, DIFFUSE = 0, 1  # kinds of light: the first axis of arrays of both
 KINDS = (SPECULAR, DIFFUSE)
@@ -280,6 +281,22 @@ def observe(
             for one in fields(Observations)
         }
     )
+
+
+def reflects_itself(mesh: TriangleMesh, scene: RayScene, found: Observations) -> Mask:
+    """Which observations ``(K,)`` show a mirror image of the mesh itself.
+
+    Such light was reflected twice and may be polarized by either surface.
+
+    Parameters
+    ----------
+    mesh, scene : whose faces ``found`` observes; the whole surface, for ray casting.
+    """
+    normals = mesh.face_normals.take(found.face, axis=0)
+    rays = np.asarray(found.rays, np.float64)
+    mirrored = rays - 2 * dots(rays, normals)[:, None] * normals
+    away = 0.5 * scene.mesh.mean_edge * normals
+    return np.asarray(scene.cast(mesh.centers.take(found.face, axis=0) + away, mirrored).face >= 0)
 
 
 def _observe_view(

@@ -29,7 +29,14 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import PointKind, evenly_spread
 from polmvs.surface.held_out import HeldOutTolerances, predict, predict_left_out
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
-from polmvs.surface.observations import DIFFUSE, SPECULAR, Looking, level_image, observe
+from polmvs.surface.observations import (
+    DIFFUSE,
+    SPECULAR,
+    Looking,
+    level_image,
+    observe,
+    reflects_itself,
+)
 from polmvs.surface.soundness import find_soundness
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.surroundings import sparse_surroundings
@@ -147,7 +154,9 @@ def _camera_complaint(
     some = TriangleMesh(
         mesh.vertices, mesh.faces[shown[evenly_chosen(len(shown), MAX_CAMERA_POINTS)]]
     )
-    found = observe(some, RayScene(mesh), views, images, looking)
+    scene = RayScene(mesh)
+    found = observe(some, scene, views, images, looking)
+    found = found.only(~reflects_itself(some, scene, found))
     residuals = np.abs(found.residuals(some.face_normals))
     if light is None:
         kind = residuals.argmin(axis=0)
