@@ -164,7 +164,7 @@ class _StoredRegion(Region):
         object.__setattr__(self, "flags", flags)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Region, (self.inside, self.reliable, self.edges)
+        return Region, (self.inside, self.reliable, self.edges, self.unbounded)
 
     def _mask(self, bit: int) -> Mask:
         return np.asarray((vars(self)["flags"] & bit) > 0)
@@ -180,6 +180,10 @@ class _StoredRegion(Region):
     @property
     def edges(self) -> Mask:
         return self._mask(4)
+
+    @property
+    def unbounded(self) -> Mask:
+        return self._mask(16)
 
 
 def build_phase_map(
@@ -338,6 +342,8 @@ def store_phase_map(phase_map: PhaseMap, folder: Path) -> PhaseMap:
     """
     region, name = phase_map.region, phase_map.view.name
     flags = region.inside * 1 | region.reliable * 2 | region.edges * 4 | phase_map.diffuse * 8
+    if region.unbounded is not None:
+        flags |= region.unbounded * 16
     save_array(folder / _samples_name(name, phase_map.tilted), phase_map.samples)
     save_array(folder / f"{name}.intensity.npy", phase_map.intensity)
     save_array(folder / f"{name}.region.npy", flags.astype(np.uint8))

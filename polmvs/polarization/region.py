@@ -79,11 +79,14 @@ class Region:
     reliable : (H, W) bool, pixels for averages over windows and votes on the light: polarized,
         unsaturated, and not like a mark. Phase maps use all pixels.
     edges : (H, W) bool, creases and depth edges; contours stop there.
+    unbounded : (H, W) bool, hardly polarized pixels inside that reach the image's border: a surface
+        seen frontally, or a textureless background as bright as it. None: there are none.
     """
 
     inside: Mask
     reliable: Mask
     edges: Mask
+    unbounded: Mask | None = None
 
 
 def smooth(image: Image, sigma_px: float) -> Image:
@@ -105,7 +108,8 @@ def find_region(
     """Find the polarized, textureless region of a view.
 
     The polarized pixels are the core. The core grows into dark neighbours without texture (a
-    surface seen frontally has no polarization). Its holes are filled if they show no texture or
+    surface seen frontally has no polarization). Where growth meets the image's border nothing shows
+    whether it has left the surface. Its holes are filled if they show no texture or
     are as small as a printed mark.
 
     Parameters
@@ -127,7 +131,8 @@ def find_region(
     marks = _marks(s0, inside & core, tolerances.mark_reach_px)
     reliable = inside & valid & ~marks & (dolp > 0.3 * min_dolp)
     edges = inside & _phase_jumps(axial, dolp, min_dolp, tolerances)
-    return Region(inside, reliable, edges)
+    unbounded = _at_border(_open(inside & ~core, 5)) if mask is None else None
+    return Region(inside, reliable, edges, unbounded)
 
 
 def _open(mask: Mask, size: int) -> Mask:
@@ -153,8 +158,8 @@ def _grow(core: Mask, intensity: Image, texture: Image, tolerances: RegionTolera
     """Core plus textureless neighbours of like intensity, holes filled, small regions dropped.
 
     The intensity that a neighbour must resemble is that of the region next to it, and follows
-    shading as the region grows. Where what is grown reaches the image's border, or swallows much
-    more than the core (an open, textureless background), the core stays as it is.
+    shading as the region grows. Where growth would swallow much more than the core (an open,
+    textureless background) the core stays as it is.
     """
     flat = texture < tolerances.low_texture
     grown = core
@@ -170,7 +175,6 @@ def _grow(core: Mask, intensity: Image, texture: Image, tolerances: RegionTolera
         grown = _touching(_open(grown | similar, 5), core)
         if grown.sum() < 1.02 * before:
             break
-    grown = _touching(_open(core | _enclosed(grown & ~core), 5), core)
     grown = _fill_holes(grown, texture, tolerances)
     grown = _substantial(grown, core, tolerances.min_area_px, tolerances.min_core_share)
     alone = _fill_holes(core, texture, tolerances) & ~grown
@@ -194,11 +198,11 @@ def _touching(mask: Mask, core: Mask) -> Mask:
     return np.asarray(held[labels])
 
 
-def _enclosed(mask: Mask) -> Mask:
-    """Connected parts of the mask that do not touch the image's border."""
+def _at_border(mask: Mask) -> Mask:
+    """Connected parts of the mask that touch the image's border."""
     labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]
     at_border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
-    return mask & ~np.isin(labels, at_border[at_border > 0])
+    return np.isin(labels, at_border[at_border > 0])
 
 
 def _substantial(mask: Mask, core: Mask, min_area_px: int, min_core_share: float) -> Mask:

@@ -2,8 +2,9 @@
 
 The polarized region of a view is on the objects. Where they are dark, frontal or show mixed light
 they are hardly polarized, and the region ends too early. Pixels that continue it and look more like
-it than like the surroundings (a graph cut on intensity) are unknown. Views check one another: a
-claim or denial by only one view is also unknown.
+it than like the surroundings (a graph cut on intensity) are unknown. So are hardly polarized parts of
+the region that reach the image's border. Views check one another: a claim or denial by only one
+view is also unknown.
 """
 
 from __future__ import annotations
@@ -82,11 +83,14 @@ def find_silhouette(
     if mask_given or not inside.any():
         return Silhouette(inside, inside)
     scale = phase_map.view.camera.mean_focal_px / REFERENCE_FOCAL_PX
-    certain = _cleaned(inside, scale, tol)
+    unbounded = phase_map.region.unbounded
+    certain = _cleaned(inside if unbounded is None else inside & ~unbounded, scale, tol)
     if not certain.any():
         return Silhouette(certain, certain)
     intensity = np.asarray(phase_map.intensity, np.float32)
     possible = _continued(certain, intensity, scale, tol)
+    if unbounded is not None:
+        possible = possible | unbounded
     possible = possible | _cut_by_the_border(possible, tol.mark_area_px * scale**2)
     inner = _outline_shift(certain, intensity, scale, tol)
     sharp = bool((possible == certain).all())

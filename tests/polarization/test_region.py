@@ -114,17 +114,35 @@ def test_the_users_mask_replaces_the_search():
     np.testing.assert_array_equal(find(s0, s1, s2, mask=mask).inside, mask)
 
 
-@pytest.mark.parametrize("shade", [1.0, 0.97])
-@pytest.mark.parametrize("size", [20, 60])
-def test_growth_does_not_run_into_an_open_textureless_background(shade, size):
-    """A polarized patch before a flat background of like brightness keeps its own extent."""
+def patch_before_a_background(size, shade=1.0):
+    """A polarized patch before a flat unpolarized background of like brightness."""
     s0 = np.full(SHAPE, 0.1 * shade)
     s1, s2 = np.zeros(SHAPE), np.zeros(SHAPE)
     patch = (slice(60 - size // 2, 60 + size // 2), slice(80 - size // 2, 80 + size // 2))
     s0[patch], s1[patch] = 0.1, 0.06
-    region = find(s0, s1, s2)
+    return find(s0, s1, s2), patch
+
+
+@pytest.mark.parametrize("shade", [1.0, 0.97])
+def test_growth_does_not_run_into_an_open_textureless_background(shade):
+    """A small patch keeps its own extent."""
+    region, _ = patch_before_a_background(20, shade)
     assert region.inside[55:65, 75:85].all()
-    assert region.inside.sum() < 2 * size**2
+    assert region.inside.sum() < 4 * 400
+
+
+def test_growth_that_meets_the_images_border_is_unbounded():
+    """Beside a larger patch, nothing shows whether the background is more of the surface."""
+    region, patch = patch_before_a_background(60)
+    assert not region.unbounded[patch].any()
+    beyond = region.inside & ~region.unbounded
+    beyond[patch] = False
+    assert beyond.sum() < 5 * 4 * 60  # what the smoothing adds along the patch
+    assert region.unbounded[5:115, 5:30].all()
+
+
+def test_growth_that_ends_within_the_image_is_bounded():
+    assert not find(*stokes_scene()[:3]).unbounded.any()
 
 
 def test_a_larger_image_of_a_scene_has_the_same_region():
