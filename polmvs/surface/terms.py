@@ -405,11 +405,12 @@ def find_rim(
     away = middle - view.center
     distance = lengths(away)[:, None]
     outwards = unit_or_zero(outwards - dots(outwards, away)[:, None] / distance**2 * away)
-    # One pixel outside of the outline there is nothing, one pixel inside the surface itself.
+    # One pixel outside of the outline there is nothing, one pixel inside the surface: on a round or
+    # oblique one it lies far before the outline.
     beyond = scene.cast(view.center, away + 1.0 * pixel[:, None] * outwards).distance
     before = scene.cast(view.center, away - 1.0 * pixel[:, None] * outwards).distance
     slack = 4 * mesh.mean_edge / distance[:, 0]
-    rim = ~np.isfinite(beyond) & (np.abs(before - 1) < slack)
+    rim = ~np.isfinite(beyond) & (before < 1 + slack)
     if not on_outline:
         return Rim(ends[rim], faces[rim], xy[rim], length[rim])
     away, step = away[rim], (pixel[:, None] * outwards)[rim]
