@@ -2,8 +2,8 @@
 
 The polarized region of a view is on the objects. Where they are dark, frontal or show mixed light
 they are hardly polarized, and the region ends too early. Pixels that continue it and look more like
-it than like the surroundings (a graph cut on intensity) are unknown. So are hardly polarized parts of
-the region that reach the image's border. Views check one another: a claim or denial by only one
+it than like the surroundings (a graph cut on intensity) are unknown. So are hardly polarized parts
+of the region that reach the image's border. Views check one another: a claim or denial by only one
 view is also unknown.
 """
 

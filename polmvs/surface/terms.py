@@ -68,6 +68,9 @@ class TermTolerances:
     outline_bias_px : deviation of a common error of all silhouettes, too wide or too narrow.
         Measured on the true outlines of four captures: -0.35 to 0.04. It is part of the stated
         deviations and not solved for.
+    outline_alike_px : length of an outline over which its errors are correlated, px. Derived: it is
+        smoothed along itself over 1.5 px, or 6 px where the plane behind it shows it, and a
+        Gaussian averages the root of 4 pi of its widths.
     smoothness : deviation of the scale-free curvature from the mean of its surroundings. Measured:
         0.02 to 0.08 give the same.
     smoothness_memory : share of the surroundings' curvature without penalty. Measured: 0.8.
@@ -81,6 +84,7 @@ class TermTolerances:
     alike_views: int = 20
     place_sigma_px: float = 0.3
     outline_bias_px: float = 0.1
+    outline_alike_px: float = 10.0
     smoothness: float = 0.04
     smoothness_memory: float = 0.8
     vote_sigma: float = 0.03
@@ -519,7 +523,7 @@ def add_outlines(
     slope = np.zeros(equations.num)
     scale = max(3 * tol.place_sigma_px, 0.5 * gate_px) ** 2
     for own in rows:
-        weight = own.length_px * geman_mcclure_weights(own.residual, scale)
+        weight = geman_mcclure_weights(own.residual, scale) * own.length_px / tol.outline_alike_px
         # An outline crosses an area of correlated errors over the root of its pixels.
         weight *= np.sqrt(tol.phase_correlation(face_area_px)) / outline_sigma(own, tol) ** 2
         equations.add(own.vertices, own.jacobian, own.residual, weight)

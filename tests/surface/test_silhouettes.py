@@ -72,6 +72,19 @@ def test_specks_gaps_and_marks_are_cleaned(ball):
     assert (found_silhouette(with_region(ball, inside)).certain == clean).all()
 
 
+def test_an_unbounded_part_of_the_region_is_unknown(ball):
+    """It may be the surface or the background, out to where the region ends."""
+    inside = ball.region.inside.copy()
+    unbounded = np.zeros_like(inside)
+    unbounded[:, :40] = True
+    unbounded &= ~cv2.dilate(inside.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+    whole = Region(inside | unbounded, inside, np.zeros_like(inside), unbounded)
+    silhouette = found_silhouette(replace(ball, region=whole))
+    assert not silhouette.certain[unbounded].any()
+    assert silhouette.possible[unbounded].all()
+    assert (silhouette.certain == found_silhouette(ball).certain).all()
+
+
 def test_what_the_border_of_the_image_and_the_object_enclose_is_unknown(ball):
     """It may be a mark that the border cuts, or background."""
     inside = np.zeros_like(ball.region.inside)
