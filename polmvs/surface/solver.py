@@ -545,7 +545,14 @@ def linearize(
         if not view.has_outline:
             return None
         return outline_rows(
-            mesh, scene, view, edges, sharp, gate_px=level.gate_px, on_outline=sides is not None
+            mesh,
+            scene,
+            view,
+            edges,
+            sharp,
+            terms,
+            gate_px=level.gate_px,
+            on_outline=sides is not None,
         )
 
     # Threads, as products of large arrays and ray casting release Python's lock.

@@ -10,7 +10,8 @@ share:
 
 Here ``r = m . n`` are the residuals of observations under their probable label
 (:mod:`polmvs.surface.labels`), d the distances of the mesh's outline to the silhouettes, h the
-heights above known points, and k the changes of the scale-free curvature. All losses rho are robust
+heights above known points, and k the changes of the scale-free curvature. ``sigma_v`` includes the
+bias of outlines of round surfaces (:mod:`polmvs.surface.grazing`). All losses rho are robust
 (Geman and McClure 1985). One Gauss-Newton step solves the sum (:mod:`polmvs.surface.solver`).
 """
 
@@ -31,6 +32,7 @@ from polmvs.config import default_num_workers
 from polmvs.fitting import geman_mcclure_weights, robust_deviation
 from polmvs.geometry import dots, lengths, unit_or_zero
 from polmvs.surface.creases import CreaseTolerances
+from polmvs.surface.grazing import outline_bias
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import DIFFUSE, SPECULAR, Observations
 from polmvs.surface.surface_view import SurfaceView
@@ -68,9 +70,10 @@ class TermTolerances:
     outline_bias_px : deviation of a common error of all silhouettes, too wide or too narrow.
         Measured on the true outlines of four captures: -0.35 to 0.04. It is part of the stated
         deviations and not solved for.
-    outline_alike_px : length of an outline over which its errors are correlated, px. Derived: it is
-        smoothed along itself over 1.5 px, or 6 px where the plane behind it shows it, and a
-        Gaussian averages the root of 4 pi of its widths.
+    alike_outline_px : length over which the bias of an outline (:func:`outline_bias`) is the same,
+        px. Outlines are smoothed along themselves: 5 px, or 20 px where the plane shows them.
+    plane_outline_px : deviation of outlines that the plane behind them shows. Measured on three
+        captures, medians of fifths of the outlines: -0.8 to -0.2.
     smoothness : deviation of the scale-free curvature from the mean of its surroundings. Measured:
         0.02 to 0.08 give the same.
     smoothness_memory : share of the surroundings' curvature without penalty. Measured: 0.8.
@@ -84,7 +87,8 @@ class TermTolerances:
     alike_views: int = 20
     place_sigma_px: float = 0.3
     outline_bias_px: float = 0.1
-    outline_alike_px: float = 10.0
+    alike_outline_px: float = 10.0
+    plane_outline_px: float = 0.5
     smoothness: float = 0.04
     smoothness_memory: float = 0.8
     vote_sigma: float = 0.03
@@ -372,12 +376,14 @@ class Rim:
     faces : (K, 2) that share these edges.
     xy : (K, 2) image coordinates of the points, or of the mesh's outline beside them.
     length_px : (K,) length of the outline of each point.
+    radius_px : (K,) radius of curvature of the surface along the line of sight.
     """
 
     ends: Indices
     faces: Indices
     xy: Array
     length_px: Array
+    radius_px: Array
 
 
 def find_rim(
@@ -415,16 +421,21 @@ def find_rim(
     before = scene.cast(view.center, away - 1.0 * pixel[:, None] * outwards).distance
     slack = 4 * mesh.mean_edge / distance[:, 0]
     rim = ~np.isfinite(beyond) & (before < 1 + slack)
-    if not on_outline:
-        return Rim(ends[rim], faces[rim], xy[rim], length[rim])
     away, step = away[rim], (pixel[:, None] * outwards)[rim]
+    # The surface lies a d + sqrt(2 r d) before the outline, d inside of it; a is that of a plane.
+    inner = scene.cast(view.center, away - 4.0 * step).distance
+    gap, inner_gap = ((1 - t) * distance[rim, 0] / pixel[rim] for t in (before[rim], inner))
+    bend = np.clip((4 * gap - inner_gap) / 2, 0, None)
+    radius = np.where(np.isfinite(bend), bend**2 / 2, 0)
+    if not on_outline:
+        return Rim(ends[rim], faces[rim], xy[rim], length[rim], radius)
     low, high = np.zeros(len(away)), np.ones(len(away))
     for _ in range(RIM_HALVINGS):
         middle = 0.5 * (low + high)
         met = np.isfinite(scene.cast(view.center, away + middle[:, None] * step).distance)
         low, high = np.where(met, middle, low), np.where(met, high, middle)
     xy, _ = view.project(view.center + away + (0.5 * (low + high))[:, None] * step)
-    return Rim(ends[rim], faces[rim], xy, length[rim])
+    return Rim(ends[rim], faces[rim], xy, length[rim], radius)
 
 
 def rim_residuals(view: SurfaceView, xy: Array) -> tuple[Array, Array]:
@@ -442,12 +453,20 @@ def rim_residuals(view: SurfaceView, xy: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class OutlineRows:
-    """Residuals (K,) of a view's outline, px, with their vertices (K, 3) and lengths (K,)."""
+    """Rows of a view's outline.
+
+    Attributes
+    ----------
+    vertices, jacobian : (K, 3).
+    residual, length_px : (K,) px, of the outline.
+    bias_px : (K,) deviation of the error that neighbours share.
+    """
 
     vertices: Indices
     jacobian: Array
     residual: Array
     length_px: Array
+    bias_px: Array
 
 
 def outline_rows(
@@ -456,6 +475,7 @@ def outline_rows(
     view: SurfaceView,
     edges: SharedEdges,
     sharp: Mask,
+    tol: TermTolerances,
     *,
     gate_px: float,
     on_outline: bool = False,
@@ -474,7 +494,10 @@ def outline_rows(
         behind, _ = view.project(middle - reach * directions[:, column])
         jacobian[:, column] = dots(gradient, ahead - behind) / (2 * reach)
     vertices = np.column_stack([vertices, vertices[:, 0]])
-    return OutlineRows(vertices, np.nan_to_num(jacobian), residual, rim.length_px[near])
+    bias = outline_bias(rim.radius_px[near])
+    if view.phase_map.outline_shift is not None:
+        bias = np.hypot(bias, tol.plane_outline_px)
+    return OutlineRows(vertices, np.nan_to_num(jacobian), residual, rim.length_px[near], bias)
 
 
 def outline_moves(
@@ -523,9 +546,10 @@ def add_outlines(
     slope = np.zeros(equations.num)
     scale = max(3 * tol.place_sigma_px, 0.5 * gate_px) ** 2
     for own in rows:
-        weight = geman_mcclure_weights(own.residual, scale) * own.length_px / tol.outline_alike_px
+        variance = outline_sigma(own, tol) ** 2 + tol.alike_outline_px * own.bias_px**2
+        weight = own.length_px * geman_mcclure_weights(own.residual, scale) / variance
         # An outline crosses an area of correlated errors over the root of its pixels.
-        weight *= np.sqrt(tol.phase_correlation(face_area_px)) / outline_sigma(own, tol) ** 2
+        weight *= np.sqrt(tol.phase_correlation(face_area_px))
         equations.add(own.vertices, own.jacobian, own.residual, weight)
         change = (weight[:, None] * own.jacobian).ravel()
         slope += np.bincount(own.vertices.ravel(), change, equations.num)

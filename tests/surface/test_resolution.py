@@ -134,8 +134,8 @@ def test_the_surface_of_all_views_is_the_balls(surfaces, scale):
     area = surface.mesh.face_areas[surface.supported].sum()
     assert area > 0.6 * 4 * np.pi * BALL.radius**2  # no view looks up at it
     assert (np.abs(error) < 2 * sigma).mean() > 0.95
-    # Nearly all of it is the bias of outlines, of a tenth of a pixel, which all vertices share.
-    assert 0.1 < np.median(sigma) / surface.gsd < 0.2
+    # Most of it is the bias of outlines, of a tenth of a pixel, which all vertices share.
+    assert 0.05 < np.median(sigma) / surface.gsd < 0.2
 
 
 @pytest.mark.parametrize("scale", OTHERS)

@@ -127,6 +127,16 @@ def test_the_rim_is_the_outline_of_the_mesh(ball, step):
     assert 0.8 < rim.length_px.sum() / (2 * np.pi * expected) < 2.5
 
 
+def test_the_rim_knows_how_round_the_surface_is(ball):
+    """The radius of a sphere, in pixels at its distance; none at edges between sides."""
+    mesh = extracted(sphere(), step=0.03)
+    rim = find_rim(mesh, RayScene(mesh), ball[0], shared_edges(mesh))
+    assert np.median(rim.radius_px) == pytest.approx(150 / 5, rel=0.3)
+    view, mesh = views_of(box(), ring_of_views(1, elevations=(30.0,)))[0], sharp_box()
+    rim = find_rim(mesh, RayScene(mesh), view, shared_edges(mesh))
+    assert np.median(rim.radius_px) < 1
+
+
 def test_rim_points_lie_on_the_outline_not_within_it():
     """Middles of edges that wander about a rough outline lie within it."""
     view, mesh = views_of(sphere())[0], extracted(sphere(), step=0.2)
@@ -290,13 +300,7 @@ def test_a_shared_error_is_eliminated_exactly():
     assert shared.solved(found) == pytest.approx(expected[8], abs=5e-3)
 
 
-VOTES_BIAS = "votes at the round edges of so small a box turn the share by 0.41"
-
-
-@pytest.mark.parametrize(
-    "is_tilted",
-    [pytest.param(False, marks=pytest.mark.xfail(reason=VOTES_BIAS, strict=True)), True],
-)
+@pytest.mark.parametrize("is_tilted", [False, True])
 def test_phases_show_whether_polarizers_are_tilted(is_tilted):
     # Wide views of flat faces: on the axis, and on a sphere about it, the tilt turns no phase.
     near = ring_of_views(12, distance=2.4, elevations=(15.0, 40.0, 65.0), focal=75.0)
@@ -358,15 +362,18 @@ def test_faces_of_a_box_become_flat():
 
 
 def test_outlines_that_known_points_contradict_are_told(ball):
-    """All silhouettes are two pixels too wide; the phases of a sphere hardly see its scale."""
-    wide = []
+    """All silhouettes are two pixels too wide; the phases of a sphere hardly see its scale.
+
+    Few points do not outweigh them.
+    """
+    num, wide = 12, []
     for view in ball:
         mask = cv2.dilate(view.silhouette.certain.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         wide.append(replace(view, silhouette=Silhouette(mask, mask)))
     rng = np.random.default_rng(0)
-    points = rng.standard_normal((80, 3))
+    points = rng.standard_normal((num, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    known = KnownPoints(points, np.full(80, 0.3 * FOOTPRINT))
+    known = KnownPoints(points, np.full(num, 0.3 * FOOTPRINT))
     found = []
     for views in (ball, wide):
         hull = visual_hull(views, num_wrong=0)
@@ -459,7 +466,7 @@ def test_views_that_disagree_widen_the_deviations(ball):
         mask = views[index].silhouette.certain.astype(np.uint8)
         wide = cv2.dilate(mask, np.ones((5, 5), np.uint8)) > 0
         views[index] = replace(views[index], silhouette=Silhouette(wide, wide))
-    assert np.median(deviations(mesh, views) / alike) > 1.3
+    assert np.median(deviations(mesh, views) / alike) > 1.2
 
 
 def test_deviations_are_larger_where_less_is_known(ball):
