@@ -108,9 +108,9 @@ def find_region(
     """Find the polarized, textureless region of a view.
 
     The polarized pixels are the core. The core grows into dark neighbours without texture (a
-    surface seen frontally has no polarization). Where growth meets the image's border nothing shows
-    whether it has left the surface. Its holes are filled if they show no texture or
-    are as small as a printed mark.
+    surface seen frontally has no polarization). Its holes are filled if they show no texture or are
+    as small as a printed mark. Where growth meets the image's border, nothing shows whether it has
+    left the surface.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def find_region(
     marks = _marks(s0, inside & core, tolerances.mark_reach_px)
     reliable = inside & valid & ~marks & (dolp > 0.3 * min_dolp)
     edges = inside & _phase_jumps(axial, dolp, min_dolp, tolerances)
-    unbounded = _at_border(_open(inside & ~core, 5)) if mask is None else None
+    unbounded = parts_at_border(_open(inside & ~core, 5)) if mask is None else None
     return Region(inside, reliable, edges, unbounded)
 
 
@@ -198,8 +198,8 @@ def _touching(mask: Mask, core: Mask) -> Mask:
     return np.asarray(held[labels])
 
 
-def _at_border(mask: Mask) -> Mask:
-    """Connected parts of the mask that touch the image's border."""
+def parts_at_border(mask: Mask) -> Mask:
+    """Connected parts (H, W) of the mask that touch the image's border."""
     labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]
     at_border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     return np.isin(labels, at_border[at_border > 0])

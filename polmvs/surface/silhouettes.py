@@ -20,7 +20,7 @@ from scipy import ndimage
 from polmvs.camera import sample_image
 from polmvs.io.arrays import StoredArray, map_array, save_array
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.polarization.region import RegionTolerances
+from polmvs.polarization.region import RegionTolerances, parts_at_border
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX, Silhouette, signed_distance_px
 
 Array = NDArray[np.float64]
@@ -142,10 +142,7 @@ def _without_small(mask: Mask, min_area: float, *, connectivity: int) -> Mask:
 
 def _cut_by_the_border(mask: Mask, max_area: float) -> Mask:
     """Small pieces beside a mask that only it and the image's border enclose."""
-    small = ~mask & ~_without_small(~mask, max_area, connectivity=4)
-    labels = cv2.connectedComponents(small.astype(np.uint8), connectivity=4)[1]
-    at_border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
-    return np.isin(labels, at_border[at_border > 0])
+    return parts_at_border(~mask & ~_without_small(~mask, max_area, connectivity=4))
 
 
 def _ellipse(radius: int) -> NDArray[np.uint8]:

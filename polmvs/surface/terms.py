@@ -459,7 +459,7 @@ class OutlineRows:
     ----------
     vertices, jacobian : (K, 3).
     residual, length_px : (K,) px, of the outline.
-    bias_px : (K,) deviation of the error that neighbours share.
+    bias_px : (K,) deviation of the error that neighbours on the outline share.
     """
 
     vertices: Indices
