@@ -319,7 +319,7 @@ def test_comparison_goes_on_with_a_run(demo_run: Path, demo_capture: Path, tmp_p
     assert set(run.models) == set(polmvs.AngleModel)
 
 
-@pytest.mark.parametrize("as_object", [False, True])
+@pytest.mark.parametrize("as_object", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_normals_of_sparse_points(demo_run: Path, demo_capture: Path, as_object: bool) -> None:
     """The same as the stages find on the same model; writing it anew changes the last digits."""
     folder = demo_run / "sparse"

@@ -110,6 +110,7 @@ def test_errors_of_tasks_arrive_whole(address) -> None:
         list(workers.map(fail, range(2)))
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_comes_back(tmp_path) -> None:
     first = local_cluster()
     port = int(first.scheduler_address.rpartition(":")[2])
@@ -175,6 +176,7 @@ def test_without_dask(monkeypatch) -> None:
         Cluster("tcp://127.0.0.1:9")
 
 
+@pytest.mark.slow
 def test_commands_on_a_cluster(cli, address, tmp_path) -> None:
     views, scene = orbit_views(4, camera_of(96)), scene_of(Part.BOARD)
     write_printed_capture(tmp_path / "capture", views, scene)
@@ -266,6 +268,7 @@ def test_a_killed_worker_changes_nothing(address, tmp_path) -> None:
     assert (tmp_path / "died").exists()
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_every_worker(address) -> None:
     with (
         Workers.of_cluster(address) as workers,

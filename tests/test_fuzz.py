@@ -14,6 +14,7 @@ from fuzzing.readers import KINDS
 ROUNDS = 25
 
 
+@pytest.mark.slow
 def test_every_reader_survives_damaged_files(tmp_path: Path) -> None:
     script = Path(__file__).parent / "fuzzing" / "fuzz.py"
     done = subprocess.run(

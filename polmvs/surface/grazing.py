@@ -18,6 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from polmvs.surface.matting import MattingTolerances
+from polmvs.surface.surface_view import OutlineSource
+
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
@@ -26,10 +29,11 @@ BLUR_PX = 0.8  # deviation of the blur of optics, demosaicing and the smoothing 
 STEP_PX = 0.02
 REACH_PX = 12.0
 RADII_PX = np.geomspace(0.5, 1000, 24)
+DISTANCE = np.arange(-REACH_PX, REACH_PX, STEP_PX)  # outside of the outline
 
 
-def outline_bias(radius_px: Floats) -> Array:
-    """Distance (K,), px, by which outlines lie within the true ones.
+def outline_bias(radius_px: Floats, source: OutlineSource) -> Array:
+    """Largest distance (K,), px, by which outlines lie within the true ones; 0 for given masks.
 
     It holds where the surface mirrors a background as bright as the one beside it, and is smaller
     elsewhere, such as beside a shadow.
@@ -37,22 +41,41 @@ def outline_bias(radius_px: Floats) -> Array:
     Parameters
     ----------
     radius_px : (K,) radius of curvature of the surface along the line of sight.
+    source : of the outlines.
     """
+    if source is OutlineSource.MASK:
+        return np.zeros(len(radius_px))
     radii = np.log(np.clip(radius_px, RADII_PX[0], RADII_PX[-1]))
-    return np.asarray(np.interp(radii, np.log(RADII_PX), _biases()))
+    biases = _matting_biases() if source is OutlineSource.MATTING else _edge_biases()
+    return np.asarray(np.interp(radii, np.log(RADII_PX), biases))
 
 
 @cache
-def _biases() -> Array:
+def _edge_biases() -> Array:
     """Bias for each of ``RADII_PX``: how far inside the brightness changes most."""
-    distance = np.arange(-REACH_PX, REACH_PX, STEP_PX)
+    steepest = [ndimage.gaussian_filter1d(_share(r), BLUR_PX / STEP_PX, order=1) for r in RADII_PX]
+    return np.array([-DISTANCE[np.argmin(slope)] for slope in steepest])
+
+
+@cache
+def _matting_biases() -> Array:
+    """Bias for each of ``RADII_PX``: what the integral of alpha lacks."""
+    tol = MattingTolerances()
+    weight = np.exp(-0.5 * (DISTANCE / tol.blend_px) ** 2) * (tol.core_px < -DISTANCE)
+    near = (DISTANCE < 0) & (tol.reach_px > -DISTANCE)
     found = []
     for radius in RADII_PX:
-        sine = np.clip(1 + distance / radius, 0, 1)
-        share = np.where(distance < 0, 1 - _reflectance(sine), 0.0)
-        slope = ndimage.gaussian_filter1d(share, BLUR_PX / STEP_PX, order=1)
-        found.append(-distance[np.argmin(slope)])
+        share = _share(radius)
+        slope, level = np.polyfit(DISTANCE, share, 1, w=np.sqrt(weight))
+        alpha = share / (level + slope * DISTANCE)
+        found.append(STEP_PX * (1 - np.clip(alpha[near], 0, 1)).sum())
     return np.array(found)
+
+
+def _share(radius_px: float) -> Array:
+    """Share of a pixel's light that differs from the background, at each of ``DISTANCE``."""
+    sine = np.clip(1 + DISTANCE / radius_px, 0, 1)
+    return np.asarray(np.where(DISTANCE < 0, 1 - _reflectance(sine), 0.0))
 
 
 def _reflectance(sine: Array) -> Array:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -23,7 +24,8 @@ from polmvs.config import default_num_workers
 from polmvs.geometry import lengths
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
-from polmvs.surface.surface_view import signed_distance_px
+from polmvs.surface.matting import find_outline
+from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
 from polmvs.surface.visual_hull import Plane
 
 Array = NDArray[np.float64]
@@ -59,10 +61,7 @@ class SearchTolerances:
         view.
     num_cells : of the coarse grid, along its side; the fine one has as many along the object's.
     num_rounds : of prediction and carving; a third changes the outlines by 0.1 px.
-    core_px, blend_px : distance from the outline at which object and surroundings are averaged, and
-        deviation of the average, working pixels.
-    along_px : deviation of the average along the outline, working pixels.
-    reach_px : of the search for the outline, working pixels.
+    inner_px : distance from the outline of what is well within the object, working pixels.
     """
 
     working_px: int = 320
@@ -79,10 +78,7 @@ class SearchTolerances:
     seen_share: float = 0.6
     num_cells: int = 72
     num_rounds: int = 2
-    core_px: float = 2.0
-    blend_px: float = 2.5
-    along_px: float = 3.0
-    reach_px: float = 4.0
+    inner_px: float = 6.0
 
     def needed(self, num_views: int) -> int:
         """Number of views that must deny a point."""
@@ -169,10 +165,10 @@ def find_object(
     changes = np.concatenate([plate.changes for plate in plates])
     if not len(changes) or float(np.median(changes)) > noise:
         return None  # the lamp moves with the camera: outlines would be pixels wide
-    return [
-        _outlined(view, mask, plate, noise, tol)
-        for view, mask, plate in zip(small, masks, plates, strict=True)
-    ]
+    # Threads, as sampling images releases Python's lock.
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        one = partial(_found, small, plane=plane, noise=noise, tol=tol)
+        return list(pool.map(one, range(len(small)), masks, plates))
 
 
 @dataclass(frozen=True)
@@ -183,6 +179,8 @@ class _Working:
     ----------
     view : in its own pixels.
     factor : of its own pixels to a working one.
+    intensity : (H, W) float32, in its own pixels.
+    lowest : intensity whose logarithm is the lowest.
     log : (h, w) float32, logarithm of the intensity.
     polarized : (h, w) bool, its polarized region.
     on_plane : (h, w, 3), where each pixel's ray meets the plane; NaN where it does not.
@@ -191,6 +189,8 @@ class _Working:
 
     view: View
     factor: float
+    intensity: Image
+    lowest: float
     log: Image
     polarized: Mask
     on_plane: Array
@@ -225,13 +225,18 @@ def _working(phase_map: PhaseMap, plane: Plane, longest_px: float) -> _Working:
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1 else image
     lowest = 1e-3 * max(float(np.percentile(small, 99)), 1e-12)
     log = np.log(np.maximum(cv2.GaussianBlur(small, (0, 0), 0.5), lowest)).astype(np.float32)
-    rays = view.rays_in_world(pixel_centers(*size) * factor)
-    center = view.center_in_world
+    polarized = cv2.resize(inside, size, interpolation=cv2.INTER_AREA) > 0.5
+    on_plane = _on_plane(view, plane, pixel_centers(*size) * factor)
+    has_plane = np.asarray(np.isfinite(on_plane).all(axis=-1), np.bool_)
+    return _Working(view, factor, image, lowest, log, polarized, on_plane, has_plane)
+
+
+def _on_plane(view: View, plane: Plane, xy: Floats) -> Array:
+    """Where the rays of image coordinates ``(..., 2)`` meet a plane; NaN where they do not."""
+    rays, center = view.rays_in_world(xy), view.center_in_world
     with np.errstate(divide="ignore", invalid="ignore"):
         ranges = (plane.offset - center @ plane.normal) / (rays @ plane.normal)
-    ranges = np.where(ranges > 0, ranges, np.nan)
-    polarized = cv2.resize(inside, size, interpolation=cv2.INTER_AREA) > 0.5
-    return _Working(view, factor, log, polarized, center + ranges[..., None] * rays, ranges > 0)
+    return np.asarray(center + np.where(ranges > 0, ranges, np.nan)[..., None] * rays)
 
 
 def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
@@ -482,11 +487,14 @@ class _Plate:
     log : (h, w) float32, logarithm of the intensity; NaN where fewer than two other views see the
         plane.
     deviation : (h, w) float32, of the views that see it.
+    predictions : of each other view: its index, 1 where it shows no object (h, w), and what is
+        added to its logarithm, in a smaller image.
     changes : (n,), variation of the light on the plane over the image from view to view.
     """
 
     log: Image
     deviation: Image
+    predictions: list[tuple[int, Image, Image]]
     changes: Array
 
 
@@ -508,9 +516,10 @@ def _plates(
     kernel = np.ones((3, 3), np.uint8)
     free = [cv2.dilate(mask.astype(np.uint8), kernel) == 0 for mask in masks]
     beside = [mask.astype(np.float32) for mask in free]
+    shrink = 8 / tol.lighting_px  # of an average over the window
 
     def plate(index: int) -> _Plate:
-        view, shown, changes = views[index], [], []
+        view, shown, changes, predictions = views[index], [], [], []
         for other in _others(views, index, tol):
             xy = views[other].project(view.on_plane)
             seen = views[other].sees(xy) & (sample_image(beside[other], xy) >= 1)
@@ -519,13 +528,15 @@ def _plates(
             log = sample_image(views[other].log, xy)
             change = _local_mean(view.log - log, both, tol.lighting_px)
             shown.append(np.where(seen, log + change, np.nan))
+            small = cv2.resize(change, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+            predictions.append((int(other), beside[other], np.asarray(small, np.float32)))
             varying = change[both]
             changes.append(1.4826 * np.median(np.abs(varying - np.median(varying))))
         stack = np.array(shown, np.float32).reshape(-1, *view.log.shape)
         log = _median(stack)
         deviation = np.nan_to_num(1.4826 * _median(np.abs(stack - log)))
         log[~view.has_plane] = np.nan
-        return _Plate(log, deviation, np.array(changes))
+        return _Plate(log, deviation, predictions, np.array(changes))
 
     # Threads, as sampling images and sorting release Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
@@ -661,87 +672,50 @@ def _odds(residual: Image, sigma: Image, spread: float) -> Image:
     return np.asarray(np.clip(odds, -MAX_ODDS, MAX_ODDS), np.float32)
 
 
-def _outlined(
-    view: _Working, mask: Mask, plate: _Plate, noise: float, tol: SearchTolerances
+def _found(
+    views: Sequence[_Working],
+    index: int,
+    mask: Mask,
+    plate: _Plate,
+    *,
+    plane: Plane,
+    noise: float,
+    tol: SearchTolerances,
 ) -> FoundObject:
-    """The object in a view's own pixels, with the sub-pixel position of its outline.
-
-    Along a line across the outline, the share of the object in a pixel's light (its alpha, between
-    the predicted plane and the brightness of the object) falls from 1 to 0. Its sum is the position
-    of the outline, for any blur.
-    """
-    distance = signed_distance_px(mask)
-    border = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
-    rows, columns = np.nonzero(border)
+    """The object in a view's own pixels, with the sub-pixel position of its outline."""
+    view = views[index]
     size = (view.view.camera.width, view.view.camera.height)
-    full = cv2.resize(distance, size) * np.float32(view.factor)
-    if len(rows) < 10:
-        return FoundObject(full < 0, np.zeros_like(full), np.zeros_like(full, np.bool_))
-    smooth_distance = cv2.GaussianBlur(distance, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
-    slopes = [cv2.Sobel(smooth_distance, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)]
-    outwards = np.stack(slopes, axis=-1)[rows, columns]
-    outwards = outwards / np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-6)
-    image, predicted = np.exp(view.log), np.exp(plate.log)  # a pixel's light is a sum
-    inner = _trend(image, distance, distance < -tol.core_px, tol.blend_px)
-    outer, _, outer_variance = _trend(image, distance, distance > tol.core_px, tol.blend_px)
-    known = np.isfinite(predicted)
-    behind = np.where(known, predicted, outer).astype(np.float32)
-    relative = plate.deviation**2 + noise**2
-    variance = np.where(known, relative * predicted**2, outer_variance).astype(np.float32)
-    step = 0.25
-    along = np.arange(-tol.reach_px, tol.reach_px + step, step)
-    onto = (
-        np.stack([columns + 0.5, rows + 0.5], axis=1) - outwards * distance[rows, columns][:, None]
-    )
-    places = onto[:, None] + outwards[:, None] * along[:, None]
-    # Shading continues to the outline: the object's brightness there is extrapolated.
-    level, slope, own_variance = (
-        sample_image(part, onto - outwards * tol.core_px)[:, None] for part in inner
-    )
-    own = np.maximum(level + slope * np.minimum(along, 0), 0)
-    back = sample_image(behind, places)
-    weight = 1 / (sample_image(variance, places) + own_variance)
-    contrast = own - back
-    of_object = np.zeros((2, *mask.shape, len(along)), np.float32)
-    of_object[0, rows, columns] = weight * contrast * (sample_image(image, places) - back)
-    of_object[1, rows, columns] = weight * contrast**2
-    total, most = (_blurred(part, tol.along_px)[rows, columns] for part in of_object)
-    alpha = np.clip(total / np.maximum(most, 1e-9), 0, 1)
-    # An outline needs a mean contrast of one deviation. Beyond it the plane is visible; anything
-    # else there hides the outline.
-    told = np.minimum(most.mean(axis=1) * 2 * np.pi * tol.along_px, 1)
-    told *= (known | ~view.has_plane)[rows, columns] & (alpha[:, -4:].mean(axis=1) < 0.5)
-    found, certainty = np.zeros((2, *mask.shape), np.float32)
-    found[rows, columns] = told * (step * (alpha.sum(axis=1) - 0.5) - tol.reach_px)
-    certainty[rows, columns] = told
-    found, certainty = (cv2.GaussianBlur(i, (0, 0), tol.along_px) for i in (found, certainty))
-    mean = np.asarray(found / np.maximum(certainty, 0.1), np.float32)
-    nearest = ndimage.distance_transform_edt(~border, return_distances=False, return_indices=True)
-    shift = cv2.resize(mean[nearest[0], nearest[1]], size)
-    inner_px = 1.5 * tol.reach_px * view.factor
-    return FoundObject(full < 0, np.float32(view.factor) * shift, full < -inner_px)
+    coarse = cv2.resize(signed_distance_px(mask), size) * np.float32(view.factor)
+    behind = partial(_behind, views, index, plate, plane)
+    distance = find_outline(view.intensity, coarse, behind, noise, start_px=view.factor)
+    found = distance < 0
+    inner = coarse < -tol.inner_px * view.factor
+    return FoundObject(found, smooth_distance_px(found) - distance, inner)
 
 
-def _blurred(stack: Image, sigma: float) -> Image:
-    """A stack (h, w, n), each of which is blurred."""
-    return np.stack(
-        [cv2.GaussianBlur(stack[..., k], (0, 0), sigma) for k in range(stack.shape[-1])], axis=-1
-    )
+def _behind(
+    views: Sequence[_Working], index: int, plate: _Plate, plane: Plane, places: Floats
+) -> tuple[Image, Image, Mask]:
+    """The plane at image coordinates ``(..., 2)`` of a view, predicted from others.
 
-
-def _trend(image: Image, distance: Image, where: Mask, sigma: float) -> tuple[Image, Image, Image]:
-    """Local line over the distance through some pixels: its value at 0, its slope, the variance.
-
-    Each is (h, w). The slope shrinks where pixels at few distances tell it.
+    Returns
+    -------
+    Intensity (...), NaN where it is not predicted, its relative deviation, and whether there is a
+    plane.
     """
-    weight = np.maximum(cv2.GaussianBlur(where.astype(np.float32), (0, 0), sigma), 1e-6)
-
-    def mean(values: Image) -> Image:
-        blurred = cv2.GaussianBlur(np.where(where, values, 0).astype(np.float32), (0, 0), sigma)
-        return np.asarray(blurred / weight, np.float32)
-
-    level, middle = mean(image), mean(distance)
-    spread = mean(distance * distance) - middle * middle
-    slope = (mean(image * distance) - level * middle) / (spread + 1)
-    variance = mean(image * image) - level * level - slope * slope * spread
-    return level - slope * middle, slope, np.maximum(variance, 1e-8)
+    view = views[index]
+    on_plane = _on_plane(view.view, plane, places)
+    xy = places / view.factor
+    has_plane = _marked(view.has_plane, xy)
+    shown = []
+    for other, free, change in plate.predictions:
+        there = views[other].project(on_plane)
+        seen = views[other].sees(there) & (sample_image(free, there) >= 1)
+        image = sample_image(views[other].intensity, there * views[other].factor)
+        small = xy * (np.array(change.shape[::-1]) / np.array(view.log.shape[::-1]))
+        log = np.log(np.maximum(image, views[other].lowest)) + sample_image(change, small)
+        shown.append(np.where(seen & has_plane, log, np.nan))
+    stack = np.array(shown, np.float32).reshape(-1, *places.shape[:-1])
+    log = _median(stack)
+    deviation = np.nan_to_num(1.4826 * _median(np.abs(stack - log)))
+    return np.exp(log), deviation, has_plane

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 from pathlib import Path
 
@@ -96,13 +97,29 @@ def _distance_px(pixels: NDArray[np.uint8]) -> Image:
         cv2.ipp.setUseIPP(used)
 
 
+def smooth_distance_px(mask: Mask) -> Image:
+    """:func:`signed_distance_px` without the staircase of the pixels."""
+    distance, sigma = signed_distance_px(mask), FIELD_SMOOTHING_PX
+    smooth = cv2.GaussianBlur(distance, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(smooth, np.float32)
+
+
 def _distance_field(mask: Mask, shift: Image | StoredArray | None) -> Image:
-    distance = cv2.GaussianBlur(
-        signed_distance_px(mask), (0, 0), FIELD_SMOOTHING_PX, borderType=cv2.BORDER_REPLICATE
-    )
+    distance = smooth_distance_px(mask)
     if shift is not None:
         distance = distance - np.asarray(shift)
     return np.asarray(distance, np.float32)
+
+
+class OutlineSource(Enum):
+    """What shows an outline.
+
+    The last two end within round objects (:mod:`polmvs.surface.grazing`).
+    """
+
+    MASK = "given mask"
+    EDGE = "greatest change of brightness"
+    MATTING = "share of the object in each pixel's light"
 
 
 @dataclass(frozen=True)
@@ -114,11 +131,13 @@ class SurfaceView:
     phase_map : its phase; read anew each time, as it may be on disk.
     silhouette : of the objects.
     has_outline : whether the silhouette may carve and pull: it has pixels on and off the objects.
+    outline_source : what shows its outline.
     """
 
     phase_map: PhaseMap
     silhouette: Silhouette
     has_outline: bool = True
+    outline_source: OutlineSource = OutlineSource.MASK
 
     @property
     def view(self) -> View:
@@ -169,9 +188,14 @@ def surface_view(
     silhouette : of the objects in this view.
     folder : for the derived arrays; None: in memory, some 30 bytes a pixel.
     """
-    name = phase_map.view.name
+    name, source = phase_map.view.name, OutlineSource.MASK
+    if phase_map.outline_shift is not None:
+        source = OutlineSource.MATTING
+    elif silhouette.inner_shift is not None:
+        source = OutlineSource.EDGE
     return SurfaceView(
         phase_map=phase_map,
         silhouette=silhouette if folder is None else _StoredSilhouette(silhouette, folder, name),
         has_outline=bool(silhouette.certain.any() and not silhouette.possible.all()),
+        outline_source=source,
     )

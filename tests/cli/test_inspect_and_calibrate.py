@@ -84,6 +84,7 @@ EQUAL = {0: 0.5, 45: 0.5, 90: 0.5, 135: 0.5}
 UNEQUAL = {0: 0.15, 45: 0.5, 90: 0.6, 135: 0.5}
 
 
+@pytest.mark.slow
 def test_exposures_that_differ_between_angles_are_found_and_made_up_for(
     cli, demo_capture, tmp_path
 ):

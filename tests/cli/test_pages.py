@@ -70,7 +70,7 @@ def test_a_run_without_clouds_has_no_report(cli, run_copy: Path) -> None:
     assert "polmvs densify" in refused(cli("report", run_copy))
 
 
-@pytest.mark.parametrize("display", ["", ":99"])
+@pytest.mark.parametrize("display", ["", pytest.param(":99", marks=pytest.mark.slow)])
 def test_view_without_a_display_points_at_the_report(
     cli, run_copy: Path, monkeypatch: pytest.MonkeyPatch, display: str
 ) -> None:

@@ -72,6 +72,7 @@ def test_the_background_is_found_and_left_out(turntable, tmp_path: Path, caplog)
     assert largest_error(model, views) < 0.02
 
 
+@pytest.mark.slow
 def test_features_inside_masks_alone_find_the_turning_poses(turntable, tmp_path: Path) -> None:
     """Without them, and without the search for a background, the camera seems to stand still."""
     folder, views = turntable
@@ -89,6 +90,7 @@ def test_features_inside_masks_alone_find_the_turning_poses(turntable, tmp_path:
         assert (mask[row, col] > 0).all()
 
 
+@pytest.mark.slow
 def test_a_camera_that_moves_has_no_static_background(tmp_path: Path, caplog) -> None:
     views = write_printed_images(tmp_path, 5)
     names = [view.name for view in views]

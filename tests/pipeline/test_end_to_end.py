@@ -219,7 +219,9 @@ def test_run_killed_in_sfm_finds_the_same_model(
     assert_no_temporary_files(out)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_interrupt_keeps_finished_stages_only(demo_run: Path, tmp_path: Path, number: int) -> None:
     """And does not wait for the surfaces that are being made."""
     out = tmp_path / "out"
@@ -235,6 +237,7 @@ def test_interrupt_keeps_finished_stages_only(demo_run: Path, tmp_path: Path, nu
     assert stages_of(out) == BEFORE_CLOUDS
 
 
+@pytest.mark.slow
 def test_stage_alone_is_done_again_only_with_overwrite(
     demo_run: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:

@@ -262,6 +262,7 @@ def test_run_goes_on_with_the_same_scale_only(
 # Markers
 
 
+@pytest.mark.slow
 def test_markers_where_there_are_none(take_poses, out: Path) -> None:
     err = refused(take_poses("--aruco", "DICT_4X4_50:0.05"))
     assert "--aruco DICT_4X4_50:0.05: " in err

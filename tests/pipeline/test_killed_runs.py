@@ -139,7 +139,8 @@ def test_a_run_killed_at_any_moments_comes_to_the_same(
     assert max(kills_of_runs) > 1
 
 
-@pytest.mark.parametrize("first", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [0, 1])
 def test_a_run_interrupted_in_any_stage_goes_on(
     call: Call, given, undisturbed, tmp_path: Path, first: int
 ) -> None:

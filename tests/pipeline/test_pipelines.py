@@ -60,6 +60,7 @@ def test_benchmark_of_no_run_is_one_line(
     assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_trust_table_tells_a_right_run(demo_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert load("trust_table").main([str(demo_run)]) == 0
     text = capsys.readouterr().out

@@ -68,6 +68,7 @@ def test_a_view_that_the_surface_contradicts_is_taken_out(
     assert status == 0, err
 
 
+@pytest.mark.slow
 def test_images_can_be_taken_out_by_hand(demo_run: Path, demo_capture, tmp_path, cli) -> None:
     out = tmp_path / "out"
     given = ("--sparse", demo_run / "sparse")

@@ -15,7 +15,7 @@ from polmvs.polarization.region import Region
 from polmvs.scene import Tracks, View
 from polmvs.surface.object_search import FoundObject, fill_false_holes, find_object
 from polmvs.surface.silhouettes import find_silhouette
-from polmvs.surface.surface_view import signed_distance_px
+from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
 from polmvs.surface.visual_hull import Plane
 
 RADIUS = 0.8
@@ -145,10 +145,10 @@ def test_a_ball_is_found_to_a_fraction_of_a_pixel(white, ball):
     overlaps, places = compared(maps, found)
     # The hull of ten views has a tip above the ball where two views alone bound it: 2 to 9 %.
     assert np.median(overlaps) > 0.9
-    assert np.median(np.abs(places)) < 0.6  # measured: 0.35 to 0.41 px
+    assert np.median(np.abs(places)) < 0.4  # measured: 0.28 and 0.14 px
 
 
-@pytest.mark.parametrize("ball", [0.6, 0.05])
+@pytest.mark.parametrize("ball", [0.6, pytest.param(0.05, marks=pytest.mark.slow)])
 def test_what_stands_before_a_wall_is_told_from_it(ball):
     """Low views show the ball's top before what lies beyond the table's end."""
     maps = capture(printed(), ball=ball, end=1.7, elevations=(10.0, 50.0))
@@ -176,9 +176,8 @@ def compared(maps: list[PhaseMap], found: list[FoundObject]) -> tuple[list[float
         truth = signed_distance_px(on_ball(one.view, fine)) / 4
         truth = truth.reshape(camera.height, 4, camera.width, 4).mean(axis=(1, 3))
         overlaps.append((hiding.mask & (truth < 0)).sum() / (hiding.mask | (truth < 0)).sum())
-        own = signed_distance_px(hiding.mask)
-        border = hiding.mask & (own > -1)
-        places.append((truth - own + hiding.outline_shift)[border])
+        own = smooth_distance_px(hiding.mask) - hiding.outline_shift
+        places.append((truth - own)[np.abs(truth) < 0.6])
     return overlaps, np.concatenate(places)
 
 

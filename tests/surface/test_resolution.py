@@ -19,8 +19,8 @@ from polmvs.surface.surface_view import surface_view
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Sphere
 
-LARGE = pytest.param(4, marks=pytest.mark.slow)
-SCALES = (1, 2, LARGE)  # 306x256, 612x512, 1224x1024
+MEDIUM, LARGE = (pytest.param(scale, marks=pytest.mark.slow) for scale in (2, 4))
+SCALES = (1, MEDIUM, LARGE)  # 306x256, 612x512, 1224x1024
 OTHERS = (1, LARGE)  # than the one that they are held against
 BALL = Sphere(center=np.zeros(3), radius=0.16)
 NOISE = 1e-3 / np.sqrt(2)  # of intensities, full scales: 1e-3 of s1 and s2, as the maps state

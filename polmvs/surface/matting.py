@@ -1,0 +1,202 @@
+"""Sub-pixel outline of an object before a known background, as in matting.
+
+Along a line across the outline, the object's share of a pixel's light,
+
+    alpha = (I - B) / (F - B),
+
+falls from 1 to 0. I is the image, B the background, and F the object's brightness, a line fitted
+within the outline. The integral of alpha over the line is the position of the outline, for any
+blur.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from polmvs.camera import in_frame, sample_image
+from polmvs.surface.surface_view import FIELD_SMOOTHING_PX
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Background at image coordinates (..., 2): intensity (NaN: not known), its relative deviation, and
+# whether it should be known there.
+Background = Callable[[Floats], tuple[Image, Image, Mask]]
+
+STEP = 0.25  # along the lines across the outline
+NORMAL_PX = 2.0  # deviation of the blur of the distance before its gradient
+LEAST_SPREAD = 0.1  # of the depths of a line's values, px^2: at one depth they tell no slope
+LEAST_TOLD = 0.5  # share of the outline about a point that is told; the rest stays
+MIN_BORDER = 10  # pixels of an outline; fewer tell nothing
+
+
+@dataclass(frozen=True, kw_only=True)
+class MattingTolerances:
+    """Tolerances of the matting, in pixels of the scale of each pass.
+
+    Attributes
+    ----------
+    reach_px : of the search, on both sides.
+    core_px : distance from the outline beyond which there is only object, or only background.
+    blend_px : deviation of the weights of pixels beyond it, by their distance from it.
+    along_px : deviation of averages along the outline.
+    """
+
+    reach_px: float = 4.0
+    core_px: float = 2.0
+    blend_px: float = 2.5
+    along_px: float = 3.0
+
+
+def find_outline(
+    image: Image,
+    distance: Image,
+    background: Background,
+    noise: float,
+    *,
+    start_px: float,
+    tolerances: MattingTolerances | None = None,
+) -> Image:
+    """Signed distance (H, W) to the outline, px, negative inside.
+
+    Parameters
+    ----------
+    image : (H, W) intensity.
+    distance : (H, W) approximate signed distance, right to about ``start_px``.
+    noise : least relative deviation of the background's intensity.
+    """
+    tol = tolerances or MattingTolerances()
+    scale = max(start_px, 1.0)
+    while scale > 1:
+        distance = _moved(image, distance, background, noise, scale, tol)
+        scale = max(scale / 2, 1.0)
+    # The lines of the last pass start at the outline.
+    for _ in range(2):
+        distance = _moved(image, distance, background, noise, 1.0, tol)
+    return distance
+
+
+def _moved(
+    image: Image,
+    distance: Image,
+    background: Background,
+    noise: float,
+    scale: float,
+    tol: MattingTolerances,
+) -> Image:
+    """The distance after one pass."""
+    inside = (distance < 0).astype(np.uint8)
+    border = (inside > 0) & (cv2.erode(inside, np.ones((3, 3), np.uint8)) == 0)
+    rows, columns = np.nonzero(border)
+    if len(rows) < MIN_BORDER:
+        return distance
+    smooth = _smoothed(distance, NORMAL_PX)
+    slopes = [cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)]
+    outwards = np.stack(slopes, axis=-1)[rows, columns]
+    outwards = outwards / np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-6)
+    centers = np.stack([columns + 0.5, rows + 0.5], axis=1)
+    onto = centers - outwards * distance[rows, columns][:, None]
+    mean = _along_border(onto, tol.along_px * scale)
+    far = tol.core_px + 2 * tol.blend_px
+    along = np.arange(-far, far + STEP, STEP)
+    places = onto[:, None] + scale * along[:, None] * outwards[:, None]
+    alpha, told = _alpha(
+        image, places, along, sample_image(distance, places) / scale, background, noise, mean, tol
+    )
+    shift = scale * (STEP * (alpha.sum(axis=1) - 0.5) - tol.reach_px)
+    shift = (mean @ (told * shift)) / np.maximum(mean @ told, LEAST_TOLD)
+    # Each pixel moves with the nearest of the border.
+    _, labels = cv2.distanceTransformWithLabels(
+        (~border).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(labels.max() + 1, np.float32)
+    of_label[labels[rows, columns]] = shift
+    return _smoothed(distance - of_label[labels], FIELD_SMOOTHING_PX * scale)
+
+
+def _alpha(
+    image: Image,
+    places: Array,
+    along: Array,
+    depth: Image,
+    background: Background,
+    noise: float,
+    mean: sparse.csr_array,
+    tol: MattingTolerances,
+) -> tuple[Array, Array]:
+    """Share of the object ``(N, S)`` along lines across an outline, and if it is told ``(N,)``.
+
+    Parameters
+    ----------
+    places : (N, L, 2) image coordinates of the lines.
+    along, depth : (L,) and (N, L), places on the lines and distances from the outline, scaled.
+    mean : (N, N) averages over neighbours.
+    """
+    height, width = image.shape
+    values = sample_image(image, places)
+    in_image = in_frame(places, width, height)
+    weight = np.where(in_image, np.exp(-0.5 * (along / tol.blend_px) ** 2), 0)
+    level, slope, own_variance = _line(values, depth, weight * (depth < -tol.core_px), mean)
+    outer, _, outer_variance = _line(values, depth, weight * (depth > tol.core_px), mean)
+    near = np.abs(along) <= tol.reach_px + 1e-9
+    # Shading continues to the outline: the object's brightness there is extrapolated.
+    own = np.maximum(level + slope * np.minimum(along[near], 0), 0)
+    behind, deviation, should_be_known = background(places[:, near])
+    known = np.asarray(np.isfinite(behind), np.bool_)
+    variance = np.where(known, (deviation**2 + noise**2) * behind**2, outer_variance)
+    behind = np.where(known, behind, outer)
+    contrast = own - behind
+    precision = in_image[:, near] / (variance + own_variance)
+    total = mean @ (precision * contrast * (values[:, near] - behind))
+    most = mean @ (precision * contrast**2)
+    alpha = np.clip(total / np.maximum(most, 1e-9), 0, 1)
+    # An outline needs a mean contrast of one deviation. Beyond it the background is visible;
+    # anything else there hides the outline.
+    told = np.minimum(most.mean(axis=1), 1) ** 2
+    told *= (known | ~should_be_known)[:, int(near.sum()) // 2]
+    told *= alpha[:, -round(1 / STEP) :].mean(axis=1) < 0.5
+    return alpha, told
+
+
+def _smoothed(distance: Image, sigma: float) -> Image:
+    blurred = cv2.GaussianBlur(distance, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(blurred, np.float32)
+
+
+def _along_border(points: Floats, sigma: float) -> sparse.csr_array:
+    """Gaussian weights ``(N, N)`` of the points of a border near each."""
+    pairs = cKDTree(points).sparse_distance_matrix(
+        cKDTree(points), 2.5 * sigma, output_type="coo_matrix"
+    )
+    weights = np.exp(-0.5 * (pairs.data / sigma) ** 2)
+    total = np.bincount(pairs.row, weights, len(points))
+    return sparse.csr_array((weights / total[pairs.row], (pairs.row, pairs.col)), pairs.shape)
+
+
+def _line(
+    values: Floats, depth: Floats, weight: Floats, mean: sparse.csr_array
+) -> tuple[Array, Array, Array]:
+    """Line over the depth through weighted values ``(N, S)``: its value at 0, its slope, variance.
+
+    Each is (N, 1). The slope shrinks where values at few depths tell it.
+    """
+    total = np.maximum(mean @ weight.sum(axis=1), 1e-6)
+
+    def averaged(quantity: Floats) -> Array:
+        return np.asarray((mean @ (weight * quantity).sum(axis=1)) / total)
+
+    level, middle = averaged(values), averaged(depth)
+    spread = averaged(depth * depth) - middle**2
+    slope = (averaged(values * depth) - level * middle) / (spread + LEAST_SPREAD)
+    variance = averaged(values * values) - level**2 - slope**2 * spread
+    line = level - slope * middle, slope, np.maximum(variance, 1e-8)
+    return line[0][:, None], line[1][:, None], line[2][:, None]
