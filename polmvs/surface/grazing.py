@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from polmvs.surface.matting import MattingTolerances
-from polmvs.surface.surface_view import OutlineSource
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -32,8 +31,8 @@ RADII_PX = np.geomspace(0.5, 1000, 24)
 DISTANCE = np.arange(-REACH_PX, REACH_PX, STEP_PX)  # outside of the outline
 
 
-def outline_bias(radius_px: Floats, source: OutlineSource) -> Array:
-    """Largest distance (K,), px, by which outlines lie within the true ones; 0 for given masks.
+def outline_bias(radius_px: Floats, *, matted: bool) -> Array:
+    """Largest distance (K,), px, by which outlines lie within the true ones.
 
     It holds where the surface mirrors a background as bright as the one beside it, and is smaller
     elsewhere, such as beside a shadow.
@@ -41,12 +40,11 @@ def outline_bias(radius_px: Floats, source: OutlineSource) -> Array:
     Parameters
     ----------
     radius_px : (K,) radius of curvature of the surface along the line of sight.
-    source : of the outlines.
+    matted : of outlines from matting (:mod:`polmvs.surface.matting`); else of those where the
+        brightness changes most, as masks of photographs have them.
     """
-    if source is OutlineSource.MASK:
-        return np.zeros(len(radius_px))
     radii = np.log(np.clip(radius_px, RADII_PX[0], RADII_PX[-1]))
-    biases = _matting_biases() if source is OutlineSource.MATTING else _edge_biases()
+    biases = _matting_biases() if matted else _edge_biases()
     return np.asarray(np.interp(radii, np.log(RADII_PX), biases))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from functools import cached_property
 from pathlib import Path
 
@@ -111,17 +110,6 @@ def _distance_field(mask: Mask, shift: Image | StoredArray | None) -> Image:
     return np.asarray(distance, np.float32)
 
 
-class OutlineSource(Enum):
-    """What shows an outline.
-
-    The last two end within round objects (:mod:`polmvs.surface.grazing`).
-    """
-
-    MASK = "given mask"
-    EDGE = "greatest change of brightness"
-    MATTING = "share of the object in each pixel's light"
-
-
 @dataclass(frozen=True)
 class SurfaceView:
     """One posed view for the surface of all views.
@@ -131,13 +119,14 @@ class SurfaceView:
     phase_map : its phase; read anew each time, as it may be on disk.
     silhouette : of the objects.
     has_outline : whether the silhouette may carve and pull: it has pixels on and off the objects.
-    outline_source : what shows its outline.
+    is_matted : whether its outline comes from matting (:mod:`polmvs.surface.matting`), not from the
+        greatest change of brightness or a mask.
     """
 
     phase_map: PhaseMap
     silhouette: Silhouette
     has_outline: bool = True
-    outline_source: OutlineSource = OutlineSource.MASK
+    is_matted: bool = False
 
     @property
     def view(self) -> View:
@@ -188,14 +177,10 @@ def surface_view(
     silhouette : of the objects in this view.
     folder : for the derived arrays; None: in memory, some 30 bytes a pixel.
     """
-    name, source = phase_map.view.name, OutlineSource.MASK
-    if phase_map.outline_shift is not None:
-        source = OutlineSource.MATTING
-    elif silhouette.inner_shift is not None:
-        source = OutlineSource.EDGE
+    name = phase_map.view.name
     return SurfaceView(
         phase_map=phase_map,
         silhouette=silhouette if folder is None else _StoredSilhouette(silhouette, folder, name),
         has_outline=bool(silhouette.certain.any() and not silhouette.possible.all()),
-        outline_source=source,
+        is_matted=phase_map.outline_shift is not None,
     )

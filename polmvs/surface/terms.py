@@ -35,7 +35,7 @@ from polmvs.surface.creases import CreaseTolerances
 from polmvs.surface.grazing import outline_bias
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import DIFFUSE, SPECULAR, Observations
-from polmvs.surface.surface_view import OutlineSource, SurfaceView
+from polmvs.surface.surface_view import SurfaceView
 
 EDGE_NOISE = 0.1  # of the sines of normals beside an edge: half of the difference of its sides
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # entries of a symmetric block
@@ -494,9 +494,9 @@ def outline_rows(
         behind, _ = view.project(middle - reach * directions[:, column])
         jacobian[:, column] = dots(gradient, ahead - behind) / (2 * reach)
     vertices = np.column_stack([vertices, vertices[:, 0]])
-    largest = outline_bias(rim.radius_px[near], view.outline_source)
+    largest = outline_bias(rim.radius_px[near], matted=view.is_matted)
     bias = 0.5 * largest
-    if view.outline_source is OutlineSource.MATTING:
+    if view.is_matted:
         # The true bias lies anywhere between none and the largest.
         residual = residual - 0.5 * largest
         bias = np.hypot(largest / np.sqrt(12), tol.matting_sigma_px)

