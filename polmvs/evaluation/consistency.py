@@ -34,7 +34,8 @@ class Consistency:
     ----------
     num_points : of the cloud, on the polarized surface.
     phase_residual : angle between the phase that a point's normal predicts, under the cloud's
-        model, and the measured one, over all views that see the point.
+        model for the kind of light that fits better, and the measured one, over all views that see
+        the point.
     coverage : share of the region's pixels, over all views, that show a point of the cloud.
     agreement : share of the views that see a point which agree with it in position and normal.
     track_residual_median_deg : angle between the normals of the sparse points and their planes
@@ -85,8 +86,11 @@ def measure_consistency(
         covered += int((np.isfinite(nearest) & cells).sum())
         seeing += visible
         chosen = np.flatnonzero(visible[::step]) * step
+        points, normals = cloud.points[chosen], cloud.normals[chosen]
         errors.append(
-            phase_residuals_deg(angle_model, cloud.points[chosen], cloud.normals[chosen], phase_map)
+            phase_residuals_deg(
+                angle_model, points, normals, phase_map, labelled=is_labelled(cloud)
+            )
         )
     # Views in which the cells hide a point may still have confirmed it.
     confirmed = np.minimum(cloud.scalars.get("num_views", np.zeros(num)), seeing)
@@ -156,14 +160,27 @@ def _region_cells(inside: Mask) -> Mask:
     return np.asarray(padded[half::CELL_PX, half::CELL_PX][: shape[0], : shape[1]])
 
 
+def is_labelled(cloud: Cloud) -> bool:
+    """Whether a cloud's normals come with the light of each observation (`--method surface`)."""
+    return "diffuse" in cloud.scalars
+
+
 def phase_residuals_deg(
-    angle_model: AngleModel, points: Floats, normals: Floats, phase_map: PhaseMap
+    angle_model: AngleModel,
+    points: Floats,
+    normals: Floats,
+    phase_map: PhaseMap,
+    *,
+    labelled: bool,
 ) -> NDArray[np.float64]:
     """Axial difference between predicted and measured phase at points, degrees.
 
     Parameters
     ----------
     points, normals : (N, 3), world.
+    labelled : whether the light of each observation was inferred with the normals
+        (:func:`is_labelled`). Light of the other kind turns the phase by 90 deg: the smaller
+        difference counts, 22.5 deg by chance.
 
     Returns
     -------
@@ -177,7 +194,10 @@ def phase_residuals_deg(
     samples = sample_image(phase_map.samples, view.project(points))
     measured = 0.5 * np.arctan2(samples[:, 1], samples[:, 0])
     counted = (samples[:, 2] > 0) & (np.hypot(samples[:, 0], samples[:, 1]) > MIN_DOLP)
-    return np.where(counted, axial_errors_deg(measured, predicted), np.nan)
+    difference = axial_errors_deg(measured, predicted)
+    if labelled:
+        difference = np.minimum(difference, 90 - difference)
+    return np.where(counted, difference, np.nan)
 
 
 def best_fitting_model(found: Mapping[AngleModel, Consistency]) -> AngleModel | None:

@@ -20,6 +20,7 @@ from polmvs.config import PropagationOptions
 from polmvs.evaluation.consistency import (
     MAX_RESIDUAL_POINTS,
     first_seen,
+    is_labelled,
     measure_consistency,
     phase_residuals_deg,
     within_box,
@@ -319,7 +320,9 @@ def measure_trust(
         region = grow_mask(phase_map.region.inside, BORDER_MARGIN_PX).astype(np.float32)
         inside = sample_image(region, xy, nearest=True) > 0
         num_seen, num_inside = num_seen + len(inside), num_inside + int(inside.sum())
-        residuals = phase_residuals_deg(angle_model, points[seen], normals[seen], phase_map)
+        residuals = phase_residuals_deg(
+            angle_model, points[seen], normals[seen], phase_map, labelled=is_labelled(surface)
+        )
         precision = sample_image(np.ascontiguousarray(phase_map.samples[..., 2]), xy)
         known = (precision > 0) & np.isfinite(residuals)
         in_sigmas.append(np.radians(residuals[known]) * np.sqrt(precision[known]))

@@ -22,7 +22,7 @@ from polmvs.evaluation.comparison import (
     named_as_truth,
     read_comparison,
 )
-from polmvs.evaluation.consistency import first_seen, phase_residuals_deg
+from polmvs.evaluation.consistency import first_seen, is_labelled, phase_residuals_deg
 from polmvs.evaluation.metrics import angular_errors_deg
 from polmvs.evaluation.tables import number
 from polmvs.evaluation.trust import Trust
@@ -421,7 +421,9 @@ def _cloud_layer(given: ReportInput, model: AngleModel, cloud: Cloud, factor: fl
         ),
         MAX_POINTS,
     )
-    layer = replace(layer, values={**layer.values, "residual": _residuals(given, model, layer)})
+    layer = replace(
+        layer, values={**layer.values, "residual": _residuals(given, model, layer, cloud)}
+    )
     if given.truth is None:
         return layer
     truth, truth_from_world = given.truth
@@ -436,14 +438,16 @@ def _cloud_layer(given: ReportInput, model: AngleModel, cloud: Cloud, factor: fl
     return replace(layer, values={**layer.values, **errors})
 
 
-def _residuals(given: ReportInput, model: AngleModel, layer: Layer) -> Floats:
+def _residuals(given: ReportInput, model: AngleModel, layer: Layer, cloud: Cloud) -> Floats:
     """Mean residual phase of each point over the views that see it, degrees; NaN without one."""
     total, count = np.zeros(len(layer.points)), np.zeros(len(layer.points))
     on_surface = np.flatnonzero(np.linalg.norm(layer.normals, axis=1) > 0.5)
     points, normals = layer.points[on_surface], layer.normals[on_surface]
     for phase_map in open_maps(given.folder, model):
         visible, _ = first_seen(points, normals, phase_map.view, phase_map.shows_surface)
-        found = phase_residuals_deg(model, points[visible], normals[visible], phase_map)
+        found = phase_residuals_deg(
+            model, points[visible], normals[visible], phase_map, labelled=is_labelled(cloud)
+        )
         known = np.isfinite(found)
         index = on_surface[visible][known]
         total[index] += found[known]

@@ -61,6 +61,16 @@ def test_wrong_light_is_not_normal(scene):
     assert any("check `region.light`" in doubt for doubt in trust.doubts())
 
 
+def test_inferred_light_may_be_of_either_kind(scene):
+    """A white object's is diffuse everywhere. Wrong normals fit neither kind."""
+    diffuse = [turned(m, np.ones(m.region.inside.shape, bool)) for m in scene.maps]
+    cloud = cloud_of(scene)
+    cloud = replace(cloud, scalars={**cloud.scalars, "diffuse": np.ones(len(cloud.points))})
+    assert measure_trust(AngleModel.PPA, cloud, NO_TRACKS, diffuse).residual_deg < 1
+    across = replace(cloud, normals=cloud.normals[:, [1, 2, 0]])
+    assert measure_trust(AngleModel.PPA, across, NO_TRACKS, diffuse).residual_deg > 3
+
+
 def test_a_surface_in_a_wrong_place_leaves_the_silhouettes(scene):
     trust = measure_trust(AngleModel.PPA, cloud_of(scene, shift=0.08), NO_TRACKS, scene.maps)
     assert trust.inside < 0.9
