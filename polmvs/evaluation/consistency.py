@@ -34,8 +34,8 @@ class Consistency:
     ----------
     num_points : of the cloud, on the polarized surface.
     phase_residual : angle between the phase that a point's normal predicts, under the cloud's
-        model for the kind of light that fits better, and the measured one, over all views that see
-        the point.
+        model, and the measured one, over all views that see the point
+        (:func:`phase_residuals_deg`).
     coverage : share of the region's pixels, over all views, that show a point of the cloud.
     agreement : share of the views that see a point which agree with it in position and normal.
     track_residual_median_deg : angle between the normals of the sparse points and their planes

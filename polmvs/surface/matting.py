@@ -21,7 +21,12 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from polmvs.camera import in_frame, sample_image
-from polmvs.surface.surface_view import FIELD_SMOOTHING_PX
+from polmvs.surface.surface_view import (
+    FIELD_SMOOTHING_PX,
+    border_pixels,
+    outward_normals,
+    smoothed_distance,
+)
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -33,7 +38,6 @@ Mask = NDArray[np.bool_]
 Background = Callable[[Floats], tuple[Image, Image, Mask]]
 
 STEP = 0.25  # along the lines across the outline
-NORMAL_PX = 2.0  # deviation of the blur of the distance before its gradient
 LEAST_SPREAD = 0.1  # of the depths of a line's values, px^2: at one depth they tell no slope
 LEAST_TOLD = 0.5  # share of the outline about a point that is told; the rest stays
 MIN_BORDER = 10  # pixels of an outline; fewer tell nothing
@@ -94,15 +98,11 @@ def _moved(
     tol: MattingTolerances,
 ) -> Image:
     """The distance after one pass."""
-    inside = (distance < 0).astype(np.uint8)
-    border = (inside > 0) & (cv2.erode(inside, np.ones((3, 3), np.uint8)) == 0)
+    border = border_pixels(distance < 0)
     rows, columns = np.nonzero(border)
     if len(rows) < MIN_BORDER:
         return distance
-    smooth = _smoothed(distance, NORMAL_PX)
-    slopes = [cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)]
-    outwards = np.stack(slopes, axis=-1)[rows, columns]
-    outwards = outwards / np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-6)
+    outwards = outward_normals(distance, border)
     centers = np.stack([columns + 0.5, rows + 0.5], axis=1)
     onto = centers - outwards * distance[rows, columns][:, None]
     mean = _along_border(onto, tol.along_px * scale)
@@ -120,7 +120,7 @@ def _moved(
     )
     of_label = np.zeros(labels.max() + 1, np.float32)
     of_label[labels[rows, columns]] = shift
-    return _smoothed(distance - of_label[labels], FIELD_SMOOTHING_PX * scale)
+    return smoothed_distance(distance - of_label[labels], FIELD_SMOOTHING_PX * scale)
 
 
 def _alpha(
@@ -165,11 +165,6 @@ def _alpha(
     told *= (known | ~should_be_known)[:, int(near.sum()) // 2]
     told *= alpha[:, -round(1 / STEP) :].mean(axis=1) < 0.5
     return alpha, told
-
-
-def _smoothed(distance: Image, sigma: float) -> Image:
-    blurred = cv2.GaussianBlur(distance, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(blurred, np.float32)
 
 
 def _along_border(points: Floats, sigma: float) -> sparse.csr_array:

@@ -533,8 +533,7 @@ def _plates(
             varying = change[both]
             changes.append(1.4826 * np.median(np.abs(varying - np.median(varying))))
         stack = np.array(shown, np.float32).reshape(-1, *view.log.shape)
-        log = _median(stack)
-        deviation = np.nan_to_num(1.4826 * _median(np.abs(stack - log)))
+        log, deviation = _median_and_deviation(stack)
         log[~view.has_plane] = np.nan
         return _Plate(log, deviation, predictions, np.array(changes))
 
@@ -561,6 +560,12 @@ def _median(stack: Image) -> Image:
     low, high = np.maximum(num - 1, 0) // 2, np.minimum(num // 2, len(stack) - 1)
     middle = [np.take_along_axis(ordered, k[None], axis=0)[0] for k in (low, high)]
     return np.where(num >= 2, 0.5 * (middle[0] + middle[1]), np.nan).astype(np.float32)
+
+
+def _median_and_deviation(stack: Image) -> tuple[Image, Image]:
+    """:func:`_median`, and the robust deviation from it, 0 where it is NaN."""
+    median = _median(stack)
+    return median, np.nan_to_num(1.4826 * _median(np.abs(stack - median)))
 
 
 def _residual(views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequence[Mask]) -> float:
@@ -716,6 +721,5 @@ def _behind(
         log = np.log(np.maximum(image, views[other].lowest)) + sample_image(change, small)
         shown.append(np.where(seen & has_plane, log, np.nan))
     stack = np.array(shown, np.float32).reshape(-1, *places.shape[:-1])
-    log = _median(stack)
-    deviation = np.nan_to_num(1.4826 * _median(np.abs(stack - log)))
+    log, deviation = _median_and_deviation(stack)
     return np.exp(log), deviation, has_plane

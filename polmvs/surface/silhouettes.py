@@ -21,7 +21,13 @@ from polmvs.camera import sample_image
 from polmvs.io.arrays import StoredArray, map_array, save_array
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.polarization.region import RegionTolerances, parts_at_border
-from polmvs.surface.surface_view import REFERENCE_FOCAL_PX, Silhouette, signed_distance_px
+from polmvs.surface.surface_view import (
+    REFERENCE_FOCAL_PX,
+    Silhouette,
+    border_pixels,
+    outward_normals,
+    signed_distance_px,
+)
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -209,15 +215,12 @@ def _outline_shift(
     -------
     (H, W) px, at each pixel that of the nearest border pixel; None without a border.
     """
-    border = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    border = border_pixels(mask)
     rows, cols = np.nonzero(border)
     if len(rows) < 10:
         return None
     distance = signed_distance_px(mask)
-    smooth_distance = cv2.GaussianBlur(distance, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
-    slopes = [cv2.Sobel(smooth_distance, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)]
-    outwards = np.stack(slopes, axis=-1)[rows, cols]
-    outwards = outwards / np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-6)
+    outwards = outward_normals(distance, border)
     step = 0.25
     reach = tol.edge_reach_px * max(scale, 1.0)
     along = np.arange(-reach - 1, reach + 1 + step, step)

@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 
 REFERENCE_FOCAL_PX = 445.0  # focal length of the images for which lengths were chosen
 FIELD_SMOOTHING_PX = 0.8  # of the distance to a silhouette; it smooths its pixel staircase
+NORMAL_SMOOTHING_PX = 2.0  # of the distance before its gradient
 FAR_PX = 1000.0  # distance to a missing silhouette
 
 
@@ -96,11 +97,30 @@ def _distance_px(pixels: NDArray[np.uint8]) -> Image:
         cv2.ipp.setUseIPP(used)
 
 
+def smoothed_distance(distance: Image, sigma_px: float) -> Image:
+    """A signed distance (H, W), blurred."""
+    blurred = cv2.GaussianBlur(distance, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(blurred, np.float32)
+
+
 def smooth_distance_px(mask: Mask) -> Image:
     """:func:`signed_distance_px` without the staircase of the pixels."""
-    distance, sigma = signed_distance_px(mask), FIELD_SMOOTHING_PX
-    smooth = cv2.GaussianBlur(distance, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(smooth, np.float32)
+    return smoothed_distance(signed_distance_px(mask), FIELD_SMOOTHING_PX)
+
+
+def border_pixels(mask: Mask) -> Mask:
+    """Pixels (H, W) of a mask with a pixel outside of it beside them."""
+    pixels = mask.astype(np.uint8)
+    return np.asarray(mask & (cv2.erode(pixels, np.ones((3, 3), np.uint8)) == 0), np.bool_)
+
+
+def outward_normals(distance: Image, where: Mask) -> Image:
+    """Outward normals (N, 2) of the level lines of a signed distance at some pixels."""
+    smooth = smoothed_distance(distance, NORMAL_SMOOTHING_PX)
+    slopes = [cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx) for dx in (1, 0)]
+    outwards = np.stack(slopes, axis=-1)[where]
+    lengths = np.linalg.norm(outwards, axis=1, keepdims=True)
+    return np.asarray(outwards / np.maximum(lengths, 1e-6), np.float32)
 
 
 def _distance_field(mask: Mask, shift: Image | StoredArray | None) -> Image:

@@ -494,12 +494,11 @@ def outline_rows(
         behind, _ = view.project(middle - reach * directions[:, column])
         jacobian[:, column] = dots(gradient, ahead - behind) / (2 * reach)
     vertices = np.column_stack([vertices, vertices[:, 0]])
-    largest = outline_bias(rim.radius_px[near], matted=view.is_matted)
-    bias = 0.5 * largest
+    bias = half = 0.5 * outline_bias(rim.radius_px[near], matted=view.is_matted)
     if view.is_matted:
-        # The true bias lies anywhere between none and the largest.
-        residual = residual - 0.5 * largest
-        bias = np.hypot(largest / np.sqrt(12), tol.matting_sigma_px)
+        # The true bias lies anywhere between none and the largest: about half of it.
+        residual = residual - half
+        bias = np.hypot(half / np.sqrt(3), tol.matting_sigma_px)
     return OutlineRows(vertices, np.nan_to_num(jacobian), residual, rim.length_px[near], bias)
 
 
