@@ -38,9 +38,14 @@ def voxel_representatives(points: Array, side: float) -> NDArray[np.intp]:
         return np.zeros(0, np.intp)
     scaled = points / side + _SHIFT
     cells = np.floor(scaled)
-    order = np.argsort(((scaled - cells - 0.5) ** 2).sum(axis=1))
-    _, first = np.unique(_cell_keys(cells)[order], return_index=True)
-    return np.sort(order[first])
+    keys, distance = _cell_keys(cells), ((scaled - cells - 0.5) ** 2).sum(axis=1)
+    order = np.argsort(keys)
+    starts = np.flatnonzero(np.diff(keys[order], prepend=keys[order[0]] - 1))
+    counts = np.diff(starts, append=len(points))
+    least = np.repeat(np.minimum.reduceat(distance[order], starts), counts)
+    # Of points equally near, the first one counts.
+    candidates = np.where(distance[order] == least, order, len(points))
+    return np.sort(np.minimum.reduceat(candidates, starts))
 
 
 def point_spacings(points: Array) -> Array:

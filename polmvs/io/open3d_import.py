@@ -5,6 +5,9 @@ from __future__ import annotations
 import ctypes
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
 from typing import Any
 
 from polmvs.errors import PolmvsError
@@ -33,10 +36,28 @@ def import_open3d() -> Any:
     if "open3d" not in sys.modules:
         find_libusb()
     try:
-        import open3d
+        with _without_ml():
+            import open3d
     except (ImportError, OSError) as error:  # OSError: it loads its library by ctypes
         raise PolmvsError(f"Open3D cannot be imported ({error}); {remedy(str(error))}.") from error
     return open3d
+
+
+@contextmanager
+def _without_ml() -> Iterator[None]:
+    """Import Open3D without its data sets for machine learning, which take half of the time.
+
+    They bring scikit-learn and pandas. A later ``import open3d.ml`` finds them.
+    """
+    name = "open3d.ml"
+    if "open3d" in sys.modules:
+        yield
+        return
+    sys.modules[name] = ModuleType(name)
+    try:
+        yield
+    finally:
+        del sys.modules[name]
 
 
 def remedy(reason: str) -> str:

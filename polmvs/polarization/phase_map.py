@@ -285,6 +285,26 @@ def smoothed_polarization(
     known = np.isfinite(polarization[..., 2])
     if counted is not None:
         known &= counted
+    whole = np.zeros((*known.shape, 3), np.float32)
+    # The window reaches no farther about the usable pixels.
+    reach = len(_window(width_px)[0]) // 2
+    part = _box_about(known, reach)
+    whole[part] = _smoothed_part(polarization[part], known[part], width_px)
+    return whole
+
+
+def _box_about(known: Mask, margin: int) -> tuple[slice, slice]:
+    """Smallest part of an image that holds its marked pixels with a margin."""
+    ends = []
+    for axis in (1, 0):
+        marked = np.flatnonzero(known.any(axis=axis))
+        first, last = (marked[0], marked[-1]) if len(marked) else (0, -1)
+        ends.append(slice(max(int(first) - margin, 0), int(last) + 1 + margin))
+    return ends[0], ends[1]
+
+
+def _smoothed_part(polarization: Image, known: Mask, width_px: float) -> Image:
+    """As :func:`smoothed_polarization`, with the usable pixels."""
     axial = np.where(known[..., None], polarization[..., :2], 0).astype(np.float32)
     own, shared = (np.where(known, polarization[..., c], 0).astype(np.float32) for c in (2, 3))
     found = _smoothed(axial, own, known, width_px, PhaseTolerances.ridge)

@@ -9,6 +9,7 @@ predicted plane to the brightness of the object, as in matting against a known b
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -27,6 +28,8 @@ from polmvs.scene import View
 from polmvs.surface.matting import find_outline
 from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
 from polmvs.surface.visual_hull import Plane
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -62,6 +65,8 @@ class SearchTolerances:
     num_cells : of the coarse grid, along its side; the fine one has as many along the object's.
     num_rounds : of prediction and carving; a third changes the outlines by 0.1 px.
     inner_px : distance from the outline of what is well within the object, working pixels.
+    polarized_share : of an object within its outline that is polarized if polarization shows all
+        of it: its region is then complete.
     """
 
     working_px: int = 320
@@ -79,6 +84,7 @@ class SearchTolerances:
     num_cells: int = 72
     num_rounds: int = 2
     inner_px: float = 6.0
+    polarized_share: float = 0.99
 
     def needed(self, num_views: int) -> int:
         """Number of views that must deny a point."""
@@ -119,7 +125,8 @@ def find_object(
 
     Returns
     -------
-    None if the plane has too little texture to find what hides it, or if its light moves.
+    None if the plane has too little texture to find what hides it, if its light moves, or if
+    polarization shows the whole object.
     """
     tol = tolerances or SearchTolerances()
     near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
@@ -143,8 +150,11 @@ def find_object(
     coarse = _bounded(_space(small, plane, tol), small, shows_plane, tol)
     if coarse is None:
         return None
-    cells = coarse.finer(tol)
     masks = [coarse.mask(view) for view in small]
+    # More than the object: if all of it is polarized, the object is, and the rest is not needed.
+    if _is_polarized(small, masks, tol):
+        return None
+    cells = coarse.finer(tol)
     for _ in range(tol.num_rounds):
         plates = _plates(small, masks, tol)
         alone, together = _denied(small, plates, masks, tol)
@@ -158,6 +168,8 @@ def find_object(
         if left is None:
             return None
         masks = [left.mask(view) for view in small]
+    if _is_polarized(small, masks, tol):
+        return None
     plates = _plates(small, masks, tol)
     noise = _residual(small, plates, masks)
     odds = _plane_odds(small, plates, noise)
@@ -237,6 +249,18 @@ def _on_plane(view: View, plane: Plane, xy: Floats) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         ranges = (plane.offset - center @ plane.normal) / (rays @ plane.normal)
     return np.asarray(center + np.where(ranges > 0, ranges, np.nan)[..., None] * rays)
+
+
+def _is_polarized(views: Sequence[_Working], masks: Sequence[Mask], tol: SearchTolerances) -> bool:
+    """Whether polarization shows all that is well within some masks, in the median view."""
+    shares = [
+        view.polarized[inner].mean()
+        for view, mask in zip(views, masks, strict=True)
+        if (inner := signed_distance_px(mask) < -tol.inner_px).any()
+    ]
+    share = float(np.median(shares)) if shares else 0.0
+    logger.info("%.1f %% of what hides its support is polarized.", 100 * share)
+    return share >= tol.polarized_share
 
 
 def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -60,3 +61,19 @@ def test_the_message_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> N
 )
 def test_remedies(reason: str, package: str) -> None:
     assert package in remedy(reason)
+
+
+def test_data_sets_for_learning_wait_until_they_are_asked_for() -> None:
+    """They bring pandas and scikit-learn, half of the time of the import."""
+    script = (
+        "import sys\n"
+        "from polmvs.io.open3d_import import import_open3d\n"
+        "import_open3d()\n"
+        "print('sklearn' in sys.modules, 'open3d.ml' in sys.modules)\n"
+        "import open3d.ml\n"
+        "print(open3d.ml.datasets.__name__)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["False", "False", "open3d.ml.datasets"]

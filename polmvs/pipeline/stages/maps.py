@@ -47,7 +47,6 @@ from polmvs.surface.visual_hull import supporting_plane
 
 logger = logging.getLogger(__name__)
 
-POLARIZED_SHARE = 0.99  # of an object within its outline: its polarized region is then complete
 MIN_DOLP_SIGMAS = 3.0  # of the median pixel of an object; white plastic in a studio has 12
 DOLP_WINDOW_PX = 3.0
 MAX_CHECKED_VIEWS = 24  # for what settings they fit; a guess, their maps are held together
@@ -252,11 +251,7 @@ def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] 
         for one, hiding in zip(maps, found, strict=True)
         if (inner := hiding.inner).any()
     ]
-    share = float(np.median(shares)) if shares else 0.0
-    logger.info("%.1f %% of what hides its support is polarized.", 100 * share)
-    if share >= POLARIZED_SHARE:
-        return None
-    if share > 0.5:  # most of it is polarized
+    if shares and float(np.median(shares)) > 0.5:  # most of it is polarized
         return found
     # Without any phase, its outline alone would pass for a surface.
     strengths = [
