@@ -20,6 +20,16 @@ DEMO = Path(polmvs.__file__).parent / "demo_capture"
 Cli = Callable[..., tuple[int, str, str]]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order files so that no process waits for the demo's run.
+
+    One process makes it, with the first file that needs it, while the others run all tests without.
+    """
+    users = {item.path for item in items if "demo_run" in getattr(item, "fixturenames", ())}
+    first = next((item.path for item in items if item.path in users), None)
+    items.sort(key=lambda item: 0 if item.path == first else 1 + (item.path in users))
+
+
 @pytest.fixture(scope="session")
 def demo_capture() -> Path:
     return DEMO
