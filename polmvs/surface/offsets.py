@@ -32,10 +32,13 @@ from scipy.spatial import Delaunay, cKDTree
 from polmvs.camera import in_frame, sample_image
 from polmvs.config import default_num_workers
 from polmvs.fitting import geman_mcclure_weights, robust_deviation
+from polmvs.geometry import lengths
 from polmvs.io.arrays import kept_array
-from polmvs.normals.rows import Rows, gather_rows
+from polmvs.normals.rows import AS_MEASURED, OTHER_LIGHT, Rows, gather_rows, gather_rows_under
 from polmvs.normals.tracks import SeedTolerances
-from polmvs.polarization.kinds import AngleModel
+from polmvs.polarization.fresnel import fresnel_dolp
+from polmvs.polarization.kinds import AngleModel, Light
+from polmvs.polarization.light_mixture import LightMixtureTolerances
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
 from polmvs.surface.borders import drawn_border, smoothly_beside
@@ -577,10 +580,22 @@ class FaceScene:
         return gather_rows(self.angle_model, points, chosen, tilt_aware=self.tilt_aware)
 
     def losses(self, points: Array, normals: Floats, tol: OffsetTolerances) -> Image:
-        """Loss (K, N) of the rows of points, as :func:`row_losses`."""
+        """Loss (K, N) of the rows of points, as :func:`row_losses`, under the light that fits.
+
+        A glossy plate shows diffuse light where it mirrors something dark, such as a wall on it.
+        """
 
         def of_view(one: PhaseMap) -> Image:
-            return row_losses(self.rows(points, [one]), normals, tol)[0]
+            measured, other = gather_rows_under(
+                (AS_MEASURED, OTHER_LIGHT),
+                self.angle_model,
+                points,
+                [one],
+                tilt_aware=self.tilt_aware,
+            )
+            loss, cosine = row_losses(measured, normals, tol)
+            may_be_other = _may_be_diffuse(one, points, cosine)
+            return np.where(may_be_other, np.fmin(loss, row_losses(other, normals, tol)[0]), loss)
 
         # Threads, as sampling images releases Python's lock; each holds one view's rows.
         with ThreadPoolExecutor(default_num_workers()) as pool:
@@ -613,6 +628,18 @@ def face_scene(
     with ThreadPoolExecutor(default_num_workers()) as pool:
         features = list(pool.map(features_of, maps))
     return FaceScene(maps, angle_model, tilt_aware, features)
+
+
+def _may_be_diffuse(phase_map: PhaseMap, points: Array, cosine: Floats) -> Mask:
+    """Whether the DoLP that a view shows at points (N, 3) is possible for diffuse light.
+
+    ``cosine`` (..., N) is that of the angle between normal and direction to the camera.
+    """
+    xy = phase_map.view.project(points)
+    axial = sample_image(phase_map.samples[..., :2], xy)
+    tol = LightMixtureTolerances()
+    bound = fresnel_dolp(np.clip(cosine, 0, 1), Light.DIFFUSE, tol.max_ior) + tol.dolp_margin
+    return np.asarray(lengths(axial) < bound)
 
 
 @dataclass(frozen=True)

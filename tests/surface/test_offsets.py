@@ -52,10 +52,11 @@ class Scene:
     true_height: object  # of (N, 2)
 
 
-def step_scene(height, tilt_deg=0.0, num_views=9, noise=SIGMA, top_gain=1.0):
+def step_scene(height, tilt_deg=0.0, num_views=9, noise=SIGMA, top_gain=1.0, diffuse_dolp=None):
     """A plate with a box on it (or a recess in it), ten and nine points on the two faces.
 
-    The box's top is brighter by ``top_gain``.
+    The box's top is brighter by ``top_gain``. With ``diffuse_dolp``, the plate shows diffuse light
+    of that DoLP beside the box, where it mirrors the dark walls.
     """
     normal = tilted(tilt_deg)
     lift = BOX * np.tan(np.radians(tilt_deg))  # so that the lower edge of the top is at height
@@ -77,7 +78,16 @@ def step_scene(height, tilt_deg=0.0, num_views=9, noise=SIGMA, top_gain=1.0):
         points = view.center_in_world + np.where(seen.mask, seen.range, 0)[..., None] * rays
         on_top = seen.mask & (np.abs((points - top) @ normal) < 1e-6)
         gain = np.where(on_top, top_gain, 1.0)
-        maps.append(phase_map_of(replace(seen, intensities=gain * seen.intensities)))
+        intensities = gain * seen.intensities
+        if diffuse_dolp is not None:
+            beside = seen.mask & (np.abs(points[..., 2]) < 1e-6)
+            beside &= np.abs(points[..., :2]).max(axis=-1) < 1.4 * BOX
+            mean = intensities.mean(axis=0)
+            swing = intensities - mean
+            dolp = np.sqrt(2 * np.mean(swing**2, axis=0)) / np.maximum(mean, 1e-9)
+            turned = mean - diffuse_dolp / np.maximum(dolp, 1e-3) * swing
+            intensities = np.where(beside, turned, intensities)
+        maps.append(phase_map_of(replace(seen, intensities=intensities)))
     rng = np.random.default_rng(1)
     grid = np.stack(np.meshgrid([-0.6, 0.0, 0.6], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
     on_top = BOX * grid
@@ -126,6 +136,29 @@ def test_space_above_the_faces_of_a_step_is_free(height, tilt_deg):
     near = (np.abs(above) < 3e-3) & (np.abs(np.abs(points[:, :2]).max(axis=1) - BOX) > 0.015)
     cosine = np.where(np.abs(points[near, :2]).max(axis=1) < BOX, np.cos(np.radians(tilt_deg)), 1)
     assert np.quantile(np.abs(group.values(points[near]) - above[near] * cosine), 0.95) < 5e-4
+
+
+def free_share(scene):
+    """Share of the points above the plate beside the box that are free, and of those in the box."""
+    (group,) = stepped_faces(
+        find_faces(scene.seeds), scene.seeds, face_scene(scene.maps, AngleModel.PPA)
+    )
+    points = column_points()
+    outside = np.abs(points[:, :2]).max(axis=1)
+    free = group.values(points) > 0
+    above = points[:, 2] > 1e-3
+    beside = above & (outside > BOX) & (outside < 1.4 * BOX)
+    within = above & (outside < BOX) & (points[:, 2] < 0.029)
+    return free[beside].mean(), free[within].mean()
+
+
+def test_diffuse_light_beside_a_wall_is_no_obstacle():
+    """Specular light of that strength is: its plane of incidence is another."""
+    free, in_box = free_share(step_scene(0.03, diffuse_dolp=0.05))
+    assert free > 0.99
+    assert in_box < 0.01
+    free, _ = free_share(step_scene(0.03, diffuse_dolp=0.4))
+    assert free < 0.7
 
 
 @pytest.mark.parametrize(("top_gain", "most"), [(1.2, 0.12), (1.0, 0.6)])
