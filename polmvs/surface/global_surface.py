@@ -90,6 +90,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
+WRONG_SHARES = (0.1, 0.2, 0.3)  # of the silhouettes, tolerated by a hull
 MAX_FILLED_SHARE = 0.35  # of the image's border on the objects: a silhouette then bounds little
 REMESHED_EDGE = 0.85  # mean edge of a mesh from a grid, in its steps; measured on spheres
 # Before edges are sharp, outlines pull the faces outwards by what rounding removes: 0.2 to 0.4 px.
@@ -276,18 +277,26 @@ def consistent_hull(views: Sequence[SurfaceView], plane: Plane | None) -> Visual
     """The hull whose outlines best match the silhouettes: of all views, or with some wrong ones.
 
     A single wrong silhouette carves the object away; tolerating some makes a hull of few views too
-    wide.
+    wide. So more are tolerated only until most views agree with the hull.
     """
-    strict = visual_hull(views, plane, num_wrong=0)
-    if len(strict.mesh.faces):
-        mismatch = np.nan_to_num(outline_mismatch(strict.mesh, views), nan=1.0)
-        if not (mismatch > MAX_SHARE).any():
-            return strict
-    robust = visual_hull(views, plane)
-    if not len(strict.mesh.faces) or not len(robust.mesh.faces):
-        return robust
-    other = np.nan_to_num(outline_mismatch(robust.mesh, views), nan=1.0)
-    return strict if np.median(mismatch) <= np.median(other) else robust
+
+    def mismatch(hull: VisualHull) -> Array:
+        if not len(hull.mesh.faces):
+            return np.ones(len(views))
+        return np.nan_to_num(outline_mismatch(hull.mesh, views), nan=1.0)
+
+    best = visual_hull(views, plane, wrong_share=0.0)
+    least = mismatch(best)
+    if not (least > MAX_SHARE).any():
+        return best
+    for share in WRONG_SHARES:
+        hull = visual_hull(views, plane, wrong_share=share)
+        found = mismatch(hull)
+        if np.median(found) < np.median(least):
+            best, least = hull, found
+        if np.median(least) <= MAX_SHARE:
+            break
+    return best
 
 
 def _warn_of_inconsistent(

@@ -359,7 +359,8 @@ def stand_apart(unexplained: Array, least: float) -> Mask:
 
     The criterion is the explained share or the unexplained share. A view with a wrong pose may
     agree with the surface by chance on most pixels, as either kind of light is possible, and still
-    leave many times more unexplained than a correct one.
+    leave many times more unexplained than a correct one. It also stands beyond the spread of the
+    views: if they differ widely, the surface is wrong in places and not a view.
 
     Parameters
     ----------
@@ -375,8 +376,11 @@ def stand_apart(unexplained: Array, least: float) -> Mask:
     known = np.isfinite(explained)
     odd = np.zeros(len(explained), np.bool_)
     if known.any() and np.median(explained[known]) > 0.5:
-        odd[known] = explained[known] < least * np.median(explained[known])
+        usual = float(np.median(explained[known]))
+        odd[known] = explained[known] < least * usual
         odd[known] |= ~like_most(unexplained[known], floor=MAX_SHARE)
+        spread = robust_deviation(explained[known] - usual)
+        odd[known] &= explained[known] < usual - MAX_SIGMAS * spread
     return odd if (~odd).sum() >= MIN_VIEWS else np.zeros_like(odd)
 
 

@@ -37,7 +37,6 @@ class HullTolerances:
         supporting plane, where no view sees it, the hull extends by three default spacings: two
         edges of that mesh. Measured: a plate on the demo's table vanishes without this extension,
         and with half of it a thin bowl loses 0.3 points of F at 1 mm.
-    wrong_share : of the views that may deny a point wrongly. Measured: 3 of 18 to 20 views.
     min_seen_share : of the views that must have a point in their image. Measured with the two
         tolerances of the plane on an analytic vase: both factors of two within 0.01 points of F at
         1 mm.
@@ -48,7 +47,6 @@ class HullTolerances:
     """
 
     step_px: float = 4.0
-    wrong_share: float = 0.1
     min_seen_share: float = 0.34
     min_piece_share: float = 0.01
     plane_distance: float = 0.004
@@ -175,7 +173,7 @@ def visual_hull(
     views: Sequence[SurfaceView],
     plane: Plane | None = None,
     *,
-    num_wrong: int | None = None,
+    wrong_share: float = 0.1,
     tolerances: HullTolerances | None = None,
 ) -> VisualHull:
     """Carve space by the views' silhouettes; unknown pixels do not carve.
@@ -184,15 +182,14 @@ def visual_hull(
     ----------
     views : those without an outline are ignored.
     plane : space behind it is outside.
-    num_wrong : number of views that may deny a point wrongly; by default a share of the views.
+    wrong_share : of the views that may deny a point wrongly. Measured: 3 of 18 to 20 views.
     """
     tol = tolerances or HullTolerances()
     used = [view for view in views if view.has_outline]
     nothing = VisualHull(np.ones((2, 2, 2), np.float32), np.zeros(3), 1.0, 1.0)
     if len(used) < 2:
         return nothing
-    wrong = round(tol.wrong_share * len(used)) if num_wrong is None else num_wrong
-    on_grid = partial(_values_on_grid, used, wrong, plane, tol)
+    on_grid = partial(_values_on_grid, used, wrong_share, plane, tol)
     center = _meeting_point(used)
     distance = float(np.median([np.linalg.norm(view.center - center) for view in used]))
     gsd = float(np.median([distance / view.view.camera.mean_focal_px for view in used]))
@@ -226,7 +223,7 @@ def _meeting_point(views: Sequence[SurfaceView]) -> Array:
 def hull_values(
     views: Sequence[SurfaceView],
     points: Floats,
-    num_wrong: int,
+    wrong_share: float,
     plane: Plane | None,
     tol: HullTolerances,
 ) -> NDArray[np.float32]:
@@ -241,7 +238,7 @@ def hull_values(
         num_seen += seen
     largest = np.sort(of_views, axis=0)[::-1]
     # If few views see a point, fewer may be wrong.
-    chosen = np.minimum((tol.wrong_share * num_seen + 0.5).astype(np.int64), num_wrong)
+    chosen = (wrong_share * num_seen + 0.5).astype(np.int64)
     values = largest[chosen, np.arange(len(points))]
     values = np.where(num_seen < max(2, tol.min_seen_share * len(views)), OUTSIDE, values)
     if plane is not None:
@@ -258,7 +255,7 @@ def _grid(low: Array, high: Array, step: float) -> tuple[int, ...]:
 
 def _values_on_grid(
     views: Sequence[SurfaceView],
-    num_wrong: int,
+    wrong_share: float,
     plane: Plane | None,
     tol: HullTolerances,
     low: Array,
@@ -277,7 +274,7 @@ def _values_on_grid(
     for start in range(0, len(chosen), num):
         some = chosen[start : start + num]
         points = low + step * np.stack(np.unravel_index(some, shape), axis=1)
-        flat[some] = hull_values(views, points, num_wrong, plane, tol)
+        flat[some] = hull_values(views, points, wrong_share, plane, tol)
     return values
 
 

@@ -322,13 +322,13 @@ def test_phases_show_whether_polarizers_are_tilted(is_tilted):
             phase_map = replace(phase_map, polarization=polarization)
         inside = phase_map.region.inside
         views.append(surface_view(phase_map, Silhouette(inside, inside)))
-    hull = visual_hull(views, num_wrong=0)
+    hull = visual_hull(views, wrong_share=0.0)
     found = refined(hull, views, tilt_aware=True)
     assert found.fit.looking.tilt_share == pytest.approx(float(is_tilted), abs=0.2)
 
 
 def test_a_sphere_comes_from_its_hull(ball):
-    hull = visual_hull(ball, num_wrong=0)
+    hull = visual_hull(ball, wrong_share=0.0)
     mesh = refined(hull, ball).mesh
     radii = np.linalg.norm(mesh.vertices, axis=1)
     assert np.abs(radii - 1).mean() < 0.3 * FOOTPRINT
@@ -341,7 +341,7 @@ def test_the_hole_of_a_torus_stays_and_noise_averages_out():
     views = views_of(
         torus(), ring_of_views(12, elevations=(15.0, 45.0, 70.0)), noise=np.radians(2.0)
     )
-    hull = visual_hull(views, num_wrong=0)
+    hull = visual_hull(views, wrong_share=0.0)
     mesh = refined(hull, views).mesh
     assert euler_number(mesh) == 0
     upper = mesh.vertices[:, 2] > 0
@@ -350,7 +350,7 @@ def test_the_hole_of_a_torus_stays_and_noise_averages_out():
 
 def test_faces_of_a_box_become_flat():
     views = views_of(box(), ring_of_views(12, elevations=(15.0, 40.0, 65.0)))
-    hull = visual_hull(views, num_wrong=0)
+    hull = visual_hull(views, wrong_share=0.0)
     mesh = refined(hull, views).mesh
     top = mesh.vertices[
         (np.abs(mesh.vertices[:, 0]) < 0.6)
@@ -376,7 +376,7 @@ def test_outlines_that_known_points_contradict_are_told(ball):
     known = KnownPoints(points, np.full(num, 0.3 * FOOTPRINT))
     found = []
     for views in (ball, wide):
-        hull = visual_hull(views, num_wrong=0)
+        hull = visual_hull(views, wrong_share=0.0)
         mesh = refined(hull, views, known=known).mesh
         sigma = deviations(mesh, views, known=known)
         all_faces = np.ones(len(mesh.faces), np.bool_)
@@ -397,7 +397,7 @@ def test_many_views_that_err_alike_do_not_outweigh_known_points(ball):
     points = np.random.default_rng(0).standard_normal((2000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     known = KnownPoints(points, np.full(2000, 0.3 * FOOTPRINT))
-    hull = visual_hull(wide, num_wrong=0)
+    hull = visual_hull(wide, wrong_share=0.0)
     off_px = []
     for views in (2 * wide, 6 * wide):
         mesh = refined(hull, views, known=known).mesh
@@ -413,7 +413,7 @@ def test_outliers_among_known_points_lose(ball):
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     points[:8] *= 0.75  # mirror images inside
     known = KnownPoints(points, np.full(40, 0.3 * FOOTPRINT))
-    hull = visual_hull(ball, num_wrong=0)
+    hull = visual_hull(ball, wrong_share=0.0)
     mesh = refined(hull, ball, known=known).mesh
     assert np.linalg.norm(mesh.vertices, axis=1).min() > 0.95
 
@@ -446,7 +446,7 @@ def test_the_better_of_two_ways_is_taken():
 
 
 def test_progress_is_whole(ball):
-    hull = visual_hull(ball, num_wrong=0)
+    hull = visual_hull(ball, wrong_share=0.0)
     steps = []
     refine(hull.mesh, fit_of(ball, hull.gsd, tolerances=QUICK), on_progress=steps.append)
     assert sum(steps) == QUICK.num_steps

@@ -19,6 +19,8 @@ NAN = np.nan
         # Of the surface that explains so little nothing is known, hence nothing of a view.
         ([0.7, 0.6, 0.7, 0.95, 0.7], []),
         ([0.45, 0.4, 0.45, 0.95, 0.45], [3]),
+        # Some views see the wrong parts of a surface: no view is apart.
+        ([0.2, 0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.7, 0.75], []),
     ],
 )
 def test_views_that_stand_apart_from_a_surface(unexplained, apart):

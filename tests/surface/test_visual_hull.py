@@ -12,6 +12,7 @@ from analytic_objects import (
     union,
 )
 
+from polmvs.surface.global_surface import consistent_hull
 from polmvs.surface.surface_view import Silhouette, surface_view
 from polmvs.surface.visual_hull import HullTolerances, Plane, supporting_plane, visual_hull
 
@@ -27,7 +28,7 @@ def ball():
 
 
 def test_the_hull_holds_the_object_and_little_more(ball):
-    hull = visual_hull(ball, num_wrong=0)
+    hull = visual_hull(ball, wrong_share=0.0)
     radii = np.linalg.norm(hull.mesh.vertices, axis=1)
     assert radii.min() > 1 - 1.5 * hull.gsd
     assert np.median(radii) < 1.08
@@ -45,12 +46,23 @@ def test_one_wrong_mask_does_no_harm(ball):
     assert mesh.face_areas.sum() == pytest.approx(good.face_areas.sum(), rel=0.1)
 
 
+@pytest.mark.parametrize("num_wrong", [0, 1, 3])
+def test_as_many_wrong_masks_are_tolerated_as_there_are(ball, num_wrong):
+    certain = np.zeros_like(ball[0].silhouette.certain)
+    certain[:8, :8] = True
+    wrong = [replace(view, silhouette=Silhouette(certain, certain)) for view in ball[::4]]
+    hull = consistent_hull([*wrong[:num_wrong], *ball[num_wrong:]], None)
+    radii = np.linalg.norm(hull.mesh.vertices, axis=1)
+    assert radii.min() > 0.9
+    assert np.median(radii) < (1.08 if num_wrong == 0 else 1.3)
+
+
 def test_several_objects_and_loops(ball):
     views = ring_of_views(12, elevations=(10.0, 40.0, 65.0))
     pair = union(sphere(0.4, (0.7, 0, 0)), sphere(0.4, (-0.7, 0, 0)))
-    hull = visual_hull(views_of(pair, views), num_wrong=0)
+    hull = visual_hull(views_of(pair, views), wrong_share=0.0)
     assert len(set(hull.mesh.face_components)) == 2
-    ring = visual_hull(views_of(torus(), views), num_wrong=0)
+    ring = visual_hull(views_of(torus(), views), wrong_share=0.0)
     assert euler_number(ring.mesh) == 0
 
 
@@ -61,7 +73,7 @@ def test_an_object_cut_by_the_images_borders_is_not_carved_there():
         looking_at((2.4, 0.3, 0.4), target=(0, 0.9, 0), name="near0.png"),
         looking_at((-0.2, 2.4, 0.4), target=(0.9, 0, 0), name="near1.png"),
     ]
-    hull = visual_hull(views_of(sphere(), far + near), num_wrong=0)
+    hull = visual_hull(views_of(sphere(), far + near), wrong_share=0.0)
     assert np.linalg.norm(hull.mesh.vertices, axis=1).min() > 0.93
 
 
@@ -70,10 +82,10 @@ def test_unknown_pixels_do_not_carve(ball):
     certain = inside.copy()
     certain[:, 66:] = False
     doubtful = [replace(ball[0], silhouette=Silhouette(certain, inside)), *ball[1:]]
-    area = visual_hull(doubtful, num_wrong=0).mesh.face_areas.sum()
-    assert area == pytest.approx(visual_hull(ball, num_wrong=0).mesh.face_areas.sum(), rel=0.01)
+    area = visual_hull(doubtful, wrong_share=0.0).mesh.face_areas.sum()
+    assert area == pytest.approx(visual_hull(ball, wrong_share=0.0).mesh.face_areas.sum(), rel=0.01)
     denied = [replace(ball[0], silhouette=Silhouette(certain, certain)), *ball[1:]]
-    assert visual_hull(denied, num_wrong=0).mesh.face_areas.sum() < 0.9 * area
+    assert visual_hull(denied, wrong_share=0.0).mesh.face_areas.sum() < 0.9 * area
 
 
 def test_the_supporting_plane_bounds_the_hull(ball):
@@ -96,7 +108,7 @@ def test_no_common_object_is_an_empty_hull(ball):
     corner = certain.copy()
     corner[:5, :5] = True
     scattered = [replace(v, silhouette=Silhouette(corner, corner)) for v in ball]
-    assert len(visual_hull(scattered, num_wrong=0).mesh.faces) == 0
+    assert len(visual_hull(scattered, wrong_share=0.0).mesh.faces) == 0
 
 
 def plane_scene(rng, share):
