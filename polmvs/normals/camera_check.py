@@ -10,7 +10,9 @@ no longer belong to one normal. For camera parameters ``c`` and normals ``n_p`` 
 with Gauss-Newton steps from which the normals are eliminated. Derivatives are taken at the
 predicted phase: at the measured one they would depend on its noise, which would favour long focal
 lengths. The check needs no matches, so it serves objects without texture as well. Its deviations
-are those of the jackknife over the views, as errors of light and pose are common to a view.
+have two parts: the jackknife over the views, as errors of light and pose are common to a view, and
+errors that all views share, such as blur. The latter count as the deviations of the rows, for the
+number of rows with independent errors.
 """
 
 from __future__ import annotations
@@ -116,6 +118,7 @@ def fit_camera(
     normals: Floats,
     rotations: Floats,
     *,
+    num_independent: float,
     tolerances: CameraCheckTolerances = CameraCheckTolerances(),
 ) -> CameraFit | None:
     """Focal length and principal point that fit phases.
@@ -125,6 +128,7 @@ def fit_camera(
     observed : of points in views that share a camera, under PPA or tilted.
     normals : (P, 3) unit, world, of the points under the given camera; where the fit starts.
     rotations : (K, 3, 3) from the world to the cameras of the views.
+    num_independent : number of observations with independent errors.
 
     Returns
     -------
@@ -132,6 +136,7 @@ def fit_camera(
     """
     t = tolerances
     change, sigma = _fitted(observed, normals, rotations, t)
+    sigma *= np.sqrt(max(len(observed.point) / max(num_independent, 1.0), 1.0))
     if not (sigma < 0.5 * np.array(t.prior_sigma)).all() or not (np.abs(change) < 0.5).all():
         return None
     num = min(len(rotations), t.num_groups)
@@ -141,7 +146,8 @@ def fit_camera(
             for group in range(num)
         ]
     )
-    deviation = np.sqrt((num - 1) / num * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
+    between = np.sqrt((num - 1) / num * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
+    deviation = np.hypot(between, sigma)
     least = np.array([t.min_focal_change, t.min_point_change, t.min_point_change])
     differs = (np.abs(change) > t.max_sigmas * deviation) & (np.abs(change) > least)
     return CameraFit(

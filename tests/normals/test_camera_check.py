@@ -50,7 +50,7 @@ def ellipsoid(
     observed = PhaseRows(
         rows=joined,
         rays=np.concatenate(rays),
-        variance=np.full(len(joined), 0.02**2),
+        variance=np.full(len(joined), max(noise, 0.002) ** 2),
         point=np.concatenate(point),
         view=np.concatenate(view),
     )
@@ -58,7 +58,8 @@ def ellipsoid(
 
 
 def fit_of(given: PinholeCamera, **options: object) -> CameraFit:
-    fit = fit_camera(*ellipsoid(given, **options))  # type: ignore[arg-type]
+    observed, normals, rotations = ellipsoid(given, **options)  # type: ignore[arg-type]
+    fit = fit_camera(observed, normals, rotations, num_independent=len(observed.view))
     assert fit is not None
     return fit
 
@@ -75,8 +76,8 @@ def test_a_wrong_focal_length_is_found(scale: float) -> None:
     given = replace(CAMERA, fx=445 * scale, fy=445 * scale)
     fit = fit_of(given)
     assert not fit.agrees
-    # The prior pulls by the square of the deviation over its own: (0.045 / 0.2)^2 of the change.
-    assert 1 + fit.focal_change == pytest.approx(1 / scale, rel=6e-3)
+    # The prior pulls by the square of the deviation over its own: (0.0045 / 0.2)^2 of the change.
+    assert 1 + fit.focal_change == pytest.approx(1 / scale, rel=1e-3)
     assert "a focal length of 44" in fit.message(given)
 
 
@@ -91,7 +92,22 @@ def test_noise_stays_within_its_deviation() -> None:
     assert fit.agrees
     # Twelve groups give a deviation with an error of a fifth: three deviations are at most four.
     assert abs(fit.focal_change) < 4 * fit.focal_sigma
-    assert 0.02 < fit.focal_sigma < 0.06  # 0.044 by the noise of the rows
+    assert (
+        0.044 < fit.focal_sigma < 0.08
+    )  # 0.044 by the noise of the rows, and as much between views
+
+
+def test_errors_that_views_share_do_not_accuse_the_camera() -> None:
+    """A camera that fits somewhat better is none if few observations have independent errors."""
+    observed, normals, rotations = ellipsoid(replace(CAMERA, fx=450.0, fy=450.0), noise=0.002)
+    as_if_all = fit_camera(observed, normals, rotations, num_independent=len(observed.view))
+    assert as_if_all is not None
+    assert abs(as_if_all.focal_change) > 2 * as_if_all.focal_sigma
+    few = fit_camera(observed, normals, rotations, num_independent=len(observed.view) / 100)
+    assert few is not None
+    assert few.agrees
+    assert few.focal_sigma > 5 * as_if_all.focal_sigma
+    assert fit_camera(observed, normals, rotations, num_independent=1) is None
 
 
 def test_one_wrong_view_does_not_accuse_the_camera() -> None:
@@ -99,7 +115,8 @@ def test_one_wrong_view_does_not_accuse_the_camera() -> None:
     turned = observed.rows.copy()
     odd = observed.view == 3
     turned[odd] = np.cross(observed.rays[odd], turned[odd])
-    fit = fit_camera(replace(observed, rows=turned), normals, rotations)
+    turned_rows = replace(observed, rows=turned)
+    fit = fit_camera(turned_rows, normals, rotations, num_independent=len(odd))
     assert fit is not None
     assert fit.agrees
 
@@ -109,4 +126,4 @@ def test_narrow_views_determine_no_camera() -> None:
     far = replace(CAMERA, fx=445e3, fy=445e3)
     observed, normals, rotations = ellipsoid(far, distance=3e3, true=far, noise=0.02)
     some = observed.only(np.arange(len(observed.view)) % 3 == 0)
-    assert fit_camera(some, normals, rotations) is None
+    assert fit_camera(some, normals, rotations, num_independent=len(some.view)) is None
