@@ -20,6 +20,11 @@ DEMO = Path(polmvs.__file__).parent / "demo_capture"
 Cli = Callable[..., tuple[int, str, str]]
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    # Of pytest-xdist, which would begin with the largest files: the order is that below.
+    config.option.loadscopereorder = False
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Order files so that no process waits for the demo's run.
 
