@@ -174,8 +174,6 @@ def _camera_complaint(
         ),
         some.face_normals,
         np.array([one.view.cam_from_world.rotation for one in views]),
-        num_independent=sum(int(one.silhouette.certain.sum()) for one in views)
-        / TermTolerances().alike_px,
     )
     if fit is None:
         return None
