@@ -39,7 +39,7 @@ class CameraCheckTolerances:
         determine no camera.
     num_groups : groups of views for the jackknife.
     num_steps : Gauss-Newton steps.
-    shared_sigma : rad, error of the phases that all views share. Measured: right cameras of eleven
+    shared_sigma : rad, error of the phases that all views share. Measured: right cameras of six
         captures leave up to 0.0008 that another camera would explain, and a dome of 306 x 256 px
         0.0035; a focal length 10 % off leaves 0.010.
     max_sigmas : a difference is certain above this many deviations, as in the check by matches.

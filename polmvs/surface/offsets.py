@@ -574,10 +574,9 @@ class FaceScene:
         maps, features = list(compress(self.maps, kept)), list(compress(self.features, kept))
         return replace(self, maps=maps, features=features)
 
-    def rows(self, points: Array, maps: Sequence[PhaseMap] | None = None) -> Rows:
-        """Rows of points ``(N, 3)``, of all views or of some."""
-        chosen = self.maps if maps is None else maps
-        return gather_rows(self.angle_model, points, chosen, tilt_aware=self.tilt_aware)
+    def rows(self, points: Array) -> Rows:
+        """Rows of points ``(N, 3)``."""
+        return gather_rows(self.angle_model, points, self.maps, tilt_aware=self.tilt_aware)
 
     def losses(self, points: Array, normals: Floats, tol: OffsetTolerances) -> Image:
         """Loss (K, N) of the rows of points, as :func:`row_losses`, under the light that fits.
