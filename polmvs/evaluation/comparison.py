@@ -18,6 +18,7 @@ from polmvs.evaluation.consistency import Consistency, best_fitting_model, measu
 from polmvs.evaluation.map_errors import MapErrors, map_errors
 from polmvs.evaluation.metrics import AngleStats, CloudMetrics
 from polmvs.evaluation.tables import (
+    NONE,
     cloud_rows,
     format_table,
     mean_and_median,
@@ -361,11 +362,18 @@ def _truth_rows(
         ],
         [
             "depths within one / two sigma, %",
-            *[_within_sigmas(m) if m else number(None) for m in maps],
+            *[_shares(m.within_one_sigma, m.within_two_sigma) if m else NONE for m in maps],
         ],
         [
             "normal maps, mean / median error, deg",
             *[mean_and_median(m.normals if m else None) for m in maps],
+        ],
+        [
+            "normals within one / two sigma, %",
+            *[
+                _shares(m.normals_within_one_sigma, m.normals_within_two_sigma) if m else NONE
+                for m in maps
+            ],
         ],
     ]
     for same in zip(*(cloud_rows(f.cloud) for f in figures), strict=True):
@@ -373,8 +381,7 @@ def _truth_rows(
     return rows
 
 
-def _within_sigmas(errors: MapErrors) -> str:
-    shares = (errors.within_one_sigma, errors.within_two_sigma)
+def _shares(*shares: float) -> str:
     return " / ".join(number(share, 100, 0) for share in shares)
 
 

@@ -48,6 +48,8 @@ class MapErrors:
         normal errors and true deviations.
     within_one_sigma, within_two_sigma : shares of the errors below one and two standard
         deviations; 0.68 and 0.95 likewise.
+    normals_within_one_sigma, normals_within_two_sigma : the same shares of the normals' angles;
+        NaN in files of earlier versions.
     """
 
     num_pixels: int
@@ -62,6 +64,8 @@ class MapErrors:
     sigma_ratio_median: float
     within_one_sigma: float
     within_two_sigma: float
+    normals_within_one_sigma: float = float("nan")
+    normals_within_two_sigma: float = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,6 +81,7 @@ class LatticeErrors:
         ``known``.
     sigma_m : standard deviation that the view states for it, m; NaN likewise.
     normal_deg : angle between the normal and the true one, degrees; NaN likewise.
+    normal_sigma_deg : standard deviation that the view states for it, degrees; NaN likewise.
     """
 
     on_part: Mask
@@ -85,6 +90,7 @@ class LatticeErrors:
     depth_m: Array
     sigma_m: Array
     normal_deg: Array
+    normal_sigma_deg: Array
 
 
 class _Truth(NamedTuple):
@@ -151,7 +157,7 @@ def lattice_errors(
     if dense is None:
         xy = lattice_xy(camera.height // stride_px, camera.width // stride_px, stride_px)
         true, known = _truth_at(xy, view, truth), np.zeros(xy.shape[:2], np.bool_)
-        depth_m = sigma_m = normal_deg = np.full(xy.shape[:2], np.nan)
+        depth_m = sigma_m = normal_deg = normal_sigma_deg = np.full(xy.shape[:2], np.nan)
     else:
         xy = dense.lattice_xy()
         true, known = _truth_at(xy, view, truth), dense.range_map > 0
@@ -161,6 +167,7 @@ def lattice_errors(
         depth_m = np.where(compared, z_per_range * dense.range_map - true.depth, np.nan)
         sigma_m = np.where(compared, z_per_range * dense.sigma, np.nan)
         normal_deg = np.where(compared, angular_errors_deg(in_cam, true.normals), np.nan)
+        normal_sigma_deg = np.where(compared, dense.sigma_deg, np.nan)
     return LatticeErrors(
         on_part=true.on_part,
         off_part=true.off_part,
@@ -168,6 +175,7 @@ def lattice_errors(
         depth_m=depth_m,
         sigma_m=sigma_m,
         normal_deg=normal_deg,
+        normal_sigma_deg=normal_sigma_deg,
     )
 
 
@@ -206,9 +214,10 @@ def _summary(views: Sequence[LatticeErrors]) -> MapErrors:
             [np.zeros(0), *(values(one)[one.known & one.on_part] for one in views)]
         )
 
-    depth, sigma = pooled(lambda one: one.depth_m), pooled(lambda one: one.sigma_m)
+    depth, angle = pooled(lambda one: one.depth_m), pooled(lambda one: one.normal_deg)
     size = np.abs(depth)
-    ratio = size[sigma > 0] / sigma[sigma > 0]
+    ratio = _ratios(size, pooled(lambda one: one.sigma_m))
+    angle_ratio = _ratios(angle, pooled(lambda one: one.normal_sigma_deg))
     num_known = sum(int(one.known.sum()) for one in views)
     median, p95 = np.percentile(size, (50, 95)) if len(size) else (np.nan, np.nan)
     return MapErrors(
@@ -220,11 +229,19 @@ def _summary(views: Sequence[LatticeErrors]) -> MapErrors:
         depth_p95_m=float(p95),
         depth_bias_m=_mean(depth),
         depth_within_1mm=_mean(size < min(THRESHOLDS_M)),
-        normals=AngleStats.from_degrees(pooled(lambda one: one.normal_deg)),
+        normals=AngleStats.from_degrees(angle),
         sigma_ratio_median=float(np.median(ratio)) if len(ratio) else float("nan"),
         within_one_sigma=_mean(ratio < 1),
         within_two_sigma=_mean(ratio < 2),
+        normals_within_one_sigma=_mean(angle_ratio < 1),
+        normals_within_two_sigma=_mean(angle_ratio < 2),
     )
+
+
+def _ratios(errors: Array, sigma: Array) -> Array:
+    """Errors over their standard deviations, where these are known."""
+    known = np.isfinite(errors) & np.isfinite(sigma) & (sigma > 0)
+    return np.asarray(errors[known] / sigma[known])
 
 
 def _ratio(part: int, whole: int) -> float:

@@ -41,6 +41,8 @@ _MEANINGS = {
     "depth maps within": "Share of the depths with an error below that distance.",
     "depths within one / two": "Share of the depths with an error below one and two of their "
     "stated standard deviations; 68 and 95 % are ideal.",
+    "normals within one / two": "Share of the normals with an angular error below one and two of "
+    "their stated standard deviations; 68 and 95 % are ideal.",
     "normal maps": "Angle between the normals of the depth maps and the true ones.",
     "F-score": "Harmonic mean of accuracy and completeness.",
     "accuracy": "Share of the cloud's points within this distance of the true surface.",

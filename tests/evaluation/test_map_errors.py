@@ -99,6 +99,23 @@ def changed(scale: float, change: Callable[[DenseView], DenseView]) -> list[Dens
     return [change(dense_of(PLANE, view, scale)) for view in VIEWS]
 
 
+@pytest.mark.parametrize("turn_deg", [0.6, 1.5, 4.0])
+def test_a_turn_of_the_normals_in_units_of_its_sigma(plane: ExactTruth, turn_deg: float) -> None:
+    def change(one: DenseView) -> DenseView:
+        normal = one.normals_in_world
+        across = np.cross(normal, np.roll(normal, 1, axis=-1))
+        across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+        turned = np.cos(np.radians(turn_deg)) * normal + np.sin(np.radians(turn_deg)) * across
+        sigma = np.full_like(one.sigma_deg, 1.0)
+        sigma[::2] = np.inf  # unknown: no part of the shares
+        return replace(one, normals_in_world=turned.astype(np.float32), sigma_deg=sigma)
+
+    errors = map_errors(scrambled(1.0), changed(1.0, change), plane)
+    assert errors.normals.median_deg == pytest.approx(turn_deg, rel=1e-3)
+    assert errors.normals_within_one_sigma == (1 if turn_deg < 1 else 0)
+    assert errors.normals_within_two_sigma == (1 if turn_deg < 2 else 0)
+
+
 @pytest.mark.parametrize("offset_m", [0.0005, -0.002])
 def test_an_offset_of_the_range_in_units_of_its_sigma(plane: ExactTruth, offset_m: float) -> None:
     scale, sigma_m = 7.0, 0.0008
@@ -246,5 +263,6 @@ def test_comparison_tells_of_the_maps(demo_run: Path) -> None:
         "depth maps within 1 mm, %",
         "depths within one / two sigma, %",
         "normal maps, mean / median error, deg",
+        "normals within one / two sigma, %",
     ):
         assert any(digit in rows[name] for digit in "0123456789")
