@@ -59,12 +59,32 @@ class CreaseTolerances:
     vertex_rounds: int = 20
 
 
+@dataclass(frozen=True)
+class SideAverage:
+    """Average of values of faces over the sides of edges.
+
+    Attributes
+    ----------
+    weights : (F, F) float32, of one round; rows sum to 1.
+    rounds : how often it is applied.
+    """
+
+    weights: sparse.csr_array
+    rounds: int
+
+    def of(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Averages ``(F, C)`` of values ``(F, C)``."""
+        for _ in range(self.rounds):
+            values = self.weights @ values
+        return values
+
+
 def sided_normals(
     mesh: TriangleMesh,
     normals: Array,
     is_fitted: Mask,
     tolerances: CreaseTolerances | None = None,
-) -> Array:
+) -> tuple[Array, SideAverage]:
     """Normals of faces smoothed within the sides of edges (a bilateral filter).
 
     Parameters
@@ -75,7 +95,7 @@ def sided_normals(
 
     Returns
     -------
-    (F, 3) unit.
+    The normals ``(F, 3)``, unit, and the average that made them.
     """
     tol = tolerances or CreaseTolerances()
     average = mesh.face_pairs.copy()
@@ -88,7 +108,9 @@ def sided_normals(
         apart = _squared_distance(normals, one, other)
         average.data = near * np.exp(-0.5 * apart / tol.like_sine**2)
         normals = _unit(average @ normals)
-    return normals
+    total = np.maximum(np.asarray(average.sum(axis=1)), 1e-300)
+    average.data = (average.data / total[one]).astype(np.float32)
+    return normals, SideAverage(average, tol.normal_rounds)
 
 
 def _taken_from_sides(

@@ -380,7 +380,8 @@ def _polished(
             to_uncarved,
         )
     is_known = fitted.is_fitted | is_wall
-    normals = sided_normals(mesh, facing, is_known)
+    normals, average = sided_normals(mesh, facing, is_known)
+    sigma_deg = fitted.sigma_deg(mesh, average, fit.tol.terms.alike_views)
     sides = KnownSides(sides_known(mesh, normals, is_known), fitted.is_fitted & ~is_wall)
 
     def polish(mesh: TriangleMesh) -> tuple[TriangleMesh, bool]:
@@ -393,7 +394,7 @@ def _polished(
     logger.info("the surface is %s.", "sharpened" if is_sharp else "left as smooth as it is")
     mesh = sharp if is_sharp else mesh
     labelled = label(mesh, fit, min_cosine=MIN_FACING_COSINE)
-    return _Polished(mesh, fit, labelled, normals, fitted.sigma_deg)
+    return _Polished(mesh, fit, labelled, normals, sigma_deg)
 
 
 def _supported(

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from polmvs.camera import sample_image
 from polmvs.fitting import like_most, robust_deviation
-from polmvs.geometry import dots
-from polmvs.normals.estimator import NormalEstimate, solve_normals
+from polmvs.geometry import dots, unit
+from polmvs.normals.estimator import solve_normals
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS
-from polmvs.surface.creases import CreaseTolerances
+from polmvs.surface.creases import CreaseTolerances, SideAverage
 from polmvs.surface.dense_view import lattice_xy
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
 from polmvs.surface.solver import Fit, Labelled, covered_share
@@ -38,6 +38,8 @@ MIN_POINTS = 10  # least number on the surface for a median
 # each with the pose of one view exchanged: 0.80 and more; wrong ones under PPA had 0.47 and
 # less.
 MIN_EXPLAINED = 0.65
+MIN_OTHERS = 0.05  # least share of a normal's precision that a row leaves to the others
+MAX_GROUPS = 16  # of views: the relative error of a variance is the root of 2 over their number
 MAX_ROWS = 500_000  # faces times views at a time; bounds memory
 
 
@@ -168,36 +170,69 @@ class FaceNormals:
     Attributes
     ----------
     normals : (F, 3) unit, world: from the phases where they agree with the mesh, else the mesh's.
-    sigma_deg : (F,) standard deviation, degrees; inf where the phases give none.
+    noise : (F,) variance of the normal that the rows state, trace of its covariance, rad^2; inf
+        where the phases give no normal.
+    changes : (G, F, 3) float32, change of the normal by each of G groups of views.
+    num_rows : (F,) rows that count.
     """
 
     normals: Array
-    sigma_deg: Array
+    noise: Array
+    changes: NDArray[np.float32]
+    num_rows: NDArray[np.int64]
 
     @property
     def is_fitted(self) -> Mask:
         """(F,), whether a normal is from the phases."""
-        return np.isfinite(self.sigma_deg)
+        return np.isfinite(self.noise)
+
+    def sigma_deg(self, mesh: TriangleMesh, average: SideAverage, alike_views: int) -> Array:
+        """Standard deviation ``(F,)`` of the angle of averaged normals; inf where not fitted.
+
+        The variance is the jackknife over groups of views (Tukey 1958). The changes are averaged
+        as the normals are, so it includes errors that neighbours share in a view. Errors that the
+        views share are added: ``alike_views`` views have one more view's variance. A face has few
+        views: the ratio of the jackknife to the stated variance is that of its surroundings, and of
+        one view of the whole surface.
+
+        Parameters
+        ----------
+        mesh : with F faces.
+        average : of the normals, as of :func:`polmvs.surface.creases.sided_normals`.
+        alike_views : as in :class:`polmvs.surface.terms.TermTolerances`.
+        """
+        num, fitted = len(self.noise), self.is_fitted
+        columns = average.of(np.moveaxis(self.changes, 1, 0).reshape(num, -1))
+        squares = np.einsum("fc,fc->f", columns, columns, dtype=np.float64)
+        freedom = np.where(fitted, np.maximum(self.num_rows - 2, 0), 0)
+        ratio = np.where(freedom > 0, freedom * squares / np.where(fitted, self.noise, 1), 0)
+        sums = np.stack([ratio, freedom], axis=1)
+        whole = sums.sum(axis=0)
+        expected = whole[0] / whole[1] if whole[1] else 1.0
+        about = _smoothed(mesh, sums)
+        excess = (about[:, 0] + expected) / (about[:, 1] + 1)
+        excess *= 1 + self.num_rows / alike_views
+        return np.degrees(np.sqrt(self.noise * excess))
 
 
 def fit_normals(mesh: TriangleMesh, labelled: Labelled) -> FaceNormals:
     """Normals from the phases of all views at the faces of the mesh, which does not move.
 
-    A mesh's own normals are noisier, as they are differences of positions. The deviations are those
-    of the phases' noise, times the Birge ratio (1932) of the rows about a face: light outside of
-    the model has larger errors than noise.
+    A mesh's own normals are noisier, as they are differences of positions.
 
     Parameters
     ----------
     mesh : refined.
     labelled : its observations, with their light.
     """
-    num = len(mesh.faces)
-    normals, sigma = mesh.face_normals.copy(), np.full(num, np.inf)
-    chi_squared = np.zeros((num, 2))  # chi squared and degrees of freedom
+    num, view_count = len(mesh.faces), labelled.num_views
+    group = np.arange(view_count) % MAX_GROUPS
+    normals, noise = mesh.face_normals.copy(), np.full(num, np.inf)
+    num_rows = np.zeros(num, np.int64)
+    changes = np.zeros((min(view_count, MAX_GROUPS), num, 3), np.float32)
     if not num:
-        return FaceNormals(normals, sigma)
-    o, view_count = labelled.observations, labelled.num_views
+        return FaceNormals(normals, noise, changes, num_rows)
+    o = labelled.observations
     kind, excess = labelled.kind, labelled.excess
     index = np.arange(len(o.face))
     chosen = o.rows[kind, index]
@@ -206,8 +241,8 @@ def fit_normals(mesh: TriangleMesh, labelled: Labelled) -> FaceNormals:
     at_a_time = max(1, MAX_ROWS // max(view_count, 1))
     for start in range(0, num, at_a_time):
         part = slice(start, min(start + at_a_time, num))
-        own = mesh.face_normals[part]
-        shape = (view_count, len(own))
+        expected = mesh.face_normals[part]
+        shape = (view_count, len(expected))
         rows = np.full((3, *shape), np.nan, np.float32)
         rays = np.zeros((3, *shape), np.float32)
         turns = np.full(shape, np.inf, np.float32)
@@ -216,36 +251,63 @@ def fit_normals(mesh: TriangleMesh, labelled: Labelled) -> FaceNormals:
         rows[:, view, face] = chosen[here].T
         rays[:, view, face] = o.rays[here].T
         turns[view, face] = turn[here]
-        estimate = solve_normals(rows, rays, turns, initial_normals=own.T)
-        cosine = np.clip((estimate.normals * own).sum(axis=1), -1, 1)
+        estimate = solve_normals(rows, rays, turns, initial_normals=expected.T)
+        cosine = np.clip((estimate.normals * expected).sum(axis=1), -1, 1)
         apart = np.degrees(np.arccos(cosine))
         # A mesh rounds a right-angled edge: a face there is turned by at most 45 deg.
         good = estimate.valid & (apart < CreaseTolerances.crease_deg + 3 * estimate.sigma_deg)
         good &= estimate.residual < 3 * row_sigma
-        normals[part][good] = estimate.normals[good]
-        sigma[part][good] = estimate.sigma_deg[good]
-        chi_squared[part][good, 0] = _chi_squared(rows, rays, turns, estimate)[good]
-        chi_squared[part][good, 1] = np.maximum(estimate.num_rows[good] - 2, 0)
-    return FaceNormals(normals, sigma * np.sqrt(_excess_variance(mesh, chi_squared)))
+        own = np.flatnonzero(good)
+        fitted = start + own
+        normals[fitted] = estimate.normals[own]
+        num_rows[fitted] = estimate.num_rows[own]
+        noise[fitted], changes[:, fitted] = _spread_of_views(
+            normals[fitted].T,
+            rows[..., own],
+            rays[..., own],
+            turns[:, own],
+            estimate.row_weights[:, own],
+            group,
+        )
+    return FaceNormals(normals, noise, changes, num_rows)
 
 
-def _chi_squared(rows: Floats, rays: Floats, turns: Floats, estimate: NormalEstimate) -> Array:
-    """Weighted sum (N,) of squares of ``m . n`` in the variances that the turns' state."""
-    along, across = (np.einsum("ikn,ni->kn", a, estimate.normals) for a in (rays, rows))
-    squares = across**2 / (turns**2 * (1 - along**2))
-    return np.asarray(np.nansum(estimate.row_weights * squares, axis=0))
+def _spread_of_views(
+    normals: Array,
+    rows: Floats,
+    rays: Floats,
+    turns: Floats,
+    row_weights: Floats,
+    group: NDArray[np.int64],
+) -> tuple[Array, Floats]:
+    """Stated variance (N,) of normals (3, N), and their change (G, N, 3) by each group of views.
 
-
-def _excess_variance(mesh: TriangleMesh, chi_squared: Array) -> Array:
-    """Chi squared over degrees of freedom (F,), at least 1, from both (F, 2) about each face.
-
-    A face has few degrees of freedom: those of its surroundings are added, and one row of the mean
-    of the whole surface.
+    A row k changes the normal by ``A^-1 w_k m_k (m_k . n) / (1 - h_k)`` on the tangent plane, with
+    ``A = M^T W M`` and its leverage ``h_k = w_k m_k^T A^-1 m_k``: the change if it is left out.
     """
-    whole = chi_squared.sum(axis=0)
-    expected = whole[0] / whole[1] if whole[1] else 1.0
-    about = _smoothed(mesh, chi_squared)
-    return np.maximum((about[:, 0] + expected) / (about[:, 1] + 1), 1.0)
+    least = np.eye(3)[np.argmin(np.abs(normals), axis=0)].T
+    first = unit(np.cross(normals, least, axis=0).T).T
+    second = np.cross(normals, first, axis=0)
+    along, across, a, b = (
+        np.einsum("ikn,in->kn", one, axis)
+        for one, axis in ((rays, normals), (rows, normals), (rows, first), (rows, second))
+    )
+    usable = np.isfinite(across) & np.isfinite(turns)
+    variance = turns**2 * (1 - along**2)
+    weights = np.where(usable, row_weights / np.where(usable, variance, 1), 0)
+    a, b, across = (np.where(usable, values, 0) for values in (a, b, across))
+    aa, ab, bb = ((weights * p).sum(axis=0, dtype=np.float64) for p in (a * a, a * b, b * b))
+    determinant = aa * bb - ab**2
+    num_groups = int(group.max()) + 1
+    pulls = np.zeros((2, num_groups, normals.shape[1]))
+    leverage = weights * (bb * a**2 - 2 * ab * a * b + aa * b**2) / determinant
+    across /= np.maximum(1 - leverage, MIN_OTHERS)
+    for axis, direction in enumerate((a, b)):
+        np.add.at(pulls[axis], group, weights * direction * across)
+    along_first = (bb * pulls[0] - ab * pulls[1]) / determinant
+    along_second = (aa * pulls[1] - ab * pulls[0]) / determinant
+    changes = along_first[..., None] * first.T + along_second[..., None] * second.T
+    return (aa + bb) / determinant, changes.astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
