@@ -407,14 +407,14 @@ def _supported(
     """A surface with the part of it that the views support."""
     mesh, fit, labelled = polished.mesh, polished.fit, polished.labelled
     evidence = face_evidence(mesh, fit, labelled)
-    supported = supported_faces(mesh, evidence, min_views=given.min_views)
+    given.on_progress(1)
+    sigma = _deviations(mesh, fit)
+    given.on_progress(1)
+    supported = supported_faces(mesh, evidence, min_views=given.min_views, sigma=sigma)
     seen = evidence.num_views >= given.min_views
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     inferred = seen & ~supported & _lie_on(mesh, [cavity.values for cavity in cavities])
     supported |= inferred
-    given.on_progress(1)
-    sigma = _deviations(mesh, fit)
-    given.on_progress(1)
     known = fit.known or KnownPoints(np.zeros((0, 3)), np.zeros(0))
     offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, fit.gsd)
     residual, _ = labelled.residuals(mesh)

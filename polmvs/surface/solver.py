@@ -25,7 +25,7 @@ from scipy import sparse
 
 from polmvs.config import default_num_workers
 from polmvs.fitting import CAUCHY_SCALE, robust_deviation
-from polmvs.geometry import points_on_rays
+from polmvs.geometry import dots, points_on_rays
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.polarization.kinds import Light
 from polmvs.surface.creases import CreaseTolerances, crease_vertices
@@ -658,6 +658,21 @@ class Labelled:
         residuals = self.observations.residuals(mesh.face_normals)
         variances = self.observations.variances(mesh.face_normals, self.row_sigma)
         return residuals[kind, index], variances[kind, index]
+
+    def information(self, mesh: TriangleMesh, fit: Fit) -> Array:
+        """Log-likelihood (K,) of the phases under the mesh's normals, over that of any phase, nats.
+
+        The light is unknown. Phases that are noisy, or seen frontally, say little; phases that
+        contradict the normal have a negative value.
+        """
+        o = self.observations
+        sine2 = np.maximum(1 - dots(o.rays, mesh.face_normals.take(o.face, axis=0)) ** 2, 1e-6)
+        turn = np.arcsin(np.clip(o.residuals(mesh.face_normals) / np.sqrt(sine2), -1, 1))
+        variance = o.variances(mesh.face_normals, self.row_sigma) / sine2
+        density = np.exp(-0.5 * turn**2 / variance) / np.sqrt(2 * np.pi * variance)
+        either = np.einsum("l,lk->k", fit.light_weights, density)
+        other = fit.tol.labels.outlier  # share of neither light
+        return np.asarray(np.log((1 - other) * np.pi * either + other))
 
     def contradicts(self, mesh: TriangleMesh) -> Mask:
         """(K,) bool, residuals beyond noise and beyond the difference between sides of a crease."""
