@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.sparse.csgraph import connected_components
 
 from polmvs.camera import in_frame, sample_image
 from polmvs.fitting import robust_deviation
@@ -167,11 +166,11 @@ def surface_faces(mesh: TriangleMesh, seen: Mask, supported: Mask, gsd: float) -
     supported : (F,), faces whose phases support them.
     gsd : ground sampling distance at the surface, world units.
     """
-    pieces = _pieces(mesh, supported)
+    pieces = mesh.pieces(supported)
     area = np.bincount(pieces + 1, mesh.face_areas)[1:]
     # Phases may support islands of a cap by chance.
     is_body = (pieces >= 0) & (pieces == (np.argmax(area) if len(area) else 0))
-    patches = _pieces(mesh, seen & ~is_body)
+    patches = mesh.pieces(seen & ~is_body)
     area = np.bincount(patches + 1, mesh.face_areas)[1:]
     openings = []
     for number in np.argsort(-area, kind="stable"):
@@ -184,14 +183,6 @@ def surface_faces(mesh: TriangleMesh, seen: Mask, supported: Mask, gsd: float) -
         openings.append(Opening(patch, border))
     inside_along = RayScene(mesh).inside_along
     return SurfaceFaces(mesh.centers, mesh.face_normals, is_body, openings, inside_along, gsd)
-
-
-def _pieces(mesh: TriangleMesh, chosen: Mask) -> Indices:
-    """Number ``(F,)`` of the connected piece of each chosen face, from 0; -1 of the others."""
-    found = np.full(len(mesh.faces), -1, np.int64)
-    index = np.flatnonzero(chosen)
-    found[index] = connected_components(mesh.face_pairs[index][:, index], directed=False)[1]
-    return found
 
 
 def find_cavities(

@@ -410,7 +410,7 @@ def _supported(
     given.on_progress(1)
     sigma = _deviations(mesh, fit)
     given.on_progress(1)
-    supported = supported_faces(mesh, evidence, min_views=given.min_views, sigma=sigma)
+    supported = supported_faces(mesh, evidence, min_views=given.min_views, gsd=fit.gsd, sigma=sigma)
     seen = evidence.num_views >= given.min_views
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     inferred = seen & ~supported & _lie_on(mesh, [cavity.values for cavity in cavities])
@@ -467,7 +467,7 @@ def _cavities(given: _Given, refined: Refined, labelled: Labelled) -> tuple[Cavi
     """Cavities behind the parts of a refined mesh that no phase supports."""
     mesh, fit = refined.mesh, refined.fit
     evidence = face_evidence(mesh, fit, labelled)
-    supported = supported_faces(mesh, evidence, min_views=given.min_views)
+    supported = supported_faces(mesh, evidence, min_views=given.min_views, gsd=fit.gsd)
     seen = evidence.num_views >= given.min_views
     return find_cavities(surface_faces(mesh, seen, supported, fit.gsd), given.scene)
 

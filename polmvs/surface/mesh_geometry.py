@@ -135,6 +135,13 @@ class TriangleMesh:
         _, compact = np.unique(labels[self.faces[:, 0]], return_inverse=True)
         return np.asarray(compact, np.int64)
 
+    def pieces(self, chosen: Mask) -> NDArray[np.int64]:
+        """Number ``(F,)`` of the connected piece of each chosen face, from 0; -1 of the others."""
+        found = np.full(len(self.faces), -1, np.int64)
+        index = np.flatnonzero(chosen)
+        found[index] = connected_components(self.face_pairs[index][:, index], directed=False)[1]
+        return found
+
     def moved(self, displacement: Array) -> TriangleMesh:
         """Vertices displaced by ``(V, 3)``."""
         return TriangleMesh(self.vertices + displacement, self.faces)

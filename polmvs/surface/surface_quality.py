@@ -66,6 +66,7 @@ class QualityTolerances:
     max_outside_share: float = 0.34
     min_information: float = math.log(2)
     max_sigma_ratio: float = 2.0
+    min_gap_px: float = 6.0
 
 
 @dataclass(frozen=True)
@@ -146,6 +147,7 @@ def supported_faces(
     evidence: FaceEvidence,
     *,
     min_views: int = 2,
+    gsd: float,
     sigma: Array | None = None,
     tolerances: QualityTolerances | None = None,
 ) -> Mask:
@@ -156,6 +158,7 @@ def supported_faces(
     mesh : of the evidence.
     evidence : of its faces.
     min_views : number of views that must see a face and have a phase there.
+    gsd : ground sampling distance, world units.
     sigma : (V,) position uncertainty of the vertices; None: no face counts as certain.
     """
     tol = tolerances or QualityTolerances()
@@ -171,6 +174,9 @@ def supported_faces(
         known = np.isfinite(of_face)
         usual = np.median(of_face[known]) if known.any() else 0.0
         determined |= of_face <= tol.max_sigma_ratio * usual
+    gaps = mesh.pieces(~determined)
+    area = np.bincount(gaps + 1, mesh.face_areas)
+    determined |= area[gaps + 1] < np.pi * (tol.min_gap_px * gsd) ** 2
     seen = (evidence.num_views >= min_views) & (rows >= min_views - 0.5)
     return np.asarray(seen & determined & ~denied & ~contradicted)
 
