@@ -1,6 +1,9 @@
 """Shared by tests of whole commands: runs cut short, bytes of folders, one-line errors."""
 
 import json
+import os
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 
@@ -39,3 +42,9 @@ def refused(outcome: tuple[int, str, str], status: int = 1) -> str:
     assert err.count("\n") == 1, err
     assert ": error: " in err
     return err
+
+
+def wait_for_the_end(path: Path, on_message: Callable[[str], None]) -> None:
+    """Work of a process that is ended from outside; its number is written first."""
+    path.write_text(str(os.getpid()))
+    time.sleep(60)

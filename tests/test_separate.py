@@ -35,11 +35,6 @@ def crash_farther_down(on_message):
     run_separately(crash)
 
 
-def wait(path, on_message):
-    path.write_text(str(os.getpid()))
-    time.sleep(60)
-
-
 def test_what_a_function_returns_says_and_raises(caplog, tmp_path: Path) -> None:
     said: list[str] = []
     with caplog.at_level(logging.INFO, "polmvs"):
@@ -69,12 +64,12 @@ WAITING = """
 import signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from test_separate import wait
+from helpers import wait_for_the_end
 from polmvs.separate import run_separately
 for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background ignores the first
     signal.signal(number, signal.default_int_handler)
 try:
-    run_separately(wait, Path(sys.argv[2]), on_message=print)
+    run_separately(wait_for_the_end, Path(sys.argv[2]), on_message=print)
 except KeyboardInterrupt:
     sys.exit(130)
 """

@@ -40,7 +40,7 @@ _REMEDY = "copy the ground truth again"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SurfacePoints:
+class TrueSurfacePoints:
     """A sampling of every true surface of the scene.
 
     Attributes
@@ -69,7 +69,7 @@ class GroundTruth:
 
     folder: Path
     views: Mapping[str, View]
-    _surfaces: dict[tuple[float, float], SurfacePoints] = field(
+    _surfaces: dict[tuple[float, float], TrueSurfacePoints] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
@@ -126,7 +126,7 @@ class GroundTruth:
 
     def surface_points(
         self, spacing_m: float = PART_SPACING_M, other_spacing_m: float = OTHER_SPACING_M
-    ) -> SurfacePoints:
+    ) -> TrueSurfacePoints:
         """Sample all surfaces that the views see: their back-projected depth pixels, thinned.
 
         Parameters
@@ -136,7 +136,7 @@ class GroundTruth:
 
         Returns
         -------
-        SurfacePoints
+        TrueSurfacePoints
             Pixels of the part next to a depth discontinuity are left out. Points are not denser
             than the pixels of all views; they are kept in memory for the next call.
 
@@ -266,7 +266,9 @@ def _parse_view(path: Path, name: str, entry: Any, width: int, height: int) -> V
     return View(name=name, camera=camera, cam_from_world=RigidTransform(rotation, pose[:, 3]))
 
 
-def _sample_surfaces(truth: GroundTruth, spacing_m: float, other_spacing_m: float) -> SurfacePoints:
+def _sample_surfaces(
+    truth: GroundTruth, spacing_m: float, other_spacing_m: float
+) -> TrueSurfacePoints:
     """Back-project every view; thin the part and what is near it finely, the rest coarsely."""
     if not 0 < spacing_m <= other_spacing_m:
         raise ValueError(f"{spacing_m=}, {other_spacing_m=} but expected 0 < spacing <= other.")
@@ -287,7 +289,7 @@ def _sample_surfaces(truth: GroundTruth, spacing_m: float, other_spacing_m: floa
         coarse = _thinned(np.concatenate([coarse, other[~near]]), other_spacing_m)
     fine = _thinned(fine, spacing_m)
     num_other = len(fine) + len(coarse)
-    return SurfacePoints(
+    return TrueSurfacePoints(
         points=np.concatenate([part, fine, coarse]),
         normals=np.concatenate([normals, np.full((num_other, 3), np.nan, np.float32)]),
         is_part=np.arange(len(part) + num_other) < len(part),
