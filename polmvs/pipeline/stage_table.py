@@ -171,148 +171,140 @@ def sparse_figures(record: Record) -> SparseFigures:
 # The table
 
 
-@lru_cache(maxsize=32)
-def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[StageSpec, ...]:
-    """All stages, each after those whose files it reads.
-
-    Parameters
-    ----------
-    compared : angle models to evaluate.
-    """
-    ppa = AngleModel.PPA
-    table = [
-        StageSpec(
-            name="images",
-            command=SFM,
-            writes=(HERE.images,),
-            decides=("capture",),
-            work=lambda run: images.write_images(
-                run.capture,
-                run.run_folder.images,
-                workers=run.workers,
-                on_progress=run.on_progress,
-            ),
-            result=images.ImagesResult,
-            num_steps=lambda run: len(run.capture.names),
+# Stages that all angle models share, up to their phase maps.
+COMMON_STAGES = (
+    StageSpec(
+        name="images",
+        command=SFM,
+        writes=(HERE.images,),
+        decides=("capture",),
+        work=lambda run: images.write_images(
+            run.capture,
+            run.run_folder.images,
+            workers=run.workers,
+            on_progress=run.on_progress,
         ),
-        StageSpec(
-            name="sfm",
-            command=SFM,
-            reads=(HERE.images,),
-            writes=(HERE.sfm,),
-            decides=tuple(path for path in option_paths(SfmOptions) if path != WITHOUT),
-            work=_find_model,
-            result=sfm.SfmResult,
-            num_steps=lambda run: None if run.given_model else sfm.NUM_SFM_STEPS,
+        result=images.ImagesResult,
+        num_steps=lambda run: len(run.capture.names),
+    ),
+    StageSpec(
+        name="sfm",
+        command=SFM,
+        reads=(HERE.images,),
+        writes=(HERE.sfm,),
+        decides=tuple(path for path in option_paths(SfmOptions) if path != WITHOUT),
+        work=_find_model,
+        result=sfm.SfmResult,
+        num_steps=lambda run: None if run.given_model else sfm.NUM_SFM_STEPS,
+    ),
+    StageSpec(
+        name="poses",
+        command=SFM,
+        reads=(HERE.images, HERE.sfm),
+        writes=(HERE.sparse, HERE.camera_modes, HERE.pose_covariances),
+        decides=("reference", WITHOUT),
+        work=lambda run: poses.place_model(
+            run.run_folder,
+            images.image_names(run.capture),
+            run.options.reference,
+            run.options.sfm.without,
         ),
-        StageSpec(
-            name="poses",
-            command=SFM,
-            reads=(HERE.images, HERE.sfm),
-            writes=(HERE.sparse, HERE.camera_modes, HERE.pose_covariances),
-            decides=("reference", WITHOUT),
-            work=lambda run: poses.place_model(
-                run.run_folder,
-                images.image_names(run.capture),
-                run.options.reference,
-                run.options.sfm.without,
-            ),
-            result=poses.PosesResult,
+        result=poses.PosesResult,
+    ),
+    StageSpec(
+        name="box",
+        command=NORMALS,
+        reads=(HERE.images, HERE.sparse),
+        writes=(),
+        decides=CROPPING,
+        work=lambda run: box.check_box(
+            run.run_folder, run.options.crop, run.options.reference.aruco
         ),
-        StageSpec(
-            name="box",
-            command=NORMALS,
-            reads=(HERE.images, HERE.sparse),
-            writes=(),
-            decides=CROPPING,
-            work=lambda run: box.check_box(
-                run.run_folder, run.options.crop, run.options.reference.aruco
-            ),
-            result=box.BoxResult,
-            is_wanted=lambda options: options.crop.box is not None,
-            is_redone=True,
+        result=box.BoxResult,
+        is_wanted=lambda options: options.crop.box is not None,
+        is_redone=True,
+    ),
+    StageSpec(
+        name="maps",
+        command=NORMALS,
+        reads=(HERE.sparse,),
+        writes=(HERE.maps(AngleModel.PPA),),
+        decides=("capture", "region"),
+        work=lambda run: maps.build_maps(
+            run.capture,
+            run.run_folder,
+            run.options.region,
+            max_rows=run.max_rows,
+            workers=run.workers,
+            on_progress=run.on_progress,
         ),
-        StageSpec(
-            name="maps",
-            command=NORMALS,
-            reads=(HERE.sparse,),
-            writes=(HERE.maps(ppa),),
-            decides=("capture", "region"),
-            work=lambda run: maps.build_maps(
-                run.capture,
-                run.run_folder,
-                run.options.region,
-                max_rows=run.max_rows,
-                workers=run.workers,
-                on_progress=run.on_progress,
-            ),
-            result=maps.MapsResult,
-            num_steps=lambda run: run.num_views,
+        result=maps.MapsResult,
+        num_steps=lambda run: run.num_views,
+    ),
+    StageSpec(
+        name="maps_tilted",
+        command=NORMALS,
+        angle_model=AngleModel.TILTED,
+        reads=(HERE.sparse, HERE.maps(AngleModel.PPA)),
+        writes=(HERE.maps(AngleModel.TILTED),),
+        work=lambda run: maps.tilt_maps(
+            run.run_folder, workers=run.workers, on_progress=run.on_progress
         ),
-        StageSpec(
-            name="maps_tilted",
-            command=NORMALS,
-            angle_model=AngleModel.TILTED,
-            reads=(HERE.sparse, HERE.maps(ppa)),
-            writes=(HERE.maps(AngleModel.TILTED),),
-            work=lambda run: maps.tilt_maps(
-                run.run_folder, workers=run.workers, on_progress=run.on_progress
-            ),
-            result=maps.TiltedMapsResult,
-            num_steps=lambda run: run.num_views,
+        result=maps.TiltedMapsResult,
+        num_steps=lambda run: run.num_views,
+    ),
+    StageSpec(
+        name="silhouettes",
+        command=NORMALS,
+        reads=(HERE.sparse, HERE.maps(AngleModel.PPA)),
+        writes=(HERE.silhouettes,),
+        decides=("region.mask",),
+        work=lambda run: silhouettes.find_silhouettes(
+            run.run_folder,
+            masks_given=run.options.region.mask is not None,
+            workers=run.workers,
+            on_progress=run.on_progress,
         ),
-        StageSpec(
-            name="silhouettes",
-            command=NORMALS,
-            reads=(HERE.sparse, HERE.maps(ppa)),
-            writes=(HERE.silhouettes,),
-            decides=("region.mask",),
-            work=lambda run: silhouettes.find_silhouettes(
-                run.run_folder,
-                masks_given=run.options.region.mask is not None,
-                workers=run.workers,
-                on_progress=run.on_progress,
-            ),
-            result=silhouettes.SilhouettesResult,
-            num_steps=lambda run: run.num_views,
-        ),
-    ]
-    for same_kind in zip(*map(_model_stages, AngleModel), strict=True):
-        table += same_kind
-    table += [
-        StageSpec(
-            name="seeds",
-            command=NORMALS,
-            reads=(HERE.sparse, HERE.maps(ppa), HERE.track_normals(ppa)),
-            writes=(HERE.seeds,),
-            work=lambda run: seeds.find_seeds(run.run_folder),
-            result=seeds.SeedsResult,
-        ),
-        StageSpec(
-            name="evaluation",
-            command=COMPARE,
-            reads=(
-                HERE.sparse,
-                HERE.seeds,
-                # PPA's once: OPA's are the same, and all are measured with them.
-                *dict.fromkeys(HERE.maps(model) for model in (ppa, *compared)),
-                *(HERE.sparse_cloud(model) for model in compared),
-                *(HERE.cloud(model) for model in compared),
-                *(HERE.views(model) for model in compared),
-            ),
-            writes=(HERE.metrics, HERE.summary),
-            decides=("evaluation",),
-            work=partial(_evaluate, compared),
-            result=evaluation.EvaluationResult,
-            is_redone=True,
-        ),
-    ]
-    return in_order(table)
+        result=silhouettes.SilhouettesResult,
+        num_steps=lambda run: run.num_views,
+    ),
+)
+# The seeds are chosen by the normals of PPA for all angle models.
+SEEDS_STAGE = StageSpec(
+    name="seeds",
+    command=NORMALS,
+    reads=(HERE.sparse, HERE.maps(AngleModel.PPA), HERE.track_normals(AngleModel.PPA)),
+    writes=(HERE.seeds,),
+    work=lambda run: seeds.find_seeds(run.run_folder),
+    result=seeds.SeedsResult,
+)
 
 
-def _model_stages(model: AngleModel) -> list[StageSpec]:
-    """The stages that there are for each angle model."""
-    track_normals, cloud, views = HERE.track_normals(model), HERE.cloud(model), HERE.views(model)
+def _evaluation_stage(compared: tuple[AngleModel, ...]) -> StageSpec:
+    """The measures of several models together."""
+    return StageSpec(
+        name="evaluation",
+        command=COMPARE,
+        reads=(
+            HERE.sparse,
+            HERE.seeds,
+            # PPA's once: OPA's are the same, and all are measured with them.
+            *dict.fromkeys(HERE.maps(model) for model in (AngleModel.PPA, *compared)),
+            *(HERE.sparse_cloud(model) for model in compared),
+            *(HERE.cloud(model) for model in compared),
+            *(HERE.views(model) for model in compared),
+        ),
+        writes=(HERE.metrics, HERE.summary),
+        decides=("evaluation",),
+        work=partial(_evaluate, compared),
+        result=evaluation.EvaluationResult,
+        is_redone=True,
+    )
+
+
+def _stages_to_cloud(model: AngleModel) -> list[StageSpec]:
+    """The stages of an angle model up to its dense cloud."""
+    track_normals = HERE.track_normals(model)
     return [
         StageSpec(
             name=f"normals_{model}",
@@ -347,7 +339,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
                 *(HERE.sparse, HERE.camera_modes, HERE.pose_covariances, HERE.images),
                 *(HERE.maps(model), HERE.silhouettes, track_normals, HERE.seeds),
             ),
-            writes=(cloud, views),
+            writes=(HERE.cloud(model), HERE.views(model)),
             decides=(TILT_AWARE, "region.light", "propagation", "fusion", *CROPPING),
             work=lambda run: densify.densify(
                 model,
@@ -360,6 +352,13 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             result=densify.DensifyResult,
             num_steps=lambda run: densify.num_densify_steps(run.num_views, run.options.propagation),
         ),
+    ]
+
+
+def _stages_from_cloud(model: AngleModel) -> list[StageSpec]:
+    """The stages that use the dense cloud of an angle model."""
+    cloud, views = HERE.cloud(model), HERE.views(model)
+    return [
         StageSpec(
             name=f"trust_{model}",
             command=FINISH,
@@ -376,7 +375,7 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
                 views,
             ),
             writes=(),
-            decides=("region.light", "normals.tilt_aware_weights"),
+            decides=("region.light", TILT_AWARE),
             work=lambda run: trust.find_trust(model, run.run_folder, run.record, run.options),
             result=Trust,
         ),
@@ -402,6 +401,21 @@ def _model_stages(model: AngleModel) -> list[StageSpec]:
             is_wanted=lambda options: options.export.colmap,
         ),
     ]
+
+
+@lru_cache(maxsize=32)
+def stage_table(compared: tuple[AngleModel, ...] = tuple(AngleModel)) -> tuple[StageSpec, ...]:
+    """All stages, each after those whose files it reads.
+
+    Parameters
+    ----------
+    compared : angle models to evaluate.
+    """
+    table = list(COMMON_STAGES)
+    for stages in (_stages_to_cloud, _stages_from_cloud):
+        for same_kind in zip(*map(stages, AngleModel), strict=True):
+            table += same_kind
+    return in_order([*table, SEEDS_STAGE, _evaluation_stage(compared)])
 
 
 # What follows from it

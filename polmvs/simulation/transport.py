@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -248,14 +249,7 @@ def _follow(scene: MitsubaScene, ray: Any, sampler: Any, bounces: int) -> tuple[
     upright = mi.Vector3f(0.0, 0.0, 1.0)
     part = mi.ShapePtr(scene.part)
 
-    def gathered(light: Any, radiance: Any, lit: Any) -> Any:
-        # Unpolarized light through what was met so far; its mean over wavelengths.
-        return dr.select(
-            lit, mi.Vector3f(*(dr.mean(light[k, 0] * radiance) for k in range(3))), 0.0
-        )
-
-    def proceeds(active: Any, *_: Any) -> Any:
-        return active
+    gathered = partial(_gathered, mi, dr)
 
     # A loop of Dr.Jit: rays that end do not wait for the others.
     def follow(
@@ -300,8 +294,13 @@ def _follow(scene: MitsubaScene, ray: Any, sampler: Any, bounces: int) -> tuple[
         mi.Vector3f(0.0),
         mi.Vector2f(0.0),
     )
-    *_, total, diffuse = dr.while_loop(state, proceeds, follow)
+    *_, total, diffuse = dr.while_loop(state, lambda active, *_: active, follow)
     return total, diffuse
+
+
+def _gathered(mi: Any, dr: Any, light: Any, radiance: Any, lit: Any) -> Any:
+    """Unpolarized light through what was met so far; its mean over wavelengths."""
+    return dr.select(lit, mi.Vector3f(*(dr.mean(light[k, 0] * radiance) for k in range(3))), 0.0)
 
 
 def _relative_illuminant(scene: MitsubaScene, hit: Any, active: Any) -> Any:
@@ -313,7 +312,7 @@ def _relative_illuminant(scene: MitsubaScene, hit: Any, active: Any) -> Any:
 
 
 def _albedo(scene: MitsubaScene, hit: Any, active: Any) -> Any:
-    """Of the object's base: the material's, the mesh's colours, or that of a printed mark."""
+    """Albedo of the object's base: the material's, the mesh's, or that of a printed mark."""
     mi, dr = scene.renderer.mi, scene.renderer.dr
     albedo = scene.albedo.eval(hit, active)
     marks = scene.description.marks
