@@ -45,6 +45,7 @@ from polmvs.config import (
     ExportOptions,
     OptionGroup,
     Options,
+    RegionOptions,
     RunOptions,
     default_num_workers,
     option,
@@ -550,7 +551,7 @@ def _per_view(capture: Capture, model: Path, workers: Workers) -> float:
         shutil.copytree(model, folder.sparse)
         start = time.perf_counter()
         write_images(capture, folder.images, workers=workers)
-        build_maps(capture, folder, workers=workers)
+        build_maps(capture, folder, RegionOptions(), workers=workers)
         return time.perf_counter() - start
 
 

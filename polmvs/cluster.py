@@ -208,7 +208,7 @@ class Cluster:
                 self.address, f"has no workers. Start some: dask worker {self.address}"
             ) from error
         mine = own_versions()
-        for worker, found in self._on_all(_try_versions).items():
+        for worker, found in self._on_all(own_versions).items():
             for package, wanted in mine.items():
                 if found.get(package) != wanted:
                     raise DataError(
@@ -250,7 +250,7 @@ class Cluster:
                 )
 
     def _on_all(self, function: Callable[..., Any], *arguments: Any) -> Mapping[str, Any]:
-        """What each worker answers, by its address."""
+        """Result of a function on each worker, by address."""
         try:
             return dict(self._client.run(function, *arguments, on_error="raise"))
         except Exception as error:  # whatever the worker could not load
@@ -323,7 +323,7 @@ def _connect(address: str, tls: TlsFiles | None, patience: ClusterPatience) -> A
 
 
 def _work(versions: dict[str, str], packed: bytes) -> Any:
-    """Do a task; a worker that came later is checked as the first ones were."""
+    """Do a task; the versions of a worker that joined later are checked here."""
     import cloudpickle
 
     if versions != own_versions():
@@ -333,10 +333,6 @@ def _work(versions: dict[str, str], packed: bytes) -> Any:
     keep_to_one_core()  # a worker's thread is one core
     function, task = cloudpickle.loads(packed)
     return function(*task)
-
-
-def _try_versions() -> dict[str, str]:
-    return own_versions()
 
 
 def _try_storage(folder: str, token: str) -> str:

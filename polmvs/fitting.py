@@ -9,6 +9,7 @@ import numpy as np
 from polmvs.arrays import Array, Floats, Mask
 
 CAUCHY_SCALE = 2.385  # deviations; 95 % efficiency on normal residuals (Holland & Welsch 1977)
+FINAL_ROUNDS = 3  # of an annealed fit, at its final scale
 MEDIAN_OF_NORMAL = 0.6745  # median of |x|, x normal of unit deviation
 # Of an outlier's residual over the median one. Of normal residuals in one, two and three dimensions
 # 5 medians are 3.4, 5.9 and 7.7 deviations.
@@ -40,18 +41,17 @@ def geman_mcclure_weights(residuals: Floats, square: float | Floats) -> Array:
     return np.asarray((square / (square + residuals**2)) ** 2)
 
 
-def annealed_scales(num_rounds: int, *, num_final: int = 3) -> Iterator[float]:
+def annealed_scales(num_rounds: int) -> Iterator[float]:
     """Scales of a Cauchy loss for the rounds of a fit: wide first, halved to ``CAUCHY_SCALE``.
 
     A wide loss is nearly convex, so the fit finds the minimum on which most data agree.
 
     Parameters
     ----------
-    num_rounds : scales to give.
-    num_final : how many of them, the last ones, are the final one.
+    num_rounds : scales to give; the last ``FINAL_ROUNDS`` are the final one.
     """
     for index in range(num_rounds):
-        yield CAUCHY_SCALE * 2.0 ** max(num_rounds - num_final - index, 0)
+        yield CAUCHY_SCALE * 2.0 ** max(num_rounds - FINAL_ROUNDS - index, 0)
 
 
 def robust_deviation(residuals: Floats) -> float:
@@ -60,7 +60,7 @@ def robust_deviation(residuals: Floats) -> float:
 
 
 def like_most(residuals: Floats, *, floor: float, ceiling: float = np.inf) -> Mask:
-    """Which residuals ``(N,)``, none negative, are like those of the majority.
+    """Whether residuals ``(N,)``, none negative, are like those of the majority.
 
     Parameters
     ----------

@@ -76,11 +76,9 @@ class View:
         along = dots(to_camera, np.asarray(normals, np.float64))
         return np.asarray(along / lengths(to_camera))
 
-    def faces(
-        self, points: Floats, normals: Floats, *, min_cosine: float = MIN_FACING_COSINE
-    ) -> Mask:
+    def faces(self, points: Floats, normals: Floats) -> Mask:
         """Whether surface points ``(..., 3)`` with unit normals face the camera; not where NaN."""
-        return np.asarray(self.facing_cosines(points, normals) > min_cosine, np.bool_)
+        return np.asarray(self.facing_cosines(points, normals) > MIN_FACING_COSINE, np.bool_)
 
 
 def stem_of(name: str) -> str:
@@ -89,7 +87,7 @@ def stem_of(name: str) -> str:
 
 
 def match_names(names: Sequence[str], known: Iterable[str]) -> dict[str, str]:
-    """Which of the known names each image has; images without one are left out.
+    """The known name of each image; images without one are left out.
 
     An equal name goes before the only name with the same stem. A known name is used once, so that
     ``a/0.png`` and ``b/0.png`` do not share a ``0.png``.

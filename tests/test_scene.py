@@ -40,7 +40,6 @@ def test_a_surface_faces_the_camera_up_to_grazing(view):
         assert view.facing_cosines(points, normals)[0] == pytest.approx(cosine)
         assert view.faces(points, normals)[0] == (cosine > 0.1)
     assert not view.faces(points, normals * np.nan)[0]
-    assert not view.faces(points, -ray, min_cosine=1.1)[0]
 
 
 def test_the_image_has_its_upper_left_border_and_not_its_lower_right():

@@ -11,7 +11,7 @@ from polmvs.scene import View
 from polmvs.simulation.irradiance import bake
 from polmvs.simulation.lights import environment
 from polmvs.simulation.marks import marks_on
-from polmvs.simulation.materials import Material, fresnel
+from polmvs.simulation.materials import METALS, Material
 from polmvs.simulation.options import LightingOptions, LightName
 from polmvs.simulation.renderer_import import Renderer
 from polmvs.simulation.scene import MitsubaScene, SceneDescription, build_scene
@@ -23,6 +23,35 @@ SIDE = 64  # px
 CAMERA = PinholeCamera(width=SIDE, height=SIDE, fx=56.0, fy=56.0, cx=30.0, cy=33.0)
 SMOOTH = 0.004  # roughness; slopes of 0.2 degrees
 GLOSS = Material(roughness=SMOOTH, ior=1.5)
+
+
+def refractive_index(material: Material) -> complex:
+    """Of a dielectric, or ``n + i k`` of a metal at 550 nm."""
+    if material.metal is None:
+        return complex(material.ior)
+    n, k, _ = METALS[material.metal]
+    return complex(n, k)
+
+
+def fresnel(cos_incidence: np.ndarray, index: complex) -> tuple[np.ndarray, np.ndarray]:
+    """Reflectances ``(R_s, R_p)`` of a smooth surface in air.
+
+    Parameters
+    ----------
+    cos_incidence : (...), 0 to 1.
+    index : refractive index ``n + i k``.
+    """
+    c = np.asarray(cos_incidence, np.complex128)
+    refracted = np.sqrt(index**2 - (1 - c * c))
+    across = (c - refracted) / (c + refracted)
+    along = (index**2 * c - refracted) / (index**2 * c + refracted)
+    return np.abs(across) ** 2, np.abs(along) ** 2
+
+
+def transmittance(cos_incidence: np.ndarray, index: complex) -> np.ndarray:
+    """Share of unpolarized light that enters a dielectric."""
+    across, along = fresnel(cos_incidence, index)
+    return np.asarray(1 - 0.5 * (across + along))
 
 
 def specular_dolp(cos_incidence: np.ndarray, index: complex) -> np.ndarray:

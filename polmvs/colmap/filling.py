@@ -60,8 +60,6 @@ def fill_workspace(
     source: DenseWorkspace,
     target: str | PathLike[str] | None,
     load_fill: FillLoader,
-    *,
-    in_place: bool = False,
 ) -> Path | None:
     """Add depth and normals to a workspace where it has none.
 
@@ -71,11 +69,11 @@ def fill_workspace(
 
     Parameters
     ----------
-    source : the workspace; not modified unless ``in_place``.
-    target : folder of the new workspace, which may exist if it is empty; None with ``in_place``.
+    source : the workspace.
+    target : folder of the new workspace, which may exist if it is empty. None: the source itself
+        is changed. Every replaced file is first moved to ``stereo.polmvs-backup-<n>/``; after a
+        failure the former state is restored.
     load_fill : gives a view's depth and normals by name.
-    in_place : change the source itself. Every replaced file is first moved to
-        ``stereo.polmvs-backup-<n>/``; after a failure the former state is restored.
 
     Returns
     -------
@@ -86,10 +84,8 @@ def fill_workspace(
     DataError
         A map is damaged, or the system refuses.
     OptionError
-        Both or neither of ``target`` and ``in_place``, or the target is inside the source.
+        The target is inside the source.
     """
-    if in_place != (target is None):
-        raise OptionError("Filling a workspace needs a new folder or in_place, and not both.")
     if target is None:
         with _scratch(source.folder) as scratch:
             staged = scratch / STEREO
@@ -144,7 +140,7 @@ def _require_size(item: WorkspaceView, fill: DepthNormals) -> None:
 
 
 def _swap_in(staged: Path, stereo: Path) -> Path:
-    """Put staged files in the place of those of a stereo folder, which go to a new backup."""
+    """Replace files of a stereo folder by staged ones; the old files go to a new backup."""
     backup = _new_backup(stereo.parent)
     moved: list[tuple[Path, Path]] = []  # from, to; in order
     try:

@@ -68,7 +68,7 @@ class TruthFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelFigures:
-    """What a model came to.
+    """Metrics of an angle model.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class PhaseFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class SparseFigures:
-    """What all models started from.
+    """Numbers of the input that all models share.
 
     Attributes
     ----------
@@ -181,7 +181,7 @@ def compare_models(
     estimates: Mapping[AngleModel, ModelEstimate],
     truth: GroundTruth | None,
     *,
-    workers: Workers | None = None,
+    workers: Workers,
 ) -> Comparison:
     """Metrics of several models.
 
@@ -201,7 +201,7 @@ def compare_models(
         partial(measure_consistency, m, e.cloud, e.tracks, e.maps, e.outside)
         for m, e in estimates.items()
     ]
-    done = list((workers or Workers()).map(operator.call, tasks))
+    done = list(workers.map(operator.call, tasks))
     found: list[Consistency] = done[len(done) - len(estimates) :]
     consistency = dict(zip(estimates, found, strict=True))
     against_truth: Mapping[AngleModel, TruthFigures] = done[0] if truth is not None else {}
@@ -300,7 +300,7 @@ def _measure_all(
 
 
 def best_fit_lines(comparison: Comparison) -> list[str]:
-    """Which of several models the capture's phases fit best, if there is anything to tell it by."""
+    """A sentence on the model that fits the capture's phases best; empty if it is unknown."""
     best = comparison.best_fit
     if best is None or len(comparison.models) < 2:
         return []

@@ -33,7 +33,8 @@ from polmvs.poses.image_check import (
     intensity_loader,
     require_cameras_of_images,
 )
-from polmvs.poses.metric_frame import check_reference, frame_from_distance, read_centers
+from polmvs.poses.markers import parse_marker_option
+from polmvs.poses.metric_frame import frame_from_distance, read_centers
 from polmvs.scene import SparseModel, find_name, match_names, short_list
 
 MAX_CAMERA_DIFFERENCE = 0.01  # of the focal length, between equivalent options; a guess
@@ -90,7 +91,7 @@ def require_apart(
 
 
 def _real_places(path: Path) -> list[Path]:
-    """Where an input lies, and what links in it lead to."""
+    """Real paths of an input and of the targets of links in it."""
     try:
         links = [entry for entry in path.iterdir() if entry.is_symlink()] if path.is_dir() else []
         return [entry.resolve() for entry in (path, *links)]
@@ -245,8 +246,9 @@ def _check_masks(capture: Capture, folder: Path) -> None:
 
 
 def _check_references(capture: Capture, options: ReferenceOptions) -> None:
-    """What is known of a metric frame's sources before there are poses."""
-    check_reference(options)
+    """Check the sources of a metric frame as far as possible before there are poses."""
+    if options.aruco is not None:
+        parse_marker_option(options.aruco)
     names = list(image_names(capture))
     if options.reference is not None:
         centers = read_centers(options.reference)

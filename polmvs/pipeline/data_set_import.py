@@ -33,6 +33,7 @@ from polmvs.io.data_sets import (
 )
 from polmvs.io.images import write_bytes, write_mask
 from polmvs.io.typed_json import from_json, parse_json, write_json
+from polmvs.parallel import Workers
 from polmvs.pipeline.stages.images import image_names, write_images
 from polmvs.polarization.capture import Capture, open_capture
 from polmvs.polarization.kinds import Light
@@ -46,7 +47,7 @@ SAME_CAMERA = 1e-6  # relative difference by the rounding of a set's matrices
 
 @dataclass(frozen=True, kw_only=True)
 class _Made:
-    """What a folder of an import was made from."""
+    """Source of an import."""
 
     folder: Path
     kind: DataSetKind
@@ -164,7 +165,7 @@ def _found_import(folder: Path, place: Path, options: CaptureOptions) -> Importe
 
 
 def _described(data_set: DataSet, out: Path, num_points: int | None) -> ImportedSet:
-    """What an import in a folder comes to."""
+    """Description of the import of a set in a folder."""
     options = data_set.options
     if data_set.capture is None:
         options = replace(options, kind=CaptureKind.STOKES)
@@ -226,7 +227,7 @@ def _triangulate(data_set: DataSet, capture: Capture, out: Path) -> int:
         camera = ColmapCamera(**vars(intrinsics))
         views.append(View(name=name, camera=camera, cam_from_world=pose))
     images, work = out / "images", out / "work"
-    write_images(capture, images)
+    write_images(capture, images, workers=Workers())
     model = triangulate_views(images, views, work, out / "sparse")
     shutil.rmtree(work)
     return len(model.tracks.point3D_ids)

@@ -24,11 +24,12 @@ from polmvs.io.mesh_files import MESH_FORMATS, Texture, mesh_format_of, write_me
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import dense_models, load_record
+from polmvs.pipeline.stages.box import find_box
 from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.polarization.capture import DISPLAY_GAMMA, Capture, open_capture
 from polmvs.polarization.kinds import AngleModel
-from polmvs.poses.crop_box import CropBox, crop_box
+from polmvs.poses.crop_box import CropBox
 from polmvs.scene import PointKind, SparseModel, View
 from polmvs.surface.coloring import paint_texture, surface_colors, texture_size
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
@@ -47,7 +48,7 @@ MESHES = (ExportFormat.PLY, ExportFormat.OBJ, ExportFormat.STL, ExportFormat.GLB
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRequest:
-    """What is to be written of a run.
+    """Request for an export.
 
     Attributes
     ----------
@@ -212,12 +213,8 @@ def _box_of_run(run_folder: RunFolder, record: Record, crop: CropOptions) -> Cro
     if crop.box is None:
         return None
     options = options_from_plain(record.options, str(run_folder.run_file))
-    return crop_box(
-        crop,
-        options.reference.aruco,
-        read_model(run_folder.sparse).views,
-        lambda name: read_gray(run_folder.images / name),
-    )
+    views = read_model(run_folder.sparse).views
+    return find_box(run_folder, views, crop, options.reference.aruco)
 
 
 def _existing(path: Path, what: str) -> Path:

@@ -12,6 +12,7 @@ from polmvs.config import options_from_plain
 from polmvs.errors import DataError, OptionError
 from polmvs.evaluation.comparison import Comparison, read_comparison
 from polmvs.evaluation.trust import Trust
+from polmvs.parallel import Workers
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.runner import Job, Run, load_record, open_run
@@ -169,6 +170,7 @@ def measure(run_folder: RunFolder, models: Sequence[AngleModel]) -> Comparison:
         run_folder,
         models,
         options.evaluation.gt,
+        workers=Workers(),
     )
 
 
@@ -241,7 +243,7 @@ def _open(
 
 
 def _do_all(run: Run, last: Sequence[StageSpec]) -> None:
-    """Do stages that the options ask for, and all that they need."""
+    """Run the stages that the options select, and all that they need."""
     wanted = [spec.name for spec in last if spec.is_wanted(run.options)]
     for _, same in groupby(with_needed(wanted, run.table), key=lambda spec: spec.result):
         run.do_all(list(same))

@@ -32,7 +32,7 @@ MAX_CLIPPED = 0.001  # share of a frame's samples that may be clipped: dust and 
 
 
 def calibrate_polarizers(
-    folder: Path, options: CaptureOptions | None = None, *, per_sample: bool = False
+    folder: Path, options: CaptureOptions, *, per_sample: bool
 ) -> PolarizerResponse:
     """Measure a sensor's response from the frames of a folder.
 
@@ -47,7 +47,7 @@ def calibrate_polarizers(
     DataError
         Frames are missing, misnamed, clipped, or do not fit the pattern.
     """
-    chosen = replace(options or CaptureOptions(), kind=CaptureKind.MOSAIC, calibration=None)
+    chosen = replace(options, kind=CaptureKind.MOSAIC, calibration=None)
     measure: Callable[..., PolarizerResponse] = measure_response
     if chosen.bayer is not None:
         measure = partial(measure_colour_response, bayer=chosen.bayer)

@@ -130,18 +130,13 @@ class Capture:
         )
 
     @property
-    def bit_depth(self) -> int:
-        """Of the samples; 0 for floats."""
-        return self.levels.bit_depth
-
-    @property
     def full_scale(self) -> float:
         """Value of a saturated sample."""
         return self.levels.full_scale
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was recognized and decided, one line each."""
+        """Recognized files and decisions, one line each."""
         files, header = self.files, self.header
         what = {
             CaptureKind.MOSAIC: "raw mosaics",

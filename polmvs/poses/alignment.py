@@ -167,7 +167,7 @@ def spread_of(points: Array) -> float:
 def _consistent_cameras(
     centers: Array, true_centers: Array, tolerances: AlignmentTolerances
 ) -> Mask:
-    """Which cameras one similarity explains; all of them when there are few."""
+    """Cameras that one similarity explains; all of them if there are few."""
     majority = max(len(centers) // 2 + 1, MIN_CAMERAS + 1)  # any three agree well enough
     if len(centers) <= majority:
         return np.ones(len(centers), np.bool_)

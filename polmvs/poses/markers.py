@@ -110,28 +110,23 @@ class Detection:
 def parse_marker_option(option: str) -> tuple[int, float]:
     """OpenCV's number of a dictionary, and the side in metres, of ``DICT:SIZE``.
 
+    Parameters
+    ----------
+    option : as :class:`polmvs.config.ReferenceOptions` has checked it.
+
     Raises
     ------
     OptionError
-        The text is malformed, the size is not positive, or the dictionary is unknown.
+        The dictionary is unknown.
     """
-    name, _, size_text = option.rpartition(":")
-    try:
-        size_m = float(size_text)
-    except ValueError:
-        size_m = np.nan
-    if not 0 < size_m < np.inf:
-        raise OptionError(
-            f"needs DICT:SIZE with a positive size in metres, not {option}.",
-            field="reference.aruco",
-        )
+    name, _, size_m = option.rpartition(":")
     known = {key: value for key, value in vars(cv2.aruco).items() if key.startswith("DICT_")}
     if name not in known:
         raise OptionError(
             f"names an unknown dictionary {name!r}; known are {', '.join(known)}.",
             field="reference.aruco",
         )
-    return int(known[name]), size_m
+    return int(known[name]), float(size_m)
 
 
 def detect_markers(

@@ -97,20 +97,6 @@ class Frame:
         return self.metric_from_world.scale
 
 
-def check_reference(options: ReferenceOptions) -> None:
-    """Check the options and the file before there is a model.
-
-    Raises
-    ------
-    DataError, OptionError
-        The file is unusable, or the dictionary of markers is unknown.
-    """
-    if options.reference is not None:
-        read_centers(options.reference)
-    if options.aruco is not None:
-        parse_marker_option(options.aruco)
-
-
 def metric_frame(
     sparse_model: SparseModel, options: ReferenceOptions, load_image: ImageLoader
 ) -> Frame | None:
@@ -131,7 +117,6 @@ def metric_frame(
     OptionError
         An option is malformed, names what the model lacks, or two sources contradict each other.
     """
-    check_reference(options)
     frames = []
     if options.reference is not None:
         centers = read_centers(options.reference)
@@ -270,8 +255,6 @@ def frame_from_distance(
     OptionError
         An end is unknown, or both ends are the same, or their distance in the model is 0.
     """
-    if not 0 < distance_m < np.inf:
-        raise OptionError(f"needs a positive distance, not {distance_m}.", field="reference.scale")
     ends = [_end_of_distance(sparse_model, text) for text in (first, second)]
     offset = ends[1][0] - ends[0][0]
     distance = float(np.linalg.norm(offset))

@@ -110,7 +110,7 @@ class SimulatedCapture:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """For people."""
+        """Lines of text for the terminal."""
         lines = [
             f"{self.folder}: {self.num_views} views, raw/, gt/, camera.txt; Mitsuba {self.variant}"
         ]
@@ -129,7 +129,7 @@ def simulate_capture(
     mesh: str | Path | Mesh,
     out: Path,
     simulation: Simulation,
-    run: SimulationRun | None = None,
+    run: SimulationRun,
     *,
     on_progress: OnProgress = no_progress,
 ) -> SimulatedCapture:
@@ -148,7 +148,6 @@ def simulate_capture(
     DataError, OptionError
         A file is unusable, options contradict each other, or a view sees nothing.
     """
-    run = run or SimulationRun()
     options = simulation.for_preview() if simulation.rendering.preview else simulation
     plan = _Plan.make(mesh, options)
     record = {"version": __version__, "mesh": plan.mesh.source, **to_plain(asdict(options))}
@@ -439,7 +438,7 @@ def _entry(record: Any, group: str, name: str) -> Any:
 
 
 def _write_head(out: Path, plan: _Plan, record: dict[str, Any]) -> None:
-    """What a capture has beside its views."""
+    """Write the files of a capture other than its views."""
     options = plan.options
     with as_data_error(out, "written"):
         for folder in (out / "raw", out / "gt"):

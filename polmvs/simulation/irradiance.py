@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from polmvs.arrays import Array
-from polmvs.simulation.materials import transmittance
 from polmvs.simulation.scene import SPREAD_NM, MitsubaScene
 
 CHUNK = 1 << 21  # paths at a time: about 100 MB
@@ -91,7 +90,7 @@ def _spread(
 
 @dataclass(frozen=True, kw_only=True)
 class _Gathering:
-    """How light is gathered at places: under which surface, after how many reflections."""
+    """Settings of gathering light at places: surface, reflections and samples."""
 
     scene: MitsubaScene
     ior: float | None
@@ -108,7 +107,7 @@ class _Gathering:
         return np.concatenate(parts) if parts else np.zeros(0)
 
     def by_hemisphere(self, place: Any, points: Any, sampler: Any) -> Any:
-        """By samples of the hemisphere: light from surfaces, and that of the sky with its share."""
+        """Irradiance by samples of the hemisphere: surfaces, and emitters with their MIS weight."""
         scene = self.scene
         mi, dr = scene.renderer.mi, scene.renderer.dr
         local = mi.warp.square_to_cosine_hemisphere(points)
@@ -118,7 +117,7 @@ class _Gathering:
         hit = scene.scene.ray_intersect(ray)
         density = cosine / dr.pi
         emitter = hit.emitter(scene.scene)
-        has_emitter = dr.neq(emitter, None) if hasattr(dr, "neq") else emitter != None  # noqa: E711
+        has_emitter = emitter != None  # noqa: E711  (of each ray)
         emitted = self.brightness(emitter.eval(hit, has_emitter))
         record = mi.DirectionSample3f(scene.scene, hit, place)
         of_emitter = scene.scene.pdf_emitter_direction(place, record, has_emitter)
@@ -135,7 +134,7 @@ class _Gathering:
         return dr.pi * self.entering(cosine) * (dr.select(has_emitter, emitted, 0.0) + indirect)
 
     def by_emitters(self, place: Any, points: Any) -> Any:
-        """By samples of the emitters, with theirs."""
+        """Irradiance by samples of the emitters, with their MIS weight."""
         dr = self.scene.renderer.dr
         towards, weight = self.scene.scene.sample_emitter_direction(place, points, True)
         cosine = dr.dot(towards.d, place.n)
@@ -145,7 +144,7 @@ class _Gathering:
         return dr.select(lit, self.brightness(weight) * cosine * entering * share, 0.0)
 
     def brightness(self, value: Any) -> Any:
-        """Of unpolarized light: the first element of Mueller's matrix, mean over wavelengths."""
+        """First element of Mueller's matrix, for unpolarized light, mean over wavelengths."""
         return self.scene.renderer.dr.mean(value[0, 0])
 
     def entering(self, cosine: Any) -> Any:
@@ -156,8 +155,7 @@ class _Gathering:
         refracted = dr.sqrt(1 - (1 - cosine * cosine) / ior**2)
         across = dr.square((cosine - ior * refracted) / (cosine + ior * refracted))
         along = dr.square((ior * cosine - refracted) / (ior * cosine + refracted))
-        normal_incidence = float(transmittance(np.array(1.0), complex(ior)))
-        return (1 - 0.5 * (across + along)) / normal_incidence
+        return (1 - 0.5 * (across + along)) / (1 - ((ior - 1) / (ior + 1)) ** 2)
 
 
 def _gather(light: _Gathering, points: Array, normals: Array, seed: int) -> Array:

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from polmvs.arrays import Array
 from polmvs.errors import OptionError
 from polmvs.simulation.options import MaterialName, Metal, ObjectOptions
 
@@ -42,15 +41,6 @@ class Material:
     roughness: float
     ior: float | None = None
     metal: Metal | None = None
-
-    @property
-    def index(self) -> complex:
-        """Refractive index at 550 nm, ``n + i k``."""
-        if self.metal is None:
-            assert self.ior is not None
-            return complex(self.ior)
-        n, k, _ = METALS[self.metal]
-        return complex(n, k)
 
     @property
     def grey(self) -> float:
@@ -102,27 +92,6 @@ def material_of(options: ObjectOptions) -> Material:
     return material if options.metal is None else replace(material, metal=options.metal)
 
 
-def fresnel(cos_incidence: Array, index: complex) -> tuple[Array, Array]:
-    """Reflectances ``(R_s, R_p)`` of a smooth surface in air.
-
-    Parameters
-    ----------
-    cos_incidence : (...), 0 to 1.
-    index : refractive index ``n + i k``.
-    """
-    c = np.asarray(cos_incidence, np.complex128)
-    refracted = np.sqrt(index**2 - (1 - c * c))
-    across = (c - refracted) / (c + refracted)
-    along = (index**2 * c - refracted) / (index**2 * c + refracted)
-    return np.abs(across) ** 2, np.abs(along) ** 2
-
-
-def transmittance(cos_incidence: Array, index: complex) -> Array:
-    """Share of unpolarized light that enters a dielectric."""
-    across, along = fresnel(cos_incidence, index)
-    return np.asarray(1 - 0.5 * (across + along))
-
-
 def bsdf_of(material: Material, *, colour: bool) -> dict[str, Any]:
     """Mitsuba's description of the material, with its own albedo."""
     if material.metal is not None:
@@ -134,6 +103,7 @@ def bsdf_of(material: Material, *, colour: bool) -> dict[str, Any]:
             else {"eta": {"type": "uniform", "value": n}, "k": {"type": "uniform", "value": k}}
         )
         return {"type": "roughconductor", "alpha": material.roughness, **optics}
+    assert material.ior is not None  # of a dielectric
     albedo = (
         {"type": "rgb", "value": list(material.albedo)}
         if colour
@@ -142,7 +112,7 @@ def bsdf_of(material: Material, *, colour: bool) -> dict[str, Any]:
     return {
         "type": "pplastic",
         "alpha": material.roughness,
-        "int_ior": float(material.index.real),
+        "int_ior": material.ior,
         "ext_ior": 1.0,
         "diffuse_reflectance": albedo,
     }

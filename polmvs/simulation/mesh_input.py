@@ -20,6 +20,7 @@ from polmvs.arrays import Array
 from polmvs.errors import DataError, OptionError
 from polmvs.geometry import unit
 from polmvs.io.clouds import Mesh
+from polmvs.io.mesh_files import linear_of_display
 from polmvs.simulation.options import Facets, ObjectOptions
 from polmvs.synthetic.shapes import named_shape, shape_names
 
@@ -128,14 +129,13 @@ def _colours(loaded: Any, num: int) -> NDArray[np.float32] | None:
     try:
         if visual.kind == "texture":
             visual = visual.to_color()
-        colours = np.asarray(visual.vertex_colors, np.float64)[:, :3] / 255
+        colours = np.asarray(visual.vertex_colors)[:, :3]
     except Exception:  # an image that is missing or damaged: the material's own colour serves
         logger.warning("the mesh's texture cannot be read; it is rendered without")
         return None
     if colours.shape != (num, 3):
         return None
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    return linear.astype(np.float32)
+    return linear_of_display(colours)
 
 
 def _surface(
@@ -236,7 +236,7 @@ def _placed(
     options: ObjectOptions,
     unit_m: float,
 ) -> ObjectMesh:
-    """In metres, its lowest point on the plane z = 0, its middle over the origin."""
+    """The mesh in metres, its lowest point on the plane z = 0, its middle over the origin."""
     if options.size is not None and options.unit is not None:
         raise OptionError("and `object.unit` exclude each other.", field="object.size")
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)

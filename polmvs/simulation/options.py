@@ -34,7 +34,7 @@ class Metal(StrEnum):
 
 
 class Facets(StrEnum):
-    """What the surface between a mesh's vertices is."""
+    """Surface between a mesh's vertices."""
 
     FLAT = "flat"
     SMOOTH = "smooth"
@@ -60,7 +60,7 @@ class Scenery(StrEnum):
 
 
 class PathName(StrEnum):
-    """How the camera goes about the object."""
+    """Path of the camera about the object."""
 
     RING = "ring"
     DOME = "dome"
@@ -70,14 +70,14 @@ class PathName(StrEnum):
 
 
 class Optics(StrEnum):
-    """At which angle rays meet the polarizers."""
+    """Angle at which rays meet the polarizers."""
 
     TILTED = "tilted"
     TELECENTRIC = "telecentric"
 
 
 class SensorKind(StrEnum):
-    """What makes the polarization images."""
+    """Device that makes the polarization images."""
 
     MOSAIC = "mosaic"
     FILTER = "filter"
@@ -272,7 +272,7 @@ class SensorOptions(OptionGroup, group="sensor"):
     )
 
     def check(self) -> None:
-        """What does not go together."""
+        """Sizes and patterns are valid, and no options contradict each other."""
         self.require(self.bits in (8, 10, 12, 16), "bits", "must be 8, 10, 12 or 16", self.bits)
         width, height = self.image_size
         cell = 4 if self.colour is not None else 2

@@ -109,7 +109,7 @@ def find_llvm() -> str | None:
 
 
 def _fault_of(llvm: str | None) -> str | None:
-    """Why LLVM's library does not serve; None if it does, as far as its name tells."""
+    """Reason why LLVM's library is unusable; None if it is usable, as far as its name shows."""
     if llvm is None:
         return "LLVM's library was not found"
     major = _version(llvm)[0]

@@ -154,9 +154,19 @@ def _albedo_texture(renderer: Renderer, description: SceneDescription) -> Any:
 
 def _shape(renderer: Renderer, mesh: Mesh, bsdf: Any, uv: NDArray[np.float32] | None = None) -> Any:
     """A mesh of Mitsuba with a place for the irradiance of its vertices."""
+    shape = _mitsuba_mesh(renderer, mesh, uv, mesh_bsdf=bsdf)
+    shape.add_attribute("vertex_irradiance", 1, np.zeros(len(mesh.vertices), np.float32))
+    return shape
+
+
+def _mitsuba_mesh(
+    renderer: Renderer, mesh: Mesh, uv: NDArray[np.float32] | None = None, **given: Any
+) -> Any:
+    """A mesh of Mitsuba with given properties."""
     mi = renderer.mi
     properties = mi.Properties()
-    properties["mesh_bsdf"] = bsdf
+    for name, value in given.items():
+        properties[name] = value
     shape = mi.Mesh(
         "mesh",
         len(mesh.vertices),
@@ -172,7 +182,6 @@ def _shape(renderer: Renderer, mesh: Mesh, bsdf: Any, uv: NDArray[np.float32] | 
     if uv is not None:
         parameters["vertex_texcoords"] = np.asarray(uv, np.float32).ravel()
     parameters.update()
-    shape.add_attribute("vertex_irradiance", 1, np.zeros(len(mesh.vertices), np.float32))
     return shape
 
 
@@ -204,17 +213,8 @@ def _ring(renderer: Renderer, cam_from_world: RigidTransform, distance: float) -
     ).astype(np.int32)
     axis = world_from_cam.rotation @ [0.0, 0.0, 1.0]
     normals = np.broadcast_to(axis, points.shape)
-    mi = renderer.mi
     solid_angle = np.pi * (RING_RADII[1] ** 2 - RING_RADII[0] ** 2)
-    properties = mi.Properties()
-    emitter = mi.load_dict(
+    emitter = renderer.mi.load_dict(
         {"type": "area", "radiance": {"type": "uniform", "value": RING_IRRADIANCE / solid_angle}}
     )
-    properties["emitter"] = emitter
-    shape = mi.Mesh("ring", len(points), len(triangles), props=properties, has_vertex_normals=True)
-    parameters = mi.traverse(shape)
-    parameters["vertex_positions"] = np.asarray(points, np.float32).ravel()
-    parameters["vertex_normals"] = np.asarray(normals, np.float32).ravel()
-    parameters["faces"] = triangles.astype(np.uint32).ravel()
-    parameters.update()
-    return shape
+    return _mitsuba_mesh(renderer, Mesh(points, normals, triangles), emitter=emitter)

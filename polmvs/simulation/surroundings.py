@@ -67,26 +67,20 @@ def surroundings(
     rng = np.random.default_rng(seed)
     if options.surroundings is Scenery.BOARD:
         table = _table(size, rng, round_=options.turntable)
-        return [replace(table, print=marker_board(BOARD_MARKERS, BOARD_TEXELS))]
+        return [replace(table, print=_marker_board())]
     return [_table(size, rng, round_=options.turntable), *_blocks(size, radius, rng, options)]
 
 
-def marker_board(markers: int, texels: int) -> Image:
-    """A square grid of ArUco markers (DICT_4X4_250), black on white paper, all different.
-
-    Parameters
-    ----------
-    markers : along each side.
-    texels : of the print along each side.
-    """
+def _marker_board() -> Image:
+    """A square grid of ArUco markers (DICT_4X4_250), black on white paper, all different."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
-    cell = texels // markers
+    cell = BOARD_TEXELS // BOARD_MARKERS
     side = round(cell * MARKER_SHARE / 6) * 6  # 4 bits and the border
     margin = (cell - side) // 2
-    board = np.full((markers * cell, markers * cell), WHITE, np.float32)
-    for index in range(markers * markers):
+    board = np.full((BOARD_TEXELS, BOARD_TEXELS), WHITE, np.float32)
+    for index in range(BOARD_MARKERS**2):
         drawn = cv2.aruco.generateImageMarker(dictionary, index, side)
-        row, col = divmod(index, markers)
+        row, col = divmod(index, BOARD_MARKERS)
         top, left = row * cell + margin, col * cell + margin
         board[top : top + side, left : left + side] = np.where(drawn > 0, WHITE, BLACK)
     return board

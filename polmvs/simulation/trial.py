@@ -60,7 +60,7 @@ class TrialResult:
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """Of a row of the table."""
+        """Cells of a row of the table."""
         return (
             self.name,
             str(self.views),

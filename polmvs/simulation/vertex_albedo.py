@@ -30,7 +30,7 @@ def _register(renderer: Renderer) -> None:
     mi = renderer.mi
 
     class VertexAlbedo(mi.Texture):  # type: ignore[misc, name-defined]
-        """What Mitsuba's ``mesh_attribute`` is, with a mean."""
+        """As Mitsuba's ``mesh_attribute``, with a mean."""
 
         def __init__(self, properties: Any) -> None:
             mi.Texture.__init__(self, properties)
@@ -42,7 +42,7 @@ def _register(renderer: Renderer) -> None:
             return self.attribute.eval(si, active)
 
         def mean(self) -> Any:
-            """Of the mesh."""
+            """Mean of the mesh."""
             return mi.Float(self.share)
 
         def is_spatially_varying(self) -> bool:
@@ -53,7 +53,7 @@ def _register(renderer: Renderer) -> None:
             """There is nothing to optimise."""
 
         def to_string(self) -> str:
-            """For Mitsuba's messages."""
+            """Name for Mitsuba's messages."""
             return NAME
 
     mi.register_texture(NAME, VertexAlbedo)

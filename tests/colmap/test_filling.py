@@ -119,7 +119,7 @@ def test_the_filled_workspace_fuses(scene, made, tmp_path):
 def test_in_place_with_a_backup(scene, workspace):
     before = contents(workspace)
     source = open_dense_workspace(workspace)
-    backup = fill_workspace(source, None, exact_fill(scene, source), in_place=True)
+    backup = fill_workspace(source, None, exact_fill(scene, source))
     assert backup == workspace / "stereo.polmvs-backup-1"
     after = contents(workspace)
     saved = contents(backup)
@@ -132,7 +132,7 @@ def test_in_place_with_a_backup(scene, workspace):
     assert without_maps(open_dense_workspace(workspace)) == ()
     assert not [path for path in workspace.iterdir() if path.name.startswith(".")]
     again = open_dense_workspace(workspace)
-    second = fill_workspace(again, None, lambda _: None, in_place=True)
+    second = fill_workspace(again, None, lambda _: None)
     assert second == workspace / "stereo.polmvs-backup-2"
     now = contents(workspace / "stereo")
     assert now == {name[7:]: data for name, data in after.items() if name.startswith("stereo/")}
@@ -155,7 +155,7 @@ def test_a_failure_while_swapping_restores_all(scene, workspace, monkeypatch, fa
 
     monkeypatch.setattr("polmvs.colmap.filling.os", Os)  # the swap's alone, not write_bytes'
     with pytest.raises(DataError, match="No space left on device"):
-        fill_workspace(source, None, exact_fill(scene, source), in_place=True)
+        fill_workspace(source, None, exact_fill(scene, source))
     assert len(calls) > fail_at or fail_at == 1
     assert contents(workspace) == before
     assert not list(workspace.glob("stereo.*"))
@@ -169,7 +169,7 @@ def test_a_damaged_map_changes_nothing(scene, workspace):
     path.write_bytes(data)
     before = contents(workspace)
     with pytest.raises(DataError, match="not finite"):
-        fill_workspace(source, None, exact_fill(scene, source), in_place=True)
+        fill_workspace(source, None, exact_fill(scene, source))
     with pytest.raises(DataError, match="not finite"):
         fill_workspace(source, workspace.parent / "new", exact_fill(scene, source))
     assert contents(workspace) == before
@@ -189,9 +189,6 @@ def test_links_in_the_source_are_not_followed_by_writes(scene, workspace, tmp_pa
 
 def test_bad_targets(workspace):
     source = open_dense_workspace(workspace)
-    for arguments in ((None, False), (workspace.parent / "new", True)):
-        with pytest.raises(OptionError, match="in_place"):
-            fill_workspace(source, arguments[0], lambda _: None, in_place=arguments[1])
     for target in (workspace, workspace / "new"):
         with pytest.raises(OptionError, match="lies in the workspace"):
             fill_workspace(source, target, lambda _: None)

@@ -260,7 +260,7 @@ def test_capture_describes_and_loads(tmp_path):
     capture = open_capture(tmp_path)
     assert capture.names == ("a.png", "b.png")
     assert (capture.width, capture.height) == (16, 12)
-    assert (capture.bit_depth, capture.full_scale) == (8, 255)
+    assert (capture.levels.bit_depth, capture.full_scale) == (8, 255)
     stokes = capture.load("b.png")  # 90 45 / 135 0
     assert stokes.shape == (12, 16)
     np.testing.assert_allclose(stokes.s0, 160 / 255, rtol=1e-6)

@@ -85,7 +85,7 @@ def test_a_pile_at_the_top_decides_the_depth(tmp_path, bits):
     image[:10, :10] = top
     dark = tail(top // 20, seed=1)
     capture = open_capture(save16(tmp_path, dark, image))
-    assert (capture.bit_depth, capture.full_scale) == (bits, top)
+    assert (capture.levels.bit_depth, capture.full_scale) == (bits, top)
     assert not capture.load("1.png").valid[2, 2]
     assert capture.load("0.png").valid.all()
 

@@ -208,11 +208,6 @@ def test_image_of_another_size() -> None:
     [
         ("DICT_4X4_51:0.05", "unknown dictionary 'DICT_4X4_51'; known are .*DICT_4X4_50"),
         ("Board:0.05", "unknown dictionary"),
-        ("DICT_4X4_50", "needs DICT:SIZE"),
-        ("DICT_4X4_50:-0.05", "positive size"),
-        ("DICT_4X4_50:0", "positive size"),
-        ("DICT_4X4_50:nan", "positive size"),
-        ("DICT_4X4_50:5cm", "positive size"),
     ],
 )
 def test_bad_options(option: str, message: str) -> None:

@@ -18,7 +18,6 @@ from polmvs.errors import DataError, OptionError
 from polmvs.geometry import RigidTransform, SimilarityTransform
 from polmvs.poses.metric_frame import (
     Frame,
-    check_reference,
     frame_from_centers,
     metric_frame,
     read_centers,
@@ -223,7 +222,9 @@ def test_bad_ends_of_a_distance(scale: tuple[str, str, float], message: str) -> 
         {"scale": ("a", "b", float("inf"))},
         {"aruco": "DICT_4X4_50"},
         {"aruco": "DICT_4X4_50:-0.05"},
+        {"aruco": "DICT_4X4_50:0"},
         {"aruco": "DICT_4X4_50:nan"},
+        {"aruco": "DICT_4X4_50:5cm"},
         {"aruco": ":0.05"},
     ],
 )
@@ -235,7 +236,7 @@ def test_malformed_options(options: dict[str, object]) -> None:
 def test_unknown_dictionary_is_refused_before_anything_else() -> None:
     options = ReferenceOptions(aruco="DICT_9X9_7:0.05", scale=("000", "001", 1.0))
     with pytest.raises(OptionError, match="unknown dictionary"):
-        check_reference(options)
+        metric_frame(WORLD, options, {}.__getitem__)
 
 
 @pytest.mark.parametrize(
@@ -274,7 +275,7 @@ def test_malformed_file(tmp_path: Path, name: str, content: str | bytes, message
 
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="No such file"):
-        check_reference(ReferenceOptions(reference=tmp_path / "none.txt"))
+        metric_frame(WORLD, ReferenceOptions(reference=tmp_path / "none.txt"), {}.__getitem__)
 
 
 def test_too_few_names_match() -> None:

@@ -5,13 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
-from traced_scenes import GLOSS, SIDE, cosines, lit_scene, scaled, specular_dolp, stokes_of, view_of
+from traced_scenes import (
+    GLOSS,
+    SIDE,
+    cosines,
+    fresnel,
+    lit_scene,
+    scaled,
+    specular_dolp,
+    stokes_of,
+    transmittance,
+    view_of,
+)
 
 import polmvs
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.io.ground_truth import open_ground_truth
 from polmvs.simulation.lights import RING_DIM, RING_RADII
-from polmvs.simulation.materials import Material, fresnel, transmittance
+from polmvs.simulation.materials import Material
 from polmvs.simulation.options import LightName
 from polmvs.simulation.scene import RING_IRRADIANCE
 from polmvs.simulation.truth import true_maps

@@ -90,7 +90,7 @@ def fill_given(
         return warp_dense_view(view, pair.view, pair.item.camera)
 
     if in_place:
-        backup = fill_workspace(source, None, load_fill, in_place=True)
+        backup = fill_workspace(source, None, load_fill)
         return DenseWorkspaceResult(folder=given.absolute(), backup=backup)
     with _new_workspace(target) as new:
         fill_workspace(source, new, load_fill)

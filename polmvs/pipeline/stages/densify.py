@@ -36,6 +36,7 @@ from polmvs.pipeline.run_folder import (
     replace_folder,
     scratch,
 )
+from polmvs.pipeline.stages.box import find_box
 from polmvs.pipeline.stages.maps import open_maps, posed_views
 from polmvs.pipeline.stages.poses import load_floats
 from polmvs.pipeline.stages.seeds import load_seeds
@@ -43,7 +44,7 @@ from polmvs.pipeline.stages.silhouettes import open_surface_views
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
-from polmvs.poses.crop_box import CropBox, crop_box
+from polmvs.poses.crop_box import CropBox
 from polmvs.scene import PointKind, Seeds, Tracks, View
 from polmvs.surface.camera_sigma import CameraModes, widen_by_poses
 from polmvs.surface.consensus import hidden_by
@@ -115,7 +116,7 @@ class DensifyResult:
 
 @dataclass(frozen=True, kw_only=True)
 class _Inputs:
-    """What both ways to a surface start from."""
+    """Input of both methods of making a surface."""
 
     model: AngleModel
     maps: Sequence[PhaseMap]
@@ -180,12 +181,7 @@ def densify(
     )
     workspace = _open_given(options.fusion, folder)
     sparse = read_model(folder.sparse)
-    box = crop_box(
-        options.crop,
-        options.reference.aruco,
-        given.views,
-        lambda name: read_gray(folder.images / name),
-    )
+    box = find_box(folder, given.views, options.crop, options.reference.aruco)
     if box is not None:
         centers = np.array([view.center_in_world for view in given.views])
         box.require_possible(sparse.tracks.points_in_world, centers)

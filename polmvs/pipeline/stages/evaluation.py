@@ -60,9 +60,9 @@ def evaluate_models(
     sparse: SparseFigures,
     run_folder: RunFolder,
     models: Sequence[AngleModel],
-    gt: Path | None = None,
+    gt: Path | None,
     *,
-    workers: Workers | None = None,
+    workers: Workers,
 ) -> Comparison:
     """Evaluate the clouds of a run.
 

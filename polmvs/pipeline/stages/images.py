@@ -32,7 +32,7 @@ def write_images(
     capture: Capture,
     target: Path,
     *,
-    workers: Workers | None = None,
+    workers: Workers,
     on_progress: OnProgress = no_progress,
 ) -> ImagesResult:
     """Write the intensity images of a capture, all with one exposure, named after the mosaics.
@@ -48,7 +48,6 @@ def write_images(
     """
     names = image_names(capture)
     white = capture.exposure()
-    workers = workers or Workers()
     with replacing(target) as folder, workers.stopped_on_error():
         write = partial(_write_image, capture, white, folder)
         for _ in workers.map(write, names.values(), names):

@@ -92,10 +92,10 @@ class TiltedMapsResult:
 def build_maps(
     capture: Capture,
     run_folder: RunFolder,
-    options: RegionOptions | None = None,
+    options: RegionOptions,
     *,
     max_rows: int = MAX_ROWS,
-    workers: Workers | None = None,
+    workers: Workers,
     on_progress: OnProgress = no_progress,
 ) -> MapsResult:
     """Find the region of every posed view and store its phase map.
@@ -104,7 +104,7 @@ def build_maps(
     ----------
     capture : raw mosaics.
     run_folder : with the sparse model; the maps are written whole or not at all.
-    options : defaults if None.
+    options : of the region, and the kind of light.
     max_rows : rows of points and views from which normals are solved at a time.
 
     Raises
@@ -112,13 +112,10 @@ def build_maps(
     DataError
         Fewer than three views have a pose, or a mosaic or mask is unusable.
     """
-    options = options or RegionOptions()
     model = read_model(run_folder.sparse)
     views, tracks = _enough(model.views, run_folder.sparse), model.tracks
     names = image_names(capture)
-    workers = workers or Workers()
-    target = run_folder.maps(AngleModel.PPA)
-    with replacing(target) as folder, workers.stopped_on_error():
+    with replacing(run_folder.maps(AngleModel.PPA)) as folder, workers.stopped_on_error():
         build = partial(_build_map, capture, options, folder)
         raw_names = [names[view.name] for view in views]
         built: list[_Built] = []
@@ -128,7 +125,6 @@ def build_maps(
         num_inside = sum(one.num_inside for one in built)
         maps = [open_phase_map(view, folder) for view in views]
         if options.mask is None and (found := hidden_plane(maps, tracks)) is not None:
-            build = partial(_build_map, capture, options, folder)
             again = workers.map(build, views, raw_names, found)
             num_inside = sum(one.num_inside for one in again)
             maps = [open_phase_map(view, folder) for view in views]
@@ -171,14 +167,10 @@ def _cut_by_masks(built: Sequence[_Built]) -> float | None:
 
 
 def tilt_maps(
-    run_folder: RunFolder,
-    *,
-    workers: Workers | None = None,
-    on_progress: OnProgress = no_progress,
+    run_folder: RunFolder, *, workers: Workers, on_progress: OnProgress = no_progress
 ) -> TiltedMapsResult:
     """Correct the phase maps of a run for tilted polarizers."""
     stored = open_maps(run_folder, AngleModel.PPA)
-    workers = workers or Workers()
     with replacing(run_folder.maps(AngleModel.TILTED)) as folder, workers.stopped_on_error():
         for _ in workers.map(partial(_tilt_map, folder), stored):
             on_progress(1)
@@ -237,7 +229,7 @@ def find_mask(folder: Path, image: str) -> Path:
 
 
 def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] | None:
-    """What hides the plane beneath it, in each view; None where polarization shows it as well."""
+    """The object on a plane, in each view; None if polarization shows it as well."""
     points = tracks.points_in_world
     centers = np.array([one.view.center_in_world for one in maps])
     plane = supporting_plane(points, centers)
@@ -305,7 +297,7 @@ def _build_map(
 def _wrong_setting(
     capture: Capture, light: Light | None, tracks: Tracks, maps: Sequence[PhaseMap]
 ) -> str | None:
-    """Which setting the planes of incidence of all views contradict, without its full stop."""
+    """Message about a setting that the planes of incidence contradict, without its full stop."""
     tracks, maps = _some_views(tracks, maps)
     axes = check_axes(tracks, maps)
     if axes.change is not None:

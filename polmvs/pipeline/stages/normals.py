@@ -52,7 +52,7 @@ class NormalsResult:
 def solve_track_normals(
     model: AngleModel,
     folder: RunFolder,
-    options: NormalOptions | None = None,
+    options: NormalOptions,
     light: Light | None = None,
     *,
     max_rows: int = MAX_ROWS,
@@ -64,7 +64,7 @@ def solve_track_normals(
     model : angle model.
     folder : of a run with model and phase maps; one row of ``NORMALS_TYPE`` is written for each
         track.
-    options : defaults if None.
+    options : of the estimator.
     light : kind of light of all observations, if known.
     max_rows : rows of points and views that are solved at a time.
     """
@@ -72,7 +72,6 @@ def solve_track_normals(
     phase_maps = open_maps(folder, model)
     stored = np.zeros(len(tracks.point3D_ids), NORMALS_TYPE)
     if len(stored):
-        options = options or NormalOptions()
         if model.is_textbook:
             options = replace(options, tilt_aware_weights=False)
         estimate = track_normals(

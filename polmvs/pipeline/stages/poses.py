@@ -83,8 +83,8 @@ class PosesResult:
 def place_model(
     run_folder: RunFolder,
     names: Iterable[str],
-    reference: ReferenceOptions | None = None,
-    without: Sequence[str] = (),
+    reference: ReferenceOptions,
+    without: Sequence[str],
 ) -> PosesResult:
     """Transform the model of SfM, or a given one, to the metric frame of the options.
 
@@ -93,7 +93,7 @@ def place_model(
     run_folder : with the images, in which markers are searched, and the model of SfM in its own
         frame; the model, the camera's modes and the poses' covariances are written there.
     names : names of the images.
-    reference : defaults if None.
+    reference : sources of the frame.
     without : names of images to remove from the model, with or without suffix.
 
     Raises
@@ -113,9 +113,7 @@ def place_model(
         model, kept, points = without_views(model, set(named.values()))
         modes = modes[:, points]
         covariances = covariances[kept] if len(covariances) else covariances
-    frame = metric_frame(
-        model, reference or ReferenceOptions(), lambda name: read_gray(run_folder.images / name)
-    )
+    frame = metric_frame(model, reference, lambda name: read_gray(run_folder.images / name))
     if frame is not None:
         similarity = frame.metric_from_world
         model = transform_model(model, similarity)

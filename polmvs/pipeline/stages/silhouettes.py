@@ -40,7 +40,7 @@ def find_silhouettes(
     run_folder: RunFolder,
     *,
     masks_given: bool,
-    workers: Workers | None = None,
+    workers: Workers,
     on_progress: OnProgress = no_progress,
 ) -> SilhouettesResult:
     """Find and store the silhouette of every posed view.
@@ -50,7 +50,6 @@ def find_silhouettes(
     run_folder : with the phase maps; the silhouettes are written whole or not at all.
     masks_given : the maps' regions are the user's masks.
     """
-    workers = workers or Workers()
     maps = open_maps(run_folder, AngleModel.PPA)
     num = 0
     with replacing(run_folder.silhouettes) as folder, workers.stopped_on_error():
