@@ -326,7 +326,7 @@ class Reconstruction:
     angle_model: AngleModel
 
     def __repr__(self) -> str:
-        """What was found."""
+        """Folder, angle model and size of the result."""
         return f"Reconstruction({str(self.folder)!r}, {self.angle_model}: {self._dense})"
 
     @property
@@ -421,7 +421,7 @@ class Reconstruction:
 
     @cached_property
     def metrics(self) -> ModelFigures:
-        """How well the result fits its images and, if there is one, the ground truth."""
+        """Metrics of the result against its images and, if there is one, the ground truth."""
         from polmvs.pipeline.jobs import measure
 
         return measure(self._run_folder, (self.angle_model,)).models[self.angle_model]
@@ -715,7 +715,7 @@ def _kept_frames(
 
 
 def _run_options(workers: int | None, **given: Any) -> RunOptions:
-    """How a run is carried out, by one process for each core where ``workers`` is None."""
+    """Execution options of a run; ``workers`` None: one process for each core."""
     return RunOptions(**given) if workers is None else RunOptions(workers=workers, **given)
 
 

@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 
 class Method(StrEnum):
-    """How the surface comes from the phases."""
+    """Method that makes the surface from the phases."""
 
     SURFACE = "surface"
     INTEGRATE = "integrate"
@@ -44,14 +44,14 @@ class Method(StrEnum):
 
 
 class Contour(StrEnum):
-    """How a PPA contour is traced."""
+    """Method of tracing a PPA contour."""
 
     TANGENT = "tangent"
     NORMALS = "normals"
 
 
 class Surroundings(StrEnum):
-    """What a cloud holds beside the polarized parts."""
+    """Points of a cloud around the polarized parts."""
 
     NONE = "none"
     SPARSE = "sparse"
@@ -59,7 +59,7 @@ class Surroundings(StrEnum):
 
 
 class Estimator(StrEnum):
-    """How a normal is solved from its rows."""
+    """Estimator of a normal from its rows."""
 
     ROBUST = "robust"
     ALGEBRAIC = "algebraic"
@@ -75,21 +75,21 @@ class Experiment(StrEnum):
 
 
 class Poses(StrEnum):
-    """Whose poses an experiment uses."""
+    """Poses of an experiment."""
 
     TRUE = "true"
     SFM = "sfm"
 
 
 class Selection(StrEnum):
-    """How the experiment on tracks chooses K views of a point."""
+    """Choice of the K views of a point in the experiment on tracks."""
 
     RANDOM = "random"
     ANGLE = "angle"
 
 
 class PairChoice(StrEnum):
-    """Which images SfM matches with which, where no list says so."""
+    """Choice of the image pairs that SfM matches, unless a list is given."""
 
     EXHAUSTIVE = "exhaustive"
     RETRIEVAL = "retrieval"
@@ -97,14 +97,14 @@ class PairChoice(StrEnum):
 
 
 class Mapper(StrEnum):
-    """How SfM makes a model of matched images."""
+    """Mapper of SfM."""
 
     INCREMENTAL = "incremental"
     GLOBAL = "global"
 
 
 class Packing(StrEnum):
-    """How a dump without a header holds its samples."""
+    """Packing of the samples in a dump without a header."""
 
     MONO8 = "mono8"
     MONO16 = "mono16"
@@ -115,7 +115,7 @@ class Packing(StrEnum):
 
 
 class ExportFormat(StrEnum):
-    """As what a finished run is exported."""
+    """Format of an exported run."""
 
     PLY = "ply"
     OBJ = "obj"
@@ -133,7 +133,7 @@ class ExportFormat(StrEnum):
 
 
 class CaptureKind(StrEnum):
-    """What the files of a capture hold."""
+    """Kind of the files of a capture."""
 
     MOSAIC = "mosaic"
     ANGLES = "angles"
@@ -151,7 +151,7 @@ class BayerOrder(StrEnum):
 
 
 class Channel(StrEnum):
-    """Which colour the Stokes images are made of."""
+    """Colour channel of the Stokes images."""
 
     COMBINED = "combined"
     RED = "red"
@@ -200,7 +200,7 @@ def option(
 
 @dataclass(frozen=True, kw_only=True)
 class Range:
-    """Which numbers an option takes; no end: any finite one.
+    """Range of an option's numbers; None: no limit on that side.
 
     Attributes
     ----------
@@ -224,7 +224,7 @@ class Range:
         )
 
     def __str__(self) -> str:
-        """What must hold, after "must"."""
+        """The condition, as messages have it after "must"."""
         low = self.least if self.above is None else self.above
         high = self.most if self.below is None else self.below
         if low is not None and high is not None:
@@ -378,7 +378,7 @@ class CaptureOptions(OptionGroup, group="capture"):
     )
 
     def check(self) -> None:
-        """Each angle of a pattern once; names that tell views apart; angles that suffice."""
+        """Each angle of a pattern occurs once, names distinguish views, angles are enough."""
         needed = sorted(self.pattern) == [0, 45, 90, 135]
         self.require(needed, "pattern", "needs each of 0, 45, 90, 135 once", self.pattern)
         named = self.naming is None or "{view}" in self.naming
@@ -451,7 +451,7 @@ class SfmOptions(OptionGroup, group="sfm"):
     )
 
     def check(self) -> None:
-        """Four positive numbers, or a file; nothing for an SfM that is not run."""
+        """Intrinsics are valid, and options of SfM are not given with a model."""
         _require_intrinsics(self, self.intrinsics)
         once = self.intrinsics is None or self.camera is None
         self.require(once, "camera", "and `sfm.intrinsics` exclude each other")
@@ -525,7 +525,7 @@ class NormalOptions(OptionGroup, group="normals"):
     )
 
     def check(self) -> None:
-        """A window has a middle."""
+        """The window has a centre pixel."""
         self.require(self.window_px % 2 == 1, "window_px", "must be odd", self.window_px)
 
 
@@ -567,7 +567,7 @@ class PropagationOptions(OptionGroup, group="propagation"):
     max_neighbors: int = option(15, "other views that give rows to one view", least=1)
 
     def check(self) -> None:
-        """Contours lie no closer than they step."""
+        """The spacing of contours is not smaller than their step."""
         wide = self.spacing_px >= self.step_px
         reason = "must be as long as `propagation.step_px` or longer"
         self.require(wide, "spacing_px", reason, self.spacing_px)
@@ -631,7 +631,7 @@ class CropOptions(OptionGroup, group="crop"):
     )
 
     def check(self) -> None:
-        """A box has three sides, and a marker is that of a box."""
+        """A box has three sides, and a marker needs a box."""
         if self.box is not None:
             sides = [
                 abs(first - second)
@@ -694,7 +694,7 @@ class ReferenceOptions(OptionGroup, group="reference"):
     )
 
     def check(self) -> None:
-        """A marker has a size, a distance two ends."""
+        """A marker has a positive size, and a distance two different ends."""
         if self.aruco is not None:
             name, _, size = self.aruco.rpartition(":")
             reason = "needs DICT:SIZE with a positive size in metres, such as DICT_4X4_50:0.05"
@@ -806,7 +806,7 @@ class PlaneOptions(OptionGroup, group="plane"):
     find_planes: bool = option(False, "find all planes in view")
 
     def check(self) -> None:
-        """A place is given once, and planes are found under models that tell them apart."""
+        """Only one of mask and polygon is given, and the model can find planes."""
         _require_intrinsics(self, self.intrinsics)
         models = f"must be {', '.join(FORMULAS)}: of one plane they are the published models"
         self.require(not self.model.is_textbook, "model", models, self.model)
@@ -856,7 +856,7 @@ class ExperimentOptions(OptionGroup, group="experiment"):
     step_px: float = option(0.5, "contours: step of the tracing, px", least=0.05, most=4)
 
     def check(self) -> None:
-        """Estimated poses come from a model."""
+        """Estimated poses need a model."""
         agree = (self.poses is Poses.SFM) == (self.sparse is not None)
         self.require(agree, "poses", "sfm and `experiment.sparse` go together")
 
@@ -892,7 +892,7 @@ class FieldInfo:
 
     @property
     def path(self) -> str:
-        """How messages name it."""
+        """Name of the option in messages."""
         return f"{self.group}.{self.name}"
 
 
@@ -1079,7 +1079,7 @@ def convert_value(info: FieldInfo, value: Any) -> Any:
 
 
 def in_table(error: OptionError, source: str) -> OptionError:
-    """What is wrong with an option, as of a key in a table of a file, and not of a flag.
+    """The error of an option from a file: it names key and table instead of a flag.
 
     Parameters
     ----------
@@ -1135,7 +1135,7 @@ def _as_python(value: Any) -> Any:
 
 
 def _decode(kind: Any, value: Any) -> Any:
-    """What msgspec does not know of itself."""
+    """Convert types that msgspec does not support."""
     if kind is Path:
         if not isinstance(value, str):
             raise ValueError("Expected a path")

@@ -40,7 +40,7 @@ class MemoryNeeds:
 
 @dataclass(frozen=True, kw_only=True)
 class MemoryPlan:
-    """What fits into a budget.
+    """Workers and tiles that fit into a memory budget.
 
     Attributes
     ----------

@@ -61,7 +61,7 @@ def point_spacings(points: Array) -> Array:
 
 
 def are_usual(spacings: Array) -> NDArray[np.bool_]:
-    """Which points ``(N,)`` are not far from their neighbours, compared with the usual spacing."""
+    """Whether points ``(N,)`` are near their neighbours, compared with the usual spacing."""
     return np.asarray(spacings <= LONE_SPACINGS * np.median(spacings), np.bool_)
 
 

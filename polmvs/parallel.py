@@ -50,7 +50,7 @@ def no_step(name: str) -> None:
 
 
 class Backend(Protocol):
-    """Where submitted tasks run."""
+    """Interface of what runs submitted tasks."""
 
     def submit(self, function: Callable[..., Any], task: tuple[Any, ...]) -> Any:
         """Submit a task; return a handle of its result."""

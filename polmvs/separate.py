@@ -104,7 +104,7 @@ def _send(stream: IO[bytes], content: Any) -> None:
 
 
 def _result(stream: IO[bytes], on_message: Callable[[str], None]) -> Any:
-    """What comes at the end; messages and log records are passed on until then."""
+    """Result of the process; messages and log records before it are passed on."""
     while True:
         kind, content = pickle.load(stream)
         match kind:
@@ -135,7 +135,7 @@ class _Sender(logging.Handler):
 
 
 def work() -> None:
-    """Do the task that comes on standard input; the way of its result is standard output."""
+    """Do the task from standard input and write its result to standard output."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     results = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print is no result

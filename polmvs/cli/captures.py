@@ -93,7 +93,7 @@ def import_set(call: Call, terminal: Terminal) -> int:
 
 
 def _arguments_of(imported: ImportedSet) -> list[str]:
-    """What to call ``polmvs reconstruct`` with."""
+    """Arguments of ``polmvs reconstruct`` for an imported set."""
     words = [str(imported.capture), "RUN", "--config", str(imported.options_file)]
     if imported.sparse is not None:
         words += ["--sparse", str(imported.sparse)]

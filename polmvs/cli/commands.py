@@ -152,7 +152,7 @@ class EvaluateArguments(OptionGroup, group="arguments", in_files=False):
 
 
 class LengthUnit(StrEnum):
-    """Of a reference's coordinates."""
+    """Unit of a reference's coordinates."""
 
     UM = "um"
     MM = "mm"
@@ -294,7 +294,7 @@ class PlanArguments(OptionGroup, group="arguments", in_files=False):
 
 
 class CalibrationKind(StrEnum):
-    """What is calibrated."""
+    """Kind of calibration."""
 
     CAMERA = "camera"
     POLARIZERS = "polarizers"

@@ -108,7 +108,7 @@ def package(module: str, name: str) -> Finding:
 def _tried(
     what: str, work: Callable[[], str], before: Callable[[], object] = lambda: None
 ) -> Finding:
-    """What came of some work; whatever goes wrong is the finding."""
+    """Result of a check; any error is its finding."""
     try:
         before()
         return Finding(what=what, text=work())

@@ -366,7 +366,7 @@ def metavar_of(info: FieldInfo) -> str:
 
 
 def _name(kind: Any) -> str:
-    """What a value is, in the help and in messages."""
+    """Name of a value's type, in the help and in messages."""
     if typing.get_origin(kind) is tuple:
         elements = typing.get_args(kind)
         dots = ",..." if Ellipsis in elements else ""
@@ -377,7 +377,7 @@ def _name(kind: Any) -> str:
 
 
 def _message(error: CycloptsError) -> str:
-    """What cyclopts has to say, in one line."""
+    """Message of an error of cyclopts, in one line."""
     if isinstance(error, UnusedCliTokensError):
         return f"unexpected argument: {' '.join(error.unused_tokens or [])}"
     if isinstance(error, MissingArgumentError) and error.argument is not None:

@@ -81,7 +81,7 @@ def _execute(command: Command, call: Call, prog: str) -> int:
 
 
 def _function(command: Command) -> Callable[[Call, Any], int]:
-    """What does a command; its module is imported only now."""
+    """The function of a command; its module is imported only now."""
     if not isinstance(command.run, str):
         return command.run
     module, _, name = command.run.partition(":")

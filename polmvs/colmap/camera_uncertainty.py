@@ -167,7 +167,7 @@ def _in_world(cam_from_world: pycolmap.Rigid3d) -> Array:
 
 
 def _with_centers_aligned(centers: Sequence[Array]) -> Array:
-    """What is left (6 V, 6 V) of turns and moves when a similarity takes the centres back."""
+    """Map (6 V, 6 V) from changes of all poses to those that remain after alignment."""
     num = len(centers)
     around = np.asarray(centers) - np.mean(centers, axis=0)
     by_similarity = np.zeros((num, 6, 7))  # a turn, a move, a scale
@@ -254,7 +254,7 @@ def adjuster_of(
 def _displacements(
     reconstruction: pycolmap.Reconstruction, moved: pycolmap.Reconstruction
 ) -> Array:
-    """How far (T, 3) the points have moved, seen from cameras that stay."""
+    """Displacements (T, 3) of the points after the cameras are aligned."""
     ids, images = sorted(reconstruction.points3D), sorted(reconstruction.reg_image_ids())
     points, others = (
         np.array([r.points3D[i].xyz for i in ids], np.float64).reshape(-1, 3)

@@ -86,7 +86,7 @@ def sound(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _room() -> Iterator[None]:
-    """What SQLite cannot write meanwhile is no fault of a database."""
+    """Turn SQLite's write errors in this block into :class:`NoRoomError`."""
     try:
         yield
     except sqlite3.OperationalError as error:

@@ -253,7 +253,7 @@ def write_dense_workspace(
 
 
 def source_order(sparse_model: SparseModel) -> list[list[int]]:
-    """For each view the other views, by common sparse points and then by distance."""
+    """Other views of each view, ordered by common sparse points and then by distance."""
     tracks, num_views = sparse_model.tracks, len(sparse_model.views)
     seen = sparse.csr_matrix(
         (np.ones(len(tracks.obs_view)), (tracks.obs_view, tracks.obs_track)),
@@ -373,7 +373,7 @@ def require_same_frame(
 
 
 def _after_similarity(pairs: Sequence[CommonView], distances: Array, max_error_px: float) -> str:
-    """What to say of the two models after a similarity."""
+    """Part of the message: agreement of the two models after a similarity."""
     ours = np.array([pair.view.center_in_world for pair in pairs])
     theirs = np.array([pair.item.view.center_in_world for pair in pairs])
     try:
@@ -393,7 +393,7 @@ def _after_similarity(pairs: Sequence[CommonView], distances: Array, max_error_p
 def _pose_errors_px(
     pairs: Sequence[CommonView], distances: Array, theirs_from_ours: SimilarityTransform | None
 ) -> Array:
-    """By how many pixels of the workspace (N,) the scene moves between two poses of each view."""
+    """Shift (N,) of the scene between the two poses of each view, pixels of the workspace."""
     errors = np.empty(len(pairs))
     for i, (item, view) in enumerate(pairs):
         center, rotation = view.center_in_world, view.cam_from_world.rotation

@@ -97,7 +97,7 @@ def _require_sound(folder: Path, views: Sequence[View], tracks: Tracks | None = 
 
 
 def _unsound(views: Iterable[View], tracks: Tracks | None) -> str | None:
-    """What is wrong with the numbers of a model, if anything is."""
+    """The reason why the numbers of a model are implausible; None if they are plausible."""
     for view in views:
         camera, pose = view.camera, view.cam_from_world
         sides = (camera.width, camera.height)
@@ -143,7 +143,7 @@ def _open(folder: Path) -> pycolmap.Reconstruction:
 
 @contextmanager
 def _as_data_error(folder: Path) -> Iterator[None]:
-    """What pycolmap says of a damaged model as one line."""
+    """Turn pycolmap's errors about a damaged model into one line."""
     try:
         yield
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OverflowError) as error:

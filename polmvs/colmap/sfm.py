@@ -463,7 +463,7 @@ def triangulate_views(
 
 
 def _place_of_database(work_folder: Path) -> Path:
-    """Where COLMAP's database is to lie; what an earlier run left there is removed."""
+    """Path for COLMAP's database; files of an earlier run are removed."""
     work_folder.mkdir(parents=True, exist_ok=True)
     for left_over in work_folder.glob("database.db*"):
         left_over.unlink()

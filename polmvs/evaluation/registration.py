@@ -205,7 +205,7 @@ class _Fit:
     tolerances: RegistrationTolerances
 
     def some(self, num: int) -> _Fit:
-        """With that many of the points."""
+        """The same with a random choice of the points."""
         index = np.random.default_rng(0).permutation(len(self.points))[:num]
         normals = None if self.normals is None else self.normals[index]
         return replace(self, points=self.points[index], normals=normals)

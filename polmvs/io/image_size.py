@@ -176,7 +176,7 @@ def tiff_images(data: bytes) -> Iterator[dict[int, TiffTag]]:
 
 
 def _of_tiff(data: bytes) -> ImageSize:
-    """Of the first image."""
+    """Size of the first image."""
     tags = {tag: found.value for tag, found in next(tiff_images(data), {}).items()}
     if _TIFF_WIDTH not in tags or _TIFF_HEIGHT not in tags:
         raise ValueError("no size")

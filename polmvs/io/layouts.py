@@ -55,7 +55,7 @@ class BoardTruth:
 
     @property
     def offset(self) -> float:
-        """Of the board's plane: ``normal . x = offset``."""
+        """Offset of the board's plane: ``normal . x = offset``."""
         return float((self.corners @ self.normal).mean())
 
     def mask(self, name: str) -> Mask:

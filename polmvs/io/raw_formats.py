@@ -126,14 +126,14 @@ class RawHeader(NamedTuple):
 
 
 class _Limit(NamedTuple):
-    """What a file may declare, and what to do about one that declares more."""
+    """Largest size that a file may declare, and the remedy for a larger one."""
 
     max_pixels: int
     remedy: str
 
     @property
     def most_bytes(self) -> int:
-        """Of the file; none that is read needs more than its samples and a header."""
+        """Limit of the file's length: its samples and a header."""
         return BYTES_OF_PIXEL * self.max_pixels + MAX_HEADER_BYTES
 
 
@@ -389,7 +389,7 @@ def _read_exr(path: PathArg, limit: _Limit) -> NDArray[Any]:
 
 
 def _size_of_part(part: Any) -> ImageSize:
-    """What the header of a part of an OpenEXR file declares, four bytes a sample; whole tiles."""
+    """Declared size of a part of an OpenEXR file, four bytes a sample; whole tiles."""
     low, high = part.header["dataWindow"]
     width, height = (int(high[axis]) - int(low[axis]) + 1 for axis in (0, 1))
     tile = part.header.get("tiles")

@@ -167,7 +167,7 @@ class Run(StageInput):
         return finished is not None and not finished.is_lost and not self._lost(finished)
 
     def _lost(self, finished: StageRecord) -> list[str]:
-        """What a finished stage wrote and is no longer there, or not whole."""
+        """Files and folders of a finished stage that are gone or incomplete."""
         root, wrote = self.run_folder.root, finished.wrote
         return [path for path, number in wrote.items() if num_files(root / path) < number]
 
@@ -230,7 +230,7 @@ class Run(StageInput):
         return True
 
     def _carry_out(self, spec: StageSpec) -> None:
-        """Do a stage whose input is there, and record it."""
+        """Run a stage whose input exists, and record it."""
         logger.info("%s: begins", spec.name)
         start, cpu_start, memory = time.perf_counter(), cpu_seconds(), PeakMemory()
         with (
@@ -254,7 +254,7 @@ class Run(StageInput):
     def _carry_out_side_by_side(
         self, specs: Sequence[StageSpec], calls: Sequence[Callable[[], Any]]
     ) -> None:
-        """Do stages each in a process of its own, and record them in their order.
+        """Run each stage in a process of its own, and record them in order.
 
         The memory of each is that of all together.
         """
@@ -407,7 +407,7 @@ class Run(StageInput):
 
 @dataclass(frozen=True)
 class _Logged:
-    """What a process said: the name of its logger, the level and the text."""
+    """One log message: the name of its logger, the level and the text."""
 
     logger: str
     level: int
@@ -438,7 +438,7 @@ class _Keeper(logging.Handler):
 
 @contextmanager
 def _kept(level: int) -> Iterator[list[_Logged]]:
-    """What this package says meanwhile, from a level on."""
+    """Log messages of this package in this block, from a level on."""
     keeper, package = _Keeper(level), logging.getLogger("polmvs")
     package.addHandler(keeper)
     try:
@@ -448,7 +448,7 @@ def _kept(level: int) -> Iterator[list[_Logged]]:
 
 
 def _done_apart(token: str, call: Callable[[], Any]) -> _Done:
-    """Do a stage's work in this process, which is a worker of the run with a token."""
+    """Run a stage in this process, a worker of the run with a token."""
     work_for(token)
     package = logging.getLogger("polmvs")
     package.setLevel(logging.INFO)

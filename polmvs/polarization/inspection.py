@@ -333,7 +333,7 @@ def _edge_width(s0: Image) -> float:
 
 
 def _block_differences(capture: Capture, stokes: Stokes) -> float:
-    """How the brightness of neighbouring cells differs in a 2x2 rhythm, share: a Bayer pattern."""
+    """Relative difference of brightness in blocks of 2x2 cells, as a Bayer pattern makes it."""
     options = capture.options
     half = options.resolution is Resolution.HALF
     if capture.files.kind is not CaptureKind.MOSAIC or options.bayer is not None or not half:
@@ -351,7 +351,7 @@ def _block_differences(capture: Capture, stokes: Stokes) -> float:
 def _obstacles(
     capture: Capture, views: Sequence[ViewFigures], limits: InspectionLimits
 ) -> list[str]:
-    """Why nothing is to be had from a capture, as clauses after "because"."""
+    """Reasons why a capture is unusable, as clauses after "because"."""
     lines = []
     if len(views) < MIN_VIEWS:
         lines.append(
@@ -385,7 +385,7 @@ def _warnings(
     colour: float,
     limits: InspectionLimits,
 ) -> list[str]:
-    """What a user should look at."""
+    """Warnings for the user."""
     lines = list(capture.warnings)
     if colour > limits.colour:
         lines.append(

@@ -37,7 +37,7 @@ class AngleModel(StrEnum):
 
 
 class Light(StrEnum):
-    """Which reflection dominates the polarization of the part."""
+    """Reflection that dominates the polarization of the part."""
 
     SPECULAR = "specular"
     DIFFUSE = "diffuse"

@@ -38,7 +38,7 @@ POLARIZED_SHARE = 0.05  # of s0, beyond which the sums of the best pairing count
 
 @dataclass(frozen=True, kw_only=True)
 class PatternCheck:
-    """How well a pattern fits a capture.
+    """Result of the check of a pattern.
 
     Attributes
     ----------

@@ -136,7 +136,7 @@ def view_page(
 
 
 def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[PagePicture]:
-    """What the camera saw, and where a polarized surface was found."""
+    """Pictures of the measured images and of the polarized region."""
     inside = phase_map.region.inside
     intensity = phase_map.intensity
     aolp: Floats

@@ -311,7 +311,7 @@ def _frame_json(frame: BoxFrame) -> dict[str, Any]:
 
 
 def _cameras(views: Sequence[View], target: Array) -> list[dict[str, Any]]:
-    """Of each camera where it is drawn and what it sees; ``index`` is that of its view.
+    """Drawn position and field of view of each camera; ``index`` is that of its view.
 
     ``corners`` are the ends of its frustum, from the image's upper left corner clockwise;
     ``half_field`` tangents from its axis to the image's side and top.

@@ -158,7 +158,7 @@ def page_text(page: Page) -> str:
 
 
 def _without_controls(value: Any) -> Any:
-    """What is put into the page; markup is the page's own."""
+    """A value for the page without control characters."""
     return printable(value, keep="\n\t") if type(value) is str else value
 
 

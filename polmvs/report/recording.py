@@ -231,7 +231,7 @@ class _Recorder:
         )
 
     def length(self) -> float:
-        """Of a normal that is drawn: a fortieth of the cameras' median distance."""
+        """Drawn length of a normal: a fortieth of the cameras' median distance."""
         points = self.model.tracks.points_in_world
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)
         centers = np.array([view.center_in_world for view in self.model.views])

@@ -311,7 +311,7 @@ def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColori
 
 
 def _point_colorings(given: ReportInput) -> dict[str, PointColoring]:
-    """What a run's points can be coloured by."""
+    """Quantities that colour a run's points."""
     sigmas = [
         np.asarray(cloud.scalars["sigma"])[cloud.are(PointKind.SURFACE)]
         for cloud in given.clouds.values()
@@ -508,7 +508,7 @@ def _box_frames(given: ReportInput) -> list[BoxFrame]:
 
 
 def _title(given: ReportInput) -> str:
-    """What the run made, in a sentence."""
+    """The result of the run in a sentence."""
     capture = given.record.capture
     name = capture.folder.name if capture else given.folder.root.name
     num_views = given.record.result(PosesResult).num_views
@@ -542,7 +542,7 @@ def _sides(points: Floats) -> Floats:
 
 
 def _quality_words(given: ReportInput) -> list[str]:
-    """How good the surface is, and how it would be under OPA where that was tried."""
+    """Quality of the surface, compared with that under OPA if it was computed."""
     main = given.main
     figures = given.comparison.models if given.comparison is not None else {}
     if main not in figures:
@@ -577,7 +577,7 @@ def _quality_words(given: ReportInput) -> list[str]:
 
 
 def _uncertainty_words(given: ReportInput) -> list[str]:
-    """What the points state of themselves."""
+    """Median uncertainty of the points."""
     cloud = given.clouds[given.main]
     sigma = np.asarray(cloud.scalars.get("sigma", ()), np.float64)
     known = sigma[cloud.are(PointKind.SURFACE)] if len(sigma) else sigma
@@ -645,7 +645,7 @@ def _verdict(given: ReportInput) -> list[str]:
 
 
 def trust_table(given: ReportInput) -> Table | None:
-    """What the main result says about itself, with what is normal."""
+    """Quality checks of the main result with their normal ranges."""
     main = given.main
     found = given.record.find(Trust, main)
     if found is None:

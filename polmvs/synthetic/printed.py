@@ -134,7 +134,7 @@ def orbit_views(
 
 
 def _print_seen(view: View, scene: PrintedScene, xy: Array) -> tuple[Mask, Array]:
-    """Which image coordinates (H, W, 2) show a print, and how bright it is there."""
+    """Whether image coordinates (H, W, 2) show a print, and its brightness."""
     rays = view.camera.rays(xy) @ view.cam_from_world.rotation
     center = view.center_in_world
     on_part, _ = scene.part.intersect(center, rays)

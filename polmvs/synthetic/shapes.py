@@ -158,12 +158,12 @@ _SHAPES: dict[str, Callable[[], Mesh]] = {
 
 
 def _segments(radius: float) -> int:
-    """Of a circle whose chords lie within ``MAX_SAG`` of it; a multiple of four."""
+    """Segments of a circle whose chords lie within ``MAX_SAG`` of it; a multiple of four."""
     return 4 * math.ceil(math.pi / math.acos(1 - MAX_SAG / radius) / 4)
 
 
 def grid_triangles(rows: int, cols: int) -> Triangles:
-    """Of a grid of (rows + 1) x (cols + 1) vertices."""
+    """Triangles of a grid of (rows + 1) x (cols + 1) vertices."""
     index = np.arange((rows + 1) * (cols + 1)).reshape(rows + 1, cols + 1)
     a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
     c, d = index[1:, 1:].ravel(), index[1:, :-1].ravel()

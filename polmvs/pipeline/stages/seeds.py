@@ -81,7 +81,7 @@ def load_seeds(folder: RunFolder, model: AngleModel) -> Seeds:
 
 
 def seed_tracks(source: Path, num_tracks: int) -> NDArray[np.bool_]:
-    """Which of the sparse points ``(num_tracks,)`` are seeds.
+    """Whether sparse points ``(num_tracks,)`` are seeds.
 
     Raises
     ------

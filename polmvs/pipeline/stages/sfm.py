@@ -262,7 +262,7 @@ def _warn_of_missing(model: SparseModel, source: Path) -> None:
 
 
 def _warn_of_cameras(model: Path, given: str, remedy: str) -> tuple[Complaint, ...]:
-    """Say which cameras would fit the matches where the given ones do not."""
+    """Warn of given cameras that do not fit the matches, and name those that do."""
     trial = try_cameras(model)
     complaints = () if trial is None else trial.complaints
     for complaint in complaints:

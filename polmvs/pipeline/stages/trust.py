@@ -97,7 +97,7 @@ def _contradicted(
     folder: RunFolder,
     options: Options,
 ) -> Trust:
-    """With the figures of a surface of all views that it was not fitted to."""
+    """The checks with those of a surface of all views against views that were left out."""
     views = folder.views(model)
     assert made.tilt_share is not None
     around = sparse_surroundings(read_model(folder.sparse).tracks, maps).points
@@ -141,7 +141,7 @@ def _camera_complaint(
     looking: Looking,
     light: Light | None,
 ) -> str | None:
-    """Which camera fits the phases of a surface, if the given one does not.
+    """Message about the given camera if it does not fit the phases of the surface.
 
     ``shown`` are the faces whose phases count, without inferred ones.
     """
