@@ -138,9 +138,7 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
         It is not TOML, or it has an unknown or repeated table or key or a value of a wrong type.
         The message names it.
     """
-    import tomllib  # not for --help
-
-    from polmvs.io.plain_files import read_text
+    from polmvs.io.plain_files import parse_toml, read_text  # not for --help
 
     try:
         with as_data_error(path, "read"):
@@ -148,9 +146,7 @@ def read_config(path: Path, groups: tuple[type[OptionGroup], ...]) -> dict[str, 
     except UnicodeDecodeError as error:
         raise OptionError(f"{path}: is no TOML file (not UTF-8).") from error
     try:
-        content = tomllib.loads(text)
-    except RecursionError as error:
-        raise OptionError(f"{path}: is no TOML file (it is nested too deeply).") from error
+        content = parse_toml(text)
     except ValueError as error:  # of the parser, or an integer of thousands of digits
         raise OptionError(f"{path}: is no TOML file ({error}{_line_of(text, error)}).") from error
     known = {cls.group: cls for cls in groups}

@@ -9,10 +9,12 @@ from __future__ import annotations
 import errno
 import os
 import stat
+import tomllib
 from collections.abc import Iterator
 from io import BufferedReader
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from polmvs.errors import DataError, as_data_error
 
@@ -75,6 +77,14 @@ def read_list(path: Path, what: str, encoding: str = "utf-8") -> str:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8"
         raise DataError(path, f"is no readable list of {what} ({reason}).") from error
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a TOML text; ValueError where it is none, or nested too deeply."""
+    try:
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
 
 
 def read_head(path: str | PathLike[str], most: int) -> tuple[bytes, int]:

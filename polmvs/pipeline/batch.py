@@ -10,7 +10,6 @@ import csv
 import logging
 import os
 import re
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -35,7 +34,7 @@ from polmvs.config import (
 from polmvs.errors import DataError, OptionError, PolmvsError, as_data_error
 from polmvs.evaluation.tables import format_table, number
 from polmvs.io.images import write_bytes
-from polmvs.io.plain_files import read_list
+from polmvs.io.plain_files import parse_toml, read_list
 from polmvs.io.typed_json import from_json, parse_json, write_json
 from polmvs.parallel import Workers
 from polmvs.pipeline.jobs import JobOutcome, reconstruct
@@ -339,9 +338,7 @@ def _failed(entry: BatchEntry, message: str) -> BatchRow:
 
 def _toml_tables(path: Path, text: str) -> list[tuple[str, dict[str, Any]]]:
     try:
-        content = tomllib.loads(text)
-    except RecursionError as error:
-        raise DataError(path, "is no TOML file (it is nested too deeply).") from error
+        content = parse_toml(text)
     except ValueError as error:  # of the parser, or an integer of thousands of digits
         hint = ""
         if re.search(r"^\s*\[captures\.capture\]", text, re.MULTILINE):

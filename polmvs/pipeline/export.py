@@ -14,16 +14,15 @@ from polmvs.camera import pixel_centers
 from polmvs.colmap.camera_exports import CAMERA_FORMATS, CameraExport
 from polmvs.colmap.dense_workspace import open_dense_workspace
 from polmvs.colmap.models import read_model
-from polmvs.config import Channel, CropOptions, ExportFormat, options_from_plain
+from polmvs.config import Channel, CropOptions, ExportFormat
 from polmvs.errors import DataError, OptionError, PolmvsError
 from polmvs.io.cloud_files import write_cloud_file
 from polmvs.io.clouds import Cloud, Mesh, read_cloud, read_mesh
 from polmvs.io.folders import new_folder
 from polmvs.io.images import read_gray
 from polmvs.io.mesh_files import MESH_FORMATS, Texture, mesh_format_of, write_mesh_file
-from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.runner import dense_models, load_record
+from polmvs.pipeline.runner import dense_models, load_record, load_run
 from polmvs.pipeline.stages.box import find_box
 from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.poses import PosesResult
@@ -143,31 +142,27 @@ def export_run(run_folder: RunFolder, wanted: ExportRequest) -> Exported:
     model = surface_of(run_folder, dense_models(record), wanted.model)
     wanted.check()
     if wanted.form in CLOUDS:
-        exported = _export_cloud(run_folder, model, record, wanted)
+        exported = _export_cloud(run_folder, model, wanted)
     elif wanted.form in MESHES:
-        exported = _export_mesh(run_folder, model, record, wanted)
+        exported = _export_mesh(run_folder, model, wanted)
     else:
         exported = _export_cameras(run_folder, model, wanted)
     return replace(exported, is_metric=record.result(PosesResult).is_metric)
 
 
-def _export_cloud(
-    run_folder: RunFolder, model: AngleModel, record: Record, wanted: ExportRequest
-) -> Exported:
+def _export_cloud(run_folder: RunFolder, model: AngleModel, wanted: ExportRequest) -> Exported:
     cloud = read_cloud(run_folder.cloud(model))
     cloud = part_of(cloud) if wanted.part else cloud
-    if (box := _box_of_run(run_folder, record, wanted.crop)) is not None:
+    if (box := _box_of_run(run_folder, wanted.crop)) is not None:
         cloud = cloud.only(box.require_some(cloud.points))
     write_cloud_file(wanted.target, cloud, CLOUDS[wanted.form])
     return Exported(files=(wanted.target,), num_points=len(cloud.points))
 
 
-def _export_mesh(
-    run_folder: RunFolder, model: AngleModel, record: Record, wanted: ExportRequest
-) -> Exported:
+def _export_mesh(run_folder: RunFolder, model: AngleModel, wanted: ExportRequest) -> Exported:
     mesh_format_of(wanted.target)
     mesh = read_mesh(_existing(run_folder.mesh(model), "mesh"))
-    if (box := _box_of_run(run_folder, record, wanted.crop)) is not None:
+    if (box := _box_of_run(run_folder, wanted.crop)) is not None:
         mesh = mesh.only(box.require_some(mesh.vertices))
         if not len(mesh.triangles):
             raise OptionError("holds no whole triangle of the mesh.", field="crop.box")
@@ -208,11 +203,11 @@ def surface_of(
     return model
 
 
-def _box_of_run(run_folder: RunFolder, record: Record, crop: CropOptions) -> CropBox | None:
+def _box_of_run(run_folder: RunFolder, crop: CropOptions) -> CropBox | None:
     """The box that is asked for, in the world of a finished run."""
     if crop.box is None:
         return None
-    options = options_from_plain(record.options, str(run_folder.run_file))
+    _, options = load_run(run_folder)
     views = read_model(run_folder.sparse).views
     return find_box(run_folder, views, crop, options.reference.aruco)
 
@@ -258,10 +253,9 @@ class _Painter:
         self.scene = RayScene(self.mesh)
         self.model: SparseModel = read_model(run_folder.sparse)
         self.images = run_folder.images
-        record = load_record(run_folder)
+        record, options = load_run(run_folder)
         self.capture: Capture | None = None
         if record.capture is not None:
-            options = options_from_plain(record.options, str(run_folder.run_file))
             try:
                 self.capture = open_capture(record.capture.folder, options.capture)
                 self.raw = image_names(self.capture)

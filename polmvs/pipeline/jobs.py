@@ -8,14 +8,13 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from itertools import groupby
 
-from polmvs.config import options_from_plain
 from polmvs.errors import DataError, OptionError
 from polmvs.evaluation.comparison import Comparison, read_comparison
 from polmvs.evaluation.trust import Trust
 from polmvs.parallel import Workers
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import RunFolder
-from polmvs.pipeline.runner import Job, Run, load_record, open_run
+from polmvs.pipeline.runner import Job, Run, load_run, open_run
 from polmvs.pipeline.stage_table import (
     COMPARE,
     DENSIFY,
@@ -144,8 +143,7 @@ def judge(run_folder: RunFolder, model: AngleModel = AngleModel.PPA) -> Trust:
     DataError
         The folder holds no such run.
     """
-    record = load_record(run_folder)
-    options = options_from_plain(record.options, str(run_folder.run_file))
+    record, options = load_run(run_folder)
     if record.find(DensifyResult, model) is None:
         raise DataError(run_folder.cloud(model), "is not made yet; run `polmvs densify` first.")
     return find_trust(model, run_folder, record, options)
@@ -161,9 +159,8 @@ def measure(run_folder: RunFolder, models: Sequence[AngleModel]) -> Comparison:
     DataError
         The folder holds no such run, or its capture is gone.
     """
-    record = load_record(run_folder)
+    record, options = load_run(run_folder)
     assert record.capture is not None
-    options = options_from_plain(record.options, str(run_folder.run_file))
     return evaluate_models(
         open_capture(record.capture.folder, options.capture),
         sparse_figures(record),

@@ -23,6 +23,7 @@ from polmvs.colmap.cameras import quiet_colmap
 from polmvs.config import (
     Options,
     RunOptions,
+    options_from_plain,
     plain_options,
     replace_option,
     show_value,
@@ -557,6 +558,12 @@ def load_record(run_folder: RunFolder) -> Record:
         It is missing, no record of a run, or one of another version.
     """
     return read_record(run_folder, result_types())
+
+
+def load_run(run_folder: RunFolder) -> tuple[Record, Options]:
+    """The record of a run and its options; errors as of :func:`load_record`."""
+    record = load_record(run_folder)
+    return record, options_from_plain(record.options, str(run_folder.run_file))
 
 
 def dense_models(record: Record) -> tuple[AngleModel, ...]:

@@ -19,7 +19,6 @@ microgrid polarization cameras, Opt. Eng. 58(8), 2019).
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +32,7 @@ from polmvs.config import BayerOrder, CaptureOptions
 from polmvs.errors import DataError, as_data_error
 from polmvs.io.arrays import map_array, save_array
 from polmvs.io.images import write_bytes
-from polmvs.io.plain_files import read_text
+from polmvs.io.plain_files import parse_toml, read_text
 from polmvs.polarization.mosaic import (
     ANGLES_DEG,
     split_colour_mosaic,
@@ -352,8 +351,8 @@ def read_calibration(path: Path) -> PolarizerCalibration:
     """
     try:
         with as_data_error(path, "read"):
-            content = tomllib.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
+            content = parse_toml(read_text(path))
+    except ValueError as error:
         raise DataError(path, "is no TOML file of a calibration.") from error
     known = {"version", "pattern", "bayer", "gains", "angles_deg", "diattenuations", "full_scale"}
     arrays = ("dark", "flat", "angle_map", "diattenuation_map")

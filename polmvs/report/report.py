@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.arrays import Floats
 from polmvs.colmap.models import read_model
-from polmvs.config import Options, options_from_plain, to_plain
+from polmvs.config import Options, to_plain
 from polmvs.errors import DataError, PolmvsError
 from polmvs.evaluation.comparison import (
     Comparison,
@@ -34,7 +34,7 @@ from polmvs.neighbors import nearest_points
 from polmvs.parallel import OnProgress, no_progress
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import SURFACE_MESH, RunFolder
-from polmvs.pipeline.runner import dense_models, load_record
+from polmvs.pipeline.runner import dense_models, load_run
 from polmvs.pipeline.stages.densify import DensifyResult, open_dense_views
 from polmvs.pipeline.stages.images import image_names
 from polmvs.pipeline.stages.maps import open_maps
@@ -192,8 +192,7 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
 
 
 def _open(folder: RunFolder) -> ReportInput:
-    record = load_record(folder)
-    options = options_from_plain(record.options, source=str(folder.run_file))
+    record, options = load_run(folder)
     models = dense_models(record)
     if not models:
         raise DataError(folder.root, "has no dense cloud to report on. Run 'polmvs densify' first.")
