@@ -699,7 +699,7 @@ def _job(
 def _kept_frames(
     frames: Frames, out: Path, options: Options, *, overwrite: bool
 ) -> tuple[Path, Options]:
-    """Frames as a capture beside a run, and the options that it is read with.
+    """Store frames as a capture beside the run; return it with the options to read it.
 
     Only ``overwrite`` replaces existing frames: a run that is continued has the same frames.
     """

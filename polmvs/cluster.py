@@ -181,7 +181,7 @@ class Cluster:
         return future
 
     def _await_return(self, error: BaseException) -> None:
-        """Wait for a scheduler at the address; connect anew."""
+        """Wait for a scheduler at the address and connect again."""
         end = time.monotonic() + self.patience.return_s
         while True:
             try:
@@ -218,7 +218,7 @@ class Cluster:
                     )
 
     def _check_storage(self, folder: Path) -> None:
-        """Every worker reads what is written here, and writes what is read here."""
+        """Check that every worker reads files written here and writes files readable here."""
         token = secrets.token_hex(8)
         probe = folder / f".polmvs-probe-{token}.tmp"
         answers: dict[str, Path] = {}

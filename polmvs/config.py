@@ -260,7 +260,7 @@ class OptionGroup:
         cls.in_files = in_files
 
     def __post_init__(self) -> None:
-        """Check the values, which become of their fields' types as :func:`convert_value` does it.
+        """Convert the values to their fields' types by :func:`convert_value` and check them.
 
         Raises
         ------
@@ -476,7 +476,7 @@ class SfmOptions(OptionGroup, group="sfm"):
 
     @property
     def known_camera(self) -> str | None:
-        """The option that tells the camera; None: it is estimated."""
+        """Option that gives the camera; None if the camera is estimated."""
         given = "sfm.camera" if self.camera is not None else None
         return given if self.intrinsics is None else "sfm.intrinsics"
 
@@ -721,7 +721,7 @@ class Options:
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)
 
     def __post_init__(self) -> None:
-        """Refuse, by OptionError, what is no group in its place."""
+        """Raise OptionError for a value that is not the group expected in its place."""
         for name, cls in groups_of(type(self)).items():
             group = getattr(self, name)
             if not isinstance(group, cls):
@@ -1098,7 +1098,7 @@ def _table(group: str, source: str) -> str:
 
 
 def options_from_plain(plain: Mapping[str, Any], source: str = "") -> Options:
-    """All options from JSON or TOML tables by group; what is not named keeps its default.
+    """All options from JSON or TOML tables by group; missing options keep their defaults.
 
     Raises
     ------
@@ -1115,7 +1115,7 @@ def options_from_plain(plain: Mapping[str, Any], source: str = "") -> Options:
 
 
 def require_table(name: str, table: Any, known: Iterable[str], source: str) -> None:
-    """Refuse, by OptionError, what is no table of options with a known name."""
+    """Raise OptionError unless this is a table of options with a known name."""
     begin = f"{source}: " if source else ""
     names = tuple(known)
     if name not in names:

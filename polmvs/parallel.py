@@ -65,7 +65,7 @@ class Backend(Protocol):
         """Result of a task of those submitted, in order; lost tasks are submitted again."""
 
     def close(self, *, cancel: bool) -> None:
-        """Finish the running tasks, or cancel them with ``cancel``; a later map starts anew."""
+        """Finish the running tasks, or cancel them with ``cancel``; a later map restarts them."""
 
 
 class Workers:
@@ -233,14 +233,14 @@ def _signals_held_back() -> Iterator[None]:
 
 
 class _Stopped(BaseException):
-    """A worker is to end; what it is at leaves nothing behind."""
+    """Raised in a worker that has to end, so that its task removes its temporary files."""
 
 
 _works = False  # whether this process, a worker, is at a task
 
 
 def _at_work(function: Callable[..., T], task: tuple[Any, ...]) -> T:
-    """Do a task in a worker, which may be stopped meanwhile."""
+    """Do a task in a worker, which may be stopped during it."""
     global _works
     try:
         _works = True
@@ -252,7 +252,7 @@ def _at_work(function: Callable[..., T], task: tuple[Any, ...]) -> T:
 
 
 def _stop_worker(number: int, frame: FrameType | None) -> None:
-    """End this worker: at once, or when what it is at has cleared up, which may not take long.
+    """End this worker: at once, or after its running task has cleaned up, which must be quick.
 
     An exception that arrives in a callback of a library is lost; what is left then is the parent's
     to clear away.

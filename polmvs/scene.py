@@ -123,7 +123,7 @@ def short_list(names: Sequence[str]) -> str:
 
 
 def evenly_spread(num: int, most: int) -> NDArray[np.int64]:
-    """Indices of at most so many of ``num`` things, spread evenly over their order."""
+    """Indices of at most ``most`` of ``num`` things, spread evenly over their order."""
     return np.linspace(0, num - 1, min(num, most)).round().astype(np.int64)
 
 
@@ -158,7 +158,7 @@ class Tracks:
         return _by_owner(self.obs_track, len(self.point3D_ids))
 
     def in_views(self, kept: Mask) -> Tracks:
-        """All tracks with the observations of the chosen ``(V,)`` views, which count anew."""
+        """All tracks with the observations of the chosen ``(V,)`` views, renumbered from 0."""
         index = np.cumsum(kept) - 1
         seen = kept[self.obs_view]
         return replace(

@@ -46,7 +46,7 @@ class CrashError(PolmvsError):
         self.said = said
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Errors are made again of what they say, which is not what this one is made of."""
+        """Pickle by constructor arguments; exceptions default to their message."""
         return type(self), (self.status, self.said)
 
 
@@ -154,6 +154,6 @@ def work() -> None:
 
 
 def _end_with_parent() -> None:
-    """A killed parent closes its end, and what is done here is for nobody."""
+    """End this process when the parent's end of the pipe closes, as when it is killed."""
     sys.stdin.buffer.read()
     os._exit(1)

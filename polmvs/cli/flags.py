@@ -242,7 +242,7 @@ def _key(info: FieldInfo) -> str:
 
 
 def _parameter(info: FieldInfo, group: Group, *, is_setting: bool) -> inspect.Parameter:
-    """A field as a parameter; without a default of its own, so that only what is given counts.
+    """Parameter of a field, without a default, so that only given options count.
 
     Parameters
     ----------
@@ -308,7 +308,7 @@ def _choice_of_member(name: str) -> str:
 
 
 def _is_mixed(kind: Any) -> bool:
-    """Whether a tuple's elements differ in type: each is a text of its own."""
+    """Whether a tuple's elements differ in type, so that each is an argument of its own."""
     elements = typing.get_args(kind)
     return len(set(elements)) > 1 and Ellipsis not in elements
 
@@ -320,7 +320,7 @@ def _is_list(kind: Any) -> bool:
 
 
 def _read_integer(_: Any, tokens: Sequence[Token]) -> int:
-    """Reads an integer; cyclopts would round what is none."""
+    """Read an integer; cyclopts would round a fraction."""
     text = tokens[0].value
     try:
         return int(text)
@@ -347,7 +347,7 @@ def _read_several(kind: Any, _: Any, tokens: Sequence[Token]) -> tuple[Any, ...]
 
 
 def _read_list(kind: Any, text: str) -> tuple[Any, ...]:
-    """A tuple from a list with commas; ValueError says what it should have been."""
+    """Read a tuple from a comma-separated list; ValueError states the expected form."""
     elements = typing.get_args(kind)
     try:
         values = tuple(elements[0](part.strip()) for part in text.split(","))

@@ -80,7 +80,7 @@ class _LogFileHandler(logging.FileHandler):
         """Do nothing."""
 
     def close(self) -> None:
-        """Close the file; what is left of the log may find no room any more."""
+        """Close the file; a full disk may not take the rest of the log."""
         with suppress(OSError):
             super().close()
 

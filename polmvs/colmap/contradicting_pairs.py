@@ -15,12 +15,13 @@ import pycolmap
 
 from polmvs.colmap.database import opened
 
-# Of the verified pairs. If more contradict the camera, the camera is wrong: then the pairs are
-# kept, and the trial adjustment names the camera.
+# Largest share of the verified pairs. If more contradict the camera, the camera is wrong: then the
+# pairs are kept, and the trial adjustment names the camera.
 MAX_SHARE = 0.5
-# Of images that this is done for. A guess: where each has many pairs, the others outvote a wrong
-# one, and contradicting pairs hold good matches too. Measured: of six images of a mug two choices
-# had a view turned by 83 degrees, and have none now; of 16 small images one got worse by this.
+# Largest number of images for which pairs are dropped. A guess: among many images the right pairs
+# outvote a wrong one, and contradicting pairs hold good matches too. Measured: with all pairs, two
+# choices of six images of a mug had a view turned by 83 degrees, without these pairs none; among 16
+# small images, one choice got worse without them.
 MAX_IMAGES = 8
 
 

@@ -239,7 +239,7 @@ def read_descriptors(content: pycolmap.Database, number: int) -> NDArray[Any]:
 
 @contextmanager
 def _renamed(database: Path, names: Mapping[int, str], *, keep: bool = False) -> Iterator[None]:
-    """Name images ``idNUMBER`` meanwhile; afterwards, or at once, as given, else as before."""
+    """Name images ``idNUMBER`` in the context; then by ``names`` with ``keep``, else as before."""
     with closing(sqlite3.connect(database)) as connection, connection:
         before = dict(connection.execute("SELECT image_id, name FROM images"))
         connection.execute("UPDATE images SET name = 'id' || image_id")

@@ -432,7 +432,7 @@ def reconstruction_of_views(
 def _posed(
     views: Sequence[View], camera_ids: Sequence[int], keypoints: Sequence[Array]
 ) -> pycolmap.Reconstruction:
-    """Posed images, each with its keypoints and a camera, which is of the first view of its id."""
+    """Posed images with keypoints; views with one camera id share the first one's camera."""
     reconstruction = pycolmap.Reconstruction()
     of_views = zip(views, camera_ids, keypoints, strict=True)
     for image_id, (view, camera_id, points) in enumerate(of_views, start=1):

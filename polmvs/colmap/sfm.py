@@ -620,7 +620,7 @@ def _adjust(
     free_intrinsics: bool,
     free_principal_point: bool,
 ) -> None:
-    """Bundle adjustment in place on one thread, then drop what is beyond the thresholds."""
+    """Bundle-adjust in place on one thread, then drop points beyond the thresholds."""
     bundle, config = bundle_of(
         reconstruction,
         tolerances.loss_scale_px,

@@ -104,7 +104,7 @@ def measure_consistency(
 
 
 def within_box(phase_map: PhaseMap, outside: Mapping[str, Mask]) -> PhaseMap:
-    """The map with a region without the pixels that show what is outside a box.
+    """The map, its region without pixels that show something outside a box.
 
     Points behind a surface that the box cut away then do not count as visible.
     """

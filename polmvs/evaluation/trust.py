@@ -132,7 +132,7 @@ def _figure(
     scale: float = 100.0,
     decides: bool = True,
 ) -> TrustFigure:
-    """A share as per cent, or with a scale of 1 what it is; unknown where it is not finite."""
+    """Figure of a share in per cent, or of a value with a scale of 1; None if not finite."""
     return TrustFigure(
         name=name,
         value=scale * value if np.isfinite(value) else None,

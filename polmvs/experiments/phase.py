@@ -269,7 +269,7 @@ class ErrorTally:
         )
 
     def _quantile(self, share: float) -> float:
-        """Absolute error that a share of all errors stays under, linear within a bin."""
+        """Quantile of the absolute error, linear within a bin."""
         cumulative = np.cumsum(self.counts)
         if cumulative[-1] == 0:
             return float("nan")

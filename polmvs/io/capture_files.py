@@ -246,7 +246,7 @@ def _by_template(
 def _match(
     root: Path, files: Iterable[Path], pattern: str, angles: Sequence[float] | None = None
 ) -> list[_Named]:
-    """Files whose path below a folder fits a pattern, and what it says."""
+    """Files whose path below a folder matches a pattern, with the match."""
     compiled = re.compile(pattern)
     found = []
     for path in files:

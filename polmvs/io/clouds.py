@@ -53,7 +53,7 @@ class Cloud:
         )
 
     def are(self, *kinds: PointKind) -> Mask:
-        """Which points (N,) are of these kinds; all if the cloud has no kinds."""
+        """Mask (N,) of the points of these kinds; all points if the cloud has no kinds."""
         if "kind" not in self.scalars:
             return np.ones(len(self.points), np.bool_)
         return np.isin(self.scalars["kind"], kinds)

@@ -269,7 +269,7 @@ def _parse_view(path: Path, name: str, entry: Any, width: int, height: int) -> V
 def _sample_surfaces(
     truth: GroundTruth, spacing_m: float, other_spacing_m: float
 ) -> TrueSurfacePoints:
-    """Back-project every view; thin the part and what is near it finely, the rest coarsely."""
+    """Back-project every view; thin finely on and near the part, coarsely elsewhere."""
     if not 0 < spacing_m <= other_spacing_m:
         raise ValueError(f"{spacing_m=}, {other_spacing_m=} but expected 0 < spacing <= other.")
     parts = [_back_project(truth, name, part=True) for name in truth.names]

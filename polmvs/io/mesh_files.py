@@ -160,7 +160,7 @@ def _write_obj(path: Path, mesh: Mesh, texture: Texture | None) -> tuple[Path, .
 
 
 class _Buffer:
-    """Binary data of a glTF, with the views and accessors that say what lies where in it."""
+    """Binary data of a glTF with its buffer views and accessors."""
 
     def __init__(self) -> None:
         self.data = bytearray()

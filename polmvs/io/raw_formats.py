@@ -399,7 +399,7 @@ def _size_of_part(part: Any) -> ImageSize:
 
 
 def _read_pgm(path: PathArg, data: bytes) -> RawImage:
-    """A binary PGM; OpenCV would forget its largest value, which tells the bit depth."""
+    """Read a binary PGM; OpenCV drops its maximum value, which gives the bit depth."""
     (width, height, largest), start = netpbm_header(data)
     if not 0 < largest < 1 << 16:
         raise DataError(path, f"is damaged: its PGM header makes no image. {BROKEN}")

@@ -116,7 +116,7 @@ def _decode_tuple(elements: tuple[Any, ...], value: Any, where: str) -> tuple[An
 
 
 def _expect(value: Any, kind: Any, where: str) -> Any:
-    """The value, if it is of that type; true and false are no numbers."""
+    """Return the value if it has that type; true and false do not count as numbers."""
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise ValueError(f"{_place(where)} cannot be {str(value)[:MAX_QUOTED]!r}")
     return value

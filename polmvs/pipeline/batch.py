@@ -273,7 +273,7 @@ class _LogMonitor(NoMonitor):
 
 
 def _run_one(out: Path, run_options: RunOptions, entry: BatchEntry) -> BatchRow:
-    """Reconstruct one capture; what goes wrong is told, not raised."""
+    """Reconstruct one capture; errors are reported, not raised."""
     package = logging.getLogger("polmvs")
     if package.getEffectiveLevel() > logging.INFO:  # a worker's, which no terminal has set
         package.setLevel(logging.INFO)

@@ -246,7 +246,7 @@ def _check_masks(capture: Capture, folder: Path) -> None:
 
 
 def _check_references(capture: Capture, options: ReferenceOptions) -> None:
-    """Check the sources of a metric frame as far as possible before there are poses."""
+    """Check the sources of a metric frame as far as possible before SfM."""
     if options.aruco is not None:
         parse_marker_option(options.aruco)
     names = list(image_names(capture))

@@ -152,7 +152,7 @@ def as_capture(folder: Path, out: Path, options: Options) -> tuple[Path, Options
 
 
 def _found_import(folder: Path, place: Path, options: CaptureOptions) -> ImportedSet:
-    """An import that is there, if it is of this set."""
+    """Existing import, if it is of this set."""
     path = place / IMPORT_FILE
     try:
         made = from_json(_Made, parse_json(path.read_text(encoding="utf-8")))

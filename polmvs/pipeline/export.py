@@ -73,7 +73,7 @@ class ExportRequest:
     overwrite: bool = False
 
     def check(self) -> None:
-        """OptionError where the format cannot hold what is asked for, or the target exists."""
+        """Raise OptionError if the format cannot hold the requested data or the target exists."""
         if self.crop.box is not None and self.form not in (*MESHES, *CLOUDS):
             raise OptionError("is of a mesh or a cloud.", field="crop.box")
         if self.texture and self.form not in MESHES:

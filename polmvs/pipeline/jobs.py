@@ -206,7 +206,7 @@ def _do_alone(
 def _of_models(
     commands: Sequence[str], models: Sequence[AngleModel], table: Sequence[StageSpec]
 ) -> list[StageSpec]:
-    """The stages of commands that are of these angle models or of all."""
+    """Stages of commands that belong to these angle models or to all."""
     return [
         spec for spec in table if spec.command in commands and spec.angle_model in (None, *models)
     ]
@@ -230,7 +230,7 @@ def _open(
     min_images: int = MIN_VIEWS,
     continues: bool = False,
 ) -> AbstractContextManager[Run]:
-    """Open the run; what it needs is taken over where it is finished."""
+    """Open the run; finished stages that it needs are taken over."""
     table = table or stage_table()
     if taken_over is None:
         taken_over = {spec.name for spec in with_needed((s.name for s in last), table)}

@@ -154,7 +154,7 @@ def _read(path: Path) -> dict[str, int]:
 
 
 def _write(descriptor: int, path: Path, tokens: dict[str, int]) -> None:
-    """Overwrite the list; a process killed meanwhile leaves too many entries at worst."""
+    """Overwrite the list; a process killed during this leaves surplus entries at worst."""
     data = "".join(f"{token} {number}\n" for token, number in tokens.items()).encode()
     with as_data_error(path, "written"):
         os.lseek(descriptor, 0, os.SEEK_SET)

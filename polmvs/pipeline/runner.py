@@ -197,7 +197,7 @@ class Run(StageInput):
             self._carry_out_side_by_side(due, calls)
 
     def _is_due(self, spec: StageSpec) -> bool:
-        """Whether a stage is to be done; what is left of it is cleared away then.
+        """Whether a stage has to be done; if so, its remains are deleted.
 
         One whose files are gone is done again, and alone: what was made of them stays, for the same
         options give the same files.
@@ -278,7 +278,7 @@ class Run(StageInput):
     def _record(
         self, spec: StageSpec, done: _Done, peak_mb: float, said: Sequence[_Logged]
     ) -> None:
-        """Record a stage that is done, and tell of it."""
+        """Record a finished stage and report it."""
         result, seconds = done.result, round(done.seconds, 3)
         logger.info("%s: %.1f s, %s", spec.name, seconds, result, extra=FILE_ONLY)
         finished = StageRecord(
@@ -348,7 +348,7 @@ class Run(StageInput):
         self.forget(["poses"])
 
     def _delete(self, stale: Sequence[StageSpec], remembered: StageRecord | None = None) -> None:
-        """Delete the files of stages, and what is recorded of them but for what is remembered."""
+        """Delete the files of stages and their records, except the remembered ones."""
         paths = [self.run_folder.root / path for spec in stale for path in spec.writes]
         paths.append(self.run_folder.report)  # which shows them
         images = frozenset(self.record.images)
@@ -417,7 +417,7 @@ class _Logged:
 
 @dataclass(frozen=True)
 class _Done:
-    """A stage's work: its result, how long it took, and what a process of its own said."""
+    """Finished work of a stage: its result, its duration, and messages of its process."""
 
     result: Any
     seconds: float
@@ -426,7 +426,7 @@ class _Done:
 
 
 class _Keeper(logging.Handler):
-    """Keeps what is said."""
+    """Collects messages."""
 
     def __init__(self, level: int) -> None:
         super().__init__(level)

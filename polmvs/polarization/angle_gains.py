@@ -114,7 +114,7 @@ def find_angle_gains(
 
 
 def _misfit(samples: Array, angles_deg: Sequence[float]) -> float:
-    """Root mean square of what three Stokes parameters leave of (K, N) samples, share of them."""
+    """RMS residual of (K, N) samples from three Stokes parameters, share of the samples."""
     analyzers = ideal_analyzers(angles_deg)
     left = samples - analyzers @ (np.linalg.pinv(analyzers) @ samples)
     return float(np.sqrt(np.mean(np.square(left / samples.mean(axis=0)))))

@@ -58,7 +58,7 @@ class Levels:
 
     @property
     def quantum(self) -> float:
-        """Step of a sample, share of full scale."""
+        """Quantization step of a sample, share of full scale."""
         return self.step / self.full_scale
 
 

@@ -274,7 +274,7 @@ class Capture:
         return raw.samples
 
     def _linear(self, paths: Sequence[Path]) -> tuple[Image, NDArray[Any], float]:
-        """Linear samples; what is clipped of them: an array, and the value from which it is."""
+        """Linear samples, and an array of samples with the value from which they are clipped."""
         threshold = self._threshold
         images, raws = [], []
         for path in paths:
@@ -604,7 +604,7 @@ def _dump_size(options: CaptureOptions) -> DumpSize:
 
 
 def _require_fitting_options(files: CaptureFiles, options: CaptureOptions) -> None:
-    """Options that say nothing of this kind of files are not ignored."""
+    """Raise OptionError for options that do not apply to this kind of files."""
     if options.equalize and files.kind is not CaptureKind.ANGLES:
         raise OptionError(
             f"is of an image for each polarizer angle; {files.folder} holds {files.kind} images.",
@@ -673,7 +673,7 @@ def _evenly_chosen(things: Sequence[T]) -> list[T]:
 def _require_usable(
     kind: CaptureKind, path: Path, header: RawHeader, options: CaptureOptions
 ) -> None:
-    """A file may hold what the capture's kind says."""
+    """Raise an error if a file cannot belong to this kind of capture."""
     if kind is CaptureKind.MOSAIC:
         if header.dtype == "float32" and (header.channels in (3, 4) or header.height in (3, 4)):
             raise DataError(

@@ -23,7 +23,7 @@ MAX_CUT_SHARE = 0.03
 
 
 def cut_share(stokes: Stokes, mask: Mask, *, min_dolp: float) -> float:
-    """Share of the band outside of a mask that is as polarized as a surface; NaN without a band.
+    """Share of the band around a mask that is polarized like a surface; NaN without a band.
 
     Parameters
     ----------

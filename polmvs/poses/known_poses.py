@@ -120,7 +120,7 @@ def retriangulate(views: Sequence[View], tracks: Tracks) -> Tracks:
 
 
 def _intersect(views: Sequence[View], tracks: Tracks) -> Array:
-    """Points ``(T, 3)`` nearest to the rays of each track; NaN where these do not tell."""
+    """Points ``(T, 3)`` nearest to the rays of each track; NaN where they are undetermined."""
     centers, rays = np.zeros((2, len(tracks.obs_view), 3))
     for view, own in zip(views, tracks.of_views(len(views)), strict=True):
         centers[own] = view.center_in_world

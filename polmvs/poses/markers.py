@@ -479,7 +479,7 @@ def measure_markers(
 def _measure(
     views: Sequence[View], marker_id: int, seen: Sequence[Detection], tolerances: ScaleTolerances
 ) -> _Square | str:
-    """The triangulated marker, or what is wrong with it."""
+    """The triangulated marker, or the reason why it is unusable."""
     names = [views[d.view].name for d in seen]
     if len(seen) < 2:
         return f"marker {marker_id} is seen in one view only ({names[0]})"

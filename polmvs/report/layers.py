@@ -206,7 +206,7 @@ def pack_scene(
 def _bytes_of(
     layer: Layer, channels: Mapping[str, PointColoring], origin: Array, extent: float
 ) -> tuple[bytes, dict[str, Any]]:
-    """One buffer, and where what lies in it; every part begins at a multiple of four bytes."""
+    """One buffer and the offsets of its parts, which begin at multiples of four bytes."""
     pieces: list[bytes] = []
     used = 0
 
@@ -230,7 +230,7 @@ def _bytes_of(
 
 
 def _quantised(values: NDArray[Any], channel: PointColoring) -> NDArray[np.uint8]:
-    """One byte a value; what is not finite counts as the highest, which is the worst.
+    """One byte a value; values that are not finite count as the highest, which is the worst.
 
     Of a channel that some points lack, 255 stands for no value.
     """

@@ -217,7 +217,7 @@ def _open(folder: RunFolder) -> ReportInput:
 
 
 def _open_capture(record: Record, options: Options) -> Capture | None:
-    """The capture, if it still lies where it was."""
+    """The capture, if its folder still exists."""
     if record.capture is None:
         return None
     try:

@@ -196,7 +196,7 @@ class _Plan:
 
     @classmethod
     def make(cls, source: str | Path | Mesh, options: Simulation) -> _Plan:
-        """Read what is given, and place everything.
+        """Read the inputs and place everything.
 
         Raises
         ------
@@ -253,7 +253,7 @@ def _marks(mesh: Mesh, options: ObjectOptions, size: float, seed: int) -> Marks:
 
 
 class _Studio:
-    """The scene with its light, built anew for each view only where the light moves with it."""
+    """The scene with its light, rebuilt for each view only if the light moves with it."""
 
     def __init__(self, renderer: Renderer, plan: _Plan) -> None:
         self.renderer, self.plan = renderer, plan

@@ -159,7 +159,7 @@ class _Gathering:
 
 
 def _gather(light: _Gathering, points: Array, normals: Array, seed: int) -> Array:
-    """Irradiance (N,) at so many points as are looked at together."""
+    """Irradiance (N,) at the points of one chunk."""
     scene, samples = light.scene, light.samples
     mi, dr = scene.renderer.mi, scene.renderer.dr
     num = len(points) * samples

@@ -131,7 +131,7 @@ def _film(
 
 
 def _to_image_basis(parameters: Array, rays: Array) -> Array:
-    """Stokes parameters (H, W, 3, C) from the basis of Mitsuba's integrator to the image's.
+    """Rotate Stokes parameters (H, W, 3, C) from the basis of Mitsuba's integrator to the image's.
 
     The integrator's first axis lies across the sensor's upward axis in the transverse plane.
     """

@@ -93,7 +93,7 @@ class Samples:
         )
 
     def padded(self, num: int) -> Samples:
-        """Followed by others, so that they are so many."""
+        """These rays padded by others to a number."""
         add, waves = (0, num - len(self.places)), self.wavelengths
         return Samples(
             places=np.pad(self.places, add),

@@ -162,5 +162,5 @@ def _with_figures(trial: TrialResult, figures: ModelFigures) -> TrialResult:
 
 
 def trial_table(trials: Sequence[TrialResult], *, first: str = "capture") -> str:
-    """A row for each trial, in Markdown; ``first`` says what their names are."""
+    """Markdown table with a row for each trial; ``first`` is the heading of their names."""
     return format_table((first, *HEADER), [trial.cells for trial in trials])

@@ -45,7 +45,7 @@ def faulty_sensor(
     sample_share: float = 0.0,
     dark: float = 0.01,
 ) -> FaultySensor:
-    """Draw a sensor's errors, one of each kind per channel, and a share of it for every sample.
+    """Draw a sensor's errors, one of each kind per channel plus a share of it per sample.
 
     Parameters
     ----------

@@ -185,7 +185,7 @@ def _without_slivers(points: Array, triangles: Triangles) -> Triangles:
 
 
 def _lathe(profile: Array, segments: int) -> Mesh:
-    """A body of revolution of a profile (radius, height) whose material lies on its left.
+    """Body of revolution of a profile (radius, height) with the material on its left.
 
     Corners of the profile sharper than 30 degrees stay sharp.
     """

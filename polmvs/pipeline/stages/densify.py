@@ -136,7 +136,7 @@ class _Inputs:
 
 @dataclass(frozen=True, kw_only=True)
 class _Surface:
-    """The polarized surfaces, and how they were made; ``points`` are of a surface of all views."""
+    """Polarized surfaces and their making; ``points`` belong to a surface of all views."""
 
     cloud: FusedCloud
     method: Method
@@ -394,7 +394,7 @@ def open_dense_views(folder: RunFolder, model: AngleModel) -> list[DenseView | N
 
 
 def open_outside(folder: RunFolder, model: AngleModel) -> dict[str, NDArray[np.bool_]]:
-    """Pixels (H, W) of views, by name, that show what is outside a box; none without a box."""
+    """Masks (H, W) by view of pixels that show something outside a box; none without a box."""
     names = [view.name for view in posed_views(folder)]
     paths = {name: folder.views(model) / OUTSIDE.format(name=name) for name in names}
     return {n: map_array(path, np.bool_) for n, path in paths.items() if path.is_file()}

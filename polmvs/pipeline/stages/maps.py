@@ -151,7 +151,7 @@ def build_maps(
 
 
 def _cut_by_masks(built: Sequence[_Built]) -> float | None:
-    """Mean share of what lies outside of masks and is polarized, told if it is too much."""
+    """Mean share of the bands outside of masks that is polarized; a warning if it is too large."""
     shares = [one.cut_share for one in built if np.isfinite(one.cut_share)]
     if not shares:
         return None
@@ -308,7 +308,7 @@ def _wrong_setting(
 
 
 def _some_views(tracks: Tracks, maps: Sequence[PhaseMap]) -> tuple[Tracks, list[PhaseMap]]:
-    """Evenly spread views, so many as a check may hold at a time, and what these observe."""
+    """Evenly spread views, as many as a check may hold at a time, with their observations."""
     chosen = evenly_spread(len(maps), MAX_CHECKED_VIEWS)
     kept = np.isin(np.arange(len(maps)), chosen)
     return tracks.in_views(kept), [maps[k] for k in chosen]

@@ -133,7 +133,7 @@ def _find_apart(
     options: SfmOptions,
     on_progress: OnProgress,
 ) -> SparseModel:
-    """SfM in a process of its own, which COLMAP ends where it cannot write its database."""
+    """SfM in a process of its own, since COLMAP ends it if it cannot write its database."""
     masks = None
     if (given := options.feature_masks) is not None:
         masks = {name: find_mask(given, name) for name in names}
@@ -173,7 +173,7 @@ def _run_sfm(
     masks: Mapping[str, Path] | None,
     on_step: OnStep,
 ) -> SparseModel:
-    """SfM, where what COLMAP says of a folder that it cannot work in is an error of that folder."""
+    """SfM; COLMAP's errors about an unusable folder become errors of that folder."""
     try:
         return run_sfm(images, names, work, new, options, on_step, masks=masks)
     except RuntimeError as error:
@@ -220,7 +220,7 @@ def _store_uncertainty(
     camera: CameraUncertainty | None,
     covariances: NDArray[np.float64] | None,
 ) -> None:
-    """Beside a model what its adjustment leaves open; empty arrays where that is not known."""
+    """Store the uncertain modes of an adjustment beside its model; empty arrays if unknown."""
     modes = np.zeros((0, len(model.tracks.point3D_ids), 3)) if camera is None else camera.modes
     save_array(folder / CAMERA_MODES, modes)
     save_array(
@@ -229,7 +229,7 @@ def _store_uncertainty(
 
 
 def _bending(model: SparseModel, modes: NDArray[np.float64]) -> float:
-    """Median over the sparse points of how far the modes move them, share of their distance."""
+    """Median shift of the sparse points by the modes, share of their distance."""
     if modes.size == 0:
         return 0.0
     moved = np.sqrt(np.square(modes).sum(axis=(0, 2)))
