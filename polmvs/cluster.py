@@ -208,7 +208,7 @@ class Cluster:
                 self.address, f"has no workers. Start some: dask worker {self.address}"
             ) from error
         mine = own_versions()
-        for worker, found in self._on_all(own_versions).items():
+        for worker, found in self._on_all(installed_versions, PACKAGES).items():
             for package, wanted in mine.items():
                 if found.get(package) != wanted:
                     raise DataError(

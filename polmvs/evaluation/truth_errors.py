@@ -75,9 +75,10 @@ def evaluate(
     """
     truth_from_world, report = align_views(views, truth.views, source=truth.cameras)
     surface = truth.surface_points()
+    finite = np.isfinite(cloud_points).all(axis=1)
     metrics = evaluate_cloud(
-        truth_from_world * cloud_points,
-        None if cloud_normals is None else cloud_normals @ truth_from_world.rotation.T,
+        truth_from_world * cloud_points[finite],
+        None if cloud_normals is None else cloud_normals[finite] @ truth_from_world.rotation.T,
         surface.points,
         surface.normals,
         surface.is_part,
