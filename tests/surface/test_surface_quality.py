@@ -1,7 +1,23 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import trimesh
+from analytic_objects import phase_maps_of, ring_of_views, sphere
 
-from polmvs.surface.surface_quality import MIN_EXPLAINED, stand_apart
+from polmvs.polarization.kinds import AngleModel
+from polmvs.surface.creases import sided_normals
+from polmvs.surface.mesh_geometry import TriangleMesh
+from polmvs.surface.observations import Looking
+from polmvs.surface.solver import first_fit, label
+from polmvs.surface.surface_quality import (
+    MIN_EXPLAINED,
+    FaceEvidence,
+    fit_normals,
+    stand_apart,
+    supported_faces,
+)
+from polmvs.surface.surface_view import Silhouette, surface_view
 
 NAN = np.nan
 
@@ -25,3 +41,87 @@ NAN = np.nan
 )
 def test_views_that_stand_apart_from_a_surface(unexplained, apart):
     assert np.flatnonzero(stand_apart(np.array(unexplained), MIN_EXPLAINED)).tolist() == apart
+
+
+@pytest.fixture(scope="module")
+def exact() -> TriangleMesh:
+    """A unit sphere, whose normals are those of its faces."""
+    made = trimesh.creation.icosphere(subdivisions=5)
+    return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64))
+
+
+def fit_of(noise):
+    views = [
+        surface_view(m, Silhouette(m.region.inside, m.region.inside))
+        for m in phase_maps_of(
+            sphere(), ring_of_views(12, elevations=(0.0, 45.0, -35.0)), noise=noise
+        )
+    ]
+    looking = Looking(angle_model=AngleModel.PPA, tilt_aware=False)
+    return first_fit(views, looking, 5 / 150).at_width(1.0)
+
+
+def test_normals_err_by_their_stated_deviation(exact):
+    """Of phases with independent noise; the views share no error."""
+    fit = fit_of(np.radians(2.0))
+    fitted = fit_normals(exact, label(exact, fit))
+    normals, average = sided_normals(exact, fitted.normals, fitted.is_fitted)
+    sigma = fitted.sigma_deg(exact, average, alike_views=10**9)
+    known = np.isfinite(sigma)
+    cosine = np.clip((normals * exact.face_normals).sum(axis=1), -1, 1)[known]
+    ratio = np.degrees(np.arccos(cosine)) / sigma[known]
+    assert known.mean() > 0.95
+    # Of a normal error in two dimensions 63 to 68 % are within the root of its mean square. Rows of
+    # few views have a larger jackknife than variance (Efron and Stein 1981).
+    assert 0.6 < (ratio < 1).mean() < 0.85
+    assert (ratio < 2).mean() > 0.93
+    shared = fitted.sigma_deg(exact, average, alike_views=4)[known]
+    assert np.allclose(shared / sigma[known], np.sqrt(1 + fitted.num_rows[known] / 4))
+
+
+def test_phases_of_another_place_carry_no_information(exact):
+    labelled = label(exact, fit_of(np.radians(0.5)))
+    fit = fit_of(np.radians(0.5))
+    own = labelled.information(exact, fit)
+    assert np.median(own) > 1.5
+    rng = np.random.default_rng(0)
+    rows = labelled.observations.rows[:, rng.permutation(len(own))]
+    mixed = replace(labelled, observations=replace(labelled.observations, rows=rows))
+    assert mixed.information(exact, fit).mean() < 0
+
+
+def evidence_of(num, **changes):
+    some = {"num_views": 8, "num_outside": 0, "num_rows": 8, "num_contradicting": 0}
+    counts = {name: np.full(num, value) for name, value in some.items()}
+    found = FaceEvidence(**counts, num_outlines=np.zeros(num, int), information=np.full(num, 20.0))
+    return replace(found, **changes)
+
+
+@pytest.mark.parametrize(
+    ("information", "outlines", "sigma", "cap", "is_kept"),
+    [
+        (2.0, 0, 5.0, 0.8, False),  # a quarter of a nat for each of eight phases
+        (8.0, 0, 5.0, 0.8, True),
+        (2.0, 2, 5.0, 0.8, True),  # outlines show it
+        (2.0, 0, 1.5, 0.8, True),  # points or the views' agreement fix it
+        (2.0, 0, 5.0, 0.995, True),  # a small gap
+        (2.0, 0, np.inf, 0.8, False),
+    ],
+)
+def test_a_part_that_nothing_determines_is_not_supported(
+    exact, information, outlines, sigma, cap, is_kept
+):
+    top = exact.centers[:, 2] > cap
+    given = evidence_of(
+        len(top),
+        information=np.where(top, information, 20.0),
+        num_outlines=np.where(top, outlines, 0),
+    )
+    of_vertices = np.where(exact.vertices[:, 2] > cap - 0.1, sigma, 1.0)
+    kept = supported_faces(exact, given, gsd=5 / 150, sigma=of_vertices)
+    inner = exact.centers[:, 2] > 0.5 * (1 + cap)
+    assert kept[inner].all() if is_kept else not kept[inner].any()
+    assert kept[exact.centers[:, 2] < cap - 0.1].all()
+    if is_kept and sigma > 2:
+        # The cavities are found before the uncertainty is known.
+        assert supported_faces(exact, given, gsd=5 / 150)[inner].all()
