@@ -58,8 +58,11 @@ class QualityTolerances:
     min_information : mean of the phases of a face, nats. Derived: one bit tells a direction from
         the perpendicular one, as the label of the light does.
     max_sigma_ratio : position uncertainty over its median, above which neither phases nor points
-        determine a face. Measured on five captures: wrong caps of a mug's opening have 1.8 to 4, 99
-        % of right faces of the other captures less than 2.2.
+        determine a face. Measured on a mug with a wrong cap over its opening: most faces of the
+        cap have 1.8 to 4, 95 % of the right ones less than 1.7.
+    min_gap_px : radius of a circle with the area of the smallest undetermined part that is removed,
+        GSD; smoothness bridges smaller ones. The least size of an opening
+        (:class:`polmvs.surface.cavities.CavityTolerances`).
     """
 
     outside_px: float = 1.5
@@ -114,9 +117,9 @@ def face_evidence(
     """
     tol = tolerances or QualityTolerances()
     num = len(mesh.faces)
-    counts = np.zeros((5, num), np.int64)
+    views, outside, outlines = np.zeros((3, num), np.int64)
     if not num:
-        return _evidence(counts, np.zeros(0))
+        return FaceEvidence(views, outside, views, views, outlines, np.zeros(0))
     scene = RayScene(mesh)
     for view in fit.views:
         seen, _, _ = visible_points(
@@ -125,21 +128,20 @@ def face_evidence(
         xy, _ = view.project(mesh.centers[seen])
         inside = view.in_image(xy, 2.0)
         seen, xy = seen[inside], xy[inside]
-        counts[0, seen] += 1
+        views[seen] += 1
         if view.has_outline:
             distance = sample_image(view.silhouette.outer, xy)
-            counts[1, seen[distance > tol.outside_px]] += 1
-            counts[4, seen[np.abs(distance) <= tol.outside_px]] += 1
+            outside[seen[distance > tol.outside_px]] += 1
+            outlines[seen[np.abs(distance) <= tol.outside_px]] += 1
     face = labelled.observations.face
-    counts[2] = np.bincount(face, minlength=num)
-    counts[3] = np.bincount(face[labelled.contradicts(mesh)], minlength=num)
-    information = labelled.information(mesh, fit)
-    return _evidence(counts, np.bincount(face, information, num).astype(np.float64))
-
-
-def _evidence(counts: NDArray[np.int64], information: Array) -> FaceEvidence:
-    views, outside, rows, contradicting, outlines = counts
-    return FaceEvidence(views, outside, rows, contradicting, outlines, information)
+    return FaceEvidence(
+        num_views=views,
+        num_outside=outside,
+        num_rows=np.bincount(face, minlength=num),
+        num_contradicting=np.bincount(face[labelled.contradicts(mesh)], minlength=num),
+        num_outlines=outlines,
+        information=np.bincount(face, labelled.information(mesh, fit), num).astype(np.float64),
+    )
 
 
 def supported_faces(
@@ -164,8 +166,16 @@ def supported_faces(
     tol = tolerances or QualityTolerances()
     if not len(mesh.faces):
         return np.zeros(0, np.bool_)
-    of_faces = np.stack([np.asarray(values, np.float64) for values in vars(evidence).values()])
-    views, outside, rows, contradicting, outlines, information = _smoothed(mesh, of_faces.T).T
+    of_faces = (
+        evidence.num_views,
+        evidence.num_outside,
+        evidence.num_rows,
+        evidence.num_contradicting,
+        evidence.num_outlines,
+        evidence.information,
+    )
+    smooth = _smoothed(mesh, np.stack(of_faces, axis=1).astype(np.float64))
+    views, outside, rows, contradicting, outlines, information = smooth.T
     denied = outside > np.maximum(tol.max_outside_share * views, 1.5)
     contradicted = contradicting > 0.5 * rows  # most of them
     determined = (information >= tol.min_information * rows) | (outlines >= 0.5)
@@ -236,7 +246,7 @@ class FaceNormals:
         columns = average.of(np.moveaxis(self.changes, 1, 0).reshape(num, -1))
         squares = np.einsum("fc,fc->f", columns, columns, dtype=np.float64)
         freedom = np.where(fitted, np.maximum(self.num_rows - 2, 0), 0)
-        ratio = np.where(freedom > 0, freedom * squares / np.where(fitted, self.noise, 1), 0)
+        ratio = freedom * squares / np.where(fitted, self.noise, 1)
         sums = np.stack([ratio, freedom], axis=1)
         whole = sums.sum(axis=0)
         expected = whole[0] / whole[1] if whole[1] else 1.0
@@ -311,7 +321,7 @@ def _spread_of_views(
     row_weights: Floats,
     group: NDArray[np.int64],
 ) -> tuple[Array, Floats]:
-    """Stated variance (N,) of normals (3, N), and their change (G, N, 3) by each group of views.
+    """Stated variance (N,) of normals (3, N), and their change (G, N, 3) by each group.
 
     A row k changes the normal by ``A^-1 w_k m_k (m_k . n) / (1 - h_k)`` on the tangent plane, with
     ``A = M^T W M`` and its leverage ``h_k = w_k m_k^T A^-1 m_k``: the change if it is left out.

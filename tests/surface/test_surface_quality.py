@@ -80,8 +80,8 @@ def test_normals_err_by_their_stated_deviation(exact):
 
 
 def test_phases_of_another_place_carry_no_information(exact):
-    labelled = label(exact, fit_of(np.radians(0.5)))
     fit = fit_of(np.radians(0.5))
+    labelled = label(exact, fit)
     own = labelled.information(exact, fit)
     assert np.median(own) > 1.5
     rng = np.random.default_rng(0)
