@@ -53,6 +53,7 @@ from polmvs.surface.offsets import (
 from polmvs.surface.solver import (
     Fit,
     Labelled,
+    PositionSigma,
     Refined,
     SolverTolerances,
     first_fit,
@@ -410,13 +411,15 @@ def _supported(
     given.on_progress(1)
     sigma = _deviations(mesh, fit)
     given.on_progress(1)
-    supported = supported_faces(mesh, evidence, min_views=given.min_views, gsd=fit.gsd, sigma=sigma)
+    supported = supported_faces(
+        mesh, evidence, min_views=given.min_views, gsd=fit.gsd, sigma=sigma.own
+    )
     seen = evidence.num_views >= given.min_views
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     inferred = seen & ~supported & _lie_on(mesh, [cavity.values for cavity in cavities])
     supported |= inferred
     known = fit.known or KnownPoints(np.zeros((0, 3)), np.zeros(0))
-    offset_px, offset_sigmas = point_offset(mesh, supported, sigma, known, fit.gsd)
+    offset_px, offset_sigmas = point_offset(mesh, supported, sigma.total, known, fit.gsd)
     residual, _ = labelled.residuals(mesh)
     contradictions = replace(
         find_contradictions(
@@ -436,7 +439,7 @@ def _supported(
         light=labelled.means(len(mesh.faces)),
         normals=corner_normals(mesh, polished.normals),
         sigma_deg=polished.sigma_deg,
-        sigma=sigma,
+        sigma=sigma.total,
         gsd=fit.gsd,
         contradictions=contradictions,
         inferred=inferred,
@@ -509,19 +512,22 @@ def _border_share(mask: Mask) -> float:
     return float(border.mean())
 
 
-def _deviations(mesh: TriangleMesh, fit: Fit) -> Array:
-    """Deviations of the vertices, sampled on a coarser mesh if that saves time."""
+def _deviations(mesh: TriangleMesh, fit: Fit) -> PositionSigma:
+    """Position uncertainty of the vertices, sampled on a coarser mesh if that saves time."""
     coarse = remeshed(RayScene(mesh), DEVIATION_EDGE_PX * fit.gsd)
     if not len(coarse.faces):
         coarse = mesh
     sigma = place_deviations(coarse, fit)
     _, face, barycentric = RayScene(coarse).closest(mesh.vertices)
-    corners = sigma[coarse.faces[face]]
-    known_corners = np.isfinite(corners)
-    weight = barycentric * known_corners
-    total = weight.sum(axis=1)
-    mean = (np.where(known_corners, corners, 0) * weight).sum(axis=1) / np.maximum(total, 1e-9)
-    return np.where(total > 1e-6, mean, np.inf)
+
+    def at_vertices(of_coarse: Array) -> Array:
+        corners = of_coarse[coarse.faces[face]]
+        weight = barycentric * np.isfinite(corners)
+        total = weight.sum(axis=1)
+        sums = (np.where(np.isfinite(corners), corners, 0) * weight).sum(axis=1)
+        return np.where(total > 1e-6, sums / np.maximum(total, 1e-9), np.inf)
+
+    return PositionSigma(at_vertices(sigma.own), at_vertices(sigma.shared))
 
 
 def supported_mesh(surface: GlobalSurface) -> Mesh:

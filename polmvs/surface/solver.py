@@ -425,7 +425,8 @@ class _Evidence:
     Attributes
     ----------
     equations : of their phases and outlines.
-    outline_slope : (V,), change of the gradient by an error of all silhouettes, per px.
+    outline_slope : (V,), change of the gradient by one deviation of the error that all silhouettes
+        share.
     tilt : share of the polarizers' tilt that is not yet corrected.
     """
 
@@ -824,6 +825,25 @@ def unexplained_shares(mesh: TriangleMesh, fit: Fit, *, stride_px: int = 4) -> A
     return shares
 
 
+@dataclass(frozen=True)
+class PositionSigma:
+    """Position uncertainty (1 sigma) along the normals of V vertices; inf where no view sees one.
+
+    Attributes
+    ----------
+    own : (V,) of what differs from place to place: views, noise, points, smoothness.
+    shared : (V,) of what moves the whole surface: the polarizers' tilt and the bias of outlines.
+    """
+
+    own: Array
+    shared: Array
+
+    @property
+    def total(self) -> Array:
+        """(V,) of both."""
+        return np.asarray(np.hypot(self.own, self.shared))
+
+
 def place_deviations(
     mesh: TriangleMesh,
     fit: Fit,
@@ -831,8 +851,8 @@ def place_deviations(
     max_groups: int = 24,
     num_samples: int = 12,
     seed: int = 0,
-) -> Array:
-    """Position uncertainty ``(V,)`` (1 sigma) along the normal of each vertex of a refined mesh.
+) -> PositionSigma:
+    """Position uncertainty of each vertex of a refined mesh.
 
     The contribution of the views is the jackknife (Tukey 1958): the displacement of the surface
     when one of them, or one of some groups of them, is left out. It includes all errors that the
@@ -851,7 +871,7 @@ def place_deviations(
     tol = fit.tol
     num, rng, level = len(mesh.vertices), np.random.default_rng(seed), tol.levels[-1]
     if not num:
-        return np.zeros(0)
+        return PositionSigma(np.zeros(0), np.zeros(0))
     edge, num_views = mesh.mean_edge, len(fit.views)
     face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
 
@@ -875,7 +895,7 @@ def place_deviations(
         tol.terms.phase_correlation(face_area_px)
     )
     by_outlines = solve(matrix, energy.views.outline_slope, loose, none)
-    variance = by_tilt**2 + (tol.terms.outline_bias_px * by_outlines) ** 2
+    variance = np.zeros(num)
     for _ in range(num_samples):
         noise = energy.views.equations.noise(rng) + energy.smooth_factor @ rng.standard_normal(num)
         noise += np.sqrt(tol.terms.point_weight(num_views, face_area_px)) * energy.points.noise(rng)
@@ -887,4 +907,5 @@ def place_deviations(
         own = left_out.matrix()
         change = solve(sparse.csr_array(matrix - own), left_out.gradient + own @ rest, loose, none)
         variance += (num_groups - 1) / num_groups * change**2
-    return np.where(energy.free, np.sqrt(variance), np.inf)
+    own = np.where(energy.free, np.sqrt(variance), np.inf)
+    return PositionSigma(own, np.where(energy.free, np.hypot(by_tilt, by_outlines), np.inf))

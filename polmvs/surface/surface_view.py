@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 from pathlib import Path
 
@@ -24,6 +25,18 @@ REFERENCE_FOCAL_PX = 445.0  # focal length of the images for which lengths were 
 FIELD_SMOOTHING_PX = 0.8  # of the distance to a silhouette; it smooths its pixel staircase
 NORMAL_SMOOTHING_PX = 2.0  # of the distance before its gradient
 FAR_PX = 1000.0  # distance to a missing silhouette
+
+
+class OutlineSource(Enum):
+    """How an outline was found.
+
+    ``MASK``: the border of pixels; ``EDGE``: the greatest change of brightness; ``MATTING``: see
+    :mod:`polmvs.surface.matting`.
+    """
+
+    MASK = "mask"
+    EDGE = "edge"
+    MATTING = "matting"
 
 
 @dataclass(frozen=True)
@@ -139,14 +152,13 @@ class SurfaceView:
     phase_map : its phase; read anew each time, as it may be on disk.
     silhouette : of the objects.
     has_outline : whether the silhouette may carve and pull: it has pixels on and off the objects.
-    is_matted : whether its outline comes from matting (:mod:`polmvs.surface.matting`), not from the
-        greatest change of brightness or a mask.
+    outline_source : how its outline was found.
     """
 
     phase_map: PhaseMap
     silhouette: Silhouette
     has_outline: bool = True
-    is_matted: bool = False
+    outline_source: OutlineSource = OutlineSource.MASK
 
     @property
     def view(self) -> View:
@@ -198,9 +210,10 @@ def surface_view(
     folder : for the derived arrays; None: in memory, some 30 bytes a pixel.
     """
     name = phase_map.view.name
+    source = OutlineSource.MASK if silhouette.inner_shift is None else OutlineSource.EDGE
     return SurfaceView(
         phase_map=phase_map,
         silhouette=silhouette if folder is None else _StoredSilhouette(silhouette, folder, name),
         has_outline=bool(silhouette.certain.any() and not silhouette.possible.all()),
-        is_matted=phase_map.outline_shift is not None,
+        outline_source=source if phase_map.outline_shift is None else OutlineSource.MATTING,
     )

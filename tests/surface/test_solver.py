@@ -18,6 +18,7 @@ from polmvs.polarization.angle_models import tilt_turn
 from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import view_rays
 from polmvs.surface.creases import crease_vertices, sharpened
+from polmvs.surface.grazing import outline_bias
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed
 from polmvs.surface.observations import Looking, level_image, observe
 from polmvs.surface.solver import (
@@ -41,6 +42,7 @@ from polmvs.surface.terms import (
     find_rim,
     normal_changes,
     outline_moves,
+    outline_rows,
     shared_edges,
     solve,
     with_edges,
@@ -75,7 +77,7 @@ def refined(hull, views, *, tolerances=QUICK, **kwargs):
 
 def deviations(mesh, views, **kwargs):
     given = {name: kwargs.pop(name) for name in ("known", "tolerances") if name in kwargs}
-    return place_deviations(mesh, fit_of(views, **given).at_width(1.0), **kwargs)
+    return place_deviations(mesh, fit_of(views, **given).at_width(1.0), **kwargs).own
 
 
 @pytest.fixture(scope="module")
@@ -452,6 +454,39 @@ def test_progress_is_whole(ball):
     assert sum(steps) == QUICK.num_steps
 
 
+def test_outlines_by_brightness_are_moved_by_half_of_their_bias(ball):
+    """A silhouette whose outline lies that far inside the true one has no residuals."""
+    mesh = extracted(sphere(), step=0.05)
+    radius_px = 1 / FOOTPRINT
+    half = 0.5 * outline_bias(np.array([radius_px]), matted=False)[0]
+    shift = np.full(ball[0].silhouette.certain.shape, -half, np.float32)
+    edges, sharp = shared_edges(mesh), np.zeros(len(mesh.vertices), np.bool_)
+
+    def rows(view, silhouette):
+        seen = surface_view(view.phase_map, silhouette)
+        found = outline_rows(
+            mesh, RayScene(mesh), seen, edges, sharp, TermTolerances(), gate_px=4.0, on_outline=True
+        )
+        return np.median(found.residual), np.median(found.bias_px)
+
+    given, bias_of_mask = rows(ball[0], ball[0].silhouette)
+    mask = ball[0].silhouette.certain
+    found, bias_of_edge = rows(ball[0], Silhouette(mask, mask, shift, shift))
+    assert found == pytest.approx(given, abs=0.1 * half)
+    assert half > 0.1
+    # What is not corrected remains whole; of the rest, the deviation of an even distribution.
+    assert bias_of_edge / bias_of_mask == pytest.approx(1 / np.sqrt(3), abs=1e-6)
+
+
+def test_the_bias_of_outlines_is_part_of_the_position_uncertainty(ball):
+    """All views share it, so their number does not reduce it."""
+    mesh = extracted(sphere(), step=0.12)
+    sigma = place_deviations(mesh, fit_of(ball).at_width(1.0))
+    bias = 0.5 * outline_bias(np.array([1 / FOOTPRINT]), matted=False)[0]
+    expected = np.hypot(bias, TermTolerances().outline_bias_px) * FOOTPRINT
+    assert np.median(sigma.shared) == pytest.approx(expected, rel=0.3)
+
+
 def test_an_empty_mesh_stays_empty(ball):
     empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     assert len(refine(empty, fit_of(ball)).mesh.faces) == 0
@@ -473,11 +508,8 @@ def test_deviations_are_larger_where_less_is_known(ball):
     mesh = extracted(sphere(), step=0.12)
     sigma = deviations(mesh, ball, num_samples=16)
     assert np.isfinite(sigma).all()
-    # Beside the bias that all outlines share, however many they are.
-    tolerances = replace(SolverTolerances(), terms=TermTolerances(outline_bias_px=0.0))
-    many = deviations(mesh, ball, tolerances=tolerances, num_samples=16)
-    few = deviations(mesh, ball[::3], tolerances=tolerances, num_samples=16)
-    assert np.median(few / many) > 1.3
+    few = deviations(mesh, ball[::3], num_samples=16)
+    assert np.median(few / sigma) > 1.3
     one_side = [view for view in ball if view.center[0] > 0][:2]
     few = deviations(mesh, one_side, num_samples=16)
     behind = mesh.vertices[:, 0] < -0.5
