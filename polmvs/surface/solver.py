@@ -51,6 +51,7 @@ from polmvs.surface.terms import (
     KnownPoints,
     KnownSides,
     OutlineRows,
+    SharedEdges,
     SharedError,
     TermTolerances,
     add_outlines,
@@ -199,6 +200,10 @@ class Fit:
         if self.light is None:
             return 0.5, 0.5
         return (1.0, 0.0) if self.light is Light.SPECULAR else (0.0, 1.0)
+
+    def independent_area(self, level: Level) -> float:
+        """Area of the surface over which a level's phase errors are correlated."""
+        return self.tol.terms.independent_px * level.width_px**2 * self.gsd**2
 
     def at_width(self, width_px: float) -> Fit:
         """The fit with images smoothed over another width."""
@@ -481,6 +486,130 @@ class Energy:
         return replace(looking, tilt_share=float(np.clip(share, 0, 1)))
 
 
+@dataclass(frozen=True)
+class _Observed:
+    """What the views show of a mesh with F faces.
+
+    Attributes
+    ----------
+    observations : K of them, those that are used.
+    shares : (2, K) probabilities of specular and of diffuse light.
+    variances : (2, K) of the rows' residuals.
+    voted : the normals that the observations prefer.
+    is_seen : (F,) bool, faces that a view observes, used or not.
+    """
+
+    observations: Observations
+    shares: Array
+    variances: Array
+    voted: Vote
+    is_seen: Mask
+
+
+def _observed(
+    scene: RayScene,
+    fit: Fit,
+    pairs: tuple[Indices, Indices],
+    used: Mask | None,
+    *,
+    normal_sigma: float,
+    with_vote: bool,
+    with_slope: bool,
+) -> _Observed:
+    """The observations of a mesh and their labels.
+
+    ``pairs`` are faces that share an edge; ``used`` (F,) those whose observations are used (None:
+    all); the others are parameters of :func:`linearize`.
+    """
+    mesh, tol = scene.mesh, fit.tol.labels
+    gsd = fit.gsd if with_slope else None
+    observations = observe(mesh, scene, fit.views, fit.images, fit.looking, gsd=gsd)
+    is_seen = np.zeros(len(mesh.faces), np.bool_)
+    is_seen[observations.face] = True
+    if used is not None:
+        observations = observations.only(used[observations.face])
+    row_sigma = fit.scales.of(observations)
+    voted = Vote(mesh.face_normals, np.zeros(len(mesh.faces), np.bool_))
+    if with_vote:
+        voted = vote(mesh, observations, pairs, row_sigma=row_sigma, tolerances=tol)
+    shares = responsibilities(
+        observations,
+        voted.normals,
+        normal_sigma=normal_sigma,
+        row_sigma=row_sigma,
+        pairs=pairs,
+        weights=fit.light_weights,
+        tolerances=tol,
+    )
+    variances = observations.variances(mesh.face_normals, row_sigma)
+    return _Observed(observations, shares, variances, voted, is_seen)
+
+
+def _outlines(
+    scene: RayScene,
+    fit: Fit,
+    edges: SharedEdges,
+    sharp: Mask,
+    *,
+    gate_px: float,
+    on_outline: bool,
+) -> list[OutlineRows | None]:
+    """Rows of the outline of each view; None for a view without one."""
+
+    def outline(view: SurfaceView) -> OutlineRows | None:
+        if not view.has_outline:
+            return None
+        return outline_rows(
+            scene.mesh,
+            scene,
+            view,
+            edges,
+            sharp,
+            fit.tol.terms,
+            gate_px=gate_px,
+            on_outline=on_outline,
+        )
+
+    # Threads, as products of large arrays and ray casting release Python's lock.
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        return list(pool.map(outline, fit.views))
+
+
+def _evidence_of_views(
+    mesh: TriangleMesh,
+    fit: Fit,
+    level: Level,
+    observed: _Observed,
+    outlines: Sequence[OutlineRows | None],
+    chosen: Sequence[int],
+) -> _Evidence:
+    """Equations of the phases and outlines of some views, by their indices."""
+    terms, observations = fit.tol.terms, observed.observations
+    face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
+    equations = Equations(len(mesh.vertices))
+    # The share is anywhere between a sensor of the angle model and a tilted polarizer, and is as
+    # uncertain as other errors that the rows share.
+    tilt = SharedError(
+        len(mesh.vertices),
+        prior=terms.phase_correlation(face_area_px),
+        expected=-fit.looking.tilt_share,
+    )
+    kept = np.isin(observations.view, chosen)
+    add_phases(
+        equations,
+        tilt,
+        mesh,
+        observations if kept.all() else observations.only(kept),
+        observed.shares[:, kept],
+        observed.variances[:, kept],
+        independent_area=fit.independent_area(level),
+        loss_scale=level.loss_scale,
+    )
+    own = [rows for rows in (outlines[index] for index in chosen) if rows is not None]
+    slope = add_outlines(equations, own, terms, face_area_px=face_area_px, gate_px=level.gate_px)
+    return _Evidence(equations, slope, tilt)
+
+
 def linearize(
     scene: RayScene,
     fit: Fit,
@@ -504,98 +633,58 @@ def linearize(
         position of parts that no outline bounds (the floor of a dish, waves).
     sides : of a sharpened mesh, whose exact outline is then compared with the silhouettes.
     """
-    views, tol = fit.views, fit.tol
-    terms, mesh = tol.terms, scene.mesh
+    terms, mesh = fit.tol.terms, scene.mesh
     edges = shared_edges(mesh)
     pairs = edges.faces[:, 0], edges.faces[:, 1]
-    observations = observe(
-        mesh,
-        scene,
-        views,
-        fit.images,
-        fit.looking,
-        gsd=fit.gsd if with_slope else None,
-    )
-    is_seen = np.zeros(len(mesh.faces), np.bool_)
-    is_seen[observations.face] = True
-    sharp = np.zeros(len(mesh.vertices), np.bool_)
+    sharp, used = np.zeros(len(mesh.vertices), np.bool_), None
     if sides is not None:
         edges = edges.only(np.all(sides.is_shown[edges.faces], axis=1))
         sharp = crease_vertices(mesh, sides.is_shown)
         # Edges move to where their sides intersect: the faces there do not constrain the sides.
         used = sides.is_fitted & ~np.any(sharp[mesh.faces], axis=1)
-        observations = observations.only(used[observations.face])
-    row_sigma = fit.scales.of(observations)
-    voted = Vote(mesh.face_normals, np.zeros(len(mesh.faces), np.bool_))
-    if with_vote:
-        voted = vote(mesh, observations, pairs, row_sigma=row_sigma, tolerances=tol.labels)
-    shares = responsibilities(
-        observations,
-        voted.normals,
+    observed = _observed(
+        scene,
+        fit,
+        pairs,
+        used,
         normal_sigma=normal_sigma,
-        row_sigma=row_sigma,
-        pairs=pairs,
-        weights=fit.light_weights,
-        tolerances=tol.labels,
+        with_vote=with_vote,
+        with_slope=with_slope,
     )
-    variances = observations.variances(mesh.face_normals, row_sigma)
-    face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
-    independent_area = terms.independent_px * level.width_px**2 * fit.gsd**2
-
-    def outline(view: SurfaceView) -> OutlineRows | None:
-        if not view.has_outline:
-            return None
-        return outline_rows(
-            mesh,
-            scene,
-            view,
-            edges,
-            sharp,
-            terms,
-            gate_px=level.gate_px,
-            on_outline=sides is not None,
-        )
-
-    # Threads, as products of large arrays and ray casting release Python's lock.
-    with ThreadPoolExecutor(default_num_workers()) as pool:
-        outlines = list(pool.map(outline, views))
-
-    def of_views(chosen: Sequence[int]) -> _Evidence:
-        equations = Equations(len(mesh.vertices))
-        # The share is anywhere between a sensor of the angle model and a tilted polarizer, and is
-        # as uncertain as other errors that the rows share.
-        tilt = SharedError(
-            len(mesh.vertices),
-            prior=terms.phase_correlation(face_area_px),
-            expected=-fit.looking.tilt_share,
-        )
-        kept = np.isin(observations.view, chosen)
-        add_phases(
-            equations,
-            tilt,
-            mesh,
-            observations if kept.all() else observations.only(kept),
-            shares[:, kept],
-            variances[:, kept],
-            independent_area=independent_area,
-            loss_scale=level.loss_scale,
-        )
-        own = [rows for rows in (outlines[index] for index in chosen) if rows is not None]
-        slope = add_outlines(
-            equations, own, terms, face_area_px=face_area_px, gate_px=level.gate_px
-        )
-        return _Evidence(equations, slope, tilt)
-
-    everything = of_views(range(len(views)))
-    if voted.has_won.any():
+    outlines = _outlines(
+        scene, fit, edges, sharp, gate_px=level.gate_px, on_outline=sides is not None
+    )
+    of_views = partial(_evidence_of_views, mesh, fit, level, observed, outlines)
+    everything = of_views(range(len(fit.views)))
+    if observed.voted.has_won.any():
         add_votes(
             everything.equations,
             mesh,
-            voted.normals,
-            voted.has_won,
+            observed.voted.normals,
+            observed.voted.has_won,
             sigma=terms.vote_sigma,
-            independent_area=independent_area,
+            independent_area=fit.independent_area(level),
         )
+    smooth, pull, factor = smoothness(mesh, edge, terms, sharp)
+    free = np.zeros(len(mesh.vertices), np.bool_)
+    free[mesh.faces[observed.is_seen]] = True
+    shares = observed.shares
+    return Energy(
+        views=everything,
+        of_views=of_views,
+        points=_of_points(mesh, fit, observed.is_seen, gate_px=level.gate_px),
+        smooth=smooth,
+        pull=pull,
+        smooth_factor=factor,
+        free=free,
+        sharp=sharp,
+        light=shares.mean(axis=1) if shares.size else np.zeros(2),
+        shown_scales=partial(_shown_scales, observed.observations, mesh.face_normals, shares, fit),
+    )
+
+
+def _of_points(mesh: TriangleMesh, fit: Fit, is_seen: Mask, *, gate_px: float) -> Equations:
+    """Equations of the known points, which the seen (F,) faces are pulled to."""
     points = Equations(len(mesh.vertices))
     if fit.known is not None and len(fit.known.points) and is_seen.any():
         add_points(
@@ -603,27 +692,13 @@ def linearize(
             mesh,
             is_seen,
             fit.known,
-            terms,
-            num_views=len(views),
+            fit.tol.terms,
+            num_views=len(fit.views),
             gsd=fit.gsd,
-            face_area_px=face_area_px,
-            gate_px=level.gate_px,
+            face_area_px=float(mesh.face_areas.mean()) / fit.gsd**2,
+            gate_px=gate_px,
         )
-    smooth, pull, factor = smoothness(mesh, edge, terms, sharp)
-    free = np.zeros(len(mesh.vertices), np.bool_)
-    free[mesh.faces[is_seen]] = True
-    return Energy(
-        views=everything,
-        of_views=of_views,
-        points=points,
-        smooth=smooth,
-        pull=pull,
-        smooth_factor=factor,
-        free=free,
-        sharp=sharp,
-        light=shares.mean(axis=1) if shares.size else np.zeros(2),
-        shown_scales=partial(_shown_scales, observations, mesh.face_normals, shares, fit),
-    )
+    return points
 
 
 @dataclass(frozen=True)
