@@ -44,15 +44,17 @@ def demo_capture() -> Path:
 def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Output folder of ``polmvs demo``; tests that change it take a copy.
 
-    Of several processes of pytest-xdist one makes it, and each has a copy.
+    Of several processes of pytest-xdist one makes it, and each has a copy. So do several runs of
+    the tests that have the same path in the environment variable ``POLMVS_TEST_DEMO``.
     """
     out = tmp_path_factory.mktemp("demo") / "out"
-    if "PYTEST_XDIST_WORKER" not in os.environ:
+    given = os.environ.get("POLMVS_TEST_DEMO")
+    if given is None and "PYTEST_XDIST_WORKER" not in os.environ:
         make_demo_run(out)
         return out
     import fcntl
 
-    shared = tmp_path_factory.getbasetemp().parent / "demo"
+    shared = Path(given) if given else tmp_path_factory.getbasetemp().parent / "demo"
     with shared.with_suffix(".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not shared.with_suffix(".done").exists():

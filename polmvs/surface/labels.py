@@ -203,62 +203,111 @@ def vote(
     normals, num = mesh.face_normals, len(mesh.faces)
     helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
     first = unit(np.cross(helper, normals) + 1e-300)
-    second = np.cross(normals, first)
+    frames = np.stack([normals, first, np.cross(normals, first)], axis=1)
+    tilts, candidates = _candidates(tol)
+    ones = np.ones(len(pairs[0]), np.float32)
+    shared = sparse.coo_array((ones, pairs), shape=(num, num))
+    shared = sparse.csr_array(shared + shared.T + sparse.eye_array(num, dtype=np.float32))
+    voters = _Voters.of(o, frames, row_sigma, tol)
+
+    def over_rings(sums: NDArray[np.float32]) -> NDArray[np.float32]:
+        for _ in range(tol.vote_rings):
+            sums = shared @ sums
+        return sums
+
+    count = over_rings(np.bincount(o.face, minlength=num).astype(np.float32)[:, None])
+    count = np.maximum(count, 1e-6)
+    own = over_rings(voters.costs(candidates[:1], num, tol)) / count
+    # Costs are not negative: nothing wins where the mesh's own normal costs less than the margin.
+    doubted = own[:, 0] > tol.vote_margin
+    near = over_rings(doubted.astype(np.float32)) > 0
+    others = over_rings(voters.only(near[o.face]).costs(candidates[1:], num, tol)) / count
+    others += np.float32(tol.vote_prior) * np.square(tilts[1:])
+    best = 1 + others.argmin(axis=1)
+    has_won = doubted & (own[:, 0] - others.min(axis=1) > tol.vote_margin)
+    winner = np.einsum("fa,fai->fi", candidates[best].astype(np.float64), frames)
+    return Vote(np.where(has_won[:, None], winner, normals), has_won)
+
+
+def _candidates(tol: LabelTolerances) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Tilts (C,), rad, and unit vectors (C, 3) of the candidates in a face's frame.
+
+    The first is the face's own normal.
+    """
     tilts, turns = [0.0], [0.0]
     for ring, tilt in enumerate(tol.vote_tilts):
         tilts += 10 * [tilt]
         turns += list(2 * np.pi * (np.arange(10) + 0.3 * ring) / 10)
-    candidates = np.stack(
-        [np.cos(tilts), np.sin(tilts) * np.cos(turns), np.sin(tilts) * np.sin(turns)], axis=1
-    ).astype(np.float32)
-    axes = np.stack([normals, first, second], axis=1)[o.face].astype(np.float32)
-    local = {
-        SPECULAR: np.einsum("kai,ki->ka", axes, o.rows[SPECULAR].astype(np.float32)),
-        DIFFUSE: np.einsum("kai,ki->ka", axes, o.rows[DIFFUSE].astype(np.float32)),
-    }
-    towards = np.einsum("kai,ki->ka", axes, -o.rays.astype(np.float32))
-    turn = np.minimum(o.turn_variance, 1e6).astype(np.float32)
-    base = np.broadcast_to(np.square(row_sigma, dtype=np.float32), turn.shape)
-    angles = np.linspace(0, 1.5, 256)
-    table = fresnel_dolp(np.cos(angles), Light.DIFFUSE, tol.refractive_index) + 0.01
-    ones = np.ones(len(pairs[0]), np.float32)
-    shared = sparse.coo_array((ones, pairs), shape=(num, num))
-    shared = sparse.csr_array(shared + shared.T + sparse.eye_array(num, dtype=np.float32))
-    count = np.bincount(o.face, minlength=num).astype(np.float32)[:, None]
-    for _ in range(tol.vote_rings):
-        count = shared @ count
+    vectors = [np.cos(tilts), np.sin(tilts) * np.cos(turns), np.sin(tilts) * np.sin(turns)]
+    return np.array(tilts, np.float32), np.stack(vectors, axis=1).astype(np.float32)
 
-    def costs(candidates: Floats, chosen: Indices) -> NDArray[np.float32]:
-        """Sums (F, C) over the ``chosen`` observations of faces."""
+
+@dataclass(frozen=True)
+class _Voters:
+    """Observations of a vote, in the frames of their faces; float32.
+
+    Attributes
+    ----------
+    face : (K,) of each.
+    rows : (2, K, 3), for both kinds of light.
+    towards : (K, 3), direction to the camera.
+    turn_variance, base_variance : (2, K) of the row's angle about the ray, and of ``m . n`` beyond
+        noise.
+    dolp, sigma_dolp : (K,)
+    """
+
+    face: Indices
+    rows: Floats
+    towards: Floats
+    turn_variance: Floats
+    base_variance: Floats
+    dolp: Floats
+    sigma_dolp: Floats
+
+    @classmethod
+    def of(
+        cls, observations: Observations, frames: Array, row_sigma: Floats, tol: LabelTolerances
+    ) -> _Voters:
+        """The voters of observations of a mesh whose faces have these frames (F, 3, 3)."""
+        o = observations
+        axes = frames[o.face].astype(np.float32)
+        turn = np.minimum(o.turn_variance, 1e6).astype(np.float32)
+        return cls(
+            face=o.face,
+            rows=np.stack([np.einsum("kai,ki->ka", axes, rows) for rows in o.rows]),
+            towards=np.einsum("kai,ki->ka", axes, -o.rays),
+            turn_variance=turn + np.float32(tol.vote_sigma**2),
+            base_variance=np.broadcast_to(np.square(row_sigma, dtype=np.float32), turn.shape),
+            dolp=o.dolp,
+            sigma_dolp=o.sigma_dolp,
+        )
+
+    def only(self, kept: Mask) -> _Voters:
+        """The ``kept`` (K,) voters."""
+        return _Voters(
+            face=self.face[kept],
+            rows=self.rows[:, kept],
+            towards=self.towards[kept],
+            turn_variance=self.turn_variance[:, kept],
+            base_variance=self.base_variance[:, kept],
+            dolp=self.dolp[kept],
+            sigma_dolp=self.sigma_dolp[kept],
+        )
+
+    def costs(self, candidates: Floats, num: int, tol: LabelTolerances) -> NDArray[np.float32]:
+        """Sums (num, C) over the observations of each face, of the costs of candidates (C, 3)."""
+        angles = np.linspace(0, 1.5, 256)
+        table = fresnel_dolp(np.cos(angles), Light.DIFFUSE, tol.refractive_index) + 0.01
         found = np.zeros((num, len(candidates)), np.float32)
-        face, dolp, sigma = o.face[chosen], o.dolp[chosen], o.sigma_dolp[chosen]
-        towards_here, turn_here, base_here = towards[chosen], turn[:, chosen], base[:, chosen]
-        specular_here, diffuse_here = local[SPECULAR][chosen], local[DIFFUSE][chosen]
         for index, candidate in enumerate(candidates):
-            cosine = towards_here @ candidate
+            cosine = self.towards @ candidate
             sine2 = 1 - np.clip(cosine, 0.02, 1) ** 2
             angle = np.minimum(np.arccos(np.clip(cosine, 0.02, 1)) + tol.angle_margin, 1.5)
-            bound = table[(angle * (255 / 1.5)).astype(np.int64)] + 2 * sigma
-            variance = base_here + sine2 * (turn_here + np.float32(tol.vote_sigma**2))
-            specular = (specular_here @ candidate) ** 2 / variance[SPECULAR]
-            diffuse = (diffuse_here @ candidate) ** 2 / variance[DIFFUSE]
-            diffuse = np.where(dolp > 1.3 * bound, tol.max_cost, diffuse)
-            best = np.minimum(np.minimum(specular, diffuse), tol.max_cost)
-            found[:, index] = np.bincount(face, np.where(cosine < 0.05, tol.max_cost, best), num)
-        for _ in range(tol.vote_rings):
-            found = shared @ found
-        return np.asarray(found / np.maximum(count, 1e-6), np.float32)
-
-    own = costs(candidates[:1], np.arange(len(o.face)))
-    # Costs are not negative: nothing wins where the mesh's own normal costs less than the margin.
-    doubted = near = own[:, 0] > tol.vote_margin
-    for _ in range(tol.vote_rings):
-        near = np.asarray(shared @ near.astype(np.float32)) > 0
-    chosen = np.flatnonzero(near[o.face])
-    prior = tol.vote_prior * np.square(tilts[1:], dtype=np.float32)
-    others = costs(candidates[1:], chosen) + prior
-    best = 1 + others.argmin(axis=1)
-    has_won = doubted & (own[:, 0] - others.min(axis=1) > tol.vote_margin)
-    winning = candidates[best].astype(np.float64)
-    winner = winning[:, :1] * normals + winning[:, 1:2] * first + winning[:, 2:] * second
-    return Vote(np.where(has_won[:, None], winner, normals), has_won)
+            bound = table[(angle * (255 / 1.5)).astype(np.int64)] + 2 * self.sigma_dolp
+            variance = self.base_variance + sine2 * self.turn_variance
+            specular, diffuse = (self.rows @ candidate) ** 2 / variance
+            is_diffuse = self.dolp <= 1.3 * bound
+            best = np.where(is_diffuse, np.minimum(specular, diffuse), specular)
+            best = np.where(cosine < 0.05, tol.max_cost, np.minimum(best, tol.max_cost))
+            found[:, index] = np.bincount(self.face, best, num)
+        return found

@@ -687,15 +687,15 @@ def _of_points(mesh: TriangleMesh, fit: Fit, is_seen: Mask, *, gate_px: float) -
     """Equations of the known points, which the seen (F,) faces are pulled to."""
     points = Equations(len(mesh.vertices))
     if fit.known is not None and len(fit.known.points) and is_seen.any():
+        face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
         add_points(
             points,
             mesh,
             is_seen,
             fit.known,
             fit.tol.terms,
-            num_views=len(fit.views),
+            weight=fit.tol.terms.point_weight(len(fit.views), face_area_px),
             gsd=fit.gsd,
-            face_area_px=float(mesh.face_areas.mean()) / fit.gsd**2,
             gate_px=gate_px,
         )
     return points

@@ -575,12 +575,14 @@ def add_points(
     known: KnownPoints,
     tol: TermTolerances,
     *,
-    num_views: int,
+    weight: float,
     gsd: float,
-    face_area_px: float,
     gate_px: float,
 ) -> None:
-    """Pull the ``seen`` (F,) faces, not those behind them, to nearby known points."""
+    """Pull the ``seen`` (F,) faces, not those behind them, to nearby known points.
+
+    ``weight`` is that of a point (:meth:`TermTolerances.point_weight`).
+    """
     visible = TriangleMesh(mesh.vertices, mesh.faces[seen])
     place, face, barycentric = RayScene(visible).closest(known.points)
     face = np.flatnonzero(seen)[face]
@@ -592,8 +594,7 @@ def add_points(
     along = dots(mesh.vertex_normals[mesh.faces[face]], normals[near][:, None])
     jacobian = barycentric[near] * along
     scale = np.maximum(4 * sigma, 0.1 * gate_px * gsd) ** 2
-    weights = geman_mcclure_weights(residual, scale) / sigma**2
-    weights *= tol.point_weight(num_views, face_area_px)
+    weights = weight * geman_mcclure_weights(residual, scale) / sigma**2
     equations.add(mesh.faces[face], jacobian, residual, weights)
 
 
