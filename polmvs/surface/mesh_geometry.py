@@ -473,46 +473,8 @@ def remeshed(
     shape = tuple(
         int(n) for n in np.ceil((np.ptp(mesh.vertices, axis=0)) / step) + 2 * BAND_CELLS + 3
     )
-    band = np.zeros(shape, np.bool_)
-    num = int(np.ceil(1 + 2 * mesh.mean_edge / step))
-    for weights in _simplex_lattice(num):
-        place = np.rint((np.tensordot(weights, mesh.corners, (0, 1)) - origin) / step)
-        band[tuple(place.astype(np.int64).T)] = True
-    band = ndimage.binary_dilation(band, iterations=BAND_CELLS)
     limit = np.float32(BAND_CELLS * step)
-    values = np.full(shape, np.nan, np.float32)
-    values[band] = scene.distance(origin + step * np.argwhere(band))
-    # One ray decides for a whole line of the grid. It runs beside the line, on which vertices may
-    # lie.
-    lines = np.argwhere(band.any(axis=2))
-    starts = np.column_stack([lines + LINE_OFFSET, np.zeros(len(lines))])
-    is_inside = np.zeros(shape, np.bool_)
-    is_inside[tuple(lines.T)] = scene.inside_along(
-        origin + step * starts,
-        np.array([0.0, 0.0, 1.0]),
-        step * np.arange(shape[2], dtype=np.float64),
-    ).T
-    values[is_inside] *= -1
-    # The sign cannot change between neighbours that are farther from the mesh than from each other.
-    doubtful = np.zeros(shape, np.bool_)
-    for axis in range(3):
-        first, second = (np.moveaxis(values, axis, 0)[part] for part in (slice(-1), slice(1, None)))
-        apart = np.minimum(np.abs(first), np.abs(second)) > 1.01 * step
-        jumps = (first * second < 0) & apart
-        for part in (slice(-1), slice(1, None)):
-            np.moveaxis(doubtful, axis, 0)[part] |= jumps
-    if doubtful.any():
-        values[doubtful] = scene.signed_distance(origin + step * np.argwhere(doubtful))
-    values[band] = np.clip(values[band], -limit, limit)
-    values[~band] = limit
-    pieces, num_pieces = ndimage.label(~band)
-    # Outside of the band a piece has the sign of the adjacent band.
-    if num_pieces > 1:
-        beside = ndimage.grey_dilation(np.where(band, 0, pieces), size=(3, 3, 3))
-        touching = band & (beside > 0)
-        negative = np.bincount(beside[touching], values[touching] < 0, num_pieces + 1)
-        total = np.bincount(beside[touching], minlength=num_pieces + 1)
-        values[(negative > 0.5 * total)[pieces] & (pieces > 0)] = -limit
+    values = _signed_distances(scene, origin, step, shape)
     if smoothing > 0:
         values = ndimage.gaussian_filter(values, smoothing)
     if solid:
@@ -530,6 +492,66 @@ def remeshed(
             values[inner] = np.maximum(values[inner], np.minimum(function(points), limit))
     _drop_small(values, min_cells, limit)
     return relaxed(mesh_from_grid(values, origin, step))
+
+
+def _signed_distances(
+    scene: RayScene, origin: Array, step: float, shape: tuple[int, ...]
+) -> NDArray[np.float32]:
+    """Signed distance to a scene on a grid, clipped to ``BAND_CELLS`` steps, negative inside."""
+    band = _band_about(scene.mesh, origin, step, shape)
+    limit = np.float32(BAND_CELLS * step)
+    values = np.full(shape, np.nan, np.float32)
+    values[band] = scene.distance(origin + step * np.argwhere(band))
+    # One ray decides for a whole line of the grid. It runs beside the line, on which vertices may
+    # lie.
+    lines = np.argwhere(band.any(axis=2))
+    starts = np.column_stack([lines + LINE_OFFSET, np.zeros(len(lines))])
+    is_inside = np.zeros(shape, np.bool_)
+    is_inside[tuple(lines.T)] = scene.inside_along(
+        origin + step * starts,
+        np.array([0.0, 0.0, 1.0]),
+        step * np.arange(shape[2], dtype=np.float64),
+    ).T
+    values[is_inside] *= -1
+    doubtful = _impossible_signs(values, step)
+    if doubtful.any():
+        values[doubtful] = scene.signed_distance(origin + step * np.argwhere(doubtful))
+    values[band] = np.clip(values[band], -limit, limit)
+    values[~band] = limit
+    pieces, num_pieces = ndimage.label(~band)
+    # Outside of the band a piece has the sign of the adjacent band.
+    if num_pieces > 1:
+        beside = ndimage.grey_dilation(np.where(band, 0, pieces), size=(3, 3, 3))
+        touching = band & (beside > 0)
+        negative = np.bincount(beside[touching], values[touching] < 0, num_pieces + 1)
+        total = np.bincount(beside[touching], minlength=num_pieces + 1)
+        values[(negative > 0.5 * total)[pieces] & (pieces > 0)] = -limit
+    return values
+
+
+def _band_about(mesh: TriangleMesh, origin: Array, step: float, shape: tuple[int, ...]) -> Mask:
+    """Grid points within about ``BAND_CELLS`` steps of a mesh."""
+    band = np.zeros(shape, np.bool_)
+    num = int(np.ceil(1 + 2 * mesh.mean_edge / step))
+    for weights in _simplex_lattice(num):
+        place = np.rint((np.tensordot(weights, mesh.corners, (0, 1)) - origin) / step)
+        band[tuple(place.astype(np.int64).T)] = True
+    return np.asarray(ndimage.binary_dilation(band, iterations=BAND_CELLS))
+
+
+def _impossible_signs(values: NDArray[np.float32], step: float) -> Mask:
+    """Grid points whose sign differs from a neighbour's although both are too far from the mesh.
+
+    The sign cannot change between neighbours that are farther from the mesh than from each other.
+    """
+    doubtful = np.zeros(values.shape, np.bool_)
+    for axis in range(3):
+        first, second = (np.moveaxis(values, axis, 0)[part] for part in (slice(-1), slice(1, None)))
+        apart = np.minimum(np.abs(first), np.abs(second)) > 1.01 * step
+        jumps = (first * second < 0) & apart
+        for part in (slice(-1), slice(1, None)):
+            np.moveaxis(doubtful, axis, 0)[part] |= jumps
+    return doubtful
 
 
 def _drop_small(values: NDArray[np.float32], min_cells: int, outside: np.float32) -> None:
