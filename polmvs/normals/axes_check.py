@@ -1,9 +1,10 @@
 """Check of the angle convention of the polarization against the planes of incidence of many views.
 
-A wrong order of the polarizers that still pairs perpendicular ones, clockwise angles, or another
-zero direction mirrors all phases or turns them by 45 degrees. The sums of the samples and a single
-view do not show it. Many views do: with wrong angles their planes of incidence do not intersect in
-one normal. (A rotation by 90 degrees is equivalent to the other kind of light.)
+Three wrong settings mirror all phases or turn them by 45 degrees: an order of the polarizers that
+is wrong but still pairs perpendicular ones, clockwise angles, and another zero direction. Neither
+the sums of the samples nor a single view shows such an error. Many views do: with wrong angles, the
+planes of incidence of a point do not intersect in one normal. (A rotation by 90 degrees is
+equivalent to the other kind of light.)
 """
 
 from __future__ import annotations

@@ -8,10 +8,10 @@ no longer belong to one normal. For camera parameters ``c`` and normals ``n_p`` 
     sum over observations k of  rho((phase_k - phase(v_k(c), n_p)) / sigma_k)  +  prior of c
 
 with Gauss-Newton steps from which the normals are eliminated. Derivatives are taken at the
-predicted phase: at the measured one they would depend on its noise, which would favour long focal
-lengths. The check needs no matches, so it serves objects without texture as well. Its deviations
-have two parts: the jackknife over the views, as errors of light and pose are common to a view, and
-errors that all views share, such as blur, which the jackknife does not show.
+predicted phase. At the measured phase they would depend on its noise, which would favour long focal
+lengths. The check needs no matches, so it also works on objects without texture. The standard
+deviation of c has two parts: the jackknife over the views, because errors of light and pose are
+common to a view, and errors such as blur that all views share and the jackknife does not show.
 """
 
 from __future__ import annotations

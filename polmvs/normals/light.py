@@ -1,11 +1,11 @@
 """Specular or diffuse: the dominant kind of light in each connected part of a region.
 
-The phases of the two differ by 90 degrees, so the wrong choice turns every plane of incidence by 90
-degrees. One view does not show it. Three or more do, because wrong planes of incidence do not
-intersect in one normal. Every sparse point on a part votes with the likelihoods of its two best
-normals. Pixels of the part also vote: they are placed in the visual hull of the regions, at the
-depth that best explains their phases, for each kind of light. One view alone is unreliable, so all
-views that show a part decide. The DoLP votes where phases do not decide (specular light may be
+The phases of the two kinds differ by 90 degrees, so the wrong choice turns every plane of incidence
+by 90 degrees. One view does not show the error. Three or more do, because wrong planes of incidence
+do not intersect in one normal. Every sparse point on a part votes with the likelihoods of its two
+best normals. Pixels of the part also vote: they are placed in the visual hull of the regions, at
+the depth that best explains their phases, for each kind of light. One view alone is unreliable, so
+all views that show a part decide. The DoLP votes where phases do not decide (specular light may be
 fully polarized, diffuse light of a smooth dielectric hardly over 0.4).
 """
 

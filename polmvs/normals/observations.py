@@ -1,7 +1,7 @@
 """Observations of points in views: the planes of incidence under both kinds of light.
 
 Weakly polarized, bright and edge pixels are not excluded: each pixel of a window is weighted by the
-inverse variance of its phase, and each window by its own.
+inverse variance of its phase, and each window by the inverse variance of the mean.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 A camera that exposes each image anew, or a filter that is turned by hand, makes one image of a view
 brighter than another. This looks like strong polarization everywhere. Where the light is
-unpolarized, the ratios of the images are those of the gains, the same at all pixels. Polarized
-surfaces have all kinds of ratios. So the gains are the most frequent ratios.
+unpolarized, the ratios of the images are those of the gains, the same at all pixels. On polarized
+surfaces the ratios vary. So the most frequent ratios are those of the gains.
 
 Four or more angles separate a gain from uniformly polarized light: linear images fit three Stokes
 parameters, images of different gains do not.

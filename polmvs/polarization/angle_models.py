@@ -12,17 +12,17 @@ with the transverse coherency J, ``a = normalise(A - (A . v) v)`` for the ray v 
 which they enter the lens; for other lenses see below.
 
 The basis of a ray's transverse plane is the image's x and upward y, turned by the shortest
-rotation from the optical axis to the ray; in it J is three Stokes parameters ``S``. Projection on
-that plane shrinks the radial component of A by ``v_z``, so that with the doubled radial direction
-``(C, S)`` of the pixel, ``g = (1 - v_z^2) / (1 + v_z^2)`` and ``q = sqrt(1 - g^2)`` the sensor
-measures
+rotation from the optical axis to the ray. In this basis J has three Stokes parameters. Projection
+on the plane shrinks the radial component of A by ``v_z``. Let C, S be the cosine and sine of twice
+the angle of the pixel's radial direction, ``g = (1 - v_z^2) / (1 + v_z^2)`` and
+``q = sqrt(1 - g^2)``. Then the sensor measures
 
     (1 - g^2 C^2) s1 = q^2 C S1r - q S S2r,   (1 - g^2 S^2) s2 = q^2 S S1r + q C S2r
 
-with S1r, S2r relative to the radial direction. They give the direction e of polarization, a 3D
-vector perpendicular to the ray; the normal of the plane of incidence is e for specular light,
-``v x e`` for diffuse light. The *corrected* Stokes parameters are those of a sensor that obeys
-PPA, so that all later steps are those of PPA:
+with the Stokes parameters S1r, S2r relative to the radial direction. They give the direction e of
+polarization, a 3D vector perpendicular to the ray; the normal of the plane of incidence is e for
+specular light, ``v x e`` for diffuse light. The *corrected* Stokes parameters are those of a sensor
+that obeys PPA, so that all later steps are those of PPA:
 
 - specular: the plane of incidence cuts the image plane perpendicular to the orthogonal projection
   of e, ``(e_x, e_y)``, so AoLP' is the direction of that projection;
@@ -40,11 +40,12 @@ Telecentric lenses
 ------------------
 A lens that is telecentric on the image side turns each ray, and the field with it, in the plane
 of ray and axis until it meets the sensor perpendicularly. The polarizers are then not tilted, and
-the sensor measures the Stokes parameters ``S`` of the ray's transverse plane. PPA is not exact here
+the sensor measures the Stokes parameters of the ray's transverse plane. PPA is not exact here
 either: it assumes the projections above. Its phase is off by up to ``arcsin((1 - v_z) / (1 +
-v_z))``, 4.1 degrees at 30 degrees off the axis, about as much as behind tilted polarizers, because
-tilt changes ``S`` only to second order in g. For the same reason the tilted model is nearly right
-behind such a lens: it is off by up to 0.2 degrees at 30 and 1.2 degrees at 45 degrees off the axis.
+v_z))``, 4.1 degrees at 30 degrees off the axis. This is about as much as behind tilted polarizers,
+because tilt changes these parameters only to second order in g. For the same reason the tilted
+model is nearly right behind such a lens: it is off by up to 0.2 degrees at 30 and 1.2 degrees at 45
+degrees off the axis.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Full scale, clipping and step of samples, decided from all files of a capture.
+"""Full scale, clipping and quantization step of samples, decided from all files of a capture.
 
 Cameras write 10, 12 and 14 bits into 16, at the lower end (right-aligned), at the upper end, or
 scaled. No file says which. The samples of a whole capture show it:
 
 - the *low bits* are zero in every sample of data shifted to the left;
 - the *gaps* between occupied levels are 16 or 17 if 12 bits were scaled to 16;
-- a *pile* of samples at the highest level: the sensor clips there. At the largest value of a bit
-  depth it decides that depth; elsewhere only the level of clipping.
+- a *pile* of samples at the highest level shows that the sensor clips there. If this level is the
+  largest value of a bit depth, it decides the depth; otherwise it gives only the clipping level.
 
 Without a pile nothing is clipped, and the depth matters only as the unit of the darkness
 threshold. It is 12 bits if they suffice (no polarization sensor has fewer in a 16-bit format by

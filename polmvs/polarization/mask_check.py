@@ -1,8 +1,8 @@
 """Check that a user's mask ends where the polarized surface ends, not within it.
 
-A mask of only the top of a part excludes its sides, which are also polarized. The surface of all
-views is closed, so its sides appear where the masks exclude them. It then bends and frays along the
-edge of the top.
+A mask of only the top of a part excludes the sides, which are also polarized. The surface of all
+views is closed, so it has sides, where the masks allow none. It then bends and frays along the edge
+of the top.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Whether the order of the polarizers in a mosaic's cell fits its samples.
+"""Check that the order of the polarizers in a mosaic's cell fits its samples.
 
 Intensities behind perpendicular polarizers sum to the whole intensity, so ``I0 + I90 = I45 + I135``
 for any light. There are three ways to divide the four samples of a cell into two pairs. Where light
-is polarized, the sums agree only for the correct one. That leaves 8 of the 24 orders. The eight are
-turned and mirrored images of each other. One image cannot distinguish them: their angles of
+is polarized, the sums agree only for the correct pairs. Of the 24 orders, 8 have these pairs; they
+are turned and mirrored versions of each other. One image cannot distinguish them: their angles of
 polarization differ, their sums do not.
 """
 

@@ -3,14 +3,15 @@
 Noise
 -----
 The four intensities are redundant: ``r = I0 + I90 - I45 - I135`` is zero except for noise and for
-what the four filters see differently. All four are interpolated with the same weights, so
-``var(r) = var(s1) + var(s2)``; with a variance linear in the intensity (read and quantisation
-noise, and photons) the two are equal: ``var(s1) = var(s2) = a + b s0 = var(r) / 2``, the noise
-reduction of the interpolation included. ``a`` and ``b`` are estimated from the image:
+differences between the scene points of the four samples. All four are interpolated with the same
+weights, so ``var(r) = var(s1) + var(s2)``; with a variance linear in the intensity (read and
+quantisation noise, and photons) the two are equal: ``var(s1) = var(s2) = a + b s0 = var(r) / 2``,
+the noise reduction of the interpolation included. ``a`` and ``b`` are estimated from the image:
 
-1. the variance of r within patches, of which the low quantile of each intensity class is kept
-   (smooth patches; texture only adds),
-2. the highest line ``a + b s0``, ``a, b >= 0``, under all classes (a textured class only adds).
+1. take the variance of r within patches, and of each intensity class a low quantile of it (smooth
+   patches: texture only adds variance),
+2. take the highest line ``a + b s0``, ``a, b >= 0``, below the values of all classes (texture only
+   adds variance).
 
 Where r exceeds this noise (edges, texture finer than a cell), s1 and s2 have errors of the same
 size, and sigma grows with the local mean of ``r^2 / 2``. Measured on ``board`` against
@@ -23,11 +24,11 @@ the same way. Three images, or Stokes images made elsewhere, leave none; their n
 from second differences of pixels two apart: neighbours that were interpolated from a mosaic share
 samples, and differ by only 0.36 of the variance.
 
-Images that are not from a mosaic may agree at an edge and still mix the light of its two sides, or
-come from a mosaic that did. There sigma grows with the component of the second differences that is
-perpendicular to ``(s1, s2)``: a mere change of brightness turns no phase. With this, a capture has
-the same weights in every format (`tests/compare_formats.py`); without it, OPA's Chamfer distance on
-the demo differs by 5 to 13 %.
+Images that are not from a mosaic may have ``r = 0`` at an edge and still mix the light of its two
+sides, as may images that were interpolated from a mosaic. There sigma grows with the component of
+the second differences that is perpendicular to ``(s1, s2)``, because a mere change of brightness
+does not turn the phase. With this, a capture has the same weights in every format
+(`tests/compare_formats.py`); without it, OPA's Chamfer distance on the demo differs by 5 to 13 %.
 
 Gains
 -----

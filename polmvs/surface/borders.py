@@ -1,9 +1,9 @@
 """Borders of regions on a grid, as closed curves that are fitted to intensity edges across them.
 
-Labels end at whole cells, and by chance where nothing shows a border. A curve can lie between
-cells. It moves to the edges that are found on lines across it, and is elsewhere as straight as
-these allow: its penalty is the sum of its turning angles. That sum is the same for all convex
-curves, so neither a corner nor a round border shrinks.
+A labelled region ends at whole cells, and at a random place where no edge shows its border. A curve
+can lie between cells. It is fitted to the intensity edges found on lines across it. Elsewhere it is
+as straight as these edges allow: its penalty is the sum of its turning angles. That sum is the same
+for all convex closed curves, so neither a corner nor a round border shrinks.
 """
 
 from __future__ import annotations

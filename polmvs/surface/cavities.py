@@ -1,14 +1,14 @@
 """Cavities that reflect only themselves, such as the inside of a mug.
 
 The opening of a vessel is dark: light from inside has been reflected several times, and its phase
-gives no normal. Silhouettes close the opening with a cap, which no phase supports. Around it is a
-ring that the phases do support: the top of the wall, the vessel's rim, flat or rounded. It gives
-the plane of the opening. The rim's lines in the views coincide at the right offset of this plane;
-the inner line of a flat rim is the border of the opening. The width of the rim is the thickness of
-the wall. If it is the same all around, a wall of that thickness is inferred to continue below, so
-that the inside follows the outside. This is an inference, not a measurement: each cavity has its
-thickness and the thickness's variation, and points on its walls should be labelled as inferred. If
-the rim's width varies, nothing is inferred.
+gives no normal. Silhouettes close the opening with a cap, which no phase supports. The rim around
+the cap, flat or rounded, is the top of the wall; phases support it, and it gives the plane of the
+opening. At the right offset of this plane, the lines of the rim in all views coincide. The inner
+line of a flat rim is the border of the opening. The width of the rim is the thickness of the wall.
+If the width is the same all around, the wall is inferred to continue below with that thickness, so
+that the inside follows the outside. This is an inference, not a measurement: a cavity states its
+thickness and how much it varies, and points on its walls should be labelled as inferred. If the
+width of the rim varies, nothing is inferred.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Sharp edges of a mesh from the normals of its faces.
 
 A mesh whose triangles do not follow an edge of the object rounds it over the width of a triangle.
-The normals of the phases belong to one side or the other up to a few pixels from the edge. Smoothed
-only over faces with similar normals, they separate the sides. Vertices then move until all faces
-about them have these normals, which puts them on the edge.
+The normals from the phases belong to one side or the other up to a few pixels from the edge.
+Smoothing them only over faces with similar normals separates the sides. Vertices then move until
+all faces around them have the smoothed normals; this puts the vertices on the edge.
 
 Sun et al., Fast and effective feature-preserving mesh denoising, TVCG 2007.
 """

@@ -1,13 +1,14 @@
 """Bias of outlines that are found by brightness.
 
-At grazing incidence a smooth surface mirrors what lies directly behind it. Of the light of a pixel
-the share
+At grazing incidence a smooth surface mirrors the background directly behind it. The share of a
+pixel's light that differs from the background is
 
     a = (1 - F(theta)) * coverage,     sin(theta) = 1 - d / r
 
-differs from the background: F is the reflectance of Fresnel, d the distance from the outline, r the
-radius of curvature of the surface along the line of sight. It falls to 0 at the outline, for any
-colour of the surface and the background. So the outline seems to lie within the true one.
+with the Fresnel reflectance F, the distance d from the outline, the radius of curvature r of the
+surface along the line of sight, and coverage 1 on the object and 0 beside it. The share falls to 0
+at the outline, for any colour of surface and background. So the detected outline lies within the
+true one.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Integration: range and normal of every pixel of a polarized region, coarse to fine.
 
-Each view's lattice is one sparse least-squares problem for the logarithm of its ranges. Normals
-from the phases of all views give its change from pixel to pixel, seeds give its value, and the
-surfaces of the other views in the previous round tie the views to one surface. At a grazing angle a
-small error of the normals is a large error of the ranges; other views see the same point better.
-Views depend on each other only through the previous round.
+The log-ranges of a view's lattice solve one sparse least-squares problem. Normals from the phases
+of all views give the change of the log-range from pixel to pixel, and seeds give its value. The
+surfaces of the other views in the previous round tie all views to one surface: at a grazing angle a
+small error of the normals is a large error of the ranges, but other views see the same point
+better. Views depend on each other only through the previous round.
 
 Normals need the nodes' positions in the other views, and ranges come from the normals, so the two
 alternate (:func:`relax`). Normals depend weakly on the positions, so few rounds suffice. Contour

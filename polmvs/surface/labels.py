@@ -5,15 +5,16 @@ of light. Its likelihood is the mixture
 
     p = w_s N(r_s; 0, v) + w_d f(dolp, theta) N(r_d; 0, v) + w_o U,
 
-Here v is the variance of the row plus the assumed error of the current normal, which shrinks from
-iteration to iteration. The factor f falls where the degree of polarization exceeds that of diffuse
-light at this angle (Fresnel, for the largest refractive index of dielectrics). Labels of
-neighbouring faces in one view are equal unless the polarization between them turns by a right
-angle, which takes it through zero: a mean field (Ising) couples them by the cosine of the angle
-between their axial vectors.
+where the w are prior shares, U is a constant density, and v is the variance of the row plus the
+assumed error of the current normal, which shrinks from iteration to iteration. The factor f falls
+where the degree of polarization exceeds that of diffuse light at this angle (Fresnel, for the
+largest refractive index of dielectrics). Neighbouring faces in one view have the same label unless
+the polarization turns by a right angle between them; there its degree passes through zero. A mean
+field (Ising) therefore couples the labels by the cosine of the angle between the axial vectors of
+the faces.
 
-A normal that all observations around a face contradict cannot give labels: :func:`vote` tries
-normals about it with both labels open.
+A normal that all observations around a face contradict cannot give labels. There :func:`vote` tries
+other normals near it, each with either label.
 """
 
 from __future__ import annotations

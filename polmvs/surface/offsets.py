@@ -1,14 +1,14 @@
-"""Planar patches whose offset silhouettes and phases do not show: height steps, lids, recesses.
+"""Planar patches with an offset that no silhouette or phase shows: height steps, lids, recesses.
 
 In this module a *face* is a planar patch. Phases give normals, which are the same on parallel
-patches, and a silhouette does not show what lies below its outline. Sparse points do: points that
-share a plane, and whose phases have its normal, show a patch and its offset. Its extent is found on
-a grid in its own plane. At the right offset, its border and its marks have the same position in all
-views, and lines on other patches do not: a line that several views show at the same position is a
-border. The points of each patch then claim the cells that they reach without crossing such a line
-(a random walker, Grady 2006) and that their phases do not contradict. Space above a claimed cell is
-free: its signed distance carves the first surface. Smoothness does not round the walls that this
-leaves between the patches.
+patches, and a silhouette does not show a surface inside its outline. Sparse points do: points that
+share a plane, and whose phases agree with its normal, show a patch and its offset. The extent of a
+patch is found on a grid in its plane. At the right offset, the border and the marks of the patch
+have the same grid position in all views; lines on other patches do not. So a line that several
+views show at the same position is a border. The points of each patch then claim the cells that they
+reach without crossing such a line (a random walker, Grady 2006), unless phases contradict. Space
+above a claimed cell is free: its signed distance carves the first surface. Smoothness does not
+round the walls that the carving leaves between the patches.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Silhouettes of the polarized objects: each pixel of each view is on, off or unknown.
 
-The polarized region of a view is on the objects. Where they are dark, frontal or show mixed light
-they are hardly polarized, and the region ends too early. Pixels that continue it and look more like
-it than like the surroundings (a graph cut on intensity) are unknown. So are hardly polarized parts
-of the region that reach the image's border. Views check one another: a claim or denial by only one
-view is also unknown.
+The polarized region of a view is on the objects. Where an object is dark, frontal or shows mixed
+light, it is hardly polarized, and the region ends too early. Pixels next to the region that look
+more like the region than like the surroundings (a graph cut on intensity) are unknown. So are
+hardly polarized parts of the region that reach the image's border. Views check one another: pixels
+that only one view claims or denies are also unknown.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Check of a mesh for double layers and self-intersections.
 
-Both come from views that contradict each other: each view has its own sheet. A ray from a camera
-enters and leaves a valid solid in turn, at some distance.
+Both come from views that contradict each other: each view has its own sheet. In a valid solid the
+crossings of a camera ray alternate between entering and leaving, and are some distance apart.
 """
 
 from __future__ import annotations

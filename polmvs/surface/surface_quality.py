@@ -1,8 +1,8 @@
 """Support of a surface: evidence for its faces, and their normals with uncertainty.
 
-A part of the mesh is not a result if fewer than two views see it, their silhouettes deny it, most
-of their phases contradict it, or neither phases nor outlines nor points determine it: it comes only
-from smoothness or the limits of the hull.
+A part of the mesh is discarded if fewer than two views see it, if silhouettes deny it, if most of
+its phases contradict it, or if neither phases nor outlines nor points determine it. Such an
+undetermined part comes only from smoothness or the visual hull.
 """
 
 from __future__ import annotations

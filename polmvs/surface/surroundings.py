@@ -1,13 +1,13 @@
 """Surroundings of the polarized parts: sparse points, and stereo of textured surfaces.
 
 The surroundings are textured and unpolarized, so features and patches match there. On the parts
-they do not: a glossy surface shows mirror images, which make good sparse points behind it. The
-region of the parts in each view is known, and points in it are left out.
+they do not: a glossy surface shows mirror images, which give consistent sparse points behind it.
+The region of the parts in each view is known, and points in it are left out.
 
 Stereo is OpenCV's semi-global matching on rectified pairs of views. Any camera model is rectified
-through its rays: both views are turned into one frame whose x axis is the baseline, and resampled
-by pinholes of that frame. A turned pinhole has the view's own rays, so that what is matched is the
-range of the view's own pixels and nothing is reprojected.
+through its rays: both views are rotated into one frame whose x axis is the baseline, and resampled
+by pinhole cameras of that frame. A rotated pinhole camera has the rays of its view, so matching
+gives the ranges of the view's own pixels, without reprojection.
 """
 
 from __future__ import annotations

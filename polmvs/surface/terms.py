@@ -1,18 +1,19 @@
 """Terms of the energy, linearized about a mesh.
 
-The unknowns are the displacements u of the vertices along their normals, and few that all views
-share:
+The unknowns are the displacements u of the vertices along their normals, and a few unknowns that
+all views share:
 
     E(u) = sum_o  w_o rho(r_o / sigma_o)     phases      :func:`add_phases`
          + sum_v  rho(d_v / sigma_v)         outlines    :func:`add_outlines`
          + sum_p  rho(h_p / sigma_p)         points      :func:`add_points`
          + sum_i  rho(k_i / sigma_k)         smoothness  :func:`smoothness`
 
-Here ``r = m . n`` are the residuals of observations under their probable label
-(:mod:`polmvs.surface.labels`), d the distances of the mesh's outline to the silhouettes, h the
-heights above known points, and k the changes of the scale-free curvature. ``sigma_v`` includes the
-bias of outlines of round surfaces (:mod:`polmvs.surface.grazing`). All losses rho are robust
-(Geman and McClure 1985). One Gauss-Newton step solves the sum (:mod:`polmvs.surface.solver`).
+Here ``r = m . n`` are the residuals of observations under their likelier label, w the certainties
+of the labels (:mod:`polmvs.surface.labels`), d the distances of the mesh's outline to the
+silhouettes, h the heights above known points, and k the changes of the scale-free curvature.
+``sigma_v`` includes the bias of outlines of round surfaces (:mod:`polmvs.surface.grazing`). All
+losses rho are robust (Geman and McClure 1985). One Gauss-Newton step solves the sum
+(:mod:`polmvs.surface.solver`).
 """
 
 from __future__ import annotations
