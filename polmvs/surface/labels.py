@@ -3,15 +3,16 @@
 Let ``r_s = m_s . n`` and ``r_d = m_d . n`` be the residuals of an observation under the two kinds
 of light. Its likelihood is the mixture
 
-    p = w_s N(r_s; 0, v) + w_d f(dolp, theta) N(r_d; 0, v) + w_o U,
+    p = w_s k(r_s) + w_d f(dolp, theta) k(r_d) + w_o,    k(r) = exp(-r^2 / 2 v),
 
-where the w are prior shares, U is a constant density, and v is the variance of the row plus the
-assumed error of the current normal, which shrinks from iteration to iteration. The factor f falls
-where the degree of polarization exceeds that of diffuse light at this angle (Fresnel, for the
-largest refractive index of dielectrics). Neighbouring faces in one view have the same label unless
-the polarization turns by a right angle between them; there its degree passes through zero. A mean
-field (Ising) therefore couples the labels by the cosine of the angle between the axial vectors of
-the faces.
+where the w are prior shares, and v is the variance of the row plus the assumed error of the current
+normal, which shrinks from iteration to iteration. k is a normal density over its peak: under the
+density itself, the light whose residuals are larger would lose observations, and so get still
+larger residuals. The factor f falls where the degree of polarization exceeds that of diffuse light
+at this angle (Fresnel, for the largest refractive index of dielectrics). Neighbouring faces in one
+view have the same label unless the polarization turns by a right angle between them; there its
+degree passes through zero. A mean field (Ising) therefore couples the labels by the cosine of the
+angle between the axial vectors of the faces.
 
 A normal that all observations around a face contradict cannot give labels. There :func:`vote` tries
 other normals near it, each with either label.
