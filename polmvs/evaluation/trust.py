@@ -202,12 +202,12 @@ class Trust:
             if odd is not None:
                 remedy = f"pose, image and mask of {odd}"
             name = (
-                "planes of incidence of views left out, from a surface of the others, median "
-                f"error, deg ({self.predicted.chance_deg:g} by chance)"
+                "held-out views: median error of their planes of incidence, deg "
+                f"({self.predicted.chance_deg:g} by chance)"
             )
             error = self.predicted.error_deg if enough else float("nan")
             yield _figure(name, error, ranges.predicted_deg, remedy, scale=1.0)
-            name = "silhouettes of views left out, overlap with their prediction, %"
+            name = "held-out views: overlap of their silhouettes with the prediction, %"
             remedy = "`region.mask`, `capture.gamma`, poses"
             yield _figure(name, self.predicted.overlap, ranges.overlap, remedy)
         if self.fitted is not None:
@@ -276,12 +276,12 @@ class Trust:
     def _why(self, weak: Sequence[str]) -> str:
         if self.predicted is not None:
             reason = (
-                f"{self.predicted.num_views} views that were left out show what a surface of the "
-                f"others predicts, phases to {self.predicted.error_deg:.1f} deg (by chance "
-                f"{self.predicted.chance_deg:g}), silhouettes to {self.predicted.overlap:.0%}"
+                f"a surface of the other views predicts {self.predicted.num_views} held-out views, "
+                f"phases to {self.predicted.error_deg:.1f} deg ({self.predicted.chance_deg:g} by "
+                f"chance), silhouettes to {self.predicted.overlap:.0%}"
             )
         else:
-            reason = "the views agree with each other; no view was left out to check it"
+            reason = "the views agree with each other; no view was held out as a check"
         return reason + (f". But {weak[0]}" if weak else "")
 
 

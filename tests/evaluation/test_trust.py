@@ -162,8 +162,8 @@ def test_a_right_result_says_why_it_is_to_be_trusted():
     assert found.is_trusted
     assert found.verdict == str(found)
     assert found.verdict == (
-        "To be trusted: 3 views that were left out show what a surface of the others predicts, "
-        "phases to 1.2 deg (by chance 22.5), silhouettes to 98%."
+        "To be trusted: a surface of the other views predicts 3 held-out views, "
+        "phases to 1.2 deg (22.5 by chance), silhouettes to 98%."
     )
 
 
@@ -172,7 +172,7 @@ def test_a_right_result_says_why_it_is_to_be_trusted():
     [
         ({"predicted": replace(PREDICTED, error_deg=12.0)}, "median error.* 12 .*region.light"),
         ({"predicted": replace(PREDICTED, num_phases=20)}, "median error.* unknown"),
-        ({"predicted": replace(PREDICTED, overlap=0.7)}, "silhouettes of views left out.* 70 "),
+        ({"predicted": replace(PREDICTED, overlap=0.7)}, "overlap of their silhouettes.* 70 "),
         ({"fitted": replace(PREDICTED, unexplained=0.5)}, "neither kind of light explains.* 50 "),
         ({"soundness": Soundness(layered=0.2, overlapping=0.0)}, "double layer.* 20 "),
         ({"soundness": Soundness(layered=0.0, overlapping=0.1)}, "intersects itself.* 10 "),
@@ -209,10 +209,10 @@ def test_a_part_that_is_missing_is_a_reservation():
     assert "But coverage of the polarized regions, %: 30 " in found.verdict
 
 
-def test_views_integrated_one_by_one_say_that_none_was_left_out():
+def test_views_integrated_one_by_one_say_that_none_was_held_out():
     found = replace(RIGHT, predicted=None, fitted=None, soundness=None).judged()
     assert found.is_trusted
-    assert "no view was left out to check it" in found.verdict
+    assert "no view was held out as a check" in found.verdict
 
 
 @pytest.mark.parametrize(("share", "said"), [(None, False), (0.01, False), (0.1, True)])

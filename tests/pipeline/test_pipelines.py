@@ -64,7 +64,7 @@ def test_benchmark_of_no_run_is_one_line(
 def test_trust_table_tells_a_right_run(demo_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert load("trust_table").main([str(demo_run)]) == 0
     text = capsys.readouterr().out
-    assert "To be trusted: 2 views that were left out" in text
+    assert "To be trusted: a surface of the other views predicts 2 held-out views" in text
     assert "0 false alarms of 1 right results, 0 misses of 0 wrong ones" in text
 
 

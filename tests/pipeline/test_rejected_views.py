@@ -57,8 +57,10 @@ def test_a_view_that_the_surface_contradicts_is_taken_out(
     assert any("004.png contradicts the other views" in note for note in record["notes"])
     # What is left is right: the complaint about the pose went with its view.
     first, figures = text.splitlines()[0], text.splitlines()[1:]
-    assert first.startswith("PPA: To be trusted: 2 views that were left out show what a surface")
-    assert any(line.startswith("silhouettes of views left out") for line in figures)
+    assert first.startswith(
+        "PPA: To be trusted: a surface of the other views predicts 2 held-out views"
+    )
+    assert any(line.startswith("held-out views: overlap of their silhouettes") for line in figures)
     trust = result_of(out, "trust_ppa")
     assert trust["is_trusted"]
     assert first == f"PPA: {trust['verdict']}"
