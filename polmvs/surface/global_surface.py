@@ -307,9 +307,9 @@ def _warn_of_inconsistent(
     shares = zip(views, refined.unexplained, strict=True)
     for view, share in compress(shares, refined.left_out):
         logger.warning(
-            "%s: %s contradicts the other views: %.0f %% of what it shows is not explained by "
-            "a first surface (median of all: %.0f %%). It is left out; its pose, its mask "
-            "or its image may be wrong, or the object was moved.",
+            "%s: %s is inconsistent with the other views: a first surface does not explain "
+            "%.0f %% of what it shows (median of all views: %.0f %%). It is left out; its pose, "
+            "its mask or its image may be wrong, or the object was moved.",
             angle_model,
             view.view.name,
             100 * share,

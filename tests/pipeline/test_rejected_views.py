@@ -54,7 +54,7 @@ def test_a_view_that_the_surface_contradicts_is_taken_out(
     assert len(read_model(out / "dense" / "sparse").views) == 9
     record = record_of(out)
     assert record["options"]["sfm"]["without"] == ["004.png"]
-    assert any("004.png contradicts the other views" in note for note in record["notes"])
+    assert any("004.png is inconsistent with the other views" in note for note in record["notes"])
     # What is left is right: the complaint about the pose went with its view.
     first, figures = text.splitlines()[0], text.splitlines()[1:]
     assert first.startswith(

@@ -35,7 +35,7 @@ class EvaluationResult:
     def __str__(self) -> str:
         names = ", ".join(model.label for model in self.models)
         best = self.best_fit
-        return f"figures of {names}" + (f"; {best.label} fits best" if best is not None else "")
+        return f"metrics of {names}" + (f"; {best.label} fits best" if best is not None else "")
 
 
 def load_estimate(run_folder: RunFolder, model: AngleModel) -> ModelEstimate:
