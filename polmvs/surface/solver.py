@@ -950,9 +950,9 @@ def place_deviations(
     edge, num_views = mesh.mean_edge, len(fit.views)
     face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
 
-    def energy_of(mesh: TriangleMesh) -> Energy:
+    def energy_of(mesh: TriangleMesh, *, with_slope: bool = True) -> Energy:
         return linearize(
-            RayScene(mesh), fit, edge, level, normal_sigma=tol.annealing[1], with_slope=True
+            RayScene(mesh), fit, edge, level, normal_sigma=tol.annealing[1], with_slope=with_slope
         )
 
     energy = energy_of(mesh)
@@ -969,7 +969,9 @@ def place_deviations(
     by_tilt *= energy.views.tilt.deviation(by_tilt) * np.sqrt(
         tol.terms.phase_correlation(face_area_px)
     )
-    by_outlines = solve(matrix, energy.views.outline_slope, loose, none)
+    # The noise of the slopes would seem to hold the surface against a common error of outlines.
+    without = energy_of(mesh, with_slope=False)
+    by_outlines = solve(without.matrix(), without.views.outline_slope, loose, none)
     variance = np.zeros(num)
     for _ in range(num_samples):
         noise = energy.views.equations.noise(rng) + energy.smooth_factor @ rng.standard_normal(num)
