@@ -201,6 +201,10 @@ class Fit:
             return 0.5, 0.5
         return (1.0, 0.0) if self.light is Light.SPECULAR else (0.0, 1.0)
 
+    def face_area_px(self, mesh: TriangleMesh) -> float:
+        """Mean area of a mesh's faces, px^2."""
+        return float(mesh.face_areas.mean()) / self.gsd**2
+
     def independent_area(self, level: Level) -> float:
         """Area of the surface over which a level's phase errors are correlated."""
         return self.tol.terms.independent_px * level.width_px**2 * self.gsd**2
@@ -585,7 +589,7 @@ def _evidence_of_views(
 ) -> _Evidence:
     """Equations of the phases and outlines of some views, by their indices."""
     terms, observations = fit.tol.terms, observed.observations
-    face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
+    face_area_px = fit.face_area_px(mesh)
     equations = Equations(len(mesh.vertices))
     # The share is anywhere between a sensor of the angle model and a tilted polarizer, and is as
     # uncertain as other errors that the rows share.
@@ -687,7 +691,7 @@ def _of_points(mesh: TriangleMesh, fit: Fit, is_seen: Mask, *, gate_px: float) -
     """Equations of the known points, which the seen (F,) faces are pulled to."""
     points = Equations(len(mesh.vertices))
     if fit.known is not None and len(fit.known.points) and is_seen.any():
-        face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
+        face_area_px = fit.face_area_px(mesh)
         add_points(
             points,
             mesh,
@@ -948,7 +952,7 @@ def place_deviations(
     if not num:
         return PositionSigma(np.zeros(0), np.zeros(0))
     edge, num_views = mesh.mean_edge, len(fit.views)
-    face_area_px = float(mesh.face_areas.mean()) / fit.gsd**2
+    face_area_px = fit.face_area_px(mesh)
 
     def energy_of(mesh: TriangleMesh, *, with_slope: bool = True) -> Energy:
         return linearize(
@@ -970,8 +974,8 @@ def place_deviations(
         tol.terms.phase_correlation(face_area_px)
     )
     # The noise of the slopes would seem to hold the surface against a common error of outlines.
-    without = energy_of(mesh, with_slope=False)
-    by_outlines = solve(without.matrix(), without.views.outline_slope, loose, none)
+    no_slopes = energy_of(mesh, with_slope=False)
+    by_outlines = solve(no_slopes.matrix(), no_slopes.views.outline_slope, loose, none)
     variance = np.zeros(num)
     for _ in range(num_samples):
         noise = energy.views.equations.noise(rng) + energy.smooth_factor @ rng.standard_normal(num)

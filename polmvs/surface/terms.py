@@ -498,7 +498,8 @@ def outline_rows(
         jacobian[:, column] = dots(gradient, ahead - behind) / (2 * reach)
     vertices = np.column_stack([vertices, vertices[:, 0]])
     is_matted = view.outline_source is OutlineSource.MATTING
-    # The true bias lies anywhere between none and the largest.
+    # The true bias lies anywhere between none and the largest: half of it is subtracted, and the
+    # deviation of an even distribution remains.
     bias = half = 0.5 * outline_bias(rim.radius_px[near], matted=is_matted)
     if view.outline_source is not OutlineSource.MASK:
         residual, bias = residual - half, half / np.sqrt(3)

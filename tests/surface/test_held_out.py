@@ -1,4 +1,4 @@
-"""Views that were left out: predicted by a surface of the others, if it is right."""
+"""Held-out views: predicted by a surface of the others, if it is right."""
 
 from dataclasses import replace
 

@@ -97,7 +97,7 @@ def _contradicted(
     folder: RunFolder,
     options: Options,
 ) -> Trust:
-    """The checks with those of a surface of all views against views that were left out."""
+    """The checks with those of a surface of all views against held-out views."""
     views = folder.views(model)
     assert made.tilt_share is not None
     around = sparse_surroundings(read_model(folder.sparse).tracks, maps).points
