@@ -67,6 +67,7 @@ from polmvs.surface.surface_quality import (
     MIN_EXPLAINED,
     Contradictions,
     FaceEvidence,
+    contradicted_faces,
     face_evidence,
     find_contradictions,
     fit_normals,
@@ -121,6 +122,7 @@ class GlobalSurface:
     contradictions : between the surface and the data.
     inferred : (F,) bool, faces that no phase shows: walls of cavities, inferred with the thickness
         that the opening shows.
+    contradicted : (F,) bool, faces that phases contradict: without points and depths.
     tilt_share : as in :class:`polmvs.surface.observations.Looking`.
     left_out : (K,) bool, inconsistent views; the surface is made without them.
     """
@@ -135,6 +137,7 @@ class GlobalSurface:
     gsd: float
     contradictions: Contradictions
     inferred: Mask
+    contradicted: Mask
     tilt_share: float
     left_out: Mask
 
@@ -142,6 +145,11 @@ class GlobalSurface:
         """The surface without the inferred faces."""
         seen = self.supported & ~self.inferred
         return replace(self, supported=seen, inferred=np.zeros_like(seen))
+
+    @property
+    def measured(self) -> Mask:
+        """(F,) supported faces that phases do not contradict."""
+        return np.asarray(self.supported & ~self.contradicted)
 
 
 @dataclass(frozen=True)
@@ -418,6 +426,7 @@ def _supported(
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     inferred = seen & ~supported & _lie_on(mesh, [cavity.values for cavity in cavities])
     supported |= inferred
+    contradicted = contradicted_faces(mesh, evidence, gsd=fit.gsd) & ~inferred
     known = fit.known or KnownPoints(np.zeros((0, 3)), np.zeros(0))
     offset_px, offset_sigmas = point_offset(mesh, supported, sigma.total, known, fit.gsd)
     residual, _ = labelled.residuals(mesh)
@@ -426,6 +435,7 @@ def _supported(
             mesh,
             evidence,
             supported,
+            contradicted,
             fit.views,
             float(np.median(np.abs(residual))) if len(residual) else 0.0,
         ),
@@ -443,6 +453,7 @@ def _supported(
         gsd=fit.gsd,
         contradictions=contradictions,
         inferred=inferred,
+        contradicted=contradicted,
         tilt_share=fit.looking.tilt_share,
         left_out=left_out,
     )
@@ -571,7 +582,7 @@ class SurfacePoints:
 def surface_points(
     surface: GlobalSurface, maps: Sequence[PhaseMap], spacing: float, *, max_points: int = 2_000_000
 ) -> SurfacePoints:
-    """Points spread evenly over the part of a surface that the views support.
+    """Points spread evenly over the part of a surface that views support and phases allow.
 
     Parameters
     ----------
@@ -581,13 +592,13 @@ def surface_points(
     max_points : largest number of points; above it the spacing grows.
     """
     mesh = surface.mesh
-    area = float(mesh.face_areas[surface.supported].sum())
+    area = float(mesh.face_areas[surface.measured].sum())
     if area <= 0:
         return SurfacePoints(no_points(), np.zeros(0, np.bool_), np.zeros((3, 0)))
     # Random points leave gaps: three times as many are drawn, and one is kept in each voxel.
     num = int(min(max(3 * area / spacing**2, 1), 3 * max_points))
     face, barycentric = sample_surface(
-        mesh, surface.supported.astype(np.float64), num, np.random.default_rng(0)
+        mesh, surface.measured.astype(np.float64), num, np.random.default_rng(0)
     )
     points = mesh.points_at(face, barycentric)
     kept = voxel_representatives(points, max(spacing, np.sqrt(area / max_points)))
@@ -654,7 +665,7 @@ def render_view(
     rays = view.rays_in_world(xy)
     hits = scene.cast(view.center_in_world, rays)
     index = np.flatnonzero(hits.face >= 0)
-    index = index[surface.supported[hits.face[index]]]
+    index = index[surface.measured[hits.face[index]]]
     face, barycentric = hits.face[index], hits.barycentric[index]
     cosine = -(mesh.face_normals[face] * rays[index]).sum(axis=1)
     front = cosine > 0

@@ -1,8 +1,9 @@
 """Support of a surface: evidence for its faces, and their normals with uncertainty.
 
-A part of the mesh is discarded if fewer than two views see it, if silhouettes deny it, if most of
-its phases contradict it, or if neither phases nor outlines nor points determine it. Such an
-undetermined part comes only from smoothness or the visual hull.
+A part of the mesh is discarded if fewer than two views see it, if silhouettes deny it, or if
+neither phases nor outlines nor points determine it. Such an undetermined part comes only from
+smoothness or the visual hull. A part that its phases contradict has no points; the mesh keeps it,
+because a hole would show the inside.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ class QualityTolerances:
     max_sigma_ratio : position uncertainty over its median, above which neither phases nor points
         determine a face. Measured on a mug with a wrong cap over its opening: most faces of the
         cap have 1.8 to 4, 95 % of the right ones less than 1.7.
-    min_gap_px : radius of a circle with the area of the smallest undetermined part that is removed,
-        GSD; smoothness bridges smaller ones. The least size of an opening
+    min_gap_px : radius of a circle with the area of the smallest undetermined or contradicted part
+        that is removed, GSD; smoothness bridges smaller ones. The least size of an opening
         (:class:`polmvs.surface.cavities.CavityTolerances`).
     """
 
@@ -170,25 +171,45 @@ def supported_faces(
         evidence.num_views,
         evidence.num_outside,
         evidence.num_rows,
-        evidence.num_contradicting,
         evidence.num_outlines,
         evidence.information,
     )
     smooth = _smoothed(mesh, np.stack(of_faces, axis=1).astype(np.float64))
-    views, outside, rows, contradicting, outlines, information = smooth.T
+    views, outside, rows, outlines, information = smooth.T
     denied = outside > np.maximum(tol.max_outside_share * views, 1.5)
-    contradicted = contradicting > 0.5 * rows  # most of them
     determined = (information >= tol.min_information * rows) | (outlines >= 0.5)
     if sigma is not None:
         of_face = sigma[mesh.faces].mean(axis=1)
         known = np.isfinite(of_face)
         usual = np.median(of_face[known]) if known.any() else 0.0
         determined |= of_face <= tol.max_sigma_ratio * usual
-    gaps = mesh.pieces(~determined)
-    area = np.bincount(gaps + 1, mesh.face_areas)
-    determined |= area[gaps + 1] < np.pi * (tol.min_gap_px * gsd) ** 2
+    undetermined = _wide_parts(mesh, ~determined, gsd, tol)
     seen = (evidence.num_views >= min_views) & (rows >= min_views - 0.5)
-    return np.asarray(seen & determined & ~denied & ~contradicted)
+    return np.asarray(seen & ~undetermined & ~denied)
+
+
+def contradicted_faces(
+    mesh: TriangleMesh,
+    evidence: FaceEvidence,
+    *,
+    gsd: float,
+    tolerances: QualityTolerances | None = None,
+) -> Mask:
+    """Which faces ``(F,)`` have phases that are less likely than those of any direction.
+
+    Parameters
+    ----------
+    mesh, evidence, gsd : as of :func:`supported_faces`.
+    """
+    information = _smoothed(mesh, evidence.information[:, None])[:, 0]
+    return _wide_parts(mesh, information < 0, gsd, tolerances or QualityTolerances())
+
+
+def _wide_parts(mesh: TriangleMesh, chosen: Mask, gsd: float, tol: QualityTolerances) -> Mask:
+    """Faces ``(F,)`` of the chosen ones whose connected part is as wide as an opening."""
+    part = mesh.pieces(chosen)
+    area = np.bincount(part + 1, mesh.face_areas)
+    return np.asarray(chosen & (area[part + 1] >= np.pi * (tol.min_gap_px * gsd) ** 2))
 
 
 def _smoothed(mesh: TriangleMesh, values: Array) -> Array:
@@ -358,8 +379,8 @@ class Contradictions:
     Attributes
     ----------
     phase_sine : median of the absolute residuals of the phases.
-    contradicted_share : share of the area that two views see where most phases contradict the
-        normal.
+    contradicted_share : share of the area that two views see where the phases contradict the
+        normals.
     denied_share : share of that area which silhouettes deny.
     uncovered_share : mean over the views of the share of the silhouette that the surface leaves
         uncovered.
@@ -379,8 +400,8 @@ class Contradictions:
         found = []
         if self.contradicted_share > MAX_SHARE:
             found.append(
-                f"on {self.contradicted_share:.0%} of the surface most phases contradict it; "
-                "these parts are left out"
+                f"on {self.contradicted_share:.0%} of the surface the phases contradict it; the "
+                "cloud leaves these parts out"
             )
         if self.denied_share > MAX_SHARE:
             found.append(
@@ -407,6 +428,7 @@ def find_contradictions(
     mesh: TriangleMesh,
     evidence: FaceEvidence,
     supported: Mask,
+    contradicted: Mask,
     views: Sequence[SurfaceView],
     phase_sine: float,
     *,
@@ -417,14 +439,13 @@ def find_contradictions(
     Parameters
     ----------
     mesh, evidence : the surface.
-    supported : (F,) faces that are kept.
+    supported, contradicted : (F,) faces that are kept, and those that phases contradict.
     views : all views.
     phase_sine : median of the absolute residuals of the phases.
     """
     tol = tolerances or QualityTolerances()
     area = mesh.face_areas * (evidence.num_views >= 2)
     total = max(float(area.sum()), 1e-300)
-    contradicted = evidence.num_contradicting > 0.5 * evidence.num_rows
     denied = evidence.num_outside > np.maximum(tol.max_outside_share * evidence.num_views, 1.5)
     return Contradictions(
         phase_sine=phase_sine,

@@ -277,6 +277,19 @@ def test_inferred_faces_can_be_left_out(surface, maps):
     assert cloud.cloud.points[:, 2].max() < 2.5 * FOOTPRINT  # an edge of a face
 
 
+def test_contradicted_faces_have_neither_points_nor_depths(surface, maps):
+    upper = surface.mesh.centers[:, 2] > 0
+    doubted = replace(surface, contradicted=upper)
+    assert len(supported_mesh(doubted).triangles) == surface.supported.sum()
+    cloud = surface_points(doubted, maps, 0.5 * FOOTPRINT).cloud
+    assert len(cloud.points)
+    assert cloud.points[:, 2].max() < 2.5 * FOOTPRINT  # an edge of a face
+    scene = RayScene(surface.mesh)
+    whole = render_view(surface, scene, maps[0].view, 2)
+    part = render_view(doubted, scene, maps[0].view, 2)
+    assert 0 < (part.range_map > 0).sum() < (whole.range_map > 0).sum()
+
+
 def test_progress_is_within_what_is_announced(maps):
     steps = []
     reconstruct(maps[:4], on_progress=steps.append)

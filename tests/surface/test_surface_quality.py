@@ -13,6 +13,7 @@ from polmvs.surface.solver import first_fit, label
 from polmvs.surface.surface_quality import (
     MIN_EXPLAINED,
     FaceEvidence,
+    contradicted_faces,
     fit_normals,
     stand_apart,
     supported_faces,
@@ -90,6 +91,15 @@ def test_phases_of_another_place_carry_no_information(exact):
     assert mixed.information(exact, fit).mean() < 0
 
 
+def test_phases_of_any_direction_carry_no_information(exact):
+    fit = fit_of(np.radians(0.5))
+    labelled = label(exact, fit)
+    observations = labelled.observations
+    vague = replace(observations, turn_variance=np.full_like(observations.turn_variance, 100.0))
+    information = replace(labelled, observations=vague).information(exact, fit)
+    assert np.allclose(information, 0, atol=0.015)
+
+
 def evidence_of(num, **changes):
     some = {"num_views": 8, "num_outside": 0, "num_rows": 8, "num_contradicting": 0}
     counts = {name: np.full(num, value) for name, value in some.items()}
@@ -125,3 +135,16 @@ def test_a_part_that_nothing_determines_is_not_supported(
     if is_kept and sigma > 2:
         # The cavities are found before the uncertainty is known.
         assert supported_faces(exact, given, gsd=5 / 150)[inner].all()
+
+
+@pytest.mark.parametrize(("information", "is_denied"), [(-1.0, True), (1.0, False)])
+def test_wide_parts_that_phases_contradict_have_no_points(exact, information, is_denied):
+    def found_at(cap):
+        top = exact.centers[:, 2] > cap
+        given = evidence_of(len(top), information=np.where(top, information, 20.0))
+        return contradicted_faces(exact, given, gsd=5 / 150)
+
+    wide = found_at(0.8)
+    assert wide[exact.centers[:, 2] > 0.9].all() == is_denied
+    assert not wide[exact.centers[:, 2] < 0.7].any()
+    assert not found_at(0.995).any()  # smoothness bridges it
