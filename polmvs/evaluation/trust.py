@@ -198,9 +198,9 @@ class Trust:
                 "`sfm.intrinsics`, `sfm.sparse`, `region.light`, `capture.pattern`, and that "
                 "nothing was moved between the images"
             )
-            odd = self.predicted.odd_view(ranges.predicted_deg[1])
-            if odd is not None:
-                remedy = f"pose, image and mask of {odd}"
+            name_of_view = self.predicted.inconsistent_view(ranges.predicted_deg[1])
+            if name_of_view is not None:
+                remedy = f"pose, image and mask of {name_of_view}"
             name = (
                 "held-out views: median error of their planes of incidence, deg "
                 f"({self.predicted.chance_deg:g} by chance)"

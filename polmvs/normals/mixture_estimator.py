@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from polmvs.arrays import Array, Floats, Mask
 from polmvs.fitting import MEDIAN_OF_NORMAL
 from polmvs.normals.estimator import NormalEstimate, smallest_eigenvectors
-from polmvs.normals.observations import Observations
+from polmvs.normals.observations import PointObservations
 from polmvs.polarization.light_mixture import (
     LightMixtureTolerances,
     LightShares,
@@ -122,7 +122,7 @@ class RowScales:
 
 
 def solve_mixture(
-    observations: Observations,
+    observations: PointObservations,
     matched: Mask,
     *,
     prior_specular: float = 0.5,
@@ -168,7 +168,7 @@ def solve_mixture(
 
 
 def row_scales(
-    observations: Observations,
+    observations: PointObservations,
     matched: Mask,
     estimate: MixtureEstimate,
     *,
@@ -227,7 +227,7 @@ class _MixtureProblem:
     """Observations of which nothing is NaN, and who surely sees a point."""
 
     def __init__(
-        self, found: Observations, matched: Mask, prior_specular: float, t: MixtureTolerances
+        self, found: PointObservations, matched: Mask, prior_specular: float, t: MixtureTolerances
     ) -> None:
         self.known = np.isfinite(found.turn_variances[0]) & np.isfinite(found.rows[0, 0])
         self.rows = np.where(self.known, found.rows, 0)
@@ -241,7 +241,7 @@ class _MixtureProblem:
         if len(points) == self.matched.shape[1]:
             return self
         stated = (self.rows, self.rays, self.turns, self.dolp, self.dolp_variance)
-        found = Observations(*stated).some(points)
+        found = PointObservations(*stated).some(points)
         return _MixtureProblem(found, self.matched[:, points], self.prior_specular, self.t)
 
     def best_directions(self) -> list[tuple[Array, Floats]]:

@@ -34,7 +34,7 @@ NUM_VARYING = 9  # neighbourhoods of a window, 3 x 3, that vary of their own. Gu
 
 
 @dataclass(frozen=True)
-class Observations:
+class PointObservations:
     """Polarization of N points in K views, world frame, component first.
 
     Attributes
@@ -54,10 +54,10 @@ class Observations:
     dolp: NDArray[np.float32]
     dolp_variance: NDArray[np.float32]
 
-    def some(self, points: NDArray[Any]) -> Observations:
+    def some(self, points: NDArray[Any]) -> PointObservations:
         """Those of some of the points."""
-        parts = (getattr(self, field.name)[..., points] for field in fields(Observations))
-        return Observations(*parts)
+        parts = (getattr(self, field.name)[..., points] for field in fields(PointObservations))
+        return PointObservations(*parts)
 
 
 def gather_observations(
@@ -67,7 +67,7 @@ def gather_observations(
     *,
     window_px: int,
     tilt_aware: bool = True,
-) -> Observations:
+) -> PointObservations:
     """Observations of points in all views that show them; one map is held at a time.
 
     Parameters are those of :func:`gather_observations_under`.
@@ -91,7 +91,7 @@ def gather_observations_under(
     *,
     window_px: int,
     tilt_aware: bool = True,
-) -> tuple[Observations, ...]:
+) -> tuple[PointObservations, ...]:
     """Observations of points under several readings of the same angles; each map is read once.
 
     Parameters
@@ -110,7 +110,7 @@ def gather_observations_under(
     dolps = np.zeros(shape, np.float32)
     dolp_variances = np.full(shape, np.inf, np.float32)
     gathered = tuple(
-        Observations(
+        PointObservations(
             rows=np.full((2, 3, *shape), np.nan, np.float32),
             rays=rays,
             turn_variances=np.full((2, *shape), np.inf, np.float32),

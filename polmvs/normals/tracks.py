@@ -20,7 +20,7 @@ from polmvs.config import Estimator, NormalOptions
 from polmvs.memory import MemoryNeeds
 from polmvs.normals.estimator import NormalEstimate, solve_normals
 from polmvs.normals.mixture_estimator import MixtureEstimate, row_scales, solve_mixture
-from polmvs.normals.observations import Observations, gather_observations
+from polmvs.normals.observations import PointObservations, gather_observations
 from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS, Seeds, Tracks, evenly_spread, point_sigmas, some_tracks
@@ -59,7 +59,7 @@ class SeedTolerances:
 
 def observe(
     angle_model: AngleModel, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
-) -> tuple[Observations, Mask]:
+) -> tuple[PointObservations, Mask]:
     """Observations of tracks in all views, and the views (K, T) that match them."""
     found = gather_observations(
         angle_model,
@@ -135,7 +135,7 @@ def track_normals(
     return MixtureEstimate(**joined)
 
 
-def _algebraic(found: Observations, estimate: MixtureEstimate) -> MixtureEstimate:
+def _algebraic(found: PointObservations, estimate: MixtureEstimate) -> MixtureEstimate:
     """The paper's estimator on rows whose light is told: their eigenvector, all alike."""
     diffuse = estimate.labels < 0
     rows = np.where(diffuse, found.rows[1], found.rows[0])

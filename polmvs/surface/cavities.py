@@ -32,15 +32,15 @@ from polmvs.surface.mesh_geometry import MAX_CELLS, RayScene, TriangleMesh
 from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
     MAX_COST,
-    NO_FACE,
-    Face,
-    FaceGrid,
-    FaceScene,
+    NO_PATCH,
     OffsetTolerances,
+    Patch,
+    PatchGrid,
+    PatchScene,
     border_of_steps,
-    face_evidence,
-    face_lines,
     median_loss,
+    patch_evidence,
+    patch_lines,
     row_losses,
     snapped_border,
 )
@@ -101,8 +101,8 @@ class Cavity:
     first_layer : depth of the first layer below the rim, in layers (negative: above).
     """
 
-    rim: Face
-    grid: FaceGrid
+    rim: Patch
+    grid: PatchGrid
     thickness: float
     thickness_sigma: float
     field: Image
@@ -187,7 +187,7 @@ def surface_faces(mesh: TriangleMesh, seen: Mask, supported: Mask, gsd: float) -
 
 def find_cavities(
     surface: SurfaceFaces,
-    scene: FaceScene,
+    scene: PatchScene,
     *,
     tolerances: CavityTolerances | None = None,
     offset_tolerances: OffsetTolerances | None = None,
@@ -200,18 +200,18 @@ def find_cavities(
     scene : the views.
     tolerances, offset_tolerances : of the search, and of the borders.
     """
-    tol, face_tol = tolerances or CavityTolerances(), offset_tolerances or OffsetTolerances()
+    tol, offset_tol = tolerances or CavityTolerances(), offset_tolerances or OffsetTolerances()
     if len(scene.maps) < MIN_VIEWS:
         return ()
     found: list[Cavity] = []
     for opening in surface.openings:
-        rim = _rim(surface, opening, scene, tol, face_tol)
+        rim = _rim(surface, opening, scene, tol, offset_tol)
         if rim is None or any(_is_same(rim, other.rim, surface) for other in found):
             continue
         grid = _grid_about(surface, rim, tol)
         wall = _rounded_wall(surface, rim, grid, tol)
         if wall is None:
-            wall = _flat_wall(surface, rim, grid, scene, tol, face_tol)
+            wall = _flat_wall(surface, rim, grid, scene, tol, offset_tol)
         if wall is None:
             continue
         cap_height = max(float(rim.height(surface.centers[opening.patch]).max()), 0.0)
@@ -242,10 +242,10 @@ def _plane_of(opening: Opening, surface: SurfaceFaces) -> tuple[Array, float] | 
 def _rim(
     surface: SurfaceFaces,
     opening: Opening,
-    scene: FaceScene,
+    scene: PatchScene,
     tol: CavityTolerances,
-    face_tol: OffsetTolerances,
-) -> Face | None:
+    offset_tol: OffsetTolerances,
+) -> Patch | None:
     """The rim about a dark opening, with the normal that the phases of its faces have.
 
     Its members are faces of the surface. None if the border of the opening is not planar, if the
@@ -275,13 +275,13 @@ def _rim(
         return None
     normal = np.median(estimate.normals[agree], axis=0)
     normal /= np.linalg.norm(normal)
-    losses = row_losses(rows, normal[:, None], face_tol)[0]
+    losses = row_losses(rows, normal[:, None], offset_tol)[0]
     losses = np.where(facing, losses, np.nan)
     has_phase = np.isfinite(losses).sum(axis=0) >= 0.5 * facing.sum(axis=0)
     fits = has_phase & (median_loss(losses[:, None])[0] < MAX_COST)
     if not fits.any():
         return None
-    rim = Face(normal, float(np.median(places[fits] @ normal)), members[fits])
+    rim = Patch(normal, float(np.median(places[fits] @ normal)), members[fits])
     cap = surface.centers[opening.patch]
     cap = cap - rim.height(cap)[:, None] * normal
     tangents = np.linalg.svd(normal[None])[2][1:]
@@ -291,13 +291,13 @@ def _rim(
     return rim if is_rim else None
 
 
-def _is_same(rim: Face, other: Face, surface: SurfaceFaces) -> bool:
+def _is_same(rim: Patch, other: Patch, surface: SurfaceFaces) -> bool:
     """Whether two rims are of the same opening."""
     near = np.abs(other.height(surface.centers[rim.members])) < SAME_PLANE_PX * surface.gsd
     return bool(near.mean() > 0.5)
 
 
-def _grid_about(surface: SurfaceFaces, rim: Face, tol: CavityTolerances) -> FaceGrid:
+def _grid_about(surface: SurfaceFaces, rim: Patch, tol: CavityTolerances) -> PatchGrid:
     """A grid across the rim that holds all of the surface below it."""
     tangents = np.linalg.svd(rim.normal[None])[2][1:]
     first, second = tangents[0], np.cross(rim.normal, tangents[0])
@@ -309,24 +309,23 @@ def _grid_about(surface: SurfaceFaces, rim: Face, tol: CavityTolerances) -> Face
     half = int(np.ceil(1.5 * radius / surface.gsd))
     step = surface.gsd
     origin = center - half * step * (first + second)
-    return FaceGrid(origin, first, second, rim.normal, step, (2 * half + 1, 2 * half + 1))
+    return PatchGrid(origin, first, second, rim.normal, step, (2 * half + 1, 2 * half + 1))
 
 
 def _in_focus(
-    rim: Face,
-    grid: FaceGrid,
-    scene: FaceScene,
+    rim: Patch,
+    grid: PatchGrid,
+    scene: PatchScene,
     gsd: float,
     tol: CavityTolerances,
-    face_tol: OffsetTolerances,
-) -> Face:
+    offset_tol: OffsetTolerances,
+) -> Patch:
     """The rim at the offset at which its lines in the views coincide (a plane sweep)."""
 
     def strength(shift: float) -> float:
-        face = replace(rim, offset=rim.offset + shift * gsd)
-        return float(
-            face_lines(grid.points(face), face, scene, face_tol, 1 - face_tol.view_share).sum()
-        )
+        patch = replace(rim, offset=rim.offset + shift * gsd)
+        places, share = grid.points(patch), 1 - offset_tol.view_share
+        return float(patch_lines(places, patch, scene, offset_tol, share).sum())
 
     shifts = np.arange(-HullTolerances.step_px, HullTolerances.step_px + 0.5)  # a cell of the hull
     sums = np.array([strength(shift) for shift in shifts])
@@ -337,13 +336,13 @@ def _in_focus(
     return replace(rim, offset=rim.offset + float(shifts[best] + vertex) * gsd)
 
 
-def _mouth(
-    rim: Face,
+def _open_cells(
+    rim: Patch,
     on_rim: Array,
-    grid: FaceGrid,
-    scene: FaceScene,
+    grid: PatchGrid,
+    scene: PatchScene,
     tol: CavityTolerances,
-    face_tol: OffsetTolerances,
+    offset_tol: OffsetTolerances,
 ) -> Mask:
     """Cells (H, W) of the opening: those inside the bright cells of the rim, up to its inner line.
 
@@ -353,8 +352,8 @@ def _mouth(
     """
     nothing_near = np.zeros(grid.shape, np.bool_)
     places = grid.points(rim)
-    losses = scene.losses_on(places, rim, face_tol)
-    evidence = face_evidence(places, rim, scene, losses, nothing_near, None, face_tol)
+    losses = scene.losses_on(places, rim, offset_tol)
+    evidence = patch_evidence(places, rim, scene, losses, nothing_near, None, offset_tol)
     brightness = _brightness(places.reshape(-1, 3), on_rim, scene.maps).reshape(grid.shape)
     bright = brightness > tol.max_brightness
     closed = ndimage.binary_closing(bright, iterations=round(tol.max_gap))
@@ -363,12 +362,12 @@ def _mouth(
     pieces, num = ndimage.label(enclosed)
     if num == 0:
         return enclosed
-    mouth = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
-    if mouth.sum() < np.pi * tol.rounding**2:
+    open_cells = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+    if open_cells.sum() < np.pi * tol.rounding**2:
         return np.zeros(grid.shape, np.bool_)
-    labels = np.where(mouth, 0, NO_FACE)
+    labels = np.where(open_cells, 0, NO_PATCH)
     jump = evidence.jump.astype(np.float64)
-    snapped = snapped_border(labels, 0, jump, tol.max_gap, face_tol.line_steps)
+    snapped = snapped_border(labels, 0, jump, tol.max_gap, offset_tol.line_steps)
     return np.asarray(snapped == 0)
 
 
@@ -404,9 +403,9 @@ def _intensities(points: Array, phase_map: PhaseMap) -> Array:
     return np.where(shown, sampled, np.nan)
 
 
-def _ring_about(mouth: Mask, tol: CavityTolerances) -> Mask:
+def _ring_about(open_cells: Mask, tol: CavityTolerances) -> Mask:
     """Cells (H, W) of the rim about an opening, away from the line between them."""
-    line = ndimage.binary_dilation(mouth, iterations=2)
+    line = ndimage.binary_dilation(open_cells, iterations=2)
     ring = ndimage.binary_dilation(line, iterations=max(round(0.5 * tol.rounding), 1))
     return np.asarray(ring & ~line, np.bool_)
 
@@ -425,7 +424,7 @@ class _Wall:
     radius : of a rounded rim; 0 of a flat one.
     """
 
-    rim: Face
+    rim: Patch
     thickness: float
     sigma: float
     top: Array
@@ -442,7 +441,7 @@ class _Wall:
         return known * (-self.outer - self.thickness) + (1 - known) * self.top
 
 
-def _outside_at(surface: SurfaceFaces, rim: Face, grid: FaceGrid, depth: float) -> Array:
+def _outside_at(surface: SurfaceFaces, rim: Patch, grid: PatchGrid, depth: float) -> Array:
     """Distance (H, W) in cells to the outer wall at a depth of cells, negative inside."""
     origins, depths = grid.points(rim).reshape(-1, 3), np.array([depth * grid.step])
     return _outside(surface.inside_along(origins, -rim.normal, depths).reshape(grid.shape))
@@ -456,29 +455,29 @@ def _outside(inside: Mask) -> Array:
 
 def _flat_wall(
     surface: SurfaceFaces,
-    rim: Face,
-    grid: FaceGrid,
-    scene: FaceScene,
+    rim: Patch,
+    grid: PatchGrid,
+    scene: PatchScene,
     tol: CavityTolerances,
-    face_tol: OffsetTolerances,
+    offset_tol: OffsetTolerances,
 ) -> _Wall | None:
     """The wall under a flat rim: as thick as the rim is wide. None without a dark opening in it."""
-    rim = _in_focus(rim, grid, scene, surface.gsd, tol, face_tol)
-    mouth = _mouth(rim, surface.centers[rim.members], grid, scene, tol, face_tol)
-    inner = ndimage.binary_erosion(mouth, iterations=3)
+    rim = _in_focus(rim, grid, scene, surface.gsd, tol, offset_tol)
+    open_cells = _open_cells(rim, surface.centers[rim.members], grid, scene, tol, offset_tol)
+    inner = ndimage.binary_erosion(open_cells, iterations=3)
     places = grid.points(rim)
-    if not _is_dark(places[inner], places[_ring_about(mouth, tol)], scene.maps, tol):
+    if not _is_dark(places[inner], places[_ring_about(open_cells, tol)], scene.maps, tol):
         return None
-    beside = border_of_steps(mouth, mouth, rim, grid, scene, face_tol)
+    beside = border_of_steps(open_cells, open_cells, rim, grid, scene, offset_tol)
     outer = _outside_at(surface, rim, grid, tol.rounding)
-    width = (beside - outer)[mouth & ~ndimage.binary_erosion(mouth)]
+    width = (beside - outer)[open_cells & ~ndimage.binary_erosion(open_cells)]
     thickness = float(np.median(width))
     sigma = robust_deviation(width - thickness)
     return _Wall(rim, thickness, sigma, -np.asarray(beside, np.float64), outer, tol.rounding, 0.0)
 
 
 def _rounded_wall(
-    surface: SurfaceFaces, rim: Face, grid: FaceGrid, tol: CavityTolerances
+    surface: SurfaceFaces, rim: Patch, grid: PatchGrid, tol: CavityTolerances
 ) -> _Wall | None:
     """The wall under a rim that is a half circle across: twice as thick as its radius r.
 
@@ -517,7 +516,7 @@ def _sectors(x: Floats, y: Floats) -> Indices:
 
 
 def _cavity(
-    surface: SurfaceFaces, wall: _Wall, grid: FaceGrid, cap_height: float, tol: CavityTolerances
+    surface: SurfaceFaces, wall: _Wall, grid: PatchGrid, cap_height: float, tol: CavityTolerances
 ) -> Cavity | None:
     """The cavity within a wall; None if its thickness varies.
 

@@ -44,11 +44,11 @@ from polmvs.surface.mesh_geometry import (
 )
 from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
-    FaceScene,
-    SteppedFaces,
-    face_scene,
-    find_faces,
-    stepped_faces,
+    PatchScene,
+    SteppedPatches,
+    find_patches,
+    patch_scene,
+    stepped_patches,
 )
 from polmvs.surface.solver import (
     Fit,
@@ -80,7 +80,7 @@ from polmvs.surface.surface_quality import (
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints, KnownSides
 from polmvs.surface.visual_hull import (
-    Plane,
+    SupportingPlane,
     VisualHull,
     supporting_plane,
     visual_hull,
@@ -207,7 +207,7 @@ def reconstruct_surface(
         return Undetermined("the silhouettes of the views have no common object")
     logger.info("visual hull: %d vertices.", len(hull.mesh.vertices))
     given = _Given(
-        scene=face_scene(
+        scene=patch_scene(
             [view.phase_map for view in views],
             angle_model,
             tilt_aware=tilt_aware,
@@ -264,16 +264,16 @@ class _Given:
     on_progress : called with the number of steps done.
     """
 
-    scene: FaceScene
+    scene: PatchScene
     seeds: Seeds
     min_views: int
     on_progress: OnProgress
 
-    def steps(self, mesh: TriangleMesh) -> tuple[SteppedFaces, ...]:
+    def steps(self, mesh: TriangleMesh) -> tuple[SteppedPatches, ...]:
         """Planar patches that silhouettes do not separate."""
         return tuple(
-            stepped_faces(
-                find_faces(self.seeds),
+            stepped_patches(
+                find_patches(self.seeds),
                 self.seeds,
                 self.scene.of(evenly_chosen(len(self.scene.maps), MAX_PATCH_VIEWS)),
                 signed_distance=RayScene(mesh).signed_distance,
@@ -282,7 +282,7 @@ class _Given:
         )
 
 
-def consistent_hull(views: Sequence[SurfaceView], plane: Plane | None) -> VisualHull:
+def consistent_hull(views: Sequence[SurfaceView], plane: SupportingPlane | None) -> VisualHull:
     """The hull whose outlines best match the silhouettes: of all views, or with some wrong ones.
 
     A single wrong silhouette carves the object away; tolerating some makes a hull of few views too
@@ -328,7 +328,7 @@ def _warn_of_inconsistent(
 def _carved(
     mesh: TriangleMesh,
     hull: VisualHull,
-    steps: Sequence[SteppedFaces],
+    steps: Sequence[SteppedPatches],
     cavities: Sequence[Cavity],
 ) -> TriangleMesh:
     """A refined mesh with height steps and cavities carved, their walls sharp."""
@@ -373,7 +373,7 @@ def _polished(
     mesh: TriangleMesh,
     labelled: Labelled,
     refined: Refined,
-    carvings: Sequence[SteppedFaces | Cavity],
+    carvings: Sequence[SteppedPatches | Cavity],
 ) -> _Polished:
     """A carved mesh with the sides of its edges sharp, moved until it has converged."""
     fit = refined.fit
@@ -409,7 +409,7 @@ def _polished(
 def _supported(
     given: _Given,
     polished: _Polished,
-    steps: Sequence[SteppedFaces],
+    steps: Sequence[SteppedPatches],
     cavities: Sequence[Cavity],
     left_out: Mask,
 ) -> GlobalSurface:

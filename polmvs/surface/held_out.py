@@ -24,7 +24,7 @@ from polmvs.surface.observations import Image, Looking, level_image, rows_of_bot
 from polmvs.surface.solver import Level, SolverTolerances, first_fit, refine
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints
-from polmvs.surface.visual_hull import Plane, visual_hull
+from polmvs.surface.visual_hull import SupportingPlane, visual_hull
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -105,15 +105,15 @@ class Prediction:
     overlap: float
     views: tuple[ViewError, ...] = ()
 
-    def odd_view(self, limit_deg: float) -> str | None:
+    def inconsistent_view(self, limit_deg: float) -> str | None:
         """The view, if exactly one of several, that is predicted worse than a limit."""
-        odd = [view.name for view in self.views if view.error_deg > limit_deg]
-        return odd[0] if len(odd) == 1 < len(self.views) else None
+        found = [view.name for view in self.views if view.error_deg > limit_deg]
+        return found[0] if len(found) == 1 < len(self.views) else None
 
 
 def predict_left_out(
     views: Sequence[SurfaceView],
-    plane: Plane | None,
+    plane: SupportingPlane | None,
     looking: Looking,
     known: KnownPoints,
     *,

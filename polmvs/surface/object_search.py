@@ -27,7 +27,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
 from polmvs.surface.matting import find_outline
 from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
-from polmvs.surface.visual_hull import Plane
+from polmvs.surface.visual_hull import SupportingPlane
 
 logger = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ class FoundObject:
 
 def find_object(
     maps: Sequence[PhaseMap],
-    plane: Plane,
+    plane: SupportingPlane,
     points: Floats,
     *,
     tolerances: SearchTolerances | None = None,
@@ -229,7 +229,7 @@ class _Working:
         return distance * self.factor / self.view.camera.mean_focal_px
 
 
-def _working(phase_map: PhaseMap, plane: Plane, longest_px: float) -> _Working:
+def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> _Working:
     view, image = phase_map.view, np.asarray(phase_map.intensity, np.float32)
     inside = phase_map.region.inside.astype(np.float32)
     factor = max(max(image.shape) / longest_px, 1.0)
@@ -243,7 +243,7 @@ def _working(phase_map: PhaseMap, plane: Plane, longest_px: float) -> _Working:
     return _Working(view, factor, image, lowest, log, polarized, on_plane, has_plane)
 
 
-def _on_plane(view: View, plane: Plane, xy: Floats) -> Array:
+def _on_plane(view: View, plane: SupportingPlane, xy: Floats) -> Array:
     """Where the rays of image coordinates ``(..., 2)`` meet a plane; NaN where they do not."""
     rays, center = view.rays_in_world(xy), view.center_in_world
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -410,7 +410,7 @@ class _Cells:
         return np.asarray(cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, kernel) > 0)
 
 
-def _space(views: Sequence[_Working], plane: Plane, tol: SearchTolerances) -> _Cells:
+def _space(views: Sequence[_Working], plane: SupportingPlane, tol: SearchTolerances) -> _Cells:
     """Cells above the plane about the point where the cameras look, within the view of most."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
@@ -455,7 +455,7 @@ def _bounded(
 def _with_extent(
     views: Sequence[_Working],
     shows_plane: Sequence[Mask],
-    plane: Plane,
+    plane: SupportingPlane,
     tol: SearchTolerances,
 ) -> list[_Working]:
     """Views that know how far the plane reaches: where two of them show it, and in between."""
@@ -496,7 +496,7 @@ def _cells_of(
     return np.where(inside[..., None], cells, 0).astype(np.int64), inside
 
 
-def _along(plane: Plane) -> Array:
+def _along(plane: SupportingPlane) -> Array:
     """A unit vector on a plane (3,)."""
     along = np.cross(plane.normal, np.eye(3)[np.argmin(np.abs(plane.normal))])
     return np.asarray(along / lengths(along))
@@ -707,7 +707,7 @@ def _found(
     mask: Mask,
     plate: _Plate,
     *,
-    plane: Plane,
+    plane: SupportingPlane,
     noise: float,
     tol: SearchTolerances,
 ) -> FoundObject:
@@ -723,7 +723,7 @@ def _found(
 
 
 def _behind(
-    views: Sequence[_Working], index: int, plate: _Plate, plane: Plane, places: Floats
+    views: Sequence[_Working], index: int, plate: _Plate, plane: SupportingPlane, places: Floats
 ) -> tuple[Image, Image, Mask]:
     """The plane at image coordinates ``(..., 2)`` of a view, predicted from others.
 

@@ -1,6 +1,6 @@
 """Planar patches with an offset that no silhouette or phase shows: height steps, lids, recesses.
 
-In this module a *face* is a planar patch. Phases give normals, which are the same on parallel
+Phases give normals, which are the same on parallel
 patches, and a silhouette does not show a surface inside its outline. Sparse points do: points that
 share a plane, and whose phases agree with its normal, show a patch and its offset. The extent of a
 patch is found on a grid in its plane. At the right offset, the border and the marks of the patch
@@ -54,11 +54,11 @@ Mask = NDArray[np.bool_]
 SignedDistance: TypeAlias = Callable[[Array], Floats]
 FirstHit: TypeAlias = Callable[[Array, Array], tuple[Floats, Floats]]
 
-NO_FACE = -1
+NO_PATCH = -1
 BESIDE, ACROSS = ((0, 1), (1, 0)), ((1, 1), (1, -1))  # neighbours of a cell: down, right
 SPACING = 0.25  # of samples across a border, cells
 CUT_UNIT = 10_000  # scale of the weights of a cut, which are integers
-MAX_COST = 0.5  # median loss beyond which phases contradict a face: that of ``sigmas`` deviations
+MAX_COST = 0.5  # median loss beyond which phases contradict a patch: that of ``sigmas`` deviations
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,13 +67,13 @@ class OffsetTolerances:
 
     Attributes
     ----------
-    min_points : of a face. Three always share a plane. The same number of neighbours decides
-        whether a point lies among those of another face.
-    num_trials : random triples of points per face; a face of a tenth of the points is then missed
+    min_points : of a patch. Three always share a plane. The same number of neighbours decides
+        whether a point lies among those of another patch.
+    num_trials : random triples of points per patch; a patch of a tenth of the points is then missed
         once in 1000 searches. Derived.
-    sigmas : largest distance of a point to its face, and residual of a phase on it, in deviations.
+    sigmas : largest distance of a point to its patch, and residual of a phase on it, in deviations.
         Derived (99.7 %).
-    normal_deg : largest angle between a point's normal and its face. Guess: several deviations.
+    normal_deg : largest angle between a point's normal and its patch. Guess: several deviations.
     min_normal_sigma_deg : least deviation of the mean of the points' normals (sensor and model, the
         same for all points). Measured on board: 0.2.
     max_cells : of a grid. Memory and time: one solution takes 7 us a cell.
@@ -87,20 +87,20 @@ class OffsetTolerances:
     mark_contrast : of a mark's intensity to its surroundings. As for the region's marks.
     mark_share : share of the views of a point that must show a mark there. Half of them see a wall
         of a convex part. Measured, 0.5: F at 1 mm of an analytic bracket falls by 0.9 points.
-    seed_cells : radius about a sparse point that belongs to its face, and distance of a face's
+    seed_cells : radius about a sparse point that belongs to its patch, and distance of a patch's
         points to the given surface above which the surface does not explain them; a cell is a GSD.
         Guess: a point's uncertainty, and the size of a first surface's cells.
-    leak : conductance to ground of a cell that contradicts its face. Measured, 0.2: F at 1 mm of an
-        analytic bracket falls by 0.2 points.
+    leak : conductance to ground of a cell that contradicts its patch. Measured, 0.2: F at 1 mm of
+        an analytic bracket falls by 0.2 points.
     seed_weight : probability that a walk ends on a point that it passes, relative to a move. Guess.
-    min_total : probability that a walk from a cell ends on the points of any face. Guess: one in a
+    min_total : probability that a walk from a cell ends on the points of any patch. Guess: one in a
         hundred gets through where the phases contradict.
     min_share : share of the views of a point in whose region it must lie. Guess: one view in six
         wrong.
-    min_radius_cells : of a face's area: smaller ones are tangent planes of curved surfaces. Guess.
-        A border moves to the lines in a band of this width: every face has a core. Measured on
+    min_radius_cells : of a patch's area: smaller ones are tangent planes of curved surfaces. Guess.
+        A border moves to the lines in a band of this width: every patch has a core. Measured on
         `step`: bands of 8, 12 and 20 give the same corners.
-    better_by : median loss by which the given surface must explain the views better than a face to
+    better_by : median loss by which the given surface must explain the views better than a patch to
         remain. Guess.
     """
 
@@ -127,7 +127,7 @@ class OffsetTolerances:
 
 
 @dataclass(frozen=True)
-class Face:
+class Patch:
     """A planar patch that sparse points show: points x with ``normal . x = offset``.
 
     Attributes
@@ -147,8 +147,8 @@ class Face:
 
 
 @dataclass(frozen=True)
-class FaceGrid:
-    """A grid of cells perpendicular to a direction; each face is a height over it.
+class PatchGrid:
+    """A grid of cells perpendicular to a direction; each patch is a height over it.
 
     Attributes
     ----------
@@ -170,81 +170,81 @@ class FaceGrid:
         local = np.asarray(points, np.float64) - self.origin
         return np.stack([local @ self.first, local @ self.second], axis=-1) / self.step
 
-    def points(self, face: Face) -> Array:
-        """Points ``(H, W, 3)`` of a face over all cells."""
-        return self.lifted(np.moveaxis(np.indices(self.shape), 0, -1), face)
+    def points(self, patch: Patch) -> Array:
+        """Points ``(H, W, 3)`` of a patch over all cells."""
+        return self.lifted(np.moveaxis(np.indices(self.shape), 0, -1), patch)
 
-    def lifted(self, cells: Floats | NDArray[np.int64], face: Face) -> Array:
-        """Points ``(..., 3)`` of a face over fractional cells ``(..., 2)``."""
+    def lifted(self, cells: Floats | NDArray[np.int64], patch: Patch) -> Array:
+        """Points ``(..., 3)`` of a patch over fractional cells ``(..., 2)``."""
         base = self.origin + self.step * (
             cells[..., :1] * self.first + cells[..., 1:] * self.second
         )
-        rise = -face.height(base) / (self.axis @ face.normal)
+        rise = -patch.height(base) / (self.axis @ patch.normal)
         return np.asarray(base + rise[..., None] * self.axis)
 
 
 @dataclass(frozen=True)
-class SteppedFaces:
-    """Faces of about one normal, and the cells of a grid where the cameras see each.
+class SteppedPatches:
+    """Patches of about one normal, and the cells of a grid where the cameras see each.
 
     Attributes
     ----------
-    faces : by number.
+    patches : by number.
     grid : of the labels.
-    labels : (H, W) int64, number of the face, ``NO_FACE`` where none is shown.
-    shown : (H, W) bool, cells where the views show the face; next to them its label is extended.
-    beside : (G, H, W), signed distance in cells to the cells that are not below each face,
+    labels : (H, W) int64, number of the patch, ``NO_PATCH`` where none is shown.
+    shown : (H, W) bool, cells where the views show the patch; next to them its label is extended.
+    beside : (G, H, W), signed distance in cells to the cells that are not below each patch,
         negative inside; its border lies between cells.
     """
 
-    faces: tuple[Face, ...]
-    grid: FaceGrid
+    patches: tuple[Patch, ...]
+    grid: PatchGrid
     labels: NDArray[np.int64]
     shown: Mask
     beside: Image
 
     def values(self, points: Floats) -> Array:
-        """Signed distance ``(N,)`` of points, positive in the free space above the faces.
+        """Signed distance ``(N,)`` of points, positive in the free space above the patches.
 
-        Space is free above a face's own cells, in the direction of the axis. Above cells without a
-        face it is unknown, and the value is negative. The maximum of this and of another shape's
+        Space is free above a patch's own cells, in the direction of the axis. Above cells without a
+        patch it is unknown, and the value is negative. The maximum of this and of another shape's
         signed distance is that shape, carved.
         """
         points = np.asarray(points, np.float64)
         cells = np.moveaxis(self.grid.cells(points), -1, 0)
-        solid = self._interpolated(self._without_face, cells)
-        for face, beside in self._borders:
+        solid = self._interpolated(self._without_patch, cells)
+        for patch, beside in self._borders:
             across = self._interpolated(beside, cells)
-            solid = np.minimum(solid, np.maximum(across, face.height(points)))
+            solid = np.minimum(solid, np.maximum(across, patch.height(points)))
         return solid
 
     @cached_property
-    def _without_face(self) -> Image:
-        """Distance to the cells that show no face."""
-        return self._smoothly_beside(self.labels == NO_FACE)
+    def _without_patch(self) -> Image:
+        """Distance to the cells that show no patch."""
+        return self._smoothly_beside(self.labels == NO_PATCH)
 
     @cached_property
-    def _borders(self) -> list[tuple[Face, Image]]:
-        """The faces that cells show, with the distance to the cells that are not below each."""
+    def _borders(self) -> list[tuple[Patch, Image]]:
+        """The patches that cells show, with the distance to the cells that are not below each."""
         return [
-            (face, self.grid.step * self.beside[number])
-            for number, face in enumerate(self.faces)
+            (patch, self.grid.step * self.beside[number])
+            for number, patch in enumerate(self.patches)
             if (self.labels == number).any()
         ]
 
     def not_below(self, number: int) -> Mask:
-        """Cells (H, W) of a face, of those above it, and of none.
+        """Cells (H, W) of a patch, of those above it, and of none.
 
-        A face continues below those that stand on it: it has no border inside the solid.
+        A patch continues below those that stand on it: it has no border inside the solid.
         """
-        heights = np.stack([self._rise(face) for face in self.faces])
+        heights = np.stack([self._rise(patch) for patch in self.patches])
         at_label = np.take_along_axis(heights, np.maximum(self.labels, 0)[None], axis=0)[0]
-        return np.asarray((self.labels == NO_FACE) | (at_label >= heights[number]))
+        return np.asarray((self.labels == NO_PATCH) | (at_label >= heights[number]))
 
     def solid(self, points: Floats) -> Array:
-        """Signed distance ``(N,)`` of points to the solid on the lowest face, negative inside.
+        """Signed distance ``(N,)`` of points to the solid on the lowest patch, negative inside.
 
-        The solid below each face is assumed to reach down to the lowest face; inf more than two
+        The solid below each patch is assumed to reach down to the lowest patch; inf more than two
         cells beside it.
         """
         points = np.asarray(points, np.float64)
@@ -252,25 +252,25 @@ class SteppedFaces:
         cells = np.moveaxis(self.grid.cells(points), -1, 0)
         nearest = np.clip(np.rint(cells), 0, np.array(self.labels.shape)[:, None] - 1).astype(int)
         lowest, *standing = self._by_height
-        for face, beside in standing:
+        for patch, beside in standing:
             near = np.flatnonzero(beside[tuple(nearest)] < 2 * self.grid.step)
             across = self._interpolated(beside, cells[:, near])
-            above, under = face.height(points[near]), lowest[0].height(points[near])
+            above, under = patch.height(points[near]), lowest[0].height(points[near])
             found[near] = np.minimum(found[near], np.maximum(across, np.maximum(above, -under)))
         return found
 
     @cached_property
-    def _by_height(self) -> list[tuple[Face, Image]]:
-        """The faces, the lowest first, with the distance to the cells shown not below each."""
-        rise = [float(np.median(self._rise(face))) for face in self.faces]
+    def _by_height(self) -> list[tuple[Patch, Image]]:
+        """The patches, the lowest first, with the distance to the cells shown not below each."""
+        rise = [float(np.median(self._rise(patch))) for patch in self.patches]
         shown = self._smoothly_beside(self.shown)
         return [
-            (self.faces[number], np.maximum(shown, self.grid.step * self.beside[number]))
+            (self.patches[number], np.maximum(shown, self.grid.step * self.beside[number]))
             for number in np.argsort(rise, kind="stable")
         ]
 
-    def _rise(self, face: Face) -> Array:
-        return np.asarray((self.grid.points(face) - self.grid.origin) @ self.grid.axis)
+    def _rise(self, patch: Patch) -> Array:
+        return np.asarray((self.grid.points(patch) - self.grid.origin) @ self.grid.axis)
 
     def _smoothly_beside(self, inside: Mask) -> Image:
         """Signed distance (H, W) to a set of cells, world units, negative inside."""
@@ -282,7 +282,7 @@ class SteppedFaces:
         return np.asarray(found, np.float64)
 
 
-def find_faces(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tuple[Face, ...]:
+def find_patches(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tuple[Patch, ...]:
     """Planes through seeds whose normals agree with them, the largest number of seeds first.
 
     Parameters
@@ -292,8 +292,8 @@ def find_faces(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tupl
 
     Returns
     -------
-    Faces without common seeds. Points among those of a larger face but below it are mirror images
-    and not a separate face.
+    Patches without common seeds. Points among those of a larger patch but below it are mirror
+    images and not a separate patch.
     """
     tol = tolerances or OffsetTolerances()
     points, normals = seeds.points_in_world, seeds.normals_in_world
@@ -301,7 +301,7 @@ def find_faces(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tupl
     rng = np.random.default_rng(0)
     left: Mask = np.asarray(np.isfinite(normals).all(axis=1) & np.isfinite(points).all(axis=1))
     agree = np.cos(np.radians(tol.normal_deg))
-    faces: list[Face] = []
+    patches: list[Patch] = []
     while left.sum() >= tol.min_points:
         index = np.flatnonzero(left)
         triples = index[rng.integers(0, len(index), (tol.num_trials, 3))]
@@ -322,21 +322,21 @@ def find_faces(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tupl
         inlier = distance < tol.sigmas * sigma[index, None]
         inlier &= normals[index] @ trial.T > agree
         members = index[inlier[:, int(inlier.sum(axis=0).argmax())]]
-        face = None
+        patch = None
         for _ in range(5):
             if len(members) < tol.min_points:
                 break
-            face = _fitted(seeds, members, tol)
-            near = np.abs(face.height(points[index])) < tol.sigmas * sigma[index]
-            members = index[near & (normals[index] @ face.normal > agree)]
-        if face is None or len(members) < tol.min_points:
+            patch = _fitted(seeds, members, tol)
+            near = np.abs(patch.height(points[index])) < tol.sigmas * sigma[index]
+            members = index[near & (normals[index] @ patch.normal > agree)]
+        if patch is None or len(members) < tol.min_points:
             break
-        faces.append(Face(face.normal, face.offset, members))
+        patches.append(Patch(patch.normal, patch.offset, members))
         left[members] = False
-    return tuple(_without_interlopers(faces, points, tol))
+    return tuple(_without_interlopers(patches, points, tol))
 
 
-def _fitted(seeds: Seeds, members: NDArray[np.int64], tol: OffsetTolerances) -> Face:
+def _fitted(seeds: Seeds, members: NDArray[np.int64], tol: OffsetTolerances) -> Patch:
     """The plane of most likelihood for the places and the normals of some seeds."""
     points, normals = seeds.points_in_world[members], seeds.normals_in_world[members]
     weight = 1 / np.maximum(seeds.sigma[members], 1e-12) ** 2
@@ -353,26 +353,29 @@ def _fitted(seeds: Seeds, members: NDArray[np.int64], tol: OffsetTolerances) -> 
         right += certain * (tangents @ (mean - normal))
         normal = normal + np.linalg.solve(matrix, right) @ tangents
         normal /= np.linalg.norm(normal)
-    return Face(normal, float(normal @ center), members)
+    return Patch(normal, float(normal @ center), members)
 
 
-def _without_interlopers(faces: Sequence[Face], points: Array, tol: OffsetTolerances) -> list[Face]:
-    """Faces that are no mirror images in a larger one of like normal.
+def _without_interlopers(
+    patches: Sequence[Patch], points: Array, tol: OffsetTolerances
+) -> list[Patch]:
+    """Patches that are no mirror images in a larger one of like normal.
 
-    What a face mirrors lies behind it, sideways within its points and scattered among them. A face
-    below that goes on beside the one above lies around its points, the floor of a recess apart.
+    What a patch mirrors lies behind it, sideways within its points and scattered among them. A
+    patch below that goes on beside the one above lies around its points, the floor of a recess
+    apart.
     """
-    kept: list[Face] = []
-    for face in faces:
+    kept: list[Patch] = []
+    for patch in patches:
         mirrors = [
             other
             for other in kept
-            if face.normal @ other.normal > np.cos(np.radians(CreaseTolerances.crease_deg))
-            and np.median(other.height(points[face.members])) < 0
+            if patch.normal @ other.normal > np.cos(np.radians(CreaseTolerances.crease_deg))
+            and np.median(other.height(points[patch.members])) < 0
         ]
         if mirrors:
-            tangents = np.linalg.svd(face.normal[None])[2][1:]
-            own = points[face.members] @ tangents.T
+            tangents = np.linalg.svd(patch.normal[None])[2][1:]
+            own = points[patch.members] @ tangents.T
             others = np.concatenate([points[other.members] for other in mirrors]) @ tangents.T
             within = Delaunay(others, qhull_options="QJ").find_simplex(own) >= 0
             tree = cKDTree(np.concatenate([own, others]))
@@ -380,24 +383,24 @@ def _without_interlopers(faces: Sequence[Face], points: Array, tol: OffsetTolera
             near = np.atleast_2d(tree.query(own, num)[1])
             if np.mean(within) > 0.5 and np.mean(near[:, 1:] < len(own)) < 0.5:
                 continue
-        kept.append(face)
+        kept.append(patch)
     return kept
 
 
-def stepped_faces(
-    faces: Sequence[Face],
+def stepped_patches(
+    patches: Sequence[Patch],
     seeds: Seeds,
-    scene: FaceScene,
+    scene: PatchScene,
     *,
     signed_distance: SignedDistance | None = None,
     first_hit: FirstHit | None = None,
     tolerances: OffsetTolerances | None = None,
-) -> tuple[SteppedFaces, ...]:
-    """Groups of parallel faces that a first surface does not explain, with their extents.
+) -> tuple[SteppedPatches, ...]:
+    """Groups of parallel patches that a first surface does not explain, with their extents.
 
     Parameters
     ----------
-    faces : from :func:`find_faces`.
+    patches : from :func:`find_patches`.
     seeds : their members.
     scene : the views.
     signed_distance : of points ``(N, 3)`` to the first surface. Groups whose seeds all lie on it
@@ -408,40 +411,40 @@ def stepped_faces(
     """
     tol = tolerances or OffsetTolerances()
     found = []
-    for group in _grouped(faces):
-        points = seeds.points_in_world[np.concatenate([face.members for face in group])]
+    for group in _grouped(patches):
+        points = seeds.points_in_world[np.concatenate([patch.members for patch in group])]
         gsd = _gsd(points, scene.maps)
         if signed_distance is not None and not any(
-            _is_off(face, seeds, signed_distance, tol.seed_cells * gsd) for face in group
+            _is_off(patch, seeds, signed_distance, tol.seed_cells * gsd) for patch in group
         ):
             continue
         grid = _grid_over(group, points, scene.maps, gsd, tol)
         if grid is None:
             continue
         labels, shown = _labels(group, seeds, grid, scene, first_hit, tol)
-        if (labels != NO_FACE).any():
+        if (labels != NO_PATCH).any():
             not_drawn = np.zeros((len(group), *grid.shape), np.float32)
-            steps = SteppedFaces(tuple(group), grid, labels, shown, not_drawn)
+            steps = SteppedPatches(tuple(group), grid, labels, shown, not_drawn)
             beside = [_border(steps, number, scene, tol) for number in range(len(group))]
             found.append(replace(steps, beside=np.stack(beside)))
     return tuple(found)
 
 
-def _border(steps: SteppedFaces, number: int, scene: FaceScene, tol: OffsetTolerances) -> Image:
-    """Signed distance (H, W) in cells to the border of a face with lower ones, negative inside."""
+def _border(steps: SteppedPatches, number: int, scene: PatchScene, tol: OffsetTolerances) -> Image:
+    """Signed distance (H, W) in cells to the border of a patch with lower ones, negative inside."""
     inside, own = steps.not_below(number), steps.labels == number
-    return border_of_steps(inside, own, steps.faces[number], steps.grid, scene, tol)
+    return border_of_steps(inside, own, steps.patches[number], steps.grid, scene, tol)
 
 
 def border_of_steps(
     inside: Mask,
     own: Mask,
-    face: Face,
-    grid: FaceGrid,
-    scene: FaceScene,
-    face_tol: OffsetTolerances,
+    patch: Patch,
+    grid: PatchGrid,
+    scene: PatchScene,
+    offset_tol: OffsetTolerances,
 ) -> Image:
-    """Signed distance (H, W) in cells to the border of a region on a face, negative inside.
+    """Signed distance (H, W) in cells to the border of a region on a patch, negative inside.
 
     Labels also follow lines of polarization, which the smoothing of phases moves outwards. The
     border is the nearest intensity edge that the views show together.
@@ -450,9 +453,9 @@ def border_of_steps(
     ----------
     inside : (H, W) bool, the region.
     own : (H, W) bool, cells where the border may move.
-    face, grid : of the region.
+    patch, grid : of the region.
     scene : the views.
-    face_tol : tolerances.
+    offset_tol : tolerances.
     """
     is_border = inside & ndimage.binary_dilation(~inside)
     if not (is_border & own).any():
@@ -467,15 +470,15 @@ def border_of_steps(
         last = np.array(grid.shape) - 1
         cell = np.clip(np.rint(curve), 0, last).astype(np.int64)
         is_own = own[tuple(nearest[:, cell[:, 0], cell[:, 1]])] & in_frame(curve, *last)
-        places = grid.lifted(curve[:, None] + normals[:, None] * along[:, None], face)
+        places = grid.lifted(curve[:, None] + normals[:, None] * along[:, None], patch)
         steepness, num_views = np.zeros(places.shape[:2]), np.zeros(len(curve))
         for phase_map, images in zip(scene.maps, scene.features, strict=True):
-            xy, seen = _seen(places, face, phase_map)
+            xy, seen = _seen(places, patch, phase_map)
             values = sample_image(np.asarray(images), xy)
             shown = is_own & np.all(seen & (values[..., 3] == 1), axis=1)  # and no printed mark
             if shown.any():
                 slope = step_slope(values[shown, :, 0]) / SPACING
-                steepness[shown] += slope / max(robust_deviation(slope), face_tol.dark)
+                steepness[shown] += slope / max(robust_deviation(slope), offset_tol.dark)
                 num_views += shown
         found, height = nearest_steps(
             steepness / np.maximum(num_views[:, None], 1), along, 1.0, tol
@@ -485,20 +488,20 @@ def border_of_steps(
     return drawn_border(inside, across).astype(np.float32)
 
 
-def _grouped(faces: Sequence[Face]) -> list[list[Face]]:
-    groups: list[list[Face]] = []
-    for face in faces:
+def _grouped(patches: Sequence[Patch]) -> list[list[Patch]]:
+    groups: list[list[Patch]] = []
+    for patch in patches:
         for group in groups:
-            if face.normal @ group[0].normal > np.cos(np.radians(CreaseTolerances.crease_deg)):
-                group.append(face)
+            if patch.normal @ group[0].normal > np.cos(np.radians(CreaseTolerances.crease_deg)):
+                group.append(patch)
                 break
         else:
-            groups.append([face])
+            groups.append([patch])
     return groups
 
 
-def _is_off(face: Face, seeds: Seeds, signed_distance: SignedDistance, limit: float) -> bool:
-    distance = signed_distance(seeds.points_in_world[face.members])
+def _is_off(patch: Patch, seeds: Seeds, signed_distance: SignedDistance, limit: float) -> bool:
+    distance = signed_distance(seeds.points_in_world[patch.members])
     return bool(np.median(np.abs(distance)) > limit)
 
 
@@ -516,16 +519,16 @@ def _gsd(points: Array, maps: Sequence[PhaseMap]) -> float:
 
 
 def _grid_over(
-    group: Sequence[Face],
+    group: Sequence[Patch],
     points: Array,
     maps: Sequence[PhaseMap],
     gsd: float,
     tol: OffsetTolerances,
-) -> FaceGrid | None:
-    """A grid over all that the views' regions show in the plane of the group's largest face."""
-    face = group[0]
-    tangents = np.linalg.svd(face.normal[None])[2][1:]
-    first, second = tangents[0], np.cross(face.normal, tangents[0])
+) -> PatchGrid | None:
+    """A grid over all that the views' regions show in the plane of the group's largest patch."""
+    patch = group[0]
+    tangents = np.linalg.svd(patch.normal[None])[2][1:]
+    first, second = tangents[0], np.cross(patch.normal, tangents[0])
     center = points.mean(axis=0)
     low, high = np.full((len(maps), 2), np.nan), np.full((len(maps), 2), np.nan)
     for k, phase_map in enumerate(maps):
@@ -536,8 +539,8 @@ def _grid_over(
         rays = phase_map.view.camera.rays(xy) @ phase_map.view.cam_from_world.rotation
         origin = phase_map.view.center_in_world
         with np.errstate(divide="ignore", invalid="ignore"):
-            distance = -face.height(origin) / (rays @ face.normal)
-        hit = np.isfinite(distance) & (distance > 0) & (rays @ face.normal < -MIN_FACING_COSINE)
+            distance = -patch.height(origin) / (rays @ patch.normal)
+        hit = np.isfinite(distance) & (distance > 0) & (rays @ patch.normal < -MIN_FACING_COSINE)
         if hit.any():
             local = origin + distance[hit, None] * rays[hit] - center
             place = np.stack([local @ first, local @ second], axis=1)
@@ -552,13 +555,13 @@ def _grid_over(
     step = max(gsd, float(np.sqrt(np.prod(size) / tol.max_cells)))
     rows_cols = np.ceil(size / step).astype(np.int64) + 1
     origin = center + start[0] * first + start[1] * second
-    return FaceGrid(
-        origin, first, second, face.normal, step, (int(rows_cols[0]), int(rows_cols[1]))
+    return PatchGrid(
+        origin, first, second, patch.normal, step, (int(rows_cols[0]), int(rows_cols[1]))
     )
 
 
 @dataclass(frozen=True)
-class FaceScene:
+class PatchScene:
     """Phase maps, the model of their rows, and the images (H, W, 4) whose edges show borders.
 
     The images may be on disk: ``np.asarray`` converts them to arrays.
@@ -569,7 +572,7 @@ class FaceScene:
     tilt_aware: bool
     features: Sequence[ArrayLike]
 
-    def of(self, kept: Mask) -> FaceScene:
+    def of(self, kept: Mask) -> PatchScene:
         """The same for some of the views, ``(K,)`` bool."""
         maps, features = list(compress(self.maps, kept)), list(compress(self.features, kept))
         return replace(self, maps=maps, features=features)
@@ -600,20 +603,20 @@ class FaceScene:
         with ThreadPoolExecutor(default_num_workers()) as pool:
             return np.concatenate(list(pool.map(of_view, self.maps)))
 
-    def losses_on(self, places: Array, face: Face, tol: OffsetTolerances) -> Image:
-        """Loss (K, H, W) of the rows of points ``(H, W, 3)`` on a face."""
-        losses = self.losses(places.reshape(-1, 3), face.normal[:, None], tol)
+    def losses_on(self, places: Array, patch: Patch, tol: OffsetTolerances) -> Image:
+        """Loss (K, H, W) of the rows of points ``(H, W, 3)`` on a patch."""
+        losses = self.losses(places.reshape(-1, 3), patch.normal[:, None], tol)
         return losses.reshape(-1, *places.shape[:2])
 
 
-def face_scene(
+def patch_scene(
     maps: Sequence[PhaseMap],
     angle_model: AngleModel,
     *,
     tilt_aware: bool = True,
     tolerances: OffsetTolerances | None = None,
     folder: Path | None = None,
-) -> FaceScene:
+) -> PatchScene:
     """The scene for planar patches, from the views' phase maps; stored in a folder or in memory.
 
     ``angle_model`` and ``tilt_aware`` are as in :func:`polmvs.normals.rows.gather_rows`.
@@ -626,7 +629,7 @@ def face_scene(
 
     with ThreadPoolExecutor(default_num_workers()) as pool:
         features = list(pool.map(features_of, maps))
-    return FaceScene(maps, angle_model, tilt_aware, features)
+    return PatchScene(maps, angle_model, tilt_aware, features)
 
 
 def _may_be_diffuse(phase_map: PhaseMap, points: Array, cosine: Floats) -> Mask:
@@ -642,8 +645,8 @@ def _may_be_diffuse(phase_map: PhaseMap, points: Array, cosine: Floats) -> Mask:
 
 
 @dataclass(frozen=True)
-class FaceEvidence:
-    """Evidence of the views for a face at the cells of a grid.
+class PatchEvidence:
+    """Evidence of the views for a patch at the cells of a grid.
 
     ``jump`` (H, W): intensity edges in units of noise that a share of the views exceeds;
     ``cost`` (H, W): median robust loss of the phases, 1 where no view has one;
@@ -656,51 +659,53 @@ class FaceEvidence:
 
 
 def _labels(
-    group: Sequence[Face],
+    group: Sequence[Patch],
     seeds: Seeds,
-    grid: FaceGrid,
-    scene: FaceScene,
+    grid: PatchGrid,
+    scene: PatchScene,
     first_hit: FirstHit | None,
     tol: OffsetTolerances,
 ) -> tuple[NDArray[np.int64], Mask]:
-    """Number of the face at each cell, ``NO_FACE`` where there is none, and where it is shown."""
-    places = [grid.points(face) for face in group]
+    """Number of the patch at each cell, ``NO_PATCH`` where there is none, and where it is shown."""
+    places = [grid.points(patch) for patch in group]
     rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
     surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit, tol)
-    labels, shown = np.full(grid.shape, NO_FACE), np.zeros(grid.shape, np.bool_)
+    labels, shown = np.full(grid.shape, NO_PATCH), np.zeros(grid.shape, np.bool_)
     losses = [scene.losses_on(*own, tol) for own in zip(places, group, strict=True)]
-    # Occlusion between faces needs labels: a second pass uses those of the first.
+    # Occlusion between patches needs labels: a second pass uses those of the first.
     for is_labelled in (False, True):
         claims, jumps = np.zeros((2, len(group), *grid.shape))
         possible, fits = np.zeros((2, len(group), *grid.shape), np.bool_)
-        for number, face in enumerate(group):
+        for number, patch in enumerate(group):
             hidden = None
             if is_labelled:
                 hidden = _hidden(number, group, places[number], grid, labels, scene.maps)
-            on_grid = grid.cells(seeds.points_in_world[face.members])
+            on_grid = grid.cells(seeds.points_in_world[patch.members])
             near = _distance_to(on_grid, grid.shape) < 0.5 * tol.mark_px
-            evidence = face_evidence(places[number], face, scene, losses[number], near, hidden, tol)
+            evidence = patch_evidence(
+                places[number], patch, scene, losses[number], near, hidden, tol
+            )
             possible[number] = evidence.possible
             better = evidence.possible & (evidence.cost < surface_cost + tol.better_by)
             fits[number] = better & (evidence.cost < MAX_COST)
             claims[number] = _claim(number, group, seeds, grid, evidence, better, tol)
             jumps[number] = evidence.jump
         # A cell far from few points has a small probability of reaching them, but belongs to the
-        # face if no other face can be there.
+        # patch if no other patch can be there.
         total = claims.sum(axis=0)
         claimed = (total > tol.min_total) & (claims.max(axis=0) > 0.5 * total)
-        labels = np.where(claimed, claims.argmax(axis=0), NO_FACE)
+        labels = np.where(claimed, claims.argmax(axis=0), NO_PATCH)
         labels = _without_small(labels, len(group), tol)
-        # The lowest face ends where others stand on it; there their own borders count.
+        # The lowest patch ends where others stand on it; there their own borders count.
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1))[1:]:
             labels = snapped_border(
                 labels, int(number), jumps[number], tol.min_radius_cells, tol.line_steps
             )
-        # By something that the faces do not explain.
+        # By something that the patches do not explain.
         taken = possible.any(axis=0) & ~fits.any(axis=0)
         taken = ndimage.binary_opening(taken, iterations=2)
-        labels = np.where(taken, NO_FACE, labels)
-        shown = labels != NO_FACE
+        labels = np.where(taken, NO_PATCH, labels)
+        shown = labels != NO_PATCH
         labels = _continued(labels, fits | ~possible.any(axis=0), taken, tol)
     return np.asarray(labels, np.int64), np.asarray(shown, np.bool_)
 
@@ -708,7 +713,7 @@ def _labels(
 def snapped_border(
     labels: NDArray[np.int64], number: int, jump: Array, reach: float, line_steps: float
 ) -> NDArray[np.int64]:
-    """Labels (H, W) with the border of one face moved to the lines near it.
+    """Labels (H, W) with the border of one patch moved to the lines near it.
 
     It is the minimum cut in a band of ``reach`` cells on both sides of the border, through cells
     that a walk hardly crosses. It follows a line around its corners, which a walk rounds off.
@@ -740,7 +745,7 @@ def snapped_border(
     is_reached = np.zeros(num + 2, np.bool_)
     is_reached[breadth_first_order(left, num, return_predecessors=False)] = True
     inside = is_reached[node]
-    others = np.where(own, NO_FACE, labels)
+    others = np.where(own, NO_PATCH, labels)
     nearest = ndimage.distance_transform_edt(own, return_distances=False, return_indices=True)
     given_back = others[tuple(nearest)]
     return np.where(inside, number, np.where(own, given_back, labels))
@@ -751,12 +756,12 @@ def _continued(
 ) -> NDArray[np.int64]:
     """Labels extended to nearby free cells where they are ``allowed`` (G, H, W).
 
-    Next to a face, where the views show no part, a label cannot carve wrongly; but the first
+    Next to a patch, where the views show no part, a label cannot carve wrongly; but the first
     surface may have a margin there as wide as the uncertainty of the silhouettes.
     """
-    if not (labels != NO_FACE).any():
+    if not (labels != NO_PATCH).any():
         return labels
-    distance, nearest = ndimage.distance_transform_edt(labels == NO_FACE, return_indices=True)
+    distance, nearest = ndimage.distance_transform_edt(labels == NO_PATCH, return_indices=True)
     carried = labels[tuple(nearest)]
     free = np.take_along_axis(allowed, carried[None], axis=0)[0] & ~taken
     return np.where((distance <= tol.min_radius_cells) & free, carried, labels)
@@ -814,22 +819,22 @@ def row_losses(
     return np.where(counts, loss, np.nan).astype(np.float32), cosine
 
 
-def face_evidence(
+def patch_evidence(
     places: Array,
-    face: Face,
-    scene: FaceScene,
+    patch: Patch,
+    scene: PatchScene,
     losses: Image,
     near_points: Mask,
     hidden: Sequence[Mask] | None,
     tol: OffsetTolerances,
-) -> FaceEvidence:
-    """Evidence of the views for a face at points ``(H, W, 3)`` on it.
+) -> PatchEvidence:
+    """Evidence of the views for a patch at points ``(H, W, 3)`` on it.
 
     Parameters
     ----------
-    places, face : the face over a grid.
+    places, patch : the patch over a grid.
     scene : the views.
-    losses : (K, H, W) of :meth:`FaceScene.losses_on`.
+    losses : (K, H, W) of :meth:`PatchScene.losses_on`.
     near_points : (H, W) bool, where edges may be those of printed marks.
     hidden : for each view, points ``(H, W)`` that it does not see.
     tol : tolerances.
@@ -838,7 +843,7 @@ def face_evidence(
     own, jumps = np.full((2, *losses.shape), np.nan, np.float32)
     inside, num_seen, num_marks = np.zeros((3, *shape))
     for k, phase_map in enumerate(scene.maps):
-        xy, seen = _seen(places, face, phase_map)
+        xy, seen = _seen(places, patch, phase_map)
         if hidden is not None:
             seen &= ~hidden[k]
         shown = seen & phase_map.shows_surface(xy)
@@ -847,31 +852,31 @@ def face_evidence(
         own[k] = np.where(shown, losses[k], np.nan)
         jumps[k], marks = _line_steps(scene.features[k], xy, shown, tol)
         num_marks += marks
-    # A print on the face is a mark in all views; a print on a wall beside it has another position
+    # A print on the patch is a mark in all views; a print on a wall beside it has another position
     # in each.
     printed = near_points & (num_marks > tol.mark_share * inside)
     jumps[:, printed] = np.nan
     possible = (num_seen >= 2) & (inside >= tol.min_share * num_seen)
-    return FaceEvidence(_shared_lines(jumps, tol.view_share), median_loss(own), possible)
+    return PatchEvidence(_shared_lines(jumps, tol.view_share), median_loss(own), possible)
 
 
-def face_lines(
-    places: Array, face: Face, scene: FaceScene, tol: OffsetTolerances, view_share: float
+def patch_lines(
+    places: Array, patch: Patch, scene: PatchScene, tol: OffsetTolerances, view_share: float
 ) -> Image:
     """Edges (H, W) in units of noise that a share of the views shows at points (H, W, 3)."""
     jumps = np.full((len(scene.maps), *places.shape[:2]), np.nan, np.float32)
     for k, phase_map in enumerate(scene.maps):
-        xy, seen = _seen(places, face, phase_map)
+        xy, seen = _seen(places, patch, phase_map)
         jumps[k] = _line_steps(scene.features[k], xy, seen, tol)[0]
     return _shared_lines(jumps, view_share)
 
 
-def _seen(places: Array, face: Face, phase_map: PhaseMap) -> tuple[Image, Mask]:
-    """Pixels (H, W, 2) of points on a face, and whether the view can see them."""
+def _seen(places: Array, patch: Patch, phase_map: PhaseMap) -> tuple[Image, Mask]:
+    """Pixels (H, W, 2) of points on a patch, and whether the view can see them."""
     view = phase_map.view
     xy = np.asarray(view.camera.project(view.cam_from_world * places))
     seen = in_frame(xy, view.camera.width, view.camera.height, 1)
-    return xy.astype(np.float32), np.asarray(seen & view.faces(places, face.normal))
+    return xy.astype(np.float32), np.asarray(seen & view.faces(places, patch.normal))
 
 
 def _line_steps(
@@ -914,9 +919,9 @@ def _steps(values: Image, shown: Mask, tol: OffsetTolerances) -> Image:
 
 
 def _surface_cost(
-    grid: FaceGrid,
+    grid: PatchGrid,
     top: Array,
-    scene: FaceScene,
+    scene: PatchScene,
     first_hit: FirstHit | None,
     tol: OffsetTolerances,
 ) -> Image:
@@ -939,24 +944,24 @@ def _surface_cost(
 
 def _hidden(
     number: int,
-    group: Sequence[Face],
+    group: Sequence[Patch],
     places: Array,
-    grid: FaceGrid,
+    grid: PatchGrid,
     labels: NDArray[np.int64],
     maps: Sequence[PhaseMap],
 ) -> list[Mask]:
-    """For each view, the cells (H, W) of a face that other labelled faces of the group hide."""
+    """For each view, the cells (H, W) of a patch that other labelled patches of the group hide."""
     hidden = []
     size = np.array(grid.shape)
     for phase_map in maps:
         covered = np.zeros(grid.shape, np.bool_)
         center = phase_map.view.center_in_world
         away = places - center
-        for other, face in enumerate(group):
+        for other, patch in enumerate(group):
             if other == number or not (labels == other).any():
                 continue
             with np.errstate(divide="ignore", invalid="ignore"):
-                share = -face.height(center) / (away @ face.normal)
+                share = -patch.height(center) / (away @ patch.normal)
             between = (share > 0) & (share < 1)
             meeting = center + np.where(between, share, 0.0)[..., None] * away
             cell = np.rint(grid.cells(meeting)).astype(np.int64)
@@ -969,17 +974,17 @@ def _hidden(
 
 def _claim(
     number: int,
-    group: Sequence[Face],
+    group: Sequence[Patch],
     seeds: Seeds,
-    grid: FaceGrid,
-    evidence: FaceEvidence,
+    grid: PatchGrid,
+    evidence: PatchEvidence,
     possible: Mask,
     tol: OffsetTolerances,
 ) -> Array:
-    """Probability (H, W) that a walk from a cell, hampered by lines, ends on this face's points."""
+    """Probability (H, W) that a walk from a cell, hampered by lines, ends on a patch's points."""
     own, others = (np.full(grid.shape, np.inf) for _ in range(2))
-    for other, face in enumerate(group):
-        near = _distance_to(grid.cells(seeds.points_in_world[face.members]), grid.shape)
+    for other, patch in enumerate(group):
+        near = _distance_to(grid.cells(seeds.points_in_world[patch.members]), grid.shape)
         if other == number:
             own = near
         else:
@@ -1045,15 +1050,15 @@ def _distance_to(cells: Array, shape: tuple[int, int]) -> Array:
 
 
 def _without_small(
-    labels: NDArray[np.int64], num_faces: int, tol: OffsetTolerances
+    labels: NDArray[np.int64], num_patches: int, tol: OffsetTolerances
 ) -> NDArray[np.int64]:
-    """Labels in which pieces smaller than a disc of ``min_radius_cells`` become ``NO_FACE``."""
+    """Labels in which pieces smaller than a disc of ``min_radius_cells`` become ``NO_PATCH``."""
     least = np.pi * tol.min_radius_cells**2
     kept = labels.copy()
-    for number in range(num_faces):
+    for number in range(num_patches):
         pieces, num = ndimage.label(labels == number)
         if num:
             small = np.bincount(pieces.ravel()) < least
             small[0] = False
-            kept[small[pieces]] = NO_FACE
+            kept[small[pieces]] = NO_PATCH
     return kept

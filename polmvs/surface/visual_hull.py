@@ -54,7 +54,7 @@ class HullTolerances:
 
 
 @dataclass(frozen=True)
-class Plane:
+class SupportingPlane:
     """Points x with ``normal . x = offset``; free space has ``normal . x > offset``."""
 
     normal: Array
@@ -72,7 +72,7 @@ def supporting_plane(
     tolerances: HullTolerances | None = None,
     num_trials: int = 400,
     seed: int = 0,
-) -> Plane | None:
+) -> SupportingPlane | None:
     """The plane on which the objects stand, if the points around them show one.
 
     Parameters
@@ -116,7 +116,7 @@ def supporting_plane(
         normal, offset, heights = -normal, -offset, -heights
     if len(inliers) < tol.min_plane_share * num or heights.min() < 0:
         return None
-    return Plane(normal, offset)
+    return SupportingPlane(normal, offset)
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class VisualHull:
 
 def visual_hull(
     views: Sequence[SurfaceView],
-    plane: Plane | None = None,
+    plane: SupportingPlane | None = None,
     *,
     wrong_share: float = 0.1,
     tolerances: HullTolerances | None = None,
@@ -224,7 +224,7 @@ def hull_values(
     views: Sequence[SurfaceView],
     points: Floats,
     wrong_share: float,
-    plane: Plane | None,
+    plane: SupportingPlane | None,
     tol: HullTolerances,
 ) -> NDArray[np.float32]:
     """Signed distance ``(N,)`` to the hull's cones at points ``(N, 3)``, negative inside."""
@@ -256,7 +256,7 @@ def _grid(low: Array, high: Array, step: float) -> tuple[int, ...]:
 def _values_on_grid(
     views: Sequence[SurfaceView],
     wrong_share: float,
-    plane: Plane | None,
+    plane: SupportingPlane | None,
     tol: HullTolerances,
     low: Array,
     high: Array,

@@ -10,7 +10,7 @@ from polmvs.normals.mixture_estimator import (
     row_scales,
     solve_mixture,
 )
-from polmvs.normals.observations import Observations
+from polmvs.normals.observations import PointObservations
 from polmvs.polarization.light_mixture import phase_variance
 
 NOISE = 0.004  # of s1 / s0
@@ -27,7 +27,7 @@ def observe(rows, rays, *, diffuse=None, dolp=0.1, noise=NOISE, rng=None):
         rows = np.cos(turn) * rows + np.sin(turn) * np.cross(rays, rows, axis=0)
     other = np.cross(rays, rows, axis=0)
     of_phase = phase_variance(dolps, variance)
-    return Observations(
+    return PointObservations(
         rows=np.where(diffuse, np.stack([other, rows]), np.stack([rows, other])).astype(np.float32),
         rays=rays.astype(np.float32),
         turn_variances=np.stack([of_phase, of_phase]).astype(np.float32),

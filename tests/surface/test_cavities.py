@@ -12,13 +12,13 @@ from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
 from polmvs.surface.cavities import Opening, SurfaceFaces, find_cavities, surface_faces
 from polmvs.surface.mesh_geometry import mesh_from_grid
-from polmvs.surface.offsets import face_scene
+from polmvs.surface.offsets import patch_scene
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Cylinder, Group, Plane
 
 CAMERA = PinholeCamera(width=280, height=240, fx=260.0, fy=260.0, cx=140.0, cy=120.0)
 RADIUS, HEIGHT, WALL = 0.06, 0.12, 0.012
-FOOTPRINT = 0.5 / 260
+GSD = 0.5 / 260
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +111,8 @@ def vessel_maps(
 
 
 def closed_cylinder(bore=RADIUS - WALL, offset=0.0):
-    """Faces of the vessel's outside with a flat cap over its mouth."""
-    step = FOOTPRINT
+    """Faces of the vessel's outside with a flat cap over its opening."""
+    step = GSD
     turns = np.arange(0, 2 * np.pi, step / RADIUS)
     heights = np.arange(0.5 * step, HEIGHT, step)
     turn, height = (a.ravel() for a in np.meshgrid(turns, heights))
@@ -133,12 +133,12 @@ def closed_cylinder(bore=RADIUS - WALL, offset=0.0):
     is_top = normals[:, 2] > 0.5
     patch = is_top & (across < bore)
     opening = Opening(*map(np.flatnonzero, (patch, is_top & ~patch & (across < bore + 1.5 * step))))
-    return SurfaceFaces(centers, normals, ~patch, [opening], inside_along, FOOTPRINT)
+    return SurfaceFaces(centers, normals, ~patch, [opening], inside_along, GSD)
 
 
 def closed_rounded_vessel():
-    """Faces of the vessel with a rounded rim, up to a cap that bulges over its mouth."""
-    step, minor = FOOTPRINT, 0.5 * WALL
+    """Faces of the vessel with a rounded rim, up to a cap that bulges over its opening."""
+    step, minor = GSD, 0.5 * WALL
     middle = HEIGHT - minor
     turns = np.arange(0, 2 * np.pi, step / RADIUS)
     heights = np.arange(0.5 * step, middle, step)
@@ -165,14 +165,14 @@ def closed_rounded_vessel():
     patch = number >= len(profile)
     border = number == len(profile) - 1
     opening = Opening(np.flatnonzero(patch), np.flatnonzero(border))
-    return SurfaceFaces(centers, normals, ~patch, [opening], inside_along, FOOTPRINT)
+    return SurfaceFaces(centers, normals, ~patch, [opening], inside_along, GSD)
 
 
-def test_a_dark_mouth_with_a_rim_of_one_width_opens_into_a_cavity():
+def test_a_dark_opening_with_a_rim_of_one_width_opens_into_a_cavity():
     maps = vessel_maps()
-    (cavity,) = find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA))
-    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
-    assert cavity.thickness_sigma < 0.7 * FOOTPRINT
+    (cavity,) = find_cavities(closed_cylinder(), patch_scene(maps, AngleModel.PPA))
+    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
+    assert cavity.thickness_sigma < 0.7 * GSD
     np.testing.assert_allclose(cavity.rim.normal, [0, 0, 1], atol=0.01)
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.07, -0.07, 0.03], [0.07, 0.07, HEIGHT - 0.003], (3000, 3))
@@ -187,49 +187,49 @@ def test_a_dark_mouth_with_a_rim_of_one_width_opens_into_a_cavity():
 
 
 @pytest.mark.parametrize("harm", [{"weak_inside": True, "dark": 0.1}, {"rim_cut_in": 4}])
-def test_a_mouth_is_found_by_its_darkness(harm):
+def test_a_opening_is_found_by_its_darkness(harm):
     """With a mask the dark inside has phases, and some of them agree with the rim's normal."""
     maps = vessel_maps(**harm)
-    (cavity,) = find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA))
-    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
+    (cavity,) = find_cavities(closed_cylinder(), patch_scene(maps, AngleModel.PPA))
+    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
 
 
 def test_a_rounded_rim_is_as_wide_as_its_wall():
     """The width of what is bright is not: the inner half of the rim reflects the inside."""
-    scene = face_scene(vessel_maps(rounded=True), AngleModel.PPA)
+    scene = patch_scene(vessel_maps(rounded=True), AngleModel.PPA)
     (cavity,) = find_cavities(closed_rounded_vessel(), scene)
-    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
-    assert cavity.rim.offset == pytest.approx(HEIGHT, abs=FOOTPRINT)
+    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
+    assert cavity.rim.offset == pytest.approx(HEIGHT, abs=GSD)
     bore = RADIUS - WALL
-    inner = np.array([[bore - 2 * FOOTPRINT, 0, 0.06], [bore + 2 * FOOTPRINT, 0, 0.06]])
+    inner = np.array([[bore - 2 * GSD, 0, 0.06], [bore + 2 * GSD, 0, 0.06]])
     assert (cavity.values(inner) > 0).tolist() == [True, False]
     # The cap goes, the rim stays.
     cap, rim = [0.2 * bore, 0, HEIGHT + 0.3 * bore], [RADIUS - 0.5 * WALL, 0, HEIGHT - 0.001]
     assert (cavity.values(np.array([cap, rim])) > 0).tolist() == [True, False]
 
 
-def test_a_mouth_is_round_though_its_cells_are_not():
+def test_a_opening_is_round_though_its_cells_are_not():
     """To a tenth of a pixel; cut at whole cells it goes in and out by 0.15."""
-    (cavity,) = find_cavities(closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA))
+    (cavity,) = find_cavities(closed_cylinder(), patch_scene(vessel_maps(), AngleModel.PPA))
     around = np.linspace(0, 2 * np.pi, 180, endpoint=False)
-    radii = RADIUS - WALL + np.arange(3, -3, -0.02) * FOOTPRINT
+    radii = RADIUS - WALL + np.arange(3, -3, -0.02) * GSD
     across = np.stack([np.cos(around), np.sin(around)], axis=-1) * radii[:, None, None]
     points = np.dstack([across, np.full(across.shape[:2], HEIGHT - 0.001)])
     free = cavity.values(points.reshape(-1, 3)).reshape(points.shape[:2]) > 0
-    off = (radii[free.argmax(axis=0)] - (RADIUS - WALL)) / FOOTPRINT
+    off = (radii[free.argmax(axis=0)] - (RADIUS - WALL)) / GSD
     assert abs(off.mean()) < 0.15
     assert off.std() < 0.1
 
 
-def test_a_bent_cap_hides_no_mouth():
-    surface, scene = closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA)
+def test_a_bent_cap_hides_no_opening():
+    surface, scene = closed_cylinder(), patch_scene(vessel_maps(), AngleModel.PPA)
     x, y, z = surface.centers.T
     is_patch = np.isin(np.arange(len(x)), surface.openings[0].patch)
-    height = np.where(is_patch & (x > 0), z + 12 * FOOTPRINT, z)
+    height = np.where(is_patch & (x > 0), z + 12 * GSD, z)
     bent = replace(surface, centers=np.stack([x, y, height], axis=1))
     (cavity,) = find_cavities(bent, scene)
-    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * FOOTPRINT)
-    assert cavity.rim.offset == pytest.approx(HEIGHT, abs=0.5 * FOOTPRINT)
+    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
+    assert cavity.rim.offset == pytest.approx(HEIGHT, abs=0.5 * GSD)
     # The space above the rim is free up to the cap.
     assert (cavity.values(bent.centers[(x > 0) & (np.hypot(x, y) < 0.03)]) > 0).all()
 
@@ -237,7 +237,7 @@ def test_a_bent_cap_hides_no_mouth():
 def test_a_deep_cavity_has_a_bottom_however_fine_the_grid(monkeypatch):
     """The layers of a grid are few where its memory is bounded."""
     monkeypatch.setattr("polmvs.surface.cavities.MAX_CELLS", 12 * 97**2)
-    (cavity,) = find_cavities(closed_cylinder(), face_scene(vessel_maps(), AngleModel.PPA))
+    (cavity,) = find_cavities(closed_cylinder(), patch_scene(vessel_maps(), AngleModel.PPA))
     assert (cavity.values(np.array([[0, 0, 0.35 * HEIGHT]])) > 0).all()
 
 
@@ -264,19 +264,19 @@ def test_islands_of_a_cap_belong_to_its_opening():
 
 def test_a_closed_body_has_no_cavity():
     maps = vessel_maps(bore=1e-4)
-    assert find_cavities(closed_cylinder(0.03), face_scene(maps, AngleModel.PPA)) == ()
+    assert find_cavities(closed_cylinder(0.03), patch_scene(maps, AngleModel.PPA)) == ()
 
 
 def test_a_rim_of_varying_width_infers_nothing():
     maps = vessel_maps(bore=0.035, offset=0.015)
-    assert find_cavities(closed_cylinder(0.035, 0.015), face_scene(maps, AngleModel.PPA)) == ()
+    assert find_cavities(closed_cylinder(0.035, 0.015), patch_scene(maps, AngleModel.PPA)) == ()
 
 
-def test_a_bright_label_without_phase_is_no_mouth():
+def test_a_bright_label_without_phase_is_no_opening():
     maps = vessel_maps(dark=1.0)
-    assert find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
+    assert find_cavities(closed_cylinder(), patch_scene(maps, AngleModel.PPA)) == ()
 
 
 def test_too_few_views_find_nothing():
     maps = vessel_maps()[:2]
-    assert find_cavities(closed_cylinder(), face_scene(maps, AngleModel.PPA)) == ()
+    assert find_cavities(closed_cylinder(), patch_scene(maps, AngleModel.PPA)) == ()

@@ -39,7 +39,7 @@ from polmvs.surface.terms import KnownPoints
 PPA = AngleModel.PPA
 NO_SEEDS = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 NOTHING = np.zeros((0, 3))
-FOOTPRINT = 5 / 150
+GSD = 5 / 150
 QUICK = SolverTolerances(
     levels=(
         Level(edge_px=5.0, num_steps=8, loss_scale=12.0, gate_px=25.0),
@@ -71,14 +71,14 @@ def surface(maps):
 
 
 def test_the_cloud_lies_on_the_object_with_its_normals(surface, maps):
-    found = surface_points(surface, maps, 0.5 * FOOTPRINT)
+    found = surface_points(surface, maps, 0.5 * GSD)
     cloud = found.cloud
     radii = np.linalg.norm(cloud.points, axis=1)
     assert not found.inferred.any()
     specular, diffuse, dolp = found.light
     assert np.median(specular) > 0.9 > 0.1 > np.median(diffuse)
     assert np.median(dolp) == pytest.approx(DOLP, rel=0.05)
-    assert np.quantile(np.abs(radii - 1), 0.95) < FOOTPRINT
+    assert np.quantile(np.abs(radii - 1), 0.95) < GSD
     angle = np.degrees(np.arccos(np.clip((cloud.normals * cloud.points).sum(1) / radii, -1, 1)))
     assert np.mean(angle) < 1.6
     assert cloud.num_views.min() >= 2
@@ -86,12 +86,12 @@ def test_the_cloud_lies_on_the_object_with_its_normals(surface, maps):
 
 
 def test_deviations_hold(surface, maps):
-    cloud = surface_points(surface, maps, 0.5 * FOOTPRINT).cloud
+    cloud = surface_points(surface, maps, 0.5 * GSD).cloud
     known = np.isfinite(cloud.sigma)
     error = np.abs(np.linalg.norm(cloud.points, axis=1) - 1)
     assert known.mean() > 0.9
     assert np.mean(error[known] < 2 * cloud.sigma[known]) > 0.9
-    assert np.median(cloud.sigma[known]) < 2 * FOOTPRINT  # and says something
+    assert np.median(cloud.sigma[known]) < 2 * GSD  # and says something
 
 
 def test_what_no_view_sees_is_left_out(surface):
@@ -113,7 +113,7 @@ def test_rendered_depth_is_the_objects(surface):
     found = dense.range_map[: smooth.shape[0], : smooth.shape[1]]
     both = (found > 0) & np.isfinite(smooth) & (smooth < 4.5)
     assert both.sum() > 300
-    assert np.median(np.abs(found - smooth)[both]) < FOOTPRINT
+    assert np.median(np.abs(found - smooth)[both]) < GSD
     assert (dense.range_map > 0).sum() == dense.known.sum()
 
 
@@ -122,12 +122,12 @@ def test_the_faces_of_a_box_are_not_drawn_outwards_by_its_edges():
     half = np.array([0.8, 0.6, 0.5])
     maps = phase_maps_of(box(half), VIEWS, noise=np.radians(0.5))
     found = reconstruct(maps, tolerances=None)
-    cloud = surface_points(found, maps, 0.5 * FOOTPRINT).cloud
+    cloud = surface_points(found, maps, 0.5 * GSD).cloud
     beyond = np.abs(cloud.points) - half
     side = beyond.argmax(axis=1)
-    inner = np.sort(beyond, axis=1)[:, 1] < -3 * FOOTPRINT
+    inner = np.sort(beyond, axis=1)[:, 1] < -3 * GSD
     for axis in range(3):
-        offset = beyond[inner & (side == axis), axis] / FOOTPRINT
+        offset = beyond[inner & (side == axis), axis] / GSD
         assert abs(np.median(offset)) < 0.2, axis
 
 
@@ -138,13 +138,13 @@ def test_points_deny_what_is_farther_from_them(surface):
     ball = surface.mesh.moved(
         (1 / np.linalg.norm(surface.mesh.vertices, axis=1) - 1)[:, None] * surface.mesh.vertices
     )
-    larger = ball.moved(0.3 * FOOTPRINT * ball.vertices)
-    noise = 1 + 0.3 * FOOTPRINT * rng.standard_normal((60, 1))
-    known = KnownPoints(noise * directions, np.full(60, FOOTPRINT))
-    assert points_deny(larger, ball, known, FOOTPRINT)
-    assert not points_deny(ball, larger, known, FOOTPRINT)
+    larger = ball.moved(0.3 * GSD * ball.vertices)
+    noise = 1 + 0.3 * GSD * rng.standard_normal((60, 1))
+    known = KnownPoints(noise * directions, np.full(60, GSD))
+    assert points_deny(larger, ball, known, GSD)
+    assert not points_deny(ball, larger, known, GSD)
     few = KnownPoints(known.points[:6], known.sigma[:6])
-    assert not points_deny(larger, ball, few, FOOTPRINT)
+    assert not points_deny(larger, ball, few, GSD)
 
 
 def test_a_view_that_sees_nothing_has_no_depth(surface):
@@ -162,7 +162,7 @@ def test_one_wrong_mask_and_one_wrong_pose_do_no_harm(maps):
     found = reconstruct([wrong_mask, *maps[1:5], wrong_pose, *maps[6:]])
     assert not isinstance(found, Undetermined)
     radii = np.linalg.norm(found.mesh.centers[found.supported], axis=1)
-    assert np.median(np.abs(radii - 1)) < 1.5 * FOOTPRINT
+    assert np.median(np.abs(radii - 1)) < 1.5 * GSD
     assert found.left_out[0]
 
 
@@ -179,9 +179,9 @@ def test_views_that_contradict_the_others_are_named_and_left_out(caplog):
     assert np.flatnonzero(found.left_out).tolist() == [3, 9]
     told = [record.message for record in caplog.records if "is inconsistent" in record.message]
     assert [VIEWS[index].name in told[place] for place, index in enumerate((3, 9))] == [True, True]
-    cloud = surface_points(found, [maps[0], maps[6]], 0.5 * FOOTPRINT).cloud
+    cloud = surface_points(found, [maps[0], maps[6]], 0.5 * GSD).cloud
     off = np.abs(box(half)(cloud.points))
-    assert np.quantile(off, 0.9) < 2 * FOOTPRINT
+    assert np.quantile(off, 0.9) < 2 * GSD
 
 
 def test_views_that_agree_are_all_kept(surface):
@@ -219,7 +219,7 @@ def test_several_objects():
     found = reconstruct(phase_maps_of(pair, VIEWS))
     assert not isinstance(found, Undetermined)
     assert len(set(found.mesh.face_components)) == 2
-    assert np.median(np.abs(pair(found.mesh.vertices))) < FOOTPRINT
+    assert np.median(np.abs(pair(found.mesh.vertices))) < GSD
 
 
 def dish(radius=1.6, wall=0.07, rim=0.2):
@@ -244,7 +244,7 @@ def test_thin_walls_are_found_by_a_finer_mesh():
     x, y = np.meshgrid([-0.4, 0.0, 0.4], [-0.4, 0.0, 0.4])
     inner = np.stack([x, y, 1.3 - np.sqrt(1.53**2 - x**2 - y**2)], axis=-1).reshape(-1, 3)
     place, _, _ = RayScene(found.mesh.only(found.supported)).closest(inner)
-    assert np.linalg.norm(place - inner, axis=1).max() < 1.5 * FOOTPRINT
+    assert np.linalg.norm(place - inner, axis=1).max() < 1.5 * GSD
 
 
 def with_regions(maps, inside):
@@ -268,22 +268,22 @@ def test_inferred_faces_can_be_left_out(surface, maps):
     """Neither mesh nor cloud then has them."""
     upper = surface.mesh.centers[:, 2] > 0
     guessed = replace(surface, inferred=surface.supported & upper)
-    assert surface_points(guessed, maps, 0.5 * FOOTPRINT).inferred.any()
+    assert surface_points(guessed, maps, 0.5 * GSD).inferred.any()
     shown = guessed.shown()
     assert supported_mesh(shown).vertices[:, 2].max() < supported_mesh(guessed).vertices[:, 2].max()
     assert len(supported_mesh(shown).triangles) == (surface.supported & ~upper).sum()
-    cloud = surface_points(shown, maps, 0.5 * FOOTPRINT)
+    cloud = surface_points(shown, maps, 0.5 * GSD)
     assert not cloud.inferred.any()
-    assert cloud.cloud.points[:, 2].max() < 2.5 * FOOTPRINT  # an edge of a face
+    assert cloud.cloud.points[:, 2].max() < 2.5 * GSD  # an edge of a face
 
 
 def test_contradicted_faces_have_neither_points_nor_depths(surface, maps):
     upper = surface.mesh.centers[:, 2] > 0
     doubted = replace(surface, contradicted=upper)
     assert len(supported_mesh(doubted).triangles) == surface.supported.sum()
-    cloud = surface_points(doubted, maps, 0.5 * FOOTPRINT).cloud
+    cloud = surface_points(doubted, maps, 0.5 * GSD).cloud
     assert len(cloud.points)
-    assert cloud.points[:, 2].max() < 2.5 * FOOTPRINT  # an edge of a face
+    assert cloud.points[:, 2].max() < 2.5 * GSD  # an edge of a face
     scene = RayScene(surface.mesh)
     whole = render_view(surface, scene, maps[0].view, 2)
     part = render_view(doubted, scene, maps[0].view, 2)

@@ -110,7 +110,7 @@ def test_phases_of_something_else_are_at_chance(views) -> None:
     assert chance.unexplained > 0.5
 
 
-def test_one_view_that_is_odd_is_named(views) -> None:
+def test_one_inconsistent_view_is_named(views) -> None:
     """A view among those left out looks aside by 4 deg: it alone is predicted badly."""
     turn = Rotation.from_rotvec([0, 0.07, 0]).as_matrix()
     pose = views[6].view.cam_from_world
@@ -119,8 +119,8 @@ def test_one_view_that_is_odd_is_named(views) -> None:
     wrong = replace(views[6], phase_map=views[6].phase_map.changed(view=other))
     found = predicted([*views[:6], wrong, *views[7:]])
     assert [view.name for view in found.views] == ["002.png", "006.png", "010.png"]
-    assert found.odd_view(4.0) == "006.png"
-    assert predicted(views).odd_view(4.0) is None
+    assert found.inconsistent_view(4.0) == "006.png"
+    assert predicted(views).inconsistent_view(4.0) is None
 
 
 def test_a_short_trial_that_fails_is_done_again_with_care(views) -> None:

@@ -20,8 +20,8 @@ from polmvs.synthetic.captures import add_noise, render_view, ring_of_views
 from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
 OPTIONS = PropagationOptions(num_rounds=2)
-FOOTPRINT = 0.5 / CAMERA.fx  # of a pixel at the scenes' distance, 4 mm
-SEED_TIE = 0.02 * FOOTPRINT  # the least deviation of a seed's tie: nothing gets more certain
+GSD = 0.5 / CAMERA.fx  # of a pixel at the scenes' distance, 4 mm
+SEED_TIE = 0.02 * GSD  # the least deviation of a seed's tie: nothing gets more certain
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def rmse(values):
 def test_ppa_gives_the_board_within_the_seeds_ties(scene, dense):
     ranges, turns, found = errors_of(scene, dense)
     assert rmse(ranges) < SEED_TIE
-    assert np.abs(ranges).max() < 0.25 * FOOTPRINT
+    assert np.abs(ranges).max() < 0.25 * GSD
     assert np.median(turns) < 0.05
     # A normal that errs by more over a smoothing width of 5 px would bend a visible step.
     assert np.percentile(turns, 99) < 1.5
@@ -93,12 +93,12 @@ def test_wrong_seeds_lose(scene, tmp_path):
     dense = integrate(AngleModel.PPA, scene.maps, bad, OPTIONS, tmp_path)
     ranges, _, _ = errors_of(scene, dense)
     # Pixels that the lattice joins to no others go with the seed beside them; fusion drops them.
-    good = np.abs(ranges) < 0.25 * FOOTPRINT
+    good = np.abs(ranges) < 0.25 * GSD
     assert good.mean() > 0.99
     assert rmse(ranges[good]) < SEED_TIE
     cloud = fuse(scene.maps, dense, FusionOptions())
     normal = scene.surface.normal / np.linalg.norm(scene.surface.normal)
-    assert np.abs((cloud.points - scene.surface.point) @ normal).max() < FOOTPRINT
+    assert np.abs((cloud.points - scene.surface.point) @ normal).max() < GSD
 
 
 def test_no_seeds_no_surface(scene, tmp_path):
@@ -265,7 +265,7 @@ def test_a_depth_jump_is_not_bridged(tmp_path):
     ranges, _, _ = errors_of(scene, dense, min_cosine=0.4)
     assert np.median(np.abs(ranges)) < SEED_TIE
     # A bridge of some pixels all along the outline would spoil a quarter of the smaller board.
-    assert (np.abs(ranges) < 0.5 * FOOTPRINT).mean() > 0.93
+    assert (np.abs(ranges) < 0.5 * GSD).mean() > 0.93
 
 
 def test_no_line_runs_across_an_edge(scene):

@@ -16,11 +16,11 @@ from polmvs.scene import Tracks, View
 from polmvs.surface.object_search import FoundObject, fill_false_holes, find_object
 from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
-from polmvs.surface.visual_hull import Plane
+from polmvs.surface.visual_hull import SupportingPlane
 
 RADIUS = 0.8
 CENTER = np.array([0.0, 0.0, RADIUS - 0.3])  # it is cut by the plane
-TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+TABLE = SupportingPlane(np.array([0.0, 0.0, 1.0]), 0.0)
 TEXEL = 0.03
 WALL = 0.3
 

@@ -1,4 +1,4 @@
-"""Faces and their borders on analytic plates with steps and recesses."""
+"""Patches and their borders on analytic plates with steps and recesses."""
 
 from dataclasses import dataclass, replace
 
@@ -9,13 +9,13 @@ from scenes import phase_map_of
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
-from polmvs.surface.offsets import face_scene, find_faces, snapped_border, stepped_faces
+from polmvs.surface.offsets import find_patches, patch_scene, snapped_border, stepped_patches
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
 CAMERA = PinholeCamera(width=320, height=256, fx=270.0, fy=270.0, cx=160.0, cy=128.0)
 PLATE, BOX = 0.14, 0.055  # half sides, m
-FOOTPRINT = 0.6 / 270
+GSD = 0.6 / 270
 SIGMA = 2e-4
 
 
@@ -53,7 +53,7 @@ class Scene:
 
 
 def step_scene(height, tilt_deg=0.0, num_views=9, noise=SIGMA, top_gain=1.0, diffuse_dolp=None):
-    """A plate with a box on it (or a recess in it), ten and nine points on the two faces.
+    """A plate with a box on it (or a recess in it), ten and nine points on the two patches.
 
     The box's top is brighter by ``top_gain``. With ``diffuse_dolp``, the plate shows diffuse light
     of that DoLP beside the box, where it mirrors the dark walls.
@@ -115,7 +115,7 @@ def column_points(num=4000, seed=0):
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (num, 3)) * [0.9 * PLATE, 0.9 * PLATE, 0.06]
     from_wall = np.abs(np.abs(points[:, :2]).max(axis=1) - BOX)
-    return points[from_wall > 3 * FOOTPRINT]
+    return points[from_wall > 3 * GSD]
 
 
 @pytest.mark.parametrize(
@@ -124,15 +124,15 @@ def column_points(num=4000, seed=0):
 )
 def test_space_above_the_faces_of_a_step_is_free(height, tilt_deg):
     scene = step_scene(height, tilt_deg)
-    faces = find_faces(scene.seeds)
-    assert sorted(len(face.members) for face in faces) == [9, 10]
-    (group,) = stepped_faces(faces, scene.seeds, face_scene(scene.maps, AngleModel.PPA))
+    patches = find_patches(scene.seeds)
+    assert sorted(len(patch.members) for patch in patches) == [9, 10]
+    (group,) = stepped_patches(patches, scene.seeds, patch_scene(scene.maps, AngleModel.PPA))
     points = column_points()
     above = points[:, 2] - scene.true_height(points[:, :2])
     clear = np.abs(above) > 1e-3
     free = group.values(points) > 0
     assert np.mean(free[clear] == (above[clear] > 0)) > 0.99
-    # Near a face its distance is the value itself, to a fraction of a millimetre.
+    # Near a patch its distance is the value itself, to a fraction of a millimetre.
     near = (np.abs(above) < 3e-3) & (np.abs(np.abs(points[:, :2]).max(axis=1) - BOX) > 0.015)
     cosine = np.where(np.abs(points[near, :2]).max(axis=1) < BOX, np.cos(np.radians(tilt_deg)), 1)
     assert np.quantile(np.abs(group.values(points[near]) - above[near] * cosine), 0.95) < 5e-4
@@ -140,8 +140,8 @@ def test_space_above_the_faces_of_a_step_is_free(height, tilt_deg):
 
 def free_share(scene):
     """Share of the points above the plate beside the box that are free, and of those in the box."""
-    (group,) = stepped_faces(
-        find_faces(scene.seeds), scene.seeds, face_scene(scene.maps, AngleModel.PPA)
+    (group,) = stepped_patches(
+        find_patches(scene.seeds), scene.seeds, patch_scene(scene.maps, AngleModel.PPA)
     )
     points = column_points()
     outside = np.abs(points[:, :2]).max(axis=1)
@@ -168,11 +168,11 @@ def test_walls_stand_where_the_intensity_steps(top_gain, most):
     Polarization alone shows the border then, whose steps the regions' smoothing widens.
     """
     scene = step_scene(0.03, top_gain=top_gain)
-    (group,) = stepped_faces(
-        find_faces(scene.seeds), scene.seeds, face_scene(scene.maps, AngleModel.PPA)
+    (group,) = stepped_patches(
+        find_patches(scene.seeds), scene.seeds, patch_scene(scene.maps, AngleModel.PPA)
     )
     along = np.linspace(-0.7, 0.7, 41) * BOX
-    beside = np.arange(-3, 3.05, 0.1) * FOOTPRINT
+    beside = np.arange(-3, 3.05, 0.1) * GSD
     medians, squares = [], []
     for axis in (0, 1):
         for sign in (-1, 1):
@@ -180,7 +180,7 @@ def test_walls_stand_where_the_intensity_steps(top_gain, most):
             points[..., axis] = sign * (BOX + beside[:, None])
             points[..., 1 - axis] = along
             free = group.values(points.reshape(-1, 3)).reshape(points.shape[:2]) > 0
-            off = beside[free.argmax(axis=0)] / FOOTPRINT - 0.05
+            off = beside[free.argmax(axis=0)] / GSD - 0.05
             medians.append(np.median(off))
             squares.append(np.mean(off**2))
     assert np.abs(medians).max() < most
@@ -193,23 +193,23 @@ def test_a_surface_that_explains_all_points_is_left_alone():
     def exact(points):
         return points[:, 2] - scene.true_height(points[:, :2])
 
-    faces = find_faces(scene.seeds)
+    patches = find_patches(scene.seeds)
     assert (
-        stepped_faces(
-            faces, scene.seeds, face_scene(scene.maps, AngleModel.PPA), signed_distance=exact
+        stepped_patches(
+            patches, scene.seeds, patch_scene(scene.maps, AngleModel.PPA), signed_distance=exact
         )
         == ()
     )
-    # A plain box: one face, on the surface that silhouettes give.
+    # A plain box: one patch, on the surface that silhouettes give.
     plain = Seeds(
         *(a[9:] for a in (scene.seeds.points_in_world, scene.seeds.normals_in_world)),
         scene.seeds.sigma[9:],
     )
-    (face,) = find_faces(plain)
-    found = stepped_faces(
-        [face],
+    (patch,) = find_patches(plain)
+    found = stepped_patches(
+        [patch],
         plain,
-        face_scene(scene.maps, AngleModel.PPA),
+        patch_scene(scene.maps, AngleModel.PPA),
         signed_distance=lambda points: points[:, 2],
     )
     assert found == ()
@@ -231,8 +231,8 @@ def test_what_stands_on_a_face_is_not_carved(knows_the_ball):
         def first_hit(origins, direction):
             return ball.intersect(origins, np.broadcast_to(direction, origins.shape))
 
-    (group,) = stepped_faces(
-        find_faces(seeds), seeds, face_scene(maps, AngleModel.PPA), first_hit=first_hit
+    (group,) = stepped_patches(
+        find_patches(seeds), seeds, patch_scene(maps, AngleModel.PPA), first_hit=first_hit
     )
     rng = np.random.default_rng(0)
     inside = rng.normal(size=(500, 3))
@@ -248,11 +248,11 @@ def test_false_matches_among_the_points_of_a_face_are_no_face():
     points[30:, 2] = -0.004  # mirror images, all at one depth
     normals = unit_rows(np.array([0.0, 0.0, 1.0]) + rng.normal(0, 0.003, (40, 3)))
     points += rng.normal(0, SIGMA, points.shape)
-    (face,) = find_faces(Seeds(points, normals, np.full(40, SIGMA)))
-    assert set(face.members) <= set(range(30))
-    assert len(face.members) >= 28
-    assert abs(face.offset) < SIGMA
-    np.testing.assert_allclose(face.normal, [0, 0, 1], atol=2e-3)
+    (patch,) = find_patches(Seeds(points, normals, np.full(40, SIGMA)))
+    assert set(patch.members) <= set(range(30))
+    assert len(patch.members) >= 28
+    assert abs(patch.offset) < SIGMA
+    np.testing.assert_allclose(patch.normal, [0, 0, 1], atol=2e-3)
 
 
 def test_points_of_a_curved_surface_or_too_few_make_no_large_face():
@@ -260,17 +260,17 @@ def test_points_of_a_curved_surface_or_too_few_make_no_large_face():
     normals = unit_rows(rng.normal(size=(60, 3)) + np.array([0, 0, 2]))
     ball = Seeds(0.05 * normals, normals, np.full(60, SIGMA))
     # Neighbours that share a tangent plane by chance, at most.
-    assert all(len(face.members) < 8 for face in find_faces(ball))
+    assert all(len(patch.members) < 8 for patch in find_patches(ball))
     flat = np.column_stack([rng.uniform(size=(3, 2)), np.zeros(3)])
     few = Seeds(flat, np.tile([0.0, 0.0, 1.0], (3, 1)), np.full(3, SIGMA))
-    assert find_faces(few) == ()
+    assert find_patches(few) == ()
     unknown = Seeds(0.05 * normals, np.full((60, 3), np.nan), np.full(60, SIGMA))
-    assert find_faces(unknown) == ()
-    assert stepped_faces((), few, face_scene([], AngleModel.PPA)) == ()
+    assert find_patches(unknown) == ()
+    assert stepped_patches((), few, patch_scene([], AngleModel.PPA)) == ()
 
 
 def face_seeds(xy, height):
-    """Seeds at places (N, 2) of a level face."""
+    """Seeds at places (N, 2) of a level patch."""
     points = np.column_stack([xy, np.full(len(xy), height)])
     return Seeds(points, np.tile([0.0, 0.0, 1.0], (len(xy), 1)), np.full(len(xy), SIGMA))
 
@@ -289,7 +289,7 @@ def test_few_points_around_many_of_another_face_are_a_face(below):
             for name in ("points_in_world", "normals_in_world", "sigma")
         )
     )
-    assert sorted(len(face.members) for face in find_faces(seeds)) == [7, 40]
+    assert sorted(len(patch.members) for patch in find_patches(seeds)) == [7, 40]
 
 
 def test_a_border_follows_its_lines_around_corners():
@@ -310,8 +310,8 @@ def test_a_border_follows_its_lines_around_corners():
 
 def test_what_stands_on_the_lowest_face_is_solid():
     scene = step_scene(0.03, 0.0)
-    faces = find_faces(scene.seeds)
-    (group,) = stepped_faces(faces, scene.seeds, face_scene(scene.maps, AngleModel.PPA))
+    patches = find_patches(scene.seeds)
+    (group,) = stepped_patches(patches, scene.seeds, patch_scene(scene.maps, AngleModel.PPA))
     points = column_points()
     inside = (np.abs(points[:, :2]) < BOX).all(axis=1) & (points[:, 2] > 0) & (points[:, 2] < 0.03)
     clear = np.minimum(np.abs(points[:, 2]), np.abs(points[:, 2] - 0.03)) > 1e-3

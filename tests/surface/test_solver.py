@@ -50,7 +50,7 @@ from polmvs.surface.terms import (
 from polmvs.surface.visual_hull import visual_hull
 
 PPA = AngleModel.PPA
-FOOTPRINT = 5 / 150
+GSD = 5 / 150
 QUICK = SolverTolerances(
     levels=(
         Level(edge_px=4.0, num_steps=8, loss_scale=12.0, gate_px=25.0),
@@ -67,7 +67,7 @@ def views_of(distance, views=None, **kwargs):
     ]
 
 
-def fit_of(views, gsd=FOOTPRINT, *, tilt_aware=False, **kwargs):
+def fit_of(views, gsd=GSD, *, tilt_aware=False, **kwargs):
     return first_fit(views, Looking(angle_model=PPA, tilt_aware=tilt_aware), gsd, **kwargs)
 
 
@@ -168,7 +168,7 @@ def test_rim_points_lie_on_the_outline_not_within_it():
 HALF = np.array([0.8, 0.6, 0.5])
 
 
-def sharp_box(half=HALF, step=2 * FOOTPRINT):
+def sharp_box(half=HALF, step=2 * GSD):
     """Triangles of a box whose sides are grids that share the vertices of their edges."""
     vertices, faces, count = [], [], 0
     for axis in range(3):
@@ -198,7 +198,7 @@ def test_edges_go_where_their_sides_meet():
     sharp = crease_vertices(mesh, np.ones(len(mesh.faces), bool))
     on_edge = (np.abs(np.abs(mesh.vertices) - HALF) < 1e-9).sum(axis=1) >= 2
     assert np.array_equal(sharp, on_edge)
-    rise = 0.3 * FOOTPRINT
+    rise = 0.3 * GSD
     on_top = mesh.vertices[:, 2] > HALF[2] - 1e-9
     moves = np.where((on_top & ~sharp)[:, None], [0, 0, rise], np.zeros(3))
     moved = with_edges(mesh, moves, sharp)
@@ -216,14 +216,14 @@ def test_outlines_of_edges_move_with_their_sides():
     sharp = crease_vertices(mesh, np.ones(len(mesh.faces), bool))
     rim = find_rim(mesh, RayScene(mesh), view, shared_edges(mesh))
     vertices, directions = outline_moves(mesh, rim.ends, rim.faces, sharp)
-    rise = 1e-3 * FOOTPRINT
+    rise = 1e-3 * GSD
     top = (mesh.vertices[:, 2] > HALF[2] - 1e-9) & ~sharp
     stated = rise * (directions * top[vertices][..., None]).sum(axis=1)
     moves = np.where(top[:, None], [0, 0, rise], np.zeros(3))
     actual = with_edges(mesh, moves, sharp)[rim.ends].mean(axis=1)
     # Where the middle of an edge of the box is; at its ends three sides meet.
     middle = mesh.vertices[rim.ends].mean(axis=1)
-    inner = (np.abs(np.abs(middle) - HALF) < 2.5 * FOOTPRINT).sum(axis=1) < 3
+    inner = (np.abs(np.abs(middle) - HALF) < 2.5 * GSD).sum(axis=1) < 3
     upper = inner & (middle[:, 2] > HALF[2] - 1e-9)
     assert upper.sum() > 10
     assert np.allclose(stated[upper, 2], rise, rtol=0.01)
@@ -234,18 +234,18 @@ def test_outlines_of_edges_move_with_their_sides():
 def test_outlines_move_walls_and_leave_a_top_that_points_hold():
     """Walls lie 0.4 px outside; to lower the top would fit the outlines of its edges as well."""
     views = views_of(box(HALF), ring_of_views(12, elevations=(20.0, 45.0)))
-    mesh = sharp_box(HALF + np.array([0.4, 0.4, 0.0]) * FOOTPRINT)
+    mesh = sharp_box(HALF + np.array([0.4, 0.4, 0.0]) * GSD)
     sides = KnownSides(*np.ones((2, len(mesh.faces)), bool))
     normals = mesh.face_normals
     rng = np.random.default_rng(0)
     known = KnownPoints(
         np.column_stack([rng.uniform(-0.5, 0.5, (40, 2)), np.full(40, HALF[2])]),
-        np.full(40, 0.4 * FOOTPRINT),
+        np.full(40, 0.4 * GSD),
     )
     for _ in range(4):
         mesh, _ = polishing_step(mesh, fit_of(views, known=known).at_width(1.0), sides)
         mesh = sharpened(mesh, normals)
-    beyond = (np.abs(mesh.centers) - HALF) / FOOTPRINT
+    beyond = (np.abs(mesh.centers) - HALF) / GSD
     side = np.abs(normals).argmax(axis=1)
     seen = mesh.centers[:, 2] > -0.3
     assert np.abs(np.median(beyond[seen & (side == 0), 0])) < 0.15
@@ -266,7 +266,7 @@ def test_phases_of_faces_that_they_do_not_show_move_nothing(is_fitted):
     edges = np.zeros(len(mesh.faces), bool)  # of no known side: no outline counts
     sides = KnownSides(edges, np.full(len(mesh.faces), is_fitted))
     moved, _ = polishing_step(mesh, fit_of(views).at_width(1.0), sides)
-    inner = top & (np.abs(mesh.centers[:, :2]) < HALF[:2] - 4 * FOOTPRINT).all(axis=1)
+    inner = top & (np.abs(mesh.centers[:, :2]) < HALF[:2] - 4 * GSD).all(axis=1)
     turned = np.degrees(np.arccos(np.median(moved.face_normals[inner, 2])))
     assert turned == pytest.approx(3.0, abs=0.1) if not is_fitted else turned < 2.0
 
@@ -333,8 +333,8 @@ def test_a_sphere_comes_from_its_hull(ball):
     hull = visual_hull(ball, wrong_share=0.0)
     mesh = refined(hull, ball).mesh
     radii = np.linalg.norm(mesh.vertices, axis=1)
-    assert np.abs(radii - 1).mean() < 0.3 * FOOTPRINT
-    assert np.quantile(np.abs(radii - 1), 0.98) < 0.8 * FOOTPRINT
+    assert np.abs(radii - 1).mean() < 0.3 * GSD
+    assert np.quantile(np.abs(radii - 1), 0.98) < 0.8 * GSD
     normals = (mesh.vertex_normals * mesh.vertices).sum(axis=1) / radii
     assert np.degrees(np.arccos(np.clip(normals, -1, 1))).mean() < 2.0
 
@@ -347,7 +347,7 @@ def test_the_hole_of_a_torus_stays_and_noise_averages_out():
     mesh = refined(hull, views).mesh
     assert euler_number(mesh) == 0
     upper = mesh.vertices[:, 2] > 0
-    assert np.abs(torus()(mesh.vertices[upper])).mean() < 0.3 * FOOTPRINT
+    assert np.abs(torus()(mesh.vertices[upper])).mean() < 0.3 * GSD
 
 
 def test_faces_of_a_box_become_flat():
@@ -359,8 +359,8 @@ def test_faces_of_a_box_become_flat():
         & (np.abs(mesh.vertices[:, 1]) < 0.4)
         & (mesh.vertices[:, 2] > 0.3)
     ]
-    assert np.std(top[:, 2]) < 0.15 * FOOTPRINT
-    assert abs(np.mean(top[:, 2]) - 0.5) < 1.0 * FOOTPRINT
+    assert np.std(top[:, 2]) < 0.15 * GSD
+    assert abs(np.mean(top[:, 2]) - 0.5) < 1.0 * GSD
 
 
 def test_outlines_that_known_points_contradict_are_told(ball):
@@ -375,7 +375,7 @@ def test_outlines_that_known_points_contradict_are_told(ball):
     rng = np.random.default_rng(0)
     points = rng.standard_normal((num, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    known = KnownPoints(points, np.full(num, 0.3 * FOOTPRINT))
+    known = KnownPoints(points, np.full(num, 0.3 * GSD))
     found = []
     for views in (ball, wide):
         hull = visual_hull(views, wrong_share=0.0)
@@ -398,7 +398,7 @@ def test_many_views_that_err_alike_do_not_outweigh_known_points(ball):
         wide.append(replace(view, silhouette=Silhouette(mask, mask)))
     points = np.random.default_rng(0).standard_normal((2000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    known = KnownPoints(points, np.full(2000, 0.3 * FOOTPRINT))
+    known = KnownPoints(points, np.full(2000, 0.3 * GSD))
     hull = visual_hull(wide, wrong_share=0.0)
     off_px = []
     for views in (2 * wide, 6 * wide):
@@ -414,7 +414,7 @@ def test_outliers_among_known_points_lose(ball):
     points = rng.standard_normal((40, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     points[:8] *= 0.75  # mirror images inside
-    known = KnownPoints(points, np.full(40, 0.3 * FOOTPRINT))
+    known = KnownPoints(points, np.full(40, 0.3 * GSD))
     hull = visual_hull(ball, wrong_share=0.0)
     mesh = refined(hull, ball, known=known).mesh
     assert np.linalg.norm(mesh.vertices, axis=1).min() > 0.95
@@ -444,7 +444,7 @@ def test_the_better_of_two_ways_is_taken():
     mesh = refined(hull, views, tolerances=tolerances).mesh
     middle = np.linalg.norm(mesh.centers[:, :2], axis=1) < 0.3
     floor = mesh.centers[middle & (mesh.face_normals[:, 2] > 0.5)]
-    assert np.abs(floor[:, 2] - 0.1).mean() < 4 * FOOTPRINT
+    assert np.abs(floor[:, 2] - 0.1).mean() < 4 * GSD
 
 
 def test_progress_is_whole(ball):
@@ -457,7 +457,7 @@ def test_progress_is_whole(ball):
 def test_outlines_by_brightness_are_moved_by_half_of_their_bias(ball):
     """A silhouette whose outline lies that far inside the true one has no residuals."""
     mesh = extracted(sphere(), step=0.05)
-    radius_px = 1 / FOOTPRINT
+    radius_px = 1 / GSD
     half = 0.5 * outline_bias(np.array([radius_px]), matted=False)[0]
     shift = np.full(ball[0].silhouette.certain.shape, -half, np.float32)
     edges, sharp = shared_edges(mesh), np.zeros(len(mesh.vertices), np.bool_)
@@ -482,8 +482,8 @@ def test_the_bias_of_outlines_is_part_of_the_position_uncertainty(ball):
     """All views share it, so their number does not reduce it."""
     mesh = extracted(sphere(), step=0.12)
     sigma = place_deviations(mesh, fit_of(ball).at_width(1.0))
-    bias = 0.5 * outline_bias(np.array([1 / FOOTPRINT]), matted=False)[0]
-    expected = np.hypot(bias, TermTolerances().outline_bias_px) * FOOTPRINT
+    bias = 0.5 * outline_bias(np.array([1 / GSD]), matted=False)[0]
+    expected = np.hypot(bias, TermTolerances().outline_bias_px) * GSD
     assert np.median(sigma.shared) == pytest.approx(expected, rel=0.3)
 
 
@@ -533,7 +533,7 @@ def test_waves_are_as_high_as_they_are():
     centers = mesh.centers[mesh.face_normals[:, 2] > 0.5]
     centers = centers[(np.abs(centers[:, :2]) < [0.7, 0.5]).all(axis=1)]
     # 0.25 px; 0.79 where the last levels leave that change out.
-    assert np.median(np.abs(centers[:, 2] - height(centers))) < 0.5 * FOOTPRINT
+    assert np.median(np.abs(centers[:, 2] - height(centers))) < 0.5 * GSD
 
 
 def test_a_shoulder_on_which_views_agree_becomes_a_ledge():
@@ -548,7 +548,7 @@ def test_a_shoulder_on_which_views_agree_becomes_a_ledge():
     true = true.only(true.centers[:, 2] > -0.05)
     error = np.linalg.norm(RayScene(mesh).closest(true.centers)[0] - true.centers, axis=1)
     # 0.53 px, most of it at the edges; 1.77 without votes.
-    assert error @ true.face_areas / true.face_areas.sum() < 0.8 * FOOTPRINT
+    assert error @ true.face_areas / true.face_areas.sum() < 0.8 * GSD
 
 
 @pytest.mark.parametrize(("crossed", "num_meshes"), [(0, 1), (1, 8)])

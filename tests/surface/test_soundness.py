@@ -8,7 +8,7 @@ from polmvs.surface.mesh_geometry import TriangleMesh
 from polmvs.surface.soundness import find_soundness
 
 VIEWS = ring_of_views(6)
-FOOTPRINT = 5 / 150
+GSD = 5 / 150
 
 
 @pytest.mark.parametrize("distance", [sphere(), torus(), box()])
@@ -24,7 +24,7 @@ def test_a_shell_as_thin_as_a_pixel_is_two_sheets() -> None:
 
     thin, thick = (
         find_soundness(extracted(shell(t), half=1.2, step=0.03), VIEWS[:2]).layered
-        for t in (2 * FOOTPRINT, 6 * FOOTPRINT)
+        for t in (2 * GSD, 6 * GSD)
     )
     assert thin > 0.6  # all but the rim
     assert thick < 0.1

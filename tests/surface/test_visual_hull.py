@@ -14,7 +14,12 @@ from analytic_objects import (
 
 from polmvs.surface.global_surface import consistent_hull
 from polmvs.surface.surface_view import Silhouette, surface_view
-from polmvs.surface.visual_hull import HullTolerances, Plane, supporting_plane, visual_hull
+from polmvs.surface.visual_hull import (
+    HullTolerances,
+    SupportingPlane,
+    supporting_plane,
+    visual_hull,
+)
 
 
 def views_of(distance, views):
@@ -89,7 +94,7 @@ def test_unknown_pixels_do_not_carve(ball):
 
 
 def test_the_supporting_plane_bounds_the_hull(ball):
-    plane = Plane(np.array([0.0, 0, 1.0]), -0.3)
+    plane = SupportingPlane(np.array([0.0, 0, 1.0]), -0.3)
     mesh = visual_hull(ball, plane).mesh
     depth = 3 * HullTolerances.step_px * 5 / 150
     assert mesh.vertices[:, 2].min() == pytest.approx(-0.3 - depth, abs=0.06)
