@@ -2,10 +2,12 @@
 
 Few views determine a camera badly, and an error of its focal length or principal point bends the
 whole model although every image fits. The covariance of bundle adjustment gives the deviation of
-independent combinations of the camera's parameters. The model is adjusted again with the camera
-changed by one standard deviation along each of them. The displacement of its points is a *mode*,
-and the squares of the modes add up to the variance at any point. The covariance of the poses is
-taken after an alignment of the camera centres.
+independent combinations of the camera's parameters. Where the camera changes by one standard
+deviation along one of them, poses and points follow, to first order: with the Jacobians ``J_c`` of
+the residuals by the camera and ``J`` by poses and points, the change ``c`` moves them by the
+solution ``d`` of ``J^T J d = -J^T J_c c``. The displacement of the points is a *mode*, and the
+squares of the modes add up to the variance at any point. The covariance of the poses is taken after
+an alignment of the camera centres.
 """
 
 from __future__ import annotations
@@ -14,10 +16,13 @@ import copy
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
+from scipy import sparse
 
 from polmvs.arrays import Array
 from polmvs.colmap.models import read_reconstruction, registered
@@ -26,6 +31,9 @@ from polmvs.geometry import align_points
 from polmvs.scene import KEYPOINT_SIGMA_PX
 
 logger = logging.getLogger(__name__)
+
+DIFFERENCE = 1e-6  # relative step of a central difference: near the cube root of the precision
+GAUGE = 1e-10  # relative eigenvalue below which a change leaves all residuals as they are
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +49,8 @@ class CameraTolerances:
         the cameras of five captures are 1.8 times those from residuals of 0.17 px (RMS of 12
         parameters, from five views each), of ``demo`` with ten views 4 times.
     loss_scale_px : of the adjustment's Cauchy loss. Derived: that of SfM's last one.
-    max_views : of a model: each mode costs an adjustment, and the camera of so many views is well
-        known. Guess.
+    max_views : of a model: the covariance is dense, and the camera of so many views is well known.
+        Guess.
     """
 
     principal_point_sigma: float = 0.01
@@ -92,21 +100,20 @@ def camera_uncertainty(
     covariance = parameter_covariance(reconstruction, camera, estimated, freed, tolerances)
     if covariance is None:
         return None
-    modes = []
-    for step in _principal_steps(covariance):
-        whole = np.zeros(len(names))
-        whole[estimated] = step
-        modes.append(_mode(reconstruction, whole, tolerances, free=False))
+    steps = np.zeros((len(estimated), len(names)))
+    steps[:, estimated] = _principal_steps(covariance)
+    linear = _linearized(reconstruction, camera, tolerances)
+    responses = linear.responses(steps, [])
     if not freed:  # it was kept at the centre, which is known as well as sensors are mounted
-        for index in point:
-            whole = np.zeros(len(names))
-            whole[index] = tolerances.principal_point_sigma * camera.width
-            modes.append(_mode(reconstruction, whole, tolerances, free=True))
-    stacked = np.array([mode for mode, _ in modes]).reshape(len(modes), -1, 3)
-    if not np.isfinite(stacked).all():
+        sigma = tolerances.principal_point_sigma * camera.width
+        centered = sigma * np.eye(len(names))[point]
+        responses += linear.responses(centered, [i for i in names if i not in point])
+    modes = np.array([_displacements(reconstruction, response) for response in responses])
+    if not np.isfinite(modes).all():
         return None
-    focal = float(np.linalg.norm([change for _, change in modes])) / camera.mean_focal_length()
-    return CameraUncertainty(focal=focal, modes=stacked)
+    changes = [response.params[camera.focal_length_idxs()].mean() for response in responses]
+    focal = float(np.linalg.norm(changes)) / camera.mean_focal_length()
+    return CameraUncertainty(focal=focal, modes=modes)
 
 
 def pose_uncertainty(
@@ -190,23 +197,144 @@ def _residual_px(reconstruction: pycolmap.Reconstruction, t: CameraTolerances) -
     return float(max(reconstruction.compute_mean_reprojection_error() / 1.2533, t.min_residual_px))
 
 
-def _mode(
-    reconstruction: pycolmap.Reconstruction, step: Array, t: CameraTolerances, *, free: bool
-) -> tuple[Array, float]:
-    """Displacements (T, 3) of the points with another camera, and its change of focal length.
+@dataclass(frozen=True, eq=False)
+class _Response:
+    """Changes of a model that follow from a change of its camera.
+
+    Attributes
+    ----------
+    params : (P,) of the camera, the given change included.
+    centers : (V, 3) of the camera centres, sorted by name, world.
+    points : (T, 3) of the points in the order of their ids, world.
+    """
+
+    params: Array
+    centers: Array
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearized:
+    """Jacobians of the K residuals of a model's keypoints, times the roots of their weights.
+
+    Attributes
+    ----------
+    of_params : (2 K, P)
+    of_poses : (2 K, 6 V) by a turn and a move of each camera in its own frame.
+    of_points : (2 K, 3 T)
+    rotations : (V, 3, 3), world to camera.
+    """
+
+    of_params: Array
+    of_poses: sparse.csr_array
+    of_points: sparse.csr_array
+    rotations: Array
+
+    def responses(self, steps: Array, followers: Sequence[int]) -> list[_Response]:
+        """What follows from each of some changes (M, P); parameters ``followers`` follow as well.
+
+        The points are eliminated (Schur complement). A similarity of the whole model leaves all
+        residuals as they are; of all solutions the one of least norm is taken.
+        """
+        followed = sparse.csr_array(self.of_params[:, followers])
+        cameras = sparse.csr_array(sparse.hstack([self.of_poses, followed]))
+        inverse = self._inverse_of_points
+        across = sparse.csr_array(cameras.T @ self.of_points)
+        eliminated = sparse.csr_array(across @ inverse)
+        matrix = (cameras.T @ cameras - eliminated @ across.T).toarray()
+        residuals = self.of_params @ steps.T
+        of_points = self.of_points.T @ residuals
+        right = cameras.T @ residuals - eliminated @ of_points
+        # Turns, moves and focal lengths have different units.
+        scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))[:, None]
+        moved = -scale * (
+            np.linalg.pinv(scale * matrix * scale.T, rcond=GAUGE, hermitian=True) @ (scale * right)
+        )
+        points = -(inverse @ (of_points + across.T @ moved)).T.reshape(len(steps), -1, 3)
+        num = self.of_poses.shape[1]
+        moves = moved[:num].T.reshape(len(steps), -1, 6)[..., 3:]
+        centers = -np.einsum("vji,mvj->mvi", self.rotations, moves)
+        params = np.array(steps, np.float64)
+        params[:, followers] += moved[num:].T
+        return [_Response(*each) for each in zip(params, centers, points, strict=True)]
+
+    @cached_property
+    def _inverse_of_points(self) -> sparse.bsr_array:
+        """Inverse of the block diagonal matrix of the points; 0 along what no view shows."""
+        num = self.of_points.shape[1] // 3
+        blocks = np.zeros((num, 3, 3))
+        normal = sparse.bsr_array(self.of_points.T @ self.of_points, blocksize=(3, 3))
+        blocks[normal.indices] = normal.data  # one block a row, where there is any
+        inverse = np.linalg.pinv(blocks, rcond=GAUGE, hermitian=True)
+        return sparse.bsr_array((inverse, np.arange(num), np.arange(num + 1)))
+
+
+def _linearized(
+    reconstruction: pycolmap.Reconstruction, camera: pycolmap.Camera, t: CameraTolerances
+) -> _Linearized:
+    """The residuals of a model about its solution, under the adjustment's Cauchy loss."""
+    images, number = registered(reconstruction), {}
+    for index, point_id in enumerate(sorted(reconstruction.points3D)):
+        number[point_id] = index
+    of_params, of_poses, of_points, rotations = [], [], [], []
+    for index, image in enumerate(images):
+        pose = image.cam_from_world()
+        rotation = np.asarray(pose.rotation.matrix(), np.float64)
+        observed = image.get_observation_points2D()
+        points = np.array([reconstruction.points3D[p.point3D_id].xyz for p in observed])
+        seen = pose * points.reshape(-1, 3)
+        shown = np.flatnonzero(seen[:, 2] > 0)
+        seen, xy = seen[shown], np.array([observed[k].xy for k in shown]).reshape(-1, 2)
+        by_place, by_params = _jacobians(camera, seen)
+        square = ((np.asarray(camera.img_from_cam(seen)).reshape(-1, 2) - xy) ** 2).sum(axis=1)
+        root = np.sqrt(1 / (1 + square / t.loss_scale_px**2))[:, None, None]
+        turns = np.cross(np.eye(3), seen[:, None])  # (K, 3, 3), rows: d seen / d turn about an axis
+        by_pose = np.concatenate([by_place @ np.swapaxes(turns, 1, 2), by_place], axis=2)
+        of_params.append((root * by_params).reshape(-1, by_params.shape[2]))
+        of_poses.append(_spread(root * by_pose, np.full(len(shown), index), len(images)))
+        which = np.array([number[observed[k].point3D_id] for k in shown], np.int64)
+        of_points.append(_spread(root * (by_place @ rotation), which, len(number)))
+        rotations.append(rotation)
+    return _Linearized(
+        np.concatenate(of_params),
+        sparse.csr_array(sparse.vstack(of_poses)),
+        sparse.csr_array(sparse.vstack(of_points)),
+        np.array(rotations),
+    )
+
+
+def _jacobians(camera: pycolmap.Camera, seen: Array) -> tuple[Array, Array]:
+    """Changes of pixels by the place (K, 2, 3) and by the camera's parameters (K, 2, P).
+
+    They are central differences.
 
     Parameters
     ----------
-    step : (P,), of the camera's parameters.
-    free : focal length and distortion follow.
+    seen : (K, 3) before the camera.
     """
-    moved = copy.deepcopy(reconstruction)
-    moved_camera = next(iter(moved.cameras.values()))
-    before = moved_camera.mean_focal_length()
-    moved_camera.params = moved_camera.params + step
-    adjuster_of(moved, t, free=free, free_point=False).solve()
-    change = moved_camera.mean_focal_length() - before
-    return _displacements(reconstruction, moved), float(change)
+
+    def pixels(seen: Array, params: Array) -> Array:
+        other = copy.deepcopy(camera)
+        other.params = params.tolist()
+        return np.asarray(other.img_from_cam(seen), np.float64).reshape(-1, 2)
+
+    params = np.asarray(camera.params, np.float64)
+    by_place, by_params = [], []
+    for axis in np.eye(3):
+        reach = DIFFERENCE * seen[:, 2:]
+        change = pixels(seen + reach * axis, params) - pixels(seen - reach * axis, params)
+        by_place.append(change / (2 * reach))
+    for axis, value in zip(np.eye(len(params)), params, strict=True):
+        size = DIFFERENCE * max(abs(float(value)), 1.0)
+        change = pixels(seen, params + size * axis) - pixels(seen, params - size * axis)
+        by_params.append(change / (2 * size))
+    return np.stack(by_place, axis=2), np.stack(by_params, axis=2)
+
+
+def _spread(blocks: Array, which: NDArray[np.int64], num: int) -> sparse.bsr_array:
+    """Sparse matrix (2 K, D num) with the block (2, D) of each row in the columns of its number."""
+    shape = (2 * len(blocks), blocks.shape[2] * num)
+    return sparse.bsr_array((blocks, which, np.arange(len(blocks) + 1)), shape=shape)
 
 
 def parameter_covariance(
@@ -251,19 +379,13 @@ def adjuster_of(
     return pycolmap.create_default_ceres_bundle_adjuster(bundle, config, reconstruction)
 
 
-def _displacements(
-    reconstruction: pycolmap.Reconstruction, moved: pycolmap.Reconstruction
-) -> Array:
+def _displacements(reconstruction: pycolmap.Reconstruction, response: _Response) -> Array:
     """Displacements (T, 3) of the points after the cameras are aligned."""
-    ids, images = sorted(reconstruction.points3D), sorted(reconstruction.reg_image_ids())
-    points, others = (
-        np.array([r.points3D[i].xyz for i in ids], np.float64).reshape(-1, 3)
-        for r in (reconstruction, moved)
-    )
-    centers, other_centers = (
-        np.array([r.image(i).projection_center() for i in images], np.float64)
-        for r in (reconstruction, moved)
-    )
+    ids = sorted(reconstruction.points3D)
+    points = np.array([reconstruction.points3D[i].xyz for i in ids], np.float64).reshape(-1, 3)
+    images = registered(reconstruction)
+    centers = np.array([image.projection_center() for image in images], np.float64)
+    others, other_centers = points + response.points, centers + response.centers
     try:
         back = align_points(other_centers, centers)
     except ValueError:  # on one line: the turn about it is told by the points

@@ -30,7 +30,7 @@ from polmvs.polarization.phase_map import PhaseMap, as_tilted, build_phase_map, 
 from polmvs.polarization.region import Region, find_region, grow_mask, smooth
 from polmvs.polarization.stokes import Stokes
 from polmvs.poses.alignment import Alignment, align_views
-from polmvs.poses.image_check import intensity_loader, require_cameras_of_images
+from polmvs.poses.image_check import matches_of, require_cameras_of_images
 from polmvs.scene import View, find_name, match_names, short_list
 
 EXACT_SIGMA = 1e-3  # rad; represents no noise, far below that of any phase
@@ -193,7 +193,7 @@ def open_scene(
             )
     require_cameras_of_images(
         views,
-        intensity_loader(capture, raw_of),
+        matches_of(capture, raw_of),
         truth.folder,
         "Give the ground truth of this capture.",
     )

@@ -28,11 +28,7 @@ from polmvs.pipeline.stages.maps import find_mask
 from polmvs.pipeline.stages.sfm import fit_model
 from polmvs.polarization.capture import Capture
 from polmvs.poses.alignment import MIN_CAMERAS
-from polmvs.poses.image_check import (
-    ImageLoader,
-    intensity_loader,
-    require_cameras_of_images,
-)
+from polmvs.poses.image_check import ImageMatches, matches_of, require_cameras_of_images
 from polmvs.poses.markers import parse_marker_option
 from polmvs.poses.metric_frame import frame_from_distance, read_centers
 from polmvs.scene import SparseModel, find_name, match_names, short_list
@@ -156,9 +152,9 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
         _check_masks(capture, options.region.mask)
     if options.sfm.feature_masks is not None:
         _check_masks(capture, options.sfm.feature_masks)
-    load = intensity_loader(capture, image_names(capture))
+    matches = matches_of(capture, image_names(capture))
     if options.evaluation.gt is not None:
-        require_truth_of_capture(open_ground_truth(options.evaluation.gt), capture, load)
+        require_truth_of_capture(open_ground_truth(options.evaluation.gt), capture, matches)
     _check_references(capture, options.reference)
     if options.crop.box_marker is not None and options.reference.aruco is None:
         raise OptionError("needs `reference.aruco`, the markers.", field="crop.box_marker")
@@ -170,7 +166,7 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
         model = fit_model(capture, options.sfm.sparse)
         if dense is None:  # images of a workspace are compared by themselves
             remedy = "Give `sfm.sparse` of this capture, or leave it out."
-            require_cameras_of_images(model.views, load, options.sfm.sparse, remedy)
+            require_cameras_of_images(model.views, matches, options.sfm.sparse, remedy)
         _check_same_camera(options.sfm, model, capture)
         if options.reference.scale is not None:
             frame_from_distance(model, *options.reference.scale)
@@ -191,12 +187,12 @@ def check_input(capture: Capture, options: Options, min_images: int) -> SparseMo
     return None
 
 
-def require_truth_of_capture(truth: GroundTruth, capture: Capture, load_image: ImageLoader) -> None:
+def require_truth_of_capture(truth: GroundTruth, capture: Capture, matches: ImageMatches) -> None:
     """Refuse ground truth of another capture, by its names, image size and cameras.
 
     Parameters
     ----------
-    load_image : from :func:`polmvs.poses.image_check.intensity_loader`.
+    matches : between the images of the capture.
 
     Raises
     ------
@@ -221,7 +217,7 @@ def require_truth_of_capture(truth: GroundTruth, capture: Capture, load_image: I
             f"{capture.width}x{capture.height} px. Give the ground truth of this capture.",
         )
     remedy = "Give the ground truth of this capture."
-    require_cameras_of_images(views, load_image, truth.cameras, remedy)
+    require_cameras_of_images(views, matches, truth.cameras, remedy)
 
 
 def _check_counts(options: Options, num_images: int) -> None:

@@ -72,7 +72,7 @@ def _rhythm(
     coefficients = dctn(blocks.astype(np.float64) - 128, axes=(1, 2), norm="ortho")
     for v in range(BLOCK):
         for u in range(BLOCK):
-            values = np.abs(coefficients[:, v, u])
+            values = np.sort(np.abs(coefficients[:, v, u])).astype(np.float32)
             step = _comb_step(values)
             if step is not None:
                 rhythmic += v + u > 0
@@ -141,15 +141,16 @@ def _blocks(raw: NDArray[Any]) -> NDArray[np.float32]:
     return np.asarray(blocks[(low > 0) & (high < 255) & (low < high)], np.float32)
 
 
-def _comb_step(values: NDArray[np.float64]) -> int | None:
-    """The largest step that magnitudes are multiples of; None if of none."""
+def _comb_step(values: NDArray[np.float32]) -> int | None:
+    """The largest step that magnitudes, in ascending order, are multiples of; None if of none."""
     best = None
     for step in range(MIN_STEP, MAX_STEP + 1):
         # Half a step too: a multiple of the true step leaves the odd ones between.
-        nonzero = values[values > max(MIN_MAGNITUDE, 0.3 * step)]
-        if len(nonzero) < MIN_NONZERO:
+        first = np.searchsorted(values, max(MIN_MAGNITUDE, 0.3 * step), side="right")
+        if len(values) - first < MIN_NONZERO:
             break
-        comb = np.cos(2 * np.pi * nonzero / step).mean()
+        turns = values[first:] / np.float32(step)
+        comb = np.cos(np.float32(2 * np.pi) * (turns - np.rint(turns))).mean()
         if comb > MIN_COMB:
             best = step
     return best

@@ -76,14 +76,14 @@ class ImageFit:
 
 
 def require_cameras_of_images(
-    views: Sequence[View], load_image: ImageLoader, source: str | PathLike[str], remedy: str
+    views: Sequence[View], matches: ImageMatches, source: str | PathLike[str], remedy: str
 ) -> ImageFit:
     """Refuse cameras that cannot belong to the images of their names.
 
     Parameters
     ----------
     views : given cameras, named as the images.
-    load_image : gives an image (H, W) by its name.
+    matches : between the images.
     source : of the cameras, for messages.
     remedy : what to give instead.
 
@@ -92,7 +92,7 @@ def require_cameras_of_images(
     DataError
         The images contradict the cameras. Images with too few matches pass.
     """
-    fit = fit_to_images(views, load_image)
+    fit = fit_to_images(views, matches)
     if fit.fits is False:
         raise DataError(
             source,
@@ -103,22 +103,16 @@ def require_cameras_of_images(
     return fit
 
 
-def fit_to_images(
-    views: Sequence[View],
-    load_image: ImageLoader,
-    *,
-    tolerances: ImageCheckTolerances = ImageCheckTolerances(),
-) -> ImageFit:
-    """Compare cameras with the matches of the images' features."""
-    t = tolerances
-    chosen = [views[k] for k in evenly_spread(len(views), t.max_views)]
-    sift = feature_detector(t)
-    found = [find_features(sift, load_image(view.name)) for view in chosen]
+def fit_to_images(views: Sequence[View], matches: ImageMatches) -> ImageFit:
+    """Compare cameras with the matches of the images of their names."""
+    t = matches.tolerances
     distances = [np.zeros(0)]
-    for (first, a), (second, b) in combinations(zip(chosen, found, strict=True), 2):
-        matches = _consistent_matches(a, b, t)
-        if matches is not None:
-            distances.append(epipolar_distances(first, second, *matches))
+    for first, second in combinations(
+        [views[k] for k in evenly_spread(len(views), t.max_views)], 2
+    ):
+        found = matches.between(first.name, second.name)
+        if found is not None:
+            distances.append(epipolar_distances(first, second, *found))
     shares = np.concatenate(distances)
     if len(shares) < 2 * t.min_matches:  # one pair alone is not reliable
         return ImageFit(num_matches=len(shares), fitting=float("nan"), fits=None)
@@ -126,21 +120,47 @@ def fit_to_images(
     return ImageFit(num_matches=len(shares), fitting=fitting, fits=fitting >= t.min_fitting)
 
 
-def intensity_loader(capture: Capture, names: Mapping[str, str]) -> ImageLoader:
-    """Loader of intensity images, each with an exposure of its own; the last few are kept.
+class ImageMatches:
+    """Matches between images, each found once however many cameras are compared with them.
+
+    Parameters
+    ----------
+    load_image : gives an image (H, W) by its name.
+    tolerances : of the comparison.
+    """
+
+    def __init__(
+        self, load_image: ImageLoader, *, tolerances: ImageCheckTolerances = ImageCheckTolerances()
+    ) -> None:
+        self.tolerances = tolerances
+        sift = feature_detector(tolerances)
+        self._features = lru_cache(None)(lambda name: find_features(sift, load_image(name)))
+        self._between = lru_cache(None)(
+            lambda a, b: _consistent_matches(self._features(a), self._features(b), tolerances)
+        )
+
+    def between(self, first: str, second: str) -> tuple[Array, Array] | None:
+        """Places (N, 2) of the matches in two images that one epipolar geometry explains.
+
+        None if too few do.
+        """
+        return self._between(first, second)
+
+
+def matches_of(capture: Capture, names: Mapping[str, str]) -> ImageMatches:
+    """Matches between the intensity images of a capture, each with an exposure of its own.
 
     Parameters
     ----------
     names : of the capture's views by the names of their images.
     """
 
-    @lru_cache(maxsize=ImageCheckTolerances.max_views)
     def load(name: str) -> NDArray[np.uint8]:
         stokes = capture.load(names[name])
         white = float(np.percentile(stokes.s0, WHITE_PERCENTILE))
         return intensity_image_8bit(stokes, white if white > 0 else 1.0)
 
-    return load
+    return ImageMatches(load)
 
 
 def feature_detector(t: ImageCheckTolerances) -> cv2.SIFT:

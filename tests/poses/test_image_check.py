@@ -12,6 +12,7 @@ from polmvs.errors import DataError
 from polmvs.geometry import RigidTransform
 from polmvs.poses.image_check import (
     ImageCheckTolerances,
+    ImageMatches,
     epipolar_distances,
     feature_detector,
     find_features,
@@ -77,7 +78,8 @@ def test_cameras_of_the_images_fit_and_those_of_others_do_not(
     printed: tuple[list[View], Images],
 ) -> None:
     views, images = printed
-    fit = require_cameras_of_images(views, images.__getitem__, "cameras.txt", "Give others.")
+    matches = ImageMatches(images.__getitem__)
+    fit = require_cameras_of_images(views, matches, "cameras.txt", "Give others.")
     assert fit.fits
     assert fit.num_matches > 100
     assert fit.fitting > 0.95
@@ -87,7 +89,7 @@ def test_cameras_of_the_images_fit_and_those_of_others_do_not(
         replace(view, name=name) for view, name in zip(views, names[1:] + names[:1], strict=True)
     ]
     with pytest.raises(DataError, match=r"cameras\.txt: its cameras do not fit .* Give others\."):
-        require_cameras_of_images(others, images.__getitem__, "cameras.txt", "Give others.")
+        require_cameras_of_images(others, matches, "cameras.txt", "Give others.")
 
 
 @pytest.mark.parametrize(
@@ -103,8 +105,8 @@ def test_images_that_share_nothing_do_not_tell(
 ) -> None:
     views, _ = printed
     rng = np.random.default_rng(0)
-    images = {view.name: image_of(rng) for view in views}
-    fit = require_cameras_of_images(views, images.__getitem__, "cameras.txt", "Give others.")
+    matches = ImageMatches({view.name: image_of(rng) for view in views}.__getitem__)
+    fit = require_cameras_of_images(views, matches, "cameras.txt", "Give others.")
     assert fit.fits is None
     assert fit.num_matches == 0
     assert np.isnan(fit.fitting)
@@ -119,5 +121,7 @@ def test_views_that_are_compared_are_spread_over_all(printed: tuple[list[View], 
         seen.append(name)
         return images[views[int(name) % 3].name]
 
-    fit_to_images(many, load, tolerances=ImageCheckTolerances(max_views=3))
-    assert seen == ["0", "4", "8"]
+    matches = ImageMatches(load, tolerances=ImageCheckTolerances(max_views=3))
+    first, again = (fit_to_images(many, matches) for _ in range(2))
+    assert seen == ["0", "4", "8"]  # each once, however many cameras are compared
+    assert first == again
