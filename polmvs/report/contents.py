@@ -1,7 +1,7 @@
 """Contents of a report: metrics, pictures of the views and the 3D scene of a finished run.
 
-Views are processed one after another and only their encoded pictures are kept, so the memory does
-not grow with them.
+Few views are processed at a time and only their encoded pictures are kept, so the memory does not
+grow with them.
 """
 
 from __future__ import annotations
@@ -73,6 +73,11 @@ class ErrorSamples:
     normal_deg: list[Floats] = field(default_factory=list)
     true_viewing_deg: list[Floats] = field(default_factory=list)
 
+    def extend(self, others: ErrorSamples) -> None:
+        """Add those of other views."""
+        for name, values in vars(self).items():
+            values.extend(getattr(others, name))
+
 
 @dataclass(frozen=True, kw_only=True)
 class ViewInput:
@@ -94,24 +99,23 @@ class ViewInput:
 def view_page(
     given: ViewInput,
     truth: tuple[GroundTruth, SimilarityTransform] | None,
-    samples: Mapping[AngleModel, ErrorSamples],
     *,
     white: float,
     length: DisplayUnit,
     mesh: RayScene | None = None,
-) -> ViewPage:
-    """Pictures of one view; its errors are added to the samples.
+) -> tuple[ViewPage, dict[AngleModel, ErrorSamples]]:
+    """Pictures of one view, and samples of its errors for each model.
 
     Parameters
     ----------
     given : of the view.
     truth : ground truth and ``truth_from_world``.
-    samples : for each model that ``given`` has; added to.
     white : intensity of white.
     length : unit of depths.
     mesh : of the part, for its picture in the view; None without one.
     """
     first = next(iter(given.maps.values()))
+    samples = {model: ErrorSamples() for model in given.dense}
     shown = [*_measured(given, first, white)]
     if mesh is not None:
         over = mesh_normals_in_cam(mesh, given.view)
@@ -132,7 +136,8 @@ def view_page(
             of_model[model] = _of_model(model, given, dense, errors, samples[model], length)
     for several in zip(*of_model.values(), strict=False):
         shown += several
-    return ViewPage(name=given.view.name, pictures=tuple(shown), wipe=_wipe(of_model))
+    page = ViewPage(name=given.view.name, pictures=tuple(shown), wipe=_wipe(of_model))
+    return page, samples
 
 
 def _measured(given: ViewInput, phase_map: PhaseMap, white: float) -> list[PagePicture]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from polmvs.arrays import Floats
 from polmvs.colmap.models import read_model
-from polmvs.config import Options, to_plain
+from polmvs.config import Options, default_num_workers, to_plain
 from polmvs.errors import DataError, PolmvsError
 from polmvs.evaluation.comparison import (
     Comparison,
@@ -154,8 +155,10 @@ def write_report(run_folder: RunFolder, *, on_progress: OnProgress = no_progress
     given = _open(run_folder)
     samples = {model: ErrorSamples() for model in given.models}
     views = []
-    for page in _view_pages(given, samples):
+    for page, errors in _view_pages(given):
         views.append(page)
+        for model, own in errors.items():
+            samples[model].extend(own)
         on_progress(1)
     layers, channels = scene_layers(given)
     scene = _scene(given, layers, channels)
@@ -240,9 +243,7 @@ def _open_truth(
         return None
 
 
-def _view_pages(
-    given: ReportInput, samples: Mapping[AngleModel, ErrorSamples]
-) -> Iterator[ViewPage]:
+def _view_pages(given: ReportInput) -> Iterator[tuple[ViewPage, dict[AngleModel, ErrorSamples]]]:
     folder = given.folder
     maps = {m: open_maps(folder, m) for m in given.models}
     dense = {m: open_dense_views(folder, m) for m in given.models}
@@ -256,24 +257,28 @@ def _view_pages(
         surface = RayScene(TriangleMesh.of(mesh))
     if given.truth is not None:
         views = tuple(named_as_truth(views, given.truth[0]))
-    for index, view in enumerate(views):
+
+    def page_of(index: int) -> tuple[ViewPage, dict[AngleModel, ErrorSamples]]:
         name = given.sparse.views[index].name
         stokes = None
         if given.capture is not None and name in raw:
             stokes = given.capture.load(raw[name])
-        yield view_page(
+        return view_page(
             ViewInput(
-                view=view,
+                view=views[index],
                 maps={m: maps[m][index] for m in given.models},
                 stokes=stokes,
                 dense={m: dense[m][index] for m in given.models},
             ),
             given.truth,
-            samples,
             white=max(white, 1e-9),
             length=given.length,
             mesh=surface,
         )
+
+    # Threads, as encoding pictures and casting rays release Python's lock.
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        yield from pool.map(page_of, range(len(views)))
 
 
 def _mesh_of(given: ReportInput, model: AngleModel) -> Mesh | None:
