@@ -71,6 +71,9 @@ class ContourTolerances:
     meeting_px: float = 2.0
 
 
+TOLERANCES = ContourTolerances()
+
+
 def propagate(
     angle_model: AngleModel,
     maps: Sequence[PhaseMap],
@@ -81,7 +84,6 @@ def propagate(
     tilt_aware: bool = True,
     workers: Workers | None = None,
     on_progress: OnProgress = no_progress,
-    tolerances: ContourTolerances = ContourTolerances(),
 ) -> list[DenseView | None]:
     """Range and normal over the polarized region of every view.
 
@@ -94,7 +96,6 @@ def propagate(
     tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
     workers : processes for the views; None: this process.
     on_progress : called with the number of views done, ``(num_rounds + 1)`` times per view.
-    tolerances : of this step.
 
     Returns
     -------
@@ -102,7 +103,7 @@ def propagate(
     """
     workers = workers or Workers(1)
     nodes: list[Nodes | None] = []
-    start = partial(_start, angle_model, seeds, options, tolerances=tolerances)
+    start = partial(_start, angle_model, seeds, options)
     for started in workers.map(start, maps):
         nodes.append(started)
         on_progress(1)
@@ -114,14 +115,14 @@ def propagate(
 
 
 def _connect(
-    contours: Contours, phase_map: PhaseMap, spacing_px: float, *, tolerances: ContourTolerances
+    contours: Contours, phase_map: PhaseMap, spacing_px: float
 ) -> tuple[Indices, Indices, NDArray[np.bool_]]:
     """Edges between consecutive nodes of a curve and between neighbouring nodes of all curves."""
     xy = contours.xy
     num = len(xy)
     follows = contours.curve[1:] == contours.curve[:-1]
     along = np.stack([np.flatnonzero(follows), np.flatnonzero(follows) + 1], axis=1)
-    k = min(tolerances.num_neighbors + 1, num)
+    k = min(TOLERANCES.num_neighbors + 1, num)
     distance, index = cKDTree(xy).query(xy, k=k, distance_upper_bound=2.2 * spacing_px)
     tails = np.repeat(np.arange(num), k)
     heads, near = index.reshape(-1), distance.reshape(-1)
@@ -139,14 +140,12 @@ def _start(
     seeds: Seeds,
     options: PropagationOptions,
     phase_map: PhaseMap,
-    *,
-    tolerances: ContourTolerances,
 ) -> Nodes | None:
     """Network of a view's contours with ranges and normals from the nearest seeds."""
     path_model = AngleModel.OPA if options.contour is Contour.NORMALS else angle_model
     open_pixels = phase_map.region.inside & ~phase_map.region.edges
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
-    passable = open_pixels & (dolp > tolerances.min_dolp)
+    passable = open_pixels & (dolp > TOLERANCES.min_dolp)
     rays = view_rays(phase_map.view)
     visible, seeds_xy = visible_seeds(phase_map, seeds)
     contours = cover_with_contours(
@@ -155,14 +154,11 @@ def _start(
         open_pixels,
         spacing_px=options.spacing_px,
         step_px=options.step_px,
-        tolerances=tolerances,
     )
     surface = surface_at_seeds(phase_map, seeds, contours.xy)
     if surface is None:
         return None
-    tail, head, on_contour = _connect(
-        contours, phase_map, options.spacing_px, tolerances=tolerances
-    )
+    tail, head, on_contour = _connect(contours, phase_map, options.spacing_px)
     return Nodes(
         surface=surface,
         ray_z=phase_map.view.camera.rays(contours.xy)[:, 2],
@@ -252,7 +248,6 @@ def trace_contours(
     keep_every: int = 1,
     claims: NDArray[np.int32] | None = None,
     first_curve: int = 0,
-    tolerances: ContourTolerances = ContourTolerances(),
 ) -> Contours:
     """Trace contours both ways from all seeds in lock step (midpoint rule).
 
@@ -269,13 +264,12 @@ def trace_contours(
     claims : cells of the image, each owned by the first curve that entered it (-1: free), over
         the extent of the field; a curve ends in a cell of another. Updated in place.
     first_curve : index of the first seed's curve.
-    tolerances : of this step.
     """
     seeds = np.asarray(seeds_xy, np.float32).reshape(-1, 2)
     start = sample_image(field, seeds)
     angle = _angle(start)
     forward = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    curve = np.flatnonzero(np.linalg.norm(start, axis=-1) > tolerances.min_coherence)
+    curve = np.flatnonzero(np.linalg.norm(start, axis=-1) > TOLERANCES.min_coherence)
     nodes, owners = [seeds[curve]], [curve]
     arcs = [np.zeros(len(curve), np.float32)]
     # Both halves of a curve side by side, (2, S, 2): a closed curve ends where they meet.
@@ -287,15 +281,13 @@ def trace_contours(
     for index in range(1, int(border_px / step_px) + 1):
         if not len(curve):
             break
-        middle_heading, ok = _heading(
-            field, position + 0.5 * step_px * heading, heading, tolerances=tolerances
-        )
+        middle_heading, ok = _heading(field, position + 0.5 * step_px * heading, heading)
         position = np.where(alive[..., None], position + step_px * middle_heading, position)
-        heading, still_ok = _heading(field, position, middle_heading, tolerances=tolerances)
+        heading, still_ok = _heading(field, position, middle_heading)
         alive &= ok & still_ok
-        if index * step_px > 2 * tolerances.meeting_px:
+        if index * step_px > 2 * TOLERANCES.meeting_px:
             gap = ((position[0] - position[1]) ** 2).sum(axis=-1)
-            alive &= (gap > tolerances.meeting_px**2) | ~alive.all(axis=0)
+            alive &= (gap > TOLERANCES.meeting_px**2) | ~alive.all(axis=0)
         if claims is not None and index % check_every == 0:
             alive &= _claim(claims, field.shape, position, curve + first_curve)
         if index % keep_every == 0:
@@ -316,17 +308,15 @@ def _angle(axial: Image) -> NDArray[np.float32]:
     return np.asarray(0.5 * np.arctan2(axial[..., 1], axial[..., 0]), np.float32)
 
 
-def _heading(
-    field: Image, xy: Floats, previous: Floats, *, tolerances: ContourTolerances
-) -> tuple[Image, Mask]:
+def _heading(field: Image, xy: Floats, previous: Floats) -> tuple[Image, Mask]:
     """Unit direction of the field nearest to the previous one, and where the field is coherent."""
     axial = sample_image(field, xy)
     angle = _angle(axial)
     heading = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     dot = (heading * previous).sum(axis=-1)
     heading *= np.where(dot < 0, -1, 1)[..., None].astype(np.float32)
-    coherent = (axial**2).sum(axis=-1) > tolerances.min_coherence**2
-    return heading, coherent & (np.abs(dot) > tolerances.min_coherence)
+    coherent = (axial**2).sum(axis=-1) > TOLERANCES.min_coherence**2
+    return heading, coherent & (np.abs(dot) > TOLERANCES.min_coherence)
 
 
 def _cells(claims: NDArray[np.int32], shape: tuple[int, ...], xy: Floats) -> tuple[Any, Any]:
@@ -355,7 +345,6 @@ def cover_with_contours(
     *,
     spacing_px: float,
     step_px: float,
-    tolerances: ContourTolerances = ContourTolerances(),
 ) -> Contours:
     """Contours from the seeds, then between them until the region is covered.
 
@@ -370,7 +359,6 @@ def cover_with_contours(
     inside : (H, W) bool, the region to cover.
     spacing_px : distance between contours, and between the nodes kept of each.
     step_px : step length, px.
-    tolerances : of this step.
     """
     height, width = field.shape[:2]
     keep_every = max(round(spacing_px / step_px), 1)
@@ -383,7 +371,7 @@ def cover_with_contours(
         free = claims[_cells(claims, field.shape, places)] < 0
         free &= (
             np.linalg.norm(sample_image(field, places, nearest=True), axis=-1)
-            > tolerances.min_coherence
+            > TOLERANCES.min_coherence
         )
         parts.append(
             trace_contours(
@@ -393,7 +381,6 @@ def cover_with_contours(
                 keep_every=keep_every,
                 claims=claims,
                 first_curve=num_curves,
-                tolerances=tolerances,
             )
         )
         num_curves += int(free.sum())

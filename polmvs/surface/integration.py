@@ -89,6 +89,9 @@ class IntegrationTolerances:
     min_own_weight: float = 0.25
 
 
+TOLERANCES = IntegrationTolerances()
+
+
 def integrate(
     angle_model: AngleModel,
     maps: Sequence[PhaseMap],
@@ -99,7 +102,6 @@ def integrate(
     tilt_aware: bool = True,
     workers: Workers | None = None,
     on_progress: OnProgress = no_progress,
-    tolerances: IntegrationTolerances = IntegrationTolerances(),
 ) -> list[DenseView | None]:
     """Range and normal over the polarized region of every view.
 
@@ -112,7 +114,6 @@ def integrate(
     tilt_aware : of the rows' weights, see :func:`polmvs.normals.rows.gather_rows`.
     workers : processes to share the views among; None: this one.
     on_progress : called with the number of views done, once per view and round.
-    tolerances : of this step.
 
     Returns
     -------
@@ -120,7 +121,7 @@ def integrate(
     """
     workers = workers or Workers(1)
     neighbors = choose_neighbors(maps, seeds, options.max_neighbors)
-    solve = partial(_round, angle_model, seeds, options.bending, tilt_aware, tolerances=tolerances)
+    solve = partial(_round, angle_model, seeds, options.bending, tilt_aware)
     return in_rounds(solve, plan_rounds(options), maps, neighbors, folder, workers, on_progress)
 
 
@@ -214,8 +215,6 @@ def _round(
     bending: float,
     tilt_aware: bool,
     task: ViewTask,
-    *,
-    tolerances: IntegrationTolerances,
 ) -> tuple[None, DenseView | None]:
     """One view's result on its lattice, which the next round's nodes are made of."""
     stride_px = task.plan.stride_px
@@ -232,7 +231,6 @@ def _round(
         bending=bending,
         tilt_aware=tilt_aware,
         use_consensus=task.plan.use_consensus,
-        tolerances=tolerances,
     )
     dense = dense_view(nodes.surface, wanted, stride_px)
     return None, store_dense_view(dense, task.path) if dense.known.any() else None
@@ -303,7 +301,6 @@ def relax(
     tilt_aware: bool = True,
     along_contours: bool = False,
     use_consensus: bool = False,
-    tolerances: IntegrationTolerances = IntegrationTolerances(),
 ) -> Nodes:
     """Solve the normals at a view's nodes from all views, then the ranges of the nodes.
 
@@ -318,7 +315,6 @@ def relax(
     tilt_aware : of the rows' weights.
     along_contours : ranges (OPA: depths) are constant along the nodes' contours.
     use_consensus : the surfaces of the other views also tie the nodes.
-    tolerances : of this step.
     """
     center = maps[0].view.center_in_world
     surface = nodes.surface
@@ -334,12 +330,12 @@ def relax(
         surface,
         normals=normals,
         normal_sigma=normal_sigma,
-        confidence=_agreement(rows.sigma, rows.rays, estimate, tolerances=tolerances),
+        confidence=_agreement(rows.sigma, rows.rays, estimate),
     )
     nodes = replace(nodes, surface=surface)
     ties, num_known = tie_seeds(maps[0], nodes, seeds), len(seeds.sigma)
     if use_consensus:
-        ties = _joined(ties, tie_to_consensus(maps, dense, nodes, tolerances=tolerances), num_known)
+        ties = _joined(ties, tie_to_consensus(maps, dense, nodes), num_known)
         num_known += len(normals)
     solution = solve_log_ranges(
         len(normals),
@@ -352,9 +348,7 @@ def relax(
     return replace(nodes, surface=surface)
 
 
-def _agreement(
-    sigma: Floats, rays: Floats, estimate: NormalEstimate, *, tolerances: IntegrationTolerances
-) -> Array:
+def _agreement(sigma: Floats, rays: Floats, estimate: NormalEstimate) -> Array:
     """Share (N,) of the rows that face a node which its normal explains.
 
     0 where the view's own row, the first, is an outlier: it sees another surface there, such as
@@ -363,7 +357,7 @@ def _agreement(
     cosine = np.einsum("ikn,ni->kn", rays, np.nan_to_num(estimate.normals))
     facing = np.isfinite(sigma) & (cosine < 0)
     agree = facing & (estimate.row_weights > 0.5)
-    denied = facing[0] & (estimate.row_weights[0] < tolerances.min_own_weight)
+    denied = facing[0] & (estimate.row_weights[0] < TOLERANCES.min_own_weight)
     return np.where(denied, 0, agree.sum(axis=0) / np.maximum(facing.sum(axis=0), 1))
 
 
@@ -371,8 +365,6 @@ def tie_to_consensus(
     maps: Sequence[PhaseMap],
     dense: Sequence[DenseView | None],
     nodes: Nodes,
-    *,
-    tolerances: IntegrationTolerances = IntegrationTolerances(),
 ) -> SeedTies:
     """Tie the nodes of the first view to the surface on which the other views agree.
 
@@ -397,16 +389,16 @@ def tie_to_consensus(
         )
     place, sigma, count = _consensus(np.array(said), np.array(deviations))
     node = np.flatnonzero(
-        (count >= tolerances.min_agreeing) & np.isfinite(place) & np.isfinite(sigma)
+        (count >= TOLERANCES.min_agreeing) & np.isfinite(place) & np.isfinite(sigma)
     )
-    alike = max(tolerances.correlation_px / nodes.spacing_px, 1.0)
+    alike = max(TOLERANCES.correlation_px / nodes.spacing_px, 1.0)
     relative = sigma[node] / place[node]
     return SeedTies(
         node=node,
         seed=node,
         value=np.log(place[node]),
         sigma=alike * relative,
-        common=tolerances.common_share * relative,
+        common=TOLERANCES.common_share * relative,
     )
 
 

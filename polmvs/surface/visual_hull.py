@@ -189,7 +189,11 @@ def visual_hull(
     nothing = VisualHull(np.ones((2, 2, 2), np.float32), np.zeros(3), 1.0, 1.0)
     if len(used) < 2:
         return nothing
-    on_grid = partial(_values_on_grid, used, wrong_share, plane, tol)
+
+    def values_at(points: Array) -> NDArray[np.float32]:
+        return hull_values(used, points, wrong_share, plane, tol)
+
+    on_grid = partial(_values_on_grid, values_at, max(1, MAX_VALUES // len(used)))
     center = _meeting_point(used)
     distance = float(np.median([np.linalg.norm(view.center - center) for view in used]))
     gsd = float(np.median([distance / view.view.camera.mean_focal_px for view in used]))
@@ -254,10 +258,8 @@ def _grid(low: Array, high: Array, step: float) -> tuple[int, ...]:
 
 
 def _values_on_grid(
-    views: Sequence[SurfaceView],
-    wrong_share: float,
-    plane: SupportingPlane | None,
-    tol: HullTolerances,
+    values_at: Callable[[Array], NDArray[np.float32]],
+    num_at_a_time: int,
     low: Array,
     high: Array,
     step: float,
@@ -270,11 +272,10 @@ def _values_on_grid(
         values = np.zeros(shape, np.float32)
     flat = values.reshape(-1)
     chosen = np.arange(flat.size) if where is None else np.flatnonzero(where)
-    num = max(1, MAX_VALUES // len(views))
-    for start in range(0, len(chosen), num):
-        some = chosen[start : start + num]
+    for start in range(0, len(chosen), num_at_a_time):
+        some = chosen[start : start + num_at_a_time]
         points = low + step * np.stack(np.unravel_index(some, shape), axis=1)
-        flat[some] = hull_values(views, points, wrong_share, plane, tol)
+        flat[some] = values_at(points)
     return values
 
 
