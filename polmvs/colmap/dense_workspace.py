@@ -84,6 +84,9 @@ class MatchTolerances:
     min_common_share: float = 0.25
 
 
+TOL = MatchTolerances()
+
+
 @dataclass(frozen=True, kw_only=True)
 class WorkspaceView:
     """One view of a dense workspace.
@@ -341,8 +344,6 @@ def common_views(workspace: DenseWorkspace, sparse_model: SparseModel) -> list[C
 def require_same_frame(
     workspace: DenseWorkspace,
     sparse_model: SparseModel,
-    *,
-    tolerances: MatchTolerances = MatchTolerances(),
 ) -> None:
     """Refuse a workspace whose poses differ from those of the capture's model.
 
@@ -359,9 +360,9 @@ def require_same_frame(
     distances = _scene_distances(pairs, workspace)
     errors = _pose_errors_px(pairs, distances, None)
     worst = int(errors.argmax())
-    if errors[worst] <= tolerances.max_pose_error_px:
+    if errors[worst] <= TOL.max_pose_error_px:
         return
-    hint = _after_similarity(pairs, distances, tolerances.max_pose_error_px)
+    hint = _after_similarity(pairs, distances, TOL.max_pose_error_px)
     raise DataError(
         workspace.folder,
         f"its poses are in another frame than those of the capture's model: the scene lies "
@@ -427,8 +428,6 @@ def require_matching_images(
     workspace: DenseWorkspace,
     sparse_model: SparseModel,
     load_image: ImageLoader,
-    *,
-    tolerances: MatchTolerances = MatchTolerances(),
 ) -> float:
     """Refuse a workspace whose undistorted images differ from those of the capture.
 
@@ -450,17 +449,15 @@ def require_matching_images(
         An image does not match, or there is no common view.
     """
     pairs = common_views(workspace, sparse_model)
-    step = -(-len(pairs) // tolerances.max_compared_views)
+    step = -(-len(pairs) // TOL.max_compared_views)
     lowest = 1.0
     for item, view in pairs[::step]:
-        correlation = image_correlation(
-            item.load_image(), item.camera, load_image(view.name), view, tolerances=tolerances
-        )
-        if not correlation >= tolerances.min_correlation:
+        correlation = image_correlation(item.load_image(), item.camera, load_image(view.name), view)
+        if not correlation >= TOL.min_correlation:
             raise DataError(
                 item.image,
                 "undistorted images do not match the polarization images (correlation "
-                f"{correlation:.2f} with {view.name}, {tolerances.min_correlation:.2f} is "
+                f"{correlation:.2f} with {view.name}, {TOL.min_correlation:.2f} is "
                 "expected). "
                 "Undistort the images of this capture with its own model.",
             )
@@ -473,8 +470,6 @@ def image_correlation(
     camera: PinholeCamera,
     image: NDArray[np.uint8],
     view: View,
-    *,
-    tolerances: MatchTolerances = MatchTolerances(),
 ) -> float:
     """Correlation of the local contrast of an undistorted image and one of the sensor.
 
@@ -490,30 +485,30 @@ def image_correlation(
     -------
     From -1 to 1; 0 where the two have too few pixels in common or no contrast.
     """
-    share = min(1.0, tolerances.max_compared_px / max(camera.width, camera.height))
+    share = min(1.0, TOL.max_compared_px / max(camera.width, camera.height))
     size = max(1, round(camera.width * share)), max(1, round(camera.height * share))
     compared = rescaled_camera(camera, *size)
     assert isinstance(compared, PinholeCamera)  # it was one
-    shrunk = cv2.resize(_log(undistorted, tolerances), size, interpolation=cv2.INTER_AREA)
+    shrunk = cv2.resize(_log(undistorted), size, interpolation=cv2.INTER_AREA)
     # A pixel of the comparison covers many of the sensor's: average before sampling.
     ratio = view.camera.mean_focal_px / (camera.mean_focal_px * share)
-    smooth = cv2.GaussianBlur(_log(image, tolerances), (0, 0), max(0.5 * ratio, 0.1))
+    smooth = cv2.GaussianBlur(_log(image), (0, 0), max(0.5 * ratio, 0.1))
     warped, mask = warp_image(smooth, view.camera, compared)
-    if np.count_nonzero(mask) < tolerances.min_common_share * mask.size:
+    if np.count_nonzero(mask) < TOL.min_common_share * mask.size:
         return 0.0
-    one = _contrast(np.asarray(shrunk, np.float32), mask, tolerances)
-    two = _contrast(warped, mask, tolerances)
+    one = _contrast(np.asarray(shrunk, np.float32), mask)
+    two = _contrast(warped, mask)
     norm = float(np.sqrt((one**2).sum() * (two**2).sum()))
     return float((one * two).sum() / norm) if norm > 0 else 0.0
 
 
-def _log(image: NDArray[np.uint8], tolerances: MatchTolerances) -> Gray:
-    return np.asarray(np.log(image.astype(np.float32) + np.float32(tolerances.dark_level)))
+def _log(image: NDArray[np.uint8]) -> Gray:
+    return np.asarray(np.log(image.astype(np.float32) + np.float32(TOL.dark_level)))
 
 
-def _contrast(image: Gray, mask: NDArray[np.bool_], tolerances: MatchTolerances) -> Array:
+def _contrast(image: Gray, mask: NDArray[np.bool_]) -> Array:
     """Band-passed image at the pixels of the mask (N,), blurred within the mask only."""
-    sigmas = (tolerances.fine_sigma_px, tolerances.coarse_sigma_px)
+    sigmas = (TOL.fine_sigma_px, TOL.coarse_sigma_px)
     fine, coarse = (_masked_blur(image, mask, sigma) for sigma in sigmas)
     band = (fine - coarse)[mask].astype(np.float64)
     return np.asarray(band - band.mean(), np.float64)

@@ -46,9 +46,10 @@ class StaticTolerances:
     min_count: int = 30
 
 
-def take_out_static(
-    database: Path, *, tolerances: StaticTolerances = StaticTolerances()
-) -> float | None:
+TOL = StaticTolerances()
+
+
+def take_out_static(database: Path) -> float | None:
     """Remove features of a static background from a database that has no matches yet.
 
     Returns
@@ -59,7 +60,7 @@ def take_out_static(
         ids = [image.image_id for image in content.read_all_images()]
         keypoints = [np.asarray(content.read_keypoints(number)) for number in ids]
         values = [read_descriptors(content, number) for number in ids]
-        still = find_static([k[:, :2] for k in keypoints], values, tolerances=tolerances)
+        still = find_static([k[:, :2] for k in keypoints], values)
         if still is None:
             return None
         keep_features(content, {n: ~out for n, out in zip(ids, still, strict=True)})
@@ -80,8 +81,6 @@ def keep_features(content: pycolmap.Database, kept: Mapping[int, Mask]) -> None:
 def find_static(
     places: Sequence[NDArray[np.floating]],
     descriptors: Sequence[NDArray[np.number[Any]]],
-    *,
-    tolerances: StaticTolerances = StaticTolerances(),
 ) -> list[Mask] | None:
     """Which keypoints of each image are static; None if there is no static background.
 
@@ -101,23 +100,21 @@ def find_static(
     still = []
     for index in range(num):
         others = [other for other in range(num) if other != index]
-        step = max(1, len(others) // tolerances.num_others)
-        chosen = others[::step][: tolerances.num_others]
+        step = max(1, len(others) // TOL.num_others)
+        chosen = others[::step][: TOL.num_others]
         count = np.zeros(len(places[index]), np.int64)
         for other in chosen:
             tree = trees[other]
             if tree is None or not len(count):
                 continue
-            distance, nearest = tree.query(places[index], distance_upper_bound=tolerances.reach_px)
+            distance, nearest = tree.query(places[index], distance_upper_bound=TOL.reach_px)
             near = np.flatnonzero(np.isfinite(distance))
             alike = (unit[index][near] * unit[other][nearest[near]]).sum(axis=1)
-            count[near[alike > tolerances.min_likeness]] += 1
-        still.append(count >= tolerances.min_images * len(chosen))
+            count[near[alike > TOL.min_likeness]] += 1
+        still.append(count >= TOL.min_images * len(chosen))
     enough = [
-        out.sum() >= tolerances.min_count and out.mean() >= tolerances.min_share
-        for out in still
-        if len(out)
+        out.sum() >= TOL.min_count and out.mean() >= TOL.min_share for out in still if len(out)
     ]
-    if not enough or np.mean(enough) < tolerances.min_images:
+    if not enough or np.mean(enough) < TOL.min_images:
         return None
     return still

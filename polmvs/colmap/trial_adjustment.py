@@ -65,6 +65,9 @@ class TrialTolerances:
     pose_ratio: float = 3.0
 
 
+TOL = TrialTolerances()
+
+
 @dataclass(frozen=True, kw_only=True)
 class PoseChange:
     """Difference of a pose from the fitting one.
@@ -142,9 +145,7 @@ class CameraTrial:
         return tuple(found)
 
 
-def try_cameras(
-    model: Path, *, tolerances: TrialTolerances = TrialTolerances()
-) -> CameraTrial | None:
+def try_cameras(model: Path) -> CameraTrial | None:
     """Adjust a model's matches with its cameras free, and compare; points seen once are left out.
 
     Parameters
@@ -157,11 +158,11 @@ def try_cameras(
     an adjustment that does not determine the camera.
     """
     given = read_reconstruction(model)
-    kept = _sampled(given, tolerances.num_points)
+    kept = _sampled(given, TOL.num_points)
     for number in set(given.points3D) - kept:
         given.delete_point3D(number)
     try:
-        return _compared(given, tolerances)
+        return _compared(given)
     except (ValueError, RuntimeError) as error:  # what COLMAP says of a model that it cannot adjust
         logger.info("the cameras of %s cannot be tried: %s", model, error)
         return None
@@ -179,12 +180,12 @@ def _sampled(given: pycolmap.Reconstruction, num: int) -> set[int]:
     return kept
 
 
-def _compared(given: pycolmap.Reconstruction, t: TrialTolerances) -> CameraTrial | None:
+def _compared(given: pycolmap.Reconstruction) -> CameraTrial | None:
     """The comparison; see :func:`try_cameras`."""
     if (
         len(given.cameras) != 1
-        or not t.min_images <= given.num_reg_images() <= ADJUSTMENT.max_views
-        or given.num_points3D() < t.min_points
+        or not TOL.min_images <= given.num_reg_images() <= ADJUSTMENT.max_views
+        or given.num_points3D() < TOL.min_points
     ):
         return None
     fitting, errors = copy.deepcopy(given), _errors_of_images(given)
@@ -199,11 +200,11 @@ def _compared(given: pycolmap.Reconstruction, t: TrialTolerances) -> CameraTrial
         free_principal_point=False,
     )
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
-    bundle.ceres.solver_options.function_tolerance = t.max_cost_change
+    bundle.ceres.solver_options.function_tolerance = TOL.max_cost_change
     free, free_config = bundle_of(
         fitting, ADJUSTMENT.loss_scale_px, free_intrinsics=True, free_principal_point=True
     )
-    free.ceres.solver_options.function_tolerance = t.max_cost_change
+    free.ceres.solver_options.function_tolerance = TOL.max_cost_change
     with quiet_colmap():
         pycolmap.create_default_bundle_adjuster(bundle, config, fitting).solve()
         pycolmap.create_default_bundle_adjuster(free, free_config, fitting).solve()
@@ -222,10 +223,10 @@ def _compared(given: pycolmap.Reconstruction, t: TrialTolerances) -> CameraTrial
     fitting_errors = _errors_of_images(fitting)
     usual, usual_fitting = (float(np.median([*e.values()])) for e in (errors, fitting_errors))
     # Most views do not see the points where they are said to be: the camera was changed since.
-    stale = usual > max(t.pose_ratio * usual_fitting, ADJUSTMENT.min_residual_px)
-    certain = stale | (np.abs(change) > t.max_sigmas * sigma)
-    wrong = (certain[focal_at] & (focal_change > t.min_focal_change)).any() or (
-        certain[point_at] & (point_change > t.min_point_change)
+    stale = usual > max(TOL.pose_ratio * usual_fitting, ADJUSTMENT.min_residual_px)
+    certain = stale | (np.abs(change) > TOL.max_sigmas * sigma)
+    wrong = (certain[focal_at] & (focal_change > TOL.min_focal_change)).any() or (
+        certain[point_at] & (point_change > TOL.min_point_change)
     ).any()
     x, y = (float(before.params[i]) for i in point_at)
     fitting_x, fitting_y = (float(camera.params[i]) for i in point_at)
@@ -237,7 +238,7 @@ def _compared(given: pycolmap.Reconstruction, t: TrialTolerances) -> CameraTrial
         fitting_point=(fitting_x, fitting_y),
         point_sigma=float(sigma[point_at].max()),
         camera_fits=not wrong,
-        wrong_poses=_wrong_poses(given, fitting, errors, t),
+        wrong_poses=_wrong_poses(given, fitting, errors),
         error_px=float(np.mean(list(errors.values()))),
         fitting_error_px=float(np.mean(list(fitting_errors.values()))),
     )
@@ -265,7 +266,6 @@ def _wrong_poses(
     given: pycolmap.Reconstruction,
     fitting: pycolmap.Reconstruction,
     errors: dict[str, float],
-    t: TrialTolerances,
 ) -> tuple[PoseChange, ...]:
     """Views with a pose that does not fit while those of most others do.
 
@@ -288,7 +288,7 @@ def _wrong_poses(
     )
     fits = np.array([errors.get(image.name, 0.0) for image in images])
     usual = float(np.median(fits))
-    good = fits <= t.pose_ratio * usual
+    good = fits <= TOL.pose_ratio * usual
     try:
         back = align_points(fitting_centers[good], centers[good])
     except ValueError:  # on one line, or too few
@@ -299,5 +299,5 @@ def _wrong_poses(
     return tuple(
         PoseChange(name=image.name, turn_deg=float(turn), shift=float(shift))
         for image, turn, shift, fit in zip(images, turns, shifts, good, strict=True)
-        if not fit and (turn > t.min_turn_deg or shift > t.min_shift)
+        if not fit and (turn > TOL.min_turn_deg or shift > TOL.min_shift)
     )

@@ -50,6 +50,9 @@ class RegistrationTolerances:
     backward_points: int = 3000
 
 
+TOL = RegistrationTolerances()
+
+
 class Reference(Protocol):
     """A surface to measure distances to."""
 
@@ -140,7 +143,6 @@ def register(
     reference: Reference,
     *,
     with_scale: bool = False,
-    tolerances: RegistrationTolerances = RegistrationTolerances(),
 ) -> Registration:
     """Register points to a reference.
 
@@ -151,8 +153,8 @@ def register(
     with_scale : also estimate the scale.
     """
     size = float(np.linalg.norm(np.ptp(reference.points, axis=0)))
-    whole = _Fit(points, normals, reference, size, with_scale, tolerances)
-    few, more = whole.some(tolerances.coarse_points), whole.some(tolerances.fine_points)
+    whole = _Fit(points, normals, reference, size, with_scale)
+    few, more = whole.some(TOL.coarse_points), whole.some(TOL.fine_points)
 
     def ranked(
         places: Iterable[SimilarityTransform], steps: int
@@ -161,9 +163,9 @@ def register(
         return sorted(((few.spread(place), place) for place in refined), key=lambda pair: pair[0])
 
     found = ranked(_starts(points, reference.points, with_scale=with_scale), 4)
-    kept = [place for _, place in found[: tolerances.num_kept]]
-    found = ranked(kept, tolerances.coarse_steps)
-    best = more.refined(found[0][1], tolerances.fine_steps)
+    kept = [place for _, place in found[: TOL.num_kept]]
+    found = ranked(kept, TOL.coarse_steps)
+    best = more.refined(found[0][1], TOL.fine_steps)
     least = max(found[0][0], 1e-300)
     others = [spread / least for spread, place in found[1:] if _differ(place, found[0][1])]
     return more.described(best, min(others, default=np.inf))
@@ -202,7 +204,6 @@ class _Fit:
     reference: Reference
     size: float
     with_scale: bool
-    tolerances: RegistrationTolerances
 
     def some(self, num: int) -> _Fit:
         """The same with a random choice of the points."""
@@ -232,19 +233,19 @@ class _Fit:
 
     def refined(self, place: SimilarityTransform, num_steps: int) -> SimilarityTransform:
         """A place after some steps of weighted least squares."""
-        t, number = self.tolerances, 7 if self.with_scale else 6
+        number = 7 if self.with_scale else 6
         size, fitting = self.size, 1.0
         if self.with_scale:
             fitting = _axes(self.reference.points)[2] / _axes(self.points)[2]
-        scales = fitting / t.max_scale_ratio, fitting * t.max_scale_ratio
+        scales = fitting / TOL.max_scale_ratio, fitting * TOL.max_scale_ratio
         for step in range(num_steps):
             moved, offsets, normals, counts = self._offsets(place)
             if counts.sum() < 2 * number:
                 return place
             distance = dots(offsets, normals)
             deviation = max(robust_deviation(distance[counts]), 1e-9 * size)
-            widest = t.last_width_share * size * 0.5 ** min(step, 30)
-            width = max(t.width * deviation, widest if step < num_steps // 2 else 0.0)
+            widest = TOL.last_width_share * size * 0.5 ** min(step, 30)
+            width = max(TOL.width * deviation, widest if step < num_steps // 2 else 0.0)
             weights = np.where(counts, geman_mcclure_weights(distance, width**2), 0)
             center = moved.mean(axis=0)
             rows = _rows(moved - center, normals)[:, :number]
@@ -277,7 +278,7 @@ class _Fit:
         """Rows, distances and weights of places on the reference from the nearest points."""
         points = self.reference.points
         chosen = np.random.default_rng(1).permutation(len(points))
-        places = points[chosen[: self.tolerances.backward_points]]
+        places = points[chosen[: TOL.backward_points]]
         distance, nearest = cKDTree(moved).query(places)
         towards = (moved[nearest] - places) / np.maximum(distance, 1e-300)[:, None]
         weights = geman_mcclure_weights(distance, width**2)

@@ -57,6 +57,9 @@ class VoteTolerances:
     min_gain: float = 0.2
 
 
+TOL = VoteTolerances()
+
+
 @dataclass(frozen=True, kw_only=True)
 class AxesCheck:
     """Angle convention that the planes of incidence show.
@@ -98,9 +101,7 @@ class AxesCheck:
         return f"`capture.{name}` does not fit: {begin}. Give `capture.{name}` {hint}"
 
 
-def check_axes(
-    tracks: Tracks, maps: Sequence[PhaseMap], *, tolerances: VoteTolerances = VoteTolerances()
-) -> AxesCheck:
+def check_axes(tracks: Tracks, maps: Sequence[PhaseMap]) -> AxesCheck:
     """Let the sparse points vote on the angle convention.
 
     Parameters
@@ -108,9 +109,8 @@ def check_axes(
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps of the views.
     """
-    t = tolerances
     on_parts = tracks_on_parts(tracks, maps)
-    chosen = evenly_chosen(len(on_parts.points_in_world), t.max_points)
+    chosen = evenly_chosen(len(on_parts.points_in_world), TOL.max_points)
     some, options = some_tracks(on_parts, chosen), NormalOptions()
     # Under both kinds of light, which a rotation of all angles by 90 degrees exchanges.
     ways = (AS_MEASURED, *CHANGES)
@@ -125,28 +125,28 @@ def check_axes(
     likelihoods = np.maximum(found[::2], found[1::2])  # (conventions, N), of a row
     given, *changed = likelihoods
     # A point that no convention explains does not vote.
-    voting = (num_rows >= t.min_rows) & (np.max(likelihoods, axis=0) > t.min_gain)
+    voting = (num_rows >= TOL.min_rows) & (np.max(likelihoods, axis=0) > TOL.min_gain)
     best = AxesCheck(num_votes=int(voting.sum()), share=0.0, change=None)
-    most = t.min_gain
+    most = TOL.min_gain
     for change, likelihood in zip(CHANGES, changed, strict=True):
         votes = (likelihood - given)[voting]
-        if is_clear(votes, t) and votes.mean() > most:
+        if is_clear(votes) and votes.mean() > most:
             share = float(np.mean(votes > 0))
             best, most = AxesCheck(num_votes=len(votes), share=share, change=change), votes.mean()
     return best
 
 
-def is_clear(votes: Array, t: VoteTolerances) -> bool:
+def is_clear(votes: Array) -> bool:
     """Whether the votes (N,) of points are clearly for another setting: most, and strongly.
 
     Strongly means: not by chance, in standard errors of the mean. Right settings of nine captures
     had -2.3 to -46. Points on one surface see the same light, so their votes are not independent,
     and the limit remains a guess.
     """
-    if len(votes) < t.min_votes:
+    if len(votes) < TOL.min_votes:
         return False
     error = float(votes.std(ddof=1)) / np.sqrt(len(votes))
-    return bool(votes.mean() > BEYOND_CHANCE * error and np.mean(votes > 0) > t.min_share)
+    return bool(votes.mean() > BEYOND_CHANCE * error and np.mean(votes > 0) > TOL.min_share)
 
 
 def changed_pattern(

@@ -53,6 +53,9 @@ class EstimatorTolerances:
     min_conditioning: float = 0.02
 
 
+TOL = EstimatorTolerances()
+
+
 @dataclass(frozen=True, kw_only=True)
 class NormalEstimate:
     """Normals of N points with their quality.
@@ -133,7 +136,6 @@ def solve_normals(
     *,
     robust: bool = True,
     initial_normals: Floats | None = None,
-    tolerances: EstimatorTolerances = EstimatorTolerances(),
 ) -> NormalEstimate:
     """Normals of N points from K rows each.
 
@@ -153,7 +155,6 @@ def solve_normals(
     robust : weighted robust estimator, or the paper's.
     initial_normals : (3, N), NaN where unknown: a start, which decides the views that face the
         point before its first solution.
-    tolerances : of this step.
     """
     if rows.ndim != 3 or rows.shape[0] != 3 or rows.shape != rays.shape:
         raise ValueError(f"{rows.shape=}, {rays.shape=} but expected two (3, K, N).")
@@ -169,8 +170,8 @@ def solve_normals(
         weights = weights * ~(cosine > 0)  # NaN: unknown, kept
     normals = _smallest(rows, weights)[1]
     if robust:
-        problem = _Problem(rows, rays, precision, weights, tolerances)
-        normals = problem.iterate(normals, annealed_scales(tolerances.num_rounds))
+        problem = _Problem(rows, rays, precision, weights)
+        normals = problem.iterate(normals, annealed_scales(TOL.num_rounds))
         normals = problem.try_again(normals)
         normals = problem.unbiased(normals)
         weights, outlier_weights = problem.weights(normals, CAUCHY_SCALE)
@@ -178,14 +179,14 @@ def solve_normals(
     moments = _moments(rows, weights)
     if robust:
         moments -= problem.gained(normals, CAUCHY_SCALE)
-    estimate = _describe(rays, weights, outlier_weights, moments, tolerances)
-    kept = precision * (outlier_weights > tolerances.counted_weight)
-    determined = _spread(rows, kept, alike=not robust) > tolerances.min_spread
+    estimate = _describe(rays, weights, outlier_weights, moments)
+    kept = precision * (outlier_weights > TOL.counted_weight)
+    determined = _spread(rows, kept, alike=not robust) > TOL.min_spread
     determined &= (estimate.num_rows > 2) | (facing.sum(axis=0) <= 2)
     estimate = _only(estimate, determined)
     if robust:
         return estimate
-    sigma = _algebraic_sigma(rows, rays, precision, estimate.normals.T, tolerances.min_sin_zenith)
+    sigma = _algebraic_sigma(rows, rays, precision, estimate.normals.T, TOL.min_sin_zenith)
     return replace(estimate, sigma_deg=np.degrees(sigma, dtype=np.float64))
 
 
@@ -200,7 +201,6 @@ class _Problem:
     rays: Floats
     precision: Floats
     votes: Floats
-    tolerances: EstimatorTolerances
 
     def iterate(self, normals: Array, scales: Iterable[float]) -> Array:
         """Reweight and solve again, a round for each scale of the loss."""
@@ -215,7 +215,7 @@ class _Problem:
         rays, for short arcs by more than their deviation. The fundamental numerical scheme
         (Chojnacki et al., PAMI 2000) includes it.
         """
-        for _ in range(self.tolerances.num_unbiased_rounds):
+        for _ in range(TOL.num_unbiased_rounds):
             moments = _moments(self.rows, self.weights(normals, CAUCHY_SCALE)[0])
             normals = smallest_eigenvectors(moments - self.gained(normals, CAUCHY_SCALE))[1]
         return normals
@@ -247,8 +247,8 @@ class _Problem:
     def try_again(self, normals: Array) -> Array:
         """Start points that are badly explained again from pairs of rows; the better one stays."""
         losses = self.losses(normals)
-        enough = (self.precision > 0).sum(axis=0) >= self.tolerances.min_rows_to_doubt
-        where = np.flatnonzero((losses > self.tolerances.doubtful_loss) & enough)
+        enough = (self.precision > 0).sum(axis=0) >= TOL.min_rows_to_doubt
+        where = np.flatnonzero((losses > TOL.doubtful_loss) & enough)
         if len(where) == 0:
             return normals
         some = _Problem(
@@ -256,10 +256,9 @@ class _Problem:
             self.rays[..., where],
             self.precision[..., where],
             self.votes[..., where],
-            self.tolerances,
         )
         # A pair of correct rows is near enough to the solution: no wide loss is needed.
-        scales = (s for s in annealed_scales(self.tolerances.num_rounds) if s == CAUCHY_SCALE)
+        scales = (s for s in annealed_scales(TOL.num_rounds) if s == CAUCHY_SCALE)
         again = some.iterate(some._best_pair(normals[:, where]), scales)
         better = some.losses(again) < losses[where]
         improved = normals.copy()
@@ -274,8 +273,8 @@ class _Problem:
         order = np.argsort(self.precision <= 0, axis=0, kind="stable")
         count = (self.precision > 0).sum(axis=0)
         points = np.arange(len(count))
-        min_sine = 2 * self.tolerances.min_conditioning
-        for _ in range(self.tolerances.num_pairs):
+        min_sine = 2 * TOL.min_conditioning
+        for _ in range(TOL.num_pairs):
             first, step = rng.random((2, len(count)))
             i = np.floor(first * count).astype(np.int64)
             j = (i + 1 + np.floor(step * (count - 1)).astype(np.int64)) % count
@@ -293,7 +292,7 @@ class _Problem:
         cosine = _dot(self.rays, normals)
         facing = np.sign((cosine * self.votes).sum(axis=0))
         visible = (self.precision > 0) & (cosine * facing > MIN_FACING_COSINE)
-        sin2 = np.maximum(1 - cosine**2, self.tolerances.min_sin_zenith**2)
+        sin2 = np.maximum(1 - cosine**2, TOL.min_sin_zenith**2)
         return _dot(self.rows, normals) ** 2 * self.precision / sin2, sin2, visible
 
 
@@ -321,11 +320,10 @@ def _describe(
     weights: Floats,
     outlier_weights: Floats,
     moments: Array,
-    tolerances: EstimatorTolerances,
 ) -> NormalEstimate:
     """Final solution with its sign, conditioning, covariance and validity."""
     eigenvalues, normals = smallest_eigenvectors(moments)
-    num_rows = (outlier_weights > tolerances.counted_weight).sum(axis=0)
+    num_rows = (outlier_weights > TOL.counted_weight).sum(axis=0)
     total = weights.sum(axis=0, dtype=np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         conditioning = np.sqrt(np.maximum(eigenvalues[1], 0) / eigenvalues[2])
@@ -334,11 +332,7 @@ def _describe(
         sigma_deg = np.degrees(1 / np.sqrt(eigenvalues[1]))
     facing = (_dot(rays, normals) * weights).sum(axis=0)
     normals = np.where(facing > 0, -normals, normals)
-    valid = (
-        (num_rows >= tolerances.min_rows)
-        & (conditioning >= tolerances.min_conditioning)
-        & (total > 0)
-    )
+    valid = (num_rows >= TOL.min_rows) & (conditioning >= TOL.min_conditioning) & (total > 0)
     return NormalEstimate(
         normals=np.where(valid, normals, np.nan).T,
         valid=valid,

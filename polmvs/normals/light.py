@@ -64,10 +64,12 @@ class LightTolerances:
     widening: float = 1.3
 
 
+TOL = LightTolerances()
+
+
 def find_diffuse_parts(
     tracks: Tracks,
     maps: Sequence[PhaseMap],
-    tolerances: LightTolerances | None = None,
     *,
     max_rows: int = MAX_ROWS,
 ) -> list[Mask]:
@@ -80,22 +82,20 @@ def find_diffuse_parts(
     ----------
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps built for specular light; one is held at a time.
-    tolerances : of this step.
     max_rows : rows of points and views that are solved at a time.
 
     Returns
     -------
     For each map ``(P,)`` bool, by part, for :func:`diffuse_pixels`.
     """
-    t = tolerances or LightTolerances()
     on_parts = tracks_on_parts(tracks, maps)
-    votes, voting = track_votes(on_parts, maps, t, max_rows=max_rows)
+    votes, voting = track_votes(on_parts, maps, max_rows=max_rows)
     of_points = [
-        _part_votes(m, on_parts.points_in_world[voting], votes[voting], t.min_rows) for m in maps
+        _part_votes(m, on_parts.points_in_world[voting], votes[voting], TOL.min_rows) for m in maps
     ]
-    slots = _place_pixels(maps, tracks.points_in_world, t)
-    of_pixels = _pixel_votes(slots, maps, t, max_rows)
-    overall = float(votes[voting].sum()) + _dolp_votes(maps, t)
+    slots = _place_pixels(maps, tracks.points_in_world)
+    of_pixels = _pixel_votes(slots, maps, max_rows)
+    overall = float(votes[voting].sum()) + _dolp_votes(maps)
     own = []
     for known, dense in zip(of_points, of_pixels, strict=True):
         unknown = np.isnan(known) & np.isnan(dense)
@@ -104,8 +104,7 @@ def find_diffuse_parts(
     # Without any evidence light is specular, which is polarized most.
     tie = overall if overall != 0 else 1.0
     verdicts = (
-        np.where(np.isfinite(pooled), pooled, overall)
-        for pooled in _pooled_votes(slots, own, maps, t)
+        np.where(np.isfinite(pooled), pooled, overall) for pooled in _pooled_votes(slots, own, maps)
     )
     return [np.where(verdict == 0, tie, verdict) < 0 for verdict in verdicts]
 
@@ -118,7 +117,6 @@ def diffuse_pixels(phase_map: PhaseMap, parts: Mask) -> Mask:
 def track_votes(
     tracks: Tracks,
     maps: Sequence[PhaseMap],
-    tolerances: LightTolerances | None = None,
     *,
     max_rows: int = MAX_ROWS,
 ) -> tuple[Array, Mask]:
@@ -129,13 +127,12 @@ def track_votes(
     tracks : sparse points; ``obs_view`` counts in ``maps``.
     maps : phase maps, built for either kind of light.
     """
-    t = tolerances or LightTolerances()
     votes, voting = [], []
     for some in in_tiles(tracks, len(maps), max_rows):
         found, matched = observe(AngleModel.PPA, some, maps, NormalOptions())
         specular, diffuse = (solve_mixture(found, matched, prior_specular=p) for p in (1.0, 0.0))
         votes.append(specular.log_likelihood - diffuse.log_likelihood)
-        enough = np.maximum(specular.num_rows, diffuse.num_rows) >= t.min_rows
+        enough = np.maximum(specular.num_rows, diffuse.num_rows) >= TOL.min_rows
         # Under the wrong kind of light the rows often leave no normal at all.
         voting.append((specular.valid | diffuse.valid) & enough)
     return np.concatenate(votes), np.concatenate(voting)
@@ -158,9 +155,7 @@ def _part_votes(phase_map: PhaseMap, points: Array, votes: Array, min_points: in
     return np.where(count >= min_points, total, np.nan)
 
 
-def _pixel_votes(
-    slots: _Slots, maps: Sequence[PhaseMap], t: LightTolerances, max_rows: int
-) -> list[Array]:
+def _pixel_votes(slots: _Slots, maps: Sequence[PhaseMap], max_rows: int) -> list[Array]:
     """Votes (P,) of the pixels of each view's parts; NaN where no view sees enough.
 
     By the phases of single pixels: averaged over a window, those of a thin thing tell nothing.
@@ -171,7 +166,7 @@ def _pixel_votes(
     slots : pixels of all parts.
     maps : of all views, under the assumption of specular light.
     """
-    seen_by = evenly_spread(len(maps), t.max_pixel_views)
+    seen_by = evenly_spread(len(maps), TOL.max_pixel_views)
     asked = np.isin(slots.view, seen_by)
     points, owner = slots.points[asked], slots.owner[asked]
     total, sums = np.zeros(slots.num), np.zeros((2, slots.num))
@@ -183,11 +178,11 @@ def _pixel_votes(
             for rows in gather_rows_under(LIGHTS, AngleModel.PPA, tile, [maps[k] for k in seen_by])
         ]
         compared = (weights[0] > 0) & (weights[1] > 0)
-        counts = compared.sum(axis=0) * (compared.sum(axis=0) >= t.min_rows)
+        counts = compared.sum(axis=0) * (compared.sum(axis=0) >= TOL.min_rows)
         total += np.bincount(here, counts, slots.num)
         for which, of_light in enumerate(weights):
             # A robust weight is 1 / (1 + z^2 / c^2): minus its logarithm is a log-likelihood.
-            cost = -np.log(np.maximum(of_light, np.exp(-t.max_row_cost)))
+            cost = -np.log(np.maximum(of_light, np.exp(-TOL.max_row_cost)))
             weighted = (cost * compared).sum(axis=0) * (counts > 0)
             sums[which] += np.bincount(here, weighted, slots.num)
     mean = np.divide(sums, total, out=np.full((2, slots.num), np.inf), where=total > 0)
@@ -202,9 +197,7 @@ def _pixel_votes(
     return dense
 
 
-def _pooled_votes(
-    slots: _Slots, votes: Sequence[Array], maps: Sequence[PhaseMap], t: LightTolerances
-) -> list[Array]:
+def _pooled_votes(slots: _Slots, votes: Sequence[Array], maps: Sequence[PhaseMap]) -> list[Array]:
     """Votes (P,) of each part with those of the parts of other views that show the same.
 
     A part's pixels, as deep in the hull as most views have a part where they fall, pass on the
@@ -217,7 +210,7 @@ def _pooled_votes(
     """
     placed = np.maximum(np.bincount(slots.owner, minlength=slots.num), 1)
     covered, passed, known = np.zeros(slots.num), np.zeros(slots.num), np.zeros(slots.num)
-    for k in evenly_spread(len(maps), t.max_pixel_views):
+    for k in evenly_spread(len(maps), TOL.max_pixel_views):
         elsewhere = slots.view != k
         xy = maps[k].view.project(slots.points[elsewhere])
         part = sample_image(_parts_of(maps[k]).astype(np.float32), xy, nearest=True).astype(int)
@@ -271,16 +264,16 @@ class _Slots:
         ]
 
 
-def _place_pixels(maps: Sequence[PhaseMap], points: Array, t: LightTolerances) -> _Slots:
+def _place_pixels(maps: Sequence[PhaseMap], points: Array) -> _Slots:
     """Place pixels of all parts in the hull of the regions, about where the scene's points lie.
 
     Parameters
     ----------
     points : (T, 3), world, of the scene.
     """
-    chosen = [_choose_pixels(phase_map, points, t) for phase_map in maps]
+    chosen = [_choose_pixels(phase_map, points) for phase_map in maps]
     support = [np.zeros((len(one.distances), len(one.rays)), np.int16) for one in chosen]
-    for k in evenly_spread(len(maps), t.max_pixel_views):
+    for k in evenly_spread(len(maps), TOL.max_pixel_views):
         inside, camera = maps[k].region.inside.astype(np.float32), maps[k].view.camera
         for one, views in zip(chosen, support, strict=True):
             xy = maps[k].view.project(one.places())
@@ -293,17 +286,17 @@ def _place_pixels(maps: Sequence[PhaseMap], points: Array, t: LightTolerances) -
         most = views == views.max(axis=0, initial=-len(maps))
         first = one.distances[most.argmax(axis=0)]
         last = one.distances[len(most) - 1 - most[::-1].argmax(axis=0)]
-        for slot, share in enumerate(np.linspace(0, 1, t.num_ranges)):
+        for slot, share in enumerate(np.linspace(0, 1, TOL.num_ranges)):
             placed.append(points_on_rays(one.center, one.rays, first ** (1 - share) * last**share))
             owner.append(begin + slot * one.num_parts + one.part)
             view.append(np.full(len(one.rays), index))
-        begin += t.num_ranges * one.num_parts
+        begin += TOL.num_ranges * one.num_parts
     return _Slots(
         points=np.concatenate(placed),
         owner=np.concatenate(owner),
         view=np.concatenate(view),
         num_parts=tuple(one.num_parts for one in chosen),
-        num_ranges=t.num_ranges,
+        num_ranges=TOL.num_ranges,
     )
 
 
@@ -331,7 +324,7 @@ class _ChosenPixels:
         return points_on_rays(self.center, self.rays, self.distances[:, None])
 
 
-def _choose_pixels(phase_map: PhaseMap, points: Array, t: LightTolerances) -> _ChosenPixels:
+def _choose_pixels(phase_map: PhaseMap, points: Array) -> _ChosenPixels:
     """Evenly spread pixels of each part, and distances about those of points (T, 3)."""
     labels, reliable = _parts_of(phase_map), phase_map.region.reliable
     view, num_parts = phase_map.view, int(labels.max(initial=0)) + 1
@@ -341,7 +334,7 @@ def _choose_pixels(phase_map: PhaseMap, points: Array, t: LightTolerances) -> _C
     ahead = lengths(in_cam[in_cam[:, 2] > 0])
     for part in range(1, num_parts if len(ahead) else 1):
         rows, cols = np.nonzero((labels == part) & reliable)
-        step = max(1, len(rows) // t.num_pixels)
+        step = max(1, len(rows) // TOL.num_pixels)
         pixels.append(np.stack([cols[::step], rows[::step]], axis=-1) + 0.5)
         of_part.append(np.full(len(pixels[-1]), part))
     near, far = np.percentile(ahead, [2, 98]) if len(ahead) else (1.0, 1.0)
@@ -350,11 +343,11 @@ def _choose_pixels(phase_map: PhaseMap, points: Array, t: LightTolerances) -> _C
         rays=view.rays_in_world(np.concatenate(pixels)),
         part=np.concatenate(of_part),
         num_parts=num_parts,
-        distances=np.geomspace(near / t.widening, far * t.widening, t.num_steps),
+        distances=np.geomspace(near / TOL.widening, far * TOL.widening, TOL.num_steps),
     )
 
 
-def _dolp_votes(maps: Sequence[PhaseMap], t: LightTolerances) -> float:
+def _dolp_votes(maps: Sequence[PhaseMap]) -> float:
     """What the highest degrees of polarization of the capture speak for."""
     highest = []
     for phase_map in maps:
@@ -364,5 +357,5 @@ def _dolp_votes(maps: Sequence[PhaseMap], t: LightTolerances) -> float:
             highest.append(float(np.percentile(np.linalg.norm(axial, axis=-1), 90)))
     if not highest:
         return 0.0
-    excess = (max(highest) - t.diffuse_dolp) / t.diffuse_dolp
-    return float(np.clip(excess, -1, 1) * t.dolp_votes)
+    excess = (max(highest) - TOL.diffuse_dolp) / TOL.diffuse_dolp
+    return float(np.clip(excess, -1, 1) * TOL.dolp_votes)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polmvs.normals.axes_check import VoteTolerances, is_clear
+from polmvs.normals.axes_check import is_clear
 from polmvs.normals.light import track_votes
 from polmvs.normals.tracks import tracks_on_parts
 from polmvs.polarization.kinds import Light
@@ -55,6 +55,6 @@ def check_light(tracks: Tracks, maps: Sequence[PhaseMap], given: Light) -> Light
     votes, voting = track_votes(tracks_on_parts(tracks, maps), maps)
     votes = votes[voting] if given is Light.SPECULAR else -votes[voting]
     num = len(votes)
-    contradicted = is_clear(-votes, VoteTolerances())
+    contradicted = is_clear(-votes)
     share = float(np.mean(votes < 0)) if num else 0.0
     return LightCheck(given=given, num_votes=num, share=share, contradicted=contradicted)

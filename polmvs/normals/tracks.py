@@ -57,6 +57,9 @@ class SeedTolerances:
     min_on_region: int = 3
 
 
+TOL = SeedTolerances()
+
+
 def observe(
     angle_model: AngleModel, tracks: Tracks, maps: Sequence[PhaseMap], options: NormalOptions
 ) -> tuple[PointObservations, Mask]:
@@ -188,9 +191,7 @@ def seen_shares(points: Array, normals: Array, maps: Sequence[PhaseMap]) -> Arra
     return np.asarray(seen / np.maximum(facing, 1))
 
 
-def dolp_shares(
-    tracks: Tracks, maps: Sequence[PhaseMap], *, tolerances: SeedTolerances = SeedTolerances()
-) -> Array:
+def dolp_shares(tracks: Tracks, maps: Sequence[PhaseMap]) -> Array:
     """DoLP at the keypoints over that of the surface about them, the median ``(T,)`` of a track.
 
     NaN if the surface is nowhere polarized enough.
@@ -201,9 +202,7 @@ def dolp_shares(
         lowest = sample_image(phase_map.lowest_dolp.astype(np.float32), xy, nearest=True) / 255
         about = sample_image(phase_map.samples, xy, nearest=True)
         surface = np.hypot(about[:, 0], about[:, 1])
-        ratio[here] = np.where(
-            surface > tolerances.clear_dolp, lowest / np.maximum(surface, 1e-6), np.nan
-        )
+        ratio[here] = np.where(surface > TOL.clear_dolp, lowest / np.maximum(surface, 1e-6), np.nan)
     known = np.isfinite(ratio)
     # The median of each track: its ratios lie together once sorted by track and value.
     order = np.lexsort((ratio[known], tracks.obs_track[known]))
@@ -220,8 +219,6 @@ def select_seeds(
     tracks: Tracks,
     estimate: NormalEstimate,
     maps: Sequence[PhaseMap],
-    *,
-    tolerances: SeedTolerances = SeedTolerances(),
 ) -> tuple[Seeds, Mask]:
     """Tracks whose normal explains the observations of all views.
 
@@ -236,18 +233,17 @@ def select_seeds(
     -------
     The seeds, and whether each track ``(T,)`` is one.
     """
-    t = tolerances
     good = (
-        estimate.valid & (estimate.num_rows >= MIN_VIEWS) & (estimate.sigma_deg < t.max_sigma_deg)
+        estimate.valid & (estimate.num_rows >= MIN_VIEWS) & (estimate.sigma_deg < TOL.max_sigma_deg)
     )
     some = some_tracks(tracks, good)
-    good[good] = ~(dolp_shares(some, maps, tolerances=t) > t.max_dolp_share)
+    good[good] = ~(dolp_shares(some, maps) > TOL.max_dolp_share)
     # The slowest test last, on the remaining tracks: it looks up all points in all views.
     on_region = good.copy()
-    on_region[good] = inside_shares(some_tracks(tracks, good), maps) >= t.min_inside_share
+    on_region[good] = inside_shares(some_tracks(tracks, good), maps) >= TOL.min_inside_share
     points, normals = tracks.points_in_world[on_region], estimate.normals[on_region]
-    on_region[on_region] = seen_shares(points, normals, maps) >= t.min_inside_share
-    if on_region.sum() >= t.min_on_region:
+    on_region[on_region] = seen_shares(points, normals, maps) >= TOL.min_inside_share
+    if on_region.sum() >= TOL.min_on_region:
         good = on_region
     some = some_tracks(tracks, good)
     sigma = point_sigmas(some, [m.view for m in maps])

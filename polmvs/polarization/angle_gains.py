@@ -45,6 +45,9 @@ class GainTolerances:
     max_misfit_share: float = 0.5
 
 
+TOL = GainTolerances()
+
+
 @dataclass(frozen=True, kw_only=True)
 class AngleGains:
     """Gains of the images of a view.
@@ -70,8 +73,6 @@ def find_angle_gains(
     images: NDArray[np.floating],
     angles_deg: Sequence[float],
     usable: NDArray[np.bool_],
-    *,
-    tolerances: GainTolerances = GainTolerances(),
 ) -> AngleGains:
     """Gains between images of one view behind a polarizer.
 
@@ -87,29 +88,27 @@ def find_angle_gains(
     """
     num = len(images)
     samples = np.asarray(images, np.float64)[:, usable & (images > 0).all(axis=0)]
-    samples = samples[:, :: max(1, samples.shape[1] // tolerances.num_samples)]
+    samples = samples[:, :: max(1, samples.shape[1] // TOL.num_samples)]
     alike = AngleGains(gains=(1.0,) * num, support=0.0, differ=False)
     if samples.shape[1] < 100:
         return alike
     ratios = np.log(samples) - np.log(samples).mean(axis=0)
-    bins = np.floor(ratios / tolerances.bin_log).astype(np.int64)
+    bins = np.floor(ratios / TOL.bin_log).astype(np.int64)
     _, inverse, counts = np.unique(bins, axis=1, return_inverse=True, return_counts=True)
     center = np.median(ratios[:, inverse.ravel() == int(np.argmax(counts))], axis=1)
     near = np.zeros(samples.shape[1], np.bool_)
     for _ in range(3):  # the bin's border may cut the mode in two
-        near = (np.abs(ratios - center[:, None]) < tolerances.radius_log).all(axis=0)
+        near = (np.abs(ratios - center[:, None]) < TOL.radius_log).all(axis=0)
         if not near.any():
             return alike
         center = np.median(ratios[:, near], axis=1)
     gains = np.exp(center - center.mean())
     support = float(near.mean())
-    differ = bool(
-        gains.max() > tolerances.min_ratio * gains.min() and support >= tolerances.min_support
-    )
+    differ = bool(gains.max() > TOL.min_ratio * gains.min() and support >= TOL.min_support)
     if differ and num > 3:
         before = _misfit(samples, angles_deg)
         after = _misfit(samples / gains[:, None], angles_deg)
-        differ = after < tolerances.max_misfit_share * before
+        differ = after < TOL.max_misfit_share * before
     return AngleGains(gains=tuple(map(float, gains)), support=support, differ=differ)
 
 

@@ -52,6 +52,9 @@ class LinearityTolerances:
     max_log_sigma: float = 0.15
 
 
+TOL = LinearityTolerances()
+
+
 @dataclass(frozen=True, kw_only=True)
 class LinearityCheck:
     """The encoding gamma that the samples show.
@@ -92,8 +95,6 @@ def check_linearity(
     pattern: tuple[int, int, int, int],
     clip: float,
     gamma: float,
-    *,
-    tolerances: LinearityTolerances = LinearityTolerances(),
 ) -> LinearityCheck:
     """Compare the given gamma of mosaics with the gamma that their samples show.
 
@@ -104,24 +105,23 @@ def check_linearity(
     clip : share from which a sample is clipped.
     gamma : given by the user: linear = sample ** (1 / gamma).
     """
-    t = tolerances
     unknown = LinearityCheck(given=gamma, found=None, log_sigma=np.inf, fits=None)
     log_gamma, sigma = 0.0, np.inf
-    for _ in range(t.num_rounds):
-        decoded = [_patches(raw, pattern, clip, np.exp(-log_gamma), t) for raw in mosaics]
-        if not decoded or sum(len(rows) for rows, _ in decoded) < t.min_patches:
+    for _ in range(TOL.num_rounds):
+        decoded = [_patches(raw, pattern, clip, np.exp(-log_gamma)) for raw in mosaics]
+        if not decoded or sum(len(rows) for rows, _ in decoded) < TOL.min_patches:
             return unknown
-        slope, sigma = _quadratic_part(decoded, t)
+        slope, sigma = _quadratic_part(decoded)
         # slope = (p - 1) / (2 p); far from p = 1 the step is cut short, the next rounds go on.
         step = -np.log(1.0 - 2.0 * min(slope, 0.3))
         log_gamma += float(step)
         sigma *= 2.0
         if abs(step) < 0.1 * sigma:
             break
-    if not sigma < t.max_log_sigma or not abs(log_gamma) < np.log(10.0):
+    if not sigma < TOL.max_log_sigma or not abs(log_gamma) < np.log(10.0):
         return unknown
     apart = abs(log_gamma - np.log(gamma))
-    fits = bool(apart < max(BEYOND_CHANCE * sigma, np.log(t.min_ratio)))
+    fits = bool(apart < max(BEYOND_CHANCE * sigma, np.log(TOL.min_ratio)))
     return LinearityCheck(
         given=gamma, found=float(np.exp(log_gamma)), log_sigma=float(sigma), fits=fits
     )
@@ -132,7 +132,6 @@ def _patches(
     pattern: tuple[int, int, int, int],
     clip: float,
     exponent: float,
-    t: LinearityTolerances,
 ) -> tuple[Array, NDArray[np.int64]]:
     """Rows ``(N, 6)`` of smooth patches: s0, q, u, r, and place x, y; and their groups ``(N,)``."""
     images = split_mosaic(raw, pattern)
@@ -142,9 +141,9 @@ def _patches(
     mean = patch_means(intensity)
     spread = patch_means(np.square(intensity)) - np.square(mean)
     level = np.maximum(mean, 1e-6)
-    good = (patch_means(usable) > 0.999) & (spread < np.square(t.max_contrast * level))
+    good = (patch_means(usable) > 0.999) & (spread < np.square(TOL.max_contrast * level))
     # By the sum of all four: a choice by single ones would depend on the angle.
-    good &= level > t.min_level
+    good &= level > TOL.min_level
     if exponent != 1.0:
         images = np.power(np.maximum(images, 0), np.float32(exponent))
     i0, i45, i90, i135 = (patch_means(image) for image in images)
@@ -152,18 +151,16 @@ def _patches(
     rows, cols = np.indices(s0.shape)
     x, y = cols / s0.shape[1] - 0.5, (rows - 0.5 * s0.shape[0]) / s0.shape[1]
     stack = np.stack([s0, (i0 - i90) / s0, (i45 - i135) / s0, (i0 + i90 - i45 - i135) / s0, x, y])
-    group = (rows * 8 // s0.shape[0] * 3 + cols * 8 // s0.shape[1]) % t.num_groups
+    group = (rows * 8 // s0.shape[0] * 3 + cols * 8 // s0.shape[1]) % TOL.num_groups
     return np.asarray(stack[:, good].T, np.float64), group[good]
 
 
-def _quadratic_part(
-    parts: Sequence[tuple[Array, NDArray[np.int64]]], t: LinearityTolerances
-) -> tuple[float, float]:
+def _quadratic_part(parts: Sequence[tuple[Array, NDArray[np.int64]]]) -> tuple[float, float]:
     """Slope of r over ``q^2 - u^2`` beside all that is linear in q and u, and its deviation."""
     s0, q, u, r, x, y = np.concatenate([rows for rows, _ in parts]).T
     group = np.concatenate([groups for _, groups in parts])
     place = (np.ones_like(x), x, y, x * x, x * y, y * y)
-    if not np.std(q * q - u * u) > t.min_quadratic:
+    if not np.std(q * q - u * u) > TOL.min_quadratic:
         return 0.0, np.inf
     columns = [q * q - u * u, *(a * b for a in place for b in (np.ones_like(q), q, u))]
     # r is relative: the fewer photons, the less it says.
@@ -171,7 +168,7 @@ def _quadratic_part(
     design, right = np.stack(columns, axis=1) * weight[:, None], r * weight
     loss = np.ones_like(r)
     solution = np.zeros(design.shape[1])
-    for _ in range(t.num_rounds):
+    for _ in range(TOL.num_rounds):
         solution = _solve(design, right, loss)
         residual = right - design @ solution
         loss = cauchy_weights(np.square(residual / max(robust_deviation(residual), 1e-9)))

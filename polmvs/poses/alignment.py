@@ -42,6 +42,9 @@ class AlignmentTolerances:
     max_turn_deg: float = 15.0
 
 
+TOL = AlignmentTolerances()
+
+
 @dataclass(frozen=True, kw_only=True)
 class Alignment:
     """Alignment of the estimated cameras to the true ones.
@@ -68,7 +71,6 @@ def align_views(
     true_views: Mapping[str, View],
     *,
     source: str | PathLike[str] = "known poses",
-    tolerances: AlignmentTolerances = AlignmentTolerances(),
 ) -> tuple[SimilarityTransform, Alignment]:
     """Similarity ``truth_from_world`` that takes the estimated camera centres to the true ones.
 
@@ -99,7 +101,7 @@ def align_views(
     centers = np.array([view.center_in_world for view, _ in pairs])
     true_centers = np.array([true.center_in_world for _, true in pairs])
     try:
-        truth_from_world, used = align_cameras(centers, true_centers, tolerances=tolerances)
+        truth_from_world, used = align_cameras(centers, true_centers)
     except ValueError as error:
         raise DataError(source, f"cameras cannot be aligned: {error}") from error
     residuals = align_residuals(truth_from_world, centers[used], true_centers[used])
@@ -112,7 +114,7 @@ def align_views(
     ]
     spread = spread_of(true_centers)
     rms, turn_deg = float(np.sqrt((residuals**2).mean())), float(np.degrees(np.median(turns)))
-    if rms > tolerances.max_relative_rms * spread or turn_deg > tolerances.max_turn_deg:
+    if rms > TOL.max_relative_rms * spread or turn_deg > TOL.max_turn_deg:
         raise DataError(
             source,
             f"its cameras cannot be those of the {len(pairs)} reconstructed images: aligned, they "
@@ -129,9 +131,7 @@ def align_views(
     )
 
 
-def align_cameras(
-    centers: Array, true_centers: Array, *, tolerances: AlignmentTolerances = AlignmentTolerances()
-) -> tuple[SimilarityTransform, Mask]:
+def align_cameras(centers: Array, true_centers: Array) -> tuple[SimilarityTransform, Mask]:
     """Least-squares similarity from the camera centres that one similarity explains.
 
     Parameters
@@ -150,7 +150,7 @@ def align_cameras(
     ValueError
         For fewer than three cameras, or centres on one line.
     """
-    used = _consistent_cameras(centers, true_centers, tolerances)
+    used = _consistent_cameras(centers, true_centers)
     return align_points(centers[used], true_centers[used]), used
 
 
@@ -164,9 +164,7 @@ def spread_of(points: Array) -> float:
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
-def _consistent_cameras(
-    centers: Array, true_centers: Array, tolerances: AlignmentTolerances
-) -> Mask:
+def _consistent_cameras(centers: Array, true_centers: Array) -> Mask:
     """Cameras that one similarity explains; all of them if there are few."""
     majority = max(len(centers) // 2 + 1, MIN_CAMERAS + 1)  # any three agree well enough
     if len(centers) <= majority:
@@ -176,7 +174,7 @@ def _consistent_cameras(
     for _ in range(len(centers)):
         transform = align_points(centers[used], true_centers[used])
         residuals = align_residuals(transform, centers, true_centers)
-        again = like_most(residuals, floor=tolerances.outlier_floor * spread)
+        again = like_most(residuals, floor=TOL.outlier_floor * spread)
         if np.array_equal(again, used):
             break
         used = again

@@ -67,6 +67,9 @@ class FrameTolerances:
     max_relative_rms: float = AlignmentTolerances.max_relative_rms
 
 
+TOL = FrameTolerances()
+
+
 @dataclass(frozen=True, kw_only=True)
 class Frame:
     """Transformation of the reconstruction's world to metric units, with its uncertainty.
@@ -162,8 +165,6 @@ def frame_from_centers(
     sparse_model: SparseModel,
     known_centers: Mapping[str, Array],
     source: str | Path,
-    *,
-    tolerances: FrameTolerances = FrameTolerances(),
 ) -> Frame:
     """Whole similarity from known camera centres.
 
@@ -188,14 +189,14 @@ def frame_from_centers(
         )
     centers = np.array([view.center_in_world for view in views])
     known = np.array([known_centers[matched[view.name]] for view in views])
-    _require_breadth(centers, known, source, tolerances)
+    _require_breadth(centers, known, source)
     try:
         transform, used = align_cameras(centers, known)
     except ValueError as error:
         raise DataError(source, f"cameras cannot be aligned: {error}") from error
-    _require_breadth(centers[used], known[used], source, tolerances)
+    _require_breadth(centers[used], known[used], source)
     residuals = align_residuals(transform, centers[used], known[used])
-    spread, sigma = _fit_quality(residuals, known[used], source, tolerances)
+    spread, sigma = _fit_quality(residuals, known[used], source)
     return Frame(
         metric_from_world=transform,
         source="reference",
@@ -212,13 +213,11 @@ def _extents(points: Array) -> Array:
     return np.asarray(np.linalg.svd(np.vstack([centered, np.zeros((3, 3))]), compute_uv=False))
 
 
-def _require_breadth(
-    centers: Array, known: Array, source: str | Path, tolerances: FrameTolerances
-) -> None:
+def _require_breadth(centers: Array, known: Array, source: str | Path) -> None:
     """Refuse cameras on one line, in either frame."""
     for points, name in ((known, "known"), (centers, "reconstructed")):
         length, breadth, _ = _extents(points)
-        if not breadth > tolerances.min_breadth * length:
+        if not breadth > TOL.min_breadth * length:
             raise DataError(
                 source,
                 f"the {name} centres of the {len(points)} cameras lie on one line (or in one "
@@ -227,16 +226,14 @@ def _require_breadth(
             )
 
 
-def _fit_quality(
-    residuals: Array, known: Array, source: str | Path, tolerances: FrameTolerances
-) -> tuple[float, float]:
+def _fit_quality(residuals: Array, known: Array, source: str | Path) -> tuple[float, float]:
     """RMS distance of the cameras from their mean, and standard deviation of a coordinate."""
     num = len(known)
     _, breadth, _ = _extents(known)
     spread = spread_of(known)
     rms = float(np.sqrt((residuals**2).mean()))
     sigma = float(np.sqrt((residuals**2).sum() / (3 * num - 7)))  # a similarity has 7 parameters
-    if rms > tolerances.max_relative_rms * spread or sigma > tolerances.max_turn_sigma * breadth:
+    if rms > TOL.max_relative_rms * spread or sigma > TOL.max_turn_sigma * breadth:
         raise DataError(
             source,
             f"the known centres do not fit the {num} reconstructed cameras: RMS {rms:.4g} m at a "

@@ -59,6 +59,9 @@ class BorderTolerances:
     max_passes: int = 5
 
 
+TOL = BorderTolerances()
+
+
 def cells_beside(inside: Mask) -> Array:
     """Signed distance (H, W) in cells to the border of a set of cells, negative inside."""
     far = float(max(inside.shape))
@@ -74,7 +77,7 @@ def smoothly_beside(inside: Mask) -> Array:
     return np.asarray(ndimage.gaussian_filter(cells_beside(inside), 1.0, mode="nearest"))
 
 
-def drawn_border(inside: Mask, across: Across, tolerances: BorderTolerances | None = None) -> Array:
+def drawn_border(inside: Mask, across: Across) -> Array:
     """Signed distance (H, W) in cells to the border of a region, fitted to edges, negative inside.
 
     Parameters
@@ -84,9 +87,7 @@ def drawn_border(inside: Mask, across: Across, tolerances: BorderTolerances | No
         ``(P, 2)``; gives the distance ``(P,)`` of the edge outside of the curve, in cells, and its
         weight ``(P,)`` in [0, 1]; NaN where the border may not move. Points may lie beyond the
         grid.
-    tolerances : of the curves.
     """
-    tol = tolerances or BorderTolerances()
     if inside.all() or not inside.any():
         return smoothly_beside(inside)
     # Regions continue beyond the grid and close there: the grid's edge is not their border.
@@ -98,9 +99,7 @@ def drawn_border(inside: Mask, across: Across, tolerances: BorderTolerances | No
     def across_padded(curve: Array, normals: Array) -> tuple[Array, Array]:
         return across(curve - BEYOND, normals)
 
-    curves = [
-        _drawn(curve, slope, across_padded, tol) for curve in _outlines(inside, distance, slope)
-    ]
+    curves = [_drawn(curve, slope, across_padded) for curve in _outlines(inside, distance, slope)]
     return (_distance_to(curves, slope) if curves else distance)[on_grid]
 
 
@@ -130,16 +129,16 @@ def _evenly(curve: Array) -> Array:
     return np.stack(columns, axis=1)
 
 
-def _drawn(curve: Array, slope: Array, across: Across, tol: BorderTolerances) -> Array:
+def _drawn(curve: Array, slope: Array, across: Across) -> Array:
     """A closed curve, moved along its normals until it has converged."""
-    for _ in range(tol.max_passes):
+    for _ in range(TOL.max_passes):
         normals = _normals(curve, slope)
         step, weight = across(curve, normals)
         if not (weight > 0).any():
             return curve
-        moved = _straightened(curve, normals, step, weight, tol)
+        moved = _straightened(curve, normals, step, weight)
         curve = _evenly(curve + moved[:, None] * normals)
-        if np.abs(moved).max() < tol.at_rest:
+        if np.abs(moved).max() < TOL.at_rest:
             break
     return curve
 
@@ -154,9 +153,7 @@ def _normals(curve: Array, slope: Array) -> Array:
     return np.asarray(normals * np.sign(dots(normals, np.stack(up, axis=1)).sum()))
 
 
-def _straightened(
-    curve: Array, normals: Array, step: Array, weight: Array, tol: BorderTolerances
-) -> Array:
+def _straightened(curve: Array, normals: Array, step: Array, weight: Array) -> Array:
     """By how much (P,) the points of a closed curve move along their normals.
 
     The least sum of squared distances to the steps, under a robust loss, and of the amounts of the
@@ -176,18 +173,18 @@ def _straightened(
     moved, turned = np.zeros(num), 1.0
     while turned > LEAST_TURN:
         off = moved - step
-        sigma = max(robust_deviation(off[used]), tol.sigma)
-        certain = weight / sigma**2 * geman_mcclure_weights(off, (tol.sigmas * sigma) ** 2)
-        certain = np.where(is_free, certain + 1e-6, tol.sigma**-4)
+        sigma = max(robust_deviation(off[used]), TOL.sigma)
+        certain = weight / sigma**2 * geman_mcclure_weights(off, (TOL.sigmas * sigma) ** 2)
+        certain = np.where(is_free, certain + 1e-6, TOL.sigma**-4)
         now = np.stack([one @ moved for one in by_move], axis=1) + given
         amount = np.sqrt((now**2).sum(axis=1) + turned**2)
-        stiff = 1 / (tol.turn * amount)
+        stiff = 1 / (TOL.turn * amount)
         normal, right = sparse.csc_array(sparse.diags_array(certain)), certain * step
         for one, column in zip(by_move, given.T, strict=True):
             normal = normal + one.T @ sparse.diags_array(stiff) @ one
             right = right - one.T @ (stiff * column)
         moved = spsolve(normal.tocsc(), right)
-        turned *= tol.fit_decay
+        turned *= TOL.fit_decay
     return np.asarray(moved)
 
 

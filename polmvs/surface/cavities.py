@@ -85,6 +85,9 @@ class CavityTolerances:
     growth: float = 0.5
 
 
+TOL = CavityTolerances()
+
+
 @dataclass(frozen=True)
 class Cavity:
     """Free space inside a vessel.
@@ -174,7 +177,7 @@ def surface_faces(mesh: TriangleMesh, seen: Mask, supported: Mask, gsd: float) -
     area = np.bincount(patches + 1, mesh.face_areas)[1:]
     openings = []
     for number in np.argsort(-area, kind="stable"):
-        if area[number] < np.pi * (CavityTolerances.rounding * gsd) ** 2:
+        if area[number] < np.pi * (TOL.rounding * gsd) ** 2:
             break
         patch = np.flatnonzero(patches == number)
         touches = np.zeros(len(mesh.vertices), np.bool_)
@@ -188,9 +191,6 @@ def surface_faces(mesh: TriangleMesh, seen: Mask, supported: Mask, gsd: float) -
 def find_cavities(
     surface: SurfaceFaces,
     scene: PatchScene,
-    *,
-    tolerances: CavityTolerances | None = None,
-    offset_tolerances: OffsetTolerances | None = None,
 ) -> tuple[Cavity, ...]:
     """Openings that a surface closes with a cap, and the cavities inferred behind them.
 
@@ -198,24 +198,22 @@ def find_cavities(
     ----------
     surface : refined; its outside determines the cavity's walls.
     scene : the views.
-    tolerances, offset_tolerances : of the search, and of the borders.
     """
-    tol, offset_tol = tolerances or CavityTolerances(), offset_tolerances or OffsetTolerances()
     if len(scene.maps) < MIN_VIEWS:
         return ()
     found: list[Cavity] = []
     for opening in surface.openings:
-        rim = _rim(surface, opening, scene, tol, offset_tol)
+        rim = _rim(surface, opening, scene)
         if rim is None or any(_is_same(rim, other.rim, surface) for other in found):
             continue
-        grid = _grid_about(surface, rim, tol)
-        wall = _rounded_wall(surface, rim, grid, tol)
+        grid = _grid_about(surface, rim)
+        wall = _rounded_wall(surface, rim, grid)
         if wall is None:
-            wall = _flat_wall(surface, rim, grid, scene, tol, offset_tol)
+            wall = _flat_wall(surface, rim, grid, scene)
         if wall is None:
             continue
         cap_height = max(float(rim.height(surface.centers[opening.patch]).max()), 0.0)
-        cavity = _cavity(surface, wall, grid, cap_height, tol)
+        cavity = _cavity(surface, wall, grid, cap_height)
         if cavity is not None:
             found.append(cavity)
     return tuple(found)
@@ -243,8 +241,6 @@ def _rim(
     surface: SurfaceFaces,
     opening: Opening,
     scene: PatchScene,
-    tol: CavityTolerances,
-    offset_tol: OffsetTolerances,
 ) -> Patch | None:
     """The rim about a dark opening, with the normal that the phases of its faces have.
 
@@ -275,7 +271,7 @@ def _rim(
         return None
     normal = np.median(estimate.normals[agree], axis=0)
     normal /= np.linalg.norm(normal)
-    losses = row_losses(rows, normal[:, None], offset_tol)[0]
+    losses = row_losses(rows, normal[:, None])[0]
     losses = np.where(facing, losses, np.nan)
     has_phase = np.isfinite(losses).sum(axis=0) >= 0.5 * facing.sum(axis=0)
     fits = has_phase & (median_loss(losses[:, None])[0] < MAX_COST)
@@ -287,7 +283,7 @@ def _rim(
     tangents = np.linalg.svd(normal[None])[2][1:]
     x, y = tangents @ (places[fits] - np.median(cap, axis=0)).T
     sectors = np.unique(_sectors(x, y))
-    is_rim = len(sectors) >= tol.min_sectors and _is_dark(cap, places[fits], scene.maps, tol)
+    is_rim = len(sectors) >= TOL.min_sectors and _is_dark(cap, places[fits], scene.maps)
     return rim if is_rim else None
 
 
@@ -297,7 +293,7 @@ def _is_same(rim: Patch, other: Patch, surface: SurfaceFaces) -> bool:
     return bool(near.mean() > 0.5)
 
 
-def _grid_about(surface: SurfaceFaces, rim: Patch, tol: CavityTolerances) -> PatchGrid:
+def _grid_about(surface: SurfaceFaces, rim: Patch) -> PatchGrid:
     """A grid across the rim that holds all of the surface below it."""
     tangents = np.linalg.svd(rim.normal[None])[2][1:]
     first, second = tangents[0], np.cross(rim.normal, tangents[0])
@@ -317,15 +313,13 @@ def _in_focus(
     grid: PatchGrid,
     scene: PatchScene,
     gsd: float,
-    tol: CavityTolerances,
-    offset_tol: OffsetTolerances,
 ) -> Patch:
     """The rim at the offset at which its lines in the views coincide (a plane sweep)."""
 
     def strength(shift: float) -> float:
         patch = replace(rim, offset=rim.offset + shift * gsd)
-        places, share = grid.points(patch), 1 - offset_tol.view_share
-        return float(patch_lines(places, patch, scene, offset_tol, share).sum())
+        places, share = grid.points(patch), 1 - OffsetTolerances.view_share
+        return float(patch_lines(places, patch, scene, share).sum())
 
     shifts = np.arange(-HullTolerances.step_px, HullTolerances.step_px + 0.5)  # a cell of the hull
     sums = np.array([strength(shift) for shift in shifts])
@@ -341,8 +335,6 @@ def _open_cells(
     on_rim: Array,
     grid: PatchGrid,
     scene: PatchScene,
-    tol: CavityTolerances,
-    offset_tol: OffsetTolerances,
 ) -> Mask:
     """Cells (H, W) of the opening: those inside the bright cells of the rim, up to its inner line.
 
@@ -352,28 +344,28 @@ def _open_cells(
     """
     nothing_near = np.zeros(grid.shape, np.bool_)
     places = grid.points(rim)
-    losses = scene.losses_on(places, rim, offset_tol)
-    evidence = patch_evidence(places, rim, scene, losses, nothing_near, None, offset_tol)
+    losses = scene.losses_on(places, rim)
+    evidence = patch_evidence(places, rim, scene, losses, nothing_near, None)
     brightness = _brightness(places.reshape(-1, 3), on_rim, scene.maps).reshape(grid.shape)
-    bright = brightness > tol.max_brightness
-    closed = ndimage.binary_closing(bright, iterations=round(tol.max_gap))
+    bright = brightness > TOL.max_brightness
+    closed = ndimage.binary_closing(bright, iterations=round(TOL.max_gap))
     enclosed = np.asarray(ndimage.binary_fill_holes(closed), np.bool_) & ~closed
     enclosed = np.asarray(ndimage.binary_opening(enclosed, iterations=2), np.bool_)
     pieces, num = ndimage.label(enclosed)
     if num == 0:
         return enclosed
     open_cells = pieces == 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
-    if open_cells.sum() < np.pi * tol.rounding**2:
+    if open_cells.sum() < np.pi * TOL.rounding**2:
         return np.zeros(grid.shape, np.bool_)
     labels = np.where(open_cells, 0, NO_PATCH)
     jump = evidence.jump.astype(np.float64)
-    snapped = snapped_border(labels, 0, jump, tol.max_gap, offset_tol.line_steps)
+    snapped = snapped_border(labels, 0, jump, TOL.max_gap, OffsetTolerances.line_steps)
     return np.asarray(snapped == 0)
 
 
-def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap], tol: CavityTolerances) -> bool:
+def _is_dark(inner: Array, ring: Array, maps: Sequence[PhaseMap]) -> bool:
     """Whether half of points ``(N, 3)`` are much darker than a ring ``(R, 3)``."""
-    dark = _brightness(inner, ring, maps) < tol.max_brightness
+    dark = _brightness(inner, ring, maps) < TOL.max_brightness
     return bool(len(dark) and dark.mean() > 0.5)
 
 
@@ -403,10 +395,10 @@ def _intensities(points: Array, phase_map: PhaseMap) -> Array:
     return np.where(shown, sampled, np.nan)
 
 
-def _ring_about(open_cells: Mask, tol: CavityTolerances) -> Mask:
+def _ring_about(open_cells: Mask) -> Mask:
     """Cells (H, W) of the rim about an opening, away from the line between them."""
     line = ndimage.binary_dilation(open_cells, iterations=2)
-    ring = ndimage.binary_dilation(line, iterations=max(round(0.5 * tol.rounding), 1))
+    ring = ndimage.binary_dilation(line, iterations=max(round(0.5 * TOL.rounding), 1))
     return np.asarray(ring & ~line, np.bool_)
 
 
@@ -458,33 +450,37 @@ def _flat_wall(
     rim: Patch,
     grid: PatchGrid,
     scene: PatchScene,
-    tol: CavityTolerances,
-    offset_tol: OffsetTolerances,
 ) -> _Wall | None:
     """The wall under a flat rim: as thick as the rim is wide. None without a dark opening in it."""
-    rim = _in_focus(rim, grid, scene, surface.gsd, tol, offset_tol)
-    open_cells = _open_cells(rim, surface.centers[rim.members], grid, scene, tol, offset_tol)
+    rim = _in_focus(rim, grid, scene, surface.gsd)
+    open_cells = _open_cells(rim, surface.centers[rim.members], grid, scene)
     inner = ndimage.binary_erosion(open_cells, iterations=3)
     places = grid.points(rim)
-    if not _is_dark(places[inner], places[_ring_about(open_cells, tol)], scene.maps, tol):
+    if not _is_dark(places[inner], places[_ring_about(open_cells)], scene.maps):
         return None
-    beside = border_of_steps(open_cells, open_cells, rim, grid, scene, offset_tol)
-    outer = _outside_at(surface, rim, grid, tol.rounding)
+    beside = border_of_steps(open_cells, open_cells, rim, grid, scene)
+    outer = _outside_at(surface, rim, grid, TOL.rounding)
     width = (beside - outer)[open_cells & ~ndimage.binary_erosion(open_cells)]
     thickness = float(np.median(width))
     sigma = robust_deviation(width - thickness)
-    return _Wall(rim, thickness, sigma, -np.asarray(beside, np.float64), outer, tol.rounding, 0.0)
+    return _Wall(
+        rim,
+        thickness,
+        sigma,
+        -np.asarray(beside, np.float64),
+        outer,
+        TOL.rounding,
+        0.0,
+    )
 
 
-def _rounded_wall(
-    surface: SurfaceFaces, rim: Patch, grid: PatchGrid, tol: CavityTolerances
-) -> _Wall | None:
+def _rounded_wall(surface: SurfaceFaces, rim: Patch, grid: PatchGrid) -> _Wall | None:
     """The wall under a rim that is a half circle across: twice as thick as its radius r.
 
     On such a rim the sine between vertical and normal, positive outwards, is 1 - d / r at the
     distance d from the outside of the wall; on a flat one it is 0. None if that fits better.
     """
-    start = tol.rounding
+    start = TOL.rounding
     for _ in range(2):  # the outside is that of the wall only below the radius
         outer = _outside_at(surface, rim, grid, start)
         near = np.abs(rim.height(surface.centers)) < start * grid.step
@@ -499,7 +495,7 @@ def _rounded_wall(
             return None
         radii = distance[inner] / (1 - sine[inner])
         radius = float(np.median(radii))
-        start = max(tol.rounding, radius)
+        start = max(TOL.rounding, radius)
     misfit = np.abs(sine - (1 - distance / max(radius, 1e-300)))
     if not np.median(misfit) < np.median(np.abs(sine)):
         return None
@@ -516,18 +512,18 @@ def _sectors(x: Floats, y: Floats) -> Indices:
 
 
 def _cavity(
-    surface: SurfaceFaces, wall: _Wall, grid: PatchGrid, cap_height: float, tol: CavityTolerances
+    surface: SurfaceFaces, wall: _Wall, grid: PatchGrid, cap_height: float
 ) -> Cavity | None:
     """The cavity within a wall; None if its thickness varies.
 
     ``cap_height`` is the height of the surface's cap above the rim.
     """
     rim, thickness = wall.rim, wall.thickness
-    if thickness <= 1 or wall.sigma > max(tol.thickness_spread * thickness, 1.0):
+    if thickness <= 1 or wall.sigma > max(TOL.thickness_spread * thickness, 1.0):
         return None
     most = MAX_CELLS // (grid.shape[0] * grid.shape[1])
     lowest = -float(rim.height(surface.centers[surface.supported]).min()) / grid.step
-    spacing = max(0.5 * tol.rounding, lowest / most)
+    spacing = max(0.5 * TOL.rounding, lowest / most)
     depths = spacing * np.arange(1, int(np.ceil(lowest / spacing)) + 2, dtype=np.float64)
     insides = surface.inside_along(
         grid.points(rim).reshape(-1, 3), -rim.normal, depths * grid.step
@@ -538,7 +534,7 @@ def _cavity(
             break
         below = depth >= wall.start
         free = -_outside(inside) - thickness if below else wall.free(float(depth))
-        free = np.minimum(free, layers[-1] + tol.growth * spacing)
+        free = np.minimum(free, layers[-1] + TOL.growth * spacing)
         pieces = ndimage.label(free > 0)[0]
         linked = np.unique(pieces[(layers[-1] > 0) & (pieces > 0)])
         free = np.where((pieces > 0) & ~np.isin(pieces, linked), -0.5, free)
@@ -547,7 +543,7 @@ def _cavity(
         layers.append(free)
     # The bottom is at least as thick as the wall.
     floor = spacing * len(layers) - thickness - spacing * np.arange(len(layers), dtype=np.float64)
-    if floor[0] <= tol.rounding:
+    if floor[0] <= TOL.rounding:
         return None
     above = int(np.ceil(cap_height / (spacing * grid.step))) + 2
     field = np.minimum(np.stack(layers), floor[:, None, None])

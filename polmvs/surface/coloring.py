@@ -50,6 +50,9 @@ class ColoringTolerances:
     max_size_px: int = 8192
 
 
+TOL = ColoringTolerances()
+
+
 def surface_colors(
     points: Array,
     normals: Array,
@@ -58,7 +61,6 @@ def surface_colors(
     scene: RayScene,
     *,
     white: float,
-    tolerances: ColoringTolerances = ColoringTolerances(),
 ) -> NDArray[np.uint8]:
     """Colours of points on a surface, encoded for display.
 
@@ -76,10 +78,10 @@ def surface_colors(
     mid grey if there is none.
     """
     num = len(points)
-    weights = np.zeros((num, tolerances.num_views), np.float32)
-    values = np.zeros((num, tolerances.num_views, 3), np.float32)
+    weights = np.zeros((num, TOL.num_views), np.float32)
+    values = np.zeros((num, TOL.num_views, 3), np.float32)
     for view in views:
-        weight, value = _seen_by(view, points, normals, load(view), scene, tolerances)
+        weight, value = _seen_by(view, points, normals, load(view), scene)
         slot = weights.argmin(axis=1)
         better = np.flatnonzero(weight > weights[np.arange(num), slot])
         weights[better, slot[better]] = weight[better]
@@ -100,7 +102,6 @@ def _seen_by(
     normals: Array,
     image: NDArray[np.float32],
     scene: RayScene,
-    tolerances: ColoringTolerances,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """How well a view sees points (N,), 0 if not at all, and their colours in it (N, 3)."""
     weight = np.zeros(len(points), np.float32)
@@ -109,12 +110,12 @@ def _seen_by(
     distance = lengths(towards)
     rays = towards / np.maximum(distance, 1e-300)[:, None]
     cosine = -dots(rays, normals)
-    chosen = np.flatnonzero(cosine > tolerances.min_cosine)
+    chosen = np.flatnonzero(cosine > TOL.min_cosine)
     xy = view.project(points[chosen])
     inside = np.isfinite(xy).all(axis=-1) & in_image(view.camera, np.nan_to_num(xy, nan=-1))
     chosen, xy = chosen[inside], xy[inside]
     hits = scene.cast(view.center_in_world, rays[chosen])
-    free = hits.distance > (1 - tolerances.depth_share) * distance[chosen]
+    free = hits.distance > (1 - TOL.depth_share) * distance[chosen]
     chosen, xy = chosen[free], xy[free]
     seen = sample_image(image, xy)
     seen = np.repeat(seen[:, None], 3, axis=1) if seen.ndim == 1 else seen
@@ -136,14 +137,12 @@ def _weighted_medians(values: NDArray[np.float32], weights: NDArray[np.float32])
     return np.asarray(np.take_along_axis(ordered, middle[:, None], axis=1)[:, 0], np.float64)
 
 
-def texture_size(
-    mesh: TriangleMesh, texel: float, *, tolerances: ColoringTolerances = ColoringTolerances()
-) -> int:
+def texture_size(mesh: TriangleMesh, texel: float) -> int:
     """Sides, px, of a square texture whose texels have a size on the surface; a power of two."""
     area = float(mesh.face_areas.sum())
-    side = np.sqrt(area / tolerances.fill) / max(texel, 1e-300)
+    side = np.sqrt(area / TOL.fill) / max(texel, 1e-300)
     whole = 2 ** int(np.ceil(np.log2(max(side, 64))))
-    return int(min(whole, tolerances.max_size_px))
+    return int(min(whole, TOL.max_size_px))
 
 
 def paint_texture(
@@ -151,8 +150,6 @@ def paint_texture(
     uv: Array,
     colors_of: Callable[[Array, Array], NDArray[np.uint8]],
     size_px: int,
-    *,
-    tolerances: ColoringTolerances = ColoringTolerances(),
 ) -> Texture:
     """A square texture of a mesh whose vertices have texture coordinates.
 
@@ -176,7 +173,7 @@ def paint_texture(
     normals /= np.maximum(lengths(normals), 1e-300)[:, None]
     image = np.zeros((size_px**2, 3), np.uint8)
     image[covered] = colors_of(points, normals)
-    return Texture(image=_with_gutter(image, covered, size_px, tolerances.gutter_px), uv=uv)
+    return Texture(image=_with_gutter(image, covered, size_px, TOL.gutter_px), uv=uv)
 
 
 def _with_gutter(

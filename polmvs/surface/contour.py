@@ -71,7 +71,7 @@ class ContourTolerances:
     meeting_px: float = 2.0
 
 
-TOLERANCES = ContourTolerances()
+TOL = ContourTolerances()
 
 
 def propagate(
@@ -122,7 +122,7 @@ def _connect(
     num = len(xy)
     follows = contours.curve[1:] == contours.curve[:-1]
     along = np.stack([np.flatnonzero(follows), np.flatnonzero(follows) + 1], axis=1)
-    k = min(TOLERANCES.num_neighbors + 1, num)
+    k = min(TOL.num_neighbors + 1, num)
     distance, index = cKDTree(xy).query(xy, k=k, distance_upper_bound=2.2 * spacing_px)
     tails = np.repeat(np.arange(num), k)
     heads, near = index.reshape(-1), distance.reshape(-1)
@@ -145,7 +145,7 @@ def _start(
     path_model = AngleModel.OPA if options.contour is Contour.NORMALS else angle_model
     open_pixels = phase_map.region.inside & ~phase_map.region.edges
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
-    passable = open_pixels & (dolp > TOLERANCES.min_dolp)
+    passable = open_pixels & (dolp > TOL.min_dolp)
     rays = view_rays(phase_map.view)
     visible, seeds_xy = visible_seeds(phase_map, seeds)
     contours = cover_with_contours(
@@ -269,7 +269,7 @@ def trace_contours(
     start = sample_image(field, seeds)
     angle = _angle(start)
     forward = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    curve = np.flatnonzero(np.linalg.norm(start, axis=-1) > TOLERANCES.min_coherence)
+    curve = np.flatnonzero(np.linalg.norm(start, axis=-1) > TOL.min_coherence)
     nodes, owners = [seeds[curve]], [curve]
     arcs = [np.zeros(len(curve), np.float32)]
     # Both halves of a curve side by side, (2, S, 2): a closed curve ends where they meet.
@@ -285,9 +285,9 @@ def trace_contours(
         position = np.where(alive[..., None], position + step_px * middle_heading, position)
         heading, still_ok = _heading(field, position, middle_heading)
         alive &= ok & still_ok
-        if index * step_px > 2 * TOLERANCES.meeting_px:
+        if index * step_px > 2 * TOL.meeting_px:
             gap = ((position[0] - position[1]) ** 2).sum(axis=-1)
-            alive &= (gap > TOLERANCES.meeting_px**2) | ~alive.all(axis=0)
+            alive &= (gap > TOL.meeting_px**2) | ~alive.all(axis=0)
         if claims is not None and index % check_every == 0:
             alive &= _claim(claims, field.shape, position, curve + first_curve)
         if index % keep_every == 0:
@@ -315,8 +315,8 @@ def _heading(field: Image, xy: Floats, previous: Floats) -> tuple[Image, Mask]:
     heading = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     dot = (heading * previous).sum(axis=-1)
     heading *= np.where(dot < 0, -1, 1)[..., None].astype(np.float32)
-    coherent = (axial**2).sum(axis=-1) > TOLERANCES.min_coherence**2
-    return heading, coherent & (np.abs(dot) > TOLERANCES.min_coherence)
+    coherent = (axial**2).sum(axis=-1) > TOL.min_coherence**2
+    return heading, coherent & (np.abs(dot) > TOL.min_coherence)
 
 
 def _cells(claims: NDArray[np.int32], shape: tuple[int, ...], xy: Floats) -> tuple[Any, Any]:
@@ -370,8 +370,7 @@ def cover_with_contours(
     for places in candidates:
         free = claims[_cells(claims, field.shape, places)] < 0
         free &= (
-            np.linalg.norm(sample_image(field, places, nearest=True), axis=-1)
-            > TOLERANCES.min_coherence
+            np.linalg.norm(sample_image(field, places, nearest=True), axis=-1) > TOL.min_coherence
         )
         parts.append(
             trace_contours(

@@ -59,6 +59,9 @@ class CreaseTolerances:
     vertex_rounds: int = 20
 
 
+TOL = CreaseTolerances()
+
+
 @dataclass(frozen=True)
 class SideAverage:
     """Average of values of faces over the sides of edges.
@@ -83,7 +86,6 @@ def sided_normals(
     mesh: TriangleMesh,
     normals: Array,
     is_fitted: Mask,
-    tolerances: CreaseTolerances | None = None,
 ) -> tuple[Array, SideAverage]:
     """Normals of faces smoothed within the sides of edges (a bilateral filter).
 
@@ -97,20 +99,19 @@ def sided_normals(
     -------
     The normals ``(F, 3)``, unit, and the average that made them.
     """
-    tol = tolerances or CreaseTolerances()
     average = mesh.face_pairs.copy()
     one, other = average.tocoo().coords
     near = np.exp(-0.5 * _squared_distance(mesh.centers, one, other) / mesh.mean_edge**2)
-    certain = mesh.face_areas * np.where(is_fitted, 1.0, tol.unfitted_weight)
+    certain = mesh.face_areas * np.where(is_fitted, 1.0, TOL.unfitted_weight)
     near *= certain[other]
-    normals = _taken_from_sides(normals, is_fitted, one, other, tol)
-    for _ in range(tol.normal_rounds):
+    normals = _taken_from_sides(normals, is_fitted, one, other)
+    for _ in range(TOL.normal_rounds):
         apart = _squared_distance(normals, one, other)
-        average.data = near * np.exp(-0.5 * apart / tol.like_sine**2)
+        average.data = near * np.exp(-0.5 * apart / TOL.like_sine**2)
         normals = _unit(average @ normals)
     total = np.maximum(np.asarray(average.sum(axis=1)), 1e-300)
     average.data = (average.data / total[one]).astype(np.float32)
-    return normals, SideAverage(average, tol.normal_rounds)
+    return normals, SideAverage(average, TOL.normal_rounds)
 
 
 def _taken_from_sides(
@@ -118,7 +119,6 @@ def _taken_from_sides(
     is_known: Mask,
     one: NDArray[np.integer],
     other: NDArray[np.integer],
-    tol: CreaseTolerances,
 ) -> Array:
     """Normals ``(F, 3)``; an unknown face on an edge gets that of the nearest known side.
 
@@ -138,15 +138,13 @@ def _taken_from_sides(
     one, other, alike = one[order], other[order], alike[order]
     nearest = np.diff(one, prepend=-1) > 0
     # Turned from the nearer side of a right angle by no more than its middle is.
-    nearest &= (alike > np.sqrt(0.5)) & (alike < np.cos(np.radians(tol.crease_deg)))
+    nearest &= (alike > np.sqrt(0.5)) & (alike < np.cos(np.radians(TOL.crease_deg)))
     taken = normals.copy()
     taken[one[nearest]] = normals[other[nearest]]
     return taken
 
 
-def sides_known(
-    mesh: TriangleMesh, normals: Array, is_known: Mask, tolerances: CreaseTolerances | None = None
-) -> Mask:
+def sides_known(mesh: TriangleMesh, normals: Array, is_known: Mask) -> Mask:
     """Which faces ``(F,)`` belong to a side with a known face nearby.
 
     Parameters
@@ -155,9 +153,8 @@ def sides_known(
     normals : (F, 3) unit, as of :func:`sided_normals`.
     is_known : (F,) bool, faces with a measured normal.
     """
-    tol = tolerances or CreaseTolerances()
     one, other = mesh.face_pairs.tocoo().coords
-    alike = (normals[one] * normals[other]).sum(axis=1) > np.cos(np.radians(tol.crease_deg))
+    alike = (normals[one] * normals[other]).sum(axis=1) > np.cos(np.radians(TOL.crease_deg))
     one, other = one[alike], other[alike]
     for _ in range(2):  # rings of triangles over which an edge is rounded
         near = one[is_known[other]]
@@ -166,9 +163,7 @@ def sides_known(
     return is_known
 
 
-def crease_vertices(
-    mesh: TriangleMesh, is_shown: Mask, tolerances: CreaseTolerances | None = None
-) -> Mask:
+def crease_vertices(mesh: TriangleMesh, is_shown: Mask) -> Mask:
     """Which vertices ``(V,)`` of a sharpened mesh lie on an edge between known sides.
 
     Parameters
@@ -176,11 +171,10 @@ def crease_vertices(
     mesh : with V vertices and F faces.
     is_shown : (F,) bool, faces of sides that are known.
     """
-    tol = tolerances or CreaseTolerances()
     corner = mesh.faces.ravel()
     apart = dots(mesh.vertex_normals[corner], np.repeat(mesh.face_normals, 3, axis=0))
     # The angle of each side to their mean is half of the angle between them.
-    turned = apart < np.cos(np.radians(0.5 * tol.crease_deg))
+    turned = apart < np.cos(np.radians(0.5 * TOL.crease_deg))
     found = np.zeros(len(mesh.vertices), np.bool_)
     found[corner[turned]] = True
     found[mesh.faces[~is_shown]] = False
@@ -193,7 +187,6 @@ def wall_normals(
     is_fitted: Mask,
     carvings: Sequence[Callable[[Array], Floats]],
     to_uncarved: Floats,
-    tolerances: CreaseTolerances | None = None,
 ) -> tuple[Array, Mask]:
     """Normals ``(F, 3)`` with those of carved walls as carved, and which faces ``(F,)`` are walls.
 
@@ -207,7 +200,6 @@ def wall_normals(
     carvings : signed distances of points ``(N, 3)``, positive in the carved space.
     to_uncarved : (F,), distances of the faces to the surface before carving.
     """
-    tol = tolerances or CreaseTolerances()
     carved, is_carved = normals.copy(), np.zeros(len(normals), np.bool_)
     # The grid has rounded the edges of walls: a face belongs to what passes nearest to it.
     nearest = np.minimum(to_uncarved, mesh.mean_edge)
@@ -221,7 +213,7 @@ def wall_normals(
     # phases show another side than the carving, the face has that of the two which is nearer.
     is_wall = is_carved & (to_carved > np.sqrt(0.5))
     is_wall &= ~is_fitted | (to_carved > dots(normals, mesh.face_normals))
-    is_wall &= ~is_fitted | (dots(carved, normals) < np.cos(np.radians(tol.crease_deg)))
+    is_wall &= ~is_fitted | (dots(carved, normals) < np.cos(np.radians(TOL.crease_deg)))
     return np.where(is_wall[:, None], carved, normals), is_wall
 
 
@@ -231,11 +223,8 @@ def _gradients(values: Callable[[Array], Floats], points: Array, step: float) ->
     return _unit(np.stack(slopes, axis=-1).astype(np.float64))
 
 
-def sharpened(
-    mesh: TriangleMesh, normals: Array, tolerances: CreaseTolerances | None = None
-) -> TriangleMesh:
+def sharpened(mesh: TriangleMesh, normals: Array) -> TriangleMesh:
     """The mesh with its vertices moved until its faces have given normals ``(F, 3)``."""
-    tol = tolerances or CreaseTolerances()
     if not len(mesh.faces):
         return mesh
     num, area = len(mesh.vertices), mesh.face_areas
@@ -243,7 +232,7 @@ def sharpened(
     # Vertices that fit stay: an edge must not be sharpened at the expense of the patch beside it.
     off = ((mesh.face_normals - normals) ** 2).sum(axis=1)
     off = (mesh.incidence.T @ (area * off))[:, None] / total
-    mobility = 1 - np.exp(-0.5 * off / (0.5 * tol.like_sine) ** 2)
+    mobility = 1 - np.exp(-0.5 * off / (0.5 * TOL.like_sine) ** 2)
     # All steps are one linear map: the mean height of a face's corners along its normal less each
     # corner's own, times the area, summed at the corners.
     columns = (3 * mesh.faces[:, :, None] + np.arange(3)).reshape(-1)
@@ -256,7 +245,7 @@ def sharpened(
     own = (mesh.incidence.T @ squares).reshape(-1, 3, 3)
     start = mesh.vertices - mesh.vertices.mean(axis=0)
     moved = before = np.zeros_like(start)
-    for k in range(tol.vertex_rounds):
+    for k in range(TOL.vertex_rounds):
         # With momentum (Nesterov): long-range moves of edges are slow without it.
         ahead = moved + k / (k + 3) * (moved - before)
         vertices, before = start + ahead, moved
@@ -269,9 +258,7 @@ def sharpened(
     return mesh.moved(moved)
 
 
-def corner_normals(
-    mesh: TriangleMesh, normals: Array, tolerances: CreaseTolerances | None = None
-) -> Array:
+def corner_normals(mesh: TriangleMesh, normals: Array) -> Array:
     """Normals ``(F, 3, 3)`` of the corners of faces: means over the faces of the same side.
 
     Parameters
@@ -279,13 +266,12 @@ def corner_normals(
     mesh : with F faces.
     normals : (F, 3) unit, of the faces.
     """
-    tol = tolerances or CreaseTolerances()
     num = len(mesh.faces)
     ones, corner_vertex = np.ones(3 * num), mesh.faces.ravel()
     shape = (3 * num, len(mesh.vertices))
     at_vertex = sparse.coo_array((ones, (np.arange(3 * num), corner_vertex)), shape=shape).tocsr()
     corner, face = (at_vertex @ mesh.incidence.T).tocoo().coords
-    alike = (normals[corner // 3] * normals[face]).sum(axis=1) > np.cos(np.radians(tol.crease_deg))
+    alike = (normals[corner // 3] * normals[face]).sum(axis=1) > np.cos(np.radians(TOL.crease_deg))
     weight = mesh.face_areas[face] * alike
     mean = sparse.coo_array((weight, (corner, face)), shape=(3 * num, num)).tocsr() @ normals
     return _unit(mean).reshape(num, 3, 3)

@@ -38,6 +38,9 @@ class FusionTolerances:
     min_sigma_px: float = 0.02
 
 
+TOL = FusionTolerances()
+
+
 @dataclass(frozen=True)
 class FusedCloud:
     """Points of the surface in the world.
@@ -76,7 +79,6 @@ def fuse(
     workers: Workers | None = None,
     on_progress: OnProgress = no_progress,
     on_confirmed: Callable[[int, Mask], None] = lambda index, confirmed: None,
-    tolerances: FusionTolerances = FusionTolerances(),
 ) -> FusedCloud:
     """Fuse the dense views into one cloud.
 
@@ -96,7 +98,6 @@ def fuse(
     on_progress : called with the number of views done.
     on_confirmed : called with the index of each view that has a result and with the points
         (h, w) of its lattice on which the others agree.
-    tolerances : of this step.
     """
     workers = workers or Workers(1)
     used = [k for k, d in enumerate(dense) if d is not None]
@@ -107,9 +108,7 @@ def fuse(
         near = [used[j] for j in order if j != i][:max_neighbors]
         tasks.append([(maps[j], dense[j]) for j in [k, *near]])
     clouds, gsds = [], []
-    for k, part in zip(
-        used, workers.map(partial(_confirm, options, tolerances=tolerances), tasks), strict=True
-    ):
+    for k, part in zip(used, workers.map(partial(_confirm, options), tasks), strict=True):
         clouds.append(part.cloud)
         gsds.append(part.gsd)
         on_confirmed(k, part.confirmed)
@@ -135,8 +134,6 @@ class _Confirmed:
 def _confirm(
     options: FusionOptions,
     views: Sequence[tuple[PhaseMap, DenseView]],
-    *,
-    tolerances: FusionTolerances,
 ) -> _Confirmed:
     """Points of the first view that enough of the others confirm."""
     phase_map, dense = views[0]
@@ -150,7 +147,7 @@ def _confirm(
     gsd = distance / view.camera.mean_focal_px
     # As the others' deviations: grazing sight counts less.
     cosine = np.maximum(np.abs((rays * normals).sum(axis=-1)), MIN_FACING_COSINE)
-    sigma = _finite_sigma(dense.sigma[known] / cosine, gsd, tolerances=tolerances)
+    sigma = _finite_sigma(dense.sigma[known] / cosine, gsd)
     tolerance = options.max_range_difference_px * gsd
     total = 1 / sigma**2
     place, normal = total * distance, total[:, None] * normals
@@ -158,9 +155,9 @@ def _confirm(
     min_cosine = np.cos(np.radians(options.max_normal_difference_deg))
     for other_map, other in views[1:]:
         seen = sight(other_map, other, center, rays, distance, normals)
-        other_sigma = _finite_sigma(seen.sigma, gsd, tolerances=tolerances)
+        other_sigma = _finite_sigma(seen.sigma, gsd)
         explained = MAX_DEVIATIONS * np.hypot(sigma, other_sigma)
-        allowed = np.clip(explained, tolerances.min_tolerance * tolerance, tolerance)
+        allowed = np.clip(explained, TOL.min_tolerance * tolerance, tolerance)
         agrees = (np.abs(seen.place - distance) < allowed) & (seen.cosine > min_cosine)
         votes += agrees
         behind = seen.excess > 2 * allowed
@@ -184,10 +181,10 @@ def _confirm(
     return _Confirmed(cloud[keep], gsd[keep].astype(np.float32), confirmed)
 
 
-def _finite_sigma(sigma: Floats, gsd: Array, *, tolerances: FusionTolerances) -> Array:
+def _finite_sigma(sigma: Floats, gsd: Array) -> Array:
     """Deviations of ranges, no smaller than a share of the gsd; large where unknown."""
     known = np.isfinite(sigma)
-    return np.where(known, np.maximum(sigma, tolerances.min_sigma_px * gsd), gsd)
+    return np.where(known, np.maximum(sigma, TOL.min_sigma_px * gsd), gsd)
 
 
 def concatenate(clouds: Sequence[FusedCloud]) -> FusedCloud:

@@ -89,7 +89,7 @@ class IntegrationTolerances:
     min_own_weight: float = 0.25
 
 
-TOLERANCES = IntegrationTolerances()
+TOL = IntegrationTolerances()
 
 
 def integrate(
@@ -357,7 +357,7 @@ def _agreement(sigma: Floats, rays: Floats, estimate: NormalEstimate) -> Array:
     cosine = np.einsum("ikn,ni->kn", rays, np.nan_to_num(estimate.normals))
     facing = np.isfinite(sigma) & (cosine < 0)
     agree = facing & (estimate.row_weights > 0.5)
-    denied = facing[0] & (estimate.row_weights[0] < TOLERANCES.min_own_weight)
+    denied = facing[0] & (estimate.row_weights[0] < TOL.min_own_weight)
     return np.where(denied, 0, agree.sum(axis=0) / np.maximum(facing.sum(axis=0), 1))
 
 
@@ -388,17 +388,15 @@ def tie_to_consensus(
             node=none, seed=none, value=np.zeros(0), sigma=np.zeros(0), common=np.zeros(0)
         )
     place, sigma, count = _consensus(np.array(said), np.array(deviations))
-    node = np.flatnonzero(
-        (count >= TOLERANCES.min_agreeing) & np.isfinite(place) & np.isfinite(sigma)
-    )
-    alike = max(TOLERANCES.correlation_px / nodes.spacing_px, 1.0)
+    node = np.flatnonzero((count >= TOL.min_agreeing) & np.isfinite(place) & np.isfinite(sigma))
+    alike = max(TOL.correlation_px / nodes.spacing_px, 1.0)
     relative = sigma[node] / place[node]
     return SeedTies(
         node=node,
         seed=node,
         value=np.log(place[node]),
         sigma=alike * relative,
-        common=TOLERANCES.common_share * relative,
+        common=TOL.common_share * relative,
     )
 
 

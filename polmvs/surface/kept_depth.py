@@ -42,11 +42,12 @@ class KeptDepthTolerances:
     clearance_px: float = 6.0
 
 
+TOL = KeptDepthTolerances()
+
+
 def kept_cloud(
     workspace: DenseWorkspace,
     surface_points: Array,
-    *,
-    tolerances: KeptDepthTolerances = KeptDepthTolerances(),
 ) -> FusedCloud:
     """Fuse the maps of a workspace without the points on polarized surfaces.
 
@@ -61,7 +62,7 @@ def kept_cloud(
     """
     clouds, gsds = [], []
     for item in workspace.views:
-        cloud, gsd = _view_cloud(item, tolerances)
+        cloud, gsd = _view_cloud(item)
         if len(cloud.points):
             clouds.append(cloud)
             gsds.append(gsd)
@@ -69,10 +70,10 @@ def kept_cloud(
         return no_points()
     cloud, gsd = concatenate(clouds), float(np.median(gsds))
     owner = np.repeat(np.arange(len(clouds)), [len(part.points) for part in clouds])
-    num_views = _views_in_voxel(cloud.points, owner, tolerances.stride_px * gsd)
+    num_views = _views_in_voxel(cloud.points, owner, TOL.stride_px * gsd)
     cloud = replace(cloud, num_views=num_views)
     keep = num_views > 1
-    if keep.mean() < tolerances.min_agreement:
+    if keep.mean() < TOL.min_agreement:
         logger.warning(
             "%s: two views agree on %.2g %% of the points of its depth maps. Are they of its own "
             "model?",
@@ -80,7 +81,7 @@ def kept_cloud(
             100 * keep.mean(),
         )
     if len(surface_points):
-        reach = tolerances.clearance_px * gsd
+        reach = TOL.clearance_px * gsd
         distance = cKDTree(surface_points).query(cloud.points, distance_upper_bound=reach)[0]
         keep &= ~np.isfinite(distance)
     return merge(cloud[keep], gsd)
@@ -93,13 +94,13 @@ def _views_in_voxel(points: Array, owner: NDArray[np.int64], voxel: float) -> ND
     return np.bincount(pairs[:, 0])[cell].astype(np.int32)
 
 
-def _view_cloud(item: WorkspaceView, tolerances: KeptDepthTolerances) -> tuple[FusedCloud, float]:
+def _view_cloud(item: WorkspaceView) -> tuple[FusedCloud, float]:
     """Points of one view's maps, and the gsd of a pixel there."""
     maps = item.load_maps()
     if maps is None or not (maps.depth > 0).any():
         return no_points(), 0.0
     view, camera = item.view, item.camera
-    lattice = (slice(None, None, tolerances.stride_px),) * 2
+    lattice = (slice(None, None, TOL.stride_px),) * 2
     depth, normals_in_cam = maps.depth[lattice], maps.normals[lattice]
     xy = map_pixel_xy(camera.width, camera.height)[lattice]
     known = (depth > 0) & (normals_in_cam != 0).any(axis=-1)
@@ -113,7 +114,7 @@ def _view_cloud(item: WorkspaceView, tolerances: KeptDepthTolerances) -> tuple[F
         normals=normals[facing],
         intensity=(item.load_image()[lattice][known][facing] / 255).astype(np.float32),
         num_views=np.ones(num, np.int32),
-        sigma_deg=np.full(num, tolerances.normal_sigma_deg, np.float32),
+        sigma_deg=np.full(num, TOL.normal_sigma_deg, np.float32),
         # COLMAP matches patches about as well as keypoints.
         sigma=(KEYPOINT_SIGMA_PX * ranges / camera.mean_focal_px).astype(np.float32),
     )

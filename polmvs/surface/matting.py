@@ -61,6 +61,9 @@ class MattingTolerances:
     along_px: float = 3.0
 
 
+TOL = MattingTolerances()
+
+
 def find_outline(
     image: Image,
     distance: Image,
@@ -68,7 +71,6 @@ def find_outline(
     noise: float,
     *,
     start_px: float,
-    tolerances: MattingTolerances | None = None,
 ) -> Image:
     """Signed distance (H, W) to the outline, px, negative inside.
 
@@ -78,14 +80,13 @@ def find_outline(
     distance : (H, W) approximate signed distance, right to about ``start_px``.
     noise : least relative deviation of the background's intensity.
     """
-    tol = tolerances or MattingTolerances()
     scale = max(start_px, 1.0)
     while scale > 1:
-        distance = _moved(image, distance, background, noise, scale, tol)
+        distance = _moved(image, distance, background, noise, scale)
         scale = max(scale / 2, 1.0)
     # The lines of the last pass start at the outline.
     for _ in range(2):
-        distance = _moved(image, distance, background, noise, 1.0, tol)
+        distance = _moved(image, distance, background, noise, 1.0)
     return distance
 
 
@@ -95,7 +96,6 @@ def _moved(
     background: Background,
     noise: float,
     scale: float,
-    tol: MattingTolerances,
 ) -> Image:
     """The distance after one pass."""
     border = border_pixels(distance < 0)
@@ -105,14 +105,14 @@ def _moved(
     outwards = outward_normals(distance, border)
     centers = np.stack([columns + 0.5, rows + 0.5], axis=1)
     onto = centers - outwards * distance[rows, columns][:, None]
-    mean = _along_border(onto, tol.along_px * scale)
-    far = tol.core_px + 2 * tol.blend_px
+    mean = _along_border(onto, TOL.along_px * scale)
+    far = TOL.core_px + 2 * TOL.blend_px
     along = np.arange(-far, far + STEP, STEP)
     places = onto[:, None] + scale * along[:, None] * outwards[:, None]
     alpha, told = _alpha(
-        image, places, along, sample_image(distance, places) / scale, background, noise, mean, tol
+        image, places, along, sample_image(distance, places) / scale, background, noise, mean
     )
-    shift = scale * (STEP * (alpha.sum(axis=1) - 0.5) - tol.reach_px)
+    shift = scale * (STEP * (alpha.sum(axis=1) - 0.5) - TOL.reach_px)
     shift = (mean @ (told * shift)) / np.maximum(mean @ told, LEAST_TOLD)
     # Each pixel moves with the nearest of the border.
     _, labels = cv2.distanceTransformWithLabels(
@@ -131,7 +131,6 @@ def _alpha(
     background: Background,
     noise: float,
     mean: sparse.csr_array,
-    tol: MattingTolerances,
 ) -> tuple[Array, Array]:
     """Share of the object ``(N, S)`` along lines across an outline, and if it is told ``(N,)``.
 
@@ -144,10 +143,10 @@ def _alpha(
     height, width = image.shape
     values = sample_image(image, places)
     in_image = in_frame(places, width, height)
-    weight = np.where(in_image, np.exp(-0.5 * (along / tol.blend_px) ** 2), 0)
-    level, slope, own_variance = _line(values, depth, weight * (depth < -tol.core_px), mean)
-    outer, _, outer_variance = _line(values, depth, weight * (depth > tol.core_px), mean)
-    near = np.abs(along) <= tol.reach_px + 1e-9
+    weight = np.where(in_image, np.exp(-0.5 * (along / TOL.blend_px) ** 2), 0)
+    level, slope, own_variance = _line(values, depth, weight * (depth < -TOL.core_px), mean)
+    outer, _, outer_variance = _line(values, depth, weight * (depth > TOL.core_px), mean)
+    near = np.abs(along) <= TOL.reach_px + 1e-9
     # Shading continues to the outline: the object's brightness there is extrapolated.
     own = np.maximum(level + slope * np.minimum(along[near], 0), 0)
     behind, deviation, should_be_known = background(places[:, near])

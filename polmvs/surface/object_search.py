@@ -86,9 +86,13 @@ class SearchTolerances:
     inner_px: float = 6.0
     polarized_share: float = 0.99
 
-    def needed(self, num_views: int) -> int:
+    @classmethod
+    def needed(cls, num_views: int) -> int:
         """Number of views that must deny a point."""
-        return max(2, round(self.wrong_share * num_views))
+        return max(2, round(cls.wrong_share * num_views))
+
+
+TOL = SearchTolerances()
 
 
 @dataclass(frozen=True)
@@ -112,8 +116,6 @@ def find_object(
     maps: Sequence[PhaseMap],
     plane: SupportingPlane,
     points: Floats,
-    *,
-    tolerances: SearchTolerances | None = None,
 ) -> list[FoundObject] | None:
     """The object that stands on a plane, in each view.
 
@@ -128,49 +130,48 @@ def find_object(
     None if the plane has too little texture to find what hides it, if its light moves, or if
     polarization shows the whole object.
     """
-    tol = tolerances or SearchTolerances()
     near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
     shows_plane: list[Mask] = []
     for scale in (4, 2, 1):  # a plane without fine texture may have a coarse one
-        small = [_working(phase_map, plane, tol.working_px / scale) for phase_map in maps]
-        shares = _showing_plane(small, near, tol)
+        small = [_working(phase_map, plane, TOL.working_px / scale) for phase_map in maps]
+        shares = _showing_plane(small, near)
         # A window next to an outline on the plane contains the outline, also inside the object.
-        size = 2 * round(0.5 * tol.window_px + tol.detail_px) - 1
+        size = 2 * round(0.5 * TOL.window_px + TOL.detail_px) - 1
         found = [
-            (cv2.erode(share, np.ones((size, size), np.uint8)) > tol.least_share) & ~view.polarized
+            (cv2.erode(share, np.ones((size, size), np.uint8)) > TOL.least_share) & ~view.polarized
             for share, view in zip(shares, small, strict=True)
         ]
-        window = np.ones((tol.window_px, tol.window_px), np.uint8)
-        textured = [cv2.erode(share, window) > tol.least_share for share in shares]
+        window = np.ones((TOL.window_px, TOL.window_px), np.uint8)
+        textured = [cv2.erode(share, window) > TOL.least_share for share in shares]
         shows_plane = [
             here | (cv2.resize(before.astype(np.uint8), here.shape[::-1]) > 0)
             for here, before in zip(found, shows_plane or found, strict=True)
         ]
-    small = _with_extent(small, textured, plane, tol)
-    coarse = _bounded(_space(small, plane, tol), small, shows_plane, tol)
+    small = _with_extent(small, textured, plane)
+    coarse = _bounded(_space(small, plane), small, shows_plane)
     if coarse is None:
         return None
     masks = [coarse.mask(view) for view in small]
     # More than the object: if all of it is polarized, the object is, and the rest is not needed.
-    if _is_polarized(small, masks, tol):
+    if _is_polarized(small, masks):
         return None
-    cells = coarse.finer(tol)
-    for _ in range(tol.num_rounds):
-        plates = _plates(small, masks, tol)
-        alone, together = _denied(small, plates, masks, tol)
+    cells = coarse.finer()
+    for _ in range(TOL.num_rounds):
+        plates = _plates(small, masks)
+        alone, together = _denied(small, plates, masks)
         together = [
             predicted | (seen & ~view.polarized)
             for predicted, seen, view in zip(together, textured, small, strict=True)
         ]
-        left = cells.carved(small, alone, tol, needed=1)
+        left = cells.carved(small, alone, needed=1)
         if left is not None:
-            left = left.carved(small, together, tol, needed=tol.needed(len(maps)))
+            left = left.carved(small, together, needed=TOL.needed(len(maps)))
         if left is None:
             return None
         masks = [left.mask(view) for view in small]
-    if _is_polarized(small, masks, tol):
+    if _is_polarized(small, masks):
         return None
-    plates = _plates(small, masks, tol)
+    plates = _plates(small, masks)
     noise = _residual(small, plates, masks)
     odds = _plane_odds(small, plates, noise)
     masks = [fill_false_holes(*pair) for pair in zip(masks, odds, strict=True)]
@@ -179,7 +180,7 @@ def find_object(
         return None  # the lamp moves with the camera: outlines would be pixels wide
     # Threads, as sampling images releases Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
-        one = partial(_found, small, plane=plane, noise=noise, tol=tol)
+        one = partial(_found, small, plane=plane, noise=noise)
         return list(pool.map(one, range(len(small)), masks, plates))
 
 
@@ -251,16 +252,16 @@ def _on_plane(view: View, plane: SupportingPlane, xy: Floats) -> Array:
     return np.asarray(center + np.where(ranges > 0, ranges, np.nan)[..., None] * rays)
 
 
-def _is_polarized(views: Sequence[_Working], masks: Sequence[Mask], tol: SearchTolerances) -> bool:
+def _is_polarized(views: Sequence[_Working], masks: Sequence[Mask]) -> bool:
     """Whether polarization shows all that is well within some masks, in the median view."""
     shares = [
         view.polarized[inner].mean()
         for view, mask in zip(views, masks, strict=True)
-        if (inner := signed_distance_px(mask) < -tol.inner_px).any()
+        if (inner := signed_distance_px(mask) < -TOL.inner_px).any()
     ]
     share = float(np.median(shares)) if shares else 0.0
     logger.info("%.1f %% of what hides its support is polarized.", 100 * share)
-    return share >= tol.polarized_share
+    return share >= TOL.polarized_share
 
 
 def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
@@ -270,20 +271,20 @@ def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
     return np.asarray(order[order != index])
 
 
-def _showing_plane(views: Sequence[_Working], points: Floats, tol: SearchTolerances) -> list[Image]:
+def _showing_plane(views: Sequence[_Working], points: Floats) -> list[Image]:
     """Share (h, w) of each view's texture on the plane, which two other views also see there."""
-    details = [view.log - cv2.GaussianBlur(view.log, (0, 0), tol.detail_px) for view in views]
+    details = [view.log - cv2.GaussianBlur(view.log, (0, 0), TOL.detail_px) for view in views]
     correlations, variances, unexplained = [], [], []
     for index, view in enumerate(views):
         best, second = np.full((2, *view.log.shape), -1, np.float32)
-        for other in _nearest(views, index)[: tol.num_near]:
+        for other in _nearest(views, index)[: TOL.num_near]:
             xy = views[other].project(view.on_plane)
-            value = _correlation(details[index], sample_image(details[other], xy), tol.window_px)
+            value = _correlation(details[index], sample_image(details[other], xy), TOL.window_px)
             seen = np.where(views[other].sees(xy), value, -1).astype(np.float32)
             second = np.maximum(second, np.minimum(best, seen))
             best = np.maximum(best, seen)
         correlations.append(np.clip(second, 0, 1))
-        variances.append(_local_variance(details[index], tol.window_px))
+        variances.append(_local_variance(details[index], TOL.window_px))
         xy = view.project(points)
         left = np.asarray(variances[-1] * (1 - correlations[-1] ** 2), np.float32)
         unexplained.append(sample_image(left, xy[view.sees(xy)]))
@@ -336,7 +337,6 @@ class _Cells:
         self,
         views: Sequence[_Working],
         free: Sequence[Mask],
-        tol: SearchTolerances,
         *,
         needed: int,
         testable: Sequence[Mask] | None = None,
@@ -363,7 +363,7 @@ class _Cells:
             num_tests += seen if testable is None else seen & _marked(testable[index], xy)
         held = np.zeros_like(self.held)
         held[self.held] = (
-            (num_free < needed) & (num_seen >= tol.seen_share * len(views)) & (num_tests >= 2)
+            (num_free < needed) & (num_seen >= TOL.seen_share * len(views)) & (num_tests >= 2)
         )
         parts, num = ndimage.label(held)
         if not num:
@@ -381,13 +381,13 @@ class _Cells:
         sides = (held[0], held[-1], held[:, 0], held[:, -1], held[:, :, -1])
         return any(side.any() for side in sides)
 
-    def finer(self, tol: SearchTolerances) -> _Cells:
+    def finer(self) -> _Cells:
         """The part, with a margin of one cell, on a finer grid."""
         inside = np.argwhere(self.held)
         low, high = inside.min(axis=0) - 1.0, inside.max(axis=0) + 1.0
         # The plane bounds the grid below.
         low[2] = max(low[2], -0.5)
-        step = float(np.prod(high - low) ** (1 / 3)) / tol.num_cells
+        step = float(np.prod(high - low) ** (1 / 3)) / TOL.num_cells
         counts = np.maximum(np.ceil((high - low) / step).astype(int), 1)
         grid = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1)
         old = np.clip(np.round(low + (grid + 0.5) * step).astype(int), 0, None)
@@ -410,7 +410,7 @@ class _Cells:
         return np.asarray(cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, kernel) > 0)
 
 
-def _space(views: Sequence[_Working], plane: SupportingPlane, tol: SearchTolerances) -> _Cells:
+def _space(views: Sequence[_Working], plane: SupportingPlane) -> _Cells:
     """Cells above the plane about the point where the cameras look, within the view of most."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
@@ -429,24 +429,26 @@ def _space(views: Sequence[_Working], plane: SupportingPlane, tol: SearchToleran
         )
     )
     along = _along(plane)
-    step = 2 * reach / tol.num_cells
+    step = 2 * reach / TOL.num_cells
     axes = step * np.stack([along, np.cross(plane.normal, along), plane.normal])
-    shape = (tol.num_cells, tol.num_cells, max(round(0.75 * tol.num_cells), 1))
-    origin = foot - 0.5 * (tol.num_cells - 1) * (axes[0] + axes[1]) + 0.5 * axes[2]
+    shape = (
+        TOL.num_cells,
+        TOL.num_cells,
+        max(round(0.75 * TOL.num_cells), 1),
+    )
+    origin = foot - 0.5 * (TOL.num_cells - 1) * (axes[0] + axes[1]) + 0.5 * axes[2]
     return _Cells(origin, axes, np.ones(shape, bool))
 
 
-def _bounded(
-    space: _Cells, views: Sequence[_Working], free: Sequence[Mask], tol: SearchTolerances
-) -> _Cells | None:
+def _bounded(space: _Cells, views: Sequence[_Working], free: Sequence[Mask]) -> _Cells | None:
     """The part around the middle that remains, if it ends within the space.
 
     A view may deny a point wrongly, so others must deny it as well. Among clutter fewer views see
     the plane; if the remaining part does not end, one view is enough.
     """
     testable = [view.has_plane for view in views]
-    for needed in (tol.needed(len(views)), 1):
-        left = space.carved(views, free, tol, needed=needed, testable=testable)
+    for needed in (TOL.needed(len(views)), 1):
+        left = space.carved(views, free, needed=needed, testable=testable)
         if left is not None and not left.ends_at_sides:
             return left
     return None
@@ -456,7 +458,6 @@ def _with_extent(
     views: Sequence[_Working],
     shows_plane: Sequence[Mask],
     plane: SupportingPlane,
-    tol: SearchTolerances,
 ) -> list[_Working]:
     """Views that know how far the plane reaches: where two of them show it, and in between."""
     along = _along(plane)
@@ -466,13 +467,13 @@ def _with_extent(
     if not len(everything):
         return [replace(view, has_plane=np.zeros_like(view.has_plane)) for view in views]
     low, high = np.percentile(everything, (0.5, 99.5), axis=0)
-    step = max(float(np.prod(high - low) ** 0.5) / tol.extent_cells, 1e-12)
+    step = max(float(np.prod(high - low) ** 0.5) / TOL.extent_cells, 1e-12)
     counts = np.ceil((high - low) / step).astype(np.int64) + 1
     num_views = np.zeros(counts, np.int32)
     for places in shown:
         cells, inside = _cells_of(places, low, step, counts)
         num_views[tuple(np.unique(cells[inside], axis=0).T)] += 1
-    size = tol.extent_gap + 1
+    size = TOL.extent_gap + 1
     extent = cv2.morphologyEx(
         np.pad(num_views >= 2, size).astype(np.uint8),
         cv2.MORPH_CLOSE,
@@ -522,16 +523,14 @@ class _Plate:
     changes: Array
 
 
-def _others(views: Sequence[_Working], index: int, tol: SearchTolerances) -> NDArray[np.int64]:
+def _others(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
     """Views that predict the plane in a view: half nearby, half from around, which see behind."""
-    near, far = np.split(_nearest(views, index), [tol.num_others // 2])
-    chosen = np.linspace(0, max(len(far) - 1, 0), tol.num_others // 2).round().astype(int)
+    near, far = np.split(_nearest(views, index), [TOL.num_others // 2])
+    chosen = np.linspace(0, max(len(far) - 1, 0), TOL.num_others // 2).round().astype(int)
     return np.concatenate([near, far[np.unique(chosen)] if len(far) else far])
 
 
-def _plates(
-    views: Sequence[_Working], masks: Sequence[Mask], tol: SearchTolerances
-) -> list[_Plate]:
+def _plates(views: Sequence[_Working], masks: Sequence[Mask]) -> list[_Plate]:
     """The plane in each view, predicted from the others where the object does not hide it.
 
     A lamp that moves with the camera, and gloss, change the plane's brightness from view to view.
@@ -540,17 +539,17 @@ def _plates(
     kernel = np.ones((3, 3), np.uint8)
     free = [cv2.dilate(mask.astype(np.uint8), kernel) == 0 for mask in masks]
     beside = [mask.astype(np.float32) for mask in free]
-    shrink = 8 / tol.lighting_px  # of an average over the window
+    shrink = 8 / TOL.lighting_px  # of an average over the window
 
     def plate(index: int) -> _Plate:
         view, shown, changes, predictions = views[index], [], [], []
-        for other in _others(views, index, tol):
+        for other in _others(views, index):
             xy = views[other].project(view.on_plane)
             seen = views[other].sees(xy) & (sample_image(beside[other], xy) >= 1)
             if not (both := seen & free[index]).any():
                 continue
             log = sample_image(views[other].log, xy)
-            change = _local_mean(view.log - log, both, tol.lighting_px)
+            change = _local_mean(view.log - log, both, TOL.lighting_px)
             shown.append(np.where(seen, log + change, np.nan))
             small = cv2.resize(change, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
             predictions.append((int(other), beside[other], np.asarray(small, np.float32)))
@@ -606,7 +605,6 @@ def _denied(
     views: Sequence[_Working],
     plates: Sequence[_Plate],
     masks: Sequence[Mask],
-    tol: SearchTolerances,
 ) -> tuple[list[Mask], list[Mask]]:
     """Pixels of each view that show the plane, or the background beyond it, and not the object.
 
@@ -623,7 +621,7 @@ def _denied(
             share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), width)
             shows_plane = (share > least) & (total > LEAST_ODDS * share)
             masks_of.append(np.asarray(shows_plane & ~view.polarized))
-    for denied, beyond in zip(found[0], _showing_beyond(views, masks, tol), strict=True):
+    for denied, beyond in zip(found[0], _showing_beyond(views, masks), strict=True):
         denied |= beyond
     return found
 
@@ -650,9 +648,7 @@ def fill_false_holes(mask: Mask, odds: Floats) -> Mask:
     return mask | np.isin(labels, 1 + np.flatnonzero(shown <= LEAST_ODDS))
 
 
-def _showing_beyond(
-    views: Sequence[_Working], masks: Sequence[Mask], tol: SearchTolerances
-) -> list[Mask]:
+def _showing_beyond(views: Sequence[_Working], masks: Sequence[Mask]) -> list[Mask]:
     """Pixels (h, w) of each view that show the background beyond the plane, such as a wall.
 
     No other view predicts it. It differs from the object in brightness, if at all: that of the
@@ -663,28 +659,28 @@ def _showing_beyond(
     highest = max(float(view.log.max()) for view in views)
 
     def levels(view: _Working) -> NDArray[np.int64]:
-        level = (view.log - lowest) / max(highest - lowest, 1e-6) * tol.num_levels
-        return np.clip(level.astype(np.int64), 0, tol.num_levels - 1)
+        level = (view.log - lowest) / max(highest - lowest, 1e-6) * TOL.num_levels
+        return np.clip(level.astype(np.int64), 0, TOL.num_levels - 1)
 
     def counts(view: _Working, where: Mask) -> Array:
-        return np.bincount(levels(view)[where], minlength=tol.num_levels).astype(np.float64)
+        return np.bincount(levels(view)[where], minlength=TOL.num_levels).astype(np.float64)
 
     def shares(counted: Array) -> Array:
         counted = ndimage.gaussian_filter1d(counted, 1.0)
         # One in a hundred may have any brightness; of nothing, all are as likely.
-        counted += max(0.01 * counted.sum(), 1.0) / tol.num_levels
+        counted += max(0.01 * counted.sum(), 1.0) / TOL.num_levels
         return np.asarray(counted / counted.sum())
 
     def eroded(mask: Mask, size: int) -> Mask:
         return cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
 
-    inner = [eroded(mask, tol.lighting_px // 4) for mask in masks]
+    inner = [eroded(mask, TOL.lighting_px // 4) for mask in masks]
     of_object = shares(
         np.sum([counts(v, own & v.has_plane) for v, own in zip(views, inner, strict=True)], axis=0)
     )
     found = []
     for view, mask in zip(views, masks, strict=True):
-        near = ~eroded(~mask, tol.lighting_px)
+        near = ~eroded(~mask, TOL.lighting_px)
         of_beyond = shares(counts(view, near & ~mask & ~view.has_plane))
         odds = np.log(of_beyond / of_object)[levels(view)]
         odds = np.clip(odds, -MAX_ODDS, MAX_ODDS).astype(np.float32)
@@ -709,7 +705,6 @@ def _found(
     *,
     plane: SupportingPlane,
     noise: float,
-    tol: SearchTolerances,
 ) -> FoundObject:
     """The object in a view's own pixels, with the sub-pixel position of its outline."""
     view = views[index]
@@ -718,7 +713,7 @@ def _found(
     behind = partial(_behind, views, index, plate, plane)
     distance = find_outline(view.intensity, coarse, behind, noise, start_px=view.factor)
     found = distance < 0
-    inner = coarse < -tol.inner_px * view.factor
+    inner = coarse < -TOL.inner_px * view.factor
     return FoundObject(found, smooth_distance_px(found) - distance, inner)
 
 

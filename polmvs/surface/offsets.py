@@ -126,6 +126,9 @@ class OffsetTolerances:
     better_by: float = 0.3
 
 
+TOL = OffsetTolerances()
+
+
 @dataclass(frozen=True)
 class Patch:
     """A planar patch that sparse points show: points x with ``normal . x = offset``.
@@ -282,29 +285,27 @@ class SteppedPatches:
         return np.asarray(found, np.float64)
 
 
-def find_patches(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tuple[Patch, ...]:
+def find_patches(seeds: Seeds) -> tuple[Patch, ...]:
     """Planes through seeds whose normals agree with them, the largest number of seeds first.
 
     Parameters
     ----------
     seeds : sparse points on the part with normals from the phases.
-    tolerances : numbers of the search.
 
     Returns
     -------
     Patches without common seeds. Points among those of a larger patch but below it are mirror
     images and not a separate patch.
     """
-    tol = tolerances or OffsetTolerances()
     points, normals = seeds.points_in_world, seeds.normals_in_world
     sigma = np.maximum(seeds.sigma, 1e-12)
     rng = np.random.default_rng(0)
     left: Mask = np.asarray(np.isfinite(normals).all(axis=1) & np.isfinite(points).all(axis=1))
-    agree = np.cos(np.radians(tol.normal_deg))
+    agree = np.cos(np.radians(TOL.normal_deg))
     patches: list[Patch] = []
-    while left.sum() >= tol.min_points:
+    while left.sum() >= TOL.min_points:
         index = np.flatnonzero(left)
-        triples = index[rng.integers(0, len(index), (tol.num_trials, 3))]
+        triples = index[rng.integers(0, len(index), (TOL.num_trials, 3))]
         a, b, c = np.moveaxis(points[triples], 1, 0)
         across = np.cross(b - a, c - a)
         length = np.linalg.norm(across, axis=1)
@@ -313,30 +314,30 @@ def find_patches(seeds: Seeds, tolerances: OffsetTolerances | None = None) -> tu
         trial = across / np.maximum(length, 1e-300)[:, None]
         aligned = (trial * mean).sum(axis=1) > agree * np.linalg.norm(mean, axis=1)
         # A plane through three points of one mark turns with their noise.
-        wide = length > (tol.sigmas * sigma[triples].max(axis=1)) ** 2
+        wide = length > (TOL.sigmas * sigma[triples].max(axis=1)) ** 2
         usable = wide & aligned & (length > 0)
         if not usable.any():
             break
         trial, a = trial[usable], a[usable]
         distance = np.abs(points[index] @ trial.T - (a * trial).sum(axis=1))
-        inlier = distance < tol.sigmas * sigma[index, None]
+        inlier = distance < TOL.sigmas * sigma[index, None]
         inlier &= normals[index] @ trial.T > agree
         members = index[inlier[:, int(inlier.sum(axis=0).argmax())]]
         patch = None
         for _ in range(5):
-            if len(members) < tol.min_points:
+            if len(members) < TOL.min_points:
                 break
-            patch = _fitted(seeds, members, tol)
-            near = np.abs(patch.height(points[index])) < tol.sigmas * sigma[index]
+            patch = _fitted(seeds, members)
+            near = np.abs(patch.height(points[index])) < TOL.sigmas * sigma[index]
             members = index[near & (normals[index] @ patch.normal > agree)]
-        if patch is None or len(members) < tol.min_points:
+        if patch is None or len(members) < TOL.min_points:
             break
         patches.append(Patch(patch.normal, patch.offset, members))
         left[members] = False
-    return tuple(_without_interlopers(patches, points, tol))
+    return tuple(_without_interlopers(patches, points))
 
 
-def _fitted(seeds: Seeds, members: NDArray[np.int64], tol: OffsetTolerances) -> Patch:
+def _fitted(seeds: Seeds, members: NDArray[np.int64]) -> Patch:
     """The plane of most likelihood for the places and the normals of some seeds."""
     points, normals = seeds.points_in_world[members], seeds.normals_in_world[members]
     weight = 1 / np.maximum(seeds.sigma[members], 1e-12) ** 2
@@ -346,7 +347,7 @@ def _fitted(seeds: Seeds, members: NDArray[np.int64], tol: OffsetTolerances) -> 
     normal = mean
     for _ in range(4):
         tangents = np.linalg.svd(normal[None])[2][1:]
-        certain = 1 / np.radians(tol.min_normal_sigma_deg) ** 2
+        certain = 1 / np.radians(TOL.min_normal_sigma_deg) ** 2
         along = (points - center) @ tangents.T
         matrix = (along * weight[:, None]).T @ along + certain * np.eye(2)
         right = -(along * weight[:, None]).T @ ((points - center) @ normal)
@@ -356,9 +357,7 @@ def _fitted(seeds: Seeds, members: NDArray[np.int64], tol: OffsetTolerances) -> 
     return Patch(normal, float(normal @ center), members)
 
 
-def _without_interlopers(
-    patches: Sequence[Patch], points: Array, tol: OffsetTolerances
-) -> list[Patch]:
+def _without_interlopers(patches: Sequence[Patch], points: Array) -> list[Patch]:
     """Patches that are no mirror images in a larger one of like normal.
 
     What a patch mirrors lies behind it, sideways within its points and scattered among them. A
@@ -379,7 +378,7 @@ def _without_interlopers(
             others = np.concatenate([points[other.members] for other in mirrors]) @ tangents.T
             within = Delaunay(others, qhull_options="QJ").find_simplex(own) >= 0
             tree = cKDTree(np.concatenate([own, others]))
-            num = min(tol.min_points + 1, len(own) + len(others))
+            num = min(TOL.min_points + 1, len(own) + len(others))
             near = np.atleast_2d(tree.query(own, num)[1])
             if np.mean(within) > 0.5 and np.mean(near[:, 1:] < len(own)) < 0.5:
                 continue
@@ -394,7 +393,6 @@ def stepped_patches(
     *,
     signed_distance: SignedDistance | None = None,
     first_hit: FirstHit | None = None,
-    tolerances: OffsetTolerances | None = None,
 ) -> tuple[SteppedPatches, ...]:
     """Groups of parallel patches that a first surface does not explain, with their extents.
 
@@ -407,33 +405,31 @@ def stepped_patches(
         are skipped. None: no group is skipped.
     first_hit : distance and normal where rays from ``(N, 3)`` along ``(3,)`` first meet the first
         surface (inf without a hit); this surface remains where it explains the views better.
-    tolerances : of the search.
     """
-    tol = tolerances or OffsetTolerances()
     found = []
     for group in _grouped(patches):
         points = seeds.points_in_world[np.concatenate([patch.members for patch in group])]
         gsd = _gsd(points, scene.maps)
         if signed_distance is not None and not any(
-            _is_off(patch, seeds, signed_distance, tol.seed_cells * gsd) for patch in group
+            _is_off(patch, seeds, signed_distance, TOL.seed_cells * gsd) for patch in group
         ):
             continue
-        grid = _grid_over(group, points, scene.maps, gsd, tol)
+        grid = _grid_over(group, points, scene.maps, gsd)
         if grid is None:
             continue
-        labels, shown = _labels(group, seeds, grid, scene, first_hit, tol)
+        labels, shown = _labels(group, seeds, grid, scene, first_hit)
         if (labels != NO_PATCH).any():
             not_drawn = np.zeros((len(group), *grid.shape), np.float32)
             steps = SteppedPatches(tuple(group), grid, labels, shown, not_drawn)
-            beside = [_border(steps, number, scene, tol) for number in range(len(group))]
+            beside = [_border(steps, number, scene) for number in range(len(group))]
             found.append(replace(steps, beside=np.stack(beside)))
     return tuple(found)
 
 
-def _border(steps: SteppedPatches, number: int, scene: PatchScene, tol: OffsetTolerances) -> Image:
+def _border(steps: SteppedPatches, number: int, scene: PatchScene) -> Image:
     """Signed distance (H, W) in cells to the border of a patch with lower ones, negative inside."""
     inside, own = steps.not_below(number), steps.labels == number
-    return border_of_steps(inside, own, steps.patches[number], steps.grid, scene, tol)
+    return border_of_steps(inside, own, steps.patches[number], steps.grid, scene)
 
 
 def border_of_steps(
@@ -442,7 +438,6 @@ def border_of_steps(
     patch: Patch,
     grid: PatchGrid,
     scene: PatchScene,
-    offset_tol: OffsetTolerances,
 ) -> Image:
     """Signed distance (H, W) in cells to the border of a region on a patch, negative inside.
 
@@ -463,8 +458,8 @@ def border_of_steps(
     nearest = ndimage.distance_transform_edt(
         ~is_border, return_distances=False, return_indices=True
     )
-    tol = SilhouetteTolerances()
-    along = np.arange(-tol.edge_reach_px - 1, tol.edge_reach_px + 1 + SPACING, SPACING)
+    reach = SilhouetteTolerances.edge_reach_px + 1
+    along = np.arange(-reach, reach + SPACING, SPACING)
 
     def across(curve: Array, normals: Array) -> tuple[Array, Array]:
         last = np.array(grid.shape) - 1
@@ -478,11 +473,9 @@ def border_of_steps(
             shown = is_own & np.all(seen & (values[..., 3] == 1), axis=1)  # and no printed mark
             if shown.any():
                 slope = step_slope(values[shown, :, 0]) / SPACING
-                steepness[shown] += slope / max(robust_deviation(slope), offset_tol.dark)
+                steepness[shown] += slope / max(robust_deviation(slope), TOL.dark)
                 num_views += shown
-        found, height = nearest_steps(
-            steepness / np.maximum(num_views[:, None], 1), along, 1.0, tol
-        )
+        found, height = nearest_steps(steepness / np.maximum(num_views[:, None], 1), along, 1.0)
         return found, np.where(is_own, np.clip(height - 1, 0, 1), np.nan)
 
     return drawn_border(inside, across).astype(np.float32)
@@ -523,7 +516,6 @@ def _grid_over(
     points: Array,
     maps: Sequence[PhaseMap],
     gsd: float,
-    tol: OffsetTolerances,
 ) -> PatchGrid | None:
     """A grid over all that the views' regions show in the plane of the group's largest patch."""
     patch = group[0]
@@ -549,10 +541,10 @@ def _grid_over(
         return None
     # A region may reach the horizon in one view: cells that half of the views show are enough.
     own = np.stack([(points - center) @ first, (points - center) @ second], axis=1)
-    margin = tol.min_radius_cells * gsd
+    margin = TOL.min_radius_cells * gsd
     start = np.minimum(np.nanmedian(low, axis=0), own.min(axis=0)) - margin
     size = np.maximum(np.nanmedian(high, axis=0), own.max(axis=0)) + margin - start
-    step = max(gsd, float(np.sqrt(np.prod(size) / tol.max_cells)))
+    step = max(gsd, float(np.sqrt(np.prod(size) / TOL.max_cells)))
     rows_cols = np.ceil(size / step).astype(np.int64) + 1
     origin = center + start[0] * first + start[1] * second
     return PatchGrid(
@@ -581,7 +573,7 @@ class PatchScene:
         """Rows of points ``(N, 3)``."""
         return gather_rows(self.angle_model, points, self.maps, tilt_aware=self.tilt_aware)
 
-    def losses(self, points: Array, normals: Floats, tol: OffsetTolerances) -> Image:
+    def losses(self, points: Array, normals: Floats) -> Image:
         """Loss (K, N) of the rows of points, as :func:`row_losses`, under the light that fits.
 
         A glossy plate shows diffuse light where it mirrors something dark, such as a wall on it.
@@ -595,17 +587,17 @@ class PatchScene:
                 [one],
                 tilt_aware=self.tilt_aware,
             )
-            loss, cosine = row_losses(measured, normals, tol)
+            loss, cosine = row_losses(measured, normals)
             may_be_other = _may_be_diffuse(one, points, cosine)
-            return np.where(may_be_other, np.fmin(loss, row_losses(other, normals, tol)[0]), loss)
+            return np.where(may_be_other, np.fmin(loss, row_losses(other, normals)[0]), loss)
 
         # Threads, as sampling images releases Python's lock; each holds one view's rows.
         with ThreadPoolExecutor(default_num_workers()) as pool:
             return np.concatenate(list(pool.map(of_view, self.maps)))
 
-    def losses_on(self, places: Array, patch: Patch, tol: OffsetTolerances) -> Image:
+    def losses_on(self, places: Array, patch: Patch) -> Image:
         """Loss (K, H, W) of the rows of points ``(H, W, 3)`` on a patch."""
-        losses = self.losses(places.reshape(-1, 3), patch.normal[:, None], tol)
+        losses = self.losses(places.reshape(-1, 3), patch.normal[:, None])
         return losses.reshape(-1, *places.shape[:2])
 
 
@@ -614,18 +606,16 @@ def patch_scene(
     angle_model: AngleModel,
     *,
     tilt_aware: bool = True,
-    tolerances: OffsetTolerances | None = None,
     folder: Path | None = None,
 ) -> PatchScene:
     """The scene for planar patches, from the views' phase maps; stored in a folder or in memory.
 
     ``angle_model`` and ``tilt_aware`` are as in :func:`polmvs.normals.rows.gather_rows`.
     """
-    tol = tolerances or OffsetTolerances()
 
     def features_of(one: PhaseMap) -> ArrayLike:
         path = folder and folder / f"{one.view.name}.features.npy"
-        return kept_array(_features(one, tol), path)
+        return kept_array(_features(one), path)
 
     with ThreadPoolExecutor(default_num_workers()) as pool:
         features = list(pool.map(features_of, maps))
@@ -639,9 +629,8 @@ def _may_be_diffuse(phase_map: PhaseMap, points: Array, cosine: Floats) -> Mask:
     """
     xy = phase_map.view.project(points)
     axial = sample_image(phase_map.samples[..., :2], xy)
-    tol = LightMixtureTolerances()
-    bound = fresnel_dolp(np.clip(cosine, 0, 1), Light.DIFFUSE, tol.max_ior) + tol.dolp_margin
-    return np.asarray(lengths(axial) < bound)
+    bound = fresnel_dolp(np.clip(cosine, 0, 1), Light.DIFFUSE, LightMixtureTolerances.max_ior)
+    return np.asarray(lengths(axial) < bound + LightMixtureTolerances.dolp_margin)
 
 
 @dataclass(frozen=True)
@@ -664,14 +653,13 @@ def _labels(
     grid: PatchGrid,
     scene: PatchScene,
     first_hit: FirstHit | None,
-    tol: OffsetTolerances,
 ) -> tuple[NDArray[np.int64], Mask]:
     """Number of the patch at each cell, ``NO_PATCH`` where there is none, and where it is shown."""
     places = [grid.points(patch) for patch in group]
     rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
-    surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit, tol)
+    surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit)
     labels, shown = np.full(grid.shape, NO_PATCH), np.zeros(grid.shape, np.bool_)
-    losses = [scene.losses_on(*own, tol) for own in zip(places, group, strict=True)]
+    losses = [scene.losses_on(*own) for own in zip(places, group, strict=True)]
     # Occlusion between patches needs labels: a second pass uses those of the first.
     for is_labelled in (False, True):
         claims, jumps = np.zeros((2, len(group), *grid.shape))
@@ -681,32 +669,34 @@ def _labels(
             if is_labelled:
                 hidden = _hidden(number, group, places[number], grid, labels, scene.maps)
             on_grid = grid.cells(seeds.points_in_world[patch.members])
-            near = _distance_to(on_grid, grid.shape) < 0.5 * tol.mark_px
-            evidence = patch_evidence(
-                places[number], patch, scene, losses[number], near, hidden, tol
-            )
+            near = _distance_to(on_grid, grid.shape) < 0.5 * TOL.mark_px
+            evidence = patch_evidence(places[number], patch, scene, losses[number], near, hidden)
             possible[number] = evidence.possible
-            better = evidence.possible & (evidence.cost < surface_cost + tol.better_by)
+            better = evidence.possible & (evidence.cost < surface_cost + TOL.better_by)
             fits[number] = better & (evidence.cost < MAX_COST)
-            claims[number] = _claim(number, group, seeds, grid, evidence, better, tol)
+            claims[number] = _claim(number, group, seeds, grid, evidence, better)
             jumps[number] = evidence.jump
         # A cell far from few points has a small probability of reaching them, but belongs to the
         # patch if no other patch can be there.
         total = claims.sum(axis=0)
-        claimed = (total > tol.min_total) & (claims.max(axis=0) > 0.5 * total)
+        claimed = (total > TOL.min_total) & (claims.max(axis=0) > 0.5 * total)
         labels = np.where(claimed, claims.argmax(axis=0), NO_PATCH)
-        labels = _without_small(labels, len(group), tol)
+        labels = _without_small(labels, len(group))
         # The lowest patch ends where others stand on it; there their own borders count.
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1))[1:]:
             labels = snapped_border(
-                labels, int(number), jumps[number], tol.min_radius_cells, tol.line_steps
+                labels,
+                int(number),
+                jumps[number],
+                TOL.min_radius_cells,
+                TOL.line_steps,
             )
         # By something that the patches do not explain.
         taken = possible.any(axis=0) & ~fits.any(axis=0)
         taken = ndimage.binary_opening(taken, iterations=2)
         labels = np.where(taken, NO_PATCH, labels)
         shown = labels != NO_PATCH
-        labels = _continued(labels, fits | ~possible.any(axis=0), taken, tol)
+        labels = _continued(labels, fits | ~possible.any(axis=0), taken)
     return np.asarray(labels, np.int64), np.asarray(shown, np.bool_)
 
 
@@ -751,9 +741,7 @@ def snapped_border(
     return np.where(inside, number, np.where(own, given_back, labels))
 
 
-def _continued(
-    labels: NDArray[np.int64], allowed: Mask, taken: Mask, tol: OffsetTolerances
-) -> NDArray[np.int64]:
+def _continued(labels: NDArray[np.int64], allowed: Mask, taken: Mask) -> NDArray[np.int64]:
     """Labels extended to nearby free cells where they are ``allowed`` (G, H, W).
 
     Next to a patch, where the views show no part, a label cannot carve wrongly; but the first
@@ -764,10 +752,10 @@ def _continued(
     distance, nearest = ndimage.distance_transform_edt(labels == NO_PATCH, return_indices=True)
     carried = labels[tuple(nearest)]
     free = np.take_along_axis(allowed, carried[None], axis=0)[0] & ~taken
-    return np.where((distance <= tol.min_radius_cells) & free, carried, labels)
+    return np.where((distance <= TOL.min_radius_cells) & free, carried, labels)
 
 
-def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
+def _features(phase_map: PhaseMap) -> Image:
     """Images (H, W, 4): root of intensity, polarization (2), and 1 off printed marks.
 
     The first three show borders by their edges. A mark is smaller than ``mark_px``, brighter than
@@ -775,26 +763,24 @@ def _features(phase_map: PhaseMap, tol: OffsetTolerances) -> Image:
     """
     intensity = np.asarray(phase_map.intensity, np.float32)
     scale = phase_map.view.camera.mean_focal_px / REFERENCE_FOCAL_PX
-    size = 2 * round(0.5 * tol.mark_px * scale) + 1
+    size = 2 * round(0.5 * TOL.mark_px * scale) + 1
     about = cv2.morphologyEx(
-        cv2.GaussianBlur(intensity, (0, 0), tol.smoothing_px),
+        cv2.GaussianBlur(intensity, (0, 0), TOL.smoothing_px),
         cv2.MORPH_OPEN,
         cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)),
     )
     dolp = np.hypot(phase_map.samples[..., 0], phase_map.samples[..., 1])
     dull = phase_map.lowest_dolp < 255 * SeedTolerances.max_dolp_share * dolp
-    mark = dull & (intensity > tol.mark_contrast * about + tol.dark)
-    kernel = np.ones((2 * round(2 * tol.smoothing_px) + 1,) * 2, np.uint8)  # its smoothed outline
+    mark = dull & (intensity > TOL.mark_contrast * about + TOL.dark)
+    kernel = np.ones((2 * round(2 * TOL.smoothing_px) + 1,) * 2, np.uint8)  # its smoothed outline
     on_mark = cv2.dilate(mark.astype(np.uint8), kernel)
     # The root has uniform photon noise; an edge that is smoothed after it keeps its position.
-    root = cv2.GaussianBlur(np.sqrt(np.maximum(intensity, 0)), (0, 0), tol.smoothing_px)
+    root = cv2.GaussianBlur(np.sqrt(np.maximum(intensity, 0)), (0, 0), TOL.smoothing_px)
     samples = phase_map.samples[..., :2]
     return np.dstack([root, samples, 1 - on_mark]).astype(np.float32)
 
 
-def row_losses(
-    rows: Rows, normals: Floats, tol: OffsetTolerances
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def row_losses(rows: Rows, normals: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Loss in [0, 1] of each row (K, N), NaN where it is not used, and cosines to the views.
 
     A row is used if it would contradict at least half of all phases; others agree with anything.
@@ -811,10 +797,10 @@ def row_losses(
         # Half of what a curved mesh leaves unexplained: a plane has no discretization error.
         floor = np.float32((0.5 * TermTolerances.row_sigma) ** 2)
         variance = (1 - cosine**2) * np.square(rows.sigma) + floor
-        z2 = np.square(residual) / (variance * np.float32(tol.sigmas**2))
+        z2 = np.square(residual) / (variance * np.float32(TOL.sigmas**2))
         loss = z2 / (1 + z2)
     # The median residual of a random phase is sin 45 deg.
-    informative = rows.sigma < np.sqrt(0.5) / tol.sigmas
+    informative = rows.sigma < np.sqrt(0.5) / TOL.sigmas
     counts = informative & (cosine > MIN_FACING_COSINE)
     return np.where(counts, loss, np.nan).astype(np.float32), cosine
 
@@ -826,7 +812,6 @@ def patch_evidence(
     losses: Image,
     near_points: Mask,
     hidden: Sequence[Mask] | None,
-    tol: OffsetTolerances,
 ) -> PatchEvidence:
     """Evidence of the views for a patch at points ``(H, W, 3)`` on it.
 
@@ -850,24 +835,22 @@ def patch_evidence(
         num_seen += seen
         inside += shown
         own[k] = np.where(shown, losses[k], np.nan)
-        jumps[k], marks = _line_steps(scene.features[k], xy, shown, tol)
+        jumps[k], marks = _line_steps(scene.features[k], xy, shown)
         num_marks += marks
     # A print on the patch is a mark in all views; a print on a wall beside it has another position
     # in each.
-    printed = near_points & (num_marks > tol.mark_share * inside)
+    printed = near_points & (num_marks > TOL.mark_share * inside)
     jumps[:, printed] = np.nan
-    possible = (num_seen >= 2) & (inside >= tol.min_share * num_seen)
-    return PatchEvidence(_shared_lines(jumps, tol.view_share), median_loss(own), possible)
+    possible = (num_seen >= 2) & (inside >= TOL.min_share * num_seen)
+    return PatchEvidence(_shared_lines(jumps, TOL.view_share), median_loss(own), possible)
 
 
-def patch_lines(
-    places: Array, patch: Patch, scene: PatchScene, tol: OffsetTolerances, view_share: float
-) -> Image:
+def patch_lines(places: Array, patch: Patch, scene: PatchScene, view_share: float) -> Image:
     """Edges (H, W) in units of noise that a share of the views shows at points (H, W, 3)."""
     jumps = np.full((len(scene.maps), *places.shape[:2]), np.nan, np.float32)
     for k, phase_map in enumerate(scene.maps):
         xy, seen = _seen(places, patch, phase_map)
-        jumps[k] = _line_steps(scene.features[k], xy, seen, tol)[0]
+        jumps[k] = _line_steps(scene.features[k], xy, seen)[0]
     return _shared_lines(jumps, view_share)
 
 
@@ -879,12 +862,10 @@ def _seen(places: Array, patch: Patch, phase_map: PhaseMap) -> tuple[Image, Mask
     return xy.astype(np.float32), np.asarray(seen & view.faces(places, patch.normal))
 
 
-def _line_steps(
-    images: ArrayLike, xy: Image, shown: Mask, tol: OffsetTolerances
-) -> tuple[Image, Mask]:
+def _line_steps(images: ArrayLike, xy: Image, shown: Mask) -> tuple[Image, Mask]:
     """Edges (H, W) of one view's images, NaN where it shows nothing, and where it shows a mark."""
     values = sample_image(np.asarray(images), xy)
-    steps = np.where(shown, _steps(values[..., :3], shown, tol), np.nan)
+    steps = np.where(shown, _steps(values[..., :3], shown), np.nan)
     return steps.astype(np.float32), np.asarray(shown & (values[..., 3] < 1))
 
 
@@ -905,7 +886,7 @@ def median_loss(losses: Image) -> Image:
     return np.where(count > 0, middle, 1.0).astype(np.float32)
 
 
-def _steps(values: Image, shown: Mask, tol: OffsetTolerances) -> Image:
+def _steps(values: Image, shown: Mask) -> Image:
     """Edges (H, W) of images (H, W, C) over the cells, each in units of its own noise."""
     total = np.zeros(shown.shape, np.float32)
     well = ndimage.binary_erosion(shown, border_value=0)
@@ -913,7 +894,7 @@ def _steps(values: Image, shown: Mask, tol: OffsetTolerances) -> Image:
         return total
     for channel in np.moveaxis(values, -1, 0):
         step = np.hypot(*np.gradient(channel))
-        scale = max(robust_deviation(step[well]), tol.dark)
+        scale = max(robust_deviation(step[well]), TOL.dark)
         total = np.maximum(total, np.where(well, step / scale, 0)).astype(np.float32)
     return total
 
@@ -923,7 +904,6 @@ def _surface_cost(
     top: Array,
     scene: PatchScene,
     first_hit: FirstHit | None,
-    tol: OffsetTolerances,
 ) -> Image:
     """Median loss (H, W) of the phases on the given surface above the cells; 1 without one."""
     cost = np.ones(grid.shape, np.float32)
@@ -936,7 +916,7 @@ def _surface_cost(
     distance, normals = first_hit(start.reshape(-1, 3), -grid.axis)
     hit = np.isfinite(distance)
     points = start.reshape(-1, 3)[hit] - np.asarray(distance, np.float64)[hit, None] * grid.axis
-    losses = scene.losses(points, np.asarray(normals)[hit].T, tol)
+    losses = scene.losses(points, np.asarray(normals)[hit].T)
     flat = cost.reshape(-1)
     flat[hit] = median_loss(losses[:, None])[0]
     return cost
@@ -979,7 +959,6 @@ def _claim(
     grid: PatchGrid,
     evidence: PatchEvidence,
     possible: Mask,
-    tol: OffsetTolerances,
 ) -> Array:
     """Probability (H, W) that a walk from a cell, hampered by lines, ends on a patch's points."""
     own, others = (np.full(grid.shape, np.inf) for _ in range(2))
@@ -989,16 +968,16 @@ def _claim(
             own = near
         else:
             others = np.minimum(others, near)
-    starts = (own < tol.seed_cells) & (own < others) & possible
-    ends = (others < tol.seed_cells) & (others < own) & possible
+    starts = (own < TOL.seed_cells) & (own < others) & possible
+    ends = (others < TOL.seed_cells) & (others < own) & possible
     if not starts.any():
         return np.zeros(grid.shape)
-    adjacency, degree = _walk(evidence.jump.astype(np.float64), tol)
+    adjacency, degree = _walk(evidence.jump.astype(np.float64))
     # A walk may end on any point that it passes, so a single false point does not decide.
-    ending = tol.seed_weight * (starts | ends).ravel()
-    leak = tol.leak * np.clip(evidence.cost.astype(np.float64).ravel() / MAX_COST - 1, 0, 1)
+    ending = TOL.seed_weight * (starts | ends).ravel()
+    leak = TOL.leak * np.clip(evidence.cost.astype(np.float64).ravel() / MAX_COST - 1, 0, 1)
     free = np.flatnonzero(possible)
-    right = tol.seed_weight * starts.ravel()[free].astype(np.float64)
+    right = TOL.seed_weight * starts.ravel()[free].astype(np.float64)
     claim = np.zeros(starts.size)
     claim[free] = _solved(adjacency[free][:, free], (degree + leak + ending + 1e-9)[free], right)
     return np.asarray(claim.reshape(grid.shape))
@@ -1016,11 +995,11 @@ def _steps_between(
     return tails, heads, 0.5 * (jump.ravel()[tails] + jump.ravel()[heads])
 
 
-def _walk(jump: Array, tol: OffsetTolerances) -> tuple[sparse.csr_array, Array]:
+def _walk(jump: Array) -> tuple[sparse.csr_array, Array]:
     """Weights of moves between neighbouring cells ``(H W, H W)``, and their sums."""
     steps = [_steps_between(jump, *direction) for direction in BESIDE]
     tails, heads, between = (np.concatenate(part) for part in zip(*steps, strict=True))
-    weight = geman_mcclure_weights(between, tol.line_steps**2)
+    weight = geman_mcclure_weights(between, TOL.line_steps**2)
     pairs = (np.concatenate([tails, heads]), np.concatenate([heads, tails]))
     both = np.concatenate([weight, weight])
     adjacency = sparse.coo_array((both, pairs), shape=(jump.size, jump.size)).tocsr()
@@ -1049,11 +1028,9 @@ def _distance_to(cells: Array, shape: tuple[int, int]) -> Array:
     return np.asarray(ndimage.distance_transform_edt(mask), np.float64)
 
 
-def _without_small(
-    labels: NDArray[np.int64], num_patches: int, tol: OffsetTolerances
-) -> NDArray[np.int64]:
+def _without_small(labels: NDArray[np.int64], num_patches: int) -> NDArray[np.int64]:
     """Labels in which pieces smaller than a disc of ``min_radius_cells`` become ``NO_PATCH``."""
-    least = np.pi * tol.min_radius_cells**2
+    least = np.pi * TOL.min_radius_cells**2
     kept = labels.copy()
     for number in range(num_patches):
         pieces, num = ndimage.label(labels == number)

@@ -49,6 +49,9 @@ class GraphTolerances:
     filled_sigma: float = 0.1
 
 
+TOL = GraphTolerances()
+
+
 @dataclass(frozen=True)
 class Nodes:
     """Nodes of one view, on contours or on a lattice, and what is known about them.
@@ -117,17 +120,15 @@ def bending_modes(xy: Image) -> Array:
     """
     low, high = xy.min(axis=0), xy.max(axis=0)
     x, y = (2 * (xy - low) / np.maximum(high - low, 1e-9) - 1).T.astype(np.float64)
-    legendre = [[np.ones_like(t), t, 1.5 * t**2 - 0.5] for t in (x, y)]
+    legendre = [[np.ones_like(t), 1.5 * t**2 - 0.5] for t in (x, y)]
     degrees = [(i, j) for i in range(3) for j in range(3) if 1 <= i + j <= 2]
     return np.stack([legendre[0][i] * legendre[1][j] for i, j in degrees], axis=-1)
 
 
-def fill_normals(
-    nodes: Nodes, estimate: NormalEstimate, *, tolerances: GraphTolerances = GraphTolerances()
-) -> tuple[Array, Array]:
+def fill_normals(nodes: Nodes, estimate: NormalEstimate) -> tuple[Array, Array]:
     """Normals with gaps filled from neighbours, with a larger deviation."""
     sigma = np.radians(estimate.sigma_deg)
-    good = estimate.valid & (estimate.num_rows >= MIN_VIEWS) & (sigma < tolerances.filled_sigma)
+    good = estimate.valid & (estimate.num_rows >= MIN_VIEWS) & (sigma < TOL.filled_sigma)
     if not good.any():
         return estimate.normals, sigma
     xy, normals = nodes.surface.xy, estimate.normals.copy()
@@ -135,7 +136,7 @@ def fill_normals(
     index = cKDTree(xy[good]).query(xy[~good], k=k)[1].reshape(-1, k)
     mean = normals[good][index].mean(axis=1)
     normals[~good] = mean / np.linalg.norm(mean, axis=-1, keepdims=True)
-    sigma[~good] = tolerances.filled_sigma
+    sigma[~good] = TOL.filled_sigma
     return normals, sigma
 
 
@@ -145,7 +146,6 @@ def node_edges(
     own_sigma: Floats,
     *,
     along_contours: bool,
-    tolerances: GraphTolerances = GraphTolerances(),
 ) -> Edges:
     """Increments from the nodes' normals on all edges, and the constancy along the contours.
 
@@ -155,11 +155,10 @@ def node_edges(
     nodes : with normals.
     own_sigma : (N,), deviation of the rotation of the view's own row about its ray, rad.
     along_contours : use that constancy.
-    tolerances : of this step.
     """
     surface = nodes.surface
-    sigma = np.hypot(surface.normal_sigma, tolerances.normal_error / np.sqrt(nodes.spacing))
-    joined = _smooth_edges(nodes, surface.normals, sigma, tolerances=tolerances)
+    sigma = np.hypot(surface.normal_sigma, TOL.normal_error / np.sqrt(nodes.spacing))
+    joined = _smooth_edges(nodes, surface.normals, sigma)
     tail, head = nodes.tail[joined], nodes.head[joined]
     rays = surface.rays_in_world.astype(np.float64)
     mean = surface.normals[tail] + surface.normals[head]
@@ -197,9 +196,7 @@ def node_edges(
     )
 
 
-def _smooth_edges(
-    nodes: Nodes, normals: Array, sigma: Array, *, tolerances: GraphTolerances
-) -> NDArray[np.bool_]:
+def _smooth_edges(nodes: Nodes, normals: Array, sigma: Array) -> NDArray[np.bool_]:
     """Edges without a crease: normals differ no more than noise and the curvature about them."""
     tail, head = nodes.tail, nodes.head
     turn = np.arccos(np.clip((normals[tail] * normals[head]).sum(axis=-1), -1, 1))
@@ -210,15 +207,13 @@ def _smooth_edges(
     local = ((np.bincount(tail, root, num) + np.bincount(head, root, num)) / degree) ** 2
     noise = np.hypot(sigma[tail], sigma[head])
     expected = np.minimum(local[tail], local[head])
-    return np.asarray(~(turn > tolerances.crease_factor * np.maximum(noise, expected)))
+    return np.asarray(~(turn > TOL.crease_factor * np.maximum(noise, expected)))
 
 
 def tie_seeds(
     phase_map: PhaseMap,
     nodes: Nodes,
     seeds: Seeds,
-    *,
-    tolerances: GraphTolerances = GraphTolerances(),
 ) -> SeedTies:
     """Tie every visible seed to the nearest nodes along the chords to them."""
     surface = nodes.surface
@@ -238,7 +233,7 @@ def tie_seeds(
         chord = node_normals + np.where(known, seed_normals, node_normals)
         step = log_range_increment(chord, rays, node_rays)
         # A seed of another surface, hidden behind this one, has another normal.
-        alike = ~((seed_normals * node_normals).sum(axis=-1) < np.cos(tolerances.filled_sigma))
+        alike = ~((seed_normals * node_normals).sum(axis=-1) < np.cos(TOL.filled_sigma))
     ok = visible[seed] & alike & (gap < REACH * nodes.spacing_px) & np.isfinite(step)
     seed, node, gap, step = seed[ok], node[ok], gap[ok], step[ok]
     gsd = 1 / phase_map.view.camera.mean_focal_px

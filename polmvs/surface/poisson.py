@@ -55,12 +55,14 @@ class MeshTolerances:
     cube_scale: float = 1.1
 
 
+TOL = MeshTolerances()
+
+
 def poisson_mesh(
     cloud: Cloud,
     *,
     kinds: Collection[int] = (PointKind.SURFACE,),
     source: str | PathLike[str] = "cloud",
-    tolerances: MeshTolerances = MeshTolerances(),
 ) -> Mesh:
     """Poisson mesh of a cloud's oriented points, where the points support it.
 
@@ -75,7 +77,6 @@ def poisson_mesh(
         points of the given kinds are used. Points and normals that are not finite are ignored.
     kinds : of points to use, see :class:`polmvs.scene.PointKind`.
     source : origin of the cloud, for messages.
-    tolerances : of this step.
 
     Returns
     -------
@@ -95,8 +96,8 @@ def poisson_mesh(
     spacing = float(np.median(spacings[usual]))
     if not spacing > 0:
         raise DataError(source, "has most of its points in the same places; merge them first.")
-    depth = octree_depth(points, spacing, tolerances=tolerances)
-    vertices, triangles = solve_poisson(points, normals, depth=depth, scale=tolerances.cube_scale)
+    depth = octree_depth(points, spacing)
+    vertices, triangles = solve_poisson(points, normals, depth=depth, scale=TOL.cube_scale)
     logger.debug("Poisson: depth %d, spacing %.3g, %d vertices", depth, spacing, len(vertices))
     surface = TriangleMesh(vertices, triangles.astype(np.int64))
     tree = cKDTree(points)
@@ -104,12 +105,12 @@ def poisson_mesh(
     near_normals = unit_or_zero(normals[nearest].sum(axis=1))
     # A vertex that faces away from the nearest points belongs to the other side of a sheet.
     supported = dots(surface.vertex_normals, near_normals) > 0
-    supported &= distance[:, 0] <= tolerances.support * spacing
+    supported &= distance[:, 0] <= TOL.support * spacing
     # A point represents its cell, which ends half-way to the next one.
-    supported = _without_rim(surface, supported, (tolerances.support - 0.5) * spacing)
+    supported = _without_rim(surface, supported, (TOL.support - 0.5) * spacing)
     islands = TriangleMesh(vertices, surface.faces[supported[surface.faces].all(axis=1)])
     areas = np.bincount(islands.face_components, islands.face_areas)
-    kept = areas[islands.face_components] >= (tolerances.min_island * spacing) ** 2
+    kept = areas[islands.face_components] >= (TOL.min_island * spacing) ** 2
     used, final = np.unique(islands.faces[kept], return_inverse=True)
     return Mesh(
         vertices=vertices[used],
@@ -139,13 +140,11 @@ def _usable(
     return cloud.points[used], normals, None if cloud.colors is None else cloud.colors[used]
 
 
-def octree_depth(
-    points: Array, spacing: float, *, tolerances: MeshTolerances = MeshTolerances()
-) -> int:
+def octree_depth(points: Array, spacing: float) -> int:
     """The greatest depth at which Poisson's cells are no narrower than the spacing."""
-    side = tolerances.cube_scale * float(np.ptp(points, axis=0).max())
+    side = TOL.cube_scale * float(np.ptp(points, axis=0).max())
     depth = np.floor(np.log2(side / spacing))
-    return int(np.clip(depth, tolerances.min_depth, tolerances.max_depth))
+    return int(np.clip(depth, TOL.min_depth, TOL.max_depth))
 
 
 def _without_rim(surface: TriangleMesh, supported: Mask, width: float) -> Mask:

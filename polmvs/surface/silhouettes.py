@@ -72,9 +72,10 @@ class SilhouetteTolerances:
     edge_smoothing_px: float = 1.5
 
 
-def find_silhouette(
-    phase_map: PhaseMap, *, mask_given: bool, tolerances: SilhouetteTolerances | None = None
-) -> Silhouette:
+TOL = SilhouetteTolerances()
+
+
+def find_silhouette(phase_map: PhaseMap, *, mask_given: bool) -> Silhouette:
     """Silhouette of a view from its region and intensity.
 
     Parameters
@@ -82,7 +83,6 @@ def find_silhouette(
     phase_map : of the view.
     mask_given : the region is the user's mask, which is certain.
     """
-    tol = tolerances or SilhouetteTolerances()
     inside = np.asarray(phase_map.region.inside, np.bool_)
     if (shift := phase_map.outline_shift) is not None:
         return Silhouette(inside, inside, shift, shift)
@@ -90,17 +90,17 @@ def find_silhouette(
         return Silhouette(inside, inside)
     scale = phase_map.view.camera.mean_focal_px / REFERENCE_FOCAL_PX
     unbounded = phase_map.region.unbounded
-    certain = _cleaned(inside if unbounded is None else inside & ~unbounded, scale, tol)
+    certain = _cleaned(inside if unbounded is None else inside & ~unbounded, scale)
     if not certain.any():
         return Silhouette(certain, certain)
     intensity = np.asarray(phase_map.intensity, np.float32)
-    possible = _continued(certain, intensity, scale, tol)
+    possible = _continued(certain, intensity, scale)
     if unbounded is not None:
         possible = possible | unbounded
-    possible = possible | _cut_by_the_border(possible, tol.mark_area_px * scale**2)
-    inner = _outline_shift(certain, intensity, scale, tol)
+    possible = possible | _cut_by_the_border(possible, TOL.mark_area_px * scale**2)
+    inner = _outline_shift(certain, intensity, scale)
     sharp = bool((possible == certain).all())
-    outer = inner if sharp else _outline_shift(possible, intensity, scale, tol)
+    outer = inner if sharp else _outline_shift(possible, intensity, scale)
     return Silhouette(certain, possible, inner, outer)
 
 
@@ -128,13 +128,13 @@ def open_silhouette(folder: Path, name: str) -> Silhouette:
     return Silhouette(flags & 1 > 0, flags & 2 > 0, *shifts)
 
 
-def _cleaned(mask: Mask, scale: float, tol: SilhouetteTolerances) -> Mask:
+def _cleaned(mask: Mask, scale: float) -> Mask:
     """The mask without specks, gaps and pinholes."""
     area = scale * scale
-    pixels = _without_small(mask, tol.min_piece_px * area, connectivity=8).astype(np.uint8)
-    size = 2 * round(0.5 * (tol.closing_px - 1) * scale) + 1
+    pixels = _without_small(mask, TOL.min_piece_px * area, connectivity=8).astype(np.uint8)
+    size = 2 * round(0.5 * (TOL.closing_px - 1) * scale) + 1
     holes = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)) == 0
-    return ~_without_small(holes, tol.min_piece_px * area, connectivity=4)
+    return ~_without_small(holes, TOL.min_piece_px * area, connectivity=4)
 
 
 def _without_small(mask: Mask, min_area: float, *, connectivity: int) -> Mask:
@@ -156,7 +156,7 @@ def _ellipse(radius: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size), np.uint8)
 
 
-def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTolerances) -> Mask:
+def _continued(certain: Mask, intensity: Image, scale: float) -> Mask:
     """The mask with the pixels that continue it, by a graph cut on intensity (GrabCut)."""
     white = max(float(np.percentile(intensity, 95)), 1e-9)
     bright = np.sqrt(np.clip(intensity / white, 0, 1)).astype(np.float32)
@@ -165,9 +165,9 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
     features = (255 * np.dstack([bright, smooth, darkest])).astype(np.uint8)
 
     pixels = certain.astype(np.uint8)
-    like = np.quantile(bright[certain], tol.object_quantile)
-    near = cv2.dilate(pixels, _ellipse(round(tol.near_px * scale))) > 0
-    far = cv2.dilate(pixels, _ellipse(round(tol.far_px * scale))) > 0
+    like = np.quantile(bright[certain], TOL.object_quantile)
+    near = cv2.dilate(pixels, _ellipse(round(TOL.near_px * scale))) > 0
+    far = cv2.dilate(pixels, _ellipse(round(TOL.far_px * scale))) > 0
     searched = near | (far & (smooth <= like))
     labels = np.full(certain.shape, cv2.GC_BGD, np.uint8)
     labels[searched] = cv2.GC_PR_BGD
@@ -191,7 +191,7 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
         (0, 0, 1, 1),  # not used: the labels are the start
         np.zeros((1, 65)),
         np.zeros((1, 65)),
-        tol.cut_rounds,
+        TOL.cut_rounds,
         cv2.GC_INIT_WITH_MASK,
     )
     found = np.zeros(certain.shape, np.uint8)
@@ -200,15 +200,13 @@ def _continued(certain: Mask, intensity: Image, scale: float, tol: SilhouetteTol
     pieces = cv2.connectedComponents((opened | certain).astype(np.uint8))[1]
     held = np.unique(pieces[certain])
     found_mask = np.isin(pieces, held[held > 0])
-    found_mask = ~_without_small(~found_mask, tol.min_piece_px * scale**2, connectivity=4)
+    found_mask = ~_without_small(~found_mask, TOL.min_piece_px * scale**2, connectivity=4)
     if 2 * (found_mask & ~certain).sum() > certain.size:
         return certain  # the cut has leaked into the surroundings
     return np.asarray(found_mask)
 
 
-def _outline_shift(
-    mask: Mask, intensity: Image, scale: float, tol: SilhouetteTolerances
-) -> Image | None:
+def _outline_shift(mask: Mask, intensity: Image, scale: float) -> Image | None:
     """Distance of the intensity edge at a mask's border outside of it.
 
     Returns
@@ -222,7 +220,7 @@ def _outline_shift(
     distance = signed_distance_px(mask)
     outwards = outward_normals(distance, border)
     step = 0.25
-    reach = tol.edge_reach_px * max(scale, 1.0)
+    reach = TOL.edge_reach_px * max(scale, 1.0)
     along = np.arange(-reach - 1, reach + 1 + step, step)
     # The border runs half a pixel outside of its pixels' centres.
     centers = np.stack([cols + 0.5, rows + 0.5], axis=1)
@@ -231,11 +229,11 @@ def _outline_shift(
     )
     profile = sample_image(intensity, places)
     contrast = step_slope(profile) * 5 / np.maximum(profile.max(axis=1, keepdims=True), 1e-6)
-    found, height = nearest_steps(contrast, along, scale, tol)
-    weight = np.clip(height / tol.edge_contrast - 1, 0, 1)
+    found, height = nearest_steps(contrast, along, scale)
+    weight = np.clip(height / TOL.edge_contrast - 1, 0, 1)
     shifts, weights = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
     shifts[rows, cols], weights[rows, cols] = weight * found, weight
-    width = tol.edge_smoothing_px * max(scale, 1.0)
+    width = TOL.edge_smoothing_px * max(scale, 1.0)
     total = np.asarray(cv2.GaussianBlur(shifts, (0, 0), width), np.float32)
     share = np.asarray(cv2.GaussianBlur(weights, (0, 0), width), np.float32)
     mean = np.where(share > 1e-4, total / np.maximum(share, 1e-4), 0).astype(np.float32)
@@ -248,9 +246,7 @@ def step_slope(profile: Image) -> Image:
     return np.asarray(np.abs(ndimage.gaussian_filter1d(profile, 2.0, axis=1, order=1)))
 
 
-def nearest_steps(
-    contrast: Floats, along: Array, scale: float, tolerances: SilhouetteTolerances | None = None
-) -> tuple[Array, Array]:
+def nearest_steps(contrast: Floats, along: Array, scale: float) -> tuple[Array, Array]:
     """Positions ``(N,)`` of the edges chosen on profiles across a border, and their contrasts.
 
     Parameters
@@ -258,10 +254,9 @@ def nearest_steps(
     contrast : (N, S), steepness of each profile.
     along : (S,) equidistant, distances from the border, in ``scale`` times the tolerances' unit.
     """
-    tol = tolerances or SilhouetteTolerances()
     step = float(along[1] - along[0])
-    score = contrast * np.exp(-0.5 * (along / (tol.edge_prior_px * max(scale, 1.0))) ** 2)
-    score[:, np.abs(along) > tol.edge_reach_px * max(scale, 1.0)] = 0
+    score = contrast * np.exp(-0.5 * (along / (TOL.edge_prior_px * max(scale, 1.0))) ** 2)
+    score[:, np.abs(along) > TOL.edge_reach_px * max(scale, 1.0)] = 0
     best, index = score.argmax(axis=1), np.arange(len(score))
     # The border only chooses among edges; it does not shift their positions.
     for _ in range(round(1 / step)):

@@ -73,6 +73,9 @@ class QualityTolerances:
     min_gap_px: float = 6.0
 
 
+TOL = QualityTolerances()
+
+
 @dataclass(frozen=True)
 class FaceEvidence:
     """Evidence of the views for each face of a mesh.
@@ -105,8 +108,6 @@ def face_evidence(
     mesh: TriangleMesh,
     fit: Fit,
     labelled: Labelled,
-    *,
-    tolerances: QualityTolerances | None = None,
 ) -> FaceEvidence:
     """Evidence of all views for all faces.
 
@@ -116,7 +117,6 @@ def face_evidence(
     fit : of the views.
     labelled : the observations of the mesh, with their light.
     """
-    tol = tolerances or QualityTolerances()
     num = len(mesh.faces)
     views, outside, outlines = np.zeros((3, num), np.int64)
     if not num:
@@ -132,8 +132,8 @@ def face_evidence(
         views[seen] += 1
         if view.has_outline:
             distance = sample_image(view.silhouette.outer, xy)
-            outside[seen[distance > tol.outside_px]] += 1
-            outlines[seen[np.abs(distance) <= tol.outside_px]] += 1
+            outside[seen[distance > TOL.outside_px]] += 1
+            outlines[seen[np.abs(distance) <= TOL.outside_px]] += 1
     face = labelled.observations.face
     return FaceEvidence(
         num_views=views,
@@ -152,7 +152,6 @@ def supported_faces(
     min_views: int = 2,
     gsd: float,
     sigma: Array | None = None,
-    tolerances: QualityTolerances | None = None,
 ) -> Mask:
     """Which faces ``(F,)`` the views support.
 
@@ -164,7 +163,6 @@ def supported_faces(
     gsd : ground sampling distance, world units.
     sigma : (V,) position uncertainty of the vertices; None: no face counts as certain.
     """
-    tol = tolerances or QualityTolerances()
     if not len(mesh.faces):
         return np.zeros(0, np.bool_)
     of_faces = (
@@ -176,14 +174,14 @@ def supported_faces(
     )
     smooth = _smoothed(mesh, np.stack(of_faces, axis=1).astype(np.float64))
     views, outside, rows, outlines, information = smooth.T
-    denied = outside > np.maximum(tol.max_outside_share * views, 1.5)
-    determined = (information >= tol.min_information * rows) | (outlines >= 0.5)
+    denied = outside > np.maximum(TOL.max_outside_share * views, 1.5)
+    determined = (information >= TOL.min_information * rows) | (outlines >= 0.5)
     if sigma is not None:
         of_face = sigma[mesh.faces].mean(axis=1)
         known = np.isfinite(of_face)
         usual = np.median(of_face[known]) if known.any() else 0.0
-        determined |= of_face <= tol.max_sigma_ratio * usual
-    undetermined = _wide_parts(mesh, ~determined, gsd, tol)
+        determined |= of_face <= TOL.max_sigma_ratio * usual
+    undetermined = _wide_parts(mesh, ~determined, gsd)
     seen = (evidence.num_views >= min_views) & (rows >= min_views - 0.5)
     return np.asarray(seen & ~undetermined & ~denied)
 
@@ -193,7 +191,6 @@ def contradicted_faces(
     evidence: FaceEvidence,
     *,
     gsd: float,
-    tolerances: QualityTolerances | None = None,
 ) -> Mask:
     """Which faces ``(F,)`` have phases that are less likely than those of any direction.
 
@@ -202,14 +199,14 @@ def contradicted_faces(
     mesh, evidence, gsd : as of :func:`supported_faces`.
     """
     information = _smoothed(mesh, evidence.information[:, None])[:, 0]
-    return _wide_parts(mesh, information < 0, gsd, tolerances or QualityTolerances())
+    return _wide_parts(mesh, information < 0, gsd)
 
 
-def _wide_parts(mesh: TriangleMesh, chosen: Mask, gsd: float, tol: QualityTolerances) -> Mask:
+def _wide_parts(mesh: TriangleMesh, chosen: Mask, gsd: float) -> Mask:
     """Faces ``(F,)`` of the chosen ones whose connected part is as wide as an opening."""
     part = mesh.pieces(chosen)
     area = np.bincount(part + 1, mesh.face_areas)
-    return np.asarray(chosen & (area[part + 1] >= np.pi * (tol.min_gap_px * gsd) ** 2))
+    return np.asarray(chosen & (area[part + 1] >= np.pi * (TOL.min_gap_px * gsd) ** 2))
 
 
 def _smoothed(mesh: TriangleMesh, values: Array) -> Array:
@@ -431,8 +428,6 @@ def find_contradictions(
     contradicted: Mask,
     views: Sequence[SurfaceView],
     phase_sine: float,
-    *,
-    tolerances: QualityTolerances | None = None,
 ) -> Contradictions:
     """Compare a surface with the views.
 
@@ -443,10 +438,9 @@ def find_contradictions(
     views : all views.
     phase_sine : median of the absolute residuals of the phases.
     """
-    tol = tolerances or QualityTolerances()
     area = mesh.face_areas * (evidence.num_views >= 2)
     total = max(float(area.sum()), 1e-300)
-    denied = evidence.num_outside > np.maximum(tol.max_outside_share * evidence.num_views, 1.5)
+    denied = evidence.num_outside > np.maximum(TOL.max_outside_share * evidence.num_views, 1.5)
     return Contradictions(
         phase_sine=phase_sine,
         contradicted_share=float(area[contradicted].sum()) / total,

@@ -53,6 +53,9 @@ class HullTolerances:
     min_plane_share: float = 0.25
 
 
+TOL = HullTolerances()
+
+
 @dataclass(frozen=True)
 class SupportingPlane:
     """Points x with ``normal . x = offset``; free space has ``normal . x > offset``."""
@@ -69,7 +72,6 @@ def supporting_plane(
     surroundings: Floats,
     centers: Array,
     *,
-    tolerances: HullTolerances | None = None,
     num_trials: int = 400,
     seed: int = 0,
 ) -> SupportingPlane | None:
@@ -87,13 +89,12 @@ def supporting_plane(
     None if fewer than ``min_plane_share`` of the points lie in one plane, or cameras are on both
     sides.
     """
-    tol = tolerances or HullTolerances()
     num = len(surroundings)
     if num < 20:
         return None
     rng = np.random.default_rng(seed)
     middle = np.median(surroundings, axis=0)
-    limit = tol.plane_distance * float(np.median(np.linalg.norm(centers - middle, axis=1)))
+    limit = TOL.plane_distance * float(np.median(np.linalg.norm(centers - middle, axis=1)))
     picks = rng.integers(0, num, (num_trials, 3))
     a, b, c = (surroundings[picks[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
@@ -114,7 +115,7 @@ def supporting_plane(
     heights = centers @ normal - offset
     if np.median(heights) < 0:
         normal, offset, heights = -normal, -offset, -heights
-    if len(inliers) < tol.min_plane_share * num or heights.min() < 0:
+    if len(inliers) < TOL.min_plane_share * num or heights.min() < 0:
         return None
     return SupportingPlane(normal, offset)
 
@@ -151,7 +152,6 @@ class VisualHull:
     def carved(
         self,
         free: Sequence[Callable[[Array], Floats]],
-        tolerances: HullTolerances | None = None,
     ) -> VisualHull:
         """The hull without known free space.
 
@@ -165,8 +165,7 @@ class VisualHull:
         values = self.values.copy()
         for function in free:
             values[near] = np.maximum(values[near], function(points).astype(np.float32))
-        tol = tolerances or HullTolerances()
-        return replace(self, values=_without_specks(values, self.step, tol))
+        return replace(self, values=_without_specks(values, self.step))
 
 
 def visual_hull(
@@ -174,7 +173,6 @@ def visual_hull(
     plane: SupportingPlane | None = None,
     *,
     wrong_share: float = 0.1,
-    tolerances: HullTolerances | None = None,
 ) -> VisualHull:
     """Carve space by the views' silhouettes; unknown pixels do not carve.
 
@@ -184,14 +182,13 @@ def visual_hull(
     plane : space behind it is outside.
     wrong_share : of the views that may deny a point wrongly. Measured: 3 of 18 to 20 views.
     """
-    tol = tolerances or HullTolerances()
     used = [view for view in views if view.has_outline]
     nothing = VisualHull(np.ones((2, 2, 2), np.float32), np.zeros(3), 1.0, 1.0)
     if len(used) < 2:
         return nothing
 
     def values_at(points: Array) -> NDArray[np.float32]:
-        return hull_values(used, points, wrong_share, plane, tol)
+        return hull_values(used, points, wrong_share, plane)
 
     on_grid = partial(_values_on_grid, values_at, max(1, MAX_VALUES // len(used)))
     center = _meeting_point(used)
@@ -205,9 +202,9 @@ def visual_hull(
         if not len(near):
             return nothing
         low, high = low + (near.min(axis=0) - 1) * step, low + (near.max(axis=0) + 1) * step
-    fine = max(tol.step_px * gsd, float(np.prod(high - low) / MAX_CELLS) ** (1 / 3))
+    fine = max(TOL.step_px * gsd, float(np.prod(high - low) / MAX_CELLS) ** (1 / 3))
     low, high = low - 3 * fine, high + 3 * fine
-    values = _cleaned(_refined(on_grid, low, high, fine), fine, tol)
+    values = _cleaned(_refined(on_grid, low, high, fine), fine)
     return VisualHull(values, low, fine, gsd)
 
 
@@ -229,7 +226,6 @@ def hull_values(
     points: Floats,
     wrong_share: float,
     plane: SupportingPlane | None,
-    tol: HullTolerances,
 ) -> NDArray[np.float32]:
     """Signed distance ``(N,)`` to the hull's cones at points ``(N, 3)``, negative inside."""
     of_views = np.empty((len(views), len(points)), np.float32)
@@ -244,11 +240,11 @@ def hull_values(
     # If few views see a point, fewer may be wrong.
     chosen = (wrong_share * num_seen + 0.5).astype(np.int64)
     values = largest[chosen, np.arange(len(points))]
-    values = np.where(num_seen < max(2, tol.min_seen_share * len(views)), OUTSIDE, values)
+    values = np.where(num_seen < max(2, TOL.min_seen_share * len(views)), OUTSIDE, values)
     if plane is not None:
         # Deeper than the plane: a thin plate on it must not be thinner than a coarse mesh's edges.
         z = np.median([view.gsd(points) for view in views], axis=0)
-        floor = -plane.height(points) - 3 * HullTolerances.step_px * z
+        floor = -plane.height(points) - 3 * TOL.step_px * z
         values = np.maximum(values, floor).astype(np.float32)
     return values
 
@@ -305,25 +301,23 @@ def _refined(
     return on_grid(low, high, step, where=fine_near, values=values)
 
 
-def _cleaned(values: NDArray[np.float32], step: float, tol: HullTolerances) -> NDArray[np.float32]:
+def _cleaned(values: NDArray[np.float32], step: float) -> NDArray[np.float32]:
     """Smoothed, closed at the grid's border, without pieces too small for objects."""
     limit = np.float32(4 * step)
     values = np.clip(values, -limit, limit)
     for axis in range(3):
         border = np.moveaxis(values, axis, 0)
         border[0], border[-1] = limit, limit
-    return _without_specks(ndimage.gaussian_filter(values, 0.7), step, tol)
+    return _without_specks(ndimage.gaussian_filter(values, 0.7), step)
 
 
-def _without_specks(
-    values: NDArray[np.float32], step: float, tol: HullTolerances
-) -> NDArray[np.float32]:
+def _without_specks(values: NDArray[np.float32], step: float) -> NDArray[np.float32]:
     """Pieces too small for objects filled with outside, in place."""
     labels, num = ndimage.label(values < 0)
     if num > 1:
         size = np.bincount(labels.ravel())
         size[0] = 0
-        small = size < max(30, tol.min_piece_share * size.max())
+        small = size < max(30, TOL.min_piece_share * size.max())
         small[0] = False
         values[small[labels]] = np.float32(4 * step)
     return values

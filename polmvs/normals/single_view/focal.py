@@ -53,6 +53,9 @@ class FocalTolerances:
     max_log_sigma: float = 0.2
 
 
+TOL = FocalTolerances()
+
+
 @dataclass(frozen=True, kw_only=True)
 class FocalEstimate:
     """Focal length of one view of a plane.
@@ -122,7 +125,6 @@ def estimate_focal(
     *,
     light: Light,
     focal_range_px: tuple[float, float],
-    tolerances: FocalTolerances = FocalTolerances(),
 ) -> FocalEstimate:
     """Focal length at which one normal best explains the phase angles of a plane.
 
@@ -134,13 +136,12 @@ def estimate_focal(
     sigma : (N,), standard deviation of the phase, rad.
     light : dominant kind of light.
     focal_range_px : shortest and longest focal length to try, px.
-    tolerances : of this step.
     """
     shortest, longest = focal_range_px
     if not 0 < shortest < longest:
         raise ValueError(f"{focal_range_px=} but expected 0 < shortest < longest.")
     view = _pick(angle_model, parameters, offsets_px, sigma, light)
-    focals = np.geomspace(shortest, longest, tolerances.num_focals)
+    focals = np.geomspace(shortest, longest, TOL.num_focals)
     planes = [view.plane(float(focal)) for focal in focals]
     errors = [view.errors(f, p.normal) for f, p in zip(focals, planes, strict=True)]
     scale = CAUCHY_SCALE * min(residual_scale(error) for error in errors)
@@ -148,14 +149,12 @@ def estimate_focal(
     inner = min(max(best, 1), len(focals) - 2)
     focal = _refine(view, focals[inner - 1], focals[inner + 1], scale)
     plane = view.plane(focal)
-    sigma_log = _log_sigma(view, focal, plane.normal, scale, tolerances=tolerances)
-    interior = (
-        focals[0] * (1 + tolerances.log_step) < focal < focals[-1] / (1 + tolerances.log_step)
-    )
+    sigma_log = _log_sigma(view, focal, plane.normal, scale)
+    interior = focals[0] * (1 + TOL.log_step) < focal < focals[-1] / (1 + TOL.log_step)
     return FocalEstimate(
         focal_px=focal,
         sigma_px=focal * sigma_log,
-        observable=bool(interior and plane.valid and sigma_log < tolerances.max_log_sigma),
+        observable=bool(interior and plane.valid and sigma_log < TOL.max_log_sigma),
         plane=plane,
         scan_focal_px=focals,
         scan_rmse_deg=np.array([p.rmse_deg for p in planes]),
@@ -199,17 +198,15 @@ def _refine(view: _View, shortest: float, longest: float, scale: float) -> float
     return float(np.exp(found.x))
 
 
-def _log_sigma(
-    view: _View, focal: float, normal: Array, scale: float, *, tolerances: FocalTolerances
-) -> float:
+def _log_sigma(view: _View, focal: float, normal: Array, scale: float) -> float:
     """Deviation of the logarithm of the focal length, the normal being free as well.
 
     Infinite where the equations are as flat as rounding makes them.
     """
-    step = float(np.exp(tolerances.log_step))
+    step = float(np.exp(TOL.log_step))
     error = view.errors(focal, normal)
     slope = (view.errors(focal * step, normal) - view.errors(focal / step, normal)) / (
-        2 * tolerances.log_step
+        2 * TOL.log_step
     )
     samples = stack_samples(view.angle_model, *view.phases(focal))
     on_normal = tangents(normal) @ error_gradients(normal, samples) * np.sqrt(samples[4])

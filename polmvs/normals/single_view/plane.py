@@ -59,6 +59,9 @@ class PlaneTolerances:
     max_step: float = 0.3
 
 
+TOL = PlaneTolerances()
+
+
 @dataclass(frozen=True, kw_only=True)
 class PlaneEstimate:
     """Normal of a plane seen in one view.
@@ -101,7 +104,6 @@ def plane_normal(
     *,
     robust: bool = True,
     initial_normal: Floats | None = None,
-    tolerances: PlaneTolerances = PlaneTolerances(),
 ) -> PlaneEstimate:
     """Common normal of pixels of one view (paper, "Single-view Normal Estimation").
 
@@ -115,7 +117,6 @@ def plane_normal(
     robust : maximum likelihood with a Cauchy loss, whose scale comes from the residuals; else the
         paper's eigenvector with equal weights.
     initial_normal : (3,), start of the robust estimator; None: the paper's eigenvector.
-    tolerances : of this step.
 
     Returns
     -------
@@ -128,18 +129,18 @@ def plane_normal(
         return PlaneEstimate(normal=np.full(3, np.nan), valid=False, num_pixels=num)
     if not robust:
         normal = _facing(_eigenvector(angle_model, samples), samples)
-        return _describe(normal, samples, None, tolerances)
-    coarse = np.ascontiguousarray(samples[:, :: max(1, num // tolerances.some_pixels)])
+        return _describe(normal, samples, None)
+    coarse = np.ascontiguousarray(samples[:, :: max(1, num // TOL.some_pixels)])
     normal = _eigenvector(angle_model, coarse)
     if initial_normal is not None:
         normal = np.array(initial_normal, np.float64)
     scale = CAUCHY_SCALE
-    for loss_scale in annealed_scales(tolerances.coarse_rounds):
+    for loss_scale in annealed_scales(TOL.coarse_rounds):
         scale = residual_scale(phase_errors(normal, coarse) * np.sqrt(coarse[4])) * loss_scale
-        normal = _improve(normal, normal_equations(normal, coarse, scale), tolerances)
-    for _ in range(tolerances.fine_rounds):
-        normal = _improve(normal, normal_equations(normal, samples, scale), tolerances)
-    return _describe(_facing(normal, samples), samples, scale, tolerances)
+        normal = _improve(normal, normal_equations(normal, coarse, scale))
+    for _ in range(TOL.fine_rounds):
+        normal = _improve(normal, normal_equations(normal, samples, scale))
+    return _describe(_facing(normal, samples), samples, scale)
 
 
 def phase_residuals(angle_model: AngleModel, normal: Floats, axial: Floats, rays: Floats) -> Floats:
@@ -179,13 +180,13 @@ def residual_scale(normalized_errors: Floats) -> float:
     return max(robust_deviation(normalized_errors), EXACT)
 
 
-def _improve(normal: Array, equations: NormalEquations, tolerances: PlaneTolerances) -> Array:
+def _improve(normal: Array, equations: NormalEquations) -> Array:
     """Gauss-Newton step on the sphere, none along a direction of which nothing is known."""
     basis = tangents(normal)
     matrix = basis @ equations.matrix @ basis.T
     gradient = basis @ equations.scores.sum(axis=0)
-    step = -np.linalg.pinv(matrix, rcond=tolerances.min_conditioning**2, hermitian=True) @ gradient
-    step *= min(1.0, tolerances.max_step / max(float(np.linalg.norm(step)), TINY))
+    step = -np.linalg.pinv(matrix, rcond=TOL.min_conditioning**2, hermitian=True) @ gradient
+    step *= min(1.0, TOL.max_step / max(float(np.linalg.norm(step)), TINY))
     moved = normal + step @ basis
     return np.asarray(moved / np.linalg.norm(moved))
 
@@ -203,24 +204,22 @@ def _facing(normal: Array, samples: Floats) -> Array:
     return -normal if float(np.array([x, y, 1.0]) @ normal) > 0 else normal
 
 
-def _describe(
-    normal: Array, samples: Floats, scale: float | None, tolerances: PlaneTolerances
-) -> PlaneEstimate:
+def _describe(normal: Array, samples: Floats, scale: float | None) -> PlaneEstimate:
     """Quality of a normal on the pixels that it was made from."""
     num = samples.shape[1]
-    run_length = min(CHUNK, max(1, num // tolerances.num_runs))
+    run_length = min(CHUNK, max(1, num // TOL.num_runs))
     equations = normal_equations(normal, samples, scale, run_length=run_length)
     basis = tangents(normal)
     eigenvalues, axes = np.linalg.eigh(basis @ equations.matrix @ basis.T)
     conditioning = float(np.sqrt(max(eigenvalues[0], 0) / max(eigenvalues[1], TINY)))
-    valid = conditioning >= tolerances.min_conditioning
+    valid = conditioning >= TOL.min_conditioning
     covariance, sigma = np.full((3, 3), np.nan), np.inf
     if valid:
         across = axes.T @ basis
         in_plane = _covariance(equations, across / eigenvalues[:, None])
         covariance = across.T @ in_plane @ across
         sigma = float(np.sqrt(np.linalg.eigvalsh(in_plane)[-1]))
-    step = max(1, num // tolerances.some_pixels)
+    step = max(1, num // TOL.some_pixels)
     some = np.abs(equations.errors[::step])
     normalized = some * np.sqrt(samples[4, ::step])
     limit = BEYOND_CHANCE * residual_scale(normalized)

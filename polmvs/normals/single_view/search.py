@@ -62,6 +62,9 @@ class PlaneSearchTolerances:
     min_angle_deg: float = 5.0
 
 
+TOL = PlaneSearchTolerances()
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FoundPlane:
     """One of the planes of a view.
@@ -89,18 +92,17 @@ class _Blocks:
     axial: Floats
     rays: Floats
     sigma: Floats
-    tolerances: PlaneSearchTolerances
 
     @cached_property
     def limit(self) -> Array:
         limit = np.zeros(self.known.shape)
-        limit[self.known] = np.hypot(np.radians(self.tolerances.max_residual_deg), 3 * self.sigma)
+        limit[self.known] = np.hypot(np.radians(TOL.max_residual_deg), 3 * self.sigma)
         return limit
 
     @cached_property
     def min_blocks(self) -> int:
-        share = int(self.tolerances.min_share * np.count_nonzero(self.known))
-        return max(share, self.tolerances.coherence_blocks**2)
+        share = int(TOL.min_share * np.count_nonzero(self.known))
+        return max(share, TOL.coherence_blocks**2)
 
     def residuals(self, normal: Floats) -> Floats:
         """Size of the phase residual (H', W'), infinite where nothing is known."""
@@ -130,7 +132,6 @@ def find_planes(
     mask: Mask,
     *,
     seed: int = 0,
-    tolerances: PlaneSearchTolerances = PlaneSearchTolerances(),
 ) -> list[FoundPlane]:
     """Find the planes of a view, the largest support first.
 
@@ -142,7 +143,6 @@ def find_planes(
     sigma : (H, W), standard deviation of the phase, rad.
     mask : (H, W) bool, pixels to explain.
     seed : of the random pairs.
-    tolerances : of this step.
 
     Returns
     -------
@@ -150,12 +150,12 @@ def find_planes(
     """
     if axial.shape != (2, *mask.shape) or rays.shape != (3, *mask.shape):
         raise ValueError(f"{axial.shape=}, {rays.shape=}, {mask.shape=}.")
-    blocks = _average(angle_model, axial, rays, sigma, mask, tolerances)
+    blocks = _average(angle_model, axial, rays, sigma, mask)
     rng = np.random.default_rng(seed)
     left = blocks.known.copy()
     normals: list[Array] = []
-    apart = np.cos(np.radians(tolerances.min_angle_deg))
-    while len(normals) < tolerances.max_planes and np.count_nonzero(left) >= blocks.min_blocks:
+    apart = np.cos(np.radians(TOL.min_angle_deg))
+    while len(normals) < TOL.max_planes and np.count_nonzero(left) >= blocks.min_blocks:
         normal, support = _best_plane(blocks, left, rng)
         if np.count_nonzero(support) < blocks.min_blocks:
             break
@@ -181,7 +181,6 @@ def _average(
     rays: Floats,
     sigma: Floats,
     mask: Mask,
-    tolerances: PlaneSearchTolerances,
 ) -> _Blocks:
     """Average a phase map over blocks, weighted by precision; half a block has to be known."""
     length = np.hypot(axial[0], axial[1])
@@ -195,8 +194,8 @@ def _average(
     means = np.stack([_block_sums(weight * u)[known] for u in unit]) / total
     mean_rays = np.stack([_block_sums(np.where(usable, r, 0))[known] for r in rays])
     mean_rays /= np.sqrt((mean_rays * mean_rays).sum(axis=0))
-    deviations = np.sqrt(1 / total + tolerances.model_sigma**2)
-    return _Blocks(angle_model, known, means, mean_rays, deviations, tolerances)
+    deviations = np.sqrt(1 / total + TOL.model_sigma**2)
+    return _Blocks(angle_model, known, means, mean_rays, deviations)
 
 
 def _block_sums(image: NDArray[Any]) -> Array:
@@ -224,16 +223,15 @@ def _best_plane(blocks: _Blocks, left: Mask, rng: np.random.Generator) -> tuple[
 
 def _hypotheses(blocks: _Blocks, left: Mask, rng: np.random.Generator) -> list[Array]:
     """Normals of pairs of rows near each other, those first that most blocks agree with."""
-    tolerances = blocks.tolerances
     rows = np.full((*left.shape, 3), np.nan)
     rows[blocks.known] = rows_from_axial(
         blocks.angle_model, blocks.axial[0], blocks.axial[1], blocks.rays.T
     )
     height, width = left.shape
     where = np.argwhere(left)
-    first = where[rng.integers(len(where), size=tolerances.num_hypotheses)]
+    first = where[rng.integers(len(where), size=TOL.num_hypotheses)]
     # Up to the side of the least plane there is.
-    reach = np.geomspace(4, np.sqrt(blocks.min_blocks), tolerances.num_hypotheses)[:, None]
+    reach = np.geomspace(4, np.sqrt(blocks.min_blocks), TOL.num_hypotheses)[:, None]
     second = first + np.rint(rng.uniform(-1, 1, first.shape) * reach).astype(np.int64)
     second = np.clip(second, 0, [height - 1, width - 1])
     normals = np.cross(rows[tuple(first.T)], rows[tuple(second.T)])
@@ -245,22 +243,21 @@ def _hypotheses(blocks: _Blocks, left: Mask, rng: np.random.Generator) -> list[A
     samples = stack_samples(
         blocks.angle_model, blocks.axial[:, some], blocks.rays[:, some], blocks.sigma[some]
     )
-    step = max(1, samples.shape[1] // tolerances.num_scored)
+    step = max(1, samples.shape[1] // TOL.num_scored)
     limits = blocks.limit[left][::step]
     scores = [
         np.count_nonzero(np.abs(phase_errors(normal, samples[:, ::step])) < limits)
         for normal in normals
     ]
-    return list(normals[np.argsort(scores)[::-1][: tolerances.num_refined]])
+    return list(normals[np.argsort(scores)[::-1][: TOL.num_refined]])
 
 
 def _coherent(blocks: _Blocks, agree: Mask, left: Mask) -> Mask:
     """Blocks left in whose neighbourhood most agree, in areas of half a plane or more."""
-    tolerances = blocks.tolerances
-    window = (tolerances.coherence_blocks, tolerances.coherence_blocks)
+    window = (TOL.coherence_blocks, TOL.coherence_blocks)
     agreeing = cv2.blur((agree & left).astype(np.float32), window)
     present = cv2.blur(left.astype(np.float32), window)
-    inside = left & (agreeing > tolerances.coherent_share * present)
+    inside = left & (agreeing > TOL.coherent_share * present)
     num, labels, stats, _ = cv2.connectedComponentsWithStats(
         inside.astype(np.uint8), connectivity=4
     )
@@ -293,6 +290,6 @@ def _assign(blocks: _Blocks, normals: Sequence[Array]) -> NDArray[np.int64]:
 
 def _mean_where(blocks: _Blocks, image: Floats) -> Floats:
     """Mean over the known blocks of a window."""
-    known, window = blocks.known, (blocks.tolerances.coherence_blocks,) * 2
+    known, window = blocks.known, (TOL.coherence_blocks,) * 2
     total = cv2.blur(np.where(known, image, 0).astype(np.float32), window)
     return np.asarray(total / np.maximum(cv2.blur(known.astype(np.float32), window), 1e-6))
