@@ -51,9 +51,9 @@ _MEANINGS = {
     "normal error": "Angle between the cloud's normals and the true ones.",
     "outliers": "Share of the points far from every surface of the scene.",
     # trust
-    "phase residual, median, deg": "Angle between measured phases and those that the surface "
-    "predicts.",
-    "phase residual, median, sigma": "The same in stated standard deviations of the phases.",
+    "phase residual beyond noise, median, deg": "Angle between measured phases and those that the "
+    "surface predicts, without the part that noise explains.",
+    "phase residual, median, sigma": "The whole angle in stated standard deviations of the phases.",
     "views that agree": "Of all views that see a point, the share that agree with its position "
     "and normal.",
     "points within the silhouettes": "Share of the points that are inside the outline of the part "

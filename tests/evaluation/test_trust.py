@@ -167,6 +167,10 @@ def test_a_right_result_says_why_it_is_to_be_trusted():
     )
 
 
+def test_noisy_phases_of_weak_polarization_are_no_contradiction():
+    assert replace(RIGHT, residual_deg=6.0, residual_sigmas=0.67).judged().is_trusted
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -178,6 +182,7 @@ def test_a_right_result_says_why_it_is_to_be_trusted():
         ({"soundness": Soundness(layered=0.0, overlapping=0.1)}, "intersects itself.* 10 "),
         ({"left_out": 5}, "a pose or inconsistent, %: 41.7 "),
         ({"num_views": 3}, "3 views leave none to check"),
+        ({"residual_deg": 6.0, "residual_sigmas": 2.0}, "beyond noise, median, deg: 5.65 "),
         ({"complaints": ("the pose of 7.png is off.",)}, r"the pose of 7.png is off\.$"),
         ({"agreement": 0.4}, "agree with a point they see, %: 40 "),
     ],
