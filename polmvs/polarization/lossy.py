@@ -143,14 +143,15 @@ def _blocks(raw: NDArray[Any]) -> NDArray[np.float32]:
 
 def _comb_step(values: NDArray[np.float32]) -> int | None:
     """The largest step that magnitudes, in ascending order, are multiples of; None if of none."""
-    best = None
-    for step in range(MIN_STEP, MAX_STEP + 1):
-        # Half a step too: a multiple of the true step leaves the odd ones between.
-        first = np.searchsorted(values, max(MIN_MAGNITUDE, 0.3 * step), side="right")
-        if len(values) - first < MIN_NONZERO:
-            break
-        turns = values[first:] / np.float32(step)
-        comb = np.cos(np.float32(2 * np.pi) * (turns - np.rint(turns))).mean()
-        if comb > MIN_COMB:
-            best = step
-    return best
+    steps = np.arange(MIN_STEP, MAX_STEP + 1, dtype=np.float32)
+    # Half a step too: a multiple of the true step leaves the odd ones between.
+    first = np.searchsorted(values, np.maximum(MIN_MAGNITUDE, 0.3 * steps), side="right")
+    enough = np.flatnonzero(len(values) - first >= MIN_NONZERO)
+    if not len(enough):
+        return None
+    values, steps, first = values[first[0] :], steps[enough], first[enough] - first[0]
+    turns = values / steps[:, None]
+    waves = np.cos(np.float32(2 * np.pi) * (turns - np.rint(turns)))
+    sums = np.array([own[start:].sum() for own, start in zip(waves, first, strict=True)])
+    combs = np.flatnonzero(sums / (len(values) - first) > MIN_COMB)
+    return int(steps[combs[-1]]) if len(combs) else None
