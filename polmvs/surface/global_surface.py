@@ -23,7 +23,7 @@ from polmvs.io.clouds import Mesh
 from polmvs.neighbors import voxel_representatives
 from polmvs.normals.tracks import evenly_chosen
 from polmvs.parallel import OnProgress, no_progress
-from polmvs.polarization.kinds import AngleModel, Light
+from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS, Seeds, View
 from polmvs.surface.cavities import Cavity, find_cavities, surface_faces
@@ -125,6 +125,7 @@ class GlobalSurface:
     contradicted : (F,) bool, faces that phases contradict: without points and depths.
     tilt_share : as in :class:`polmvs.surface.observations.Looking`.
     left_out : (K,) bool, inconsistent views; the surface is made without them.
+    levels : the hull, and the mesh after each level of refinement.
     """
 
     mesh: TriangleMesh
@@ -140,6 +141,7 @@ class GlobalSurface:
     contradicted: Mask
     tilt_share: float
     left_out: Mask
+    levels: tuple[TriangleMesh, ...] = ()
 
     def shown(self) -> GlobalSurface:
         """The surface without the inferred faces."""
@@ -170,33 +172,27 @@ def num_surface_steps(num_views: int) -> int:
 
 
 def reconstruct_surface(
-    angle_model: AngleModel,
+    looking: Looking,
     views: Sequence[SurfaceView],
     seeds: Seeds,
     surroundings: Floats,
     *,
-    light: Light | None = None,
-    tilt_aware: bool = True,
     min_views: int = 2,
     tolerances: SolverTolerances | None = None,
     on_progress: OnProgress = no_progress,
-    on_mesh: Callable[[TriangleMesh], None] | None = None,
     folder: Path | None = None,
 ) -> GlobalSurface | Undetermined:
     """The surface on which all views agree.
 
     Parameters
     ----------
-    angle_model : of the rows.
+    looking : how the views are observed, at first.
     views : all.
     seeds : points of the surface.
     surroundings : (N, 3), sparse points of the surroundings.
-    light : given by the user; None: inferred for each observation.
-    tilt_aware : as in :class:`polmvs.surface.observations.Looking`.
     min_views : number of views that must support a part.
     tolerances : of the solver.
     on_progress : called with 1 after each step.
-    on_mesh : called at the end with the hull, and with the mesh after each level.
     folder : for temporary results of each view; None: in memory.
     """
     if reason := _no_hull(views):
@@ -209,8 +205,8 @@ def reconstruct_surface(
     given = _Given(
         scene=patch_scene(
             [view.phase_map for view in views],
-            angle_model,
-            tilt_aware=tilt_aware,
+            looking.angle_model,
+            tilt_aware=looking.tilt_aware,
             folder=folder,
         ),
         seeds=seeds,
@@ -223,10 +219,9 @@ def reconstruct_surface(
         hull = hull.carved([group.values for group in steps])
     fit = first_fit(
         views,
-        Looking(angle_model=angle_model, tilt_aware=tilt_aware),
+        looking,
         hull.gsd,
         known=KnownPoints(seeds.points_in_world, seeds.sigma),
-        light=light,
         tolerances=tolerances,
     )
     refined = refine(
@@ -235,10 +230,7 @@ def reconstruct_surface(
         stands_apart=partial(stand_apart, least=MIN_EXPLAINED),
         on_progress=on_progress,
     )
-    _warn_of_inconsistent(angle_model, views, refined)
-    if on_mesh is not None:
-        for mesh in (hull.mesh, *refined.meshes):
-            on_mesh(mesh)
+    _warn_of_inconsistent(looking.angle_model, views, refined)
     if not len(refined.mesh.faces):
         return Undetermined("the surface vanishes under the phases of the views")
     given = replace(given, scene=given.scene.of(~refined.left_out))
@@ -250,7 +242,8 @@ def reconstruct_surface(
     if mesh is not refined.mesh:
         labelled = label(mesh, refined.fit)
     polished = _polished(given, mesh, labelled, refined, [*steps, *cavities])
-    return _supported(given, polished, steps, cavities, refined.left_out)
+    surface = _supported(given, polished, steps, cavities, refined.left_out)
+    return replace(surface, levels=(hull.mesh, *refined.meshes))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -117,7 +117,6 @@ def predict_left_out(
     looking: Looking,
     known: KnownPoints,
     *,
-    light: Light | None = None,
     outside: Mapping[str, Mask] = MappingProxyType({}),
     tolerances: HeldOutTolerances | None = None,
 ) -> Prediction | None:
@@ -129,7 +128,6 @@ def predict_left_out(
     plane : on which the objects stand.
     looking : angle model and the share of the tilt that the whole surface corrects.
     known : points of the surface.
-    light : as of :func:`polmvs.surface.global_surface.reconstruct_surface`.
     outside : pixels (H, W) of each view, by its name, that are not compared: they show what is
         outside the crop box.
 
@@ -150,9 +148,9 @@ def predict_left_out(
         mesh = hull.mesh
         if len(mesh.faces):
             solver = replace(SolverTolerances(), levels=levels)
-            fit = first_fit(used, looking, hull.gsd, known=known, light=light, tolerances=solver)
+            fit = first_fit(used, looking, hull.gsd, known=known, tolerances=solver)
             mesh = refine(mesh, fit).mesh
-        return predict(mesh, others, looking, light=light, outside=outside, width_px=tol.width_px)
+        return predict(mesh, others, looking, outside=outside, width_px=tol.width_px)
 
     found = trial(tol.levels)
     if found.error_deg > tol.doubtful_deg:
@@ -166,7 +164,6 @@ def predict(
     views: Sequence[SurfaceView],
     looking: Looking,
     *,
-    light: Light | None = None,
     outside: Mapping[str, Mask] = MappingProxyType({}),
     width_px: float = HeldOutTolerances.width_px,
 ) -> Prediction:
@@ -193,7 +190,7 @@ def predict(
         either += int((shown | (hit & ~possible)).sum())
         seen = shown[hit]
         own_errors, own_sigmas = _phase_errors(
-            mesh, view, image, looking, rays[hit][seen], face[seen], points[seen], light
+            mesh, view, image, looking, rays[hit][seen], face[seen], points[seen]
         )
         errors.append(own_errors)
         sigmas.append(own_sigmas)
@@ -208,7 +205,7 @@ def predict(
         num_views=len(views),
         num_phases=int(sure.sum()),
         error_deg=float(np.degrees(np.median(error[sure]))) if sure.any() else float("nan"),
-        chance_deg=CHANCE_DEG[0] if light is None else CHANCE_DEG[1],
+        chance_deg=CHANCE_DEG[0] if looking.light is None else CHANCE_DEG[1],
         within=float((error[sure] < 2 * sigma[sure]).mean()) if sure.any() else float("nan"),
         unexplained=float(far[sure].mean()) if sure.any() else float("nan"),
         overlap=common / either if either else float("nan"),
@@ -235,7 +232,6 @@ def _phase_errors(
     rays: Array,
     face: NDArray[np.int64],
     points: Array,
-    light: Light | None,
 ) -> tuple[Array, Array]:
     """Angles about the ray, rad, between phases and normals, and their stated deviations."""
     found = rows_of_both(
@@ -249,8 +245,8 @@ def _phase_errors(
     normals = mesh.face_normals[face]
     sine = np.sqrt(np.maximum(1 - dots(rays, normals) ** 2, 1e-12))
     turns = np.arcsin(np.clip(np.abs(np.einsum("lki,ki->lk", found.rows, normals)) / sine, 0, 1))
-    if light is not None:
-        turns = turns[[0 if light is Light.SPECULAR else 1]]
+    if looking.light is not None:
+        turns = turns[[0 if looking.light is Light.SPECULAR else 1]]
     nearest = turns.argmin(axis=0)
     sigma = np.sqrt(found.turn_variance[nearest, np.arange(len(nearest))])
     known = np.isfinite(sigma) & (sine > MIN_SINE)

@@ -19,7 +19,7 @@ from polmvs.camera import sample_image
 from polmvs.config import default_num_workers
 from polmvs.geometry import dots, unit_or_zero
 from polmvs.polarization.angle_models import correct_parameters, rows_from_axial, tilt_turn
-from polmvs.polarization.kinds import AngleModel
+from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.light_mixture import phase_variance
 from polmvs.polarization.phase_map import smoothed_polarization
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
@@ -242,12 +242,21 @@ class Looking:
     angle_model : of the rows.
     tilt_aware, tilt_share : as in :func:`rows_of_both`.
     min_cosine : between normal and direction to the camera; more oblique views are ignored.
+    light : of all observations, given by the user; None: inferred for each.
     """
 
     angle_model: AngleModel
     tilt_aware: bool = True
     tilt_share: float = 0.0
     min_cosine: float = 0.25
+    light: Light | None = None
+
+    @property
+    def light_weights(self) -> tuple[float, float]:
+        """Prior shares of specular and of diffuse light."""
+        if self.light is None:
+            return 0.5, 0.5
+        return (1.0, 0.0) if self.light is Light.SPECULAR else (0.0, 1.0)
 
 
 def observe(

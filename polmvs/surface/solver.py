@@ -27,7 +27,6 @@ from polmvs.config import default_num_workers
 from polmvs.fitting import CAUCHY_SCALE, robust_deviation
 from polmvs.geometry import dots, points_on_rays
 from polmvs.parallel import OnProgress, no_progress
-from polmvs.polarization.kinds import Light
 from polmvs.surface.creases import CreaseTolerances, crease_vertices
 from polmvs.surface.labels import (
     LabelTolerances,
@@ -181,7 +180,6 @@ class Fit:
     scales : of the views' rows.
     gsd : ground sampling distance at the surface, world units.
     known : points of the surface.
-    light : of all observations; None: inferred for each.
     tol : tolerances.
     """
 
@@ -191,15 +189,7 @@ class Fit:
     scales: Scales
     gsd: float
     known: KnownPoints | None
-    light: Light | None
     tol: SolverTolerances
-
-    @property
-    def light_weights(self) -> tuple[float, float]:
-        """Prior shares of specular and of diffuse light."""
-        if self.light is None:
-            return 0.5, 0.5
-        return (1.0, 0.0) if self.light is Light.SPECULAR else (0.0, 1.0)
 
     def face_area_px(self, mesh: TriangleMesh) -> float:
         """Mean area of a mesh's faces, px^2."""
@@ -232,13 +222,12 @@ def first_fit(
     gsd: float,
     *,
     known: KnownPoints | None = None,
-    light: Light | None = None,
     tolerances: SolverTolerances | None = None,
 ) -> Fit:
     """The fit of a first surface; parameters as of :class:`Fit`."""
     tol = tolerances or SolverTolerances()
     rows = np.full((len(views), 2), tol.terms.row_sigma)
-    return Fit(views, [], looking, Scales(rows), gsd, known, light, tol)
+    return Fit(views, [], looking, Scales(rows), gsd, known, tol)
 
 
 @dataclass(frozen=True)
@@ -542,7 +531,7 @@ def _observed(
         normal_sigma=normal_sigma,
         row_sigma=row_sigma,
         pairs=pairs,
-        weights=fit.light_weights,
+        weights=fit.looking.light_weights,
         tolerances=tol,
     )
     variances = observations.variances(mesh.face_normals, row_sigma)
@@ -754,7 +743,7 @@ class Labelled:
         periods = np.array([-np.pi, 0, np.pi])[:, None, None]
         density = np.exp(-0.5 * (turn + periods) ** 2 / variance).sum(axis=0)
         density /= np.sqrt(2 * np.pi * variance)
-        either = np.einsum("l,lk->k", fit.light_weights, density)
+        either = np.einsum("l,lk->k", fit.looking.light_weights, density)
         other = fit.tol.labels.outlier  # share of neither light
         return np.asarray(np.log((1 - other) * np.pi * either + other))
 
@@ -798,7 +787,7 @@ def label(mesh: TriangleMesh, fit: Fit, *, min_cosine: float | None = None) -> L
         normal_sigma=fit.tol.annealing[1],
         row_sigma=row_sigma,
         pairs=pairs,
-        weights=fit.light_weights,
+        weights=fit.looking.light_weights,
         tolerances=fit.tol.labels,
     )
     return Labelled(observations, shares, row_sigma, len(fit.views))

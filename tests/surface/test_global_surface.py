@@ -26,6 +26,7 @@ from polmvs.surface.global_surface import (
     surface_points,
 )
 from polmvs.surface.mesh_geometry import RayScene
+from polmvs.surface.observations import Looking
 from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.solver import Level, SolverTolerances
 from polmvs.surface.surface_quality import (
@@ -37,6 +38,7 @@ from polmvs.surface.surface_view import surface_view
 from polmvs.surface.terms import KnownPoints
 
 PPA = AngleModel.PPA
+LOOKING = Looking(angle_model=PPA)
 NO_SEEDS = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 NOTHING = np.zeros((0, 3))
 GSD = 5 / 150
@@ -60,7 +62,7 @@ def seen_in(maps, *, masks_given=False):
 
 def reconstruct(maps, *, tolerances=QUICK, masks_given=False, **kwargs):
     views = seen_in(maps, masks_given=masks_given)
-    return reconstruct_surface(PPA, views, NO_SEEDS, NOTHING, tolerances=tolerances, **kwargs)
+    return reconstruct_surface(LOOKING, views, NO_SEEDS, NOTHING, tolerances=tolerances, **kwargs)
 
 
 @pytest.fixture(scope="module")
@@ -298,8 +300,8 @@ def test_progress_is_within_what_is_announced(maps):
 
 def test_the_surface_is_shown_as_it_refines(maps):
     """First the hull, then the mesh after each level; the last is near the result."""
-    shown = []
-    surface = reconstruct(maps, on_mesh=shown.append)
+    surface = reconstruct(maps)
+    shown = surface.levels
     assert len(shown) == 1 + len(QUICK.levels)
     sizes = [float(np.ptp(mesh.vertices, axis=0).max()) for mesh in shown]
     assert sizes[-1] == pytest.approx(float(np.ptp(surface.mesh.vertices, axis=0).max()), rel=0.05)

@@ -44,8 +44,8 @@ def views() -> list[SurfaceView]:
     return views_of()
 
 
-def predicted(views: list[SurfaceView], **kwargs) -> Prediction:
-    found = predict_left_out(views, None, LOOKING, NOTHING, tolerances=FINE, **kwargs)
+def predicted(views: list[SurfaceView], looking: Looking = LOOKING, **kwargs) -> Prediction:
+    found = predict_left_out(views, None, looking, NOTHING, tolerances=FINE, **kwargs)
     assert found is not None
     return found
 
@@ -77,8 +77,8 @@ def test_turned_poses_are_not(views) -> None:
 
 
 def test_light_that_is_stated_wrongly_leaves_nothing_right(views) -> None:
-    right = predicted(views, light=Light.SPECULAR)
-    wrong = predicted(views, light=Light.DIFFUSE)
+    right = predicted(views, replace(LOOKING, light=Light.SPECULAR))
+    wrong = predicted(views, replace(LOOKING, light=Light.DIFFUSE))
     assert right.chance_deg == wrong.chance_deg == 45
     assert right.error_deg < 2.5
     assert wrong.error_deg > 20

@@ -14,6 +14,7 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
 from polmvs.surface.global_surface import Undetermined, reconstruct_surface
 from polmvs.surface.integration import integrate
+from polmvs.surface.observations import Looking
 from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.surface_view import surface_view
 from polmvs.synthetic.captures import render_view, ring_of_views
@@ -109,7 +110,8 @@ def surfaces():
     def at(scale):
         maps = noisy_maps_around(scale)
         views = [surface_view(one, find_silhouette(one, mask_given=False)) for one in maps]
-        found = reconstruct_surface(AngleModel.PPA, views, none, np.zeros((0, 3)))
+        looking = Looking(angle_model=AngleModel.PPA)
+        found = reconstruct_surface(looking, views, none, np.zeros((0, 3)))
         assert not isinstance(found, Undetermined)
         return found
 

@@ -62,7 +62,8 @@ from polmvs.surface.global_surface import (
 )
 from polmvs.surface.integration import integrate, plan_rounds
 from polmvs.surface.kept_depth import kept_cloud
-from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
+from polmvs.surface.mesh_geometry import RayScene
+from polmvs.surface.observations import Looking
 from polmvs.surface.surroundings import SparseSurroundings, sparse_surroundings, stereo_surroundings
 
 logger = logging.getLogger(__name__)
@@ -292,18 +293,18 @@ def _global_surface(
     """
     maps, model, options = given.maps, given.model, given.options
     fusion, stride_px = options.fusion, options.propagation.stride_px
-    levels: list[TriangleMesh] = []
     kept.mkdir()
     surface = reconstruct_surface(
-        model.formula,
+        Looking(
+            angle_model=model.formula,
+            tilt_aware=given.tilt_aware,
+            light=options.region.light,
+        ),
         open_surface_views(folder, maps, folder=kept),
         given.seeds,
         sparse_surroundings(tracks, maps).points,
-        light=options.region.light,
-        tilt_aware=given.tilt_aware,
         min_views=fusion.min_views,
         on_progress=given.on_progress,
-        on_mesh=levels.append,
         folder=kept,
     )
     if isinstance(surface, Undetermined):
@@ -329,7 +330,7 @@ def _global_surface(
     believed = list(compress(maps, ~surface.left_out))
     points = surface_points(surface, believed, spacing or FINEST_SPACING_PX * surface.gsd)
     write_mesh(views / SURFACE_MESH, supported_mesh(surface))
-    for number, mesh in enumerate(levels):
+    for number, mesh in enumerate(surface.levels):
         faces = mesh.faces.astype(np.int32)
         whole = Mesh(vertices=mesh.vertices, normals=mesh.vertex_normals, triangles=faces)
         write_mesh(views / SURFACE_LEVELS.format(number=number), whole)

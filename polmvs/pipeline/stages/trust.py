@@ -105,14 +105,18 @@ def _contradicted(
     maps = [one for one in maps if one.view.name not in made.left_out]
     maps = [maps[index] for index in evenly_spread(len(maps), MAX_TRIED_VIEWS)]
     known = load_seeds(folder, model)
-    outside, light = open_outside(folder, model), options.region.light
-    tilt_aware = options.normals.tilt_aware_weights
-    looking = Looking(angle_model=model, tilt_aware=tilt_aware, tilt_share=made.tilt_share)
+    outside = open_outside(folder, model)
+    looking = Looking(
+        angle_model=model,
+        tilt_aware=options.normals.tilt_aware_weights,
+        tilt_share=made.tilt_share,
+        light=options.region.light,
+    )
     seen = open_surface_views(folder, maps)
     mesh = TriangleMesh.of(read_mesh(views / SURFACE_MESH))
     kind = cloud.scalars["kind"][cKDTree(cloud.points).query(mesh.centers)[1]]
     shown = np.flatnonzero(kind == PointKind.SURFACE)
-    wrong_camera = _camera_complaint(mesh, shown, seen, looking, light)
+    wrong_camera = _camera_complaint(mesh, shown, seen, looking)
     return replace(
         trust,
         complaints=(*trust.complaints, *(() if wrong_camera is None else (wrong_camera,))),
@@ -121,10 +125,9 @@ def _contradicted(
             plane,
             looking,
             KnownPoints(known.points_in_world, known.sigma),
-            light=light,
             outside=outside,
         ),
-        fitted=predict(mesh, seen, looking, light=light, outside=outside),
+        fitted=predict(mesh, seen, looking, outside=outside),
         # Of the last closed mesh: the surface has holes where nothing is known.
         soundness=find_soundness(
             TriangleMesh.of(read_mesh([views / SURFACE_MESH, *surface_levels(views)][-1])),
@@ -139,7 +142,6 @@ def _camera_complaint(
     shown: NDArray[np.int64],
     views: Sequence[SurfaceView],
     looking: Looking,
-    light: Light | None,
 ) -> str | None:
     """Message about the given camera if it does not fit the phases of the surface.
 
@@ -158,10 +160,10 @@ def _camera_complaint(
     found = observe(some, scene, views, images, looking)
     found = found.only(~reflects_itself(some, scene, found))
     residuals = np.abs(found.residuals(some.face_normals))
-    if light is None:
+    if looking.light is None:
         kind = residuals.argmin(axis=0)
     else:
-        kind = np.full(len(found.face), SPECULAR if light is Light.SPECULAR else DIFFUSE)
+        kind = np.full(len(found.face), SPECULAR if looking.light is Light.SPECULAR else DIFFUSE)
     index = np.arange(len(kind))
     sigma = np.array([TermTolerances().row_sigma])
     fit = fit_camera(
