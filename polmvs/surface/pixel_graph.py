@@ -120,7 +120,7 @@ def bending_modes(xy: Image) -> Array:
     """
     low, high = xy.min(axis=0), xy.max(axis=0)
     x, y = (2 * (xy - low) / np.maximum(high - low, 1e-9) - 1).T.astype(np.float64)
-    legendre = [[np.ones_like(t), 1.5 * t**2 - 0.5] for t in (x, y)]
+    legendre = [[np.ones_like(t), t, 1.5 * t**2 - 0.5] for t in (x, y)]
     degrees = [(i, j) for i in range(3) for j in range(3) if 1 <= i + j <= 2]
     return np.stack([legendre[0][i] * legendre[1][j] for i, j in degrees], axis=-1)
 

@@ -12,7 +12,6 @@ from polmvs.evaluation.comparison import Consistency, best_fitting_model
 from polmvs.evaluation.metrics import AngleStats
 from polmvs.normals import light as light_module
 from polmvs.normals.light import (
-    LightTolerances,
     _place_pixels,
     diffuse_pixels,
     find_diffuse_parts,
@@ -116,9 +115,8 @@ def test_what_one_view_says_of_a_thing_yields_to_the_others_that_show_it():
         of_balls.append(own)
     votes[5][of_balls[5]] = np.nan  # which says nothing itself
     surroundings = np.array([[x, y, -0.06] for x in (-0.2, 0.2) for y in (-0.2, 0.2)])
-    tolerances = LightTolerances()
-    slots = light_module._place_pixels(maps, surroundings, tolerances)
-    pooled = light_module._pooled_votes(slots, votes, maps, tolerances)
+    slots = light_module._place_pixels(maps, surroundings)
+    pooled = light_module._pooled_votes(slots, votes, maps)
     for found, own in zip(pooled, of_balls, strict=True):
         assert found[own[0]] > 60
         assert found[own[1]] < -60
@@ -127,10 +125,9 @@ def test_what_one_view_says_of_a_thing_yields_to_the_others_that_show_it():
 def test_pixels_are_tried_from_the_near_to_the_far_side_of_the_hull(board):
     """As many views show the first and the last depth of a pixel, and none more than these."""
     points, _ = board.surface_points(60)
-    tolerances = LightTolerances()
-    slots = _place_pixels(board.maps, points, tolerances)
+    slots = _place_pixels(board.maps, points)
     shown = np.sum([m.shows_surface(m.view.project(slots.points)) for m in board.maps], axis=0)
-    num_tried = tolerances.num_ranges
+    num_tried = light_module.TOL.num_ranges
     per_view = np.bincount(slots.view, minlength=len(board.maps)) // num_tried
     begin = 0
     for num, phase_map in zip(per_view, board.maps, strict=True):
@@ -253,7 +250,7 @@ def test_few_misled_points_do_not_decide_against_all_pixels(light):
         maps = [m.changed(diffuse=np.zeros_like(m.diffuse)) for m in maps]
     points = rng.uniform(-1.0, 1.0, (300, 3))
     tracks = tracks_at(Scene(None, views, [], maps), points)
-    votes, _ = light_module.track_votes(tracks, maps, LightTolerances(), max_rows=10**6)
+    votes, _ = light_module.track_votes(tracks, maps, max_rows=10**6)
     wrong = votes * (1 if light is Light.SPECULAR else -1)
     misled = np.isin(np.arange(len(points)), np.argsort(wrong)[:5])
     assert wrong[misled].sum() < 10  # of some 25 each that are right

@@ -7,7 +7,6 @@ from analytic_objects import looking_at, phase_map_of, sphere
 
 from polmvs.polarization.region import Region
 from polmvs.surface.silhouettes import (
-    SilhouetteTolerances,
     _outline_shift,
     find_silhouette,
     open_silhouette,
@@ -140,7 +139,7 @@ def test_how_far_a_region_leaks_does_not_move_the_outline(leak):
     intensity = cv2.GaussianBlur(np.where(inside, 0.2, 0.6).astype(np.float32), (0, 0), 0.8)
     leaked = np.zeros_like(inside)
     leaked[:, : 40 + leak] = True
-    shift = _outline_shift(leaked, intensity, 1.0, SilhouetteTolerances())
+    shift = _outline_shift(leaked, intensity, 1.0)
     assert shift[20:40, 40] == pytest.approx(-leak, abs=0.03)
 
 
