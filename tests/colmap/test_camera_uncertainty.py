@@ -9,7 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from polmvs.colmap.camera_uncertainty import (
     CameraTolerances,
+    adjuster_of,
     camera_uncertainty,
+    parameter_covariance,
     pose_uncertainty,
 )
 from polmvs.geometry import align_points
@@ -64,6 +66,35 @@ def test_the_focal_length_errs_as_stated(tmp_path: Path) -> None:
         ratios.append(error / (found.focal * TRUE[0]))
     # Of twelve: the root mean square of a normal distribution's is within 0.6 to 1.4 (3 sigma).
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+def test_a_mode_is_what_an_adjustment_with_another_camera_gives(tmp_path: Path) -> None:
+    """The focal length is one deviation longer, all else follows; without outliers."""
+    t = CameraTolerances(loss_scale_px=20 * NOISE_PX)
+    folder = noisy_model(tmp_path / "a", num_views=6, seed=4)
+    before = pycolmap.Reconstruction(str(folder))
+    adjuster_of(before, t, free=True, free_point=False).solve()
+    before.update_point_3d_errors()
+    before.write_binary(str(folder))
+    camera = next(iter(before.cameras.values()))
+    covariance = parameter_covariance(before, camera, [0], False, t)
+    assert covariance is not None
+    after = pycolmap.Reconstruction(str(folder))
+    longer = next(iter(after.cameras.values()))
+    longer.params = [camera.params[0] + np.sqrt(covariance[0, 0]), *camera.params[1:]]
+    adjuster_of(after, t, free=False, free_point=False).solve()
+    points, moved = (
+        np.array([one.points3D[i].xyz for i in sorted(one.points3D)]) for one in (before, after)
+    )
+    centers, moved_centers = (
+        np.array([one.image(i).projection_center() for i in sorted(one.reg_image_ids())])
+        for one in (before, after)
+    )
+    displacement = align_points(moved_centers, centers) * moved - points
+    found = camera_uncertainty(folder, tolerances=t)
+    assert found is not None
+    mode = found.modes[0] * np.sign((found.modes[0] * displacement).sum())  # its sign is free
+    assert np.linalg.norm(mode - displacement) < 0.03 * np.linalg.norm(displacement)
 
 
 def test_fewer_views_leave_more_open(tmp_path: Path) -> None:
