@@ -103,6 +103,8 @@ def camera_uncertainty(
     steps = np.zeros((len(estimated), len(names)))
     steps[:, estimated] = _principal_steps(covariance)
     linear = _linearized(reconstruction, camera, tolerances)
+    if not np.isfinite(linear.of_params).all():  # a distortion that is not defined at a point
+        return None
     responses = linear.responses(steps, [])
     if not freed:  # it was kept at the centre, which is known as well as sensors are mounted
         sigma = tolerances.principal_point_sigma * camera.width
@@ -273,20 +275,22 @@ def _linearized(
     reconstruction: pycolmap.Reconstruction, camera: pycolmap.Camera, t: CameraTolerances
 ) -> _Linearized:
     """The residuals of a model about its solution, under the adjustment's Cauchy loss."""
-    images, number = registered(reconstruction), {}
-    for index, point_id in enumerate(sorted(reconstruction.points3D)):
-        number[point_id] = index
+    images = registered(reconstruction)
+    number = {point_id: index for index, point_id in enumerate(sorted(reconstruction.points3D))}
     of_params, of_poses, of_points, rotations = [], [], [], []
     for index, image in enumerate(images):
         pose = image.cam_from_world()
         rotation = np.asarray(pose.rotation.matrix(), np.float64)
+        rotations.append(rotation)
         observed = image.get_observation_points2D()
-        points = np.array([reconstruction.points3D[p.point3D_id].xyz for p in observed])
-        seen = pose * points.reshape(-1, 3)
+        places = [reconstruction.points3D[point.point3D_id].xyz for point in observed]
+        seen = pose * np.array(places).reshape(-1, 3)
         shown = np.flatnonzero(seen[:, 2] > 0)
-        seen, xy = seen[shown], np.array([observed[k].xy for k in shown]).reshape(-1, 2)
+        if not len(shown):
+            continue
+        seen, xy = seen[shown], np.array([observed[k].xy for k in shown])
         by_place, by_params = _jacobians(camera, seen)
-        square = ((np.asarray(camera.img_from_cam(seen)).reshape(-1, 2) - xy) ** 2).sum(axis=1)
+        square = ((np.asarray(camera.img_from_cam(seen)) - xy) ** 2).sum(axis=1)
         root = np.sqrt(1 / (1 + square / t.loss_scale_px**2))[:, None, None]
         turns = np.cross(np.eye(3), seen[:, None])  # (K, 3, 3), rows: d seen / d turn about an axis
         by_pose = np.concatenate([by_place @ np.swapaxes(turns, 1, 2), by_place], axis=2)
@@ -294,7 +298,6 @@ def _linearized(
         of_poses.append(_spread(root * by_pose, np.full(len(shown), index), len(images)))
         which = np.array([number[observed[k].point3D_id] for k in shown], np.int64)
         of_points.append(_spread(root * (by_place @ rotation), which, len(number)))
-        rotations.append(rotation)
     return _Linearized(
         np.concatenate(of_params),
         sparse.csr_array(sparse.vstack(of_poses)),
@@ -316,7 +319,7 @@ def _jacobians(camera: pycolmap.Camera, seen: Array) -> tuple[Array, Array]:
     def pixels(seen: Array, params: Array) -> Array:
         other = copy.deepcopy(camera)
         other.params = params.tolist()
-        return np.asarray(other.img_from_cam(seen), np.float64).reshape(-1, 2)
+        return np.asarray(other.img_from_cam(seen), np.float64)
 
     params = np.asarray(camera.params, np.float64)
     by_place, by_params = [], []
