@@ -158,8 +158,7 @@ def try_cameras(model: Path) -> CameraTrial | None:
     an adjustment that does not determine the camera.
     """
     given = read_reconstruction(model)
-    kept = _sampled(given, TOL.num_points)
-    for number in set(given.points3D) - kept:
+    for number in set(given.points3D) - _sampled(given):
         given.delete_point3D(number)
     try:
         return _compared(given)
@@ -168,15 +167,15 @@ def try_cameras(model: Path) -> CameraTrial | None:
         return None
 
 
-def _sampled(given: pycolmap.Reconstruction, num: int) -> set[int]:
-    """Points seen at least twice: the first ``num`` of each image, in one random order of all."""
+def _sampled(given: pycolmap.Reconstruction) -> set[int]:
+    """Points seen at least twice: the first of each image, in one random order of all."""
     points = sorted(number for number, p in given.points3D.items() if p.track.length() > 1)
     order = np.random.default_rng(0).permutation(len(points)).tolist()
     turn = dict(zip(points, order, strict=True))
     kept: set[int] = set()
     for image in registered(given):
         seen = {point.point3D_id for point in image.get_observation_points2D()}
-        kept.update(sorted(seen & turn.keys(), key=turn.__getitem__)[:num])
+        kept.update(sorted(seen & turn.keys(), key=turn.__getitem__)[: TOL.num_points])
     return kept
 
 
@@ -201,13 +200,13 @@ def _compared(given: pycolmap.Reconstruction) -> CameraTrial | None:
     )
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
     bundle.ceres.solver_options.function_tolerance = TOL.max_cost_change
-    free, free_config = bundle_of(
+    last, last_config = bundle_of(
         fitting, ADJUSTMENT.loss_scale_px, free_intrinsics=True, free_principal_point=True
     )
-    free.ceres.solver_options.function_tolerance = TOL.max_cost_change
+    last.ceres.solver_options.function_tolerance = TOL.max_cost_change
     with quiet_colmap():
         pycolmap.create_default_bundle_adjuster(bundle, config, fitting).solve()
-        pycolmap.create_default_bundle_adjuster(free, free_config, fitting).solve()
+        pycolmap.create_default_bundle_adjuster(last, last_config, fitting).solve()
         fitting.update_point_3d_errors()
         camera = next(iter(fitting.cameras.values()))
         estimated = list(range(len(camera.params)))

@@ -25,6 +25,7 @@ from polmvs.evaluation.consistency import (
     phase_residuals_deg,
     within_box,
 )
+from polmvs.fitting import MEDIAN_OF_NORMAL
 from polmvs.io.clouds import Cloud
 from polmvs.normals.tracks import BORDER_MARGIN_PX
 from polmvs.polarization.kinds import AngleModel
@@ -39,7 +40,6 @@ LIGHT_OPTIONS = "`region.light`, `capture.pattern`, `capture.gamma`"
 MIN_CHECKED = 4  # views: three make a surface, and one checks it
 # Least number of phases for the error of a prediction.
 MIN_PHASES = 50
-MEDIAN_SIGMAS = 0.6745  # median of the absolute values of a normal distribution, in deviations
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +195,7 @@ class Trust:
 
         Weak polarization has noisy phases, which do not make a surface wrong.
         """
-        explained = MEDIAN_SIGMAS / max(self.residual_sigmas, MEDIAN_SIGMAS)
+        explained = MEDIAN_OF_NORMAL / max(self.residual_sigmas, MEDIAN_OF_NORMAL)
         return float(self.residual_deg * np.sqrt(1 - explained**2))
 
     def figures(self, ranges: NormalRanges = NormalRanges()) -> tuple[TrustFigure, ...]:

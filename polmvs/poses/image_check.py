@@ -107,9 +107,8 @@ def fit_to_images(views: Sequence[View], matches: ImageMatches) -> ImageFit:
     """Compare cameras with the matches of the images of their names."""
     t = matches.tolerances
     distances = [np.zeros(0)]
-    for first, second in combinations(
-        [views[k] for k in evenly_spread(len(views), t.max_views)], 2
-    ):
+    chosen = [views[k] for k in evenly_spread(len(views), t.max_views)]
+    for first, second in combinations(chosen, 2):
         found = matches.between(first.name, second.name)
         if found is not None:
             distances.append(epipolar_distances(first, second, *found))

@@ -463,15 +463,7 @@ def _flat_wall(
     width = (beside - outer)[open_cells & ~ndimage.binary_erosion(open_cells)]
     thickness = float(np.median(width))
     sigma = robust_deviation(width - thickness)
-    return _Wall(
-        rim,
-        thickness,
-        sigma,
-        -np.asarray(beside, np.float64),
-        outer,
-        TOL.rounding,
-        0.0,
-    )
+    return _Wall(rim, thickness, sigma, -np.asarray(beside, np.float64), outer, TOL.rounding, 0.0)
 
 
 def _rounded_wall(surface: SurfaceFaces, rim: Patch, grid: PatchGrid) -> _Wall | None:

@@ -86,10 +86,9 @@ class SearchTolerances:
     inner_px: float = 6.0
     polarized_share: float = 0.99
 
-    @classmethod
-    def needed(cls, num_views: int) -> int:
+    def needed(self, num_views: int) -> int:
         """Number of views that must deny a point."""
-        return max(2, round(cls.wrong_share * num_views))
+        return max(2, round(self.wrong_share * num_views))
 
 
 TOL = SearchTolerances()
@@ -431,11 +430,7 @@ def _space(views: Sequence[_Working], plane: SupportingPlane) -> _Cells:
     along = _along(plane)
     step = 2 * reach / TOL.num_cells
     axes = step * np.stack([along, np.cross(plane.normal, along), plane.normal])
-    shape = (
-        TOL.num_cells,
-        TOL.num_cells,
-        max(round(0.75 * TOL.num_cells), 1),
-    )
+    shape = (TOL.num_cells, TOL.num_cells, max(round(0.75 * TOL.num_cells), 1))
     origin = foot - 0.5 * (TOL.num_cells - 1) * (axes[0] + axes[1]) + 0.5 * axes[2]
     return _Cells(origin, axes, np.ones(shape, bool))
 

@@ -1,14 +1,14 @@
 """Planar patches with an offset that no silhouette or phase shows: height steps, lids, recesses.
 
-Phases give normals, which are the same on parallel
-patches, and a silhouette does not show a surface inside its outline. Sparse points do: points that
-share a plane, and whose phases agree with its normal, show a patch and its offset. The extent of a
-patch is found on a grid in its plane. At the right offset, the border and the marks of the patch
-have the same grid position in all views; lines on other patches do not. So a line that several
-views show at the same position is a border. The points of each patch then claim the cells that they
-reach without crossing such a line (a random walker, Grady 2006), unless phases contradict. Space
-above a claimed cell is free: its signed distance carves the first surface. Smoothness does not
-round the walls that the carving leaves between the patches.
+Phases give normals, which are the same on parallel patches, and a silhouette does not show a
+surface inside its outline. Sparse points do: points that share a plane, and whose phases agree with
+its normal, show a patch and its offset. The extent of a patch is found on a grid in its plane. At
+the right offset, the border and the marks of the patch have the same grid position in all views;
+lines on other patches do not. So a line that several views show at the same position is a border.
+The points of each patch then claim the cells that they reach without crossing such a line (a random
+walker, Grady 2006), unless phases contradict. Space above a claimed cell is free: its signed
+distance carves the first surface. Smoothness does not round the walls that the carving leaves
+between the patches.
 """
 
 from __future__ import annotations
@@ -685,11 +685,7 @@ def _labels(
         # The lowest patch ends where others stand on it; there their own borders count.
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1))[1:]:
             labels = snapped_border(
-                labels,
-                int(number),
-                jumps[number],
-                TOL.min_radius_cells,
-                TOL.line_steps,
+                labels, int(number), jumps[number], TOL.min_radius_cells, TOL.line_steps
             )
         # By something that the patches do not explain.
         taken = possible.any(axis=0) & ~fits.any(axis=0)
