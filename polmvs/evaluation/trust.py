@@ -167,6 +167,8 @@ class Trust:
     complaints : errors that earlier stages found (cameras, pattern, light), one clause each.
     cut_share : share of the band outside of the user's masks that is as polarized as a surface;
         None without masks.
+    is_bounded : silhouettes bound the surface. They do not bound an open scene, so its checks
+        leave them out.
     is_trusted, verdict : the verdict, in one sentence.
     """
 
@@ -183,6 +185,7 @@ class Trust:
     soundness: Soundness | None = None
     complaints: tuple[str, ...] = ()
     cut_share: float | None = None
+    is_bounded: bool = True
     is_trusted: bool = False
     verdict: str = ""
 
@@ -218,9 +221,10 @@ class Trust:
             )
             error = self.predicted.error_deg if enough else float("nan")
             yield _figure(name, error, ranges.predicted_deg, remedy, scale=1.0)
-            name = "held-out views: overlap of their silhouettes with the prediction, %"
-            remedy = "`region.mask`, `capture.gamma`, poses"
-            yield _figure(name, self.predicted.overlap, ranges.overlap, remedy)
+            if self.is_bounded:
+                name = "held-out views: overlap of their silhouettes with the prediction, %"
+                remedy = "`region.mask`, `capture.gamma`, poses"
+                yield _figure(name, self.predicted.overlap, ranges.overlap, remedy)
         if self.fitted is not None:
             name = "phases that neither kind of light explains, %"
             yield _figure(name, self.fitted.unexplained, ranges.unexplained, LIGHT_OPTIONS)
@@ -251,8 +255,9 @@ class Trust:
         name = "views that agree with a point they see, %"
         remedy = "poses: `sfm.intrinsics`, `sfm.sparse`"
         yield _figure(name, self.agreement, ranges.agreement, remedy)
-        name = "points within the silhouettes of the views, %"
-        yield _figure(name, self.inside, ranges.inside, "`region.mask`, poses")
+        if self.is_bounded:
+            name = "points within the silhouettes of the views, %"
+            yield _figure(name, self.inside, ranges.inside, "`region.mask`, poses")
         name = "coverage of the polarized regions, %"
         remedy = "marks on the part; more views"
         yield _figure(name, self.determined, ranges.determined, remedy, decides=False)
@@ -289,8 +294,10 @@ class Trust:
             reason = (
                 f"a surface of the other views predicts {self.predicted.num_views} held-out views, "
                 f"phases to {self.predicted.error_deg:.1f} deg ({self.predicted.chance_deg:g} by "
-                f"chance), silhouettes to {self.predicted.overlap:.0%}"
+                "chance)"
             )
+            if self.is_bounded:
+                reason += f", silhouettes to {self.predicted.overlap:.0%}"
         else:
             reason = "the views agree with each other; no view was held out as a check"
         return reason + (f". But {weak[0]}" if weak else "")

@@ -21,6 +21,7 @@ from polmvs.scene import MIN_VIEWS
 from polmvs.surface.dense_view import lattice_xy
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import Image, Looking, level_image, rows_of_both
+from polmvs.surface.open_scene import OpenScene
 from polmvs.surface.solver import Level, SolverTolerances, first_fit, refine
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints
@@ -117,10 +118,14 @@ def predict_left_out(
     looking: Looking,
     known: KnownPoints,
     *,
+    scene: OpenScene | None = None,
     outside: Mapping[str, Mask] = MappingProxyType({}),
     tolerances: HeldOutTolerances | None = None,
 ) -> Prediction | None:
     """Predict some views from a surface of the others.
+
+    The sparse points and the poses are those of all views, in an open scene the normals with which
+    it starts as well.
 
     Parameters
     ----------
@@ -128,6 +133,7 @@ def predict_left_out(
     plane : on which the objects stand.
     looking : angle model and the share of the tilt that the whole surface corrects.
     known : points of the surface.
+    scene : the open scene of ``views``; None: silhouettes bound the objects.
     outside : pixels (H, W) of each view, by its name, that are not compared: they show what is
         outside the crop box.
 
@@ -142,13 +148,13 @@ def predict_left_out(
     others = [view for view, out in zip(views, left_out, strict=True) if out]
     if len(used) < MIN_PREDICTING or not others:
         return None
-    hull = visual_hull(used, plane)
+    first = visual_hull(used, plane) if scene is None else scene
 
     def trial(levels: tuple[Level, ...]) -> Prediction:
-        mesh = hull.mesh
+        mesh = first.mesh
         if len(mesh.faces):
             solver = replace(SolverTolerances(), levels=levels)
-            fit = first_fit(used, looking, hull.gsd, known=known, tolerances=solver)
+            fit = first_fit(used, looking, first.gsd, known=known, tolerances=solver)
             mesh = refine(mesh, fit).mesh
         return predict(mesh, others, looking, outside=outside, width_px=tol.width_px)
 

@@ -58,21 +58,20 @@ def truth(demo_capture: Path) -> GroundTruth:
 
 
 @pytest.fixture(scope="module")
-def metric(demo_run: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The demo's COLMAP model in the frame of the truth."""
-    out = tmp_path_factory.mktemp("metric") / "out"
-    flags = ["--sparse", demo_run / "sparse", "--reference", demo_capture / "gt" / "cameras.json"]
-    assert main(list(map(str, ["sfm", demo_capture, out, *flags, "--workers", 2]))) == 0
-    return out / "sparse"
+def run(demo_run: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output of ``reconstruct`` in the frame of the truth; tests that change it take a copy."""
+    out = tmp_path_factory.mktemp("exports") / "out"
+    cameras = demo_capture / "gt" / "cameras.json"
+    flags = ["--sparse", demo_run / "sparse", "--reference", cameras, "--stride-px", 4]
+    flags += ["--workers", 2, "--no-report"]
+    assert main(list(map(str, ["reconstruct", demo_capture, out, *flags]))) == 0
+    return out
 
 
 @pytest.fixture(scope="module")
-def run(metric: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output of ``reconstruct``; tests that change it take a copy."""
-    out = tmp_path_factory.mktemp("exports") / "out"
-    flags = ["--sparse", metric, "--stride-px", 4, "--workers", 2]
-    assert main(list(map(str, ["reconstruct", demo_capture, out, *flags, "--no-report"]))) == 0
-    return out
+def metric(run: Path) -> Path:
+    """The demo's COLMAP model in the frame of the truth."""
+    return run / "sparse"
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import cut_after, record_of, refused, result_of, stages_of
 
+from polmvs.cli import main
 from polmvs.colmap.models import read_model
 from polmvs.io.ground_truth import open_ground_truth
 
@@ -15,20 +16,33 @@ from polmvs.io.ground_truth import open_ground_truth
 CENTER_TOLERANCE_M = 0.001
 
 
-@pytest.fixture
-def out(demo_run: Path, tmp_path: Path) -> Path:
-    """A run that has images and no poses yet."""
-    folder = tmp_path / "out"
-    folder.mkdir()
-    shutil.copytree(demo_run / "images", folder / "images")
-    shutil.copy(demo_run / "run.json", folder)
-    cut_after(folder, "images")
+@pytest.fixture(scope="module")
+def posed(demo_run: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``sfm`` with the model of the finished run."""
+    folder = tmp_path_factory.mktemp("posed") / "out"
+    flags = ("--sparse", demo_run / "sparse", "--workers", 2)
+    assert main(list(map(str, ["sfm", demo_capture, folder, *flags]))) == 0
     return folder
 
 
 @pytest.fixture
+def out(posed: Path, tmp_path: Path) -> Path:
+    """A run that has images and a model, and no frame yet."""
+    return begun(posed, tmp_path / "out", "images", "sfm")
+
+
+def begun(run: Path, out: Path, *stages: str) -> Path:
+    """A copy of the run's first stages, which have folders of their names."""
+    for stage in stages:
+        shutil.copytree(run / stage, out / stage)
+    shutil.copy(run / "run.json", out)
+    cut_after(out, stages[-1])
+    return out
+
+
+@pytest.fixture
 def take_poses(cli, demo_run: Path, demo_capture: Path, out: Path):
-    """``sfm`` with the poses of the finished run, and what is given."""
+    """``sfm`` goes on with the poses of the finished run, and what is given."""
 
     def call(*flags: object) -> tuple[int, str, str]:
         return cli("sfm", demo_capture, out, "--resume", "--sparse", demo_run / "sparse", *flags)
@@ -129,9 +143,13 @@ def test_reference_from_a_config_file(
     assert record_of(out)["options"]["reference"]["reference"] == str(cameras_file(demo_capture))
 
 
-def test_reference_of_too_few_cameras(take_poses, out: Path, tmp_path: Path, true_centers) -> None:
+def test_reference_of_too_few_cameras(
+    cli, posed: Path, demo_run: Path, demo_capture: Path, tmp_path: Path, true_centers
+) -> None:
+    out = begun(posed, tmp_path / "out", "images")
     two = {name: true_centers[name] for name in ("000.png", "001.png")}
-    err = refused(take_poses("--reference", write_lines(tmp_path / "two.txt", two)))
+    flags = ("--sparse", demo_run / "sparse", "--reference", write_lines(tmp_path / "two.txt", two))
+    err = refused(cli("sfm", demo_capture, out, "--resume", *flags))
     assert "two.txt: knows 2 of the 10 images by name, 3 are needed" in err
     assert not (out / "sparse").exists()
     assert stages_of(out) == ["images"]

@@ -56,7 +56,7 @@ def test_as_many_wrong_masks_are_tolerated_as_there_are(ball, num_wrong):
     certain = np.zeros_like(ball[0].silhouette.certain)
     certain[:8, :8] = True
     wrong = [replace(view, silhouette=Silhouette(certain, certain)) for view in ball[::4]]
-    hull = consistent_hull([*wrong[:num_wrong], *ball[num_wrong:]], None)
+    hull, _ = consistent_hull([*wrong[:num_wrong], *ball[num_wrong:]], None)
     radii = np.linalg.norm(hull.mesh.vertices, axis=1)
     assert radii.min() > 0.9
     assert np.median(radii) < (1.08 if num_wrong == 0 else 1.3)

@@ -39,7 +39,7 @@ from polmvs.pipeline.run_folder import (
 from polmvs.pipeline.stages.box import find_box
 from polmvs.pipeline.stages.maps import open_maps, posed_views
 from polmvs.pipeline.stages.poses import load_floats
-from polmvs.pipeline.stages.seeds import load_seeds
+from polmvs.pipeline.stages.seeds import load_points, load_seeds
 from polmvs.pipeline.stages.silhouettes import open_surface_views
 from polmvs.polarization.capture import DISPLAY_GAMMA
 from polmvs.polarization.kinds import AngleModel
@@ -103,6 +103,7 @@ class DensifyResult:
     tilt_share : share of the rotation by tilted polarizers that the surface of all views corrects;
         None with the other methods.
     left_out : names of inconsistent views, which the surface does not use.
+    is_bounded : silhouettes bound the surface of all views; otherwise it is that of an open scene.
     """
 
     num_points: int
@@ -110,6 +111,7 @@ class DensifyResult:
     method: Method
     tilt_share: float | None
     left_out: tuple[str, ...] = ()
+    is_bounded: bool = True
 
     def __str__(self) -> str:
         return f"{self.num_points:,} points, and {self.num_surroundings:,} of the surroundings"
@@ -144,6 +146,7 @@ class _Surface:
     points: SurfacePoints | None = None
     tilt_share: float | None = None
     left_out: tuple[str, ...] = ()
+    is_bounded: bool = True
 
 
 def densify(
@@ -216,6 +219,7 @@ def densify(
         method=found.method,
         tilt_share=found.tilt_share,
         left_out=found.left_out,
+        is_bounded=found.is_bounded,
     )
 
 
@@ -303,6 +307,7 @@ def _global_surface(
         open_surface_views(folder, maps, folder=kept),
         given.seeds,
         sparse_surroundings(tracks, maps).points,
+        points=load_points(folder, model, given.views) if options.region.mask is None else None,
         min_views=fusion.min_views,
         on_progress=given.on_progress,
         folder=kept,
@@ -340,6 +345,7 @@ def _global_surface(
         points=points,
         tilt_share=surface.tilt_share,
         left_out=tuple(view.name for view in compress(given.views, surface.left_out)),
+        is_bounded=surface.is_bounded,
     )
 
 

@@ -5,6 +5,7 @@ All models use one set, which PPA chooses, so that they are compared from the sa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.normals import load_track_normals
 from polmvs.polarization.kinds import AngleModel
-from polmvs.scene import Seeds
+from polmvs.scene import Seeds, View, point_sigmas
 
 SEEDS_TYPE = np.dtype(
     [
@@ -78,6 +79,19 @@ def load_seeds(folder: RunFolder, model: AngleModel) -> Seeds:
     solved = load_track_normals(folder, model).normals
     _require_tracks(folder.seeds, stored["track"], len(solved))
     return Seeds(np.array(stored["point"]), solved[stored["track"]], np.array(stored["sigma"]))
+
+
+def load_points(folder: RunFolder, model: AngleModel, views: Sequence[View]) -> Seeds:
+    """All sparse points with the normals of a model; NaN where none is known.
+
+    Raises
+    ------
+    DataError
+        A file is missing or damaged.
+    """
+    tracks, estimate = read_model(folder.sparse).tracks, load_track_normals(folder, model)
+    normals = np.where(estimate.valid[:, None], estimate.normals, np.nan)
+    return Seeds(tracks.points_in_world, normals, point_sigmas(tracks, views))
 
 
 def seed_tracks(source: Path, num_tracks: int) -> NDArray[np.bool_]:

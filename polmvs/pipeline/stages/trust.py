@@ -19,9 +19,9 @@ from polmvs.normals.tracks import evenly_chosen
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import SURFACE_MESH, RunFolder, surface_levels
 from polmvs.pipeline.stages.densify import DensifyResult, open_outside
-from polmvs.pipeline.stages.maps import MapsResult, open_maps
+from polmvs.pipeline.stages.maps import MapsResult, open_maps, posed_views
 from polmvs.pipeline.stages.poses import PosesResult
-from polmvs.pipeline.stages.seeds import load_seeds
+from polmvs.pipeline.stages.seeds import load_points, load_seeds
 from polmvs.pipeline.stages.sfm import SfmResult
 from polmvs.pipeline.stages.silhouettes import open_surface_views
 from polmvs.polarization.kinds import AngleModel, Light
@@ -37,6 +37,7 @@ from polmvs.surface.observations import (
     observe,
     reflects_itself,
 )
+from polmvs.surface.open_scene import open_scene
 from polmvs.surface.soundness import find_soundness
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.surroundings import sparse_surroundings
@@ -76,6 +77,7 @@ def find_trust(model: AngleModel, folder: RunFolder, record: Record, options: Op
             *(mapped.complaints if mapped is not None else ()),
         ),
         cut_share=None if mapped is None else mapped.cut_share,
+        is_bounded=made.is_bounded,
     )
     if made.tilt_share is not None and (folder.views(model) / SURFACE_MESH).is_file():
         trust = _contradicted(trust, model, made, dense, phase_maps, folder, options)
@@ -104,7 +106,8 @@ def _contradicted(
     plane = supporting_plane(around, np.array([one.view.center_in_world for one in maps]))
     maps = [one for one in maps if one.view.name not in made.left_out]
     maps = [maps[index] for index in evenly_spread(len(maps), MAX_TRIED_VIEWS)]
-    known = load_seeds(folder, model)
+    seeds = load_seeds(folder, model)
+    known = KnownPoints(seeds.points_in_world, seeds.sigma)
     outside = open_outside(folder, model)
     looking = Looking(
         angle_model=model,
@@ -112,7 +115,12 @@ def _contradicted(
         tilt_share=made.tilt_share,
         light=options.region.light,
     )
-    seen = open_surface_views(folder, maps)
+    seen: Sequence[SurfaceView] = open_surface_views(folder, maps)
+    scene = None
+    if not made.is_bounded:
+        scene = open_scene(load_points(folder, model, posed_views(folder)), seen)
+    if scene is not None:
+        seen, known = scene.views, scene.known
     mesh = TriangleMesh.of(read_mesh(views / SURFACE_MESH))
     kind = cloud.scalars["kind"][cKDTree(cloud.points).query(mesh.centers)[1]]
     shown = np.flatnonzero(kind == PointKind.SURFACE)
@@ -124,7 +132,8 @@ def _contradicted(
             seen,
             plane,
             looking,
-            KnownPoints(known.points_in_world, known.sigma),
+            known,
+            scene=scene,
             outside=outside,
         ),
         fitted=predict(mesh, seen, looking, outside=outside),
