@@ -63,7 +63,7 @@ def run(demo_run: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFac
     out = tmp_path_factory.mktemp("exports") / "out"
     cameras = demo_capture / "gt" / "cameras.json"
     flags = ["--sparse", demo_run / "sparse", "--reference", cameras, "--stride-px", 4]
-    flags += ["--workers", 2, "--no-report"]
+    flags += ["--no-report"]
     assert main(list(map(str, ["reconstruct", demo_capture, out, *flags]))) == 0
     return out
 
@@ -468,7 +468,7 @@ def filled(given: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFac
     """Output of ``reconstruct --workspace``, whose poses are the workspace's."""
     out = tmp_path_factory.mktemp("filled") / "out"
     before = content_of(given)
-    flags = ["--workspace", given, "--stride-px", 4, "--workers", 2, *QUICK]
+    flags = ["--workspace", given, "--stride-px", 4, *QUICK]
     assert main(list(map(str, ["reconstruct", demo_capture, out, *flags, "--no-report"]))) == 0
     assert content_of(given) == before
     return out

@@ -20,7 +20,7 @@ CENTER_TOLERANCE_M = 0.001
 def posed(demo_run: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``sfm`` with the model of the finished run."""
     folder = tmp_path_factory.mktemp("posed") / "out"
-    flags = ("--sparse", demo_run / "sparse", "--workers", 2)
+    flags = ("--sparse", demo_run / "sparse")
     assert main(list(map(str, ["sfm", demo_capture, folder, *flags]))) == 0
     return folder
 

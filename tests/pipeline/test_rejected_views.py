@@ -46,7 +46,7 @@ def test_a_view_that_the_surface_contradicts_is_taken_out(
     wrong_model: Path, demo_capture: Path, tmp_path: Path, cli
 ) -> None:
     out = tmp_path / "out"
-    flags = ("--sparse", wrong_model, "--no-mesh", "--workers", 2)
+    flags = ("--sparse", wrong_model, "--no-mesh")
     status, text, err = cli("reconstruct", demo_capture, out, *flags)
     assert status == 0, err
     assert "points from 9 of 10 views" in text
