@@ -169,6 +169,22 @@ class Undetermined:
     reason: str
 
 
+@dataclass(frozen=True)
+class SparsePoints:
+    """Sparse points by their use.
+
+    Attributes
+    ----------
+    seeds : points of the objects.
+    surroundings : (N, 3), points of the surroundings.
+    scene : all points, for an open scene; None: the silhouettes are certain.
+    """
+
+    seeds: Seeds
+    surroundings: Floats
+    scene: Seeds | None = None
+
+
 def num_surface_steps(num_views: int) -> int:
     """Number of steps that :func:`reconstruct_surface` and the rendering of its views report."""
     return SolverTolerances().num_steps + NUM_FINAL_STEPS + num_views
@@ -177,10 +193,8 @@ def num_surface_steps(num_views: int) -> int:
 def reconstruct_surface(
     looking: Looking,
     views: Sequence[SurfaceView],
-    seeds: Seeds,
-    surroundings: Floats,
+    sparse: SparsePoints,
     *,
-    points: Seeds | None = None,
     min_views: int = 2,
     tolerances: SolverTolerances | None = None,
     on_progress: OnProgress = no_progress,
@@ -192,15 +206,13 @@ def reconstruct_surface(
     ----------
     looking : how the views are observed, at first.
     views : all.
-    seeds : points of the surface.
-    surroundings : (N, 3), sparse points of the surroundings.
-    points : all sparse points, for an open scene; None: the silhouettes are certain.
+    sparse : sparse points.
     min_views : number of views that must support a part.
     tolerances : of the solver.
     on_progress : called with 1 after each step.
     folder : for temporary results of each view; None: in memory.
     """
-    first = _first_surface(views, surroundings, seeds, points, folder)
+    first = _first_surface(views, sparse, folder)
     if isinstance(first, Undetermined):
         return first
     logger.info("first surface: %d vertices.", len(first.mesh.vertices))
@@ -212,7 +224,7 @@ def reconstruct_surface(
             tilt_aware=looking.tilt_aware,
             folder=folder,
         ),
-        seeds=seeds,
+        seeds=sparse.seeds,
         min_views=min_views,
         on_progress=on_progress,
     )
@@ -277,20 +289,16 @@ class _First:
 
 
 def _first_surface(
-    views: Sequence[SurfaceView],
-    surroundings: Floats,
-    seeds: Seeds,
-    points: Seeds | None,
-    folder: Path | None,
+    views: Sequence[SurfaceView], sparse: SparsePoints, folder: Path | None
 ) -> _First | Undetermined:
     """The visual hull, or if silhouettes contradict each other, the surface of sparse points."""
     if reason := _no_hull(views):
         return Undetermined(reason)
     centers = np.array([view.center for view in views])
-    hull, mismatch = consistent_hull(views, supporting_plane(surroundings, centers))
+    hull, mismatch = consistent_hull(views, supporting_plane(sparse.surroundings, centers))
     scene = None
-    if points is not None and mismatch > MAX_SHARE:
-        scene = open_scene(points, views, folder=None if folder is None else folder / "scene")
+    if sparse.scene is not None and mismatch > MAX_SHARE:
+        scene = open_scene(sparse.scene, views, folder=None if folder is None else folder / "scene")
     if scene is not None and len(scene.mesh.faces):
         logger.warning(
             "The silhouettes of the views contradict each other (%.0f %% of their area in the "
@@ -303,7 +311,7 @@ def _first_surface(
         return _First(mesh=scene.mesh, views=scene.views, known=scene.known, gsd=scene.gsd)
     if not len(hull.mesh.faces):
         return Undetermined("the silhouettes of the views have no common object")
-    known = KnownPoints(seeds.points_in_world, seeds.sigma)
+    known = KnownPoints(sparse.seeds.points_in_world, sparse.seeds.sigma)
     return _First(mesh=hull.mesh, views=views, known=known, gsd=hull.gsd, hull=hull)
 
 

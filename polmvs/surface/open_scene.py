@@ -85,6 +85,8 @@ def open_scene(
         places, normals, depth=octree_depth(places, spacing), scale=TOL.cube_scale
     )
     sheet = TriangleMesh(vertices, triangles.astype(np.int64))
+    if not len(triangles):
+        return None
     if folder is not None:
         folder.mkdir()
     reach = TOL.support * spacing

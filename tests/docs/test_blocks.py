@@ -22,7 +22,7 @@ TESTS = "pytest -q -n 2 --dist loadfile"
 RUN_ELSEWHERE = {
     "polmvs demo": "tests/conftest.py",
     "polmvs doctor": "tests/cli/test_doctor.py",
-    "pip install .": ".ci/packages",
+    "pip install .": ".ci/run",
     "pip install '.[docs]'": "tests/docs/test_site.py",
     "pip install '.[dev]'": ".ci/run",
     "sphinx-build -W -n docs site": "tests/docs/test_site.py",

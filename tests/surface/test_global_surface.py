@@ -18,6 +18,7 @@ from polmvs.polarization.kinds import AngleModel
 from polmvs.polarization.region import Region
 from polmvs.scene import Seeds
 from polmvs.surface.global_surface import (
+    SparsePoints,
     Undetermined,
     num_surface_steps,
     reconstruct_surface,
@@ -39,8 +40,7 @@ from polmvs.surface.terms import KnownPoints
 
 PPA = AngleModel.PPA
 LOOKING = Looking(angle_model=PPA)
-NO_SEEDS = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-NOTHING = np.zeros((0, 3))
+NOTHING = SparsePoints(Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)), np.zeros((0, 3)))
 GSD = 5 / 150
 QUICK = SolverTolerances(
     levels=(
@@ -62,7 +62,7 @@ def seen_in(maps, *, masks_given=False):
 
 def reconstruct(maps, *, tolerances=QUICK, masks_given=False, **kwargs):
     views = seen_in(maps, masks_given=masks_given)
-    return reconstruct_surface(LOOKING, views, NO_SEEDS, NOTHING, tolerances=tolerances, **kwargs)
+    return reconstruct_surface(LOOKING, views, NOTHING, tolerances=tolerances, **kwargs)
 
 
 @pytest.fixture(scope="module")

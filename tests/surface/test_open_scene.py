@@ -8,7 +8,7 @@ from polmvs.geometry import dots
 from polmvs.neighbors import point_spacings
 from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
-from polmvs.surface.global_surface import reconstruct_surface, surface_points
+from polmvs.surface.global_surface import SparsePoints, reconstruct_surface, surface_points
 from polmvs.surface.held_out import predict_left_out
 from polmvs.surface.mesh_geometry import RayScene
 from polmvs.surface.observations import Looking
@@ -19,7 +19,6 @@ from polmvs.surface.surface_view import Silhouette, SurfaceView, surface_view
 
 LOOKING = Looking(angle_model=AngleModel.PPA)
 NO_SEEDS = Seeds(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-NOTHING = np.zeros((0, 3))
 GSD = 5 / 150
 QUICK = SolverTolerances(
     levels=(
@@ -74,7 +73,9 @@ def points(views) -> Seeds:
 
 @pytest.fixture(scope="module")
 def surface(views, points):
-    return reconstruct_surface(LOOKING, views, NO_SEEDS, NOTHING, points=points, tolerances=QUICK)
+    return reconstruct_surface(
+        LOOKING, views, SparsePoints(NO_SEEDS, np.zeros((0, 3)), points), tolerances=QUICK
+    )
 
 
 def test_the_surface_is_the_desk(surface, views) -> None:
@@ -101,7 +102,9 @@ def test_what_closes_the_surface_is_not_in_the_result(surface) -> None:
 
 def test_silhouettes_that_are_certain_stay(views, points) -> None:
     """A user's masks bound the object, also where they contradict each other."""
-    found = reconstruct_surface(LOOKING, views, NO_SEEDS, NOTHING, tolerances=QUICK)
+    found = reconstruct_surface(
+        LOOKING, views, SparsePoints(NO_SEEDS, np.zeros((0, 3))), tolerances=QUICK
+    )
     assert getattr(found, "is_bounded", True)
 
 

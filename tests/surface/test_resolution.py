@@ -12,7 +12,7 @@ from polmvs.camera import PinholeCamera
 from polmvs.config import PropagationOptions
 from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
-from polmvs.surface.global_surface import Undetermined, reconstruct_surface
+from polmvs.surface.global_surface import SparsePoints, Undetermined, reconstruct_surface
 from polmvs.surface.integration import integrate
 from polmvs.surface.observations import Looking
 from polmvs.surface.silhouettes import find_silhouette
@@ -111,7 +111,7 @@ def surfaces():
         maps = noisy_maps_around(scale)
         views = [surface_view(one, find_silhouette(one, mask_given=False)) for one in maps]
         looking = Looking(angle_model=AngleModel.PPA)
-        found = reconstruct_surface(looking, views, none, np.zeros((0, 3)))
+        found = reconstruct_surface(looking, views, SparsePoints(none, np.zeros((0, 3))))
         assert not isinstance(found, Undetermined)
         return found
 

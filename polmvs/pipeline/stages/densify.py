@@ -52,6 +52,7 @@ from polmvs.surface.contour import propagate
 from polmvs.surface.dense_view import DenseView, find_dense_view, store_dense_view
 from polmvs.surface.fusion import FusedCloud, fuse, no_points
 from polmvs.surface.global_surface import (
+    SparsePoints,
     SurfacePoints,
     Undetermined,
     num_surface_steps,
@@ -305,9 +306,11 @@ def _global_surface(
             light=options.region.light,
         ),
         open_surface_views(folder, maps, folder=kept),
-        given.seeds,
-        sparse_surroundings(tracks, maps).points,
-        points=load_points(folder, model, given.views) if options.region.mask is None else None,
+        SparsePoints(
+            given.seeds,
+            sparse_surroundings(tracks, maps).points,
+            load_points(folder, model, given.views) if options.region.mask is None else None,
+        ),
         min_views=fusion.min_views,
         on_progress=given.on_progress,
         folder=kept,
