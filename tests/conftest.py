@@ -23,12 +23,6 @@ Cli = Callable[..., tuple[int, str, str]]
 def pytest_configure(config: pytest.Config) -> None:
     # Of pytest-xdist, which would begin with the largest files: the order is that below.
     config.option.loadscopereorder = False
-    # A core for each process of pytest-xdist. A run then starts no processes of its own unless a
-    # test asks for them: their imports take longer than the work on a small capture.
-    number = os.environ.get("PYTEST_XDIST_WORKER", "").removeprefix("gw")
-    if number and hasattr(os, "sched_setaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cores[int(number) % len(cores)]})
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -70,7 +64,7 @@ def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make_demo_run(out: Path) -> None:
-    assert main(["demo", str(out)]) == 0
+    assert main(["demo", str(out), "--workers", "2"]) == 0
 
 
 @pytest.fixture

@@ -58,20 +58,21 @@ def truth(demo_capture: Path) -> GroundTruth:
 
 
 @pytest.fixture(scope="module")
-def run(demo_run: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output of ``reconstruct`` in the frame of the truth; tests that change it take a copy."""
-    out = tmp_path_factory.mktemp("exports") / "out"
-    cameras = demo_capture / "gt" / "cameras.json"
-    flags = ["--sparse", demo_run / "sparse", "--reference", cameras, "--stride-px", 4]
-    flags += ["--no-report"]
-    assert main(list(map(str, ["reconstruct", demo_capture, out, *flags]))) == 0
-    return out
+def metric(demo_run: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's COLMAP model in the frame of the truth."""
+    out = tmp_path_factory.mktemp("metric") / "out"
+    flags = ["--sparse", demo_run / "sparse", "--reference", demo_capture / "gt" / "cameras.json"]
+    assert main(list(map(str, ["sfm", demo_capture, out, *flags, "--workers", 2]))) == 0
+    return out / "sparse"
 
 
 @pytest.fixture(scope="module")
-def metric(run: Path) -> Path:
-    """The demo's COLMAP model in the frame of the truth."""
-    return run / "sparse"
+def run(metric: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output of ``reconstruct``; tests that change it take a copy."""
+    out = tmp_path_factory.mktemp("exports") / "out"
+    flags = ["--sparse", metric, "--stride-px", 4, "--workers", 2]
+    assert main(list(map(str, ["reconstruct", demo_capture, out, *flags, "--no-report"]))) == 0
+    return out
 
 
 @pytest.fixture
@@ -468,7 +469,7 @@ def filled(given: Path, demo_capture: Path, tmp_path_factory: pytest.TempPathFac
     """Output of ``reconstruct --workspace``, whose poses are the workspace's."""
     out = tmp_path_factory.mktemp("filled") / "out"
     before = content_of(given)
-    flags = ["--workspace", given, "--stride-px", 4, *QUICK]
+    flags = ["--workspace", given, "--stride-px", 4, "--workers", 2, *QUICK]
     assert main(list(map(str, ["reconstruct", demo_capture, out, *flags, "--no-report"]))) == 0
     assert content_of(given) == before
     return out
