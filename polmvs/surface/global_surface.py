@@ -255,11 +255,12 @@ def reconstruct_surface(
         labelled = label(mesh, refined.fit)
     polished = _polished(given, mesh, labelled, refined, [*steps, *cavities])
     surface = _supported(given, polished, steps, cavities, refined.left_out)
-    return replace(
-        surface,
-        levels=(first.mesh, *refined.meshes),
-        is_bounded=first.hull is not None,
-    )
+    surface = replace(surface, levels=(first.mesh, *refined.meshes))
+    if first.hull is not None:
+        return surface
+    # The silhouettes of an open scene are its first surface, not what the views show of objects.
+    contradictions = replace(surface.contradictions, uncovered_share=0.0)
+    return replace(surface, is_bounded=False, contradictions=contradictions)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,11 +69,13 @@ def open_scene(
 
     Returns
     -------
-    None if fewer than ``MIN_POINTS`` points have a normal.
+    None if fewer than ``MIN_POINTS`` points have a normal, or less than half of them: phases then
+    show an object among unpolarized things, and its textureless parts have no points. Measured: 80
+    % of the points of a desk have a normal, 13 to 30 % of those of seven captures of objects.
     """
     has_normal = np.isfinite(points.normals_in_world).all(axis=1)
     places, normals = points.points_in_world[has_normal], points.normals_in_world[has_normal]
-    if len(places) < MIN_POINTS:
+    if len(places) < max(MIN_POINTS, 0.5 * len(has_normal)):
         return None
     spacings = point_spacings(places)
     usual = are_usual(spacings)

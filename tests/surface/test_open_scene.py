@@ -115,6 +115,15 @@ def test_few_points_make_no_scene(views, points) -> None:
     assert open_scene(some, views) is None
 
 
+def test_an_object_among_unpolarized_things_is_no_scene(views, points) -> None:
+    normals = points.normals_in_world.copy()
+    normals[: len(normals) // 3] = np.nan
+    some = Seeds(points.points_in_world, normals, points.sigma)
+    assert open_scene(points, views) is not None
+    assert np.isfinite(normals).all(axis=1).sum() > MIN_POINTS
+    assert open_scene(some, views) is None
+
+
 def test_held_out_views_are_predicted(views, points) -> None:
     scene = open_scene(points, views)
     assert isinstance(scene, OpenScene)
