@@ -75,7 +75,7 @@ def open_scene(
     """
     has_normal = np.isfinite(points.normals_in_world).all(axis=1)
     places, normals = points.points_in_world[has_normal], points.normals_in_world[has_normal]
-    if len(places) < max(MIN_POINTS, 0.5 * len(has_normal)):
+    if len(places) < max(MIN_POINTS, 0.5 * len(points.sigma)):
         return None
     spacings = point_spacings(places)
     usual = are_usual(spacings)
