@@ -304,8 +304,8 @@ def _first_surface(
         logger.warning(
             "The silhouettes of the views contradict each other (%.0f %% of their area in the "
             "median), so they bound no object. The surface starts from the %d sparse points "
-            "instead and ends with them. If there is one object, give `region.mask`, or check "
-            "poses and `capture.gamma`.",
+            "instead; things without any are missing. If there is one object, give "
+            "`region.mask`, or check poses and `capture.gamma`.",
             100 * mismatch,
             len(scene.known.points),
         )
