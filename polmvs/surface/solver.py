@@ -124,7 +124,7 @@ class SolverTolerances:
     converged : root mean square of the displacements of seen vertices that ends a level, in edges.
     max_lost : share of the silhouettes that a surface may lose against its hull before it is made
         again without coarse levels. Guess: more than rounded corners lose.
-    max_vertices : of a mesh; finer levels are skipped. From the time allowed.
+    max_vertices : of a mesh; its edges are longer if need be. From the time allowed.
     terms, labels : tolerances of these.
     """
 
@@ -305,8 +305,7 @@ def _through_levels(
     unexplained = np.full(len(fit.views), np.nan)
     for number, level in enumerate(levels):
         edge = level.edge_px * fit.gsd
-        if number:
-            edge *= max(float(np.sqrt(_num_vertices(mesh, edge) / tol.max_vertices)), 1.0)
+        edge *= max(float(np.sqrt(_num_vertices(mesh, edge) / tol.max_vertices)), 1.0)
         fit = fit.at_width(level.width_px)
         mesh, fit = _refined_at(mesh, fit, level, edge, (done, total), on_progress)
         done += level.num_steps

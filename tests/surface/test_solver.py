@@ -487,6 +487,18 @@ def test_the_bias_of_outlines_is_part_of_the_position_uncertainty(ball):
     assert np.median(sigma.shared) == pytest.approx(expected, rel=0.3)
 
 
+def test_no_level_has_more_vertices_than_allowed(ball):
+    """Also the first: a wide scene has many even of its longest edges."""
+    levels = (replace(QUICK.levels[0], num_steps=1),)
+    most = 400
+    free, bound = (
+        refined(visual_hull(ball), ball, tolerances=replace(QUICK, levels=levels, max_vertices=num))
+        for num in (120_000, most)
+    )
+    assert len(free.mesh.vertices) > 2 * most
+    assert 0.5 * most < len(bound.mesh.vertices) < 1.3 * most
+
+
 def test_an_empty_mesh_stays_empty(ball):
     empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     assert len(refine(empty, fit_of(ball)).mesh.faces) == 0
