@@ -340,7 +340,7 @@ def _stages_to_cloud(model: AngleModel) -> list[StageSpec]:
                 *(HERE.maps(model), HERE.silhouettes, track_normals, HERE.seeds),
             ),
             writes=(HERE.cloud(model), HERE.views(model)),
-            decides=(TILT_AWARE, "region.light", "propagation", "fusion", *CROPPING),
+            decides=(TILT_AWARE, "region.light", "region.mask", "propagation", "fusion", *CROPPING),
             work=lambda run: densify.densify(
                 model,
                 run.run_folder,
