@@ -21,9 +21,11 @@ from polmvs.cli.running import script
 from polmvs.cli.terminal import Terminal
 from polmvs.colmap.models import read_model
 from polmvs.config import OptionGroup, option
+from polmvs.errors import DataError
 from polmvs.geometry import dots, lengths
 from polmvs.io.clouds import Cloud, read_cloud
 from polmvs.scene import PointKind
+from polmvs.surface.visual_hull import largest_plane
 
 Array = NDArray[np.float64]
 
@@ -39,26 +41,18 @@ class Arguments(OptionGroup, group="arguments", in_files=False):
 
     sparse: Path = option(MISSING, "COLMAP model", positional=True)
     cloud: Path = option(MISSING, "dense cloud of the same frame (PLY)", positional=True)
-    num: int = option(3, "number of planes")
+    num: int = option(3, "number of planes", least=1)
 
 
 def planes(points: Array, num: int) -> Iterator[Array]:
     """Points (N, 3) of each of the largest planes of a cloud; each point belongs to one."""
-    rng, left = np.random.default_rng(0), points
-    thickness = THICKNESS * np.median(lengths(points - np.median(points, axis=0)))
+    limit = THICKNESS * float(np.median(lengths(points - np.median(points, axis=0))))
     for _ in range(num):
-        a, b, c = left[rng.integers(0, len(left), (3, NUM_TRIALS))]
-        normals = np.cross(b - a, c - a)
-        size = lengths(normals)
-        a, normals = a[size > 0], normals[size > 0] / size[size > 0, None]
-        counts = [
-            (np.abs((left - origin) @ normal) < thickness).sum()
-            for origin, normal in zip(a, normals, strict=True)
-        ]
-        best = int(np.argmax(counts))
-        inside = np.abs((left - a[best]) @ normals[best]) < thickness
-        yield left[inside]
-        left = left[~inside]
+        found = largest_plane(points, limit, num_trials=NUM_TRIALS)
+        if found is None or found[2].sum() <= NUM_NEAR:
+            return
+        yield points[found[2]]
+        points = points[~found[2]]
 
 
 def compared(members: Array, cloud: Cloud) -> dict[str, float]:
@@ -95,6 +89,8 @@ def _planes(call: Call, terminal: Terminal) -> int:
     if "kind" in cloud.scalars:
         cloud = cloud.only(cloud.scalars["kind"] == PointKind.SURFACE)
     rows = [compared(members, cloud) for members in planes(points, given.num)]
+    if not rows:
+        raise DataError(given.sparse, "has no plane with enough sparse points.")
     text = "\n".join(", ".join(f"{k} {v:.3g}" for k, v in row.items()) for row in rows)
     terminal.show(text, {"planes": rows})
     return 0

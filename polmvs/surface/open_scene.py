@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from polmvs.camera import pixel_centers
 from polmvs.geometry import dots, lengths
 from polmvs.io.clouds import solve_poisson
 from polmvs.neighbors import are_usual, point_spacings
@@ -30,10 +31,12 @@ from polmvs.surface.mesh_geometry import (
 from polmvs.surface.poisson import MIN_POINTS, MeshTolerances, octree_depth
 from polmvs.surface.surface_view import Silhouette, SurfaceView, surface_view
 from polmvs.surface.terms import KnownPoints
-from polmvs.surface.visual_hull import HullTolerances
+from polmvs.surface.visual_hull import HullTolerances, closed_on_grid, values_on_grid
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+MAX_POINTS = 500_000  # of a grid at a time; bounds memory
 
 TOL = MeshTolerances()
 
@@ -117,29 +120,21 @@ def _gsd(points: Array, views: Sequence[SurfaceView]) -> float:
 def _closed(sheet: TriangleMesh, low: Array, high: Array, gsd: float) -> TriangleMesh:
     """The space behind a sheet, within a box: the closed surface of it."""
     scene = RayScene(sheet)
-    step = max(HullTolerances.step_px * gsd, float(np.prod(high - low) / MAX_CELLS) ** (1 / 3))
-    shape = tuple(int(n) for n in np.ceil((high - low) / step) + 1)
-    values = np.empty(shape, np.float32)
-    rest = np.stack(np.meshgrid(*map(np.arange, shape[1:]), indexing="ij"), axis=-1).reshape(-1, 2)
-    for number, slab in enumerate(values):  # to bound the memory
-        cells = np.column_stack([np.full(len(rest), number), rest])
-        points = low + step * cells
+
+    def values_at(points: Array) -> NDArray[np.float32]:
         place, face, barycentric = scene.closest(points)
         corners = sheet.vertex_normals[sheet.faces[face]]
         normals = np.einsum("nk,nki->ni", barycentric, corners)
         offset = points - place
-        slab[...] = np.copysign(lengths(offset), dots(offset, normals)).reshape(slab.shape)
-    limit = np.float32(4 * step)
-    values = np.clip(values, -limit, limit)
-    for axis in range(3):
-        border = np.moveaxis(values, axis, 0)
-        border[0], border[-1] = limit, limit
+        return np.asarray(np.copysign(lengths(offset), dots(offset, normals)), np.float32)
+
+    step = max(HullTolerances.step_px * gsd, float(np.prod(high - low) / MAX_CELLS) ** (1 / 3))
+    values = closed_on_grid(values_on_grid(values_at, MAX_POINTS, low, high, step), step)
     return relaxed(mesh_from_grid(values, low, step))
 
 
 def _silhouette(view: SurfaceView, scene: RayScene) -> Silhouette:
     """Where a view shows a mesh; all other pixels are unknown, so it has no outline."""
-    cols, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    rays = view.view.rays_in_world(np.column_stack([cols.ravel(), rows.ravel()]))
+    rays = view.view.rays_in_world(pixel_centers(view.width, view.height).reshape(-1, 2))
     shown = (scene.cast(view.center, rays).face >= 0).reshape(view.height, view.width)
     return Silhouette(shown, np.ones_like(shown))

@@ -92,32 +92,60 @@ def supporting_plane(
     num = len(surroundings)
     if num < 20:
         return None
-    rng = np.random.default_rng(seed)
     middle = np.median(surroundings, axis=0)
     limit = TOL.plane_distance * float(np.median(np.linalg.norm(centers - middle, axis=1)))
+    found = largest_plane(surroundings, limit, num_trials=num_trials, seed=seed)
+    if found is None:
+        return None
+    normal, offset, inliers = found
+    heights = centers @ normal - offset
+    if np.median(heights) < 0:
+        normal, offset, heights = -normal, -offset, -heights
+    if inliers.sum() < TOL.min_plane_share * num or heights.min() < 0:
+        return None
+    return SupportingPlane(normal, offset)
+
+
+def largest_plane(
+    points: Floats, limit: float, *, num_trials: int = 400, seed: int = 0
+) -> tuple[Array, float, Mask] | None:
+    """The plane ``normal . x = offset`` with the most points: RANSAC, then least squares.
+
+    Parameters
+    ----------
+    points : (N, 3)
+    limit : distance of inliers.
+    num_trials : random triples of points.
+    seed : of the random numbers.
+
+    Returns
+    -------
+    Unit normal (3,), offset and inliers (N,); None if there is no plane.
+    """
+    num = len(points)
+    if num < 3:
+        return None
+    rng = np.random.default_rng(seed)
     picks = rng.integers(0, num, (num_trials, 3))
-    a, b, c = (surroundings[picks[:, i]] for i in range(3))
+    a, b, c = (points[picks[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
     usable = length > 1e-12
+    if not usable.any():
+        return None
     normals, a = normals[usable] / length[usable, None], a[usable]
-    tested = surroundings[rng.permutation(num)[:2000]]
+    tested = points[rng.permutation(num)[:2000]]
     distances = np.abs(tested @ normals.T - (a * normals).sum(axis=1))
     best = int((distances < limit).sum(axis=0).argmax())
     normal, offset = normals[best], float(a[best] @ normals[best])
     for _ in range(3):
-        inliers = surroundings[np.abs(surroundings @ normal - offset) < limit]
-        if len(inliers) < 3:
+        inside = np.abs(points @ normal - offset) < limit
+        if inside.sum() < 3:
             return None
-        center = inliers.mean(axis=0)
-        normal = np.linalg.svd(inliers - center, full_matrices=False)[2][2]
+        center = points[inside].mean(axis=0)
+        normal = np.linalg.svd(points[inside] - center, full_matrices=False)[2][2]
         offset = float(center @ normal)
-    heights = centers @ normal - offset
-    if np.median(heights) < 0:
-        normal, offset, heights = -normal, -offset, -heights
-    if len(inliers) < TOL.min_plane_share * num or heights.min() < 0:
-        return None
-    return SupportingPlane(normal, offset)
+    return normal, offset, inside
 
 
 @dataclass(frozen=True)
@@ -190,7 +218,7 @@ def visual_hull(
     def values_at(points: Array) -> NDArray[np.float32]:
         return hull_values(used, points, wrong_share, plane)
 
-    on_grid = partial(_values_on_grid, values_at, max(1, MAX_VALUES // len(used)))
+    on_grid = partial(values_on_grid, values_at, max(1, MAX_VALUES // len(used)))
     center = _meeting_point(used)
     distance = float(np.median([np.linalg.norm(view.center - center) for view in used]))
     gsd = float(np.median([distance / view.view.camera.mean_focal_px for view in used]))
@@ -253,7 +281,7 @@ def _grid(low: Array, high: Array, step: float) -> tuple[int, ...]:
     return tuple(int(n) for n in np.ceil((high - low) / step) + 1)
 
 
-def _values_on_grid(
+def values_on_grid(
     values_at: Callable[[Array], NDArray[np.float32]],
     num_at_a_time: int,
     low: Array,
@@ -303,12 +331,17 @@ def _refined(
 
 def _cleaned(values: NDArray[np.float32], step: float) -> NDArray[np.float32]:
     """Smoothed, closed at the grid's border, without pieces too small for objects."""
+    return _without_specks(ndimage.gaussian_filter(closed_on_grid(values, step), 0.7), step)
+
+
+def closed_on_grid(values: NDArray[np.float32], step: float) -> NDArray[np.float32]:
+    """Values clipped to four steps, outside at the grid's border: their surface is closed."""
     limit = np.float32(4 * step)
     values = np.clip(values, -limit, limit)
     for axis in range(3):
         border = np.moveaxis(values, axis, 0)
         border[0], border[-1] = limit, limit
-    return _without_specks(ndimage.gaussian_filter(values, 0.7), step)
+    return values
 
 
 def _without_specks(values: NDArray[np.float32], step: float) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from polmvs.colmap.models import read_model
+from polmvs.io.clouds import Cloud
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 SCRIPTS = sorted(path.stem for path in PIPELINES.glob("*.py"))
@@ -170,3 +171,24 @@ def test_figures_stand_beside_those_of_another_version() -> None:
     assert cells[0][6:8] == ["yes > no", "30.0 > 20.0"]
     assert cells[1][0] == "dome"
     assert cells[1][-1] == "no views"
+
+
+def test_a_cloud_beside_the_planes_of_sparse_points() -> None:
+    """Two planes, and a cloud one hundredth of the size above the larger, its normals turned."""
+    script, rng = load("planes"), np.random.default_rng(0)
+    floor = np.column_stack(
+        [rng.uniform(0, 3, (400, 1)), rng.uniform(0, 4, (400, 1)), np.zeros(400)]
+    )
+    wall = np.column_stack(
+        [np.zeros(200), rng.uniform(0, 4, (200, 1)), rng.uniform(0, 3, (200, 1))]
+    )
+    found = list(script.planes(np.concatenate([wall, floor]), 3))
+    assert [len(members) for members in found] == pytest.approx([400, 200], abs=8)
+    turn = np.radians(3)
+    above = np.add(floor, (0, 0, 0.05))
+    normals = np.tile((0, np.sin(turn), -np.cos(turn)), (len(above), 1))
+    row = script.compared(floor, Cloud(points=above, normals=normals))
+    assert row["covered, %"] == 100
+    assert row["distance, median, % of the size"] == pytest.approx(1, rel=0.05)
+    assert row["normals, median, deg"] == pytest.approx(3, abs=1e-6)
+    assert list(script.planes(floor[:5], 3)) == []

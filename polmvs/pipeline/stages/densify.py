@@ -309,7 +309,7 @@ def _global_surface(
         SparsePoints(
             given.seeds,
             sparse_surroundings(tracks, maps).points,
-            load_points(folder, model, given.views) if options.region.mask is None else None,
+            None if options.region.mask else load_points(folder, model, tracks, given.views),
         ),
         min_views=fusion.min_views,
         on_progress=given.on_progress,

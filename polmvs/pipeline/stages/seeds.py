@@ -20,7 +20,7 @@ from polmvs.pipeline.run_folder import RunFolder
 from polmvs.pipeline.stages.maps import open_maps
 from polmvs.pipeline.stages.normals import load_track_normals
 from polmvs.polarization.kinds import AngleModel
-from polmvs.scene import Seeds, View, point_sigmas
+from polmvs.scene import Seeds, Tracks, View, point_sigmas
 
 SEEDS_TYPE = np.dtype(
     [
@@ -81,15 +81,23 @@ def load_seeds(folder: RunFolder, model: AngleModel) -> Seeds:
     return Seeds(np.array(stored["point"]), solved[stored["track"]], np.array(stored["sigma"]))
 
 
-def load_points(folder: RunFolder, model: AngleModel, views: Sequence[View]) -> Seeds:
+def load_points(
+    folder: RunFolder, model: AngleModel, tracks: Tracks, views: Sequence[View]
+) -> Seeds:
     """All sparse points with the normals of a model; NaN where none is known.
+
+    Parameters
+    ----------
+    folder : of a run with normals of the sparse points.
+    model : angle model.
+    tracks, views : of the run's model, all of them.
 
     Raises
     ------
     DataError
         A file is missing or damaged.
     """
-    tracks, estimate = read_model(folder.sparse).tracks, load_track_normals(folder, model)
+    estimate = load_track_normals(folder, model)
     normals = np.where(estimate.valid[:, None], estimate.normals, np.nan)
     return Seeds(tracks.points_in_world, normals, point_sigmas(tracks, views))
 

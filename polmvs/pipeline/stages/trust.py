@@ -19,7 +19,7 @@ from polmvs.normals.tracks import evenly_chosen
 from polmvs.pipeline.record import Record
 from polmvs.pipeline.run_folder import SURFACE_MESH, RunFolder, surface_levels
 from polmvs.pipeline.stages.densify import DensifyResult, open_outside
-from polmvs.pipeline.stages.maps import MapsResult, open_maps, posed_views
+from polmvs.pipeline.stages.maps import MapsResult, open_maps
 from polmvs.pipeline.stages.poses import PosesResult
 from polmvs.pipeline.stages.seeds import load_points, load_seeds
 from polmvs.pipeline.stages.sfm import SfmResult
@@ -102,8 +102,9 @@ def _contradicted(
     """The checks with those of a surface of all views against held-out views."""
     views = folder.views(model)
     assert made.tilt_share is not None
-    around = sparse_surroundings(read_model(folder.sparse).tracks, maps).points
-    plane = supporting_plane(around, np.array([one.view.center_in_world for one in maps]))
+    tracks, every_view = read_model(folder.sparse).tracks, [one.view for one in maps]
+    around = sparse_surroundings(tracks, maps).points
+    plane = supporting_plane(around, np.array([view.center_in_world for view in every_view]))
     maps = [one for one in maps if one.view.name not in made.left_out]
     maps = [maps[index] for index in evenly_spread(len(maps), MAX_TRIED_VIEWS)]
     seeds = load_seeds(folder, model)
@@ -118,7 +119,7 @@ def _contradicted(
     seen: Sequence[SurfaceView] = open_surface_views(folder, maps)
     scene = None
     if not made.is_bounded:
-        scene = open_scene(load_points(folder, model, posed_views(folder)), seen)
+        scene = open_scene(load_points(folder, model, tracks, every_view), seen)
     if scene is not None:
         seen, known = scene.views, scene.known
     mesh = TriangleMesh.of(read_mesh(views / SURFACE_MESH))
@@ -128,14 +129,7 @@ def _contradicted(
     return replace(
         trust,
         complaints=(*trust.complaints, *(() if wrong_camera is None else (wrong_camera,))),
-        predicted=predict_left_out(
-            seen,
-            plane,
-            looking,
-            known,
-            scene=scene,
-            outside=outside,
-        ),
+        predicted=predict_left_out(seen, plane, looking, known, scene=scene, outside=outside),
         fitted=predict(mesh, seen, looking, outside=outside),
         # Of the last closed mesh: the surface has holes where nothing is known.
         soundness=find_soundness(
