@@ -22,6 +22,7 @@ from scipy import ndimage
 
 from polmvs.camera import pixel_centers, sample_image
 from polmvs.config import default_num_workers
+from polmvs.fitting import MEDIAN_OF_NORMAL, robust_deviation
 from polmvs.geometry import lengths
 from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import View
@@ -549,7 +550,7 @@ def _plates(views: Sequence[_Working], masks: Sequence[Mask]) -> list[_Plate]:
             small = cv2.resize(change, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
             predictions.append((int(other), beside[other], np.asarray(small, np.float32)))
             varying = change[both]
-            changes.append(1.4826 * np.median(np.abs(varying - np.median(varying))))
+            changes.append(robust_deviation(varying - np.median(varying)))
         stack = np.array(shown, np.float32).reshape(-1, *view.log.shape)
         log, deviation = _median_and_deviation(stack)
         log[~view.has_plane] = np.nan
@@ -583,7 +584,7 @@ def _median(stack: Image) -> Image:
 def _median_and_deviation(stack: Image) -> tuple[Image, Image]:
     """:func:`_median`, and the robust deviation from it, 0 where it is NaN."""
     median = _median(stack)
-    return median, np.nan_to_num(1.4826 * _median(np.abs(stack - median)))
+    return median, np.nan_to_num(_median(np.abs(stack - median)) / MEDIAN_OF_NORMAL)
 
 
 def _residual(views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequence[Mask]) -> float:
@@ -593,7 +594,7 @@ def _residual(views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequen
         beside = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) == 0
         left.append((view.log - plate.log)[beside & np.isfinite(plate.log)])
     all_left = np.concatenate(left)
-    return float(1.4826 * np.median(np.abs(all_left))) if len(all_left) else np.inf
+    return robust_deviation(all_left) if len(all_left) else np.inf
 
 
 def _denied(
