@@ -49,10 +49,13 @@ def planes(points: Array, num: int) -> Iterator[Array]:
     limit = THICKNESS * float(np.median(lengths(points - np.median(points, axis=0))))
     for _ in range(num):
         found = largest_plane(points, limit, num_trials=NUM_TRIALS)
-        if found is None or found[2].sum() <= NUM_NEAR:
+        if found is None:
             return
-        yield points[found[2]]
-        points = points[~found[2]]
+        _, _, inliers = found
+        if inliers.sum() <= NUM_NEAR:
+            return
+        yield points[inliers]
+        points = points[~inliers]
 
 
 def compared(members: Array, cloud: Cloud) -> dict[str, float]:
