@@ -39,7 +39,8 @@ Mask = NDArray[np.bool_]
 
 MAX_ODDS = 4.0  # log-odds of one pixel at most: any pixel may be wrong
 LEAST_SIGMA = 1e-3  # of a logarithm of intensity, and its least spread: no image is that exact
-LEAST_ODDS = 0.7  # log-odds of the plane, on the average of neighbours: two to one
+LEAST_ODDS = 0.7  # log-odds that decide: two to one
+BLUR_PX = 0.8  # deviation of averages of log-odds, working pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +135,7 @@ def find_object(
     shows_plane: list[Mask] = []
     for scale in (4, 2, 1):  # a plane without fine texture may have a coarse one
         small = [_working(phase_map, plane, TOL.working_px / scale) for phase_map in maps]
-        shares = _showing_plane(small, near)
+        shares, expected = _showing_plane(small, near)
         # A window next to an outline on the plane contains the outline, also inside the object.
         size = 2 * round(0.5 * TOL.window_px + TOL.detail_px) - 1
         found = [
@@ -143,9 +144,14 @@ def find_object(
         ]
         window = np.ones((TOL.window_px, TOL.window_px), np.uint8)
         textured = [cv2.erode(share, window) > TOL.least_share for share in shares]
+        hidden = [
+            (texture > TOL.least_share) & (share <= TOL.least_share)
+            for texture, share in zip(expected, shares, strict=True)
+        ]
+        # Thin parts of the object are lost at a coarse scale: it does not overrule a finer one.
         shows_plane = [
-            here | (cv2.resize(before.astype(np.uint8), here.shape[::-1]) > 0)
-            for here, before in zip(found, shows_plane or found, strict=True)
+            here | ((cv2.resize(before.astype(np.uint8), here.shape[::-1]) > 0) & ~unseen)
+            for here, before, unseen in zip(found, shows_plane or found, hidden, strict=True)
         ]
     small = _with_extent(small, textured, plane)
     coarse = _bounded(_space(small, plane), small, shows_plane)
@@ -158,14 +164,7 @@ def find_object(
     cells = coarse.finer()
     for _ in range(TOL.num_rounds):
         plates = _plates(small, masks)
-        alone, together = _denied(small, plates, masks)
-        together = [
-            predicted | (seen & ~view.polarized)
-            for predicted, seen, view in zip(together, textured, small, strict=True)
-        ]
-        left = cells.carved(small, alone, needed=1)
-        if left is not None:
-            left = left.carved(small, together, needed=TOL.needed(len(maps)))
+        left = cells.likely(small, _background_odds(small, plates, masks, textured, hidden))
         if left is None:
             return None
         masks = [left.mask(view) for view in small]
@@ -271,28 +270,39 @@ def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
     return np.asarray(order[order != index])
 
 
-def _showing_plane(views: Sequence[_Working], points: Floats) -> list[Image]:
-    """Share (h, w) of each view's texture on the plane, which two other views also see there."""
+def _showing_plane(views: Sequence[_Working], points: Floats) -> tuple[list[Image], list[Image]]:
+    """Share of each view's texture that is the plane's, and the share that it should be, (h, w).
+
+    Two other views show the same texture there; two show texture.
+    """
     details = [view.log - cv2.GaussianBlur(view.log, (0, 0), TOL.detail_px) for view in views]
-    correlations, variances, unexplained = [], [], []
+    seen_textures, textures, unexplained = [], [], []
     for index, view in enumerate(views):
-        best, second = np.full((2, *view.log.shape), -1, np.float32)
+        correlations, variances = [], []
         for other in _nearest(views, index)[: TOL.num_near]:
             xy = views[other].project(view.on_plane)
-            value = _correlation(details[index], sample_image(details[other], xy), TOL.window_px)
-            seen = np.where(views[other].sees(xy), value, -1).astype(np.float32)
-            second = np.maximum(second, np.minimum(best, seen))
-            best = np.maximum(best, seen)
-        correlations.append(np.clip(second, 0, 1))
-        variances.append(_local_variance(details[index], TOL.window_px))
+            value, variance = _correlation(
+                details[index], sample_image(details[other], xy), TOL.window_px
+            )
+            seen = views[other].sees(xy)
+            correlations.append(np.where(seen, value, 0))
+            variances.append(np.where(seen, variance, 0))
+        second, variance = (
+            np.maximum(np.partition(np.array(values, np.float32), -2, axis=0)[-2], 0)
+            for values in (correlations, variances)
+        )
+        own = _local_variance(details[index], TOL.window_px)
+        seen_textures.append((second, own))
+        textures.append((np.ones_like(second), variance))
         xy = view.project(points)
-        left = np.asarray(variances[-1] * (1 - correlations[-1] ** 2), np.float32)
+        left = np.asarray(own * (1 - second**2), np.float32)
         unexplained.append(sample_image(left, xy[view.sees(xy)]))
     noise = 3 * float(np.median(np.concatenate(unexplained)))
-    return [
-        np.asarray(value * variance / (variance + noise), np.float32)
-        for value, variance in zip(correlations, variances, strict=True)
-    ]
+
+    def shares(found: Sequence[tuple[Image, Image]]) -> list[Image]:
+        return [np.asarray(value * own / (own + noise), np.float32) for value, own in found]
+
+    return shares(seen_textures), shares(textures)
 
 
 def _local_variance(image: Image, window_px: int) -> Image:
@@ -301,12 +311,13 @@ def _local_variance(image: Image, window_px: int) -> Image:
     return np.asarray(np.maximum(cv2.blur(image * image, window) - mean * mean, 0), np.float32)
 
 
-def _correlation(a: Image, b: Image, window_px: int) -> Image:
-    """Normalised correlation of two images in the windows of all pixels."""
+def _correlation(a: Image, b: Image, window_px: int) -> tuple[Image, Image]:
+    """Normalised correlation of two images in all windows, and the variance of the second."""
     window = (window_px, window_px)
     covariance = cv2.blur(a * b, window) - cv2.blur(a, window) * cv2.blur(b, window)
-    spread = _local_variance(a, window_px) * _local_variance(b, window_px)
-    return np.asarray(covariance / np.sqrt(np.maximum(spread, 1e-12)), np.float32)
+    variance = _local_variance(b, window_px)
+    spread = _local_variance(a, window_px) * variance
+    return np.asarray(covariance / np.sqrt(np.maximum(spread, 1e-12)), np.float32), variance
 
 
 def _marked(pixels: Mask, xy: Floats) -> Mask:
@@ -365,6 +376,52 @@ class _Cells:
         held[self.held] = (
             (num_free < needed) & (num_seen >= TOL.seen_share * len(views)) & (num_tests >= 2)
         )
+        return self._middle_part(held)
+
+    def likely(self, views: Sequence[_Working], odds: Sequence[Image]) -> _Cells | None:
+        """The cells that are more likely the object's; only the part around the middle.
+
+        A pixel that shows the background frees all cells on its ray. A pixel that shows the object
+        needs one of them: they share its evidence.
+
+        Parameters
+        ----------
+        odds : log-odds (h, w) that each view's pixels show the background.
+
+        Returns
+        -------
+        None if nothing is left.
+        """
+        points = self.centers()
+        middle = points.mean(axis=0)
+        total, num_seen = np.zeros(len(points)), np.zeros(len(points), np.int32)
+        for view, image in zip(views, odds, strict=True):
+            xy = view.project(points)
+            seen = view.sees(xy, 0.5)
+            num_seen += seen
+            shared = np.where(image < 0, image / self._num_on_rays(view, xy[seen], middle), image)
+            total[seen] += sample_image(shared.astype(np.float32), xy[seen], nearest=True)
+        held = np.zeros_like(self.held)
+        held[self.held] = (total < LEAST_ODDS) & (num_seen >= TOL.seen_share * len(views))
+        return self._middle_part(held)
+
+    def _num_on_rays(self, view: _Working, xy: Floats, middle: Array) -> Image:
+        """Number (h, w) of cells on each pixel's ray, at least one, from their coordinates."""
+        height, width = view.log.shape
+        columns, rows = xy.astype(int).T
+        centers = np.bincount(rows * width + columns, minlength=height * width)
+        size = self._width_px(view, middle)
+        density = cv2.GaussianBlur(
+            centers.reshape(height, width).astype(np.float32), (0, 0), max(0.5 * size, 0.5)
+        )
+        return np.asarray(np.maximum(density * size**2, 1), np.float32)
+
+    def _width_px(self, view: _Working, middle: Array) -> float:
+        """Width of a cell at their middle in a view, working pixels."""
+        return float(lengths(self.axes).max()) / view.pixel_at(float(view.view.ranges(middle)))
+
+    def _middle_part(self, held: Mask) -> _Cells | None:
+        """The connected part of some cells around the middle; None if there is none."""
         parts, num = ndimage.label(held)
         if not num:
             return None
@@ -403,9 +460,7 @@ class _Cells:
         pixels = np.zeros(view.log.shape, np.uint8)
         columns, rows = xy[view.sees(xy, 0.5)].astype(int).T
         pixels[rows, columns] = 1
-        cell = float(lengths(self.axes).max())
-        width = cell / view.pixel_at(float(np.median(view.view.ranges(points))))
-        size = 2 * int(np.ceil(width)) + 1
+        size = 2 * int(np.ceil(self._width_px(view, points.mean(axis=0)))) + 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
         return np.asarray(cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, kernel) > 0)
 
@@ -468,7 +523,9 @@ def _with_extent(
     num_views = np.zeros(counts, np.int32)
     for places in shown:
         cells, inside = _cells_of(places, low, step, counts)
-        num_views[tuple(np.unique(cells[inside], axis=0).T)] += 1
+        reached = np.zeros(counts, np.bool_)
+        reached[tuple(cells[inside].T)] = True
+        num_views += reached
     size = TOL.extent_gap + 1
     extent = cv2.morphologyEx(
         np.pad(num_views >= 2, size).astype(np.uint8),
@@ -597,28 +654,34 @@ def _residual(views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequen
     return robust_deviation(all_left) if len(all_left) else np.inf
 
 
-def _denied(
+def _background_odds(
     views: Sequence[_Working],
     plates: Sequence[_Plate],
     masks: Sequence[Mask],
-) -> tuple[list[Mask], list[Mask]]:
-    """Pixels of each view that show the plane, or the background beyond it, and not the object.
+    textured: Sequence[Mask],
+    hidden: Sequence[Mask],
+) -> list[Image]:
+    """Log-odds (h, w) that each view's pixels show the plane, or the background beyond it.
 
-    Returns
-    -------
-    Pixels whose whole neighbourhood shows it, which excludes chance, and single pixels that do.
+    Parameters
+    ----------
+    textured : pixels that show the plane's texture.
+    hidden : pixels that do not show it where they should: their brightness agrees by chance only.
     """
-    all_odds = _plane_odds(views, plates, _residual(views, plates, masks))
-    found: tuple[list[Mask], list[Mask]] = ([], [])
-    for view, plate, odds in zip(views, plates, all_odds, strict=True):
-        known = np.isfinite(plate.log)
-        for masks_of, width, least in zip(found, (2.5, 0.8), (0.95, 0.3), strict=True):
-            total = cv2.GaussianBlur(odds, (0, 0), width)
-            share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), width)
-            shows_plane = (share > least) & (total > LEAST_ODDS * share)
-            masks_of.append(np.asarray(shows_plane & ~view.polarized))
-    for denied, beyond in zip(found[0], _showing_beyond(views, masks), strict=True):
-        denied |= beyond
+    found = []
+    for view, odds, seen, unseen, beyond in zip(
+        views,
+        _plane_odds(views, plates, _residual(views, plates, masks)),
+        textured,
+        hidden,
+        _showing_beyond(views, masks),
+        strict=True,
+    ):
+        total = np.asarray(cv2.GaussianBlur(odds, (0, 0), BLUR_PX), np.float32)
+        total[seen | beyond] = MAX_ODDS
+        total[unseen] = np.minimum(total[unseen], -LEAST_ODDS)
+        total[view.polarized] = -MAX_ODDS
+        found.append(total)
     return found
 
 
