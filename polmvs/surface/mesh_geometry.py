@@ -442,6 +442,16 @@ def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
     return mesh
 
 
+def thickened(scene: RayScene, least: float) -> TriangleMesh:
+    """The mesh of a scene, with what is thinner than a width widened to it on both sides."""
+    mesh = scene.mesh
+    inwards = -mesh.vertex_normals
+    start = 1e-3 * least  # off the vertex's own faces
+    thickness = start + scene.cast(mesh.vertices + start * inwards, inwards).distance
+    missing = np.clip(least - thickness, 0, None)
+    return mesh.moved(-0.5 * missing[:, None] * inwards)
+
+
 def remeshed(
     scene: RayScene,
     step: float,

@@ -34,7 +34,7 @@ from polmvs.surface.labels import (
     responsibilities,
     vote,
 )
-from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, thickened
 from polmvs.surface.observations import (
     KINDS,
     Image,
@@ -362,7 +362,7 @@ def _refined_at(
         # A mesh that has moved far is irregular. In one that intersects itself views see the
         # inside. Other meshes stay as they are, because the grid rounds their creases.
         if step == 0:
-            mesh = remeshed(RayScene(mesh), edge)
+            mesh = remeshed(RayScene(thickened(RayScene(mesh), 2 * edge)), edge)
             moved = np.zeros(len(mesh.vertices))
         scene = RayScene(mesh)
         if step > 0 and not is_thin and _is_irregular(scene, moved, edge, tol):
