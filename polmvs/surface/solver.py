@@ -71,7 +71,6 @@ CROSSED_DEPTH = 0.05  # of an edge: far above rounding, far below the resolution
 # Share of the silhouettes that a remeshed surface may lose. Measured: up to 0.011 if walls are
 # thicker than edges, 0.036 to 0.6 if they are thinner.
 REMESHING_LOSS = 0.02
-MIN_LEVELS = 3  # of which the coarse ones can be skipped
 MIN_RESIDUALS = 100  # least number of rows of one view and kind of light for a separate deviation
 
 Array = NDArray[np.float64]
@@ -122,8 +121,6 @@ class SolverTolerances:
     remesh_after : displacement of a fiftieth of the vertices that triggers remeshing, in edges.
         Guess: triangles of a mesh that moves by less stay usable.
     converged : root mean square of the displacements of seen vertices that ends a level, in edges.
-    max_lost : share of the silhouettes that a surface may lose against its hull before it is made
-        again without coarse levels. Guess: more than rounded corners lose.
     max_vertices : of a mesh; its edges are longer if need be. From the time allowed.
     terms, labels : tolerances of these.
     """
@@ -141,7 +138,6 @@ class SolverTolerances:
     unseen_damping: float = 0.02
     remesh_after: float = 2.0
     converged: float = 0.01
-    max_lost: float = 0.05
     max_vertices: int = 120_000
     terms: TermTolerances = field(default_factory=TermTolerances)
     labels: LabelTolerances = field(default_factory=LabelTolerances)
@@ -271,39 +267,12 @@ def refine(
         after the first level.
     on_progress : called with the number of iterations done.
     """
-    tol = fit.tol
-    found = _through_levels(mesh, fit, tol.levels, stands_apart, on_progress)
-    share = covered_share(RayScene(found.mesh), found.fit.views)
-    before = covered_share(RayScene(mesh), found.fit.views)
-    if share >= before - tol.max_lost or len(tol.levels) < MIN_LEVELS:
-        return found
-    *coarse, fine, last = tol.levels
-    if _num_vertices(mesh, fine.edge_px * fit.gsd) > tol.max_vertices:
-        logger.info("walls are thinner than coarse edges; fine edges need too many vertices.")
-        return found
-    logger.info("walls are thinner than coarse edges; the surface is made again by fine ones.")
-    # The distance is the same, and a step is at most an edge length.
-    steps = fine.num_steps + sum(level.num_steps * level.edge_px for level in coarse) / fine.edge_px
-    first = replace(coarse[0], edge_px=fine.edge_px, num_steps=round(steps))
-    again = _through_levels(mesh, fit, (first, last), stands_apart, no_progress)
-    covered = covered_share(RayScene(again.mesh), again.fit.views)
-    return again if covered > share else found
-
-
-def _through_levels(
-    mesh: TriangleMesh,
-    fit: Fit,
-    levels: Sequence[Level],
-    stands_apart: Callable[[Array], Mask] | None,
-    on_progress: OnProgress,
-) -> Refined:
-    """The surface after some levels; parameters as of :func:`refine`."""
     tol, done = fit.tol, 0
     meshes: list[TriangleMesh] = []
-    total = sum(level.num_steps for level in levels)
+    total = tol.num_steps
     left_out = np.zeros(len(fit.views), np.bool_)
     unexplained = np.full(len(fit.views), np.nan)
-    for number, level in enumerate(levels):
+    for number, level in enumerate(tol.levels):
         edge = level.edge_px * fit.gsd
         edge *= max(float(np.sqrt(_num_vertices(mesh, edge) / tol.max_vertices)), 1.0)
         fit = fit.at_width(level.width_px)
