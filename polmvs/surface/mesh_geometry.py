@@ -443,8 +443,14 @@ def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
 
 
 def thickened(scene: RayScene, least: float) -> TriangleMesh:
-    """The mesh of a scene, with what is thinner than a width widened to it on both sides."""
+    """The mesh of a scene; what is thinner than ``least``, world units, is widened on both sides.
+
+    Every position of a rod two grid spacings wide holds a point of the grid, so :func:`remeshed`
+    keeps what is widened to that.
+    """
     mesh = scene.mesh
+    if not len(mesh.faces):
+        return mesh
     inwards = -mesh.vertex_normals
     start = 1e-3 * least  # off the vertex's own faces
     thickness = start + scene.cast(mesh.vertices + start * inwards, inwards).distance

@@ -331,6 +331,7 @@ def _refined_at(
         # A mesh that has moved far is irregular. In one that intersects itself views see the
         # inside. Other meshes stay as they are, because the grid rounds their creases.
         if step == 0:
+            # The outlines make what is widened thin again.
             mesh = remeshed(RayScene(thickened(RayScene(mesh), 2 * edge)), edge)
             moved = np.zeros(len(mesh.vertices))
         scene = RayScene(mesh)

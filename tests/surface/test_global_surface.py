@@ -235,8 +235,8 @@ def dish(radius=1.6, wall=0.07, rim=0.2):
 
 
 @pytest.mark.slow
-def test_thin_walls_are_found_by_a_finer_mesh():
-    """Edges of 10 px jump over a wall of two; a level that loses it is left out."""
+def test_walls_thinner_than_coarse_edges_are_kept():
+    """Edges of 10 px jump over a wall of two; it is widened until edges are short enough."""
     maps = phase_maps_of(dish(), ring_of_views(16, elevations=(25.0, 50.0)))
     steps = []
     found = reconstruct(maps, tolerances=None, on_progress=steps.append)

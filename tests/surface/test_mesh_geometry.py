@@ -9,6 +9,7 @@ from polmvs.surface.mesh_geometry import (
     relaxed,
     remeshed,
     sample_surface,
+    thickened,
     visible_points,
 )
 
@@ -34,10 +35,25 @@ def test_extraction_keeps_a_hole_and_two_pieces():
     assert set(pair.face_components) == {0, 1}
 
 
+def test_what_is_thinner_than_the_grid_is_widened_to_it():
+    """A ring 0.12 wide and a grid of 0.1; a ball stays as it is."""
+    thin, step = extracted(torus(1.0, 0.06), half=1.2, step=0.03), 0.1
+    assert len(remeshed(RayScene(thin), step).faces) == 0
+    wide = thickened(RayScene(thin), 2 * step)
+    around = np.hypot(np.linalg.norm(wide.vertices[:, :2], axis=1) - 1, wide.vertices[:, 2])
+    np.testing.assert_allclose(around, step, atol=0.01)
+    for shift in np.linspace(0, step, 4):
+        kept = remeshed(RayScene(wide.moved(np.full(3, shift))), step)
+        assert len(kept.faces) > 0
+        assert euler_number(kept) == 0
+    ball = extracted(sphere())
+    np.testing.assert_array_equal(thickened(RayScene(ball), 2 * step).vertices, ball.vertices)
+
+
 def test_extraction_of_nothing_is_empty():
     mesh = mesh_from_grid(np.ones((4, 4, 4), np.float32), np.zeros(3), 1.0)
     assert len(mesh.vertices) == len(mesh.faces) == 0
-    assert len(remeshed(RayScene(mesh), 0.1).faces) == 0
+    assert len(remeshed(RayScene(thickened(RayScene(mesh), 0.2)), 0.1).faces) == 0
 
 
 def test_triangles_are_even():

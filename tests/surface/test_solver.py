@@ -22,7 +22,6 @@ from polmvs.surface.grazing import outline_bias
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed
 from polmvs.surface.observations import Looking, level_image, observe
 from polmvs.surface.solver import (
-    Fit,
     Level,
     SolverTolerances,
     first_fit,
@@ -575,21 +574,3 @@ def test_a_mesh_whose_sheets_have_crossed_is_made_anew(ball, monkeypatch, crosse
     monkeypatch.setattr(RayScene, "crossed_faces", lambda self, depth: np.zeros(crossed))
     refined(visual_hull(ball), ball, tolerances=replace(QUICK, levels=QUICK.levels[:1]))
     assert len(made) == num_meshes
-
-
-@pytest.mark.parametrize(("max_vertices", "num_levels"), [(100_000, 3 + 2), (300, 3)])
-def test_lost_walls_are_made_again_by_fine_levels_if_they_may_have_so_many_vertices(
-    ball, monkeypatch, max_vertices, num_levels
-):
-    hull = visual_hull(ball)
-    # Of what the views show the hull covers all, a surface half.
-    monkeypatch.setattr(
-        "polmvs.surface.solver.covered_share",
-        lambda scene, _: 1.0 if scene.mesh is hull.mesh else 0.5,
-    )
-    levels = tuple(replace(QUICK.levels[0], edge_px=px, num_steps=1) for px in (8.0, 6.0, 5.0))
-    widths = []
-    at_width = Fit.at_width
-    monkeypatch.setattr(Fit, "at_width", lambda fit, px: widths.append(px) or at_width(fit, px))
-    refined(hull, ball, tolerances=replace(QUICK, levels=levels, max_vertices=max_vertices))
-    assert len(widths) == num_levels
