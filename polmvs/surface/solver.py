@@ -331,15 +331,13 @@ def _refined_at(
         # A mesh that has moved far is irregular. In one that intersects itself views see the
         # inside. Other meshes stay as they are, because the grid rounds their creases.
         if step == 0:
-            # The outlines make what is widened thin again.
-            mesh = remeshed(RayScene(thickened(RayScene(mesh), 2 * edge)), edge)
+            mesh = _at_level(RayScene(mesh), edge, fit.views)
             moved = np.zeros(len(mesh.vertices))
         scene = RayScene(mesh)
         if step > 0 and not is_thin and _is_irregular(scene, moved, edge, tol):
             # No smoothing: the mesh is smooth. The grid loses walls thinner than its cells.
             again = RayScene(remeshed(scene, edge, smoothing=0))
-            lost = covered_share(scene, fit.views) - covered_share(again, fit.views)
-            is_thin = lost >= REMESHING_LOSS
+            is_thin = _loses_walls(scene, again, fit.views)
             if not is_thin:
                 scene, mesh = again, again.mesh
                 moved = np.zeros(len(mesh.vertices))
@@ -377,6 +375,20 @@ def _refined_at(
             break
     assert energy is not None  # a level has an iteration
     return mesh, replace(fit, scales=energy.shown_scales())
+
+
+def _at_level(scene: RayScene, edge: float, views: Sequence[SurfaceView]) -> TriangleMesh:
+    """A level's first mesh. Walls that it would lose are widened; outlines make them thin again."""
+    mesh = remeshed(scene, edge)
+    if not _loses_walls(scene, RayScene(mesh), views):
+        return mesh
+    logger.info("parts thinner than edges of the level are widened.")
+    return remeshed(RayScene(thickened(scene, 2 * edge)), edge)
+
+
+def _loses_walls(scene: RayScene, again: RayScene, views: Sequence[SurfaceView]) -> bool:
+    """Whether a surface made again covers less of the silhouettes."""
+    return covered_share(scene, views) - covered_share(again, views) >= REMESHING_LOSS
 
 
 def _is_irregular(scene: RayScene, moved: Array, edge: float, tol: SolverTolerances) -> bool:
