@@ -387,7 +387,7 @@ def _at_level(scene: RayScene, edge: float, views: Sequence[SurfaceView]) -> Tri
 
 
 def _loses_walls(scene: RayScene, again: RayScene, views: Sequence[SurfaceView]) -> bool:
-    """Whether a surface made again covers less of the silhouettes."""
+    """Whether a remeshed surface covers clearly less of the silhouettes than the one before."""
     return covered_share(scene, views) - covered_share(again, views) >= REMESHING_LOSS
 
 
