@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from polmvs.geometry import dots, lengths, unit_or_zero
 from polmvs.io.clouds import Mesh
@@ -442,19 +443,32 @@ def relaxed(mesh: TriangleMesh, rounds: int = 2) -> TriangleMesh:
     return mesh
 
 
-def thickened(scene: RayScene, least: float) -> TriangleMesh:
-    """The mesh of a scene; what is thinner than ``least``, world units, is widened on both sides.
+def thickened(scene: RayScene, coarse: RayScene, edge: float) -> TriangleMesh:
+    """The mesh of a scene, widened on both sides where a coarse mesh of it lost thin parts.
 
+    These and what lies within two edges of them, to which they are joined, become two edges thick.
     Every position of a rod two grid spacings wide holds a point of the grid, so :func:`remeshed`
-    keeps what is widened to that.
+    keeps it.
+
+    Parameters
+    ----------
+    scene : of a closed mesh.
+    coarse : of the same surface, with edges of length ``edge``. What is farther from it than a
+        cell's diagonal is lost: corners of plates, between points of the grid, are not.
     """
     mesh = scene.mesh
     if not len(mesh.faces):
         return mesh
+    is_lost = np.ones(len(mesh.vertices), np.bool_)
+    if len(coarse.mesh.faces):
+        is_lost = coarse.distance(mesh.vertices) > np.sqrt(3) * edge
+    if not is_lost.any():
+        return mesh
+    is_near = cKDTree(mesh.vertices[is_lost]).query(mesh.vertices)[0] <= 2 * edge
     inwards = -mesh.vertex_normals
-    start = 1e-3 * least  # off the vertex's own faces
+    start = 2e-3 * edge  # off the vertex's own faces
     thickness = start + scene.cast(mesh.vertices + start * inwards, inwards).distance
-    missing = np.clip(least - thickness, 0, None)
+    missing = np.where(is_near, np.clip(2 * edge - thickness, 0, None), 0.0)
     return mesh.moved(-0.5 * missing[:, None] * inwards)
 
 

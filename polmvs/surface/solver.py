@@ -378,12 +378,12 @@ def _refined_at(
 
 
 def _at_level(scene: RayScene, edge: float, views: Sequence[SurfaceView]) -> TriangleMesh:
-    """A level's first mesh. Walls that it would lose are widened; outlines make them thin again."""
-    mesh = remeshed(scene, edge)
-    if not _loses_walls(scene, RayScene(mesh), views):
-        return mesh
-    logger.info("parts thinner than edges of the level are widened.")
-    return remeshed(RayScene(thickened(scene, 2 * edge)), edge)
+    """A level's first mesh. Parts that it would lose are widened; outlines make them thin again."""
+    again = RayScene(remeshed(scene, edge))
+    if not _loses_walls(scene, again, views):
+        return again.mesh
+    logger.info("parts that edges of the level would lose are widened.")
+    return remeshed(RayScene(thickened(scene, again, edge)), edge)
 
 
 def _loses_walls(scene: RayScene, again: RayScene, views: Sequence[SurfaceView]) -> bool:

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from analytic_objects import euler_number, extracted, side_by_side, sphere, torus, union
+from analytic_objects import box, euler_number, extracted, side_by_side, sphere, torus, union
 
 from polmvs.surface.mesh_geometry import (
     RayScene,
@@ -38,22 +38,39 @@ def test_extraction_keeps_a_hole_and_two_pieces():
 def test_what_is_thinner_than_the_grid_is_widened_to_it():
     """A ring 0.12 wide and a grid of 0.1; a ball stays as it is."""
     thin, step = extracted(torus(1.0, 0.06), half=1.2, step=0.03), 0.1
-    assert len(remeshed(RayScene(thin), step).faces) == 0
-    wide = thickened(RayScene(thin), 2 * step)
+    none = RayScene(remeshed(RayScene(thin), step))
+    assert len(none.mesh.faces) == 0
+    wide = thickened(RayScene(thin), none, step)
     around = np.hypot(np.linalg.norm(wide.vertices[:, :2], axis=1) - 1, wide.vertices[:, 2])
     np.testing.assert_allclose(around, step, atol=0.01)
     for shift in np.linspace(0, step, 4):
         kept = remeshed(RayScene(wide.moved(np.full(3, shift))), step)
         assert len(kept.faces) > 0
         assert euler_number(kept) == 0
-    ball = extracted(sphere())
-    np.testing.assert_array_equal(thickened(RayScene(ball), 2 * step).vertices, ball.vertices)
+    ball = RayScene(extracted(sphere()))
+    same = thickened(ball, RayScene(remeshed(ball, step)), step)
+    np.testing.assert_array_equal(same.vertices, ball.mesh.vertices)
+
+
+def test_a_thin_plate_that_is_kept_is_not_widened():
+    """One 0.15 thick and a grid of 0.1: only its border is rounded. The rod on it is lost."""
+    step = 0.1
+    plate, rod = box((1.0, 1.0, 0.075)), box((0.03, 0.03, 0.5))
+    mesh = extracted(union(plate, lambda p: rod(p - np.array([0, 0, 0.5]))), half=1.3, step=0.02)
+    coarse = RayScene(remeshed(RayScene(mesh), step))
+    assert coarse.mesh.vertices[:, 2].max() < 0.3
+    moved = thickened(RayScene(mesh), coarse, step).vertices - mesh.vertices
+    is_beside = np.abs(mesh.vertices[:, :2]).max(axis=1) > 0.5
+    assert not moved[is_beside].any()
+    along = mesh.vertices[:, 2]
+    sides = (np.abs(mesh.vertices[:, :2]).max(axis=1) < 0.05) & (along > 0.3) & (along < 0.9)
+    assert (np.linalg.norm(moved[sides], axis=1) > 0.03).all()
 
 
 def test_extraction_of_nothing_is_empty():
     mesh = mesh_from_grid(np.ones((4, 4, 4), np.float32), np.zeros(3), 1.0)
     assert len(mesh.vertices) == len(mesh.faces) == 0
-    assert len(remeshed(RayScene(thickened(RayScene(mesh), 0.2)), 0.1).faces) == 0
+    assert len(remeshed(RayScene(thickened(RayScene(mesh), RayScene(mesh), 0.1)), 0.1).faces) == 0
 
 
 def test_triangles_are_even():
