@@ -54,8 +54,8 @@ class SearchTolerances:
     num_near : number of other views with which a view is correlated.
     num_others : largest number of other views that predict the plane.
     detail_px : deviation of the average that is subtracted to get texture.
-    lighting_px : window over which the plane's brightness may differ between views, and in which
-        the background beyond the plane is compared with the object, working pixels.
+    lighting_share : of an image's longest side, window over which the plane's brightness may differ
+        between views, and in which the background beyond the plane is compared with the object.
     num_levels : of brightness, in that comparison. Guess.
     extent_cells : of the grid on which the plane's extent is found, along its side. Guess.
     extent_gap : width of gaps in the extent that are closed, in those cells. Guess.
@@ -71,12 +71,12 @@ class SearchTolerances:
         of it: its region is then complete.
     """
 
-    working_px: int = 320
+    working_px: int = 640
     window_px: int = 5
     num_near: int = 6
     num_others: int = 12
     detail_px: float = 2.0
-    lighting_px: int = 41
+    lighting_share: float = 1 / 8
     num_levels: int = 32
     extent_cells: int = 100
     extent_gap: int = 10
@@ -85,8 +85,12 @@ class SearchTolerances:
     seen_share: float = 0.6
     num_cells: int = 72
     num_rounds: int = 2
-    inner_px: float = 6.0
+    inner_px: float = 12.0
     polarized_share: float = 0.99
+
+    def lighting_px(self, image: Image | Mask) -> int:
+        """Width of the window of :attr:`lighting_share`, pixels; odd."""
+        return 2 * round(0.5 * self.lighting_share * int(max(image.shape))) + 1
 
     def needed(self, num_views: int) -> int:
         """Number of views that must deny a point."""
@@ -132,45 +136,27 @@ def find_object(
     polarization shows the whole object.
     """
     near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
-    shows_plane: list[Mask] = []
-    for scale in (4, 2, 1):  # a plane without fine texture may have a coarse one
-        small = [_working(phase_map, plane, TOL.working_px / scale) for phase_map in maps]
-        shares, expected = _showing_plane(small, near)
-        # A window next to an outline on the plane contains the outline, also inside the object.
-        size = 2 * round(0.5 * TOL.window_px + TOL.detail_px) - 1
-        found = [
-            (cv2.erode(share, np.ones((size, size), np.uint8)) > TOL.least_share) & ~view.polarized
-            for share, view in zip(shares, small, strict=True)
-        ]
-        window = np.ones((TOL.window_px, TOL.window_px), np.uint8)
-        textured = [cv2.erode(share, window) > TOL.least_share for share in shares]
-        hidden = [
-            (texture > TOL.least_share) & (share <= TOL.least_share)
-            for texture, share in zip(expected, shares, strict=True)
-        ]
-        # Thin parts of the object are lost at a coarse scale: it does not overrule a finer one.
-        shows_plane = [
-            here | ((cv2.resize(before.astype(np.uint8), here.shape[::-1]) > 0) & ~unseen)
-            for here, before, unseen in zip(found, shows_plane or found, hidden, strict=True)
-        ]
-    small = _with_extent(small, textured, plane)
-    coarse = _bounded(_space(small, plane), small, shows_plane)
-    if coarse is None:
-        return None
-    masks = [coarse.mask(view) for view in small]
-    # More than the object: if all of it is polarized, the object is, and the rest is not needed.
-    if _is_polarized(small, masks):
-        return None
-    cells = coarse.finer()
+    # A plane without fine texture may have a coarse one.
+    shown = _shown_plane(maps, plane, near, 4, None)
+    for scale in (2, 1):
+        shown = _shown_plane(maps, plane, near, scale, shown)
+        small = _with_extent(shown.views, shown.textured, plane)
+        coarse = _bounded(_space(small, plane), small, shown.shows_plane)
+        if coarse is None:
+            return None
+        masks = [coarse.mask(view) for view in small]
+        # More than the object: if all of it is polarized, the object is. Half the size shows that.
+        if _is_polarized(small, masks):
+            return None
+        cells = coarse.finer()
     for _ in range(TOL.num_rounds):
         plates = _plates(small, masks)
-        left = cells.likely(small, _background_odds(small, plates, masks, textured, hidden))
+        left = cells.likely(small, _background_odds(shown, small, plates, masks))
         if left is None:
             return None
         masks = [left.mask(view) for view in small]
     if _is_polarized(small, masks):
         return None
-    plates = _plates(small, masks)
     noise = _residual(small, plates, masks)
     odds = _plane_odds(small, plates, noise)
     masks = [fill_false_holes(*pair) for pair in zip(masks, odds, strict=True)]
@@ -181,6 +167,56 @@ def find_object(
     with ThreadPoolExecutor(default_num_workers()) as pool:
         one = partial(_found, small, plane=plane, noise=noise)
         return list(pool.map(one, range(len(small)), masks, plates))
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Where views show the plane's texture.
+
+    Attributes
+    ----------
+    views : in working pixels.
+    textured : of each, (h, w) bool, pixels that show it.
+    hidden : (h, w) bool, pixels that do not show it where they should.
+    shows_plane : (h, w) bool, pixels that show it here or at a coarser scale.
+    """
+
+    views: list[_Working]
+    textured: list[Mask]
+    hidden: list[Mask]
+    shows_plane: list[Mask]
+
+
+def _shown_plane(
+    maps: Sequence[PhaseMap],
+    plane: SupportingPlane,
+    points: Floats,
+    scale: float,
+    coarser: _Shown | None,
+) -> _Shown:
+    """Where views show the texture of a plane with some points, at a scale of their images."""
+    views = [_working(phase_map, plane, TOL.working_px / scale) for phase_map in maps]
+    shares, expected = _showing_plane(views, points)
+    # A window next to an outline on the plane contains the outline, also inside the object.
+    size = 2 * round(0.5 * TOL.window_px + TOL.detail_px) - 1
+    found = [
+        (cv2.erode(share, np.ones((size, size), np.uint8)) > TOL.least_share) & ~view.polarized
+        for share, view in zip(shares, views, strict=True)
+    ]
+    window = np.ones((TOL.window_px, TOL.window_px), np.uint8)
+    textured = [cv2.erode(share, window) > TOL.least_share for share in shares]
+    hidden = [
+        (texture > TOL.least_share) & (share <= TOL.least_share)
+        for texture, share in zip(expected, shares, strict=True)
+    ]
+    # Thin parts of the object are lost at a coarse scale: it does not overrule a finer one.
+    shows_plane = [
+        here | ((cv2.resize(before.astype(np.uint8), here.shape[::-1]) > 0) & ~unseen)
+        for here, before, unseen in zip(
+            found, coarser.shows_plane if coarser else found, hidden, strict=True
+        )
+    ]
+    return _Shown(views, textured, hidden, shows_plane)
 
 
 @dataclass(frozen=True)
@@ -563,7 +599,7 @@ class _Plate:
     Attributes
     ----------
     log : (h, w) float32, logarithm of the intensity; NaN where fewer than two other views see the
-        plane.
+        plane, and far from the object.
     deviation : (h, w) float32, of the views that see it.
     predictions : of each other view: its index, 1 where it shows no object (h, w), and what is
         added to its logarithm, in a smaller image.
@@ -584,38 +620,55 @@ def _others(views: Sequence[_Working], index: int) -> NDArray[np.int64]:
 
 
 def _plates(views: Sequence[_Working], masks: Sequence[Mask]) -> list[_Plate]:
-    """The plane in each view, predicted from the others where the object does not hide it.
+    """The plane about the object in each view, predicted from others where it is not hidden.
 
     A lamp that moves with the camera, and gloss, change the plane's brightness from view to view.
-    At scales above ``lighting_px``, each prediction is adjusted to the brightness of the view.
+    At scales above ``lighting_share``, each prediction is adjusted to the brightness of the view.
     """
     kernel = np.ones((3, 3), np.uint8)
     free = [cv2.dilate(mask.astype(np.uint8), kernel) == 0 for mask in masks]
     beside = [mask.astype(np.float32) for mask in free]
-    shrink = 8 / TOL.lighting_px  # of an average over the window
 
     def plate(index: int) -> _Plate:
         view, shown, changes, predictions = views[index], [], [], []
+        window = TOL.lighting_px(view.log)
+        shrink = 8 / window  # of an average over the window
+        part = _about(masks[index], window)
+        own, on_plane, open_here = view.log[part], view.on_plane[part], free[index][part]
         for other in _others(views, index):
-            xy = views[other].project(view.on_plane)
+            xy = views[other].project(on_plane)
             seen = views[other].sees(xy) & (sample_image(beside[other], xy) >= 1)
-            if not (both := seen & free[index]).any():
+            if not (both := seen & open_here).any():
                 continue
             log = sample_image(views[other].log, xy)
-            change = _local_mean(view.log - log, both, TOL.lighting_px)
+            change = _local_mean(own - log, both, window)
             shown.append(np.where(seen, log + change, np.nan))
-            small = cv2.resize(change, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+            whole = np.zeros_like(view.log)
+            whole[part] = change
+            small = cv2.resize(whole, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
             predictions.append((int(other), beside[other], np.asarray(small, np.float32)))
             varying = change[both]
             changes.append(robust_deviation(varying - np.median(varying)))
-        stack = np.array(shown, np.float32).reshape(-1, *view.log.shape)
-        log, deviation = _median_and_deviation(stack)
+        stack = np.array(shown, np.float32).reshape(-1, *own.shape)
+        log, deviation = np.full_like(view.log, np.nan), np.zeros_like(view.log)
+        log[part], deviation[part] = _median_and_deviation(stack)
         log[~view.has_plane] = np.nan
         return _Plate(log, deviation, predictions, np.array(changes))
 
     # Threads, as sampling images and sorting release Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
         return list(pool.map(plate, range(len(views))))
+
+
+def _about(mask: Mask, margin: int) -> tuple[slice, slice]:
+    """The part of an image that holds a mask with a margin."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return slice(None), slice(None)
+    first, second = (
+        slice(max(int(one[0]) - margin, 0), int(one[-1]) + margin + 1) for one in (rows, columns)
+    )
+    return first, second
 
 
 def _local_mean(values: Image, where: Mask, window_px: int) -> Image:
@@ -655,25 +708,22 @@ def _residual(views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequen
 
 
 def _background_odds(
+    plane: _Shown,
     views: Sequence[_Working],
     plates: Sequence[_Plate],
     masks: Sequence[Mask],
-    textured: Sequence[Mask],
-    hidden: Sequence[Mask],
 ) -> list[Image]:
     """Log-odds (h, w) that each view's pixels show the plane, or the background beyond it.
 
-    Parameters
-    ----------
-    textured : pixels that show the plane's texture.
-    hidden : pixels that do not show it where they should: their brightness agrees by chance only.
+    Where a view does not show the plane's texture though it should, the brightness agrees by
+    chance only.
     """
     found = []
     for view, odds, seen, unseen, beyond in zip(
         views,
         _plane_odds(views, plates, _residual(views, plates, masks)),
-        textured,
-        hidden,
+        plane.textured,
+        plane.hidden,
         _showing_beyond(views, masks),
         strict=True,
     ):
@@ -733,13 +783,13 @@ def _showing_beyond(views: Sequence[_Working], masks: Sequence[Mask]) -> list[Ma
     def eroded(mask: Mask, size: int) -> Mask:
         return cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
 
-    inner = [eroded(mask, TOL.lighting_px // 4) for mask in masks]
+    inner = [eroded(mask, TOL.lighting_px(mask) // 4) for mask in masks]
     of_object = shares(
         np.sum([counts(v, own & v.has_plane) for v, own in zip(views, inner, strict=True)], axis=0)
     )
     found = []
     for view, mask in zip(views, masks, strict=True):
-        near = ~eroded(~mask, TOL.lighting_px)
+        near = ~eroded(~mask, TOL.lighting_px(mask))
         of_beyond = shares(counts(view, near & ~mask & ~view.has_plane))
         odds = np.log(of_beyond / of_object)[levels(view)]
         odds = np.clip(odds, -MAX_ODDS, MAX_ODDS).astype(np.float32)

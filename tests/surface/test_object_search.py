@@ -52,12 +52,12 @@ def on_ball(view: View, xy: np.ndarray) -> np.ndarray:
     return heights_on_ball(view, xy) > 0
 
 
-def on_arm(view: View, xy: np.ndarray) -> np.ndarray:
+def on_arm(view: View, xy: np.ndarray, radius: float = ARM) -> np.ndarray:
     """Which rays ``(..., 2)`` meet the arm, ``(...)`` bool."""
     rays, start = view.rays_in_world(xy), view.center_in_world - CENTER
     nearest = -(rays[..., 1:] @ start[1:]) / (rays[..., 1:] ** 2).sum(axis=-1)
     there = start + nearest[..., None] * rays
-    return (lengths(there[..., 1:]) < ARM) & (there[..., 0] > 0) & (there[..., 0] < ARM_END)
+    return (lengths(there[..., 1:]) < radius) & (there[..., 0] > 0) & (there[..., 0] < ARM_END)
 
 
 def photograph(
@@ -68,7 +68,7 @@ def photograph(
     cap: float | None = None,
     lamp: bool = False,
     end: float = np.inf,
-    arm: bool = False,
+    arm: float = 0.0,
 ) -> np.ndarray:
     """Intensity (H, W), each pixel the mean of four rays; beyond ``end`` the table has none.
 
@@ -90,7 +90,7 @@ def photograph(
                 shade = shade * (5 / lengths(meets - center)) ** 2
             height = heights_on_ball(view, xy)
             own = np.where(height > 0.9, ball if cap is None else cap, ball)
-            shade = np.where(on_arm(view, xy) & arm, ball, shade)
+            shade = np.where(on_arm(view, xy, arm), ball, shade)
             total += np.where(height > 0, own, shade) / 4
     rng = np.random.default_rng(1)
     return (total + rng.normal(scale=0.004, size=size)).clip(1e-3).astype(np.float32)
@@ -117,10 +117,13 @@ def capture(
     cap: float | None = None,
     lamp: bool = False,
     end: float = np.inf,
-    arm: bool = False,
+    arm: float = 0.0,
+    doublings: int = 1,
     elevations: tuple[float, ...] = (30.0, 55.0),
 ) -> list[PhaseMap]:
-    views = [finer(view) for view in ring_of_views(10, elevations=elevations)]
+    views = ring_of_views(10, elevations=elevations)
+    for _ in range(doublings):
+        views = [finer(view) for view in views]
     maps = []
     for view in views:
         size = (view.camera.height, view.camera.width)
@@ -180,17 +183,20 @@ def test_a_top_as_bright_as_what_is_beyond_the_plane_stays():
     assert min(overlaps) > 0.85
 
 
-def test_a_thin_arm_is_not_lost():
+@pytest.mark.parametrize(
+    ("radius", "doublings"), [(ARM, 1), pytest.param(0.7 * ARM, 2, marks=pytest.mark.slow)]
+)
+def test_a_thin_arm_is_not_lost(radius, doublings):
     """Averaged with the plane beside it, it looks like the plane."""
-    maps = capture(printed(), arm=True)
+    maps = capture(printed(), arm=radius, doublings=doublings)
     found = find_object(maps, TABLE, table_points())
     assert found is not None
     shares = []
     for one, hiding in zip(maps, found, strict=True):
         xy = pixel_centers(one.view.camera.width, one.view.camera.height)
-        arm = on_arm(one.view, xy) & ~on_ball(one.view, xy)
+        arm = on_arm(one.view, xy, radius) & ~on_ball(one.view, xy)
         shares.append(hiding.mask[arm].mean())
-    assert np.median(shares) > 0.9  # measured: 0.98
+    assert np.median(shares) > 0.9  # measured: 0.98, 0.97
 
 
 def compared(maps: list[PhaseMap], found: list[FoundObject]) -> tuple[list[float], np.ndarray]:
