@@ -453,15 +453,15 @@ def thickened(scene: RayScene, coarse: RayScene, edge: float) -> TriangleMesh:
     Parameters
     ----------
     scene : of a closed mesh.
-    coarse : of the same surface, with edges of length ``edge``. What is farther from it than a
-        cell's diagonal is lost: corners of plates, between points of the grid, are not.
+    coarse : of the same surface, with edges of length ``edge``. What is farther from it than an
+        edge is lost: the sides of plates, which end between points of the grid, are not.
     """
     mesh = scene.mesh
     if not len(mesh.faces):
         return mesh
     is_lost = np.ones(len(mesh.vertices), np.bool_)
     if len(coarse.mesh.faces):
-        is_lost = coarse.distance(mesh.vertices) > np.sqrt(3) * edge
+        is_lost = coarse.distance(mesh.vertices) > edge
     if not is_lost.any():
         return mesh
     is_near = cKDTree(mesh.vertices[is_lost]).query(mesh.vertices)[0] <= 2 * edge
