@@ -155,6 +155,9 @@ def find_object(
         if left is None:
             return None
         masks = [left.mask(view) for view in small]
+        # A mask of cells is right to half of one.
+        middle = left.centers().mean(axis=0)
+        starts = [0.5 * left.width_px(view, middle) * view.factor for view in small]
     if _is_polarized(small, masks):
         return None
     noise = _residual(small, plates, masks)
@@ -166,7 +169,7 @@ def find_object(
     # Threads, as sampling images releases Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
         one = partial(_found, small, plane=plane, noise=noise)
-        return list(pool.map(one, range(len(small)), masks, plates))
+        return list(pool.map(one, range(len(small)), masks, plates, starts))
 
 
 @dataclass(frozen=True)
@@ -446,13 +449,13 @@ class _Cells:
         height, width = view.log.shape
         columns, rows = xy.astype(int).T
         centers = np.bincount(rows * width + columns, minlength=height * width)
-        size = self._width_px(view, middle)
+        size = self.width_px(view, middle)
         density = cv2.GaussianBlur(
             centers.reshape(height, width).astype(np.float32), (0, 0), max(0.5 * size, 0.5)
         )
         return np.asarray(np.maximum(density * size**2, 1), np.float32)
 
-    def _width_px(self, view: _Working, middle: Array) -> float:
+    def width_px(self, view: _Working, middle: Array) -> float:
         """Width of a cell at their middle in a view, working pixels."""
         return float(lengths(self.axes).max()) / view.pixel_at(float(view.view.ranges(middle)))
 
@@ -496,7 +499,7 @@ class _Cells:
         pixels = np.zeros(view.log.shape, np.uint8)
         columns, rows = xy[view.sees(xy, 0.5)].astype(int).T
         pixels[rows, columns] = 1
-        size = 2 * int(np.ceil(self._width_px(view, points.mean(axis=0)))) + 1
+        size = 2 * int(np.ceil(self.width_px(view, points.mean(axis=0)))) + 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
         return np.asarray(cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, kernel) > 0)
 
@@ -811,16 +814,20 @@ def _found(
     index: int,
     mask: Mask,
     plate: _Plate,
+    start_px: float,
     *,
     plane: SupportingPlane,
     noise: float,
 ) -> FoundObject:
-    """The object in a view's own pixels, with the sub-pixel position of its outline."""
+    """The object in a view's own pixels, with the sub-pixel position of its outline.
+
+    ``mask`` is right to ``start_px`` of them.
+    """
     view = views[index]
     size = (view.view.camera.width, view.view.camera.height)
     coarse = cv2.resize(signed_distance_px(mask), size) * np.float32(view.factor)
     behind = partial(_behind, views, index, plate, plane)
-    distance = find_outline(view.intensity, coarse, behind, noise, start_px=view.factor)
+    distance = find_outline(view.intensity, coarse, behind, noise, start_px=start_px)
     found = distance < 0
     inner = coarse < -TOL.inner_px * view.factor
     return FoundObject(found, smooth_distance_px(found) - distance, inner)
