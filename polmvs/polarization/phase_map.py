@@ -288,12 +288,12 @@ def smoothed_polarization(
     whole = np.zeros((*known.shape, 3), np.float32)
     # The window reaches no farther about the usable pixels.
     reach = len(_window(width_px)[0]) // 2
-    part = _box_about(known, reach)
+    part = box_about(known, reach)
     whole[part] = _smoothed_part(polarization[part], known[part], width_px)
     return whole
 
 
-def _box_about(known: Mask, margin: int) -> tuple[slice, slice]:
+def box_about(known: Mask, margin: int) -> tuple[slice, slice]:
     """Smallest part of an image that holds its marked pixels with a margin."""
     ends = []
     for axis in (1, 0):

@@ -453,8 +453,8 @@ def thickened(scene: RayScene, coarse: RayScene, edge: float) -> TriangleMesh:
     Parameters
     ----------
     scene : of a closed mesh.
-    coarse : of the same surface, with edges of length ``edge``. What is farther from it than an
-        edge is lost: the sides of plates, which end between points of the grid, are not.
+    coarse : of the same surface, with edges of length ``edge``. A vertex farther from it than an
+        edge is lost. The rounded sides of a plate lie nearer.
     """
     mesh = scene.mesh
     if not len(mesh.faces):

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ from polmvs.camera import pixel_centers, sample_image
 from polmvs.config import default_num_workers
 from polmvs.fitting import MEDIAN_OF_NORMAL, robust_deviation
 from polmvs.geometry import lengths
-from polmvs.polarization.phase_map import PhaseMap
+from polmvs.polarization.phase_map import PhaseMap, box_about
 from polmvs.scene import View
 from polmvs.surface.matting import find_outline
 from polmvs.surface.surface_view import signed_distance_px, smooth_distance_px
@@ -141,6 +141,7 @@ def find_object(
     for scale in (2, 1):
         shown = _shown_plane(maps, plane, near, scale, shown)
         small = _with_extent(shown.views, shown.textured, plane)
+        shown = replace(shown, views=small)
         coarse = _bounded(_space(small, plane), small, shown.shows_plane)
         if coarse is None:
             return None
@@ -151,13 +152,12 @@ def find_object(
         cells = coarse.finer()
     for _ in range(TOL.num_rounds):
         plates = _plates(small, masks)
-        left = cells.likely(small, _background_odds(shown, small, plates, masks))
+        left = cells.likely(small, _background_odds(shown, plates, masks))
         if left is None:
             return None
         masks = [left.mask(view) for view in small]
-        # A mask of cells is right to half of one.
-        middle = left.centers().mean(axis=0)
-        starts = [0.5 * left.width_px(view, middle) * view.factor for view in small]
+        # The masks are accurate to half a cell.
+        starts = [0.5 * left.width_px(view) * view.factor for view in small]
     if _is_polarized(small, masks):
         return None
     noise = _residual(small, plates, masks)
@@ -383,6 +383,11 @@ class _Cells:
         """Centres ``(N, 3)`` of the cells that are held."""
         return np.asarray(self.origin + np.argwhere(self.held) @ self.axes)
 
+    @cached_property
+    def middle(self) -> Array:
+        """Mean (3,) of these centres."""
+        return np.asarray(self.centers().mean(axis=0))
+
     def carved(
         self,
         views: Sequence[_Working],
@@ -432,32 +437,31 @@ class _Cells:
         None if nothing is left.
         """
         points = self.centers()
-        middle = points.mean(axis=0)
         total, num_seen = np.zeros(len(points)), np.zeros(len(points), np.int32)
         for view, image in zip(views, odds, strict=True):
             xy = view.project(points)
             seen = view.sees(xy, 0.5)
             num_seen += seen
-            shared = np.where(image < 0, image / self._num_on_rays(view, xy[seen], middle), image)
+            shared = np.where(image < 0, image / self._num_on_rays(view, xy[seen]), image)
             total[seen] += sample_image(shared.astype(np.float32), xy[seen], nearest=True)
         held = np.zeros_like(self.held)
         held[self.held] = (total < LEAST_ODDS) & (num_seen >= TOL.seen_share * len(views))
         return self._middle_part(held)
 
-    def _num_on_rays(self, view: _Working, xy: Floats, middle: Array) -> Image:
+    def _num_on_rays(self, view: _Working, xy: Floats) -> Image:
         """Number (h, w) of cells on each pixel's ray, at least one, from their coordinates."""
         height, width = view.log.shape
         columns, rows = xy.astype(int).T
         centers = np.bincount(rows * width + columns, minlength=height * width)
-        size = self.width_px(view, middle)
+        size = self.width_px(view)
         density = cv2.GaussianBlur(
             centers.reshape(height, width).astype(np.float32), (0, 0), max(0.5 * size, 0.5)
         )
         return np.asarray(np.maximum(density * size**2, 1), np.float32)
 
-    def width_px(self, view: _Working, middle: Array) -> float:
+    def width_px(self, view: _Working) -> float:
         """Width of a cell at their middle in a view, working pixels."""
-        return float(lengths(self.axes).max()) / view.pixel_at(float(view.view.ranges(middle)))
+        return float(lengths(self.axes).max()) / view.pixel_at(float(view.view.ranges(self.middle)))
 
     def _middle_part(self, held: Mask) -> _Cells | None:
         """The connected part of some cells around the middle; None if there is none."""
@@ -499,7 +503,7 @@ class _Cells:
         pixels = np.zeros(view.log.shape, np.uint8)
         columns, rows = xy[view.sees(xy, 0.5)].astype(int).T
         pixels[rows, columns] = 1
-        size = 2 * int(np.ceil(self.width_px(view, points.mean(axis=0)))) + 1
+        size = 2 * int(np.ceil(self.width_px(view))) + 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
         return np.asarray(cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, kernel) > 0)
 
@@ -636,7 +640,7 @@ def _plates(views: Sequence[_Working], masks: Sequence[Mask]) -> list[_Plate]:
         view, shown, changes, predictions = views[index], [], [], []
         window = TOL.lighting_px(view.log)
         shrink = 8 / window  # of an average over the window
-        part = _about(masks[index], window)
+        part = box_about(masks[index], window)
         own, on_plane, open_here = view.log[part], view.on_plane[part], free[index][part]
         for other in _others(views, index):
             xy = views[other].project(on_plane)
@@ -661,17 +665,6 @@ def _plates(views: Sequence[_Working], masks: Sequence[Mask]) -> list[_Plate]:
     # Threads, as sampling images and sorting release Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
         return list(pool.map(plate, range(len(views))))
-
-
-def _about(mask: Mask, margin: int) -> tuple[slice, slice]:
-    """The part of an image that holds a mask with a margin."""
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return slice(None), slice(None)
-    first, second = (
-        slice(max(int(one[0]) - margin, 0), int(one[-1]) + margin + 1) for one in (rows, columns)
-    )
-    return first, second
 
 
 def _local_mean(values: Image, where: Mask, window_px: int) -> Image:
@@ -712,7 +705,6 @@ def _residual(views: Sequence[_Working], plates: Sequence[_Plate], masks: Sequen
 
 def _background_odds(
     plane: _Shown,
-    views: Sequence[_Working],
     plates: Sequence[_Plate],
     masks: Sequence[Mask],
 ) -> list[Image]:
@@ -721,7 +713,7 @@ def _background_odds(
     Where a view does not show the plane's texture though it should, the brightness agrees by
     chance only.
     """
-    found = []
+    views, found = plane.views, []
     for view, odds, seen, unseen, beyond in zip(
         views,
         _plane_odds(views, plates, _residual(views, plates, masks)),
@@ -821,7 +813,7 @@ def _found(
 ) -> FoundObject:
     """The object in a view's own pixels, with the sub-pixel position of its outline.
 
-    ``mask`` is right to ``start_px`` of them.
+    ``mask`` is accurate to ``start_px`` of them.
     """
     view = views[index]
     size = (view.view.camera.width, view.view.camera.height)

@@ -52,7 +52,7 @@ def on_ball(view: View, xy: np.ndarray) -> np.ndarray:
     return heights_on_ball(view, xy) > 0
 
 
-def on_arm(view: View, xy: np.ndarray, radius: float = ARM) -> np.ndarray:
+def on_arm(view: View, xy: np.ndarray, radius: float) -> np.ndarray:
     """Which rays ``(..., 2)`` meet the arm, ``(...)`` bool."""
     rays, start = view.rays_in_world(xy), view.center_in_world - CENTER
     nearest = -(rays[..., 1:] @ start[1:]) / (rays[..., 1:] ** 2).sum(axis=-1)
