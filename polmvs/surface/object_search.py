@@ -55,8 +55,8 @@ class SearchTolerances:
     num_others : largest number of other views that predict the plane.
     detail_px : deviation of the average that is subtracted to get texture.
     lighting_share : of an image's longest side, window over which the plane's brightness may differ
-        between views, and in which the background beyond the plane is compared with the object.
-    num_levels : of brightness, in that comparison. Guess.
+        between views, and in which the background's appearance is compared with the object's.
+    num_levels : of brightness, and of contrast, in that comparison. Guess.
     extent_cells : of the grid on which the plane's extent is found, along its side. Guess.
     extent_gap : width of gaps in the extent that are closed, in those cells. Guess.
     least_share : share of a pixel's texture that agrees with the plane in two other views. Guess.
@@ -81,7 +81,7 @@ class SearchTolerances:
     extent_cells: int = 100
     extent_gap: int = 10
     least_share: float = 0.2
-    wrong_share: float = 0.15
+    wrong_share: float = 0.25
     seen_share: float = 0.6
     num_cells: int = 72
     num_rounds: int = 2
@@ -152,14 +152,15 @@ def find_object(
         cells = coarse.finer()
     for _ in range(TOL.num_rounds):
         plates = _plates(small, masks)
-        left = cells.likely(small, _background_odds(shown, plates, masks))
+        odds = _background_odds(shown, plates, masks)
+        left = cells.likely(small, odds)
         if left is None:
             return None
         masks = [left.mask(view) for view in small]
-        # The masks are accurate to half a cell.
-        starts = [0.5 * left.width_px(view) * view.factor for view in small]
+        widths = [left.width_px(view) for view in small]
     if _is_polarized(small, masks):
         return None
+    masks = [_decided(*given) for given in zip(masks, odds, widths, strict=True)]
     noise = _residual(small, plates, masks)
     odds = _plane_odds(small, plates, noise)
     masks = [fill_false_holes(*pair) for pair in zip(masks, odds, strict=True)]
@@ -169,7 +170,7 @@ def find_object(
     # Threads, as sampling images releases Python's lock.
     with ThreadPoolExecutor(default_num_workers()) as pool:
         one = partial(_found, small, plane=plane, noise=noise)
-        return list(pool.map(one, range(len(small)), masks, plates, starts))
+        return list(pool.map(one, range(len(small)), masks, plates))
 
 
 @dataclass(frozen=True)
@@ -423,7 +424,9 @@ class _Cells:
         return self._middle_part(held)
 
     def likely(self, views: Sequence[_Working], odds: Sequence[Image]) -> _Cells | None:
-        """The cells that are more likely the object's; only the part around the middle.
+        """The cells that are more likely the object's.
+
+        A connected part of them must explain more than one pixel: any may be wrong.
 
         A pixel that shows the background frees all cells on its ray. A pixel that shows the object
         needs one of them: they share its evidence.
@@ -446,7 +449,11 @@ class _Cells:
             total[seen] += sample_image(shared.astype(np.float32), xy[seen], nearest=True)
         held = np.zeros_like(self.held)
         held[self.held] = (total < LEAST_ODDS) & (num_seen >= TOL.seen_share * len(views))
-        return self._middle_part(held)
+        parts, num = ndimage.label(held)
+        evidence = np.bincount(parts[self.held], total, num + 1)
+        evidence[0] = 0
+        held = np.asarray((evidence < -MAX_ODDS)[parts], np.bool_)
+        return replace(self, held=held) if held.any() else None
 
     def _num_on_rays(self, view: _Working, xy: Floats) -> Image:
         """Number (h, w) of cells on each pixel's ray, at least one, from their coordinates."""
@@ -503,7 +510,7 @@ class _Cells:
         pixels = np.zeros(view.log.shape, np.uint8)
         columns, rows = xy[view.sees(xy, 0.5)].astype(int).T
         pixels[rows, columns] = 1
-        size = 2 * int(np.ceil(self.width_px(view))) + 1
+        size = int(np.ceil(np.sqrt(2) * self.width_px(view))) | 1  # their diagonal, odd
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
         return np.asarray(cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, kernel) > 0)
 
@@ -710,20 +717,18 @@ def _background_odds(
 ) -> list[Image]:
     """Log-odds (h, w) that each view's pixels show the plane, or the background beyond it.
 
-    Where a view does not show the plane's texture though it should, the brightness agrees by
-    chance only.
+    Where the plane is predicted, the brightness tells; where it is not, the appearance. Where a
+    view does not show the plane's texture though it should, the brightness agrees by chance only.
     """
     views, found = plane.views, []
-    for view, odds, seen, unseen, beyond in zip(
-        views,
-        _plane_odds(views, plates, _residual(views, plates, masks)),
-        plane.textured,
-        plane.hidden,
-        _showing_beyond(views, masks),
-        strict=True,
+    predicted = _plane_odds(views, plates, _residual(views, plates, masks))
+    appearance = _appearance_odds(views, masks, predicted)
+    for view, plate, odds, looks, seen, unseen in zip(
+        views, plates, predicted, appearance, plane.textured, plane.hidden, strict=True
     ):
+        odds = np.where(np.isfinite(plate.log), odds, looks)
         total = np.asarray(cv2.GaussianBlur(odds, (0, 0), BLUR_PX), np.float32)
-        total[seen | beyond] = MAX_ODDS
+        total[seen] = np.minimum(total[seen] + MAX_ODDS, MAX_ODDS)
         total[unseen] = np.minimum(total[unseen], -LEAST_ODDS)
         total[view.polarized] = -MAX_ODDS
         found.append(total)
@@ -740,6 +745,12 @@ def _plane_odds(views: Sequence[_Working], plates: Sequence[_Plate], noise: floa
     return found
 
 
+def _decided(mask: Mask, odds: Image, width_px: float) -> Mask:
+    """A mask (h, w) of cells of a width, whose pixels within a cell of its border decide."""
+    near = np.abs(signed_distance_px(mask)) < width_px
+    return np.asarray(np.where(near & (np.abs(odds) > LEAST_ODDS), odds < 0, mask), np.bool_)
+
+
 def fill_false_holes(mask: Mask, odds: Floats) -> Mask:
     """A mask (H, W) with the holes filled that do not show the plane in this view.
 
@@ -752,44 +763,55 @@ def fill_false_holes(mask: Mask, odds: Floats) -> Mask:
     return mask | np.isin(labels, 1 + np.flatnonzero(shown <= LEAST_ODDS))
 
 
-def _showing_beyond(views: Sequence[_Working], masks: Sequence[Mask]) -> list[Mask]:
-    """Pixels (h, w) of each view that show the background beyond the plane, such as a wall.
+def _appearance_odds(
+    views: Sequence[_Working], masks: Sequence[Mask], odds: Sequence[Image]
+) -> list[Image]:
+    """Log-odds (h, w) that each view's pixels show the background, by their appearance.
 
-    No other view predicts it. It differs from the object in brightness, if at all: that of the
-    object is known in front of the plane, in some views its top alone; that of the background in
-    each view, away from the object.
+    Appearance is brightness and contrast. That of the object is known where the prediction of the
+    plane fails, in all views; that of the background in each view, about the object. It tells where
+    no other view predicts the plane: in shadow under the object, and beyond the plane's extent.
     """
     lowest = min(float(view.log.min()) for view in views)
     highest = max(float(view.log.max()) for view in views)
+    num, window = TOL.num_levels, np.ones((TOL.window_px, TOL.window_px), np.uint8)
 
-    def levels(view: _Working) -> NDArray[np.int64]:
-        level = (view.log - lowest) / max(highest - lowest, 1e-6) * TOL.num_levels
-        return np.clip(level.astype(np.int64), 0, TOL.num_levels - 1)
+    def cells(view: _Working) -> NDArray[np.int64]:
+        bright = (view.log - lowest) / max(highest - lowest, 1e-6)
+        # The least of the windows that contain a pixel: that of its own side of an outline.
+        variance = cv2.erode(_local_variance(view.log, TOL.window_px), window)
+        contrast = np.sqrt(variance) + LEAST_SIGMA
+        rough = np.log(contrast / LEAST_SIGMA) / np.log(max(highest - lowest, 1e-6) / LEAST_SIGMA)
+        a, b = (np.clip((x * num).astype(np.int64), 0, num - 1) for x in (bright, rough))
+        return np.asarray(a * num + b)
 
-    def counts(view: _Working, where: Mask) -> Array:
-        return np.bincount(levels(view)[where], minlength=TOL.num_levels).astype(np.float64)
+    def counts(cell: NDArray[np.int64], where: Mask) -> Array:
+        return np.bincount(cell[where], minlength=num * num).astype(np.float64)
 
     def shares(counted: Array) -> Array:
-        counted = ndimage.gaussian_filter1d(counted, 1.0)
-        # One in a hundred may have any brightness; of nothing, all are as likely.
-        counted += max(0.01 * counted.sum(), 1.0) / TOL.num_levels
+        counted = ndimage.gaussian_filter(counted.reshape(num, num), 1.0).ravel()
+        # One in a hundred may look like anything; of nothing, all are as likely.
+        counted += max(0.01 * counted.sum(), 1.0) / counted.size
         return np.asarray(counted / counted.sum())
 
-    def eroded(mask: Mask, size: int) -> Mask:
-        return cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    def grown(mask: Mask, size: int) -> Mask:
+        return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
 
-    inner = [eroded(mask, TOL.lighting_px(mask) // 4) for mask in masks]
+    all_cells = [cells(view) for view in views]
     of_object = shares(
-        np.sum([counts(v, own & v.has_plane) for v, own in zip(views, inner, strict=True)], axis=0)
+        np.sum(
+            [
+                counts(cell, ~grown(~mask, TOL.window_px) & (odd < -LEAST_ODDS))
+                for cell, mask, odd in zip(all_cells, masks, odds, strict=True)
+            ],
+            axis=0,
+        )
     )
     found = []
-    for view, mask in zip(views, masks, strict=True):
-        near = ~eroded(~mask, TOL.lighting_px(mask))
-        of_beyond = shares(counts(view, near & ~mask & ~view.has_plane))
-        odds = np.log(of_beyond / of_object)[levels(view)]
-        odds = np.clip(odds, -MAX_ODDS, MAX_ODDS).astype(np.float32)
-        smooth = cv2.GaussianBlur(odds, (0, 0), 1.5)
-        found.append(np.asarray(~view.has_plane & ~view.polarized & (smooth > LEAST_ODDS)))
+    for cell, mask in zip(all_cells, masks, strict=True):
+        near = grown(mask, TOL.lighting_px(mask)) & ~grown(mask, TOL.window_px)
+        told = np.log(shares(counts(cell, near)) / of_object)[cell]
+        found.append(np.clip(told, -MAX_ODDS, MAX_ODDS).astype(np.float32))
     return found
 
 
@@ -806,20 +828,16 @@ def _found(
     index: int,
     mask: Mask,
     plate: _Plate,
-    start_px: float,
     *,
     plane: SupportingPlane,
     noise: float,
 ) -> FoundObject:
-    """The object in a view's own pixels, with the sub-pixel position of its outline.
-
-    ``mask`` is accurate to ``start_px`` of them.
-    """
+    """The object in a view's own pixels, with the sub-pixel position of its outline."""
     view = views[index]
     size = (view.view.camera.width, view.view.camera.height)
     coarse = cv2.resize(signed_distance_px(mask), size) * np.float32(view.factor)
     behind = partial(_behind, views, index, plate, plane)
-    distance = find_outline(view.intensity, coarse, behind, noise, start_px=start_px)
+    distance = find_outline(view.intensity, coarse, behind, noise, start_px=view.factor)
     found = distance < 0
     inner = coarse < -TOL.inner_px * view.factor
     return FoundObject(found, smooth_distance_px(found) - distance, inner)
