@@ -169,28 +169,31 @@ def _quadratic_part(parts: Sequence[tuple[Array, NDArray[np.int64]]]) -> tuple[f
     loss = np.ones_like(r)
     solution = np.zeros(design.shape[1])
     for _ in range(TOL.num_rounds):
-        solution = _solve(design, right, loss)
+        solution = _solve(*_sums(design, right, loss))
         residual = right - design @ solution
         loss = cauchy_weights(np.square(residual / max(robust_deviation(residual), 1e-9)))
     image = np.repeat(np.arange(len(parts)), [len(rows) for rows, _ in parts])
     deviations = []
     for index in (group, image):
-        present = np.unique(index)
-        num = len(present)
-        left_out = [
-            _solve(design[index != k], right[index != k], loss[index != k])[0]
-            for k in (present if num > 1 else ())
-        ]
+        sums = [_sums(*(a[index == k] for a in (design, right, loss))) for k in np.unique(index)]
+        matrix, vector = (np.sum(one, axis=0) for one in zip(*sums, strict=True))
+        num = len(sums)
+        left_out = [_solve(matrix - m, vector - v)[0] for m, v in (sums if num > 1 else ())]
         spread = np.square(np.subtract(left_out, np.mean(left_out or 0.0))).sum()
         deviations.append(np.sqrt((num - 1) / num * spread))
     # Images of different scenes may each show something else: all together say little then.
     return float(solution[0]), float(max(deviations))
 
 
-def _solve(design: Array, right: Array, loss: Array) -> Array:
+def _sums(design: Array, right: Array, loss: Array) -> tuple[Array, Array]:
+    """Matrix (M, M) and right side (M,) of the normal equations of some rows, which are sums."""
     weighted = design * loss[:, None]
-    ridge = 1e-9 * np.trace(weighted.T @ design) * np.eye(design.shape[1])
-    return np.asarray(np.linalg.solve(weighted.T @ design + ridge, weighted.T @ right), np.float64)
+    return weighted.T @ design, weighted.T @ right
+
+
+def _solve(matrix: Array, vector: Array) -> Array:
+    ridge = 1e-9 * np.trace(matrix) * np.eye(len(matrix))
+    return np.asarray(np.linalg.solve(matrix + ridge, vector), np.float64)
 
 
 def _round_gamma(found: float, log_sigma: float) -> float:
