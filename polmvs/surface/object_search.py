@@ -789,7 +789,9 @@ def _appearance_odds(
         return np.bincount(cell[where], minlength=num * num).astype(np.float64)
 
     def shares(counted: Array) -> Array:
-        counted = ndimage.gaussian_filter(counted.reshape(num, num), 1.0).ravel()
+        joint = ndimage.gaussian_filter(counted.reshape(num, num), 1.0)
+        # In shadow, and in light that is found nowhere else, contrast stays: as likely as the rest.
+        counted = (joint + joint.mean(axis=0)).ravel()
         # One in a hundred may look like anything; of nothing, all are as likely.
         counted += max(0.01 * counted.sum(), 1.0) / counted.size
         return np.asarray(counted / counted.sum())
