@@ -2,9 +2,10 @@
 
 Polarization does not show the outline of grey and white objects. The plane on which they stand
 does, if it has a texture: its image in one view is predicted from the others. Pixels that agree
-with the prediction show the plane, so the space between it and the camera is free. The remaining
-space above the plane is the object. The outline in each view is where the image changes from the
-predicted plane to the brightness of the object, as in matting against a known background.
+with the prediction show the plane, so the space between it and the camera is free. Where there is
+no prediction, brightness and contrast decide. The remaining space above the plane is the object.
+The outline in each view is where the image changes from the predicted plane to the brightness of
+the object, as in matting against a known background.
 """
 
 from __future__ import annotations
@@ -426,10 +427,9 @@ class _Cells:
     def likely(self, views: Sequence[_Working], odds: Sequence[Image]) -> _Cells | None:
         """The cells that are more likely the object's.
 
-        A connected part of them must explain more than one pixel: any may be wrong.
-
         A pixel that shows the background frees all cells on its ray. A pixel that shows the object
-        needs one of them: they share its evidence.
+        needs one of them: they share its evidence. A connected part must have more evidence than a
+        single pixel, which may be wrong.
 
         Parameters
         ----------
@@ -510,7 +510,7 @@ class _Cells:
         pixels = np.zeros(view.log.shape, np.uint8)
         columns, rows = xy[view.sees(xy, 0.5)].astype(int).T
         pixels[rows, columns] = 1
-        size = int(np.ceil(np.sqrt(2) * self.width_px(view))) | 1  # their diagonal, odd
+        size = int(np.ceil(np.sqrt(2) * self.width_px(view))) | 1  # odd, at least a cell's diagonal
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
         return np.asarray(cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, kernel) > 0)
 
@@ -723,10 +723,10 @@ def _background_odds(
     views, found = plane.views, []
     predicted = _plane_odds(views, plates, _residual(views, plates, masks))
     appearance = _appearance_odds(views, masks, predicted)
-    for view, plate, odds, looks, seen, unseen in zip(
+    for view, plate, odds, by_appearance, seen, unseen in zip(
         views, plates, predicted, appearance, plane.textured, plane.hidden, strict=True
     ):
-        odds = np.where(np.isfinite(plate.log), odds, looks)
+        odds = np.where(np.isfinite(plate.log), odds, by_appearance)
         total = np.asarray(cv2.GaussianBlur(odds, (0, 0), BLUR_PX), np.float32)
         total[seen] = np.minimum(total[seen] + MAX_ODDS, MAX_ODDS)
         total[unseen] = np.minimum(total[unseen], -LEAST_ODDS)
@@ -746,7 +746,7 @@ def _plane_odds(views: Sequence[_Working], plates: Sequence[_Plate], noise: floa
 
 
 def _decided(mask: Mask, odds: Image, width_px: float) -> Mask:
-    """A mask (h, w) of cells of a width, whose pixels within a cell of its border decide."""
+    """A mask (h, w) of cells, corrected by the odds of its pixels within a cell of its border."""
     near = np.abs(signed_distance_px(mask)) < width_px
     return np.asarray(np.where(near & (np.abs(odds) > LEAST_ODDS), odds < 0, mask), np.bool_)
 
@@ -773,47 +773,42 @@ def _appearance_odds(
     no other view predicts the plane: in shadow under the object, and beyond the plane's extent.
     """
     lowest = min(float(view.log.min()) for view in views)
-    highest = max(float(view.log.max()) for view in views)
+    spread = max(max(float(view.log.max()) for view in views) - lowest, 1e-6)
     num, window = TOL.num_levels, np.ones((TOL.window_px, TOL.window_px), np.uint8)
 
-    def cells(view: _Working) -> NDArray[np.int64]:
-        bright = (view.log - lowest) / max(highest - lowest, 1e-6)
+    def bins(view: _Working) -> NDArray[np.int64]:
+        bright = (view.log - lowest) / spread
         # The least of the windows that contain a pixel: that of its own side of an outline.
         variance = cv2.erode(_local_variance(view.log, TOL.window_px), window)
         contrast = np.sqrt(variance) + LEAST_SIGMA
-        rough = np.log(contrast / LEAST_SIGMA) / np.log(max(highest - lowest, 1e-6) / LEAST_SIGMA)
+        rough = np.log(contrast / LEAST_SIGMA) / np.log(spread / LEAST_SIGMA)
         a, b = (np.clip((x * num).astype(np.int64), 0, num - 1) for x in (bright, rough))
         return np.asarray(a * num + b)
 
-    def counts(cell: NDArray[np.int64], where: Mask) -> Array:
-        return np.bincount(cell[where], minlength=num * num).astype(np.float64)
-
-    def shares(counted: Array) -> Array:
-        joint = ndimage.gaussian_filter(counted.reshape(num, num), 1.0)
-        # In shadow, and in light that is found nowhere else, contrast stays: as likely as the rest.
-        counted = (joint + joint.mean(axis=0)).ravel()
+    def shares(of_pixels: NDArray[np.int64]) -> Array:
+        counts = np.bincount(of_pixels, minlength=num * num).astype(np.float64)
+        joint = ndimage.gaussian_filter(counts.reshape(num, num), 1.0)
+        # Shadow, and light that is found nowhere else, change the brightness and not the contrast:
+        # they are as likely as the rest.
+        counts = (joint + joint.mean(axis=0)).ravel()
         # One in a hundred may look like anything; of nothing, all are as likely.
-        counted += max(0.01 * counted.sum(), 1.0) / counted.size
-        return np.asarray(counted / counted.sum())
+        counts += max(0.01 * counts.sum(), 1.0) / counts.size
+        return np.asarray(counts / counts.sum())
 
     def grown(mask: Mask, size: int) -> Mask:
         return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
 
-    all_cells = [cells(view) for view in views]
-    of_object = shares(
-        np.sum(
-            [
-                counts(cell, ~grown(~mask, TOL.window_px) & (odd < -LEAST_ODDS))
-                for cell, mask, odd in zip(all_cells, masks, odds, strict=True)
-            ],
-            axis=0,
-        )
-    )
+    of_views = [bins(view) for view in views]
+    known = [
+        own[~grown(~mask, TOL.window_px) & (odd < -LEAST_ODDS)]
+        for own, mask, odd in zip(of_views, masks, odds, strict=True)
+    ]
+    of_object = shares(np.concatenate(known))
     found = []
-    for cell, mask in zip(all_cells, masks, strict=True):
+    for own, mask in zip(of_views, masks, strict=True):
         near = grown(mask, TOL.lighting_px(mask)) & ~grown(mask, TOL.window_px)
-        told = np.log(shares(counts(cell, near)) / of_object)[cell]
-        found.append(np.clip(told, -MAX_ODDS, MAX_ODDS).astype(np.float32))
+        ratio = np.log(shares(own[near]) / of_object)[own]
+        found.append(np.clip(ratio, -MAX_ODDS, MAX_ODDS).astype(np.float32))
     return found
 
 
@@ -834,7 +829,10 @@ def _found(
     plane: SupportingPlane,
     noise: float,
 ) -> FoundObject:
-    """The object in a view's own pixels, with the sub-pixel position of its outline."""
+    """The object in a view's own pixels, with the sub-pixel position of its outline.
+
+    ``mask`` is accurate to a working pixel.
+    """
     view = views[index]
     size = (view.view.camera.width, view.view.camera.height)
     coarse = cv2.resize(signed_distance_px(mask), size) * np.float32(view.factor)
