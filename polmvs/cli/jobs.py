@@ -45,6 +45,7 @@ from polmvs.pipeline.stages.seeds import SeedsResult
 from polmvs.polarization.kinds import AngleModel
 
 DEMO_CAPTURE = Path(polmvs.__file__).parent / "demo_capture"
+DEMO_MODELS = (AngleModel.OPA, AngleModel.PPA, AngleModel.TILTED)
 
 
 def demo(call: Call, terminal: Terminal) -> int:
@@ -65,7 +66,7 @@ def demo(call: Call, terminal: Terminal) -> int:
         monitor=terminal,
         command_line=call.command_line,
     )
-    return _show_comparison(_reported(pipeline.compare(job), call, terminal), terminal)
+    return _show_comparison(_reported(pipeline.compare(job, DEMO_MODELS), call, terminal), terminal)
 
 
 def reconstruct(call: Call, terminal: Terminal) -> int:

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -295,11 +296,11 @@ def _mesh_of(given: ReportInput, model: AngleModel) -> Mesh | None:
 
 def scene_layers(given: ReportInput) -> tuple[list[Layer], dict[str, PointColoring]]:
     """Clouds and meshes of all models, and what they can be coloured by."""
-    layers = [
-        _cloud_layer(given, model, cloud, given.length.factor)
-        for model, cloud in given.clouds.items()
-        if len(cloud.points)
-    ]
+    if given.truth is not None:
+        given.truth[0].surface_points()  # once, before the threads
+    shown = {model: cloud for model, cloud in given.clouds.items() if len(cloud.points)}
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        layers = list(pool.map(partial(_cloud_layer, given), shown, shown.values()))
     for model in given.models:
         if (mesh := _mesh_of(given, model)) is not None:
             layers.append(_mesh_layer(model, mesh, layers))
@@ -410,8 +411,8 @@ def _top(layers: Sequence[Layer], name: str, limit: float) -> float:
     return float(steps[steps >= 0.999 * wanted].min())
 
 
-def _cloud_layer(given: ReportInput, model: AngleModel, cloud: Cloud, factor: float) -> Layer:
-    num = len(cloud.points)
+def _cloud_layer(given: ReportInput, model: AngleModel, cloud: Cloud) -> Layer:
+    num, factor = len(cloud.points), given.length.factor
     shown = {"intensity": np.full(num, 0.7) if cloud.colors is None else cloud.colors[:, 0] / 255}
     for name, values in cloud.scalars.items():
         if name in ("kind", "sigma", "sigma_deg", "num_views"):

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from polmvs.polarization.kinds import COMPARED_MODELS
+from polmvs.cli.jobs import DEMO_MODELS
 
 
 def test_demo_prints_both_models_and_no_progress(demo_run: Path, cli) -> None:
@@ -11,10 +11,10 @@ def test_demo_prints_both_models_and_no_progress(demo_run: Path, cli) -> None:
     status, out, err = cli("demo", demo_run, "--resume", "--no-report")
     assert (status, err) == (0, "")
     lines = out.splitlines()
-    names = [model.label for model in COMPARED_MODELS]
+    names = [model.label for model in DEMO_MODELS]
     assert [cell.strip() for cell in lines[0].split("|")] == ["", "", *names, ""]
     assert any(line.startswith("| F-score at 1 mm, %") for line in lines)
-    assert lines[-1].startswith(f"{demo_run}: textbook-opa.ply, textbook-ppa.ply, opa.ply, ")
+    assert lines[-1].startswith(f"{demo_run}: opa.ply, ppa.ply, tilted.ply, ")
     assert lines[-1].endswith("metrics.json, summary.md; 10 of 10 views")
     summary = (demo_run / "summary.md").read_text()
     assert "\n".join(lines[:-1]) in summary

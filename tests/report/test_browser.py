@@ -313,7 +313,7 @@ def test_the_slider_wipes_between_opa_and_ppa(opened: Opened) -> None:
         page.keyboard.press("ArrowLeft")
     assert opened.shot(".wipe >> nth=0") != before
     labels = page.locator(".wipe >> nth=0").inner_text()
-    assert "textbook OPA" in labels
+    assert "polmvs OPA" in labels
     assert "polmvs PPA" in labels
 
 

@@ -94,10 +94,6 @@ def test_the_stages_follow_each_other(recorded: Path) -> None:
         "densify_ppa",
         "normals_tilted",
         "densify_tilted",
-        "normals_textbook-opa",
-        "densify_textbook-opa",
-        "normals_textbook-ppa",
-        "densify_textbook-ppa",
     ]
 
 
