@@ -69,9 +69,11 @@ from polmvs.surface.surface_quality import (
     Contradictions,
     FaceEvidence,
     contradicted_faces,
+    disagreement_deg,
     face_evidence,
     find_contradictions,
     fit_normals,
+    misfit,
     outline_mismatch,
     point_offset,
     points_deny,
@@ -460,7 +462,7 @@ def _polished(
         )
     is_known = fitted.is_fitted | is_wall
     normals, average = sided_normals(mesh, facing, is_known)
-    sigma_deg = fitted.sigma_deg(mesh, average, fit.tol.terms.alike_views)
+    of_views = fitted.sigma_deg(mesh, average)
     sides = KnownSides(sides_known(mesh, normals, is_known), fitted.is_fitted & ~is_wall)
 
     def polish(mesh: TriangleMesh) -> tuple[TriangleMesh, bool]:
@@ -473,6 +475,7 @@ def _polished(
     logger.info("the surface is %s.", "sharpened" if is_sharp else "left as smooth as it is")
     mesh = sharp if is_sharp else mesh
     labelled = label(mesh, fit, min_cosine=MIN_FACING_COSINE)
+    sigma_deg = np.hypot(of_views, disagreement_deg(mesh, normals, fitted.is_fitted))
     return _Polished(mesh, fit, labelled, normals, sigma_deg)
 
 
@@ -493,6 +496,7 @@ def _supported(
         mesh, evidence, min_views=given.min_views, gsd=fit.gsd, sigma=sigma.own
     )
     seen = evidence.num_views >= given.min_views
+    sigma = sigma.scaled(np.sqrt(misfit(mesh, labelled)))
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     inferred = seen & ~supported & _lie_on(mesh, [cavity.values for cavity in cavities])
     supported |= inferred

@@ -14,7 +14,9 @@ from polmvs.surface.surface_quality import (
     MIN_EXPLAINED,
     FaceEvidence,
     contradicted_faces,
+    disagreement_deg,
     fit_normals,
+    misfit,
     stand_apart,
     supported_faces,
 )
@@ -67,7 +69,7 @@ def test_normals_err_by_their_stated_deviation(exact):
     fit = fit_of(np.radians(2.0))
     fitted = fit_normals(exact, label(exact, fit))
     normals, average = sided_normals(exact, fitted.normals, fitted.is_fitted)
-    sigma = fitted.sigma_deg(exact, average, alike_views=10**9)
+    sigma = fitted.sigma_deg(exact, average)
     known = np.isfinite(sigma)
     cosine = np.clip((normals * exact.face_normals).sum(axis=1), -1, 1)[known]
     ratio = np.degrees(np.arccos(cosine)) / sigma[known]
@@ -76,8 +78,38 @@ def test_normals_err_by_their_stated_deviation(exact):
     # few views have a larger jackknife than variance (Efron and Stein 1981).
     assert 0.6 < (ratio < 1).mean() < 0.85
     assert (ratio < 2).mean() > 0.93
-    shared = fitted.sigma_deg(exact, average, alike_views=4)[known]
-    assert np.allclose(shared / sigma[known], np.sqrt(1 + fitted.num_rows[known] / 4))
+
+
+def test_normals_that_all_views_turn_alike_disagree_with_the_mesh(exact):
+    upper = exact.centers[:, 2] > 0.2
+    turned = np.where(
+        upper[:, None], exact.face_normals + np.array([0, 0, 0.1]), exact.face_normals
+    )
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    is_fitted = exact.centers[:, 0] < 0.5
+    found = disagreement_deg(exact, turned, is_fitted)
+    own = np.degrees(np.arccos(np.clip((turned * exact.face_normals).sum(axis=1), -1, 1)))
+    height = exact.centers[:, 2]
+    inner = is_fitted & (height > 0.4) & (height < 0.9) & (exact.centers[:, 0] < 0.3)
+    np.testing.assert_allclose(found[inner], own[inner], rtol=0.15, atol=0.2)
+    # arccos of a rounded cosine is as large as the root of the rounding.
+    assert found[is_fitted & (height < 0)].max() < 1e-4
+    assert np.isfinite(found).all()
+
+
+def test_a_vertex_whose_phases_fit_worse_than_elsewhere_is_less_certain(exact):
+    """By the ratio of the mean squares; where they fit better, nothing changes."""
+    labelled = label(exact, fit_of(np.radians(6.0)))
+    usual = misfit(exact, labelled)
+    assert np.all(misfit(exact, label(exact, fit_of(0.0))) < 1.2)  # residuals of rounding alone
+    assert 1 <= usual.min() <= np.median(usual) < 1.2
+    is_low = exact.centers[labelled.observations.face, 2] < -0.5
+    rows = np.where(is_low[:, None], 3.0, 1.0) * labelled.observations.rows
+    worse = replace(labelled, observations=replace(labelled.observations, rows=rows))
+    ratio = misfit(exact, worse)
+    above, below = exact.vertices[:, 2] > -0.4, exact.vertices[:, 2] < -0.6
+    assert np.median(ratio[above]) < 1.2
+    assert 7 < np.median(ratio[below]) < 11
 
 
 def test_phases_of_another_place_carry_no_information(exact):
