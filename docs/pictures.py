@@ -33,7 +33,6 @@ import cv2
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
 IMAGES = DOCS / "images"
-DEMO = ROOT / "polmvs" / "demo_capture"
 MADE = "made.json"
 INTRINSICS = "445,445,307.53,262.144"  # of the captures' polarization images
 PAGE_PX = (1100, 1400)
@@ -66,14 +65,6 @@ class Sources:
         out = self.work / "demo"
         if not (out / "report.html").is_file():
             polmvs("demo", out, "--overwrite")
-        return out
-
-    def published(self) -> Path:
-        """The bundled board under the models as they are published."""
-        out = self.work / "published"
-        if not (out / "metrics.json").is_file():
-            flags = ("--sparse", self.demo() / "sparse", "--no-report", "--overwrite")
-            polmvs("compare", DEMO, out, "--models", "textbook-opa,textbook-ppa", *flags)
         return out
 
     def site(self) -> Path:
@@ -114,7 +105,7 @@ def site(sources: Sources, path: Path) -> Sequence[str]:
 def sheet(sources: Sources, path: Path) -> Sequence[str]:
     """The sheet of the bundled capture, half as large."""
     with tempfile.TemporaryDirectory() as folder:  # the sheet names the capture as it is called
-        (Path(folder) / "capture").symlink_to(DEMO / "raw")
+        (Path(folder) / "capture").symlink_to(ROOT / "polmvs" / "demo_capture" / "raw")
         polmvs("inspect", "capture", "--sheet", path.absolute(), place=Path(folder))
     whole = cv2.imread(str(path))
     cv2.imwrite(str(path), cv2.resize(whole, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
@@ -123,7 +114,7 @@ def sheet(sources: Sources, path: Path) -> Sequence[str]:
 
 def opa_ppa(sources: Sources, path: Path) -> Sequence[str]:
     """The bundled board under OPA and PPA."""
-    clouds = [sources.published() / f"textbook-{model}.ply" for model in ("opa", "ppa")]
+    clouds = [sources.demo() / f"{model}.ply" for model in ("opa", "ppa")]
     polmvs("render", path, *clouds, "--labels", "OPA,PPA", "--plain", "--part", "--overwrite")
     return ()
 

@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 
 import polmvs
+from polmvs.cli.jobs import DEMO_MODELS
 from polmvs.config import Options
 from polmvs.io.clouds import read_cloud
 from polmvs.io.images import read_mask
@@ -299,7 +300,7 @@ def test_a_script_without_a_guard_is_told_of_it(demo_capture: Path, tmp_path: Pa
 
 def test_results_of_an_earlier_run(demo_run: Path, tmp_path: Path) -> None:
     run = polmvs.open_run(demo_run)
-    assert [str(model) for model in run.models] == [str(model) for model in polmvs.AngleModel]
+    assert tuple(run.models) == DEMO_MODELS
     assert run.table() in (demo_run / "summary.md").read_text()
     assert run.metrics.best_fit == "tilted"
     assert len(run["opa"].cloud.points) == len(read_cloud(demo_run / "opa.ply").points)
@@ -314,9 +315,9 @@ def test_results_of_an_earlier_run(demo_run: Path, tmp_path: Path) -> None:
 
 def test_comparison_goes_on_with_a_run(demo_run: Path, demo_capture: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(demo_run, tmp_path / "out"))
-    run = polmvs.compare(demo_capture, out, resume=True, workers=1)
+    run = polmvs.compare(demo_capture, out, models=DEMO_MODELS, resume=True, workers=1)
     assert run.table() in (out / "summary.md").read_text()
-    assert set(run.models) == set(polmvs.AngleModel)
+    assert tuple(run.models) == DEMO_MODELS
 
 
 @pytest.mark.parametrize("as_object", [False, pytest.param(True, marks=pytest.mark.slow)])
