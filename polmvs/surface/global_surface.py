@@ -496,7 +496,7 @@ def _supported(
         mesh, evidence, min_views=given.min_views, gsd=fit.gsd, sigma=sigma.own
     )
     seen = evidence.num_views >= given.min_views
-    sigma = sigma.scaled(np.sqrt(misfit(mesh, labelled)))
+    sigma = replace(sigma, own=sigma.own * np.sqrt(misfit(mesh, labelled)))
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     inferred = seen & ~supported & _lie_on(mesh, [cavity.values for cavity in cavities])
     supported |= inferred

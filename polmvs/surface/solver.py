@@ -891,10 +891,6 @@ class PositionSigma:
     own: Array
     shared: Array
 
-    def scaled(self, factors: Array) -> PositionSigma:
-        """The same with the contribution of the views scaled by (V,) factors."""
-        return PositionSigma(self.own * factors, self.shared)
-
     @property
     def total(self) -> Array:
         """(V,) of both."""

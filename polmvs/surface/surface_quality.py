@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -220,9 +221,8 @@ def misfit(mesh: TriangleMesh, labelled: Labelled) -> Array:
     if not len(face):
         return np.ones(len(mesh.vertices))
     residual, variance = labelled.residuals(mesh)
-    sums = np.stack([np.bincount(face, weight, num) for weight in (residual**2 / variance, None)])
-    squares, rows = _smoothed(mesh, _smoothed(mesh, sums.T.astype(np.float64))).T
-    mean = squares / np.maximum(rows, 1e-9)
+    squares = np.bincount(face, residual**2 / variance, num).astype(np.float64)
+    mean, rows = _mean_about(mesh, squares, np.bincount(face, minlength=num))
     usual = max(float(np.median(mean[rows > 0])), TOL.min_mean_square)
     ratio = np.maximum(mean / usual, 1)
     count = np.maximum(np.bincount(mesh.faces.ravel(), minlength=len(mesh.vertices)), 1)
@@ -247,6 +247,13 @@ def _smoothed(mesh: TriangleMesh, values: Array) -> Array:
     for _ in range(2):
         values = np.asarray(incidence.T @ ((incidence @ values) / degree)) / 3
     return values
+
+
+def _mean_about(mesh: TriangleMesh, sums: Array, counts: NDArray[Any]) -> tuple[Array, Array]:
+    """Mean ``(F,)`` about each face of what has these sums and counts (F,), and its weight (F,)."""
+    both = np.stack([sums, counts.astype(np.float64)], axis=1)
+    total, weight = _smoothed(mesh, _smoothed(mesh, both)).T
+    return total / np.maximum(weight, 1e-9), weight
 
 
 @dataclass(frozen=True)
@@ -313,10 +320,8 @@ def disagreement_deg(mesh: TriangleMesh, normals: Array, is_fitted: Mask) -> Arr
     is_fitted : (F,) bool, where they are known.
     """
     cosine = np.clip(dots(normals, mesh.face_normals), -1, 1)
-    square = np.where(is_fitted, np.arccos(cosine) ** 2, 0)
-    sums = np.stack([square, is_fitted], axis=1)
-    squares, count = _smoothed(mesh, _smoothed(mesh, sums)).T
-    return np.asarray(np.degrees(np.sqrt(squares / np.maximum(count, 1e-9))))
+    squares = np.where(is_fitted, np.arccos(cosine) ** 2, 0)
+    return np.asarray(np.degrees(np.sqrt(_mean_about(mesh, squares, is_fitted)[0])))
 
 
 def fit_normals(mesh: TriangleMesh, labelled: Labelled) -> FaceNormals:
