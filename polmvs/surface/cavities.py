@@ -1,20 +1,27 @@
-"""Cavities that reflect only themselves, such as the inside of a mug.
+"""Cavities of vessels, such as the inside of a mug.
 
-The opening of a vessel is dark: light from inside has been reflected several times, and its phase
-gives no normal. Silhouettes close the opening with a cap, which no phase supports. The rim around
-the cap, flat or rounded, is the top of the wall; phases support it, and it gives the plane of the
-opening. At the right offset of this plane, the lines of the rim in all views coincide. The inner
-line of a flat rim is the border of the opening. The width of the rim is the thickness of the wall.
-If the width is the same all around, the wall is inferred to continue below with that thickness, so
-that the inside follows the outside. This is an inference, not a measurement: a cavity states its
-thickness and how much it varies, and points on its walls should be labelled as inferred. If the
-width of the rim varies, nothing is inferred.
+Silhouettes close the opening of a vessel with a cap, which phases hardly support. The inside is
+assumed to follow the outside, at the thickness of the wall.
+
+Light from inside a dark vessel has been reflected several times, and its phase gives no normal. The
+rim around the cap, flat or rounded, is the top of the wall; phases support it, and it gives the
+plane of the opening. At the right offset of this plane, the lines of the rim in all views coincide.
+The inner line of a flat rim is the border of the opening. The width of the rim is the thickness of
+the wall. If the width varies, nothing is inferred.
+
+Inside other vessels the phases are those of the walls. The thickness of the wall is the one at
+which they are likeliest, and they must be likelier than on the cap.
+
+A cavity states its thickness and how uncertain that is. Where no phase supports its walls they are
+an inference, not a measurement, and points on them should be labelled as inferred.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +61,9 @@ Mask = NDArray[np.bool_]
 
 SAME_PLANE_PX = HullTolerances.step_px  # GSDs, uncertainty of a rim's plane: a cell of the hull
 MIN_BORDER = 10  # least number of faces of a rim, and of the border of an opening
+ONE_SIDED = 1.645  # deviations of a normal distribution, which 5 % exceed
+THICKNESS_RATIO = 1.25  # of neighbours among the thicknesses that are tried
+TOP_SECTORS = 36  # in each of which the top of a wall is sought
 PLANE_ROUNDS = 3  # of the fit of a plane to half of a border
 
 
@@ -97,7 +107,8 @@ class Cavity:
     rim : plane of the opening; its members are faces of the surface on the rim.
     grid : across the opening.
     thickness : of the wall, world units.
-    thickness_sigma : its robust deviation around the rim, world units.
+    thickness_sigma : its robust deviation around the rim, or its deviation between views, world
+        units.
     field : (D, H, W) float32, signed distance to the cavity's walls in layers across the opening,
         positive in the cavity.
     layer_step : distance of the layers, world units.
@@ -123,6 +134,10 @@ class Cavity:
         return np.asarray(found, np.float64)
 
 
+# Information (V,) of each view's phases, nats, on the surface with a cavity, or closed (None).
+Information: TypeAlias = Callable[[Cavity | None], Array]
+
+
 @dataclass(frozen=True)
 class Opening:
     """A connected patch of a closed surface that the phases do not support.
@@ -131,10 +146,12 @@ class Opening:
     ----------
     patch : (P,) indices of its faces.
     border : (B,) indices of the supported faces about it.
+    area : of the patch, world units squared.
     """
 
     patch: Indices
     border: Indices
+    area: float
 
 
 @dataclass(frozen=True)
@@ -183,7 +200,7 @@ def surface_faces(mesh: TriangleMesh, seen: Mask, supported: Mask, gsd: float) -
         touches = np.zeros(len(mesh.vertices), np.bool_)
         touches[mesh.faces[patch]] = True
         border = np.flatnonzero(is_body & touches[mesh.faces].any(axis=1))
-        openings.append(Opening(patch, border))
+        openings.append(Opening(patch, border, float(area[number])))
     inside_along = RayScene(mesh).inside_along
     return SurfaceFaces(mesh.centers, mesh.face_normals, is_body, openings, inside_along, gsd)
 
@@ -191,66 +208,185 @@ def surface_faces(mesh: TriangleMesh, seen: Mask, supported: Mask, gsd: float) -
 def find_cavities(
     surface: SurfaceFaces,
     scene: PatchScene,
+    information: Information,
 ) -> tuple[Cavity, ...]:
-    """Openings that a surface closes with a cap, and the cavities inferred behind them.
+    """Openings that a surface closes with a cap, and the cavities behind them.
 
     Parameters
     ----------
     surface : refined; its outside determines the cavity's walls.
     scene : the views.
+    information : of the phases, for the surface with a cavity.
     """
     if len(scene.maps) < MIN_VIEWS:
         return ()
+    closed = cache(lambda: information(None))
     found: list[Cavity] = []
     for opening in surface.openings:
-        rim = _rim(surface, opening, scene)
-        if rim is None or any(_is_same(rim, other.rim, surface) for other in found):
+        plane = _plane_of(opening, surface)
+        if plane is None:
             continue
-        grid = _grid_about(surface, rim)
-        wall = _rounded_wall(surface, rim, grid)
-        if wall is None:
-            wall = _flat_wall(surface, rim, grid, scene)
-        if wall is None:
+        rim = _rim(surface, opening, plane, scene)
+        if any(_is_same(rim or plane, other.rim, surface) for other in found):
             continue
-        cap_height = max(float(rim.height(surface.centers[opening.patch]).max()), 0.0)
-        cavity = _cavity(surface, wall, grid, cap_height)
+        cavity = None if rim is None else _dark_cavity(surface, opening, rim, scene)
+        if cavity is None:
+            cavity = _bright_cavity(
+                surface, opening, plane, lambda cavity: information(cavity) - closed()
+            )
         if cavity is not None:
             found.append(cavity)
     return tuple(found)
 
 
-def _plane_of(opening: Opening, surface: SurfaceFaces) -> tuple[Array, float] | None:
-    """Normal and offset of the plane of an opening's border; None if the border is not planar."""
+def _dark_cavity(
+    surface: SurfaceFaces, opening: Opening, rim: Patch, scene: PatchScene
+) -> Cavity | None:
+    """The cavity with a wall as thick as the rim about its dark opening."""
+    grid = _grid_about(surface, rim)
+    wall = _rounded_wall(surface, rim, grid)
+    if wall is None:
+        wall = _flat_wall(surface, rim, grid, scene)
+    return None if wall is None else _cavity(surface, wall, grid, opening)
+
+
+def _bright_cavity(
+    surface: SurfaceFaces, opening: Opening, plane: Patch, gain: Callable[[Cavity], Array]
+) -> Cavity | None:
+    """The cavity with the wall at which the phases are likeliest; None if the cap explains them.
+
+    A rim of the wrong shape, flat or rounded, makes the wall too thin, as less of it is then wrong:
+    the thicker wall of the two is right. ``gain`` is the information that a cavity adds.
+    """
+    # An opening with its wall about it.
+    if opening.area < np.pi * (2 * TOL.rounding * surface.gsd) ** 2:
+        return None
+    if not _surrounds(plane, surface.centers[opening.border], surface.centers[opening.patch]):
+        return None
+    rim = _top_of_wall(surface, opening, plane)
+    grid = _grid_about(surface, rim)
+
+    def cavity_of(is_round: bool, thickness: float, sigma: float = 0.0) -> Cavity | None:
+        radius = 0.5 * thickness if is_round else 0.0
+        start = max(TOL.rounding, radius)
+        outer = _outside_at(surface, rim, grid, start)
+        wall = _Wall(rim, thickness, sigma, -outer - (radius or thickness), outer, start, radius)
+        return _cavity(surface, wall, grid, opening)
+
+    found = []
+    for is_round in (False, True):
+        likeliest = _likeliest_thickness(partial(cavity_of, is_round), gain)
+        if likeliest is not None:
+            found.append((*likeliest, is_round))
+    if not found:
+        return None
+    thickness, sigma, is_round = max(found)
+    return cavity_of(is_round, thickness, sigma)
+
+
+def _likeliest_thickness(
+    cavity_of: Callable[[float], Cavity | None], gain: Callable[[Cavity], Array]
+) -> tuple[float, float] | None:
+    """The thickness of the wall that adds the most information, and its deviation between views.
+
+    None if no wall adds any, or if views disagree on it.
+    """
+    gains: dict[int, Array] = {}
+
+    def thickness_of(number: float) -> float:
+        return float(TOL.rounding * THICKNESS_RATIO**number)
+
+    def total(number: int) -> float:
+        if number not in gains:
+            cavity = cavity_of(thickness_of(number))
+            gains[number] = np.array([-np.inf]) if cavity is None else gain(cavity)
+        return float(gains[number].sum())
+
+    best = 1
+    if not total(best) > 0:
+        return None
+    for step in (1, -1):
+        while total(best + step) > total(best):
+            best += step
+    below, here, above = gains[best - 1], gains[best], gains[best + 1]
+    if not here.mean() > ONE_SIDED * _sigma_of_mean(here):
+        return None
+    # The vertex of a parabola. Its deviation is that of the slope.
+    slope, bend = 0.5 * (above - below), (below - 2 * here + above).mean()
+    shift, sigma = 0.0, 1.0
+    if np.isfinite(bend) and bend < 0:
+        shift, sigma = -slope.mean() / bend, _sigma_of_mean(slope) / -bend
+    thickness = thickness_of(best + shift)
+    return thickness, thickness * (THICKNESS_RATIO**sigma - 1)
+
+
+def _top_of_wall(surface: SurfaceFaces, opening: Opening, plane: Patch) -> Patch:
+    """The plane through the top of the wall about an opening; ``plane`` is near it."""
+    middle = surface.centers[opening.patch].mean(axis=0)
+    for _ in range(PLANE_ROUNDS):
+        grid = _grid_about(surface, plane)
+        outer = _outside_at(surface, plane, grid, TOL.rounding)
+        cells = grid.cells(surface.centers)
+        outwards = ndimage.map_coordinates(outer, cells.T, order=1, mode="nearest")
+        height = plane.height(surface.centers)
+        near = (np.abs(outwards) < TOL.rounding) & (surface.normals @ plane.normal > 0)
+        near &= np.abs(height) < 2 * TOL.rounding * surface.gsd
+        x, y = (cells - grid.cells(middle)).T
+        sector = np.where(near, _sectors(x, y, TOP_SECTORS), -1)
+        tops = []
+        for number in range(TOP_SECTORS):
+            index = np.flatnonzero(sector == number)
+            if len(index):
+                highest = index[np.argsort(-height[index])[: -(-len(index) // 20)]]
+                tops.append(surface.centers[highest].mean(axis=0))
+        if len(tops) < MIN_BORDER:
+            break
+        point, normal, _ = _plane_through(np.array(tops))
+        normal = normal * np.sign(normal @ plane.normal)
+        plane = replace(plane, normal=normal, offset=float(point @ normal))
+    return plane
+
+
+def _sigma_of_mean(values: Array) -> float:
+    """Standard deviation of the mean of independent values."""
+    return float(values.std(ddof=1) / np.sqrt(len(values)))
+
+
+def _plane_of(opening: Opening, surface: SurfaceFaces) -> Patch | None:
+    """The plane of an opening's border, with its faces; None if the border is not planar."""
     if len(opening.border) < MIN_BORDER:
         return None
-    border = surface.centers[opening.border]
-    kept = np.ones(len(border), np.bool_)
-    for _ in range(PLANE_ROUNDS):
-        middle = border[kept].mean(axis=0)
-        normal = np.linalg.svd(border[kept] - middle, full_matrices=False)[2][2]
-        height = (border - middle) @ normal
-        kept = np.abs(height) <= max(2 * float(np.median(np.abs(height))), 1e-300)
-    if float(np.median(np.abs(height))) > SAME_PLANE_PX * surface.gsd:
+    middle, normal, distance = _plane_through(surface.centers[opening.border])
+    if distance > SAME_PLANE_PX * surface.gsd:
         return None
     if surface.normals[opening.patch].mean(axis=0) @ normal < 0:
         normal = -normal
-    return normal, float(middle @ normal)
+    return Patch(normal, float(middle @ normal), opening.border)
+
+
+def _plane_through(points: Array) -> tuple[Array, Array, float]:
+    """Point, normal and median distance of the plane through most of points (N, 3)."""
+    kept = np.ones(len(points), np.bool_)
+    for _ in range(PLANE_ROUNDS):
+        middle = points[kept].mean(axis=0)
+        normal = np.linalg.svd(points[kept] - middle, full_matrices=False)[2][2]
+        distance = np.abs((points - middle) @ normal)
+        kept = distance <= max(2 * float(np.median(distance)), 1e-300)
+    return middle, normal, float(np.median(distance))
 
 
 def _rim(
     surface: SurfaceFaces,
     opening: Opening,
+    plane: Patch,
     scene: PatchScene,
 ) -> Patch | None:
     """The rim about a dark opening, with the normal that the phases of its faces have.
 
-    Its members are faces of the surface. None if the border of the opening is not planar, if the
-    rim does not surround it, or if it is not dark.
+    Its members are faces of the surface. None if the rim does not surround the opening, or if that
+    is not dark. ``plane`` is that of the opening's border.
     """
-    plane = _plane_of(opening, surface)
-    if plane is None:
-        return None
-    normal, offset = plane
+    normal, offset = plane.normal, plane.offset
     # A rounded rim is higher than the border of its phases.
     near = np.abs(surface.centers @ normal - offset) < 2 * SAME_PLANE_PX * surface.gsd
     near &= surface.normals @ normal > np.cos(np.radians(CreaseTolerances.crease_deg))
@@ -279,12 +415,16 @@ def _rim(
         return None
     rim = Patch(normal, float(np.median(places[fits] @ normal)), members[fits])
     cap = surface.centers[opening.patch]
-    cap = cap - rim.height(cap)[:, None] * normal
-    tangents = np.linalg.svd(normal[None])[2][1:]
-    x, y = tangents @ (places[fits] - np.median(cap, axis=0)).T
-    sectors = np.unique(_sectors(x, y))
-    is_rim = len(sectors) >= TOL.min_sectors and _is_dark(cap, places[fits], scene.maps)
+    on_plane = cap - rim.height(cap)[:, None] * normal
+    is_rim = _surrounds(rim, places[fits], cap) and _is_dark(on_plane, places[fits], scene.maps)
     return rim if is_rim else None
+
+
+def _surrounds(plane: Patch, border: Array, cap: Array) -> bool:
+    """Whether points ``(B, 3)`` surround others ``(P, 3)``, seen along the normal of a plane."""
+    tangents = np.linalg.svd(plane.normal[None])[2][1:]
+    x, y = tangents @ (border - np.median(cap, axis=0)).T
+    return len(np.unique(_sectors(x, y))) >= TOL.min_sectors
 
 
 def _is_same(rim: Patch, other: Patch, surface: SurfaceFaces) -> bool:
@@ -498,18 +638,13 @@ def _rounded_wall(surface: SurfaceFaces, rim: Patch, grid: PatchGrid) -> _Wall |
     return _Wall(rim, 2 * radius, sigma, -outer - radius, outer, start, radius)
 
 
-def _sectors(x: Floats, y: Floats) -> Indices:
-    """Which of eight sectors about the origin (N,) points lie in."""
-    return np.floor((np.arctan2(y, x) / np.pi + 1) * 4).astype(np.int64) % 8
+def _sectors(x: Floats, y: Floats, num: int = 8) -> Indices:
+    """Which of a number of sectors about the origin (N,) points lie in."""
+    return np.floor((np.arctan2(y, x) / np.pi + 1) * 0.5 * num).astype(np.int64) % num
 
 
-def _cavity(
-    surface: SurfaceFaces, wall: _Wall, grid: PatchGrid, cap_height: float
-) -> Cavity | None:
-    """The cavity within a wall; None if its thickness varies.
-
-    ``cap_height`` is the height of the surface's cap above the rim.
-    """
+def _cavity(surface: SurfaceFaces, wall: _Wall, grid: PatchGrid, opening: Opening) -> Cavity | None:
+    """The cavity within a wall, below an opening; None if the wall's thickness varies."""
     rim, thickness = wall.rim, wall.thickness
     if thickness <= 1 or wall.sigma > max(TOL.thickness_spread * thickness, 1.0):
         return None
@@ -537,6 +672,7 @@ def _cavity(
     floor = spacing * len(layers) - thickness - spacing * np.arange(len(layers), dtype=np.float64)
     if floor[0] <= TOL.rounding:
         return None
+    cap_height = max(float(rim.height(surface.centers[opening.patch]).max()), 0.0)
     above = int(np.ceil(cap_height / (spacing * grid.step))) + 2
     field = np.minimum(np.stack(layers), floor[:, None, None])
     field = np.concatenate([np.repeat(field[:1], above, axis=0), field])

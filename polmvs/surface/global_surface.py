@@ -79,10 +79,12 @@ from polmvs.surface.surface_quality import (
     points_deny,
     stand_apart,
     supported_faces,
+    view_information,
 )
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints, KnownSides
 from polmvs.surface.visual_hull import (
+    HullTolerances,
     SupportingPlane,
     VisualHull,
     supporting_plane,
@@ -552,12 +554,26 @@ def _converged(
 
 
 def _cavities(given: _Given, refined: Refined, labelled: Labelled) -> tuple[Cavity, ...]:
-    """Cavities behind the parts of a refined mesh that no phase supports."""
+    """Cavities behind the parts of a refined mesh that phases hardly support."""
     mesh, fit = refined.mesh, refined.fit
     evidence = face_evidence(mesh, fit, labelled)
-    supported = supported_faces(mesh, evidence, min_views=given.min_views, gsd=fit.gsd)
+    supported = supported_faces(
+        mesh,
+        evidence,
+        min_views=given.min_views,
+        gsd=fit.gsd,
+        min_information=evidence.enough_information,
+    )
     seen = evidence.num_views >= given.min_views
-    return find_cavities(surface_faces(mesh, seen, supported, fit.gsd), given.scene)
+    scene = RayScene(mesh)
+
+    def information(cavity: Cavity | None) -> Array:
+        """Of the phases of each view, nats, on the mesh with a cavity carved."""
+        free = () if cavity is None else (cavity.values,)
+        carved = remeshed(scene, HullTolerances.step_px * fit.gsd, free=free, smoothing=0)
+        return view_information(carved, label(carved, fit), fit)
+
+    return find_cavities(surface_faces(mesh, seen, supported, fit.gsd), given.scene, information)
 
 
 def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:

@@ -132,7 +132,8 @@ def closed_cylinder(bore=RADIUS - WALL, offset=0.0):
     across = np.hypot(centers[:, 0] - offset, centers[:, 1])
     is_top = normals[:, 2] > 0.5
     patch = is_top & (across < bore)
-    opening = Opening(*map(np.flatnonzero, (patch, is_top & ~patch & (across < bore + 1.5 * step))))
+    border = is_top & ~patch & (across < bore + 1.5 * step)
+    opening = Opening(np.flatnonzero(patch), np.flatnonzero(border), np.pi * bore**2)
     return SurfaceFaces(centers, normals, ~patch, [opening], inside_along, GSD)
 
 
@@ -164,13 +165,80 @@ def closed_rounded_vessel():
 
     patch = number >= len(profile)
     border = number == len(profile) - 1
-    opening = Opening(np.flatnonzero(patch), np.flatnonzero(border))
+    opening = Opening(np.flatnonzero(patch), np.flatnonzero(border), np.pi * bore**2)
     return SurfaceFaces(centers, normals, ~patch, [opening], inside_along, GSD)
+
+
+def found_in(surface, maps, information=lambda cavity: np.zeros(8)):
+    """Cavities of a surface; without ``information`` the phases in its openings say nothing."""
+    return find_cavities(surface, patch_scene(maps, AngleModel.PPA), information)
+
+
+def information_of(inside, bore=RADIUS - WALL):
+    """How well normals agree with those of what is ``inside`` an opening, for each of 8 views."""
+    x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-bore, bore, 41)]))
+    start = np.stack([x, y, np.full_like(x, HEIGHT)], axis=1)[np.hypot(x, y) < bore - GSD]
+    views = ring_of_views(8, CAMERA, target=(0, 0, HEIGHT), distance=0.5, elevation_deg=42)
+    rays = [start - view.center_in_world for view in views]
+    rays = [ray / np.linalg.norm(ray, axis=1)[:, None] for ray in rays]
+    shown = [inside.intersect(start + 1e-9 * ray, ray)[1] for ray in rays]
+
+    def information(cavity):
+        found = np.zeros(8)
+        for number, (ray, normals) in enumerate(zip(rays, shown, strict=True)):
+            expected = np.tile([0.0, 0.0, 1.0], (len(start), 1))
+            if cavity is not None:
+                place = start - np.array([0, 0, GSD])
+                for _ in range(60):  # sphere tracing
+                    place = place + np.maximum(cavity.values(place), 0)[:, None] * ray
+                sides = GSD * np.eye(3)
+                expected = np.stack(
+                    [cavity.values(place + side) - cavity.values(place - side) for side in sides],
+                    axis=1,
+                )
+                expected /= np.maximum(np.linalg.norm(expected, axis=1), 1e-12)[:, None]
+            cosine = np.clip(np.einsum("ni,ni->n", expected, normals), -1, 1)
+            found[number] = -np.square(np.arccos(cosine)).sum()
+        return found
+
+    return information
+
+
+def test_phases_measure_the_wall_of_a_bright_vessel():
+    bore = RADIUS - WALL
+    wall = Cylinder([0, 0, HEIGHT / 2], [0, 0, 1], bore, HEIGHT / 2)
+    inside = Group([wall, Annulus(WALL, (0.0, 0.0), 0.0, bore)])
+    (cavity,) = found_in(closed_cylinder(), vessel_maps(dark=1.0), information_of(inside))
+    assert cavity.thickness == pytest.approx(WALL, abs=GSD)
+    assert 0 < cavity.thickness_sigma < GSD
+    np.testing.assert_allclose(cavity.rim.normal, [0, 0, 1], atol=1e-3)
+    assert cavity.rim.offset == pytest.approx(HEIGHT, abs=0.1 * GSD)
+    inner = np.array([[bore - 2 * GSD, 0, 0.06], [bore + 2 * GSD, 0, 0.06]])
+    assert (cavity.values(inner) > 0).tolist() == [True, False]
+
+
+def test_a_bright_lid_whose_phases_fit_is_no_opening():
+    lid = Plane([0, 0, HEIGHT - 1e-6], [0, 0, 1])
+    assert found_in(closed_cylinder(), vessel_maps(dark=1.0), information_of(lid)) == ()
+
+
+@pytest.mark.parametrize(
+    "gains",
+    [
+        [9.0, 9, -1, -1, -1, -1, -1, -1],  # likelier in total, by two views of eight
+        [1.0, 1, 1, 1, 1, 1, 1, 1],  # whatever the thickness
+    ],
+)
+def test_phases_that_do_not_determine_a_wall_show_no_cavity(gains):
+    def information(cavity):
+        return np.array(gains) * (cavity is not None)
+
+    assert found_in(closed_cylinder(), vessel_maps(dark=1.0), information) == ()
 
 
 def test_a_dark_opening_with_a_rim_of_one_width_opens_into_a_cavity():
     maps = vessel_maps()
-    (cavity,) = find_cavities(closed_cylinder(), patch_scene(maps, AngleModel.PPA))
+    (cavity,) = found_in(closed_cylinder(), maps)
     assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
     assert cavity.thickness_sigma < 0.7 * GSD
     np.testing.assert_allclose(cavity.rim.normal, [0, 0, 1], atol=0.01)
@@ -190,14 +258,13 @@ def test_a_dark_opening_with_a_rim_of_one_width_opens_into_a_cavity():
 def test_a_opening_is_found_by_its_darkness(harm):
     """With a mask the dark inside has phases, and some of them agree with the rim's normal."""
     maps = vessel_maps(**harm)
-    (cavity,) = find_cavities(closed_cylinder(), patch_scene(maps, AngleModel.PPA))
+    (cavity,) = found_in(closed_cylinder(), maps)
     assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
 
 
 def test_a_rounded_rim_is_as_wide_as_its_wall():
     """The width of what is bright is not: the inner half of the rim reflects the inside."""
-    scene = patch_scene(vessel_maps(rounded=True), AngleModel.PPA)
-    (cavity,) = find_cavities(closed_rounded_vessel(), scene)
+    (cavity,) = found_in(closed_rounded_vessel(), vessel_maps(rounded=True))
     assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
     assert cavity.rim.offset == pytest.approx(HEIGHT, abs=GSD)
     bore = RADIUS - WALL
@@ -210,7 +277,7 @@ def test_a_rounded_rim_is_as_wide_as_its_wall():
 
 def test_a_opening_is_round_though_its_cells_are_not():
     """To a tenth of a pixel; cut at whole cells it goes in and out by 0.15."""
-    (cavity,) = find_cavities(closed_cylinder(), patch_scene(vessel_maps(), AngleModel.PPA))
+    (cavity,) = found_in(closed_cylinder(), vessel_maps())
     around = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     radii = RADIUS - WALL + np.arange(3, -3, -0.02) * GSD
     across = np.stack([np.cos(around), np.sin(around)], axis=-1) * radii[:, None, None]
@@ -222,12 +289,12 @@ def test_a_opening_is_round_though_its_cells_are_not():
 
 
 def test_a_bent_cap_hides_no_opening():
-    surface, scene = closed_cylinder(), patch_scene(vessel_maps(), AngleModel.PPA)
+    surface = closed_cylinder()
     x, y, z = surface.centers.T
     is_patch = np.isin(np.arange(len(x)), surface.openings[0].patch)
     height = np.where(is_patch & (x > 0), z + 12 * GSD, z)
     bent = replace(surface, centers=np.stack([x, y, height], axis=1))
-    (cavity,) = find_cavities(bent, scene)
+    (cavity,) = found_in(bent, vessel_maps())
     assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
     assert cavity.rim.offset == pytest.approx(HEIGHT, abs=0.5 * GSD)
     # The space above the rim is free up to the cap.
@@ -237,7 +304,7 @@ def test_a_bent_cap_hides_no_opening():
 def test_a_deep_cavity_has_a_bottom_however_fine_the_grid(monkeypatch):
     """The layers of a grid are few where its memory is bounded."""
     monkeypatch.setattr("polmvs.surface.cavities.MAX_CELLS", 12 * 97**2)
-    (cavity,) = find_cavities(closed_cylinder(), patch_scene(vessel_maps(), AngleModel.PPA))
+    (cavity,) = found_in(closed_cylinder(), vessel_maps())
     assert (cavity.values(np.array([[0, 0, 0.35 * HEIGHT]])) > 0).all()
 
 
@@ -264,19 +331,19 @@ def test_islands_of_a_cap_belong_to_its_opening():
 
 def test_a_closed_body_has_no_cavity():
     maps = vessel_maps(bore=1e-4)
-    assert find_cavities(closed_cylinder(0.03), patch_scene(maps, AngleModel.PPA)) == ()
+    assert found_in(closed_cylinder(0.03), maps) == ()
 
 
 def test_a_rim_of_varying_width_infers_nothing():
     maps = vessel_maps(bore=0.035, offset=0.015)
-    assert find_cavities(closed_cylinder(0.035, 0.015), patch_scene(maps, AngleModel.PPA)) == ()
+    assert found_in(closed_cylinder(0.035, 0.015), maps) == ()
 
 
 def test_a_bright_label_without_phase_is_no_opening():
     maps = vessel_maps(dark=1.0)
-    assert find_cavities(closed_cylinder(), patch_scene(maps, AngleModel.PPA)) == ()
+    assert found_in(closed_cylinder(), maps) == ()
 
 
 def test_too_few_views_find_nothing():
     maps = vessel_maps()[:2]
-    assert find_cavities(closed_cylinder(), patch_scene(maps, AngleModel.PPA)) == ()
+    assert found_in(closed_cylinder(), maps) == ()

@@ -19,6 +19,7 @@ from polmvs.surface.surface_quality import (
     misfit,
     stand_apart,
     supported_faces,
+    view_information,
 )
 from polmvs.surface.surface_view import Silhouette, surface_view
 
@@ -130,6 +131,27 @@ def test_phases_of_any_direction_carry_no_information(exact):
     vague = replace(observations, turn_variance=np.full_like(observations.turn_variance, 100.0))
     information = replace(labelled, observations=vague).information(exact, fit)
     assert np.allclose(information, 0, atol=0.015)
+
+
+def test_information_of_a_view_does_not_depend_on_the_mesh(exact):
+    """It is that of its pixels: of half as many faces it is about the same."""
+    coarse = trimesh.creation.icosphere(subdivisions=4)
+    coarse = TriangleMesh(np.asarray(coarse.vertices), np.asarray(coarse.faces, np.int64))
+    fit = fit_of(np.radians(2.0))
+    fine = view_information(exact, label(exact, fit), fit)
+    np.testing.assert_allclose(view_information(coarse, label(coarse, fit), fit), fine, rtol=0.1)
+    # A view shows a disc with a radius of about 150 / 5 px; its middle says little.
+    assert fine.shape == (len(fit.views),)
+    assert (fine / (np.pi * 30**2) > 0.5).all()
+    assert (fine / (np.pi * 30**2) < 5).all()
+
+
+def test_phases_that_all_say_little_determine_faces_with_less():
+    assert evidence_of(9).enough_information == pytest.approx(np.log(2))
+    weak = evidence_of(9, information=np.full(9, 8 * 0.4))
+    assert weak.enough_information == pytest.approx(0.3 * 0.4)
+    nothing = evidence_of(9, num_rows=np.zeros(9, int), information=np.zeros(9))
+    assert nothing.enough_information == 0
 
 
 def evidence_of(num, **changes):
