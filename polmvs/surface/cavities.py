@@ -35,7 +35,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_VIEWS
 from polmvs.surface.borders import cells_beside
 from polmvs.surface.creases import CreaseTolerances
-from polmvs.surface.mesh_geometry import MAX_CELLS, RayScene, TriangleMesh
+from polmvs.surface.mesh_geometry import MAX_CELLS, RayScene
 from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
     MAX_COST,
@@ -51,6 +51,7 @@ from polmvs.surface.offsets import (
     row_losses,
     snapped_border,
 )
+from polmvs.surface.surface_quality import ONE_SIDED
 from polmvs.surface.visual_hull import HullTolerances
 
 Array = NDArray[np.float64]
@@ -61,7 +62,6 @@ Mask = NDArray[np.bool_]
 
 SAME_PLANE_PX = HullTolerances.step_px  # GSDs, uncertainty of a rim's plane: a cell of the hull
 MIN_BORDER = 10  # least number of faces of a rim, and of the border of an opening
-ONE_SIDED = 1.645  # deviations of a normal distribution, which 5 % exceed
 THICKNESS_RATIO = 1.25  # of neighbours among the thicknesses that are tried
 TOP_SECTORS = 36  # in each of which the top of a wall is sought
 PLANE_ROUNDS = 3  # of the fit of a plane to half of a border
@@ -176,16 +176,17 @@ class SurfaceFaces:
     gsd: float
 
 
-def surface_faces(mesh: TriangleMesh, seen: Mask, supported: Mask, gsd: float) -> SurfaceFaces:
+def surface_faces(scene: RayScene, seen: Mask, supported: Mask, gsd: float) -> SurfaceFaces:
     """The faces of a closed mesh, with the openings among them.
 
     Parameters
     ----------
-    mesh : with F faces.
+    scene : of the mesh, with F faces.
     seen : (F,), faces that views see.
     supported : (F,), faces whose phases support them.
     gsd : ground sampling distance at the surface, world units.
     """
+    mesh = scene.mesh
     pieces = mesh.pieces(supported)
     area = np.bincount(pieces + 1, mesh.face_areas)[1:]
     # Phases may support islands of a cap by chance.
@@ -201,8 +202,7 @@ def surface_faces(mesh: TriangleMesh, seen: Mask, supported: Mask, gsd: float) -
         touches[mesh.faces[patch]] = True
         border = np.flatnonzero(is_body & touches[mesh.faces].any(axis=1))
         openings.append(Opening(patch, border, float(area[number])))
-    inside_along = RayScene(mesh).inside_along
-    return SurfaceFaces(mesh.centers, mesh.face_normals, is_body, openings, inside_along, gsd)
+    return SurfaceFaces(mesh.centers, mesh.face_normals, is_body, openings, scene.inside_along, gsd)
 
 
 def find_cavities(
@@ -216,11 +216,15 @@ def find_cavities(
     ----------
     surface : refined; its outside determines the cavity's walls.
     scene : the views.
-    information : of the phases, for the surface with a cavity.
+    information : of the phases, with and without a cavity.
     """
     if len(scene.maps) < MIN_VIEWS:
         return ()
     closed = cache(lambda: information(None))
+
+    def gain(cavity: Cavity) -> Array:
+        return information(cavity) - closed()
+
     found: list[Cavity] = []
     for opening in surface.openings:
         plane = _plane_of(opening, surface)
@@ -231,9 +235,7 @@ def find_cavities(
             continue
         cavity = None if rim is None else _dark_cavity(surface, opening, rim, scene)
         if cavity is None:
-            cavity = _bright_cavity(
-                surface, opening, plane, lambda cavity: information(cavity) - closed()
-            )
+            cavity = _bright_cavity(surface, opening, plane, gain)
         if cavity is not None:
             found.append(cavity)
     return tuple(found)
@@ -255,8 +257,9 @@ def _bright_cavity(
 ) -> Cavity | None:
     """The cavity with the wall at which the phases are likeliest; None if the cap explains them.
 
-    A rim of the wrong shape, flat or rounded, makes the wall too thin, as less of it is then wrong:
-    the thicker wall of the two is right. ``gain`` is the information that a cavity adds.
+    The rim is flat or rounded. The wrong shape makes the wall too thin, because a narrower rim
+    contradicts fewer phases, so the thicker wall is taken. ``gain`` is the information that a
+    cavity adds.
     """
     # An opening with its wall about it.
     if opening.area < np.pi * (2 * TOL.rounding * surface.gsd) ** 2:
@@ -265,11 +268,12 @@ def _bright_cavity(
         return None
     rim = _top_of_wall(surface, opening, plane)
     grid = _grid_about(surface, rim)
+    outside_at = cache(partial(_outside_at, surface, rim, grid))
 
     def cavity_of(is_round: bool, thickness: float, sigma: float = 0.0) -> Cavity | None:
         radius = 0.5 * thickness if is_round else 0.0
         start = max(TOL.rounding, radius)
-        outer = _outside_at(surface, rim, grid, start)
+        outer = outside_at(start)
         wall = _Wall(rim, thickness, sigma, -outer - (radius or thickness), outer, start, radius)
         return _cavity(surface, wall, grid, opening)
 
@@ -336,7 +340,7 @@ def _top_of_wall(surface: SurfaceFaces, opening: Opening, plane: Patch) -> Patch
         tops = []
         for number in range(TOP_SECTORS):
             index = np.flatnonzero(sector == number)
-            if len(index):
+            if len(index):  # the highest twentieth
                 highest = index[np.argsort(-height[index])[: -(-len(index) // 20)]]
                 tops.append(surface.centers[highest].mean(axis=0))
         if len(tops) < MIN_BORDER:

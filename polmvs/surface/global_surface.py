@@ -573,7 +573,7 @@ def _cavities(given: _Given, refined: Refined, labelled: Labelled) -> tuple[Cavi
         carved = remeshed(scene, HullTolerances.step_px * fit.gsd, free=free, smoothing=0)
         return view_information(carved, label(carved, fit), fit)
 
-    return find_cavities(surface_faces(mesh, seen, supported, fit.gsd), given.scene, information)
+    return find_cavities(surface_faces(scene, seen, supported, fit.gsd), given.scene, information)
 
 
 def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:

@@ -112,9 +112,9 @@ class FaceEvidence:
 
     @property
     def enough_information(self) -> float:
-        """Mean of a face's phases that tells it from a cap over an opening, nats.
+        """Mean information of a face's phases that tells it from a cap over an opening, nats.
 
-        A part of the usual mean where all phases say little, as those of white things.
+        It is a share of the usual mean where all phases say little, as those of white things.
         """
         rows = self.num_rows
         usual = float(np.median(self.information[rows > 0] / rows[rows > 0])) if rows.any() else 0.0
@@ -180,7 +180,7 @@ def supported_faces(
     min_views : number of views that must see a face and have a phase there.
     gsd : ground sampling distance, world units.
     sigma : (V,) position uncertainty of the vertices; None: no face counts as certain.
-    min_information : mean of the phases of a face, nats, that determines it.
+    min_information : mean information of a face's phases, nats, that determines the face.
     """
     if not len(mesh.faces):
         return np.zeros(0, np.bool_)

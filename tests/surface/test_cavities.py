@@ -11,7 +11,7 @@ from polmvs.polarization.phase_map import build_phase_map
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
 from polmvs.surface.cavities import Opening, SurfaceFaces, find_cavities, surface_faces
-from polmvs.surface.mesh_geometry import mesh_from_grid
+from polmvs.surface.mesh_geometry import RayScene, mesh_from_grid
 from polmvs.surface.offsets import patch_scene
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Cylinder, Group, Plane
@@ -323,13 +323,15 @@ def test_islands_of_a_cap_belong_to_its_opening():
     )
     away = np.maximum(x, y)
     supported = ~(is_top & (away < 9) & (away > 2))
-    found = surface_faces(mesh, np.ones(len(away), bool), supported, gsd=1.0)
+    found = surface_faces(RayScene(mesh), np.ones(len(away), bool), supported, gsd=1.0)
     (opening,) = found.openings
     assert set(opening.patch) == set(np.flatnonzero(is_top & (away < 9)))
     assert is_top[opening.border].all()
     assert (away[opening.border] < 10.5).all()
     assert not found.supported[opening.patch].any()
-    nothing = surface_faces(mesh, np.ones(len(away), bool), np.ones(len(away), bool), gsd=1.0)
+    nothing = surface_faces(
+        RayScene(mesh), np.ones(len(away), bool), np.ones(len(away), bool), gsd=1.0
+    )
     assert nothing.openings == []
 
 
