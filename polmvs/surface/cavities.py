@@ -123,6 +123,15 @@ class Cavity:
     layer_step: float
     first_layer: int
 
+    @property
+    def is_deep(self) -> bool:
+        """Whether it is deeper than wide: light in it was reflected several times."""
+        free = self.field > 0
+        lowest = int(np.flatnonzero(free.any(axis=(1, 2))).max(initial=0))
+        area = int(free[-self.first_layer].sum()) * self.grid.step**2
+        depth = (lowest + self.first_layer) * self.layer_step
+        return bool(depth > 2 * np.sqrt(area / np.pi))
+
     def values(self, points: Floats) -> Array:
         """Signed distance ``(N,)`` of points, positive in the cavity's free space."""
         points = np.asarray(points, np.float64)
@@ -241,6 +250,42 @@ def find_cavities(
     return tuple(found)
 
 
+def find_vessel(
+    scene: RayScene, rim: Patch, gsd: float, gain: Callable[[Cavity], Array]
+) -> Cavity | None:
+    """The cavity below a plane, at whose walls the phases are likelier than on a solid.
+
+    Parameters
+    ----------
+    scene : of a closed first surface, whose cap above the plane is not the vessel's.
+    rim : the plane, below the rounding of the surface's edge; its members are not used.
+    gsd : ground sampling distance at the surface, world units.
+    gain : information (V,) of each view's phases that a cavity adds to the solid's.
+
+    Returns
+    -------
+    None if the solid explains the phases, or if views disagree on the wall.
+    """
+    mesh = scene.mesh
+    height = rim.height(mesh.centers)
+    patch = np.flatnonzero(height > 0)
+    rim = replace(rim, members=np.flatnonzero(np.abs(height) < 2 * SAME_PLANE_PX * gsd))
+    opening = Opening(patch, rim.members, float(mesh.face_areas[patch].sum()))
+    if len(rim.members) < MIN_BORDER or opening.area < _least_area(gsd):
+        return None
+    surface = SurfaceFaces(
+        mesh.centers, mesh.face_normals, height <= 0, [opening], scene.inside_along, gsd
+    )
+    cavity_of = partial(_cavities_within(surface, opening, rim), False)
+    likeliest = _likeliest_thickness(cavity_of, gain)
+    return None if likeliest is None else cavity_of(*likeliest)
+
+
+def _least_area(gsd: float) -> float:
+    """Area of an opening with its wall about it, world units squared."""
+    return float(np.pi * (2 * TOL.rounding * gsd) ** 2)
+
+
 def _dark_cavity(
     surface: SurfaceFaces, opening: Opening, rim: Patch, scene: PatchScene
 ) -> Cavity | None:
@@ -261,12 +306,26 @@ def _bright_cavity(
     contradicts fewer phases, so the thicker wall is taken. ``gain`` is the information that a
     cavity adds.
     """
-    # An opening with its wall about it.
-    if opening.area < np.pi * (2 * TOL.rounding * surface.gsd) ** 2:
+    if opening.area < _least_area(surface.gsd):
         return None
     if not _surrounds(plane, surface.centers[opening.border], surface.centers[opening.patch]):
         return None
-    rim = _top_of_wall(surface, opening, plane)
+    cavity_of = _cavities_within(surface, opening, _top_of_wall(surface, opening, plane))
+    found = []
+    for is_round in (False, True):
+        likeliest = _likeliest_thickness(partial(cavity_of, is_round), gain)
+        if likeliest is not None:
+            found.append((*likeliest, is_round))
+    if not found:
+        return None
+    thickness, sigma, is_round = max(found)
+    return cavity_of(is_round, thickness, sigma)
+
+
+def _cavities_within(
+    surface: SurfaceFaces, opening: Opening, rim: Patch
+) -> Callable[..., Cavity | None]:
+    """The cavity below a rim by its shape, its wall's thickness and the deviation of that."""
     grid = _grid_about(surface, rim)
     outside_at = cache(partial(_outside_at, surface, rim, grid))
 
@@ -277,15 +336,7 @@ def _bright_cavity(
         wall = _Wall(rim, thickness, sigma, -outer - (radius or thickness), outer, start, radius)
         return _cavity(surface, wall, grid, opening)
 
-    found = []
-    for is_round in (False, True):
-        likeliest = _likeliest_thickness(partial(cavity_of, is_round), gain)
-        if likeliest is not None:
-            found.append((*likeliest, is_round))
-    if not found:
-        return None
-    thickness, sigma, is_round = max(found)
-    return cavity_of(is_round, thickness, sigma)
+    return cavity_of
 
 
 def _likeliest_thickness(

@@ -56,6 +56,7 @@ from polmvs.surface.solver import (
     Labelled,
     PositionSigma,
     Refined,
+    SignedDistance,
     SolverTolerances,
     first_fit,
     label,
@@ -83,6 +84,7 @@ from polmvs.surface.surface_quality import (
 )
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints, KnownSides
+from polmvs.surface.vessels import opened_hull
 from polmvs.surface.visual_hull import (
     HullTolerances,
     SupportingPlane,
@@ -232,15 +234,24 @@ def reconstruct_surface(
         min_views=min_views,
         on_progress=on_progress,
     )
-    steps = () if first.hull is None else given.steps(first.mesh)
+    fit = first_fit(views, looking, first.gsd, known=first.known, tolerances=tolerances)
+    walls: SignedDistance | None = None
+    steps: tuple[SteppedPatches, ...] = ()
+    if first.hull is not None:
+        hull, walls = opened_hull(first.hull, first.plane, fit)
+        first = replace(first, mesh=hull.mesh, hull=hull)
+        if walls is None:
+            steps = given.steps(first.mesh)
+        else:  # its floor is refined; it is no height step
+            logger.info("a vessel, open at the top.")
     if steps:
         logger.info("%d groups of planar patches that silhouettes do not part.", len(steps))
         first = first.carved(steps)
-    fit = first_fit(views, looking, first.gsd, known=first.known, tolerances=tolerances)
     refined = refine(
         first.mesh,
         fit,
         stands_apart=partial(stand_apart, least=MIN_EXPLAINED),
+        walls=walls,
         on_progress=on_progress,
     )
     _warn_of_inconsistent(looking.angle_model, views, refined)
@@ -278,6 +289,7 @@ class _First:
     known : points of the surface.
     gsd : ground sampling distance at the surface, world units.
     hull : whose surface it is; None for an open scene.
+    plane : on which the objects stand, if it is known.
     """
 
     mesh: TriangleMesh
@@ -285,6 +297,7 @@ class _First:
     known: KnownPoints
     gsd: float
     hull: VisualHull | None = None
+    plane: SupportingPlane | None = None
 
     def carved(self, steps: Sequence[SteppedPatches]) -> _First:
         """The hull without the space above planar patches."""
@@ -300,7 +313,8 @@ def _first_surface(
     if reason := _no_hull(views):
         return Undetermined(reason)
     centers = np.array([view.center for view in views])
-    hull, mismatch = consistent_hull(views, supporting_plane(sparse.surroundings, centers))
+    plane = supporting_plane(sparse.surroundings, centers)
+    hull, mismatch = consistent_hull(views, plane)
     scene = None
     if sparse.scene is not None and mismatch > MAX_SHARE:
         scene = open_scene(sparse.scene, views, folder=None if folder is None else folder / "scene")
@@ -317,7 +331,7 @@ def _first_surface(
     if not len(hull.mesh.faces):
         return Undetermined("the silhouettes of the views have no common object")
     known = KnownPoints(sparse.seeds.points_in_world, sparse.seeds.sigma)
-    return _First(mesh=hull.mesh, views=views, known=known, gsd=hull.gsd, hull=hull)
+    return _First(mesh=hull.mesh, views=views, known=known, gsd=hull.gsd, hull=hull, plane=plane)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,10 +22,11 @@ from polmvs.surface.dense_view import lattice_xy
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.observations import Image, Looking, level_image, rows_of_both
 from polmvs.surface.open_scene import OpenScene
-from polmvs.surface.solver import Level, SolverTolerances, first_fit, refine
+from polmvs.surface.solver import Level, SignedDistance, SolverTolerances, first_fit, refine
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints
-from polmvs.surface.visual_hull import SupportingPlane, visual_hull
+from polmvs.surface.vessels import opened_hull
+from polmvs.surface.visual_hull import SupportingPlane, VisualHull, visual_hull
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -148,14 +149,19 @@ def predict_left_out(
     others = [view for view, out in zip(views, left_out, strict=True) if out]
     if len(used) < MIN_PREDICTING or not others:
         return None
-    first = visual_hull(used, plane) if scene is None else scene
+    walls: SignedDistance | None = None
+    first: OpenScene | VisualHull | None = scene
+    if first is None:
+        hull = visual_hull(used, plane)
+        fit = first_fit(used, looking, hull.gsd, known=known)
+        first, walls = opened_hull(hull, plane, fit)
 
     def trial(levels: tuple[Level, ...]) -> Prediction:
         mesh = first.mesh
         if len(mesh.faces):
             solver = replace(SolverTolerances(), levels=levels)
             fit = first_fit(used, looking, first.gsd, known=known, tolerances=solver)
-            mesh = refine(mesh, fit).mesh
+            mesh = refine(mesh, fit, walls=walls).mesh
         return predict(mesh, others, looking, outside=outside, width_px=tol.width_px)
 
     found = trial(tol.levels)

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +77,7 @@ MIN_RESIDUALS = 100  # least number of rows of one view and kind of light for a 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
+SignedDistance: TypeAlias = Callable[[Array], NDArray[np.floating]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,6 +253,7 @@ def refine(
     fit: Fit,
     *,
     stands_apart: Callable[[Array], Mask] | None = None,
+    walls: SignedDistance | None = None,
     on_progress: OnProgress = no_progress,
 ) -> Refined:
     """Move a closed mesh until the views' phases and silhouettes agree with it.
@@ -265,6 +268,8 @@ def refine(
     fit : of all views.
     stands_apart : finds inconsistent views from the unexplained shares ``(K,)``; these are left out
         after the first level.
+    walls : signed distance of points (N, 3) to walls that coarse meshes lose, negative inside; each
+        level starts with them.
     on_progress : called with the number of iterations done.
     """
     tol, done = fit.tol, 0
@@ -276,6 +281,7 @@ def refine(
         edge = level.edge_px * fit.gsd
         edge *= max(float(np.sqrt(_num_vertices(mesh, edge) / tol.max_vertices)), 1.0)
         fit = fit.at_width(level.width_px)
+        mesh = _at_level(RayScene(mesh), edge, fit.views, walls)
         mesh, fit = _refined_at(mesh, fit, level, edge, (done, total), on_progress)
         done += level.num_steps
         meshes.append(mesh)
@@ -325,14 +331,11 @@ def _refined_at(
     ``progress`` are the iterations done before it, and of all levels.
     """
     tol, (done, total) = fit.tol, progress
-    moved, energy, is_thin = np.zeros(0), None, False
+    moved, energy, is_thin = np.zeros(len(mesh.vertices)), None, False
     first, last = tol.annealing
     for step in range(level.num_steps):
         # A mesh that has moved far is irregular. In one that intersects itself views see the
         # inside. Other meshes stay as they are, because the grid rounds their creases.
-        if step == 0:
-            mesh = _at_level(RayScene(mesh), edge, fit.views)
-            moved = np.zeros(len(mesh.vertices))
         scene = RayScene(mesh)
         if step > 0 and not is_thin and _is_irregular(scene, moved, edge, tol):
             # No smoothing: the mesh is smooth. The grid loses walls thinner than its cells.
@@ -377,9 +380,11 @@ def _refined_at(
     return mesh, replace(fit, scales=energy.shown_scales())
 
 
-def _at_level(scene: RayScene, edge: float, views: Sequence[SurfaceView]) -> TriangleMesh:
+def _at_level(
+    scene: RayScene, edge: float, views: Sequence[SurfaceView], walls: SignedDistance | None
+) -> TriangleMesh:
     """A level's first mesh. Parts that it would lose are widened; outlines make them thin again."""
-    again = RayScene(remeshed(scene, edge))
+    again = RayScene(remeshed(scene, edge, solid=() if walls is None else (walls,)))
     if not _loses_walls(scene, again, views):
         return again.mesh
     logger.info("parts that edges of the level would lose are widened.")

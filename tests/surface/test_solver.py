@@ -74,6 +74,17 @@ def refined(hull, views, *, tolerances=QUICK, **kwargs):
     return refine(hull.mesh, fit_of(views, hull.gsd, tolerances=tolerances, **kwargs))
 
 
+@pytest.mark.parametrize("is_known", [False, True])
+def test_a_level_starts_with_walls_that_the_mesh_has_lost(is_known):
+    ends = union(sphere(0.3, (0.7, 0, 0)), sphere(0.3, (-0.7, 0, 0)))
+    lost = sphere(0.25)
+    views = views_of(union(ends, lost), ring_of_views(6))
+    short = replace(QUICK.levels[1], num_steps=1)
+    fit = fit_of(views, tolerances=SolverTolerances(levels=(short,)))
+    mesh = refine(extracted(ends), fit, walls=lost if is_known else None).mesh
+    assert len(set(mesh.face_components)) == (3 if is_known else 2)
+
+
 def deviations(mesh, views, **kwargs):
     given = {name: kwargs.pop(name) for name in ("known", "tolerances") if name in kwargs}
     return place_deviations(mesh, fit_of(views, **given).at_width(1.0), **kwargs).own

@@ -1,0 +1,93 @@
+"""The first surface of bowls, and of solids with the same silhouettes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from analytic_objects import phase_maps_of, ring_of_views
+
+from polmvs.camera import PinholeCamera
+from polmvs.polarization.kinds import AngleModel
+from polmvs.surface.mesh_geometry import RayScene
+from polmvs.surface.observations import Looking
+from polmvs.surface.solver import first_fit
+from polmvs.surface.surface_view import Silhouette, surface_view
+from polmvs.surface.vessels import opened_hull, rim_height
+from polmvs.surface.visual_hull import SupportingPlane, visual_hull
+
+WALL = 0.16
+GROUND = SupportingPlane(np.array([0.0, 0.0, 1.0]), -1.0)
+
+
+def half_ball(points):
+    return np.maximum(np.linalg.norm(points, axis=-1) - 1, points[..., 2])
+
+
+def bowl(points):
+    """Half a hollow ball, open at the top, whose rim has the height 1 above the ground."""
+    return np.maximum(half_ball(points), 1 - WALL - np.linalg.norm(points, axis=-1))
+
+
+def cylinder(points, radius, low, high=0.6):
+    beside = np.hypot(points[..., 0], points[..., 1]) - radius
+    return np.maximum(beside, np.maximum(points[..., 2] - high, low - points[..., 2]))
+
+
+def drum(points):
+    """Phases contradict the cap of its hull more than the inside of a vessel."""
+    return cylinder(points, 1.0, -1.0, 0.0)
+
+
+def beaker(points):
+    """Deeper than wide."""
+    inside = cylinder(points - [0, 0, 0.3], 0.45, -1.2)
+    return np.maximum(cylinder(points, 0.6, -1.0), -inside)
+
+
+def given(distance):
+    camera = PinholeCamera(width=264, height=224, fx=300, fy=300, cx=132, cy=112)
+    views = ring_of_views(8, elevations=(20.0, 50.0))
+    views = [replace(view, camera=camera) for view in views]
+    maps = phase_maps_of(distance, views)
+    views = [surface_view(m, Silhouette(m.region.inside, m.region.inside)) for m in maps]
+    hull = visual_hull(views, GROUND)
+    return hull, first_fit(views, Looking(angle_model=AngleModel.PPA, tilt_aware=False), hull.gsd)
+
+
+@pytest.fixture(scope="module")
+def of_bowl():
+    return given(bowl)
+
+
+def test_silhouettes_show_the_height_of_the_rim(of_bowl):
+    hull, fit = of_bowl
+    cap = GROUND.height(hull.mesh.vertices).max()
+    height = rim_height(RayScene(hull.mesh), fit.views, GROUND)
+    assert height == pytest.approx(1, abs=2 * hull.gsd)
+    assert cap > height + 5 * hull.gsd
+
+
+def test_no_silhouette_shows_no_height(of_bowl):
+    hull, _ = of_bowl
+    assert np.isnan(rim_height(RayScene(hull.mesh), [], GROUND))
+
+
+def test_the_inside_of_a_bowl_is_carved(of_bowl):
+    carved, walls = opened_hull(of_bowl[0], GROUND, of_bowl[1])
+    assert walls is not None
+    free, wall = [[0, 0, -0.3], [0.4, 0, -0.2], [0, 0, 0.2]], [[0.9, 0, -0.2], [0, -0.9, -0.2]]
+    assert (carved.distances(np.array(free)) > 0).all()
+    assert (carved.distances(np.array(wall)) < 0).all()
+
+
+@pytest.mark.parametrize("solid", [half_ball, drum, beaker])
+def test_a_lid_and_a_deep_vessel_keep_their_hull(solid):
+    hull, fit = given(solid)
+    same, walls = opened_hull(hull, GROUND, fit)
+    assert same is hull
+    assert walls is None
+
+
+def test_without_a_plane_no_vessel_is_looked_for(of_bowl):
+    hull, fit = of_bowl
+    assert opened_hull(hull, None, fit) == (hull, None)
