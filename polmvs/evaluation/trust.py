@@ -35,6 +35,7 @@ from polmvs.polarization.region import grow_mask
 from polmvs.scene import PointKind
 from polmvs.surface.held_out import Prediction
 from polmvs.surface.soundness import Soundness
+from polmvs.surface.surface_quality import MAX_SHARE
 
 LIGHT_OPTIONS = "`region.light`, `capture.pattern`, `capture.gamma`"
 MIN_CHECKED = 4  # views: three make a surface, and one checks it
@@ -70,6 +71,8 @@ class NormalRanges:
     layered, overlapping : shares of the views' rays. Measured, 0 to 0.004, and 0; the ends are
         guesses.
     left_out : share of the views without a pose or inconsistent. Guess.
+    contradicted : share of the surface. Measured, 0 to 0.08; with normals or F-scores that are
+        wrong 0.18 and 0.31, under OPA 0.12. The end is that of the surface's own warning.
     cut : measured, see :mod:`polmvs.polarization.mask_check`.
 
     Measured on right reconstructions: five rendered captures (``board``, ``dome``, ``demo``,
@@ -90,6 +93,7 @@ class NormalRanges:
     layered: tuple[float, float] = (0.0, 0.05)
     overlapping: tuple[float, float] = (0.0, 0.02)
     left_out: tuple[float, float] = (0.0, 0.25)
+    contradicted: tuple[float, float] = (0.0, MAX_SHARE)
     cut: tuple[float, float] = (0.0, MAX_CUT_SHARE)
 
 
@@ -164,6 +168,7 @@ class Trust:
     predicted : held-out views, predicted from a surface of the others; None if not made.
     fitted : all views, predicted from the surface; None if the views were integrated one by one.
     soundness : of the mesh; likewise.
+    contradicted_share : share of the surface that its phases contradict; likewise.
     complaints : errors that earlier stages found (cameras, pattern, light), one clause each.
     cut_share : share of the band outside of the user's masks that is as polarized as a surface;
         None without masks.
@@ -183,6 +188,7 @@ class Trust:
     predicted: Prediction | None = None
     fitted: Prediction | None = None
     soundness: Soundness | None = None
+    contradicted_share: float | None = None
     complaints: tuple[str, ...] = ()
     cut_share: float | None = None
     is_bounded: bool = True
@@ -228,6 +234,10 @@ class Trust:
         if self.fitted is not None:
             name = "phases that neither kind of light explains, %"
             yield _figure(name, self.fitted.unexplained, ranges.unexplained, LIGHT_OPTIONS)
+        if self.contradicted_share is not None:
+            name = "surface that its phases contradict, %"
+            remedy = "`region.mask`, `region.light`, `sfm.intrinsics`; cavities and holes"
+            yield _figure(name, self.contradicted_share, ranges.contradicted, remedy)
         if self.soundness is not None:
             views = "views that contradict each other: poses, `region.mask`"
             name = "lines of sight through a double layer of the surface, %"

@@ -54,6 +54,8 @@ def opened_hull(
         return hull, None
     scene = RayScene(hull.mesh)
     height = rim_height(scene, fit.views, plane)
+    if not np.isfinite(height):
+        return hull, None
     fit = fit.at_width(fit.tol.levels[0].width_px)
 
     def carved(*free: SignedDistance) -> RayScene:

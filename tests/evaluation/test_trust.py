@@ -154,6 +154,7 @@ RIGHT = Trust(
     predicted=PREDICTED,
     fitted=replace(PREDICTED, num_views=12),
     soundness=Soundness(layered=0.001, overlapping=0.0),
+    contradicted_share=0.05,
 )
 
 
@@ -180,6 +181,7 @@ def test_noisy_phases_of_weak_polarization_are_no_contradiction():
         ({"fitted": replace(PREDICTED, unexplained=0.5)}, "neither kind of light explains.* 50 "),
         ({"soundness": Soundness(layered=0.2, overlapping=0.0)}, "double layer.* 20 "),
         ({"soundness": Soundness(layered=0.0, overlapping=0.1)}, "intersects itself.* 10 "),
+        ({"contradicted_share": 0.18}, "that its phases contradict, %: 18 "),
         ({"left_out": 5}, "a pose or inconsistent, %: 41.7 "),
         ({"num_views": 3}, "3 views leave none to check"),
         ({"residual_deg": 6.0, "residual_sigmas": 2.0}, "beyond noise, median, deg: 5.65 "),

@@ -68,8 +68,9 @@ def test_silhouettes_show_the_height_of_the_rim(of_bowl):
 
 
 def test_no_silhouette_shows_no_height(of_bowl):
-    hull, _ = of_bowl
+    hull, fit = of_bowl
     assert np.isnan(rim_height(RayScene(hull.mesh), [], GROUND))
+    assert opened_hull(hull, GROUND, replace(fit, views=[])) == (hull, None)
 
 
 def test_the_inside_of_a_bowl_is_carved(of_bowl):

@@ -105,6 +105,8 @@ class DensifyResult:
         None with the other methods.
     left_out : names of inconsistent views, which the surface does not use.
     is_bounded : silhouettes bound the surface of all views; otherwise it is that of an open scene.
+    contradicted_share : share of the surface of all views that its phases contradict; None with the
+        other methods.
     """
 
     num_points: int
@@ -113,6 +115,7 @@ class DensifyResult:
     tilt_share: float | None
     left_out: tuple[str, ...] = ()
     is_bounded: bool = True
+    contradicted_share: float | None = None
 
     def __str__(self) -> str:
         return f"{self.num_points:,} points, and {self.num_surroundings:,} of the surroundings"
@@ -148,6 +151,7 @@ class _Surface:
     tilt_share: float | None = None
     left_out: tuple[str, ...] = ()
     is_bounded: bool = True
+    contradicted_share: float | None = None
 
 
 def densify(
@@ -221,6 +225,7 @@ def densify(
         tilt_share=found.tilt_share,
         left_out=found.left_out,
         is_bounded=found.is_bounded,
+        contradicted_share=found.contradicted_share,
     )
 
 
@@ -349,6 +354,7 @@ def _global_surface(
         tilt_share=surface.tilt_share,
         left_out=tuple(view.name for view in compress(given.views, surface.left_out)),
         is_bounded=surface.is_bounded,
+        contradicted_share=surface.contradictions.contradicted_share,
     )
 
 

@@ -77,6 +77,7 @@ def find_trust(model: AngleModel, folder: RunFolder, record: Record, options: Op
             *(mapped.complaints if mapped is not None else ()),
         ),
         cut_share=None if mapped is None else mapped.cut_share,
+        contradicted_share=made.contradicted_share,
         is_bounded=made.is_bounded,
     )
     if made.tilt_share is not None and (folder.views(model) / SURFACE_MESH).is_file():
