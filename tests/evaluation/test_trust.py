@@ -216,6 +216,12 @@ def test_a_part_that_is_missing_is_a_reservation():
     assert "But coverage of the polarized regions, %: 30 " in found.verdict
 
 
+def test_what_closes_an_open_scene_is_a_reservation():
+    found = replace(RIGHT, is_bounded=False, contradicted_share=0.2).judged()
+    assert found.is_trusted
+    assert "But surface that its phases contradict, %: 20 " in found.verdict
+
+
 def test_views_integrated_one_by_one_say_that_none_was_held_out():
     found = replace(RIGHT, predicted=None, fitted=None, soundness=None).judged()
     assert found.is_trusted
