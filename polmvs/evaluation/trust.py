@@ -236,11 +236,15 @@ class Trust:
             yield _figure(name, self.fitted.unexplained, ranges.unexplained, LIGHT_OPTIONS)
         if self.contradicted_share is not None:
             name = "surface that its phases contradict, %"
-            remedy = "`region.mask`, `region.light`, `sfm.intrinsics`; cavities and holes"
-            share = self.contradicted_share
-            # An open scene lacks things without sparse points; what closes the gap is left out.
-            is_wrong = self.is_bounded
-            yield _figure(name, share, ranges.contradicted, remedy, decides=is_wrong)
+            remedy = "`region.mask` (holes, cavities), `region.light`, `sfm.intrinsics`"
+            yield _figure(
+                name,
+                self.contradicted_share,
+                ranges.contradicted,
+                remedy,
+                # An open scene lacks things without sparse points; what closes the gap is left out.
+                decides=self.is_bounded,
+            )
         if self.soundness is not None:
             views = "views that contradict each other: poses, `region.mask`"
             name = "lines of sight through a double layer of the surface, %"

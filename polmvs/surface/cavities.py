@@ -52,7 +52,7 @@ from polmvs.surface.offsets import (
     snapped_border,
 )
 from polmvs.surface.surface_quality import ONE_SIDED
-from polmvs.surface.visual_hull import HullTolerances
+from polmvs.surface.visual_hull import HullTolerances, SupportingPlane
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -251,14 +251,14 @@ def find_cavities(
 
 
 def find_vessel(
-    scene: RayScene, rim: Patch, gsd: float, gain: Callable[[Cavity], Array]
+    scene: RayScene, top: SupportingPlane, gsd: float, gain: Callable[[Cavity], Array]
 ) -> Cavity | None:
-    """The cavity below a plane, at whose walls the phases are likelier than on a solid.
+    """The shallow cavity below a plane, at whose walls the phases are likelier than on a solid.
 
     Parameters
     ----------
     scene : of a closed first surface, whose cap above the plane is not the vessel's.
-    rim : the plane, below the rounding of the surface's edge; its members are not used.
+    top : plane of the top of the wall, with the normal upwards.
     gsd : ground sampling distance at the surface, world units.
     gain : information (V,) of each view's phases that a cavity adds to the solid's.
 
@@ -267,16 +267,23 @@ def find_vessel(
     None if the solid explains the phases, or if views disagree on the wall.
     """
     mesh = scene.mesh
-    height = rim.height(mesh.centers)
+    height = top.height(mesh.centers) + TOL.rounding * gsd  # above the rim: the hull rounds edges
     patch = np.flatnonzero(height > 0)
-    rim = replace(rim, members=np.flatnonzero(np.abs(height) < 2 * SAME_PLANE_PX * gsd))
+    members = np.flatnonzero(np.abs(height) < 2 * SAME_PLANE_PX * gsd)
+    rim = Patch(top.normal, top.offset - TOL.rounding * gsd, members)
     opening = Opening(patch, rim.members, float(mesh.face_areas[patch].sum()))
     if len(rim.members) < MIN_BORDER or opening.area < _least_area(gsd):
         return None
     surface = SurfaceFaces(
         mesh.centers, mesh.face_normals, height <= 0, [opening], scene.inside_along, gsd
     )
-    cavity_of = partial(_cavities_within(surface, opening, rim), False)
+    within = _cavities_within(surface, opening, rim)
+
+    def cavity_of(thickness: float, sigma: float = 0.0) -> Cavity | None:
+        cavity = within(False, thickness, sigma)
+        # Many reflections bias the phases in a deep one: `find_cavities` infers its wall.
+        return None if cavity is None or cavity.is_deep else cavity
+
     likeliest = _likeliest_thickness(cavity_of, gain)
     return None if likeliest is None else cavity_of(*likeliest)
 
@@ -367,10 +374,11 @@ def _likeliest_thickness(
     if not here.mean() > ONE_SIDED * _sigma_of_mean(here):
         return None
     # The vertex of a parabola. Its deviation is that of the slope.
-    slope, bend = 0.5 * (above - below), (below - 2 * here + above).mean()
     shift, sigma = 0.0, 1.0
-    if np.isfinite(bend) and bend < 0:
-        shift, sigma = -slope.mean() / bend, _sigma_of_mean(slope) / -bend
+    if np.isfinite(below).all() and np.isfinite(above).all():
+        slope, bend = 0.5 * (above - below), (below - 2 * here + above).mean()
+        if bend < 0:
+            shift, sigma = -slope.mean() / bend, _sigma_of_mean(slope) / -bend
     thickness = thickness_of(best + shift)
     return thickness, thickness * (THICKNESS_RATIO**sigma - 1)
 

@@ -10,7 +10,7 @@ Sun et al., Fast and effective feature-preserving mesh denoising, TVCG 2007.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from polmvs.geometry import dots
-from polmvs.surface.mesh_geometry import TriangleMesh
+from polmvs.surface.mesh_geometry import SignedDistance, TriangleMesh
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -185,7 +185,7 @@ def wall_normals(
     mesh: TriangleMesh,
     normals: Array,
     is_fitted: Mask,
-    carvings: Sequence[Callable[[Array], Floats]],
+    carvings: Sequence[SignedDistance],
     to_uncarved: Floats,
 ) -> tuple[Array, Mask]:
     """Normals ``(F, 3)`` with those of carved walls as carved, and which faces ``(F,)`` are walls.
@@ -217,7 +217,7 @@ def wall_normals(
     return np.where(is_wall[:, None], carved, normals), is_wall
 
 
-def _gradients(values: Callable[[Array], Floats], points: Array, step: float) -> Array:
+def _gradients(values: SignedDistance, points: Array, step: float) -> Array:
     """Unit gradients ``(N, 3)`` of a function at points ``(N, 3)``, from central differences."""
     slopes = [values(points + step * axis) - values(points - step * axis) for axis in np.eye(3)]
     return _unit(np.stack(slopes, axis=-1).astype(np.float64))

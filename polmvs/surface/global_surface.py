@@ -38,6 +38,7 @@ from polmvs.surface.dense_view import DenseView, lattice_xy
 from polmvs.surface.fusion import FusedCloud, no_points
 from polmvs.surface.mesh_geometry import (
     RayScene,
+    SignedDistance,
     TriangleMesh,
     remeshed,
     sample_surface,
@@ -56,7 +57,6 @@ from polmvs.surface.solver import (
     Labelled,
     PositionSigma,
     Refined,
-    SignedDistance,
     SolverTolerances,
     first_fit,
     label,
@@ -601,7 +601,7 @@ def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Flo
     return first_hit
 
 
-def _lie_on(mesh: TriangleMesh, carvings: Sequence[Callable[[Array], Floats]]) -> Mask:
+def _lie_on(mesh: TriangleMesh, carvings: Sequence[SignedDistance]) -> Mask:
     """Which faces ``(F,)`` border carved space."""
     found = np.zeros(len(mesh.faces), np.bool_)
     for values in carvings:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Faces = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+# Of points (N, 3): (N,), negative in solid, positive in free space.
+SignedDistance: TypeAlias = Callable[[Array], Floats]
 
 # Directions of rays whose majority decides inside or outside, as one may graze an edge; not axes.
 SIGN_DIRECTIONS = (
@@ -476,8 +478,8 @@ def remeshed(
     scene: RayScene,
     step: float,
     *,
-    solid: Sequence[Callable[[Array], Floats]] = (),
-    free: Sequence[Callable[[Array], Floats]] = (),
+    solid: Sequence[SignedDistance] = (),
+    free: Sequence[SignedDistance] = (),
     smoothing: float = 0.5,
     min_cells: int = 30,
 ) -> TriangleMesh:

@@ -43,6 +43,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
 from polmvs.surface.borders import drawn_border, smoothly_beside
 from polmvs.surface.creases import CreaseTolerances
+from polmvs.surface.mesh_geometry import SignedDistance
 from polmvs.surface.silhouettes import SilhouetteTolerances, nearest_steps, step_slope
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX
 from polmvs.surface.terms import TermTolerances
@@ -51,7 +52,6 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-SignedDistance: TypeAlias = Callable[[Array], Floats]
 FirstHit: TypeAlias = Callable[[Array, Array], tuple[Floats, Floats]]
 
 NO_PATCH = -1

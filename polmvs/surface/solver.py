@@ -18,7 +18,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +34,13 @@ from polmvs.surface.labels import (
     responsibilities,
     vote,
 )
-from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, remeshed, thickened
+from polmvs.surface.mesh_geometry import (
+    RayScene,
+    SignedDistance,
+    TriangleMesh,
+    remeshed,
+    thickened,
+)
 from polmvs.surface.observations import (
     KINDS,
     Image,
@@ -77,7 +82,6 @@ MIN_RESIDUALS = 100  # least number of rows of one view and kind of light for a 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
-SignedDistance: TypeAlias = Callable[[Array], NDArray[np.floating]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -838,7 +842,7 @@ def polishing_step(mesh: TriangleMesh, fit: Fit, sides: KnownSides) -> tuple[Tri
     return moved, not len(free) or float(np.median(free)) < 0.03 * edge
 
 
-def certain_rays(view: SurfaceView, stride_px: int) -> Array:
+def certain_rays(view: SurfaceView, stride_px: int = 4) -> Array:
     """Unit rays ``(N, 3)``, world, of pixels of a view's certain silhouette, at a stride."""
     half = stride_px // 2
     rows, cols = np.nonzero(view.silhouette.certain[half::stride_px, half::stride_px])

@@ -9,18 +9,18 @@ of one thickness. The refinement then moves the inside like any surface.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polmvs.geometry import points_on_rays
-from polmvs.surface.cavities import TOL, Cavity, find_vessel
-from polmvs.surface.mesh_geometry import RayScene, remeshed
-from polmvs.surface.offsets import Patch
+from polmvs.surface.cavities import Cavity, find_vessel
+from polmvs.surface.mesh_geometry import RayScene, SignedDistance, remeshed
 from polmvs.surface.solver import (
     REMESHING_LOSS,
     Fit,
-    SignedDistance,
     certain_rays,
     covered_share,
     label,
@@ -28,8 +28,6 @@ from polmvs.surface.solver import (
 from polmvs.surface.surface_quality import view_information
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.visual_hull import SupportingPlane, VisualHull
-
-STRIDE_PX = 4  # of the rays that show the height of the rim
 
 Array = NDArray[np.float64]
 
@@ -65,9 +63,8 @@ def opened_hull(
         """Of the phases of each view, nats."""
         return view_information(scene.mesh, label(scene.mesh, fit), fit)
 
-    closed = carved()
-    cut = carved(lambda points: plane.height(points) - height)
-    solid = max(information(closed), information(cut), key=np.sum)
+    closed, top = carved(), replace(plane, offset=plane.offset + height)
+    solid = cache(lambda: max(information(closed), information(carved(top.height)), key=np.sum))
     least = covered_share(closed, fit.views) - REMESHING_LOSS
 
     def gain(cavity: Cavity) -> Array:
@@ -75,14 +72,12 @@ def opened_hull(
         # Where nothing is left, phases contradict nothing: it must still cover the silhouettes.
         if covered_share(vessel, fit.views) < least:
             return np.full(len(fit.views), -np.inf)
-        return information(vessel) - solid
+        return information(vessel) - solid()
 
     # Outlines on the ground are uncertain, so the hull reaches below the plane; the floor does not.
     above = carved(lambda points: -plane.height(points))
-    rim = Patch(plane.normal, plane.offset + height - TOL.rounding * fit.gsd, np.zeros(0, np.int64))
-    cavity = find_vessel(above, rim, fit.gsd, gain)
-    # Many reflections bias the phases in a deep one: `find_cavities` infers its wall afterwards.
-    if cavity is None or cavity.is_deep:
+    cavity = find_vessel(above, top, fit.gsd, gain)
+    if cavity is None:
         return hull, None
     vessel = hull.carved([cavity.values])
     return vessel, vessel.distances
@@ -103,7 +98,7 @@ def rim_height(scene: RayScene, views: Sequence[SurfaceView], plane: SupportingP
     """
     found = []
     for view in views:
-        rays = certain_rays(view, STRIDE_PX)
+        rays = certain_rays(view)
         entry = scene.cast(view.center, rays).distance
         rays, entry = rays[np.isfinite(entry)], entry[np.isfinite(entry)]
         if not len(rays):
@@ -111,7 +106,7 @@ def rim_height(scene: RayScene, views: Sequence[SurfaceView], plane: SupportingP
         # The last exit is the first hit from behind all.
         far = 2 * float(entry.max())
         behind = scene.cast(view.center + far * rays, -rays).distance
-        ends = (entry, far - np.where(np.isfinite(behind), behind, far - entry))
-        heights = [plane.height(points_on_rays(view.center, rays, end)) for end in ends]
+        last = np.where(np.isfinite(behind), far - behind, entry)
+        heights = [plane.height(points_on_rays(view.center, rays, end)) for end in (entry, last)]
         found.append(float(np.minimum(*heights).max()))
     return float(np.median(found)) if found else float("nan")

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from polmvs.camera import sample_image
-from polmvs.surface.mesh_geometry import MAX_CELLS, TriangleMesh, mesh_from_grid, relaxed
+from polmvs.surface.mesh_geometry import (
+    MAX_CELLS,
+    SignedDistance,
+    TriangleMesh,
+    mesh_from_grid,
+    relaxed,
+)
 from polmvs.surface.surface_view import SurfaceView
 
 Array = NDArray[np.float64]
@@ -179,7 +185,7 @@ class VisualHull:
 
     def carved(
         self,
-        free: Sequence[Callable[[Array], Floats]],
+        free: Sequence[SignedDistance],
     ) -> VisualHull:
         """The hull without known free space.
 
