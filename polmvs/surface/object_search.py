@@ -69,7 +69,8 @@ class SearchTolerances:
     num_rounds : of prediction and carving; a third changes the outlines by 0.1 px.
     inner_px : distance from the outline of what is well within the object, working pixels.
     polarized_share : of an object within its outline that is polarized if polarization shows all
-        of it: its region is then complete.
+        of it: its region is then complete. In the median view.
+    least_polarized_share : the same of a single view. Guess.
     """
 
     working_px: int = 640
@@ -88,6 +89,7 @@ class SearchTolerances:
     num_rounds: int = 2
     inner_px: float = 12.0
     polarized_share: float = 0.99
+    least_polarized_share: float = 0.9
 
     def lighting_px(self, image: Image | Mask) -> int:
         """Width of the window of :attr:`lighting_share`, pixels; odd."""
@@ -122,7 +124,7 @@ def find_object(
     maps: Sequence[PhaseMap],
     plane: SupportingPlane,
     points: Floats,
-) -> list[FoundObject] | None:
+) -> list[FoundObject | None] | None:
     """The object that stands on a plane, in each view.
 
     Parameters
@@ -133,8 +135,8 @@ def find_object(
 
     Returns
     -------
-    None if the plane has too little texture to find what hides it, if its light moves, or if
-    polarization shows the whole object.
+    None for a view whose outline polarization shows. None for all if it does in every view, if the
+    plane has too little texture to find what hides it, or if its light moves.
     """
     near = points[np.abs(plane.height(points)) < 3 * np.median(np.abs(plane.height(points)))]
     # A plane without fine texture may have a coarse one.
@@ -148,7 +150,7 @@ def find_object(
             return None
         masks = [coarse.mask(view) for view in small]
         # More than the object: if all of it is polarized, the object is. Half the size shows that.
-        if _is_polarized(small, masks):
+        if not _views_to_search(small, masks):
             return None
         cells = coarse.finer()
     for _ in range(TOL.num_rounds):
@@ -159,7 +161,8 @@ def find_object(
             return None
         masks = [left.mask(view) for view in small]
         widths = [left.width_px(view) for view in small]
-    if _is_polarized(small, masks):
+    searched = _views_to_search(small, masks)
+    if not searched:
         return None
     masks = [_decided(*given) for given in zip(masks, odds, widths, strict=True)]
     noise = _residual(small, plates, masks)
@@ -169,9 +172,13 @@ def find_object(
     if not len(changes) or float(np.median(changes)) > noise:
         return None  # the lamp moves with the camera: outlines would be pixels wide
     # Threads, as sampling images releases Python's lock.
+    found: list[FoundObject | None] = [None] * len(small)
     with ThreadPoolExecutor(default_num_workers()) as pool:
         one = partial(_found, small, plane=plane, noise=noise)
-        return list(pool.map(one, range(len(small)), masks, plates))
+        chosen = ([values[index] for index in searched] for values in (masks, plates))
+        for index, own in zip(searched, pool.map(one, searched, *chosen), strict=True):
+            found[index] = own
+    return found
 
 
 @dataclass(frozen=True)
@@ -292,16 +299,23 @@ def _on_plane(view: View, plane: SupportingPlane, xy: Floats) -> Array:
     return np.asarray(center + np.where(ranges > 0, ranges, np.nan)[..., None] * rays)
 
 
-def _is_polarized(views: Sequence[_Working], masks: Sequence[Mask]) -> bool:
-    """Whether polarization shows all that is well within some masks, in the median view."""
-    shares = [
-        view.polarized[inner].mean()
-        for view, mask in zip(views, masks, strict=True)
-        if (inner := signed_distance_px(mask) < -TOL.inner_px).any()
-    ]
-    share = float(np.median(shares)) if shares else 0.0
-    logger.info("%.1f %% of what hides its support is polarized.", 100 * share)
-    return share >= TOL.polarized_share
+def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[int]:
+    """Views in which polarization does not show what is well within some masks.
+
+    Outlines from polarization and from the plane differ in their bias. So all views are searched,
+    or, if polarization shows the object in the median view, those in which it fails.
+    """
+    shares = np.full(len(views), np.nan)
+    for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
+        inner = signed_distance_px(mask) < -TOL.inner_px
+        if inner.any():
+            shares[index] = view.polarized[inner].mean()
+    known = np.isfinite(shares)
+    median = float(np.median(shares[known])) if known.any() else 0.0
+    logger.info("%.1f %% of what hides its support is polarized.", 100 * median)
+    if median < TOL.polarized_share:
+        return list(range(len(views)))
+    return np.flatnonzero(shares < TOL.least_polarized_share).tolist()
 
 
 def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:

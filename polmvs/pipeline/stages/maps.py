@@ -122,12 +122,19 @@ def build_maps(
         for one in workers.map(build, views, raw_names):
             built.append(one)
             on_progress(1)
-        num_inside = sum(one.num_inside for one in built)
         maps = [open_phase_map(view, folder) for view in views]
         if options.mask is None and (found := hidden_plane(maps, tracks)) is not None:
-            again = workers.map(build, views, raw_names, found)
-            num_inside = sum(one.num_inside for one in again)
+            again = [k for k, own in enumerate(found) if own is not None]
+            rebuilt = workers.map(
+                build,
+                [views[k] for k in again],
+                [raw_names[k] for k in again],
+                [found[k] for k in again],
+            )
+            for k, one in zip(again, rebuilt, strict=True):
+                built[k] = one
             maps = [open_phase_map(view, folder) for view in views]
+        num_inside = sum(one.num_inside for one in built)
         num_diffuse = num_inside if options.light is Light.DIFFUSE else 0
         wrong = None
         if len(tracks.point3D_ids):
@@ -228,8 +235,8 @@ def find_mask(folder: Path, image: str) -> Path:
     raise DataError(folder, f"has no mask {stem}.png or {stem}_mask.png.")
 
 
-def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] | None:
-    """The object on a plane, in each view; None if polarization shows it as well."""
+def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject | None] | None:
+    """The object on a plane, in each view in which polarization does not show it."""
     points = tracks.points_in_world
     centers = np.array([one.view.center_in_world for one in maps])
     plane = supporting_plane(points, centers)
@@ -239,15 +246,17 @@ def hidden_plane(maps: Sequence[PhaseMap], tracks: Tracks) -> list[FoundObject] 
     if found is None:
         return None
     shares = [
-        one.region.inside[inner].mean()
+        1.0 if hiding is None else one.region.inside[hiding.inner].mean()
         for one, hiding in zip(maps, found, strict=True)
-        if (inner := hiding.inner).any()
+        if hiding is None or hiding.inner.any()
     ]
     if shares and float(np.median(shares)) > 0.5:  # most of it is polarized
         return found
     # Without any phase, its outline alone would pass for a surface.
     strengths = [
-        _dolp_in_sigmas(one, hiding.inner) for one, hiding in zip(maps, found, strict=True)
+        _dolp_in_sigmas(one, hiding.inner)
+        for one, hiding in zip(maps, found, strict=True)
+        if hiding is not None
     ]
     return found if float(np.median(strengths)) > MIN_DOLP_SIGMAS else None
 
