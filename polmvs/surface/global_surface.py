@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import compress
 from pathlib import Path
 
@@ -47,6 +47,7 @@ from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
     PatchScene,
     SteppedPatches,
+    explains,
     find_patches,
     patch_scene,
     stepped_patches,
@@ -263,6 +264,7 @@ def reconstruct_surface(
     cavities: tuple[Cavity, ...] = ()
     if first.hull is not None:
         cavities = _cavities(given, refined, labelled)
+        steps = lost_steps(RayScene(mesh), steps, sparse.seeds, refined.fit, first.hull)
         mesh = _carved(mesh, first.hull, steps, cavities)
     if not len(mesh.faces):
         return Undetermined("the surface vanishes under the cavities found in it")
@@ -413,23 +415,69 @@ def _warn_of_inconsistent(
         )
 
 
+def lost_steps(
+    scene: RayScene,
+    steps: Sequence[SteppedPatches],
+    seeds: Seeds,
+    fit: Fit,
+    hull: VisualHull,
+) -> tuple[SteppedPatches, ...]:
+    """Height steps that a refined mesh has lost, as its sparse points or its phases show.
+
+    A tangent plane of a curved surface may pass for a patch. A mesh that passes through the points
+    of the patch, and explains the phases better, stays as it is.
+
+    Parameters
+    ----------
+    scene : of the refined mesh.
+    steps : found before the refinement.
+    seeds : of their patches.
+    fit : of the refined mesh.
+    hull : of the silhouettes, which bounds the steps.
+    """
+    edge = HullTolerances.step_px * fit.gsd
+
+    def information(*kept: SteppedPatches) -> float:
+        mesh = _with_walls(scene, edge, hull, kept)
+        return float(view_information(mesh, label(mesh, fit), fit).sum())
+
+    smooth = cache(information)
+    return tuple(
+        group
+        for group in steps
+        if not explains(group.patches, seeds, scene.signed_distance, fit.gsd)
+        or information(group) > smooth()
+    )
+
+
 def _carved(
     mesh: TriangleMesh,
     hull: VisualHull,
     steps: Sequence[SteppedPatches],
     cavities: Sequence[Cavity],
 ) -> TriangleMesh:
-    """A refined mesh with height steps and cavities carved, their walls sharp."""
+    """A refined mesh with height steps and cavities carved."""
     if not steps and not cavities:
         return mesh
+    return _with_walls(RayScene(mesh), mesh.mean_edge / REMESHED_EDGE, hull, steps, cavities)
+
+
+def _with_walls(
+    scene: RayScene,
+    edge: float,
+    hull: VisualHull,
+    steps: Sequence[SteppedPatches],
+    cavities: Sequence[Cavity] = (),
+) -> TriangleMesh:
+    """A mesh with height steps and cavities carved, their walls sharp, and edges of a length."""
     solid = [
         lambda points, group=group: np.maximum(group.solid(points), hull.distances(points))
         for group in steps
     ]
     # Smoothness rounds the walls of height steps; carving the refined surface makes them sharp.
     return remeshed(
-        RayScene(mesh),
-        mesh.mean_edge / REMESHED_EDGE,
+        scene,
+        edge,
         solid=solid,
         free=[*(group.values for group in steps), *(cavity.values for cavity in cavities)],
         smoothing=0,

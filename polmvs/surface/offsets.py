@@ -410,9 +410,7 @@ def stepped_patches(
     for group in _grouped(patches):
         points = seeds.points_in_world[np.concatenate([patch.members for patch in group])]
         gsd = _gsd(points, scene.maps)
-        if signed_distance is not None and not any(
-            _is_off(patch, seeds, signed_distance, TOL.seed_cells * gsd) for patch in group
-        ):
+        if signed_distance is not None and explains(group, seeds, signed_distance, gsd):
             continue
         grid = _grid_over(group, points, scene.maps, gsd)
         if grid is None:
@@ -493,9 +491,21 @@ def _grouped(patches: Sequence[Patch]) -> list[list[Patch]]:
     return groups
 
 
-def _is_off(patch: Patch, seeds: Seeds, signed_distance: SignedDistance, limit: float) -> bool:
-    distance = signed_distance(seeds.points_in_world[patch.members])
-    return bool(np.median(np.abs(distance)) > limit)
+def explains(
+    patches: Sequence[Patch], seeds: Seeds, signed_distance: SignedDistance, gsd: float
+) -> bool:
+    """Whether a surface passes through the seeds of each patch.
+
+    Parameters
+    ----------
+    signed_distance : of points ``(N, 3)`` to the surface.
+    gsd : ground sampling distance, world units.
+    """
+    return not any(
+        np.median(np.abs(signed_distance(seeds.points_in_world[patch.members])))
+        > TOL.seed_cells * gsd
+        for patch in patches
+    )
 
 
 def _gsd(points: Array, maps: Sequence[PhaseMap]) -> float:

@@ -20,6 +20,7 @@ from polmvs.scene import Seeds
 from polmvs.surface.global_surface import (
     SparsePoints,
     Undetermined,
+    lost_steps,
     num_surface_steps,
     reconstruct_surface,
     render_view,
@@ -28,8 +29,9 @@ from polmvs.surface.global_surface import (
 )
 from polmvs.surface.mesh_geometry import RayScene
 from polmvs.surface.observations import Looking
+from polmvs.surface.offsets import Patch, PatchGrid, SteppedPatches
 from polmvs.surface.silhouettes import find_silhouette
-from polmvs.surface.solver import Level, SolverTolerances
+from polmvs.surface.solver import Level, SolverTolerances, first_fit
 from polmvs.surface.surface_quality import (
     Contradictions,
     outline_mismatch,
@@ -37,6 +39,7 @@ from polmvs.surface.surface_quality import (
 )
 from polmvs.surface.surface_view import surface_view
 from polmvs.surface.terms import KnownPoints
+from polmvs.surface.visual_hull import visual_hull
 
 PPA = AngleModel.PPA
 LOOKING = Looking(angle_model=PPA)
@@ -247,6 +250,42 @@ def test_walls_thinner_than_coarse_edges_are_kept():
     inner = np.stack([x, y, 1.3 - np.sqrt(1.53**2 - x**2 - y**2)], axis=-1).reshape(-1, 3)
     place, _, _ = RayScene(found.mesh.only(found.supported)).closest(inner)
     assert np.linalg.norm(place - inner, axis=1).max() < 1.5 * GSD
+
+
+def drum(points):
+    beside = np.hypot(points[..., 0], points[..., 1]) - 1
+    return np.maximum(beside, np.abs(points[..., 2]) - 0.5)
+
+
+def round_patch(height, radius):
+    """A horizontal patch, with the space above it free."""
+    axis = np.arange(-1.5, 1.5, GSD)
+    beside = np.hypot(*np.meshgrid(axis, axis, indexing="ij")) - radius
+    x, y, z = np.eye(3)
+    grid = PatchGrid(np.array([axis[0], axis[0], 0]), x, y, z, GSD, beside.shape)
+    patch = Patch(z, height, np.arange(4))
+    labels = np.where(beside < 0, 0, -1)
+    return SteppedPatches((patch,), grid, labels, labels == 0, (beside / GSD)[None])
+
+
+@pytest.mark.parametrize(
+    ("distance", "step", "off", "is_lost"),
+    [
+        (drum, round_patch(0.5, 0.97), 0, True),  # the hull has a cap above the drum's flat top
+        (sphere(), round_patch(0.85, 0.5), 0, False),  # the patch cuts the ball's top
+        (sphere(), round_patch(0.85, 0.5), 3 * GSD, True),  # but points show it
+    ],
+)
+def test_a_refined_surface_has_lost_what_its_points_or_phases_show(distance, step, off, is_lost):
+    views = seen_in(phase_maps_of(distance, VIEWS), masks_given=True)
+    hull = visual_hull(views)
+    scene = RayScene(hull.mesh)
+    rays = np.array([[0, 0, -1.0], [0.2, 0, -1], [0, 0.2, -1], [-0.2, 0, -1]])
+    top = np.array([0, 0, 3.0])
+    points = top + (scene.cast(top, rays).distance + off)[:, None] * rays
+    seeds = Seeds(points, np.tile([0, 0, 1.0], (4, 1)), np.full(4, 1e-3))
+    fit = first_fit(views, LOOKING, hull.gsd).at_width(1.0)
+    assert lost_steps(scene, [step], seeds, fit, hull) == ((step,) if is_lost else ())
 
 
 def with_regions(maps, inside):
