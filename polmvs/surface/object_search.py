@@ -70,7 +70,8 @@ class SearchTolerances:
     inner_px : distance from the outline of what is well within the object, working pixels.
     polarized_share : of an object within its outline that is polarized if polarization shows all
         of it: its region is then complete. In the median view.
-    least_polarized_share : the same of a single view. Guess.
+    least_polarized_share : the same of a single view, and of its polarized region within the
+        outline. Guess.
     """
 
     working_px: int = 640
@@ -303,19 +304,28 @@ def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[i
     """Views in which polarization does not show what is well within some masks.
 
     Outlines from polarization and from the plane differ in their bias. So all views are searched,
-    or, if polarization shows the object in the median view, those in which it fails.
+    or, if polarization shows the object in the median view, those in which it fails. A view whose
+    polarized region lies beside the mask has a wrong pose, and so would its search.
     """
-    shares = np.full(len(views), np.nan)
+    shares, beside = np.full(len(views), np.nan), np.zeros(len(views))
     for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
-        inner = signed_distance_px(mask) < -TOL.inner_px
+        distance = signed_distance_px(mask)
+        inner = distance < -TOL.inner_px
         if inner.any():
             shares[index] = view.polarized[inner].mean()
+        parts, _ = ndimage.label(view.polarized)
+        met = np.isin(parts, np.unique(parts[inner & view.polarized]))
+        # Polarized clutter stands apart from the object.
+        own = met if met.any() else view.polarized
+        if own.any():
+            beside[index] = np.mean(distance[own] > TOL.inner_px)
     known = np.isfinite(shares)
     median = float(np.median(shares[known])) if known.any() else 0.0
     logger.info("%.1f %% of what hides its support is polarized.", 100 * median)
     if median < TOL.polarized_share:
         return list(range(len(views)))
-    return np.flatnonzero(shares < TOL.least_polarized_share).tolist()
+    least = TOL.least_polarized_share
+    return np.flatnonzero((shares < least) & (beside < 1 - least)).tolist()
 
 
 def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:

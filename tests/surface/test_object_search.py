@@ -272,6 +272,10 @@ def test_what_polarization_shows_is_left_to_it(white):
     assert mixed[1:] == [None] * (len(white) - 1)
     # The regions of the others mark what is not the plane, so the outline differs by some pixels.
     assert (mixed[0].mask ^ found[0].mask).sum() < 0.01 * found[0].mask.sum()
+    # A polarized region beside what the others show is that of a wrong pose.
+    aside = np.roll(found[0].mask, found[0].mask.shape[1] // 4, axis=1)
+    wrong = white[0].changed(region=Region(aside, aside, ~aside))
+    assert hidden_plane([wrong, *polarized[1:]], tracks) is None
     unpolarized = [one.changed(polarization=0.02 * one.polarization) for one in white]
     for one in unpolarized:
         one.polarization[..., 2] = 1e-4
