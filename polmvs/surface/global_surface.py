@@ -263,9 +263,11 @@ def reconstruct_surface(
     mesh = refined.mesh
     cavities: tuple[Cavity, ...] = ()
     if first.hull is not None:
-        cavities = _cavities(given, refined, labelled)
-        steps = lost_steps(RayScene(mesh), steps, sparse.seeds, refined.fit, first.hull)
-        mesh = _carved(mesh, first.hull, steps, cavities)
+        scene = RayScene(mesh)
+        cavities = _cavities(given, refined, scene, labelled)
+        steps = lost_steps(scene, steps, sparse.seeds, refined.fit, first.hull)
+        if steps or cavities:
+            mesh = _carved(scene, mesh.mean_edge / REMESHED_EDGE, first.hull, steps, cavities)
     if not len(mesh.faces):
         return Undetermined("the surface vanishes under the cavities found in it")
     if mesh is not refined.mesh:
@@ -438,7 +440,7 @@ def lost_steps(
     edge = HullTolerances.step_px * fit.gsd
 
     def information(*kept: SteppedPatches) -> float:
-        mesh = _with_walls(scene, edge, hull, kept)
+        mesh = _carved(scene, edge, hull, kept)
         return float(view_information(mesh, label(mesh, fit), fit).sum())
 
     smooth = cache(information)
@@ -451,25 +453,13 @@ def lost_steps(
 
 
 def _carved(
-    mesh: TriangleMesh,
-    hull: VisualHull,
-    steps: Sequence[SteppedPatches],
-    cavities: Sequence[Cavity],
-) -> TriangleMesh:
-    """A refined mesh with height steps and cavities carved."""
-    if not steps and not cavities:
-        return mesh
-    return _with_walls(RayScene(mesh), mesh.mean_edge / REMESHED_EDGE, hull, steps, cavities)
-
-
-def _with_walls(
     scene: RayScene,
     edge: float,
     hull: VisualHull,
     steps: Sequence[SteppedPatches],
     cavities: Sequence[Cavity] = (),
 ) -> TriangleMesh:
-    """A mesh with height steps and cavities carved, their walls sharp, and edges of a length."""
+    """A refined mesh with height steps and cavities carved, their walls sharp."""
     solid = [
         lambda points, group=group: np.maximum(group.solid(points), hull.distances(points))
         for group in steps
@@ -615,7 +605,9 @@ def _converged(
     return mesh
 
 
-def _cavities(given: _Given, refined: Refined, labelled: Labelled) -> tuple[Cavity, ...]:
+def _cavities(
+    given: _Given, refined: Refined, scene: RayScene, labelled: Labelled
+) -> tuple[Cavity, ...]:
     """Cavities behind the parts of a refined mesh that phases hardly support."""
     mesh, fit = refined.mesh, refined.fit
     evidence = face_evidence(mesh, fit, labelled)
@@ -627,7 +619,6 @@ def _cavities(given: _Given, refined: Refined, labelled: Labelled) -> tuple[Cavi
         min_information=evidence.enough_information,
     )
     seen = evidence.num_views >= given.min_views
-    scene = RayScene(mesh)
 
     def information(cavity: Cavity | None) -> Array:
         """Of the phases of each view, nats, on the mesh with a cavity carved."""

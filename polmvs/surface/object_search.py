@@ -313,12 +313,8 @@ def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[i
         inner = distance < -TOL.inner_px
         if inner.any():
             shares[index] = view.polarized[inner].mean()
-        parts, _ = ndimage.label(view.polarized)
-        met = np.isin(parts, np.unique(parts[inner & view.polarized]))
-        # Polarized clutter stands apart from the object.
-        own = met if met.any() else view.polarized
-        if own.any():
-            beside[index] = np.mean(distance[own] > TOL.inner_px)
+        if view.polarized.any():
+            beside[index] = np.mean(distance[view.polarized] > TOL.inner_px)
     known = np.isfinite(shares)
     median = float(np.median(shares[known])) if known.any() else 0.0
     logger.info("%.1f %% of what hides its support is polarized.", 100 * median)
