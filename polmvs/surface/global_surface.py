@@ -441,7 +441,7 @@ def lost_steps(
 
     def information(*kept: SteppedPatches) -> float:
         mesh = _carved(scene, edge, hull, kept)
-        return float(view_information(mesh, label(mesh, fit), fit).sum())
+        return float(view_information(mesh, fit).sum())
 
     smooth = cache(information)
     return tuple(
@@ -624,7 +624,7 @@ def _cavities(
         """Of the phases of each view, nats, on the mesh with a cavity carved."""
         free = () if cavity is None else (cavity.values,)
         carved = remeshed(scene, HullTolerances.step_px * fit.gsd, free=free, smoothing=0)
-        return view_information(carved, label(carved, fit), fit)
+        return view_information(carved, fit)
 
     return find_cavities(surface_faces(scene, seen, supported, fit.gsd), given.scene, information)
 

@@ -24,7 +24,7 @@ from polmvs.scene import MIN_FACING_COSINE, MIN_VIEWS
 from polmvs.surface.creases import CreaseTolerances, SideAverage
 from polmvs.surface.dense_view import lattice_xy
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh, visible_points
-from polmvs.surface.solver import Fit, Labelled, covered_share
+from polmvs.surface.solver import Fit, Labelled, covered_share, label
 from polmvs.surface.surface_view import SurfaceView
 from polmvs.surface.terms import KnownPoints
 from polmvs.surface.visual_hull import HullTolerances
@@ -221,13 +221,9 @@ def contradicted_faces(
     return _wide_parts(mesh, information < 0, gsd)
 
 
-def view_information(mesh: TriangleMesh, labelled: Labelled, fit: Fit) -> Array:
-    """Information of the phases of each of V views, ``(V,)``: nats, summed over its pixels.
-
-    Parameters
-    ----------
-    labelled : observations of the mesh, with their light.
-    """
+def view_information(mesh: TriangleMesh, fit: Fit) -> Array:
+    """Information of the phases of each of V views, ``(V,)``: nats, summed over its pixels."""
+    labelled = label(mesh, fit)
     seen = labelled.observations
     information = labelled.information(mesh, fit)
     found = np.zeros(len(fit.views))

@@ -23,7 +23,6 @@ from polmvs.surface.solver import (
     Fit,
     certain_rays,
     covered_share,
-    label,
 )
 from polmvs.surface.surface_quality import view_information
 from polmvs.surface.surface_view import SurfaceView
@@ -61,7 +60,7 @@ def opened_hull(
 
     def information(scene: RayScene) -> Array:
         """Of the phases of each view, nats."""
-        return view_information(scene.mesh, label(scene.mesh, fit), fit)
+        return view_information(scene.mesh, fit)
 
     closed, top = carved(), replace(plane, offset=plane.offset + height)
     solid = cache(lambda: max(information(closed), information(carved(top.height)), key=np.sum))
