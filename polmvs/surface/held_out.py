@@ -246,14 +246,7 @@ def _phase_errors(
     points: Array,
 ) -> tuple[Array, Array]:
     """Angles about the ray, rad, between phases and normals, and their stated deviations."""
-    found = rows_of_both(
-        view,
-        image,
-        looking.angle_model,
-        points,
-        tilt_aware=looking.tilt_aware,
-        tilt_share=looking.tilt_share,
-    )
+    found = rows_of_both(view, image, looking, points)
     normals = mesh.face_normals[face]
     sine = np.sqrt(np.maximum(1 - dots(rays, normals) ** 2, 1e-12))
     turns = np.arcsin(np.clip(np.abs(np.einsum("lki,ki->lk", found.rows, normals)) / sine, 0, 1))

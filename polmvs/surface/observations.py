@@ -66,29 +66,46 @@ def level_image(view: SurfaceView, width_px: float) -> Image:
     return smoothed_polarization(view.phase_map.polarization, width_px, view.silhouette.possible)
 
 
-def rows_of_both(
-    view: SurfaceView,
-    image: Image,
-    angle_model: AngleModel,
-    points: Floats,
-    *,
-    tilt_aware: bool = True,
-    tilt_share: float = 0.0,
-) -> RowsOfBoth:
+@dataclass(frozen=True, kw_only=True)
+class Looking:
+    """How views are observed.
+
+    Attributes
+    ----------
+    angle_model : OPA, PPA or tilted.
+    tilt_aware : compute the rotation of the rows by tilted polarizers, which OPA and PPA ignore.
+    tilt_share : share of that rotation that is corrected.
+    min_cosine : between normal and direction to the camera; more oblique views are ignored.
+    light : of all observations, given by the user; None: inferred for each.
+    """
+
+    angle_model: AngleModel
+    tilt_aware: bool = True
+    tilt_share: float = 0.0
+    min_cosine: float = 0.25
+    light: Light | None = None
+
+    @property
+    def light_weights(self) -> tuple[float, float]:
+        """Prior shares of specular and of diffuse light."""
+        if self.light is None:
+            return 0.5, 0.5
+        return (1.0, 0.0) if self.light is Light.SPECULAR else (0.0, 1.0)
+
+
+def rows_of_both(view: SurfaceView, image: Image, looking: Looking, points: Floats) -> RowsOfBoth:
     """Rows ``m`` with ``m . n = 0`` of one view at points of space, for both kinds of light.
 
     Parameters
     ----------
     view : its camera and pose.
     image : (H, W, 3), as :func:`level_image` makes it.
-    angle_model : OPA, PPA or tilted.
+    looking : how to observe.
     points : (N, 3), world.
-    tilt_aware : compute the rotation of the rows by tilted polarizers, which OPA and PPA ignore.
-    tilt_share : share of that rotation that is corrected.
     """
     sample = _sampled(view, image, points)
-    turns = _turns(sample, angle_model) if tilt_aware else None
-    found = _rows_of(sample, view, angle_model, turns, tilt_share)
+    turns = _turns(sample, looking.angle_model) if looking.tilt_aware else None
+    found = _rows_of(sample, view, looking.angle_model, turns, looking.tilt_share)
     known = np.isfinite(sample.phase_variance)
     return RowsOfBoth(
         rows=np.where(known[:, None], found.rows, 0.0),
@@ -231,32 +248,6 @@ class Observations(RowsOfBoth):
             for one in fields(self)
         }
         return Observations(**values)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Looking:
-    """How views are observed.
-
-    Attributes
-    ----------
-    angle_model : of the rows.
-    tilt_aware, tilt_share : as in :func:`rows_of_both`.
-    min_cosine : between normal and direction to the camera; more oblique views are ignored.
-    light : of all observations, given by the user; None: inferred for each.
-    """
-
-    angle_model: AngleModel
-    tilt_aware: bool = True
-    tilt_share: float = 0.0
-    min_cosine: float = 0.25
-    light: Light | None = None
-
-    @property
-    def light_weights(self) -> tuple[float, float]:
-        """Prior shares of specular and of diffuse light."""
-        if self.light is None:
-            return 0.5, 0.5
-        return (1.0, 0.0) if self.light is Light.SPECULAR else (0.0, 1.0)
 
 
 def observe(

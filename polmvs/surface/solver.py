@@ -864,14 +864,7 @@ def unexplained_shares(mesh: TriangleMesh, fit: Fit, *, stride_px: int = 4) -> A
         hit = np.flatnonzero(hits.face >= 0)
         points = points_on_rays(view.center, rays[hit], hits.distance[hit])
         looking = fit.looking
-        found = rows_of_both(
-            view,
-            image,
-            looking.angle_model,
-            points,
-            tilt_aware=looking.tilt_aware,
-            tilt_share=looking.tilt_share,
-        )
+        found = rows_of_both(view, image, looking, points)
         normals = mesh.face_normals[hits.face[hit]]
         residuals = np.einsum("lki,ki->lk", found.rows, normals)
         sine2 = 1 - np.einsum("ki,ki->k", rays[hit], normals) ** 2
