@@ -53,6 +53,7 @@ from polmvs.surface.offsets import (
     stepped_patches,
 )
 from polmvs.surface.open_scene import open_scene
+from polmvs.surface.phase_bias import Bias, find_bias
 from polmvs.surface.solver import (
     Fit,
     Labelled,
@@ -60,6 +61,7 @@ from polmvs.surface.solver import (
     Refined,
     SolverTolerances,
     first_fit,
+    iterated,
     label,
     place_deviations,
     polishing_step,
@@ -259,20 +261,26 @@ def reconstruct_surface(
     if not len(refined.mesh.faces):
         return Undetermined("the surface vanishes under the phases of the views")
     given = replace(given, scene=given.scene.of(~refined.left_out))
-    labelled = label(refined.mesh, refined.fit)
-    mesh = refined.mesh
+    mesh, fit, is_biased = refined.mesh, refined.fit, False
     cavities: tuple[Cavity, ...] = ()
     if first.hull is not None:
         scene = RayScene(mesh)
-        cavities = _cavities(given, refined, scene, labelled)
-        steps = lost_steps(scene, steps, sparse.seeds, refined.fit, first.hull)
+        cavities = _cavities(given, refined, scene)
+        steps = lost_steps(scene, steps, sparse.seeds, fit, first.hull)
+        # Outlines hold the surface; without the points, these show the bias of its phases.
+        free = replace(fit, known=None)
+        moved = iterated(mesh, free)
+        is_biased = _bias(moved, label(moved, free), free, first.known) is not None
+        if is_biased:
+            mesh, fit, refined = moved, free, replace(refined, mesh=moved)
         if steps or cavities:
-            mesh = _carved(scene, mesh.mean_edge / REMESHED_EDGE, first.hull, steps, cavities)
+            edge = mesh.mean_edge / REMESHED_EDGE
+            mesh = _carved(RayScene(mesh), edge, first.hull, steps, cavities)
     if not len(mesh.faces):
         return Undetermined("the surface vanishes under the cavities found in it")
-    if mesh is not refined.mesh:
-        labelled = label(mesh, refined.fit)
-    polished = _polished(given, mesh, labelled, refined, [*steps, *cavities])
+    polished = _polished(given, mesh, fit, refined, [*steps, *cavities])
+    if is_biased:
+        polished = replace(_unbiased(polished, first.known), fit=refined.fit)
     surface = _supported(given, polished, steps, cavities, refined.left_out)
     surface = replace(surface, levels=(first.mesh, *refined.meshes))
     if first.hull is not None:
@@ -485,6 +493,7 @@ class _Polished:
     labelled : its observations, with their light.
     normals : (F, 3) unit, of the sides of edges.
     sigma_deg : (F,) of the normals from the phases.
+    bias_sigma : (V,) deviation of the bias of the phases that sparse points show, world units.
     """
 
     mesh: TriangleMesh
@@ -492,17 +501,21 @@ class _Polished:
     labelled: Labelled
     normals: Array
     sigma_deg: Array
+    bias_sigma: Array
 
 
 def _polished(
     given: _Given,
     mesh: TriangleMesh,
-    labelled: Labelled,
+    fit: Fit,
     refined: Refined,
     carvings: Sequence[SteppedPatches | Cavity],
 ) -> _Polished:
-    """A carved mesh with the sides of its edges sharp, moved until it has converged."""
-    fit = refined.fit
+    """A carved mesh with the sides of its edges sharp, moved until it has converged.
+
+    ``refined`` is the mesh before it was carved, and ``fit`` its fit with or without points.
+    """
+    labelled = label(mesh, fit)
     fitted = fit_normals(mesh, labelled)
     facing, is_wall = fitted.normals, np.zeros(len(mesh.faces), np.bool_)
     if carvings:
@@ -522,7 +535,7 @@ def _polished(
     def polish(mesh: TriangleMesh) -> tuple[TriangleMesh, bool]:
         return polishing_step(mesh, fit, sides)
 
-    sharp = _converged(sharpened(mesh, normals), normals, polish, fit)
+    sharp = _converged(sharpened(mesh, normals), normals, polish, refined.fit)
     given.on_progress(1)
     # Detail as fine as the mesh looks like noise of the normals; the phases distinguish the two.
     is_sharp = label(sharp, fit).mean_loss(sharp) <= labelled.mean_loss(mesh)
@@ -530,7 +543,25 @@ def _polished(
     mesh = sharp if is_sharp else mesh
     labelled = label(mesh, fit, min_cosine=MIN_FACING_COSINE)
     sigma_deg = np.hypot(of_views, disagreement_deg(mesh, normals, fitted.is_fitted))
-    return _Polished(mesh, fit, labelled, normals, sigma_deg)
+    return _Polished(mesh, fit, labelled, normals, sigma_deg, np.zeros(len(mesh.vertices)))
+
+
+def _bias(mesh: TriangleMesh, labelled: Labelled, fit: Fit, known: KnownPoints) -> Bias | None:
+    """The bias of the phases of a mesh that sparse points show."""
+    seen = np.zeros(len(mesh.faces), np.bool_)
+    seen[labelled.observations.face] = True
+    return find_bias(mesh, seen, known, fit.gsd, gate_px=fit.tol.levels[-1].gate_px)
+
+
+def _unbiased(polished: _Polished, known: KnownPoints) -> _Polished:
+    """A mesh without the bias of its phases that sparse points show."""
+    mesh, fit = polished.mesh, polished.fit
+    bias = _bias(mesh, polished.labelled, fit, known)
+    if bias is None:
+        return polished
+    mesh = mesh.moved(bias.heights[:, None] * mesh.vertex_normals)
+    labelled = label(mesh, fit, min_cosine=MIN_FACING_COSINE)
+    return replace(polished, mesh=mesh, labelled=labelled, bias_sigma=bias.sigma)
 
 
 def _supported(
@@ -550,7 +581,8 @@ def _supported(
         mesh, evidence, min_views=given.min_views, gsd=fit.gsd, sigma=sigma.own
     )
     seen = evidence.num_views >= given.min_views
-    sigma = replace(sigma, own=sigma.own * np.sqrt(misfit(mesh, labelled)))
+    own = sigma.own * np.sqrt(misfit(mesh, labelled))
+    sigma = PositionSigma(own, np.hypot(sigma.shared, polished.bias_sigma))
     supported |= seen & _lie_on(mesh, [group.values for group in steps])
     inferred = seen & ~supported & _lie_on(mesh, [cavity.values for cavity in cavities])
     supported |= inferred
@@ -605,12 +637,10 @@ def _converged(
     return mesh
 
 
-def _cavities(
-    given: _Given, refined: Refined, scene: RayScene, labelled: Labelled
-) -> tuple[Cavity, ...]:
+def _cavities(given: _Given, refined: Refined, scene: RayScene) -> tuple[Cavity, ...]:
     """Cavities behind the parts of a refined mesh that phases hardly support."""
     mesh, fit = refined.mesh, refined.fit
-    evidence = face_evidence(mesh, fit, labelled)
+    evidence = face_evidence(mesh, fit, label(mesh, fit))
     supported = supported_faces(
         mesh,
         evidence,

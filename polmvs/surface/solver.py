@@ -842,6 +842,22 @@ def polishing_step(mesh: TriangleMesh, fit: Fit, sides: KnownSides) -> tuple[Tri
     return moved, not len(free) or float(np.median(free)) < 0.03 * edge
 
 
+def iterated(mesh: TriangleMesh, fit: Fit) -> TriangleMesh:
+    """A refined mesh after some more iterations of the last level, such as without its points."""
+    tol, edge = fit.tol, mesh.mean_edge
+    for _ in range(POLISHING_STEPS):
+        energy = linearize(
+            RayScene(mesh),
+            fit,
+            edge,
+            tol.levels[-1],
+            normal_sigma=tol.annealing[1],
+            with_slope=True,
+        )
+        mesh, _ = _step(mesh, energy, edge, tol)
+    return mesh
+
+
 def certain_rays(view: SurfaceView, stride_px: int = 4) -> Array:
     """Unit rays ``(N, 3)``, world, of pixels of a view's certain silhouette, at a stride."""
     half = stride_px // 2
@@ -887,7 +903,7 @@ class PositionSigma:
     Attributes
     ----------
     own : (V,) of what differs from place to place: views, noise, points, smoothness.
-    shared : (V,) of what moves the whole surface: the polarizers' tilt and the bias of outlines.
+    shared : (V,) of what moves wide parts: the polarizers' tilt, the bias of outlines and phases.
     """
 
     own: Array

@@ -99,6 +99,31 @@ def test_deviations_hold(surface, maps):
     assert np.median(cloud.sigma[known]) < 2 * GSD  # and says something
 
 
+def test_sparse_points_correct_the_bias_of_phases_where_they_are(maps, surface):
+    """Points that all lie 1.5 px below the phases' surface on one side of a ball."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(400, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals[normals[:, 0] > 0.5]
+    places = (1 - 1.5 * GSD + rng.normal(0, 0.3 * GSD, len(normals)))[:, None] * normals
+    seeds = Seeds(places, normals, np.full(len(normals), 0.3 * GSD))
+    found = reconstruct_surface(
+        LOOKING, seen_in(maps), SparsePoints(seeds, NOTHING.surroundings), tolerances=QUICK
+    )
+
+    def height(of, towards):
+        vertices = of.mesh.vertices
+        own = (vertices @ [towards, 0, 0] > 0.7) & (vertices[:, 2] > -0.3)
+        return np.median(np.linalg.norm(vertices[own], axis=1) - 1) / GSD
+
+    assert height(surface, 1) == pytest.approx(0, abs=0.3)
+    assert height(found, 1) == pytest.approx(-1.5, abs=0.4)
+    assert height(found, -1) == pytest.approx(height(surface, -1), abs=0.2)
+    beyond = found.sigma[found.mesh.vertices[:, 0] < -0.8]
+    within = found.sigma[found.mesh.vertices[:, 0] > 0.8]
+    assert np.median(beyond) > np.median(within)
+
+
 def test_what_no_view_sees_is_left_out(surface):
     """All cameras look down: the lowest part of the ball faces none of them."""
     heights = surface.mesh.centers[:, 2]
