@@ -281,12 +281,14 @@ def installed_versions(packages: Iterable[str]) -> dict[str, str]:
 def _connect(address: str, tls: TlsFiles | None, patience: ClusterPatience) -> Any:
     try:
         from distributed import Client
+        from distributed.comm.addressing import parse_address
+        from distributed.comm.registry import get_backend
         from distributed.security import Security
     except ImportError as error:
         raise OptionError(
             "needs dask.distributed: pip install '.[dask]'.", field="run.scheduler"
         ) from error
-    security = None
+    security = Security()  # of Dask's own configuration
     if tls is not None:
         for path in (tls.ca, tls.cert, tls.key):
             if not path.is_file():
@@ -298,18 +300,20 @@ def _connect(address: str, tls: TlsFiles | None, patience: ClusterPatience) -> A
             tls_client_key=str(tls.key),
         )
     try:
+        # A client that fails before it connects keeps a running loop, and to collect it while
+        # another client starts blocks both: such addresses are refused before.
+        scheme, _ = parse_address(address)
+        get_backend(scheme)
+        if scheme == "tls" and security.get_connection_args("client").get("ssl_context") is None:
+            raise DataError(
+                address,
+                "needs certificates. Give `run.tls_ca`, `run.tls_cert` and `run.tls_key`, or name "
+                "them in Dask's configuration.",
+            )
         return Client(address, timeout=patience.connect_s, set_as_default=False, security=security)
     except SSLError as error:
         raise DataError(
             address, f"the certificates do not fit: {error.reason or error}. Check `run.tls_ca`."
-        ) from error
-    except TypeError as error:  # what Dask says of certificates that are missing
-        if not address.startswith("tls://"):
-            raise
-        raise DataError(
-            address,
-            "needs certificates. Give `run.tls_ca`, `run.tls_cert` and `run.tls_key`, or name them "
-            "in Dask's configuration.",
         ) from error
     except (OSError, TimeoutError, ValueError) as error:
         raise DataError(

@@ -153,7 +153,7 @@ def _heights(
     place, face, _ = RayScene(visible).closest(known.points)
     normals = visible.face_normals[face]
     offset = (known.points - place) / gsd
-    near = np.flatnonzero(lengths(offset) < gate_px)
+    near = np.flatnonzero((lengths(offset) < gate_px) & np.isfinite(known.sigma))
     near = near[evenly_chosen(len(near), MAX_POINTS)]
     return _Heights(
         place[near] / gsd,

@@ -93,6 +93,12 @@ def test_too_few_points_show_none(mesh):
     assert found(KnownPoints(np.zeros((0, 3)), np.zeros(0))) is None
 
 
+def test_points_of_unknown_position_count_for_nothing(mesh):
+    known = points_above(bias_at)
+    known.sigma[MIN_POINTS - 1 :] = np.inf
+    assert found_in(mesh, known) is None
+
+
 def test_more_points_than_its_time_allows_are_thinned_evenly(mesh, on_top):
     bias = found_in(mesh, points_above(bias_at, num=4 * MAX_POINTS))
     off = bias.heights[on_top] - bias_at(mesh.vertices[on_top, 0])
