@@ -300,8 +300,8 @@ def _connect(address: str, tls: TlsFiles | None, patience: ClusterPatience) -> A
             tls_client_key=str(tls.key),
         )
     try:
-        # A client that fails before it connects keeps a running loop, and to collect it while
-        # another client starts blocks both: such addresses are refused before.
+        # A client whose constructor raises before it connects leaves its event loop running. If the
+        # garbage collector closes it while another client starts, both deadlock.
         scheme, _ = parse_address(address)
         get_backend(scheme)
         if scheme == "tls" and security.get_connection_args("client").get("ssl_context") is None:

@@ -513,7 +513,7 @@ def _polished(
 ) -> _Polished:
     """A carved mesh with the sides of its edges sharp, moved until it has converged.
 
-    ``refined`` is the mesh before it was carved, and ``fit`` its fit with or without points.
+    ``refined`` is the surface before it was carved, ``fit`` its fit with or without sparse points.
     """
     labelled = label(mesh, fit)
     fitted = fit_normals(mesh, labelled)
