@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from itertools import compress
 from pathlib import Path
 
@@ -47,7 +47,6 @@ from polmvs.surface.observations import Looking
 from polmvs.surface.offsets import (
     PatchScene,
     SteppedPatches,
-    explains,
     find_patches,
     patch_scene,
     stepped_patches,
@@ -244,12 +243,9 @@ def reconstruct_surface(
         hull, walls = opened_hull(first.hull, first.plane, fit)
         first = replace(first, mesh=hull.mesh, hull=hull)
         if walls is None:
-            steps = given.steps(first.mesh)
+            first = first.carved(given.steps(RayScene(first.mesh), is_refined=False))
         else:  # its floor is refined; it is no height step
             logger.info("a vessel, open at the top.")
-    if steps:
-        logger.info("%d groups of planar patches that silhouettes do not part.", len(steps))
-        first = first.carved(steps)
     refined = refine(
         first.mesh,
         fit,
@@ -266,7 +262,9 @@ def reconstruct_surface(
     if first.hull is not None:
         scene = RayScene(mesh)
         cavities = _cavities(given, refined, scene)
-        steps = lost_steps(scene, steps, sparse.seeds, fit, first.hull)
+        if walls is None:
+            steps = given.steps(scene, is_refined=True)
+            logger.info("%d groups of planar patches.", len(steps))
         # Outlines hold the surface; without the points, these show the bias of its phases.
         free = replace(fit, known=None)
         moved = iterated(mesh, free)
@@ -362,15 +360,15 @@ class _Given:
     min_views: int
     on_progress: OnProgress
 
-    def steps(self, mesh: TriangleMesh) -> tuple[SteppedPatches, ...]:
-        """Planar patches that silhouettes do not separate."""
+    def steps(self, scene: RayScene, *, is_refined: bool) -> tuple[SteppedPatches, ...]:
+        """Planar patches where they explain more phases than a surface."""
         return tuple(
             stepped_patches(
                 find_patches(self.seeds),
                 self.seeds,
                 self.scene.of(evenly_chosen(len(self.scene.maps), MAX_PATCH_VIEWS)),
-                signed_distance=RayScene(mesh).signed_distance,
-                first_hit=_first_hit(mesh),
+                surface=scene,
+                is_refined=is_refined,
             )
         )
 
@@ -423,41 +421,6 @@ def _warn_of_inconsistent(
             100 * share,
             100 * np.nanmedian(refined.unexplained),
         )
-
-
-def lost_steps(
-    scene: RayScene,
-    steps: Sequence[SteppedPatches],
-    seeds: Seeds,
-    fit: Fit,
-    hull: VisualHull,
-) -> tuple[SteppedPatches, ...]:
-    """Height steps that a refined mesh has lost, as its sparse points or its phases show.
-
-    A tangent plane of a curved surface may pass for a patch. A mesh that passes through the points
-    of the patch, and explains the phases better, stays as it is.
-
-    Parameters
-    ----------
-    scene : of the refined mesh.
-    steps : found before the refinement.
-    seeds : of their patches.
-    fit : of the refined mesh.
-    hull : of the silhouettes, which bounds the steps.
-    """
-    edge = HullTolerances.step_px * fit.gsd
-
-    def information(*kept: SteppedPatches) -> float:
-        mesh = _carved(scene, edge, hull, kept)
-        return float(view_information(mesh, fit).sum())
-
-    smooth = cache(information)
-    return tuple(
-        group
-        for group in steps
-        if not explains(group.patches, seeds, scene.signed_distance, fit.gsd)
-        or information(group) > smooth()
-    )
 
 
 def _carved(
@@ -657,17 +620,6 @@ def _cavities(given: _Given, refined: Refined, scene: RayScene) -> tuple[Cavity,
         return view_information(carved, fit)
 
     return find_cavities(surface_faces(scene, seen, supported, fit.gsd), given.scene, information)
-
-
-def _first_hit(mesh: TriangleMesh) -> Callable[[Array, Array], tuple[Floats, Floats]]:
-    """Distance ``(N,)`` and normal ``(N, 3)`` where rays along one direction first meet a mesh."""
-    scene = RayScene(mesh)
-
-    def first_hit(origins: Array, direction: Array) -> tuple[Floats, Floats]:
-        hits = scene.cast(origins, np.broadcast_to(direction, origins.shape))
-        return hits.distance, mesh.face_normals[hits.face]
-
-    return first_hit
 
 
 def _lie_on(mesh: TriangleMesh, carvings: Sequence[SignedDistance]) -> Mask:

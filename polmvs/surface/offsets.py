@@ -5,21 +5,22 @@ surface inside its outline. Sparse points do: points that share a plane, and who
 its normal, show a patch and its offset. The extent of a patch is found on a grid in its plane. At
 the right offset, the border and the marks of the patch have the same grid position in all views;
 lines on other patches do not. So a line that several views show at the same position is a border.
-The points of each patch then claim the cells that they reach without crossing such a line (a random
-walker, Grady 2006), unless phases contradict. Space above a claimed cell is free: its signed
-distance carves the first surface. Smoothness does not round the walls that the carving leaves
-between the patches.
+Beyond the border of a recess, some views show its walls where the patch would be; within it, where
+a surface over it would be. So a random walk from a cell (Grady 2006), hampered by lines, ends on
+points of the patch, or where the phases of some views contradict either the patch or the given
+surface, on the other one. Space above the cells whose walks end on the patch is free: its signed
+distance carves the surface. Smoothness does not round the walls that the carving leaves between the
+patches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -43,7 +44,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
 from polmvs.surface.borders import drawn_border, smoothly_beside
 from polmvs.surface.creases import CreaseTolerances
-from polmvs.surface.mesh_geometry import SignedDistance
+from polmvs.surface.mesh_geometry import RayScene, visible_points
 from polmvs.surface.silhouettes import SilhouetteTolerances, nearest_steps, step_slope
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX
 from polmvs.surface.terms import TermTolerances
@@ -52,13 +53,12 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-FirstHit: TypeAlias = Callable[[Array, Array], tuple[Floats, Floats]]
 
 NO_PATCH = -1
 BESIDE, ACROSS = ((0, 1), (1, 0)), ((1, 1), (1, -1))  # neighbours of a cell: down, right
 SPACING = 0.25  # of samples across a border, cells
 CUT_UNIT = 10_000  # scale of the weights of a cut, which are integers
-MAX_COST = 0.5  # median loss beyond which phases contradict a patch: that of ``sigmas`` deviations
+MAX_COST = 0.5  # loss beyond which a phase contradicts a patch: that of ``sigmas`` deviations
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,11 +87,11 @@ class OffsetTolerances:
     mark_contrast : of a mark's intensity to its surroundings. As for the region's marks.
     mark_share : share of the views of a point that must show a mark there. Half of them see a wall
         of a convex part. Measured, 0.5: F at 1 mm of an analytic bracket falls by 0.9 points.
-    seed_cells : radius about a sparse point that belongs to its patch, and distance of a patch's
-        points to the given surface above which the surface does not explain them; a cell is a GSD.
-        Guess: a point's uncertainty, and the size of a first surface's cells.
-    leak : conductance to ground of a cell that contradicts its patch. Measured, 0.2: F at 1 mm of
-        an analytic bracket falls by 0.2 points.
+    seed_cells : radius about a sparse point that belongs to its patch; a cell is a GSD. Guess: a
+        point's uncertainty.
+    end_weight : probability that a walk ends on a cell that two views more, or fewer, contradict on
+        the patch than on the given surface, relative to a move. Measured on the carved surfaces of
+        `step` and of a box with a recess: twice and half move 0.1 % of the surface.
     seed_weight : probability that a walk ends on a point that it passes, relative to a move. Guess.
     min_total : probability that a walk from a cell ends on the points of any patch. Guess: one in a
         hundred gets through where the phases contradict.
@@ -100,8 +100,6 @@ class OffsetTolerances:
     min_radius_cells : of a patch's area: smaller ones are tangent planes of curved surfaces. Guess.
         A border moves to the lines in a band of this width: every patch has a core. Measured on
         `step`: bands of 8, 12 and 20 give the same corners.
-    better_by : median loss by which the given surface must explain the views better than a patch to
-        remain. Guess.
     """
 
     min_points: int = 4
@@ -118,12 +116,11 @@ class OffsetTolerances:
     mark_contrast: float = 1.5
     mark_share: float = 0.6
     seed_cells: float = 2.0
-    leak: float = 0.1
+    end_weight: float = 0.1
     seed_weight: float = 0.2
     min_total: float = 0.01
     min_share: float = 0.84
     min_radius_cells: float = 12.0
-    better_by: float = 0.3
 
 
 TOL = OffsetTolerances()
@@ -391,31 +388,28 @@ def stepped_patches(
     seeds: Seeds,
     scene: PatchScene,
     *,
-    signed_distance: SignedDistance | None = None,
-    first_hit: FirstHit | None = None,
+    surface: RayScene | None = None,
+    is_refined: bool = False,
 ) -> tuple[SteppedPatches, ...]:
-    """Groups of parallel patches that a first surface does not explain, with their extents.
+    """Groups of parallel patches with their extents, where a surface does not explain more phases.
 
     Parameters
     ----------
     patches : from :func:`find_patches`.
     seeds : their members.
     scene : the views.
-    signed_distance : of points ``(N, 3)`` to the first surface. Groups whose seeds all lie on it
-        are skipped. None: no group is skipped.
-    first_hit : distance and normal where rays from ``(N, 3)`` along ``(3,)`` first meet the first
-        surface (inf without a hit); this surface remains where it explains the views better.
+    surface : what the patches carve; it remains where fewer views contradict it. None: unknown.
+    is_refined : the surface has the object's normals, so where more views contradict it than a
+        patch, this speaks for the patch; of a hull it does not.
     """
     found = []
     for group in _grouped(patches):
         points = seeds.points_in_world[np.concatenate([patch.members for patch in group])]
         gsd = _gsd(points, scene.maps)
-        if signed_distance is not None and explains(group, seeds, signed_distance, gsd):
-            continue
         grid = _grid_over(group, points, scene.maps, gsd)
         if grid is None:
             continue
-        labels, shown = _labels(group, seeds, grid, scene, first_hit)
+        labels, shown = _labels(group, seeds, grid, scene, surface, is_refined)
         if (labels != NO_PATCH).any():
             not_drawn = np.zeros((len(group), *grid.shape), np.float32)
             steps = SteppedPatches(tuple(group), grid, labels, shown, not_drawn)
@@ -489,23 +483,6 @@ def _grouped(patches: Sequence[Patch]) -> list[list[Patch]]:
         else:
             groups.append([patch])
     return groups
-
-
-def explains(
-    patches: Sequence[Patch], seeds: Seeds, signed_distance: SignedDistance, gsd: float
-) -> bool:
-    """Whether a surface passes through the seeds of each patch.
-
-    Parameters
-    ----------
-    signed_distance : of points ``(N, 3)`` to the surface.
-    gsd : ground sampling distance, world units.
-    """
-    return not any(
-        np.median(np.abs(signed_distance(seeds.points_in_world[patch.members])))
-        > TOL.seed_cells * gsd
-        for patch in patches
-    )
 
 
 def _gsd(points: Array, maps: Sequence[PhaseMap]) -> float:
@@ -648,12 +625,14 @@ class PatchEvidence:
     """Evidence of the views for a patch at the cells of a grid.
 
     ``jump`` (H, W): intensity edges in units of noise that a share of the views exceeds;
-    ``cost`` (H, W): median robust loss of the phases, 1 where no view has one;
+    ``num_phases`` (H, W): number of views with a phase there;
+    ``misfit`` (H, W): sum of their robust losses, about the number of views that contradict it;
     ``possible`` (H, W): whether the views show the part there.
     """
 
     jump: Image
-    cost: Image
+    num_phases: Image
+    misfit: Image
     possible: Mask
 
 
@@ -662,18 +641,19 @@ def _labels(
     seeds: Seeds,
     grid: PatchGrid,
     scene: PatchScene,
-    first_hit: FirstHit | None,
+    surface: RayScene | None,
+    is_refined: bool,
 ) -> tuple[NDArray[np.int64], Mask]:
     """Number of the patch at each cell, ``NO_PATCH`` where there is none, and where it is shown."""
     places = [grid.points(patch) for patch in group]
     rise = np.stack([(place - grid.origin) @ grid.axis for place in places])
-    surface_cost = _surface_cost(grid, rise.max(axis=0), scene, first_hit)
+    of_surface = _surface_misfit(grid, rise.max(axis=0), scene, surface)
     labels, shown = np.full(grid.shape, NO_PATCH), np.zeros(grid.shape, np.bool_)
     losses = [scene.losses_on(*own) for own in zip(places, group, strict=True)]
     # Occlusion between patches needs labels: a second pass uses those of the first.
     for is_labelled in (False, True):
-        claims, jumps = np.zeros((2, len(group), *grid.shape))
-        possible, fits = np.zeros((2, len(group), *grid.shape), np.bool_)
+        claims, jumps, excess = np.zeros((3, len(group), *grid.shape))
+        possible = np.zeros((len(group), *grid.shape), np.bool_)
         for number, patch in enumerate(group):
             hidden = None
             if is_labelled:
@@ -681,15 +661,13 @@ def _labels(
             on_grid = grid.cells(seeds.points_in_world[patch.members])
             near = _distance_to(on_grid, grid.shape) < 0.5 * TOL.mark_px
             evidence = patch_evidence(places[number], patch, scene, losses[number], near, hidden)
-            possible[number] = evidence.possible
-            better = evidence.possible & (evidence.cost < surface_cost + TOL.better_by)
-            fits[number] = better & (evidence.cost < MAX_COST)
-            claims[number] = _claim(number, group, seeds, grid, evidence, better)
-            jumps[number] = evidence.jump
-        # A cell far from few points has a small probability of reaching them, but belongs to the
-        # patch if no other patch can be there.
-        total = claims.sum(axis=0)
-        claimed = (total > TOL.min_total) & (claims.max(axis=0) > 0.5 * total)
+            excess[number] = _excess(evidence, of_surface, is_refined)
+            claims[number] = _claim(number, group, seeds, grid, evidence, excess[number])
+            jumps[number], possible[number] = evidence.jump, evidence.possible
+        # The other walks end on the refined surface. Without one, a cell far from few points has a
+        # small probability of reaching them, but belongs to the patch if no other can be there.
+        total = 1.0 if is_refined else claims.sum(axis=0)
+        claimed = (claims.max(axis=0) > 0.5 * total) & (claims.sum(axis=0) > TOL.min_total)
         labels = np.where(claimed, claims.argmax(axis=0), NO_PATCH)
         labels = _without_small(labels, len(group))
         # The lowest patch ends where others stand on it; there their own borders count.
@@ -698,12 +676,26 @@ def _labels(
                 labels, int(number), jumps[number], TOL.min_radius_cells, TOL.line_steps
             )
         # By something that the patches do not explain.
+        fits = possible & (excess < 1)
         taken = possible.any(axis=0) & ~fits.any(axis=0)
         taken = ndimage.binary_opening(taken, iterations=2)
         labels = np.where(taken, NO_PATCH, labels)
         shown = labels != NO_PATCH
         labels = _continued(labels, fits | ~possible.any(axis=0), taken)
     return np.asarray(labels, np.int64), np.asarray(shown, np.bool_)
+
+
+def _excess(evidence: PatchEvidence, of_surface: Image, is_refined: bool) -> Array:
+    """How many views more contradict a patch (H, W) than the given surface, or than half of them.
+
+    ``of_surface`` (H, W) contradict the given surface, NaN where there is none.
+    """
+    misfit = evidence.misfit.astype(np.float64)
+    # Normals of a hull are not those of the object: it cannot speak for a patch.
+    against = np.maximum(misfit - np.fmin(of_surface, MAX_COST * evidence.num_phases), 0)
+    if is_refined:
+        against = np.where(np.isnan(of_surface), against, misfit - of_surface)
+    return np.asarray(against)
 
 
 def snapped_border(
@@ -748,17 +740,19 @@ def snapped_border(
 
 
 def _continued(labels: NDArray[np.int64], allowed: Mask, taken: Mask) -> NDArray[np.int64]:
-    """Labels extended to nearby free cells where they are ``allowed`` (G, H, W).
+    """Labels extended to free cells nearby, over cells where they are ``allowed`` (G, H, W).
 
-    Next to a patch, where the views show no part, a label cannot carve wrongly; but the first
+    Next to a patch, where the views show no part, a label cannot carve wrongly; but the given
     surface may have a margin there as wide as the uncertainty of the silhouettes.
     """
-    if not (labels != NO_PATCH).any():
+    known = labels != NO_PATCH
+    if not known.any():
         return labels
-    distance, nearest = ndimage.distance_transform_edt(labels == NO_PATCH, return_indices=True)
+    distance, nearest = ndimage.distance_transform_edt(~known, return_indices=True)
     carried = labels[tuple(nearest)]
     free = np.take_along_axis(allowed, carried[None], axis=0)[0] & ~taken
-    return np.where((distance <= TOL.min_radius_cells) & free, carried, labels)
+    near = free & (distance <= TOL.min_radius_cells)
+    return np.where(ndimage.binary_propagation(known, mask=known | near), carried, NO_PATCH)
 
 
 def _features(phase_map: PhaseMap) -> Image:
@@ -848,7 +842,12 @@ def patch_evidence(
     printed = near_points & (num_marks > TOL.mark_share * inside)
     jumps[:, printed] = np.nan
     possible = (num_seen >= 2) & (inside >= TOL.min_share * num_seen)
-    return PatchEvidence(_shared_lines(jumps, TOL.view_share), median_loss(own), possible)
+    return PatchEvidence(
+        jump=_shared_lines(jumps, TOL.view_share),
+        num_phases=np.isfinite(own).sum(axis=0).astype(np.float32),
+        misfit=np.nansum(own, axis=0),
+        possible=possible,
+    )
 
 
 def patch_lines(places: Array, patch: Patch, scene: PatchScene, view_share: float) -> Image:
@@ -905,27 +904,28 @@ def _steps(values: Image, shown: Mask) -> Image:
     return total
 
 
-def _surface_cost(
-    grid: PatchGrid,
-    top: Array,
-    scene: PatchScene,
-    first_hit: FirstHit | None,
+def _surface_misfit(
+    grid: PatchGrid, top: Array, scene: PatchScene, surface: RayScene | None
 ) -> Image:
-    """Median loss (H, W) of the phases on the given surface above the cells; 1 without one."""
-    cost = np.ones(grid.shape, np.float32)
-    if first_hit is None:
-        return cost
+    """Sum of the losses (H, W) of the phases on a surface above the cells; NaN without one."""
+    misfit = np.full(grid.shape, np.nan, np.float32)
+    if surface is None:
+        return misfit
     rows, cols = np.indices(grid.shape)
     far = float(max(grid.shape) * grid.step)
     start = grid.origin + grid.step * (rows[..., None] * grid.first + cols[..., None] * grid.second)
-    start = start + (top[..., None] + far) * grid.axis
-    distance, normals = first_hit(start.reshape(-1, 3), -grid.axis)
-    hit = np.isfinite(distance)
-    points = start.reshape(-1, 3)[hit] - np.asarray(distance, np.float64)[hit, None] * grid.axis
-    losses = scene.losses(points, np.asarray(normals)[hit].T)
-    flat = cost.reshape(-1)
-    flat[hit] = median_loss(losses[:, None])[0]
-    return cost
+    start = (start + (top[..., None] + far) * grid.axis).reshape(-1, 3)
+    hits = surface.cast(start, np.broadcast_to(-grid.axis, start.shape))
+    hit = np.isfinite(hits.distance)
+    points = start[hit] - np.asarray(hits.distance, np.float64)[hit, None] * grid.axis
+    normals = surface.mesh.face_normals[hits.face[hit]]
+    losses = scene.losses(points, normals.T)
+    seen = np.zeros(losses.shape, np.bool_)
+    for own, phase_map in zip(seen, scene.maps, strict=True):
+        center = phase_map.view.center_in_world
+        own[visible_points(surface, center, points, normals, min_cosine=MIN_FACING_COSINE)[0]] = 1
+    misfit[np.reshape(hit, grid.shape)] = np.nansum(losses, axis=0, where=seen)
+    return misfit
 
 
 def _hidden(
@@ -964,9 +964,14 @@ def _claim(
     seeds: Seeds,
     grid: PatchGrid,
     evidence: PatchEvidence,
-    possible: Mask,
+    excess: Array,
 ) -> Array:
-    """Probability (H, W) that a walk from a cell, hampered by lines, ends on a patch's points."""
+    """Probability (H, W) that a walk from a cell, hampered by lines, ends on a patch.
+
+    It ends on points of the patch or of others, or where ``excess`` (H, W) is beyond one view: on
+    the given surface if it is positive, on the patch if it is negative.
+    """
+    possible = evidence.possible
     own, others = (np.full(grid.shape, np.inf) for _ in range(2))
     for other, patch in enumerate(group):
         near = _distance_to(grid.cells(seeds.points_in_world[patch.members]), grid.shape)
@@ -981,11 +986,13 @@ def _claim(
     adjacency, degree = _walk(evidence.jump.astype(np.float64))
     # A walk may end on any point that it passes, so a single false point does not decide.
     ending = TOL.seed_weight * (starts | ends).ravel()
-    leak = TOL.leak * np.clip(evidence.cost.astype(np.float64).ravel() / MAX_COST - 1, 0, 1)
+    contradicted = TOL.end_weight * np.clip(excess.ravel() - 1, 0, 1)
+    supported = TOL.end_weight * np.clip(-excess.ravel() - 1, 0, 1)
     free = np.flatnonzero(possible)
-    right = TOL.seed_weight * starts.ravel()[free].astype(np.float64)
+    right = TOL.seed_weight * starts.ravel() + supported
+    total = degree + ending + contradicted + supported + 1e-9
     claim = np.zeros(starts.size)
-    claim[free] = _solved(adjacency[free][:, free], (degree + leak + ending + 1e-9)[free], right)
+    claim[free] = _solved(adjacency[free][:, free], total[free], right[free])
     return np.asarray(claim.reshape(grid.shape))
 
 

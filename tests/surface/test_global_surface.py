@@ -20,7 +20,6 @@ from polmvs.scene import Seeds
 from polmvs.surface.global_surface import (
     SparsePoints,
     Undetermined,
-    lost_steps,
     num_surface_steps,
     reconstruct_surface,
     render_view,
@@ -29,9 +28,9 @@ from polmvs.surface.global_surface import (
 )
 from polmvs.surface.mesh_geometry import RayScene
 from polmvs.surface.observations import Looking
-from polmvs.surface.offsets import Patch, PatchGrid, SteppedPatches
+from polmvs.surface.offsets import find_patches, patch_scene, stepped_patches
 from polmvs.surface.silhouettes import find_silhouette
-from polmvs.surface.solver import Level, SolverTolerances, first_fit
+from polmvs.surface.solver import Level, SolverTolerances
 from polmvs.surface.surface_quality import (
     Contradictions,
     outline_mismatch,
@@ -282,35 +281,22 @@ def drum(points):
     return np.maximum(beside, np.abs(points[..., 2]) - 0.5)
 
 
-def round_patch(height, radius):
-    """A horizontal patch, with the space above it free."""
-    axis = np.arange(-1.5, 1.5, GSD)
-    beside = np.hypot(*np.meshgrid(axis, axis, indexing="ij")) - radius
-    x, y, z = np.eye(3)
-    grid = PatchGrid(np.array([axis[0], axis[0], 0]), x, y, z, GSD, beside.shape)
-    patch = Patch(z, height, np.arange(4))
-    labels = np.where(beside < 0, 0, -1)
-    return SteppedPatches((patch,), grid, labels, labels == 0, (beside / GSD)[None])
-
-
 @pytest.mark.parametrize(
-    ("distance", "step", "off", "is_lost"),
-    [
-        (drum, round_patch(0.5, 0.97), 0, True),  # the hull has a cap above the drum's flat top
-        (sphere(), round_patch(0.85, 0.5), 0, False),  # the patch cuts the ball's top
-        (sphere(), round_patch(0.85, 0.5), 3 * GSD, True),  # but points show it
-    ],
+    ("distance", "height", "is_flat"), [(drum, 0.5, True), (sphere(), 0.97, False)]
 )
-def test_a_refined_surface_has_lost_what_its_points_or_phases_show(distance, step, off, is_lost):
-    views = seen_in(phase_maps_of(distance, VIEWS), masks_given=True)
-    hull = visual_hull(views)
-    scene = RayScene(hull.mesh)
-    rays = np.array([[0, 0, -1.0], [0.2, 0, -1], [0, 0.2, -1], [-0.2, 0, -1]])
-    top = np.array([0, 0, 3.0])
-    points = top + (scene.cast(top, rays).distance + off)[:, None] * rays
-    seeds = Seeds(points, np.tile([0, 0, 1.0], (4, 1)), np.full(4, 1e-3))
-    fit = first_fit(views, LOOKING, hull.gsd).at_width(1.0)
-    assert lost_steps(scene, [step], seeds, fit, hull) == ((step,) if is_lost else ())
+def test_a_plane_carves_a_flat_top_and_not_a_round_one(distance, height, is_flat):
+    """The hull has a cap above either; points of a tangent plane look like those of a flat top."""
+    maps = phase_maps_of(distance, VIEWS)
+    hull = visual_hull(seen_in(maps, masks_given=True))
+    around = np.linspace(0, 2 * np.pi, 6, endpoint=False)
+    points = np.column_stack([0.2 * np.cos(around), 0.2 * np.sin(around), np.full(6, height)])
+    seeds = Seeds(points, np.tile([0, 0, 1.0], (6, 1)), np.full(6, 1e-3))
+    (patch,) = find_patches(seeds)
+    steps = stepped_patches([patch], seeds, patch_scene(maps, PPA), surface=RayScene(hull.mesh))
+    above = np.random.default_rng(0).uniform([-0.8, -0.8, 0], [0.8, 0.8, 0.2], (500, 3))
+    above = above[np.hypot(*above.T[:2]) < 0.8] + [0, 0, height + GSD]
+    free = [(group.values(above) > 0).mean() for group in steps]
+    assert (min(free) > 0.95) if is_flat else not any(free)
 
 
 def with_regions(maps, inside):

@@ -4,11 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import trimesh
 from scenes import phase_map_of
 
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
+from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
 from polmvs.surface.offsets import find_patches, patch_scene, snapped_border, stepped_patches
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Group, Plane, Sphere
@@ -187,32 +189,50 @@ def test_walls_stand_where_the_intensity_steps(top_gain, most):
     assert np.sqrt(np.mean(squares)) < most
 
 
-def test_a_surface_that_explains_all_points_is_left_alone():
+def height_field(height) -> RayScene:
+    """The surface at ``height(xy)`` (N, 2) over the plate."""
+    num = 141
+    side = np.linspace(-PLATE, PLATE, num)
+    xy = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    first = np.arange(num * num).reshape(num, num)[:-1, :-1].ravel()
+    lower = np.stack([first, first + num, first + num + 1], axis=1)
+    upper = np.stack([first, first + num + 1, first + 1], axis=1)
+    return RayScene(TriangleMesh(np.column_stack([xy, height(xy)]), np.concatenate([lower, upper])))
+
+
+def test_a_surface_that_explains_all_phases_is_left_alone():
     scene = step_scene(0.03, num_views=3)
-
-    def exact(points):
-        return points[:, 2] - scene.true_height(points[:, :2])
-
-    patches = find_patches(scene.seeds)
-    assert (
-        stepped_patches(
-            patches, scene.seeds, patch_scene(scene.maps, AngleModel.PPA), signed_distance=exact
-        )
-        == ()
+    maps = patch_scene(scene.maps, AngleModel.PPA)
+    (group,) = stepped_patches(
+        find_patches(scene.seeds),
+        scene.seeds,
+        maps,
+        surface=height_field(scene.true_height),
+        is_refined=True,
     )
-    # A plain box: one patch, on the surface that silhouettes give.
-    plain = Seeds(
-        *(a[9:] for a in (scene.seeds.points_in_world, scene.seeds.normals_in_world)),
-        scene.seeds.sigma[9:],
-    )
-    (patch,) = find_patches(plain)
-    found = stepped_patches(
-        [patch],
-        plain,
+    points = column_points()
+    depth = scene.true_height(points[:, :2]) - points[:, 2]
+    assert not (group.values(points[depth > 1e-3]) > 0).any()
+
+
+def test_a_recess_ends_at_its_walls_where_its_rim_has_no_points():
+    """The phases of its floor are those of the rim; only views of its walls contradict either."""
+    scene = step_scene(-0.02, top_gain=1.0)
+    of_floor = (scene.seeds.points_in_world[:9], scene.seeds.normals_in_world[:9])
+    floor = Seeds(*of_floor, scene.seeds.sigma[:9])
+    (group,) = stepped_patches(
+        find_patches(floor),
+        floor,
         patch_scene(scene.maps, AngleModel.PPA),
-        signed_distance=lambda points: points[:, 2],
+        surface=height_field(lambda xy: np.zeros(len(xy))),
+        is_refined=True,
     )
-    assert found == ()
+    points = column_points()
+    points = points[(points[:, 2] < -1e-3) & (points[:, 2] > -0.019)]
+    inside = (np.abs(points[:, :2]) < BOX).all(axis=1)
+    free = group.values(points) > 0
+    assert free[inside].mean() > 0.98
+    assert free[~inside].mean() < 0.02
 
 
 @pytest.mark.parametrize("knows_the_ball", [False, True])
@@ -225,14 +245,14 @@ def test_what_stands_on_a_face_is_not_carved(knows_the_ball):
     ring = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     points = 0.1 * np.stack([np.cos(ring), np.sin(ring), np.zeros(12)], axis=1)
     seeds = Seeds(points, np.tile([0.0, 0.0, 1.0], (12, 1)), np.full(12, SIGMA))
-    first_hit = None
+    given = None
     if knows_the_ball:
-
-        def first_hit(origins, direction):
-            return ball.intersect(origins, np.broadcast_to(direction, origins.shape))
-
+        sphere = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+        given = RayScene(
+            TriangleMesh(np.asarray(sphere.vertices) + center, np.asarray(sphere.faces, np.int64))
+        )
     (group,) = stepped_patches(
-        find_patches(seeds), seeds, patch_scene(maps, AngleModel.PPA), first_hit=first_hit
+        find_patches(seeds), seeds, patch_scene(maps, AngleModel.PPA), surface=given
     )
     rng = np.random.default_rng(0)
     inside = rng.normal(size=(500, 3))
