@@ -76,6 +76,7 @@ from polmvs.surface.surface_quality import (
     face_evidence,
     find_contradictions,
     fit_normals,
+    loses_silhouettes,
     misfit,
     outline_mismatch,
     point_offset,
@@ -263,7 +264,12 @@ def reconstruct_surface(
         scene = RayScene(mesh)
         cavities = _cavities(given, refined, scene)
         if walls is None:
-            steps = given.steps(scene, is_refined=True)
+            cell = HullTolerances.step_px * first.gsd
+            steps = tuple(
+                group
+                for group in given.steps(scene, is_refined=True)
+                if not first.loses_silhouettes(mesh, _carved(scene, cell, first.hull, [group]))
+            )
             logger.info("%d groups of planar patches.", len(steps))
         # Outlines hold the surface; without the points, these show the bias of its phases.
         free = replace(fit, known=None)
@@ -310,10 +316,20 @@ class _First:
     plane: SupportingPlane | None = None
 
     def carved(self, steps: Sequence[SteppedPatches]) -> _First:
-        """The hull without the space above planar patches."""
+        """The hull without the space above the planar patches that lose no silhouettes."""
         assert self.hull is not None
-        hull = self.hull.carved([group.values for group in steps])
+        kept = [
+            group.values
+            for group in steps
+            if not self.loses_silhouettes(self.mesh, self.hull.carved([group.values]).mesh)
+        ]
+        hull = self.hull.carved(kept)
         return replace(self, mesh=hull.mesh, hull=hull)
+
+    def loses_silhouettes(self, mesh: TriangleMesh, carved: TriangleMesh) -> bool:
+        """Whether a carved mesh loses what silhouettes show, by more than two cells of the hull."""
+        margin = 2 * HullTolerances.step_px
+        return loses_silhouettes(mesh, carved, self.views, margin_px=margin)
 
 
 def _first_surface(

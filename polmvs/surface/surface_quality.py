@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from polmvs.camera import sample_image
 from polmvs.fitting import like_most, robust_deviation
@@ -537,11 +538,7 @@ def outline_mismatch(
     """
     scene, shares = RayScene(mesh), np.full(len(views), np.nan)
     for index, view in enumerate(views):
-        camera = view.view.camera
-        xy = lattice_xy(camera.height // stride_px, camera.width // stride_px, stride_px)
-        cols, rows = np.moveaxis(np.floor(xy).astype(np.intp), -1, 0)
-        hit = scene.cast(view.center, view.view.rays_in_world(xy.reshape(-1, 2))).face >= 0
-        hit = hit.reshape(xy.shape[:-1])
+        hit, rows, cols = _covered(scene, view, stride_px)
         certain, possible = (
             mask[rows, cols] for mask in (view.silhouette.certain, view.silhouette.possible)
         )
@@ -549,6 +546,42 @@ def outline_mismatch(
         if shown:
             shares[index] = ((certain & ~hit) | (hit & ~possible)).sum() / shown
     return shares
+
+
+def loses_silhouettes(
+    mesh: TriangleMesh,
+    carved: TriangleMesh,
+    views: Sequence[SurfaceView],
+    *,
+    margin_px: float,
+    stride_px: int = 4,
+) -> bool:
+    """Whether half of the views show the object where only the mesh is and not the carved one.
+
+    Parameters
+    ----------
+    mesh, carved : the mesh, and the same with free space carved.
+    views : all.
+    margin_px : from the border of a silhouette; what is nearer does not count.
+    """
+    whole, rest = RayScene(mesh), RayScene(carved)
+    lost = np.zeros(len(views), np.bool_)
+    for index, view in enumerate(views):
+        hit, rows, cols = _covered(whole, view, stride_px)
+        inside = ndimage.distance_transform_edt(view.silhouette.certain)[rows, cols] > margin_px
+        lost[index] = bool((inside & hit & ~_covered(rest, view, stride_px)[0]).any())
+    return bool(lost.mean() >= 0.5)
+
+
+def _covered(
+    scene: RayScene, view: SurfaceView, stride_px: int
+) -> tuple[Mask, NDArray[np.intp], NDArray[np.intp]]:
+    """Where a view sees a mesh (H, W), on a lattice of pixels, and their rows and columns."""
+    camera = view.view.camera
+    xy = lattice_xy(camera.height // stride_px, camera.width // stride_px, stride_px)
+    cols, rows = np.moveaxis(np.floor(xy).astype(np.intp), -1, 0)
+    hit = scene.cast(view.center, view.view.rays_in_world(xy.reshape(-1, 2))).face >= 0
+    return hit.reshape(xy.shape[:-1]), rows, cols
 
 
 def stand_apart(unexplained: Array, least: float) -> Mask:

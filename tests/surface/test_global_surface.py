@@ -33,10 +33,11 @@ from polmvs.surface.silhouettes import find_silhouette
 from polmvs.surface.solver import Level, SolverTolerances
 from polmvs.surface.surface_quality import (
     Contradictions,
+    loses_silhouettes,
     outline_mismatch,
     points_deny,
 )
-from polmvs.surface.surface_view import surface_view
+from polmvs.surface.surface_view import Silhouette, surface_view
 from polmvs.surface.terms import KnownPoints
 from polmvs.surface.visual_hull import visual_hull
 
@@ -241,6 +242,21 @@ def test_outlines_are_held_against_a_mesh(maps):
     assert max(whole, also_whole) < 0.06  # a pixel of its border, asked every fourth
     away = ball.moved(np.broadcast_to([0.0, 0.0, 5.0], ball.vertices.shape))
     assert (outline_mismatch(away, views) == 1).all()
+
+
+@pytest.mark.parametrize(("top", "loses"), [(0.5, True), (0.9, False)])
+def test_what_is_carved_keeps_the_silhouettes(top, loses):
+    """The views see a ball cut at half its radius as lower by 15 px, at a tenth by 3 px."""
+    views = seen_in(phase_maps_of(sphere(), VIEWS), masks_given=True)
+    ball = extracted(sphere(), step=0.05)
+    cut = extracted(lambda p: np.maximum(sphere()(p), p[..., 2] - top), step=0.05)
+    assert loses_silhouettes(ball, cut, views, margin_px=4.0) is loses
+    few = [replace(view, silhouette=nothing_in(view)) for view in views[:7]]
+    assert not loses_silhouettes(ball, cut, [*few, *views[7:]], margin_px=4.0)
+
+
+def nothing_in(view):
+    return Silhouette(*np.zeros((2, *view.silhouette.certain.shape), bool))
 
 
 def test_several_objects():
