@@ -317,6 +317,8 @@ class Trust:
                 reason += f", silhouettes to {self.predicted.overlap:.0%}"
         else:
             reason = "the views agree with each other; no view was held out as a check"
+        if np.isfinite(self.determined):
+            reason += f"; points cover {self.determined:.0%} of what the views show"
         return reason + (f". But {weak[0]}" if weak else "")
 
 

@@ -167,7 +167,7 @@ def find_object(
         return None
     masks = [_decided(*given) for given in zip(masks, odds, widths, strict=True)]
     noise = _residual(small, plates, masks)
-    odds = _plane_odds(small, plates, noise)
+    odds = _by_texture(shown, _plane_odds(small, plates, noise))
     masks = [fill_false_holes(*pair) for pair in zip(masks, odds, strict=True)]
     changes = np.concatenate([plate.changes for plate in plates])
     if not len(changes) or float(np.median(changes)) > noise:
@@ -658,9 +658,11 @@ def _plates(views: Sequence[_Working], masks: Sequence[Mask]) -> list[_Plate]:
 
     A lamp that moves with the camera, and gloss, change the plane's brightness from view to view.
     At scales above ``lighting_share``, each prediction is adjusted to the brightness of the view.
+    Pixels in holes of masks predict nothing: false holes of several views would confirm each other.
     """
     kernel = np.ones((3, 3), np.uint8)
-    free = [cv2.dilate(mask.astype(np.uint8), kernel) == 0 for mask in masks]
+    whole = [ndimage.binary_fill_holes(mask).astype(np.uint8) for mask in masks]
+    free = [cv2.dilate(mask, kernel) == 0 for mask in whole]
     beside = [mask.astype(np.float32) for mask in free]
 
     def plate(index: int) -> _Plate:
@@ -737,18 +739,28 @@ def _background_odds(
 ) -> list[Image]:
     """Log-odds (h, w) that each view's pixels show the plane, or the background beyond it.
 
-    Where the plane is predicted, the brightness tells; where it is not, the appearance. Where a
-    view does not show the plane's texture though it should, the brightness agrees by chance only.
+    Where the plane is predicted, the brightness tells; where it is not, the appearance.
     """
     views, found = plane.views, []
     predicted = _plane_odds(views, plates, _residual(views, plates, masks))
-    appearance = _appearance_odds(views, masks, predicted)
-    for view, plate, odds, by_appearance, seen, unseen in zip(
-        views, plates, predicted, appearance, plane.textured, plane.hidden, strict=True
-    ):
+    appearance = _appearance_odds(plane, masks, predicted)
+    for plate, odds, by_appearance in zip(plates, predicted, appearance, strict=True):
         odds = np.where(np.isfinite(plate.log), odds, by_appearance)
-        total = np.asarray(cv2.GaussianBlur(odds, (0, 0), BLUR_PX), np.float32)
-        total[seen] = np.minimum(total[seen] + MAX_ODDS, MAX_ODDS)
+        found.append(np.asarray(cv2.GaussianBlur(odds, (0, 0), BLUR_PX), np.float32))
+    return _by_texture(plane, found)
+
+
+def _by_texture(plane: _Shown, odds: Sequence[Image]) -> list[Image]:
+    """Log-odds (h, w) that each view's pixels show the background, with its texture.
+
+    Where a view does not show the plane's texture though it should, the brightness agrees by chance
+    only. Polarized regions show the object.
+    """
+    found = []
+    for view, own, seen, unseen in zip(
+        plane.views, odds, plane.textured, plane.hidden, strict=True
+    ):
+        total = np.where(seen, np.minimum(own + MAX_ODDS, MAX_ODDS), own)
         total[unseen] = np.minimum(total[unseen], -LEAST_ODDS)
         total[view.polarized] = -MAX_ODDS
         found.append(total)
@@ -775,7 +787,7 @@ def fill_false_holes(mask: Mask, odds: Floats) -> Mask:
     """A mask (H, W) with the holes filled that do not show the plane in this view.
 
     Mirror images of the plane in two views may carve a tunnel through the object. ``odds`` (H, W)
-    are the log-odds that a pixel shows the plane.
+    are the log-odds that a pixel shows the plane; 0 where nothing tells.
     """
     holes = np.asarray(ndimage.binary_fill_holes(mask), np.bool_) & ~mask
     labels, num = ndimage.label(holes)
@@ -783,15 +795,16 @@ def fill_false_holes(mask: Mask, odds: Floats) -> Mask:
     return mask | np.isin(labels, 1 + np.flatnonzero(shown <= LEAST_ODDS))
 
 
-def _appearance_odds(
-    views: Sequence[_Working], masks: Sequence[Mask], odds: Sequence[Image]
-) -> list[Image]:
+def _appearance_odds(plane: _Shown, masks: Sequence[Mask], odds: Sequence[Image]) -> list[Image]:
     """Log-odds (h, w) that each view's pixels show the background, by their appearance.
 
     Appearance is brightness and contrast. That of the object is known where the prediction of the
-    plane fails, in all views; that of the background in each view, about the object. It tells where
-    no other view predicts the plane: in shadow under the object, and beyond the plane's extent.
+    plane fails or its texture is hidden, in all views; that of the background in each view, about
+    the object, where it shows the plane's texture or lies beyond the plane. Parts of the object
+    that the masks lack are neither. Appearance tells where no other view predicts the plane: in
+    shadow under the object, and beyond the plane's extent.
     """
+    views = plane.views
     lowest = min(float(view.log.min()) for view in views)
     spread = max(max(float(view.log.max()) for view in views) - lowest, 1e-6)
     num, window = TOL.num_levels, np.ones((TOL.window_px, TOL.window_px), np.uint8)
@@ -820,13 +833,14 @@ def _appearance_odds(
 
     of_views = [bins(view) for view in views]
     known = [
-        own[~grown(~mask, TOL.window_px) & (odd < -LEAST_ODDS)]
-        for own, mask, odd in zip(of_views, masks, odds, strict=True)
+        own[~grown(~mask, TOL.window_px) & ((odd < -LEAST_ODDS) | hidden)]
+        for own, mask, odd, hidden in zip(of_views, masks, odds, plane.hidden, strict=True)
     ]
     of_object = shares(np.concatenate(known))
     found = []
-    for own, mask in zip(of_views, masks, strict=True):
+    for view, own, mask, shown in zip(views, of_views, masks, plane.shows_plane, strict=True):
         near = grown(mask, TOL.lighting_px(mask)) & ~grown(mask, TOL.window_px)
+        near &= shown | ~view.has_plane
         ratio = np.log(shares(own[near]) / of_object)[own]
         found.append(np.clip(ratio, -MAX_ODDS, MAX_ODDS).astype(np.float32))
     return found
