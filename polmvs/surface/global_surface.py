@@ -48,6 +48,7 @@ from polmvs.surface.offsets import (
     PatchScene,
     SteppedPatches,
     find_patches,
+    free_spaces,
     patch_scene,
     stepped_patches,
 )
@@ -319,11 +320,11 @@ class _First:
         """The hull without the space above the planar patches that lose no silhouettes."""
         assert self.hull is not None
         kept = [
-            group.values
+            group
             for group in steps
             if not self.loses_silhouettes(self.mesh, self.hull.carved([group.values]).mesh)
         ]
-        hull = self.hull.carved(kept)
+        hull = self.hull.carved(free_spaces(kept))
         return replace(self, mesh=hull.mesh, hull=hull)
 
     def loses_silhouettes(self, mesh: TriangleMesh, carved: TriangleMesh) -> bool:
@@ -456,7 +457,7 @@ def _carved(
         scene,
         edge,
         solid=solid,
-        free=[*(group.values for group in steps), *(cavity.values for cavity in cavities)],
+        free=[*free_spaces(steps), *(cavity.values for cavity in cavities)],
         smoothing=0,
     )
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import compress
 from pathlib import Path
 
@@ -44,7 +44,7 @@ from polmvs.polarization.phase_map import PhaseMap
 from polmvs.scene import MIN_FACING_COSINE, Seeds
 from polmvs.surface.borders import drawn_border, smoothly_beside
 from polmvs.surface.creases import CreaseTolerances
-from polmvs.surface.mesh_geometry import RayScene, visible_points
+from polmvs.surface.mesh_geometry import RayScene, SignedDistance, visible_points
 from polmvs.surface.silhouettes import SilhouetteTolerances, nearest_steps, step_slope
 from polmvs.surface.surface_view import REFERENCE_FOCAL_PX
 from polmvs.surface.terms import TermTolerances
@@ -241,6 +241,22 @@ class SteppedPatches:
         at_label = np.take_along_axis(heights, np.maximum(self.labels, 0)[None], axis=0)[0]
         return np.asarray((self.labels == NO_PATCH) | (at_label >= heights[number]))
 
+    def under(self, points: Floats) -> Array:
+        """Signed distance ``(N,)`` of points to the solid right under the patches, negative in it.
+
+        It is as deep as borders of patches are uncertain.
+        """
+        points = np.asarray(points, np.float64)
+        cells = np.moveaxis(self.grid.cells(points), -1, 0)
+        depth, found = TOL.min_radius_cells * self.grid.step, np.full(len(points), np.inf)
+        for patch, beside in self._borders:
+            height = patch.height(points)
+            within = np.maximum(
+                self._interpolated(beside, cells), np.maximum(height, -height - depth)
+            )
+            found = np.minimum(found, within)
+        return found
+
     def solid(self, points: Floats) -> Array:
         """Signed distance ``(N,)`` of points to the solid on the lowest patch, negative inside.
 
@@ -280,6 +296,20 @@ class SteppedPatches:
         """Values at fractional cells ``(2, N)``; those of the border beyond it."""
         found = ndimage.map_coordinates(image, cells, order=1, mode="nearest")
         return np.asarray(found, np.float64)
+
+
+def free_spaces(groups: Sequence[SteppedPatches]) -> list[SignedDistance]:
+    """Signed distances of points (N, 3), positive in the free space above each group of patches.
+
+    A wall whose border lies some cells too low would cut grooves under the patch at its foot: what
+    lies right under the patches of other groups is not free.
+    """
+
+    def free(group: SteppedPatches, points: Array) -> Array:
+        below = [other.under(points) for other in groups if other is not group]
+        return np.asarray(np.minimum.reduce([group.values(points), *below]))
+
+    return [partial(free, group) for group in groups]
 
 
 def find_patches(seeds: Seeds) -> tuple[Patch, ...]:
@@ -650,20 +680,26 @@ def _labels(
     of_surface = _surface_misfit(grid, rise.max(axis=0), scene, surface)
     labels, shown = np.full(grid.shape, NO_PATCH), np.zeros(grid.shape, np.bool_)
     losses = [scene.losses_on(*own) for own in zip(places, group, strict=True)]
+    on_grid = [grid.cells(seeds.points_in_world[patch.members]) for patch in group]
+    near = [_distance_to(points, grid.shape) < 0.5 * TOL.mark_px for points in on_grid]
     # Occlusion between patches needs labels: a second pass uses those of the first.
     for is_labelled in (False, True):
-        claims, jumps, excess = np.zeros((3, len(group), *grid.shape))
-        possible = np.zeros((len(group), *grid.shape), np.bool_)
+        of_patches = []
         for number, patch in enumerate(group):
             hidden = None
             if is_labelled:
                 hidden = _hidden(number, group, places[number], grid, labels, scene.maps)
-            on_grid = grid.cells(seeds.points_in_world[patch.members])
-            near = _distance_to(on_grid, grid.shape) < 0.5 * TOL.mark_px
-            evidence = patch_evidence(places[number], patch, scene, losses[number], near, hidden)
-            excess[number] = _excess(evidence, of_surface, is_refined)
-            claims[number] = _claim(number, group, seeds, grid, evidence, excess[number])
-            jumps[number], possible[number] = evidence.jump, evidence.possible
+            of_patches.append(
+                patch_evidence(places[number], patch, scene, losses[number], near[number], hidden)
+            )
+        possible = np.stack([evidence.possible for evidence in of_patches])
+        excess = _excess(group, of_patches, near, of_surface, is_refined)
+        claims = np.stack(
+            [
+                _claim(number, group, seeds, grid, evidence, excess[number])
+                for number, evidence in enumerate(of_patches)
+            ]
+        )
         # The other walks end on the refined surface. Without one, a cell far from few points has a
         # small probability of reaching them, but belongs to the patch if no other can be there.
         total = 1.0 if is_refined else claims.sum(axis=0)
@@ -673,7 +709,7 @@ def _labels(
         # The lowest patch ends where others stand on it; there their own borders count.
         for number in np.argsort(np.median(rise.reshape(len(group), -1), axis=1))[1:]:
             labels = snapped_border(
-                labels, int(number), jumps[number], TOL.min_radius_cells, TOL.line_steps
+                labels, int(number), of_patches[number].jump, TOL.min_radius_cells, TOL.line_steps
             )
         # By something that the patches do not explain.
         fits = possible & (excess < 1)
@@ -685,14 +721,31 @@ def _labels(
     return np.asarray(labels, np.int64), np.asarray(shown, np.bool_)
 
 
-def _excess(evidence: PatchEvidence, of_surface: Image, is_refined: bool) -> Array:
-    """How many views more contradict a patch (H, W) than the given surface, or than half of them.
+def _excess(
+    group: Sequence[Patch],
+    of_patches: Sequence[PatchEvidence],
+    near_points: Sequence[Mask],
+    of_surface: Image,
+    is_refined: bool,
+) -> Array:
+    """How many views more contradict each patch (G, H, W) than what else may be there.
 
-    ``of_surface`` (H, W) contradict the given surface, NaN where there is none.
+    That is a refined surface; over a hull also another patch, except ``near_points`` (H, W) of the
+    patch, whose print has phases of its own, or what contradicts half of the views. ``of_surface``
+    (H, W) contradict the given surface, NaN where there is none.
     """
-    misfit = evidence.misfit.astype(np.float64)
+    misfit = np.stack([one.misfit for one in of_patches]).astype(np.float64)
+    num_phases = np.stack([one.num_phases for one in of_patches])
+    possible = np.stack([one.possible for one in of_patches])
+    # Patches are seen by different numbers of views.
+    share = np.where(possible, misfit / np.maximum(num_phases, 1), np.nan)
+    normals = np.stack([patch.normal for patch in group])
+    parallel = normals @ normals.T > np.cos(np.radians(TOL.normal_deg))
+    np.fill_diagonal(parallel, False)
+    others = np.stack([np.fmin.reduce(share[own], axis=0, initial=MAX_COST) for own in parallel])
+    others[np.stack(near_points)] = MAX_COST
     # Normals of a hull are not those of the object: it cannot speak for a patch.
-    against = np.maximum(misfit - np.fmin(of_surface, MAX_COST * evidence.num_phases), 0)
+    against = np.maximum(misfit - np.fmin(of_surface, others * num_phases), 0)
     if is_refined:
         against = np.where(np.isnan(of_surface), against, misfit - of_surface)
     return np.asarray(against)

@@ -164,7 +164,8 @@ def test_a_right_result_says_why_it_is_to_be_trusted():
     assert found.verdict == str(found)
     assert found.verdict == (
         "To be trusted: a surface of the other views predicts 3 held-out views, "
-        "phases to 1.2 deg (22.5 by chance), silhouettes to 98%; points cover 90% of what the views show."
+        "phases to 1.2 deg (22.5 by chance), silhouettes to 98%; points cover 90% of what the "
+        "views show."
     )
     assert "points cover" not in replace(RIGHT, determined=float("nan")).judged().verdict
 

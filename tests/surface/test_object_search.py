@@ -25,7 +25,6 @@ TEXEL = 0.03
 WALL = 0.3
 ARM = 0.06  # radius of the arm, along x from the ball's centre to its end
 ARM_END = 1.7
-BOX = np.array([1.2, 0.9, 0.15])  # its corner; the opposite one is at (-1.2, -0.9, 0)
 
 
 def printed(seed: int = 0) -> np.ndarray:
@@ -61,22 +60,6 @@ def on_arm(view: View, xy: np.ndarray, radius: float) -> np.ndarray:
     return (lengths(there[..., 1:]) < radius) & (there[..., 0] > 0) & (there[..., 0] < ARM_END)
 
 
-def shade_of_box(view: View, xy: np.ndarray) -> np.ndarray:
-    """Brightness (...) of a low box with a printed mark on it, NaN where rays miss it.
-
-    Its top is as bright as the table, one side darker, and shade lies in a band across the top.
-    """
-    rays, center = view.rays_in_world(xy), view.center_in_world
-    inverse = 1 / np.where(np.abs(rays) < 1e-9, 1e-9, rays)
-    low, high = ((bound - center) * inverse for bound in (BOX * (-1, -1, 0), BOX))
-    entry, leave = np.minimum(low, high), np.maximum(low, high).min(axis=-1)
-    start, side = entry.max(axis=-1), entry.argmax(axis=-1)
-    x, y, _ = np.moveaxis(center + start[..., None] * rays, -1, 0)
-    top = 0.5 - 0.15 * np.exp(-(((x - 0.3) / 0.1) ** 2))
-    top = np.where(np.hypot(x + 0.4, y) < 0.08, 0.05, top)
-    return np.where(start < leave, np.choose(side, [0.3, 0.4, top]), np.nan)
-
-
 def photograph(
     view: View,
     texture: np.ndarray,
@@ -87,11 +70,9 @@ def photograph(
     end: float = np.inf,
     arm: float = 0.0,
     shadow: float = 1.0,
-    box: bool = False,
 ) -> np.ndarray:
     """Intensity (H, W), each pixel the mean of four rays; beyond ``end`` the table has none.
 
-    ``box`` replaces the ball.
     The upper part of the ball has the brightness ``cap``, as a stripe of the wall beyond the table.
     Under the ball, the table's brightness is multiplied by ``shadow``.
     """
@@ -111,10 +92,6 @@ def photograph(
             if lamp:
                 shade = shade * (5 / lengths(meets - center)) ** 2
             height = heights_on_ball(view, xy)
-            if box:
-                own = shade_of_box(view, xy)
-                total += np.where(np.isnan(own), shade, own) / 4
-                continue
             own = np.where(height > 0.9, ball if cap is None else cap, ball)
             shade = np.where(on_arm(view, xy, arm), ball, shade)
             total += np.where(height > 0, own, shade) / 4
@@ -145,12 +122,10 @@ def capture(
     end: float = np.inf,
     arm: float = 0.0,
     shadow: float = 1.0,
-    box: bool = False,
     doublings: int = 1,
     elevations: tuple[float, ...] = (30.0, 55.0),
 ) -> list[PhaseMap]:
     looks = {"ball": ball, "cap": cap, "lamp": lamp, "end": end, "arm": arm, "shadow": shadow}
-    looks["box"] = box
     views = ring_of_views(10, elevations=elevations)
     for _ in range(doublings):
         views = [finer(view) for view in views]
@@ -244,19 +219,6 @@ def test_the_shadow_under_the_ball_that_one_view_sees_is_not_the_ball():
     assert found[0].mask[under].mean() < 0.1  # measured: 0.007; by brightness alone 0.296
     overlaps, _ = compared(maps, found)
     assert min(overlaps) > 0.9
-
-
-def test_a_low_box_as_bright_as_the_plane_has_no_holes():
-    """The plane is predicted from views that show it, and not from each other's holes."""
-    maps = capture(printed(), box=True)
-    found = find_object(maps, TABLE, table_points())
-    assert found is not None
-    lost = []
-    for one, hiding in zip(maps, found, strict=True):
-        xy = pixel_centers(one.view.camera.width, one.view.camera.height)
-        box = ndimage.binary_erosion(np.isfinite(shade_of_box(one.view, xy)), iterations=3)
-        lost.append((box & ~hiding.mask).sum() / box.sum())
-    assert np.mean(lost) < 0.01, np.round(lost, 3)
 
 
 def compared(maps: list[PhaseMap], found: list[FoundObject]) -> tuple[list[float], np.ndarray]:

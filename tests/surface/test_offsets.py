@@ -10,8 +10,18 @@ from scenes import phase_map_of
 from polmvs.camera import PinholeCamera, pixel_centers
 from polmvs.polarization.kinds import AngleModel
 from polmvs.scene import Seeds
+from polmvs.surface.borders import smoothly_beside
 from polmvs.surface.mesh_geometry import RayScene, TriangleMesh
-from polmvs.surface.offsets import find_patches, patch_scene, snapped_border, stepped_patches
+from polmvs.surface.offsets import (
+    Patch,
+    PatchGrid,
+    SteppedPatches,
+    find_patches,
+    free_spaces,
+    patch_scene,
+    snapped_border,
+    stepped_patches,
+)
 from polmvs.synthetic.captures import render_view, ring_of_views
 from polmvs.synthetic.surfaces import Group, Plane, Sphere
 
@@ -337,3 +347,32 @@ def test_what_stands_on_the_lowest_face_is_solid():
     clear = np.minimum(np.abs(points[:, 2]), np.abs(points[:, 2] - 0.03)) > 1e-3
     assert np.mean((group.solid(points) < 0)[clear] == inside[clear]) > 0.99
     assert np.isinf(group.solid(np.array([[0.9 * PLATE, 0.0, 0.01]]))).all()
+
+
+def whole_patch(normal, first, shown):
+    """A patch through the origin that the cells of a grid show, 1 mm each, (0, 0) in the middle."""
+    second = np.cross(normal, first)
+    origin = -1e-3 * (np.array(shown.shape) // 2) @ np.stack([first, second])
+    grid = PatchGrid(origin, first, second, np.asarray(normal), 1e-3, shown.shape)
+    patch = Patch(np.asarray(normal), 0.0, np.zeros(0, np.int64))
+    beside = smoothly_beside(shown)[None].astype(np.float32)
+    return SteppedPatches((patch,), grid, np.where(shown, 0, -1), shown, beside)
+
+
+def test_a_wall_whose_border_is_too_low_cuts_no_groove():
+    """A floor z = 0 reaches from a wall x = 0 to x = 40 mm; the wall's border lies 3 mm too low."""
+    x, y, z = np.eye(3)
+    rows, cols = np.indices((101, 101)) - 50
+    floor = whole_patch(z, x, (rows > 0) & (rows < 40) & (abs(cols) < 40))
+    wall = whole_patch(x, y, (cols > -3) & (cols < 40) & (abs(rows) < 40))
+    rng = np.random.default_rng(0)
+    points = rng.uniform((5e-3, -0.03, -2.5e-3), (0.035, 0.03, -0.5e-3), (500, 3))
+    assert (wall.values(points) > 0).all()  # the groove
+    over = points * (1, 1, -1)
+    free = np.max([one(points) for one in free_spaces([floor, wall])], axis=0)
+    assert (free < 0).all()
+    np.testing.assert_allclose(free, points[:, 2], atol=1e-4)  # the floor's own distance
+    assert (np.max([one(over) for one in free_spaces([floor, wall])], axis=0) > 0).all()
+    # The floor shows nothing of what lies far below it.
+    deep = points - (0, 0, 0.03)
+    np.testing.assert_array_equal(free_spaces([floor, wall])[1](deep), wall.values(deep))
