@@ -258,7 +258,8 @@ def _stop_worker(number: int, frame: FrameType | None) -> None:
     to clear away.
     """
     for asking in (STOP, signal.SIGTERM):
-        signal.signal(asking, signal.SIG_IGN)
+        # Not SIG_IGN: if both are pending, Python prints that one was ignored.
+        signal.signal(asking, lambda *_: None)
     if not _works:
         os._exit(1)
     timer = threading.Timer(GRACE_S, os._exit, (1,))

@@ -730,9 +730,9 @@ def _excess(
 ) -> Array:
     """How many views more contradict each patch (G, H, W) than what else may be there.
 
-    That is a refined surface; over a hull also another patch, except ``near_points`` (H, W) of the
-    patch, whose print has phases of its own, or what contradicts half of the views. ``of_surface``
-    (H, W) contradict the given surface, NaN where there is none.
+    That is a refined surface. Over a hull it is also a parallel patch, except ``near_points``
+    (H, W) of the patch itself, whose print has phases of its own, or what contradicts half of the
+    views. ``of_surface`` (H, W) contradict the given surface, NaN where there is none.
     """
     misfit = np.stack([one.misfit for one in of_patches]).astype(np.float64)
     num_phases = np.stack([one.num_phases for one in of_patches])
