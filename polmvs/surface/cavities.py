@@ -548,7 +548,7 @@ def _open_cells(
     nothing_near = np.zeros(grid.shape, np.bool_)
     places = grid.points(rim)
     losses = scene.losses_on(places, rim)
-    evidence = patch_evidence(places, rim, scene, losses, nothing_near, None)
+    evidence = patch_evidence(places, rim, scene, losses, nothing_near)
     brightness = _brightness(places.reshape(-1, 3), on_rim, scene.maps).reshape(grid.shape)
     bright = brightness > TOL.max_brightness
     closed = ndimage.binary_closing(bright, iterations=round(TOL.max_gap))

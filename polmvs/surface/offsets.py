@@ -472,7 +472,6 @@ def border_of_steps(
     own : (H, W) bool, cells where the border may move.
     patch, grid : of the region.
     scene : the views.
-    offset_tol : tolerances.
     """
     is_border = inside & ndimage.binary_dilation(~inside)
     if not (is_border & own).any():
@@ -683,23 +682,23 @@ def _labels(
     on_grid = [grid.cells(seeds.points_in_world[patch.members]) for patch in group]
     near = [_distance_to(points, grid.shape) < 0.5 * TOL.mark_px for points in on_grid]
     # Occlusion between patches needs labels: a second pass uses those of the first.
-    for is_labelled in (False, True):
-        of_patches = []
-        for number, patch in enumerate(group):
-            hidden = None
-            if is_labelled:
-                hidden = _hidden(number, group, places[number], grid, labels, scene.maps)
-            of_patches.append(
-                patch_evidence(places[number], patch, scene, losses[number], near[number], hidden)
+    for _ in range(min(len(group), 2)):
+        of_patches = [
+            patch_evidence(
+                places[number],
+                patch,
+                scene,
+                losses[number],
+                near[number],
+                _hidden(number, group, places[number], grid, labels, scene.maps),
             )
+            for number, patch in enumerate(group)
+        ]
         possible = np.stack([evidence.possible for evidence in of_patches])
         excess = _excess(group, of_patches, near, of_surface, is_refined)
-        claims = np.stack(
-            [
-                _claim(number, group, seeds, grid, evidence, excess[number])
-                for number, evidence in enumerate(of_patches)
-            ]
-        )
+        claims_of = partial(_claim, group, seeds, grid)
+        with ThreadPoolExecutor(default_num_workers()) as pool:
+            claims = np.stack(list(pool.map(claims_of, range(len(group)), of_patches, excess)))
         # The other walks end on the refined surface. Without one, a cell far from few points has a
         # small probability of reaching them, but belongs to the patch if no other can be there.
         total = 1.0 if is_refined else claims.sum(axis=0)
@@ -864,7 +863,7 @@ def patch_evidence(
     scene: PatchScene,
     losses: Image,
     near_points: Mask,
-    hidden: Sequence[Mask] | None,
+    hidden: Sequence[Mask] | None = None,
 ) -> PatchEvidence:
     """Evidence of the views for a patch at points ``(H, W, 3)`` on it.
 
@@ -874,22 +873,26 @@ def patch_evidence(
     scene : the views.
     losses : (K, H, W) of :meth:`PatchScene.losses_on`.
     near_points : (H, W) bool, where edges may be those of printed marks.
-    hidden : for each view, points ``(H, W)`` that it does not see.
-    tol : tolerances.
+    hidden : for each view, points ``(H, W)`` that it does not see; None: it sees all.
     """
     shape = places.shape[:2]
     own, jumps = np.full((2, *losses.shape), np.nan, np.float32)
     inside, num_seen, num_marks = np.zeros((3, *shape))
-    for k, phase_map in enumerate(scene.maps):
-        xy, seen = _seen(places, patch, phase_map)
+
+    def of_view(k: int) -> tuple[Mask, Mask, Mask]:
+        xy, seen = _seen(places, patch, scene.maps[k])
         if hidden is not None:
             seen &= ~hidden[k]
-        shown = seen & phase_map.shows_surface(xy)
-        num_seen += seen
-        inside += shown
+        shown = seen & scene.maps[k].shows_surface(xy)
         own[k] = np.where(shown, losses[k], np.nan)
         jumps[k], marks = _line_steps(scene.features[k], xy, shown)
-        num_marks += marks
+        return seen, shown, marks
+
+    with ThreadPoolExecutor(default_num_workers()) as pool:
+        for seen, shown, marks in pool.map(of_view, range(len(scene.maps))):
+            num_seen += seen
+            inside += shown
+            num_marks += marks
     # A print on the patch is a mark in all views; a print on a wall beside it has another position
     # in each.
     printed = near_points & (num_marks > TOL.mark_share * inside)
@@ -1012,10 +1015,10 @@ def _hidden(
 
 
 def _claim(
-    number: int,
     group: Sequence[Patch],
     seeds: Seeds,
     grid: PatchGrid,
+    number: int,
     evidence: PatchEvidence,
     excess: Array,
 ) -> Array:
