@@ -36,7 +36,7 @@ class Consistency:
     phase_residual : angle between the phase that a point's normal predicts, under the cloud's
         model, and the measured one, over all views that see the point
         (:func:`phase_residuals_deg`).
-    coverage : share of the region's pixels, over all views, that show a point of the cloud.
+    coverage : share of the bounded region's pixels, over all views, that show a point of the cloud.
     agreement : share of the views that see a point which agree with it in position and normal.
     track_residual_median_deg : angle between the normals of the sparse points and their planes
         of incidence, over the points on the polarized surface.
@@ -76,7 +76,7 @@ def measure_consistency(
     errors = [np.zeros(0)]
     for whole in maps:
         phase_map = within_box(whole, outside)
-        cells = _region_cells(phase_map.region.inside)
+        cells = _region_cells(phase_map.region.bounded)
         inside += int(cells.sum())
         if num == 0 or cloud.normals is None:
             continue
@@ -112,7 +112,12 @@ def within_box(phase_map: PhaseMap, outside: Mapping[str, Mask]) -> PhaseMap:
         return phase_map
     region = phase_map.region
     inside = region.inside & ~outside[phase_map.view.name]
-    kept = Region(inside=inside, reliable=region.reliable & inside, edges=region.edges)
+    kept = Region(
+        inside=inside,
+        reliable=region.reliable & inside,
+        edges=region.edges,
+        unbounded=None if region.unbounded is None else region.unbounded & inside,
+    )
     return phase_map.changed(region=kept)
 
 

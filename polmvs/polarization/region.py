@@ -88,6 +88,11 @@ class Region:
     edges: Mask
     unbounded: Mask | None = None
 
+    @property
+    def bounded(self) -> Mask:
+        """(H, W) bool, pixels inside that are not unbounded."""
+        return self.inside if self.unbounded is None else self.inside & ~self.unbounded
+
 
 def smooth(image: Image, sigma_px: float) -> Image:
     """Gaussian smoothing with replicated borders."""

@@ -243,7 +243,8 @@ class _Working:
     intensity : (H, W) float32, in its own pixels.
     lowest : intensity whose logarithm is the lowest.
     log : (h, w) float32, logarithm of the intensity.
-    polarized : (h, w) bool, its polarized region.
+    polarized : (h, w) bool, its polarized region, without what reaches the image's border.
+    is_bounded : whether nothing of that region does.
     on_plane : (h, w, 3), where each pixel's ray meets the plane; NaN where it does not.
     has_plane : (h, w) bool, where the plane is known to reach to.
     """
@@ -254,6 +255,7 @@ class _Working:
     lowest: float
     log: Image
     polarized: Mask
+    is_bounded: bool
     on_plane: Array
     has_plane: Mask
 
@@ -280,16 +282,18 @@ class _Working:
 
 def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> _Working:
     view, image = phase_map.view, np.asarray(phase_map.intensity, np.float32)
-    inside = phase_map.region.inside.astype(np.float32)
+    region = phase_map.region
+    is_bounded = region.unbounded is None or not region.unbounded.any()
+    bounded = region.bounded.astype(np.float32)
     factor = max(max(image.shape) / longest_px, 1.0)
     size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1 else image
     lowest = 1e-3 * max(float(np.percentile(small, 99)), 1e-12)
     log = np.log(np.maximum(cv2.GaussianBlur(small, (0, 0), 0.5), lowest)).astype(np.float32)
-    polarized = cv2.resize(inside, size, interpolation=cv2.INTER_AREA) > 0.5
+    polarized = cv2.resize(bounded, size, interpolation=cv2.INTER_AREA) > 0.5
     on_plane = _on_plane(view, plane, pixel_centers(*size) * factor)
     has_plane = np.asarray(np.isfinite(on_plane).all(axis=-1), np.bool_)
-    return _Working(view, factor, image, lowest, log, polarized, on_plane, has_plane)
+    return _Working(view, factor, image, lowest, log, polarized, is_bounded, on_plane, has_plane)
 
 
 def _on_plane(view: View, plane: SupportingPlane, xy: Floats) -> Array:
@@ -304,8 +308,9 @@ def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[i
     """Views in which polarization does not show what is well within some masks.
 
     Outlines from polarization and from the plane differ in their bias. So all views are searched,
-    or, if polarization shows the object in the median view, those in which it fails. A view whose
-    polarized region lies beside the mask has a wrong pose, and so would its search.
+    or, if polarization shows the object in the median view, those in which it fails or does not end
+    before the image's border. A view whose polarized region lies beside the mask has a wrong pose,
+    and so would its search.
     """
     shares, beside = np.full(len(views), np.nan), np.zeros(len(views))
     for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
@@ -321,7 +326,8 @@ def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[i
     if median < TOL.polarized_share:
         return list(range(len(views)))
     least = TOL.least_polarized_share
-    return np.flatnonzero((shares < least) & (beside < 1 - least)).tolist()
+    fails = (shares < least) | ~np.array([view.is_bounded for view in views])
+    return np.flatnonzero(fails & (beside < 1 - least)).tolist()
 
 
 def _nearest(views: Sequence[_Working], index: int) -> NDArray[np.int64]:

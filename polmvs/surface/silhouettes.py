@@ -90,7 +90,7 @@ def find_silhouette(phase_map: PhaseMap, *, mask_given: bool) -> Silhouette:
         return Silhouette(inside, inside)
     scale = phase_map.view.camera.mean_focal_px / REFERENCE_FOCAL_PX
     unbounded = phase_map.region.unbounded
-    certain = _cleaned(inside if unbounded is None else inside & ~unbounded, scale)
+    certain = _cleaned(phase_map.region.bounded, scale)
     if not certain.any():
         return Silhouette(certain, certain)
     intensity = np.asarray(phase_map.intensity, np.float32)

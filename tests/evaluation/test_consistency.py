@@ -7,6 +7,7 @@ from scenes import Scene, board_scene
 from polmvs.evaluation.consistency import Consistency, measure_consistency
 from polmvs.io.clouds import Cloud
 from polmvs.polarization.kinds import AngleModel
+from polmvs.polarization.region import Region
 from polmvs.scene import PointKind
 
 NO_TRACKS = Cloud(np.zeros((0, 3)))
@@ -65,6 +66,18 @@ def test_surroundings_alone_are_no_points(scene: Scene) -> None:
     assert found.num_points == 0
     assert found.coverage == 0
     assert np.isnan(found.agreement)
+
+
+def test_background_that_a_region_grew_into_is_not_missing(scene: Scene) -> None:
+    surface = surface_of(scene)
+    grown = []
+    for one in scene.maps:
+        region, everything = one.region, np.ones_like(one.region.inside)
+        leaked = Region(everything, region.reliable, region.edges, ~region.inside)
+        grown.append(one.changed(region=leaked))
+    alone = measure(scene, surface)
+    found = measure_consistency(AngleModel.PPA, surface, NO_TRACKS, grown)
+    assert found.coverage == alone.coverage > 0
 
 
 def test_no_more_than_all_views_agree(scene: Scene) -> None:

@@ -272,6 +272,14 @@ def test_what_polarization_shows_is_left_to_it(white):
     assert mixed[1:] == [None] * (len(white) - 1)
     # The regions of the others mark what is not the plane, so the outline differs by some pixels.
     assert (mixed[0].mask ^ found[0].mask).sum() < 0.01 * found[0].mask.sum()
+    # So is one whose region has grown to the image's border, over what lies beyond the plane.
+    beyond = np.indices(found[0].mask.shape)[0] < 40
+    leaked = found[0].mask | beyond
+    grown = white[0].changed(region=Region(leaked, leaked, ~leaked, beyond & ~found[0].mask))
+    bounded = hidden_plane([grown, *polarized[1:]], tracks)
+    assert bounded is not None
+    assert bounded[1:] == [None] * (len(white) - 1)
+    assert (bounded[0].mask ^ found[0].mask).sum() < 0.01 * found[0].mask.sum()
     # A polarized region beside what the others show is that of a wrong pose.
     aside = np.roll(found[0].mask, found[0].mask.shape[1] // 4, axis=1)
     wrong = white[0].changed(region=Region(aside, aside, ~aside))
