@@ -679,8 +679,13 @@ def _labels(
     of_surface = _surface_misfit(grid, rise.max(axis=0), scene, surface)
     labels, shown = np.full(grid.shape, NO_PATCH), np.zeros(grid.shape, np.bool_)
     losses = [scene.losses_on(*own) for own in zip(places, group, strict=True)]
-    on_grid = [grid.cells(seeds.points_in_world[patch.members]) for patch in group]
-    near = [_distance_to(points, grid.shape) < 0.5 * TOL.mark_px for points in on_grid]
+    to_points = np.stack(
+        [
+            _distance_to(grid.cells(seeds.points_in_world[patch.members]), grid.shape)
+            for patch in group
+        ]
+    )
+    near = to_points < 0.5 * TOL.mark_px
     # Occlusion between patches needs labels: a second pass uses those of the first.
     for _ in range(min(len(group), 2)):
         of_patches = [
@@ -696,7 +701,7 @@ def _labels(
         ]
         possible = np.stack([evidence.possible for evidence in of_patches])
         excess = _excess(group, of_patches, near, of_surface, is_refined)
-        claims_of = partial(_claim, group, seeds, grid)
+        claims_of = partial(_claim, to_points)
         with ThreadPoolExecutor(default_num_workers()) as pool:
             claims = np.stack(list(pool.map(claims_of, range(len(group)), of_patches, excess)))
         # The other walks end on the refined surface. Without one, a cell far from few points has a
@@ -723,15 +728,15 @@ def _labels(
 def _excess(
     group: Sequence[Patch],
     of_patches: Sequence[PatchEvidence],
-    near_points: Sequence[Mask],
+    near_points: Mask,
     of_surface: Image,
     is_refined: bool,
 ) -> Array:
     """How many views more contradict each patch (G, H, W) than what else may be there.
 
     That is a refined surface. Over a hull it is also a parallel patch, except ``near_points``
-    (H, W) of the patch itself, whose print has phases of its own, or what contradicts half of the
-    views. ``of_surface`` (H, W) contradict the given surface, NaN where there is none.
+    (G, H, W) of the patch itself, whose print has phases of its own, or what contradicts half of
+    the views. ``of_surface`` (H, W) contradict the given surface, NaN where there is none.
     """
     misfit = np.stack([one.misfit for one in of_patches]).astype(np.float64)
     num_phases = np.stack([one.num_phases for one in of_patches])
@@ -742,7 +747,7 @@ def _excess(
     parallel = normals @ normals.T > np.cos(np.radians(TOL.normal_deg))
     np.fill_diagonal(parallel, False)
     others = np.stack([np.fmin.reduce(share[own], axis=0, initial=MAX_COST) for own in parallel])
-    others[np.stack(near_points)] = MAX_COST
+    others[near_points] = MAX_COST
     # Normals of a hull are not those of the object: it cannot speak for a patch.
     against = np.maximum(misfit - np.fmin(of_surface, others * num_phases), 0)
     if is_refined:
@@ -1014,31 +1019,19 @@ def _hidden(
     return hidden
 
 
-def _claim(
-    group: Sequence[Patch],
-    seeds: Seeds,
-    grid: PatchGrid,
-    number: int,
-    evidence: PatchEvidence,
-    excess: Array,
-) -> Array:
+def _claim(to_points: Array, number: int, evidence: PatchEvidence, excess: Array) -> Array:
     """Probability (H, W) that a walk from a cell, hampered by lines, ends on a patch.
 
     It ends on points of the patch or of others, or where ``excess`` (H, W) is beyond one view: on
-    the given surface if it is positive, on the patch if it is negative.
+    the given surface if it is positive, on the patch if it is negative. ``to_points`` (G, H, W) are
+    the distances in cells to the points of each patch.
     """
-    possible = evidence.possible
-    own, others = (np.full(grid.shape, np.inf) for _ in range(2))
-    for other, patch in enumerate(group):
-        near = _distance_to(grid.cells(seeds.points_in_world[patch.members]), grid.shape)
-        if other == number:
-            own = near
-        else:
-            others = np.minimum(others, near)
+    possible, own = evidence.possible, to_points[number]
+    others = np.delete(to_points, number, axis=0).min(axis=0, initial=np.inf)
     starts = (own < TOL.seed_cells) & (own < others) & possible
     ends = (others < TOL.seed_cells) & (others < own) & possible
     if not starts.any():
-        return np.zeros(grid.shape)
+        return np.zeros(own.shape)
     adjacency, degree = _walk(evidence.jump.astype(np.float64))
     # A walk may end on any point that it passes, so a single false point does not decide.
     ending = TOL.seed_weight * (starts | ends).ravel()
@@ -1049,7 +1042,7 @@ def _claim(
     total = degree + ending + contradicted + supported + 1e-9
     claim = np.zeros(starts.size)
     claim[free] = _solved(adjacency[free][:, free], total[free], right[free])
-    return np.asarray(claim.reshape(grid.shape))
+    return np.asarray(claim.reshape(own.shape))
 
 
 def _steps_between(

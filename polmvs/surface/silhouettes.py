@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from polmvs.camera import sample_image
 from polmvs.io.arrays import StoredArray, map_array, save_array
-from polmvs.polarization.phase_map import PhaseMap
+from polmvs.polarization.phase_map import PhaseMap, box_about
 from polmvs.polarization.region import RegionTolerances, parts_at_border
 from polmvs.surface.surface_view import (
     REFERENCE_FOCAL_PX,
@@ -174,12 +174,7 @@ def _continued(certain: Mask, intensity: Image, scale: float) -> Mask:
     labels[searched & (bright <= like)] = cv2.GC_PR_FGD
     labels[certain] = cv2.GC_PR_FGD
     labels[cv2.erode(pixels, np.ones((5, 5), np.uint8)) > 0] = cv2.GC_FGD
-    rows, cols = np.flatnonzero(searched.any(axis=1)), np.flatnonzero(searched.any(axis=0))
-    margin = round(20 * scale)
-    box = (
-        slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
-        slice(max(cols[0] - margin, 0), cols[-1] + margin + 1),
-    )
+    box = box_about(searched, round(20 * scale))
     cut = np.ascontiguousarray(labels[box])
     objects = np.isin(cut, (cv2.GC_FGD, cv2.GC_PR_FGD))
     if objects.all() or not objects.any():
