@@ -244,7 +244,7 @@ class _Working:
     lowest : intensity whose logarithm is the lowest.
     log : (h, w) float32, logarithm of the intensity.
     polarized : (h, w) bool, its polarized region, without what reaches the image's border.
-    is_bounded : whether nothing of that region does.
+    unbounded : (h, w) bool, what does.
     on_plane : (h, w, 3), where each pixel's ray meets the plane; NaN where it does not.
     has_plane : (h, w) bool, where the plane is known to reach to.
     """
@@ -255,7 +255,7 @@ class _Working:
     lowest: float
     log: Image
     polarized: Mask
-    is_bounded: bool
+    unbounded: Mask
     on_plane: Array
     has_plane: Mask
 
@@ -283,17 +283,20 @@ class _Working:
 def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> _Working:
     view, image = phase_map.view, np.asarray(phase_map.intensity, np.float32)
     region = phase_map.region
-    is_bounded = region.unbounded is None or not region.unbounded.any()
-    bounded = region.bounded.astype(np.float32)
     factor = max(max(image.shape) / longest_px, 1.0)
     size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1 else image
     lowest = 1e-3 * max(float(np.percentile(small, 99)), 1e-12)
     log = np.log(np.maximum(cv2.GaussianBlur(small, (0, 0), 0.5), lowest)).astype(np.float32)
-    polarized = cv2.resize(bounded, size, interpolation=cv2.INTER_AREA) > 0.5
+    polarized, inside = (
+        cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+        for mask in (region.bounded, region.inside)
+    )
     on_plane = _on_plane(view, plane, pixel_centers(*size) * factor)
     has_plane = np.asarray(np.isfinite(on_plane).all(axis=-1), np.bool_)
-    return _Working(view, factor, image, lowest, log, polarized, is_bounded, on_plane, has_plane)
+    return _Working(
+        view, factor, image, lowest, log, polarized, inside & ~polarized, on_plane, has_plane
+    )
 
 
 def _on_plane(view: View, plane: SupportingPlane, xy: Floats) -> Array:
@@ -308,25 +311,26 @@ def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[i
     """Views in which polarization does not show what is well within some masks.
 
     Outlines from polarization and from the plane differ in their bias. So all views are searched,
-    or, if polarization shows the object in the median view, those in which it fails or does not end
-    before the image's border. A view whose polarized region lies beside the mask has a wrong pose,
-    and so would its search.
+    or, if polarization shows the object in the median view, those in which it fails, or in which
+    its region has grown over the background up to the image's border. A view whose polarized
+    region lies beside the mask has a wrong pose, and so would its search.
     """
-    shares, beside = np.full(len(views), np.nan), np.zeros(len(views))
+    shares, beside, grown = np.full(len(views), np.nan), *np.zeros((2, len(views)))
     for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
         distance = signed_distance_px(mask)
-        inner = distance < -TOL.inner_px
+        inner, outer = distance < -TOL.inner_px, distance > TOL.inner_px
         if inner.any():
             shares[index] = view.polarized[inner].mean()
         if view.polarized.any():
-            beside[index] = np.mean(distance[view.polarized] > TOL.inner_px)
+            beside[index] = outer[view.polarized].mean()
+            grown[index] = outer[view.polarized | view.unbounded].mean()
     known = np.isfinite(shares)
     median = float(np.median(shares[known])) if known.any() else 0.0
     logger.info("%.1f %% of what hides its support is polarized.", 100 * median)
     if median < TOL.polarized_share:
         return list(range(len(views)))
     least = TOL.least_polarized_share
-    fails = (shares < least) | ~np.array([view.is_bounded for view in views])
+    fails = (shares < least) | (grown >= 1 - least)
     return np.flatnonzero(fails & (beside < 1 - least)).tolist()
 
 
