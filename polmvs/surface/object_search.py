@@ -319,11 +319,11 @@ def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[i
     for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
         distance = signed_distance_px(mask)
         inner, outer = distance < -TOL.inner_px, distance > TOL.inner_px
+        whole = view.polarized | view.unbounded
         if inner.any():
-            shares[index] = view.polarized[inner].mean()
+            shares[index] = whole[inner].mean()
         if view.polarized.any():
-            beside[index] = outer[view.polarized].mean()
-            grown[index] = outer[view.polarized | view.unbounded].mean()
+            beside[index], grown[index] = outer[view.polarized].mean(), outer[whole].mean()
     known = np.isfinite(shares)
     median = float(np.median(shares[known])) if known.any() else 0.0
     logger.info("%.1f %% of what hides its support is polarized.", 100 * median)

@@ -266,6 +266,12 @@ def test_what_polarization_shows_is_left_to_it(white):
         for one, hiding in zip(white, found, strict=True)
     ]
     assert hidden_plane(polarized, tracks) is None
+    # A part that may be background is the object's here, as a frontal face at the border.
+    frontal = [
+        one.changed(region=Region(mask, mask, ~mask, mask & (np.indices(mask.shape)[0] % 40 < 20)))
+        for one, mask in ((one, one.region.inside) for one in polarized)
+    ]
+    assert hidden_plane(frontal, tracks) is None
     # One view without polarization is searched; the others keep the outline that they show.
     mixed = hidden_plane([white[0], *polarized[1:]], tracks)
     assert mixed is not None
