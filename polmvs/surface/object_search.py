@@ -243,8 +243,8 @@ class _Working:
     intensity : (H, W) float32, in its own pixels.
     lowest : intensity whose logarithm is the lowest.
     log : (h, w) float32, logarithm of the intensity.
-    polarized : (h, w) bool, its polarized region, without what reaches the image's border.
-    unbounded : (h, w) bool, what does.
+    region : (h, w) bool, its polarized region.
+    polarized : (h, w) bool, the region without what may be background up to the image's border.
     on_plane : (h, w, 3), where each pixel's ray meets the plane; NaN where it does not.
     has_plane : (h, w) bool, where the plane is known to reach to.
     """
@@ -254,8 +254,8 @@ class _Working:
     intensity: Image
     lowest: float
     log: Image
+    region: Mask
     polarized: Mask
-    unbounded: Mask
     on_plane: Array
     has_plane: Mask
 
@@ -282,21 +282,18 @@ class _Working:
 
 def _working(phase_map: PhaseMap, plane: SupportingPlane, longest_px: float) -> _Working:
     view, image = phase_map.view, np.asarray(phase_map.intensity, np.float32)
-    region = phase_map.region
     factor = max(max(image.shape) / longest_px, 1.0)
     size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1 else image
     lowest = 1e-3 * max(float(np.percentile(small, 99)), 1e-12)
     log = np.log(np.maximum(cv2.GaussianBlur(small, (0, 0), 0.5), lowest)).astype(np.float32)
-    polarized, inside = (
+    region, polarized = (
         cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
-        for mask in (region.bounded, region.inside)
+        for mask in (phase_map.region.inside, phase_map.region.bounded)
     )
     on_plane = _on_plane(view, plane, pixel_centers(*size) * factor)
     has_plane = np.asarray(np.isfinite(on_plane).all(axis=-1), np.bool_)
-    return _Working(
-        view, factor, image, lowest, log, polarized, inside & ~polarized, on_plane, has_plane
-    )
+    return _Working(view, factor, image, lowest, log, region, polarized, on_plane, has_plane)
 
 
 def _on_plane(view: View, plane: SupportingPlane, xy: Floats) -> Array:
@@ -319,11 +316,10 @@ def _views_to_search(views: Sequence[_Working], masks: Sequence[Mask]) -> list[i
     for index, (view, mask) in enumerate(zip(views, masks, strict=True)):
         distance = signed_distance_px(mask)
         inner, outer = distance < -TOL.inner_px, distance > TOL.inner_px
-        whole = view.polarized | view.unbounded
         if inner.any():
-            shares[index] = whole[inner].mean()
+            shares[index] = view.region[inner].mean()
         if view.polarized.any():
-            beside[index], grown[index] = outer[view.polarized].mean(), outer[whole].mean()
+            beside[index], grown[index] = outer[view.polarized].mean(), outer[view.region].mean()
     known = np.isfinite(shares)
     median = float(np.median(shares[known])) if known.any() else 0.0
     logger.info("%.1f %% of what hides its support is polarized.", 100 * median)
