@@ -285,7 +285,10 @@ def find_vessel(
         return None if cavity is None or cavity.is_deep else cavity
 
     likeliest = _likeliest_thickness(cavity_of, gain)
-    return None if likeliest is None else cavity_of(*likeliest)
+    # Neither the solid nor the vessel is refined, so errors of their shapes have a part in the sum.
+    if likeliest is None or not likeliest.views_agree:
+        return None
+    return cavity_of(likeliest.thickness, likeliest.sigma)
 
 
 def _least_area(gsd: float) -> float:
@@ -322,7 +325,7 @@ def _bright_cavity(
     for is_round in (False, True):
         likeliest = _likeliest_thickness(partial(cavity_of, is_round), gain)
         if likeliest is not None:
-            found.append((*likeliest, is_round))
+            found.append((likeliest.thickness, likeliest.sigma, is_round))
     if not found:
         return None
     thickness, sigma, is_round = max(found)
@@ -346,13 +349,30 @@ def _cavities_within(
     return cavity_of
 
 
+@dataclass(frozen=True)
+class _Thickness:
+    """The likeliest thickness of a wall.
+
+    Attributes
+    ----------
+    thickness, sigma : in cells, and its deviation between views.
+    gain : (V,) information that the wall adds to each view's phases, nats.
+    """
+
+    thickness: float
+    sigma: float
+    gain: Array
+
+    @property
+    def views_agree(self) -> bool:
+        """Whether the mean of the views shows the wall at a significance of 95 %."""
+        return bool(self.gain.mean() > ONE_SIDED * _sigma_of_mean(self.gain))
+
+
 def _likeliest_thickness(
     cavity_of: Callable[[float], Cavity | None], gain: Callable[[Cavity], Array]
-) -> tuple[float, float] | None:
-    """The thickness of the wall that adds the most information, and its deviation between views.
-
-    None if no wall adds any, or if views disagree on it.
-    """
+) -> _Thickness | None:
+    """The thickness of the wall that adds the most information; None if no wall adds any."""
     gains: dict[int, Array] = {}
 
     def thickness_of(number: float) -> float:
@@ -371,8 +391,6 @@ def _likeliest_thickness(
         while total(best + step) > total(best):
             best += step
     below, here, above = gains[best - 1], gains[best], gains[best + 1]
-    if not here.mean() > ONE_SIDED * _sigma_of_mean(here):
-        return None
     # The vertex of a parabola. Its deviation is that of the slope.
     shift, sigma = 0.0, 1.0
     if np.isfinite(below).all() and np.isfinite(above).all():
@@ -380,7 +398,7 @@ def _likeliest_thickness(
         if bend < 0:
             shift, sigma = -slope.mean() / bend, _sigma_of_mean(slope) / -bend
     thickness = thickness_of(best + shift)
-    return thickness, thickness * (THICKNESS_RATIO**sigma - 1)
+    return _Thickness(thickness, thickness * (THICKNESS_RATIO**sigma - 1), here)
 
 
 def _top_of_wall(surface: SurfaceFaces, opening: Opening, plane: Patch) -> Patch:

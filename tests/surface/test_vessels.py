@@ -8,6 +8,7 @@ from analytic_objects import phase_maps_of, ring_of_views
 
 from polmvs.camera import PinholeCamera
 from polmvs.polarization.kinds import AngleModel
+from polmvs.surface.cavities import find_vessel
 from polmvs.surface.mesh_geometry import RayScene
 from polmvs.surface.observations import Looking
 from polmvs.surface.solver import first_fit
@@ -87,6 +88,20 @@ def test_a_lid_and_a_deep_vessel_keep_their_hull(solid):
     same, walls = opened_hull(hull, GROUND, fit)
     assert same is hull
     assert walls is None
+
+
+@pytest.mark.parametrize(
+    ("gains", "is_open"), [([1.0] * 8, True), ([9.0, 9, -1, -1, -1, -1, -1, -1], False)]
+)
+def test_a_vessel_is_carved_into_a_rough_hull_only_if_views_agree(of_bowl, gains, is_open):
+    hull, _ = of_bowl
+
+    def gain(cavity):
+        return np.array(gains) * (1 - np.log(cavity.thickness / WALL) ** 2)
+
+    top = replace(GROUND, offset=GROUND.offset + 1.0)
+    vessel = find_vessel(RayScene(hull.mesh), top, hull.gsd, gain)
+    assert (vessel is not None) == is_open
 
 
 def test_without_a_plane_no_vessel_is_looked_for(of_bowl):
