@@ -143,8 +143,8 @@ class Cavity:
         return np.asarray(found, np.float64)
 
 
-# Information (V,) of each view's phases, nats, on the surface with a cavity, or closed (None).
-Information: TypeAlias = Callable[[Cavity | None], Array]
+# Information (V,) that a cavity adds to each view's phases, nats.
+Gain: TypeAlias = Callable[[Cavity], Array]
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def surface_faces(scene: RayScene, seen: Mask, supported: Mask, gsd: float) -> S
 def find_cavities(
     surface: SurfaceFaces,
     scene: PatchScene,
-    information: Information,
+    gain: Gain,
 ) -> tuple[Cavity, ...]:
     """Openings that a surface closes with a cap, and the cavities behind them.
 
@@ -225,15 +225,10 @@ def find_cavities(
     ----------
     surface : refined; its outside determines the cavity's walls.
     scene : the views.
-    information : of the phases, with and without a cavity.
+    gain : information (V,) of each view's phases that a cavity adds to the closed surface's.
     """
     if len(scene.maps) < MIN_VIEWS:
         return ()
-    closed = cache(lambda: information(None))
-
-    def gain(cavity: Cavity) -> Array:
-        return information(cavity) - closed()
-
     found: list[Cavity] = []
     for opening in surface.openings:
         plane = _plane_of(opening, surface)
@@ -250,9 +245,7 @@ def find_cavities(
     return tuple(found)
 
 
-def find_vessel(
-    scene: RayScene, top: SupportingPlane, gsd: float, gain: Callable[[Cavity], Array]
-) -> Cavity | None:
+def find_vessel(scene: RayScene, top: SupportingPlane, gsd: float, gain: Gain) -> Cavity | None:
     """The shallow cavity below a plane, at whose walls the phases are likelier than on a solid.
 
     Parameters
@@ -308,7 +301,7 @@ def _dark_cavity(
 
 
 def _bright_cavity(
-    surface: SurfaceFaces, opening: Opening, plane: Patch, gain: Callable[[Cavity], Array]
+    surface: SurfaceFaces, opening: Opening, plane: Patch, gain: Gain
 ) -> Cavity | None:
     """The cavity with the wall at which the phases are likeliest; None if the cap explains them.
 
@@ -324,8 +317,9 @@ def _bright_cavity(
     found = []
     for is_round in (False, True):
         likeliest = _likeliest_thickness(partial(cavity_of, is_round), gain)
-        if likeliest is not None:
-            found.append((likeliest.thickness, likeliest.sigma, is_round))
+        if likeliest is None:  # where no flat rim adds any, no rounded one did
+            break
+        found.append((likeliest.thickness, likeliest.sigma, is_round))
     if not found:
         return None
     thickness, sigma, is_round = max(found)
@@ -370,7 +364,7 @@ class _Thickness:
 
 
 def _likeliest_thickness(
-    cavity_of: Callable[[float], Cavity | None], gain: Callable[[Cavity], Array]
+    cavity_of: Callable[[float], Cavity | None], gain: Gain
 ) -> _Thickness | None:
     """The thickness of the wall that adds the most information; None if no wall adds any."""
     gains: dict[int, Array] = {}
@@ -385,11 +379,12 @@ def _likeliest_thickness(
         return float(gains[number].sum())
 
     best = 1
-    if not total(best) > 0:
-        return None
-    for step in (1, -1):
+    # Where a wall makes the phases less likely, a thicker one makes them so in fewer pixels.
+    for step in (1, -1) if total(best) > 0 else (-1,):
         while total(best + step) > total(best):
             best += step
+    if not total(best) > 0:
+        return None
     below, here, above = gains[best - 1], gains[best], gains[best + 1]
     # The vertex of a parabola. Its deviation is that of the slope.
     shift, sigma = 0.0, 1.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import compress
 from pathlib import Path
 
@@ -630,13 +630,18 @@ def _cavities(given: _Given, refined: Refined, scene: RayScene) -> tuple[Cavity,
     )
     seen = evidence.num_views >= given.min_views
 
-    def information(cavity: Cavity | None) -> Array:
-        """Of the phases of each view, nats, on the mesh with a cavity carved."""
-        free = () if cavity is None else (cavity.values,)
-        carved = remeshed(scene, HullTolerances.step_px * fit.gsd, free=free, smoothing=0)
-        return view_information(carved, fit)
+    def information(step: float, *free: SignedDistance) -> Array:
+        """Of the phases of each view, nats, on the mesh with free space carved."""
+        return view_information(remeshed(scene, step, free=free, smoothing=0), fit)
 
-    return find_cavities(surface_faces(scene, seen, supported, fit.gsd), given.scene, information)
+    closed = cache(information)
+
+    def gain(cavity: Cavity) -> Array:
+        # With fewer than two cells across it, a wall vanishes.
+        step = min(HullTolerances.step_px * fit.gsd, 0.5 * cavity.thickness)
+        return information(step, cavity.values) - closed(step)
+
+    return find_cavities(surface_faces(scene, seen, supported, fit.gsd), given.scene, gain)
 
 
 def _lie_on(mesh: TriangleMesh, carvings: Sequence[SignedDistance]) -> Mask:

@@ -171,7 +171,8 @@ def closed_rounded_vessel():
 
 def found_in(surface, maps, information=lambda cavity: np.zeros(8)):
     """Cavities of a surface; without ``information`` the phases in its openings say nothing."""
-    return find_cavities(surface, patch_scene(maps, AngleModel.PPA), information)
+    scene = patch_scene(maps, AngleModel.PPA)
+    return find_cavities(surface, scene, lambda cavity: information(cavity) - information(None))
 
 
 def information_of(inside, bore=RADIUS - WALL):
