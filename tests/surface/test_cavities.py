@@ -10,7 +10,14 @@ from polmvs.polarization.kinds import AngleModel, Light
 from polmvs.polarization.phase_map import build_phase_map
 from polmvs.polarization.region import find_region
 from polmvs.polarization.stokes import Stokes
-from polmvs.surface.cavities import Opening, SurfaceFaces, find_cavities, surface_faces
+from polmvs.surface.cavities import (
+    THICKNESS_RATIO,
+    CavityTolerances,
+    Opening,
+    SurfaceFaces,
+    find_cavities,
+    surface_faces,
+)
 from polmvs.surface.mesh_geometry import RayScene, mesh_from_grid
 from polmvs.surface.offsets import patch_scene
 from polmvs.synthetic.captures import render_view, ring_of_views
@@ -239,6 +246,14 @@ def test_the_wall_that_is_likeliest_in_total_is_taken_though_views_disagree():
     information = information_of_views([9.0, 9, -1, -1, -1, -1, -1, -1], 1.0)
     (cavity,) = found_in(closed_cylinder(), vessel_maps(dark=1.0), information)
     assert cavity.thickness == pytest.approx(WALL, abs=GSD)
+
+
+def test_a_wall_thinner_than_the_first_is_found_though_that_adds_nothing():
+    information = information_of_views([1.0] * 8, 50.0)
+    (cavity,) = found_in(closed_cylinder(), vessel_maps(dark=1.0), information)
+    first = CavityTolerances.rounding * THICKNESS_RATIO * GSD
+    assert 1 - 50 * np.log(first / WALL) ** 2 < 0
+    assert cavity.thickness == pytest.approx(WALL, abs=0.5 * GSD)
 
 
 def test_a_cap_that_is_likelier_in_total_stays():
