@@ -317,7 +317,7 @@ def _bright_cavity(
     found = []
     for is_round in (False, True):
         likeliest = _likeliest_thickness(partial(cavity_of, is_round), gain)
-        if likeliest is None:  # where no flat rim adds any, no rounded one did
+        if likeliest is None:  # a rounded rim adds none where a flat one does not
             break
         found.append((likeliest.thickness, likeliest.sigma, is_round))
     if not found:
@@ -379,7 +379,7 @@ def _likeliest_thickness(
         return float(gains[number].sum())
 
     best = 1
-    # Where a wall makes the phases less likely, a thicker one makes them so in fewer pixels.
+    # A thicker wall leaves less of a cavity that adds nothing, so only thinner ones may add any.
     for step in (1, -1) if total(best) > 0 else (-1,):
         while total(best + step) > total(best):
             best += step
